@@ -92,7 +92,10 @@ def test_json_lists_the_files(run: Run, tmp_path: Path) -> None:
     [
         (("--precision", "half"), "--precision: found 'half', expected double or float"),
         (("--to", "rust"), "--to: found 'rust', expected c or fmu"),
-        (("--to", "fmu", "--part", "motor"), "--part: found 'motor', expected controller or machine or loop"),
+        (
+            ("--to", "fmu", "--part", "motor"),
+            "--part: found 'motor', expected controller or supervised or machine or loop",
+        ),
         (("--to", "c", "--part", "loop"), "--part: found loop of a folder of C, expected --to fmu"),
         (("--to", "fmu", "--fmi", "1"), "--fmi: found 1, expected 2 or 3"),
         (("--to", "fmu", "--precision", "float"), "--precision: found float of an FMU, expected double"),

@@ -25,7 +25,10 @@ from malta.firmware.fmu import build_fmu
 from malta.firmware.machine import Machine, command_field
 from malta.firmware.native import FLAGS
 from malta.firmware.signals import Target, fidelity_of
+from malta.firmware.supervised import NUMBERS, Flown, Requests, supervised_engine
+from malta.firmware.supervisor import MONITORS, STATES
 from malta.firmware.unit import PARTS, Part, unit_of
+from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.simulation import references
 from malta.simulation.compiled import compiler
 
@@ -72,7 +75,10 @@ class Unit:
         self.samples = 0
         self.groups: dict[str, list[int]] = {}
         for v in d.modelVariables:
-            self.groups.setdefault(v.name.split(".")[0], []).append(v.valueReference)
+            group = v.name.split(".")[0]
+            self.groups.setdefault(group, []).append(v.valueReference)
+            if group != v.name:
+                self.groups[v.name] = [v.valueReference]
 
     def set(self, group: str, values: Any) -> None:
         call = self.fmu.setReal if self.second else self.fmu.setFloat64
@@ -244,6 +250,142 @@ def test_sensors_with_lag_dead_time_and_offsets_are_part_of_the_machine(
     assert np.abs(run.p - ideal.p[: len(run.p)]).max() > 1e-7
 
 
+@pytest.mark.parametrize(
+    ("name", "parameter"),
+    [
+        ("robust", "m"),
+        *(pytest.param("robust", key, marks=pytest.mark.slow) for key in ("I_yy", "K_A", "l_S", "R", "s_z")),
+        pytest.param("halbach", "A", marks=pytest.mark.slow),
+    ],
+)
+def test_a_machine_with_another_parameter_flies_as_simulated(
+    name: str, parameter: str, instance: Callable[..., Unit]
+) -> None:
+    """One of them 10 % larger than the gain file's, and noise of the sensors."""
+    t = target(name)
+    par: Any = silent(t).parameters
+    value = 1.1 * getattr(par, parameter)
+    other = t.believed.variant(replace(par, **{parameter: value}))
+    noise = 0.0 if other.uniform else 1.0
+    s = scenario(t, noise=noise, seed=3)
+    run = malta.simulate(other, t.controller, s)
+    usual = malta.simulate(silent(t), t.controller, s)
+    motion = s.reference(other)(run.t)
+    loop = instance(t, "loop", 2)
+    loop.begin()
+    loop.set(f"machine.{parameter}", [value])
+    if noise:
+        loop.set("noise", [1.0])
+        loop.set("seed", [3.0])
+    loop.refer(motion, 0)
+    loop.start()
+    assert fly(loop, run, motion) < 1e-12
+    assert np.abs(run.p - usual.p[: len(run.p)]).max() > 1e-9
+
+
+@pytest.mark.slow
+def test_a_machine_changes_in_flight_as_simulated(instance: Callable[..., Unit]) -> None:
+    """A payload of 0.1 kg that is picked up: a parameter that is set between steps."""
+    t = target("robust")
+    par: Any = t.believed.parameters
+    heavier = par.m + 0.1
+    s = malta.Scenario("payload", 0.02, references.hold, fidelity="phase", changes=((0.005, {"m": heavier}),))
+    run = malta.simulate(t.believed, t.controller, s)
+    loop = instance(t, "loop", 3)
+    loop.begin()
+    loop.start()
+    far = 0.0
+    for k, time in enumerate(run.t):
+        if time >= 0.005:
+            loop.set("machine.m", [heavier])
+        far = max(far, float(np.abs(loop.get("p") - run.p[k]).max()))
+        loop.advance()
+    assert float(np.abs(run.p).max()) > 5e-6
+    assert far < 1e-12
+
+
+def commission(supervised: Unit, machine: Unit, samples: int) -> tuple[Any, Any]:
+    """States and readings of a supervisor's flight from rest: started, and asked to land after 350 ms."""
+    states, places = [], []
+    for k in range(samples):
+        states.append(int(supervised.get("supervisor.state")[0]))
+        places.append(machine.get("p"))
+        for group in ("y", "i", "link"):
+            supervised.set(group, machine.get(group))
+        supervised.set("request.start", [float(k == 1)])
+        supervised.set("request.operate", [1.0])
+        supervised.set("request.land", [float(k >= 7000)])
+        supervised.advance()
+        machine.set("command", supervised.get("command"))
+        machine.advance()
+    return np.array(states), np.array(places)
+
+
+@pytest.mark.slow
+def test_a_supervisor_lifts_its_machine_off_the_bearing_and_lands_it(instance: Callable[..., Unit]) -> None:
+    """Two FMUs from rest on the touchdown bearing: the flight of the simulation with the exported supervisor."""
+    t = target("robust")
+    start = rest_on_bearing(t.believed) | {"z": 0.0}
+    s = malta.Scenario(
+        "lift",
+        0.6,
+        references.hold,
+        start=start,
+        cold=True,
+        bearing=True,
+        fidelity="phase",
+        noise=1.0,
+        seed=5,
+    )
+    flights: list[Flown] = []
+    engine = supervised_engine(flights, Requests(land=0.35))
+    run = malta.simulate(t.believed, t.controller, s, engine=engine)
+    supervised, machine = instance(t, "supervised", 3), instance(t, "machine", 3)
+    supervised.begin()
+    supervised.start()
+    machine.begin()
+    machine.set("x_start", run.x[0])
+    machine.set("cold", [1.0])
+    machine.set("noise", [1.0])
+    machine.set("seed", [5.0])
+    machine.start()
+    states, places = commission(supervised, machine, len(run.t))
+    passed = [int(state) for state in states[np.flatnonzero(np.diff(states, prepend=-1))]]
+    names = ["OFF", "OFFSETS", "SENSORS", "LIFT", "SETTLE", "OPERATE", "LANDING", "OFF"]
+    assert [list(STATES)[state] for state in passed] == names
+    assert machine.get("contact")[0] > 1  # it lies on its bearing again
+    assert np.abs(places[0][[1, 3]] - places[-1][[1, 3]]).max() < 2e-6
+    flying = states == NUMBERS["OPERATE"]
+    assert np.abs(places[flying][:, :4]).max() < 5e-6
+    assert np.abs(places - run.p).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_a_supervisor_takes_over_a_machine_that_flies(instance: Callable[..., Unit]) -> None:
+    t = target("robust")
+    supervised, machine = instance(t, "supervised", 2), instance(t, "machine", 2)
+    supervised.begin()
+    supervised.set("flying", [1.0])
+    supervised.start()
+    machine.begin()
+    machine.set("noise", [1.0])
+    machine.start()
+    assert int(supervised.get("supervisor.state")[0]) == NUMBERS["OPERATE"]
+    assert int(supervised.get("supervisor.enable")[0]) == 1
+    for k in range(200):
+        for group in ("y", "i", "link"):
+            supervised.set(group, machine.get(group))
+        supervised.set("request.sto", [float(k == 199)])
+        supervised.advance()
+        machine.set("command", supervised.get("command"))
+        machine.advance()
+    assert np.abs(machine.get("p")[:4]).max() < 5e-6
+    assert int(supervised.get("supervisor.state")[0]) == NUMBERS["FAULT"]
+    assert int(supervised.get("supervisor.monitor")[0]) == MONITORS.index("STO")
+    assert int(supervised.get("supervisor.enable")[0]) == 0
+    assert np.array_equal(supervised.get("command"), np.full(18, 0.5))
+
+
 @pytest.mark.slow
 def test_a_wrench_and_another_start_act_as_simulated(instance: Callable[..., Unit]) -> None:
     t = target("robust")
@@ -356,7 +498,7 @@ def test_validation_finds_nothing(
     causalities = {v.name: (v.causality, v.variability, v.unit) for v in d.modelVariables}
     if part != "machine" and name == "robust":
         assert causalities["v.f_D"] == ("output", "discrete", "N")
-    if part != "controller" and name == "robust":
+    if part in ("machine", "loop") and name == "robust":
         assert causalities["p.z"] == ("output", "continuous", "m")
         assert causalities["w.T_z"] == ("input", "continuous", "N m")
 
@@ -450,6 +592,8 @@ def test_what_cannot_be_is_refused_with_a_message(
 
     check("a step outside of the simulation", machine.advance)
     check("a parameter that is no finite number", lambda: machine.set("x_start", [np.nan, 0]))
+    check("a parameter out of its range", lambda: machine.set("machine.m", [-1.0]))
+    check("a parameter out of its range", lambda: machine.set("cold", [2.0]))
     check("a value reference that no variable has", lambda: machine.set("none", [0.0]))
     check("a value reference that no variable has", lambda: machine.get("none"))
     check("only inputs and parameters can be set", lambda: machine.set("p", [0.0]))
@@ -469,6 +613,28 @@ def test_what_cannot_be_is_refused_with_a_message(
     )
     with pytest.raises(Exception, match="instantiate"):
         impostor.instantiate()
+
+
+@BOTH
+def test_gains_are_parameters_of_a_tunable_controller(fmi: int, instance: Callable[..., Unit]) -> None:
+    """Set before the start and between two steps; the force is that of the estimate by these gains."""
+    from fmpy.fmi1 import FMICallException
+
+    t = replace(target("halbach"), tunable=True)
+    unit = instance(t, "controller", fmi)
+    K = unit.get("K")
+    assert list(K) == [v for v in np.ravel(t.controller.K) if abs(v) != 1]
+    unit.set("K.F_x_x", [1.05 * K[0]])
+    unit.begin()
+    unit.start()
+    for scale in (1.05, 0.95):
+        unit.set("K", [scale * K[0], K[1]])
+        unit.set("y", [1e-4])
+        unit.advance()
+        x, rate, disturbance = unit.get("xi_hat")
+        assert unit.get("v")[0] == pytest.approx(-(scale * K[0] * x + K[1] * rate + disturbance), rel=1e-12)
+    with pytest.raises(FMICallException):
+        unit.set("K", [1.2 * K[0], K[1]])
 
 
 def test_no_reading_poisons_the_controller(instance: Callable[..., Unit]) -> None:
@@ -529,7 +695,7 @@ def test_bad_input_gets_a_sentence() -> None:
     with pytest.raises(InputError, match="whose currents come from a table, expected the controller alone"):
         build_fmu(with_table, SHA256, part="machine")
     part: Any = "rotor"
-    with pytest.raises(InputError, match="part: found 'rotor', expected one of controller, machine, loop"):
+    with pytest.raises(InputError, match="part: found 'rotor', expected one of controller, supervised"):
         build_fmu(t, SHA256, part=part)
 
 

@@ -28,7 +28,9 @@ def export(
     ] = None,
     part: Annotated[
         str | None,
-        typer.Option(help="Of an FMU: controller, machine, or loop, which has both. [controller]"),
+        typer.Option(
+            help="Of an FMU: controller, supervised, machine, or loop of controller and machine. [controller]"
+        ),
     ] = None,
     fmi: Annotated[int | None, typer.Option(help="Version of an FMU's interface: 2 or 3. [2]")] = None,
     platforms: Annotated[
@@ -40,19 +42,22 @@ def export(
         typer.Option(help="The folder, new or empty, or the .fmu file. [build/NAME_c, build/NAME_PART.fmu]"),
     ] = None,
     proof: Annotated[
-        bool, typer.Option(help="Prove the margin again with the coefficients that float holds.")
+        bool, typer.Option(help="Prove the margin again with the coefficients of float, and other gains.")
     ] = True,
     clock: Annotated[
         str | None,
         typer.Option(help="Of the processor, for the report's share of a sample: 168MHz. [667MHz]"),
     ] = None,
+    tunable: Annotated[
+        bool, typer.Option("--tunable", help="Gains, limits and monitors as parameters, with an A2L file.")
+    ] = False,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Write the controller as C that computes the same bits on every processor, or as an FMU.
 
     The folder of C has a test with recorded vectors and a report of cost, rounding and margin. An FMU is of the
-    controller, of its machine, or of the loop of both, for co-simulation.
+    controller, alone or supervised, of its machine, or of the loop of both, for co-simulation.
 
     \b
     Example:  malta export design/gains/robust.json --precision float
@@ -63,7 +68,7 @@ def export(
     _require_known(to, precision, until, part, fmi, platforms, clock)
     hertz = None if clock is None else _frequency(clock)
     controller = read_controller(gains, machine)
-    chosen: Any = {"until": until}
+    chosen: Any = {"until": until, "tunable": tunable}
     if to == "fmu":
         own = part or "controller"
         file = out or Path("build") / f"{controller.name}_{own}.fmu"
@@ -76,6 +81,10 @@ def export(
     else:
         if proof and precision == "float" and not as_json:
             print_note("proving the margin with the coefficients that float holds; --no-proof leaves it out")
+        if proof and tunable and not as_json:
+            print_note(
+                "proving the margin with other gains, minutes for some designs; --no-proof leaves it out"
+            )
         folder = out or Path("build") / f"{controller.name}_c"
         with working("exporting"):
             files = export_c(

@@ -10,6 +10,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from malta.firmware.calibration import counts_of, gain_lines, law_fields, parameter_context, parameters_of
 from malta.firmware.ctext import c_name, c_number, function_text, signature
 from malta.firmware.elementary import Precision
 from malta.firmware.program import TYPES, Program
@@ -48,6 +49,7 @@ def sources(t: Target, sha256: str, name: str = "") -> dict[str, str]:
         f"{name}.h": render("controller.h", context),
         f"{name}.c": render("controller.c", context),
         f"{name}_parts.c": render("parts.c", context),
+        **({f"{name}_parameters.c": render("parameters.c", context)} if t.tunable else {}),
     }
 
 
@@ -97,6 +99,8 @@ def context_of(t: Target, programs: Mapping[str, Program], name: str, sha256: st
         **_table_context(t),
         **root_context(t.precision),
         "arithmetic": arithmetic_context(t.precision),
+        **parameter_context(t),
+        "gain_lines": [comment(line) for line in gain_lines(t)] if t.tunable else [],
     }
 
 
@@ -224,9 +228,12 @@ def _records(t: Target, n: str) -> list[dict[str, Any]]:
         f"const {n}_real *v0; /* forces at each */",
         "int32_t points;",
     ]
+    if t.tunable:
+        beside.insert(3, f"const {n}_parameters *parameters;")
     commanded = "What is commanded at a sample, and what else a log or a supervisor wants."
     remembered = "What the controller remembers from one sample to the next."
     found: list[tuple[str, str, list[Field], list[str]]] = [
+        *([_parameter_record(t)] if t.tunable else []),
         ("reference", "The reference of a sample.", reference_fields(t), []),
         ("state", remembered, state_fields(t), beside),
         ("inputs", "What is read at a sample.", input_fields(t), []),
@@ -245,6 +252,15 @@ def _records(t: Target, n: str) -> list[dict[str, Any]]:
         {"name": key, "meaning": meaning, "more": more, "fields": [_shown(f) for f in fields if f.size]}
         for key, meaning, fields, more in found
     ]
+
+
+def _parameter_record(t: Target) -> tuple[str, str, list[Field], list[str]]:
+    """The record of what a target may change."""
+    whole = [
+        f"int32_t samples[{len(counts_of(t))}]; /* in a row until a monitor acts */",
+        "uint32_t checksum;",
+    ]
+    return "parameters", "What the target may change.", [p.field for p in parameters_of(t)], whole
 
 
 def _shown(field: Field) -> dict[str, Any]:
@@ -289,6 +305,7 @@ def call(p: Program, t: Target, name: str) -> str:
     places |= {f.name: f"s->reference.{f.name}" for f in reference_fields(t)}
     places |= {f.name: f"in->{f.name}" for f in input_fields(t)}
     places |= {f.name: f"out->{f.name}" for f in output_fields(t)}
+    places |= {f.name: f"s->parameters->{f.name}" for f in law_fields(t)}
     places |= {key: key for key in ("v0", "table_at", "table")}
     return call_text(p, name, places)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -11,6 +12,7 @@ from malta.files import file_exists, locate, replace_files
 from malta.firmware.elementary import Precision
 from malta.firmware.fmu import build_fmu
 from malta.firmware.folder import folder_files
+from malta.firmware.rounding import rounded
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.unit import Part
 from malta.gains.file import content_of, read
@@ -31,6 +33,7 @@ def export_c(
     until: Until | None = None,
     proof: bool = True,
     clock: float | None = None,
+    tunable: bool = False,
 ) -> list[Path]:
     """Write the controller of a gain file as a folder of C99 with its test and a report.
 
@@ -38,8 +41,9 @@ def export_c(
     out : the folder, new or empty
     precision : of all numbers, "double" or "float"
     until : how far down the C goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
-    proof : prove the margin again with the coefficients that single precision holds
+    proof : prove the margin again with the coefficients that single precision holds, and with other gains if tunable
     clock : of the processor, Hz, with which the report turns instructions into a share of the sample; None: 667 MHz
+    tunable : gains, limits, references and monitors are in a record that the target may change, with an ASAP2 file
 
     Returns the files.
 
@@ -55,10 +59,15 @@ def export_c(
     path = locate(gains)
     if clock is not None:
         positive("export", "clock", clock, below=FASTEST)
-    target = _target(read(path), precision, until)
+    target = replace(_target(read(path), precision, until), tunable=tunable)
     folder, content = require_empty(Path(out)), content_of(path)[0]
     robust = content.verification.robust
     uncertainty = {} if robust is None else robust.uncertainty
+    if tunable and proof:
+        from malta.margins.tuned_gains import gain_box  # flint, which no other export needs
+
+        held = rounded(target.controller) if precision == "float" else target.controller
+        target = replace(target, gains=gain_box(target.believed, held, uncertainty))
     texts = folder_files(target, content.sha256, uncertainty, proof=proof, clock=clock)
     files = {folder / name: text.encode() for name, text in sorted(texts.items())}
     replace_files(files)
@@ -73,16 +82,18 @@ def export_fmu(
     fmi: int = 2,
     until: Until | None = None,
     platforms: Sequence[str] | None = None,
+    tunable: bool = False,
 ) -> str:
     """Write a part of a gain file's loop as an FMU, for co-simulation.
 
     gains : the gain file
     out : the file
-    part : "controller", "machine" or "loop"
+    part : "controller", "supervised" (with its supervisor), "machine" or "loop" (controller and machine)
     fmi : version of the interface, 2 or 3
     until : how far down the controller goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
     platforms : what it has binaries of, by the names of FMI 2 or 3, as "win64" or "aarch64-linux", or "all",
         compiled by ziglang (the extra malta[platforms]); None: this computer
+    tunable : the controller's gains, limits, references and monitors are parameters of the FMU
 
     Returns "", or a sentence that says why the FMU has sources but no binary.
 
@@ -97,7 +108,7 @@ def export_fmu(
     True
     """
     path = locate(gains)
-    target = _target(read(path), "double", until)
+    target = replace(_target(read(path), "double", until), tunable=tunable and part != "machine")
     fmu = build_fmu(target, content_of(path)[0].sha256, part=part, fmi=fmi, platforms=platforms)
     replace_files({Path(out): fmu.content})
     return fmu.note

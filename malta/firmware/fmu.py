@@ -60,7 +60,7 @@ def build_fmu(
     """An FMU.
 
     sha256 : of the gain file
-    part : "controller", "machine" or "loop"
+    part : "controller", "supervised", "machine" or "loop"
     fmi : version of the interface, 2 or 3
     platforms : names of those that it has binaries of, or "all", by ziglang; None: this computer's, by its compiler
 
@@ -126,6 +126,7 @@ def _context(u: Unit, sha256: str) -> dict[str, Any]:
     t, c = u.target, u.target.controller
     words = {
         "controller": "The controller",
+        "supervised": "The controller with its supervisor",
         "machine": "The machine",
         "loop": "The controller and the machine",
     }

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from malta.firmware.a2l import a2l_text
 from malta.firmware.ctext import c_name, c_number
 from malta.firmware.elementary import Precision
 from malta.firmware.export import RISES, context_of, render, sources
@@ -66,6 +67,8 @@ def folder_files(
         "CMakeLists.txt": render("CMakeLists.txt", context),
     }
     context["monitors"] = monitor_lines(t)
+    if t.tunable:
+        files[f"{name}.a2l"] = a2l_text(t, name)
     report = report_text(t, context, list(files), dict(uncertainty or {}), proof=proof, clock=clock)
     return files | {"REPORT.md": report}
 

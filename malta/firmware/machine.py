@@ -1,18 +1,20 @@
-"""The machine of a gain file as C: what a simulation without noise computes between two samples, in double precision.
+"""The machine of a gain file as C: what a simulation computes between two samples, in double precision.
 
     place    (p_ref, dp_ref, offset) -> x: the states that the reference gives, moved by an offset
-    begin    (x, v0) -> (state, under_way, u_integral): at rest or in motion at x, with the currents that make v0
-    substep  (state, command, w) -> state: one step of Runge and Kutta, or one period of the machine's electronics
-    read     (state) -> outputs, readings, currents, forces, contact, x
+    begin    (x, v0, cold, par) -> (state, under_way, u_integral): at x, with the currents that make v0, or with none
+    substep  (state, command, w, par) -> state: one step of Runge and Kutta, or one period of the machine's electronics
+    read     (state, normals, par) -> outputs, readings, currents, forces, contact, x
     shift    (xi_pred, offset) -> xi_pred: the filter knows the offset
 
-They come from the expressions of period.py, lowered as the controller's are. v0(z) is looked up in C.
+`par` are the machine's parameters: those of the gain file at first, of which a co-simulation may change each. `normals`
+are normal numbers, the noise of the sensors over its standard deviation. Touchdown bearings push back. The functions
+come from the expressions of period.py, lowered as the controller's are. v0(z) is looked up in C.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from typing import Any
@@ -26,13 +28,24 @@ from malta.firmware.lowering import lower
 from malta.firmware.parts import named_function, symbols
 from malta.firmware.program import Program, program_of
 from malta.firmware.signals import Field, Target, current_readings, output_fields
-from malta.model.plant import Plant, Signal
+from malta.model.parameters import acting_names, twins_of, units_of
+from malta.model.plant import Plant, Signal, symbolic
 from malta.simulation import references
-from malta.simulation.layout import Layout, Setup, layout_of, numbers_of, places_of, read_currents
+from malta.simulation.layout import (
+    Layout,
+    Setup,
+    layout_of,
+    noise_scales,
+    numbers_of,
+    places_of,
+    read_currents,
+)
+from malta.simulation.noise import COSINE, LOGARITHM, SINE
 from malta.simulation.period import Period, initial_state, period_of, state_reference
 from malta.simulation.scenario import Scenario, setup_of, substeps_of
 
 TINY = 1e-6  # share of a substep that rounding may add, see engines.substeps_until
+WAVES = {"logarithm": LOGARITHM, "cosine": COSINE, "sine": SINE}  # polynomials of the noise
 OWN = ("begin", "substep", "read")  # functions that only the machine's text calls
 
 
@@ -48,11 +61,18 @@ class Machine:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """The scenario whose functions the machine consists of: no noise, a wrench where the machine has one."""
+        """The scenario whose functions the machine consists of: a wrench and touchdown bearings where it has them."""
         wrench = (
             (lambda t: np.zeros((len(t), len(self.plant.disturbances)))) if self.plant.disturbances else None
         )
-        return Scenario("machine", 1.0, references.hold, fidelity=self.target.fidelity, disturbance=wrench)
+        return Scenario(
+            "machine",
+            1.0,
+            references.hold,
+            fidelity=self.target.fidelity,
+            disturbance=wrench,
+            bearing=any(self.plant.cushioned),
+        )
 
     @cached_property
     def setup(self) -> Setup:
@@ -72,10 +92,47 @@ class Machine:
         return sum(self.sizes.machine.values())
 
     @cached_property
+    def numbers(self) -> dict[str, ca.DM]:
+        """Every number of the loop by name."""
+        return numbers_of(self.plant, self.target.controller, self.substeps)
+
+    @cached_property
+    def symbols(self) -> dict[str, Any]:
+        """A symbol for each parameter of the machine, but for those that set the length of a substep."""
+        names = [name for name in acting_names(self.plant.parameters) if not self._sets_substeps(name)]
+        return {name: ca.SX.sym(name) for name in names}
+
+    def _sets_substeps(self, name: str) -> bool:
+        par: Any = self.plant.parameters
+        other = self.plant.variant(symbolic(par, {name: 1.01 * getattr(par, name)}))
+        return substeps_of(other, self.target.controller, self.setup, self.scenario) != self.substeps
+
+    @cached_property
+    def variable(self) -> Plant:
+        """The machine with these symbols in place of its parameters."""
+        return self.plant.variant(symbolic(self.plant.parameters, self.symbols))
+
+    @cached_property
     def period(self) -> Period:
-        c = self.target.controller
-        numbers = numbers_of(self.plant, c, self.substeps)
-        return period_of(self.plant, c, self.setup, numbers, constant=True)
+        """The functions of a control period. Twins, which would share a symbol, are told apart by their last digit."""
+        par: Any = self.plant.parameters
+        apart = {name: float(np.nextafter(getattr(par, name), np.inf)) for name in twins_of(par)}
+        plant = self.plant.variant(replace(par, **apart))
+        return period_of(plant, self.target.controller, self.setup, self.numbers, constant=False)
+
+    @cached_property
+    def theta(self) -> Any:
+        """The numbers of `period`: symbols of the machine's parameters, all others constant."""
+        values = {name: ca.SX(value) for name, value in self.numbers.items()}
+        values |= {f"machine.{name}": symbol for name, symbol in self.symbols.items()}
+        return ca.vertcat(*(ca.vertcat(*value.nonzeros()) for value in values.values()))
+
+    @cached_property
+    def parameters(self) -> tuple[str, ...]:
+        """The parameters that its start, its motion or its readings depend on."""
+        results = [e for _, _, found in _varying(self) for e in found.values()]
+        depends = ca.which_depends(ca.vertcat(*results), ca.vertcat(*self.symbols.values()))
+        return tuple(name for name, acts in zip(self.symbols, depends, strict=True) if acts)
 
 
 def command_field(t: Target) -> Field:
@@ -89,8 +146,20 @@ def wrench_fields(m: Machine) -> list[Field]:
     return [Field("w", m.plant.disturbances, "from outside")] if m.plant.disturbances else []
 
 
+def noise_channels(m: Machine) -> int:
+    """Normal numbers of a sample; none for sensors with uniform noise, which a master adds to the readings."""
+    return 0 if m.plant.uniform else len(m.plant.outputs) + read_currents(m.plant, m.setup)
+
+
 def state_field(m: Machine, name: str, meaning: str) -> Field:
     return Field(name, m.plant.states, meaning)
+
+
+def parameter_field(m: Machine) -> Field:
+    """The parameters that a co-simulation may change."""
+    units = units_of(m.plant.parameters)
+    signals = tuple(Signal(name, units[name]) for name in m.parameters)
+    return Field("machine", signals, "parameter of the machine")
 
 
 def reading_fields(m: Machine) -> list[Field]:
@@ -115,8 +184,14 @@ def reading_fields(m: Machine) -> list[Field]:
 
 def machine_functions(m: Machine) -> dict[str, ca.Function]:
     """The functions above by name, before they are lowered."""
-    found = [_place(m), _begin(m), _substep(m), _read(m), _shift(m)]
-    return {f.name(): f for f in found}
+    par = ca.vertcat(*(m.symbols[name] for name in m.parameters))
+    varying = [named_function(name, given | {"par": par}, found) for name, given, found in _varying(m)]
+    return {f.name(): f for f in [_place(m), *varying, _shift(m)]}
+
+
+def _varying(m: Machine) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
+    """Name, arguments and results of the functions that depend on the machine's parameters."""
+    return [("begin", *_begin(m)), ("substep", *_substep(m)), ("read", *_read(m))]
 
 
 def machine_programs(m: Machine) -> dict[str, Program]:
@@ -135,46 +210,50 @@ def _place(m: Machine) -> ca.Function:
     return named_function("place", {"p_ref": p, "dp_ref": dp, "offset": offset}, {"x": x})
 
 
-def _begin(m: Machine) -> ca.Function:
-    plant, c = m.plant, m.target.controller
-    x, v0 = ca.SX.sym("x", len(plant.states)), ca.SX.sym("v0", len(c.forces))
-    current = plant.currents(plant.h(x, 0), v0)
+def _begin(m: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
+    plant, c = m.variable, m.target.controller
+    x, v0, cold = ca.SX.sym("x", len(plant.states)), ca.SX.sym("v0", len(c.forces)), ca.SX.sym("cold")
+    current = (1 - cold) * m.plant.currents(plant.h(x, 0), v0)
     whole = initial_state(plant, c, m.setup, x, ca.SX.zeros(len(c.states)), current)
     parts = _split(whole, {**m.sizes.machine, **m.sizes.controller})
-    results = {
+    return {"x": x, "v0": v0, "cold": cold}, {
         "state": ca.vertcat(*(parts[name] for name in m.sizes.machine)),
         "under_way": parts["under_way"],
         "u_integral": parts.get("u_integral", ca.SX(0, 1)),
     }
-    return named_function("begin", {"x": x, "v0": v0}, results)
 
 
-def _substep(m: Machine) -> ca.Function:
+def _substep(m: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
     p = m.period
     state, command = ca.SX.sym("state", m.state_size), ca.SX.sym("command", p.substep.size1_in(1))
     given = {name: ca.SX.zeros(size) for name, size in m.sizes.given.items()}
     wrench = symbols(wrench_fields(m))
     around = ca.vertcat(*(given | wrench).values())
-    after = p.substep(state, command, around, ca.SX.zeros(p.substep.size1_in(3)), ca.SX(0, 1))
-    return named_function("substep", {"state": state, "command": command, **wrench}, {"state_next": after})
+    after = p.substep(state, command, around, ca.SX.zeros(p.substep.size1_in(3)), m.theta)
+    return {"state": state, "command": command, **wrench}, {"state_next": after}
 
 
-def _read(m: Machine) -> ca.Function:
+def _read(m: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
     p, plant, sizes = m.period, m.plant, m.sizes
     state, outputs = ca.SX.sym("state", m.state_size), len(plant.outputs)
+    normals = ca.SX.sym("normals", noise_channels(m))
     whole = ca.vertcat(state, ca.SX.zeros(sum(sizes.controller.values())))
     given = ca.SX.zeros(sum(sizes.given.values()))
-    measured, _ = p.sense(whole, given, ca.SX.zeros(outputs + read_currents(plant, m.setup)), ca.SX(0, 1))
-    row = _split(p.decide(whole, given, measured, ca.SX.zeros(len(plant.inputs)), ca.SX(0, 1))[2], sizes.row)
+    noise = ca.SX.zeros(outputs + read_currents(plant, m.setup))
+    if noise_channels(m):
+        noise = ca.vertcat(*noise_scales(m.variable, m.setup)) * normals
+    measured, _ = p.sense(whole, given, noise, m.theta)
+    row = _split(p.decide(whole, given, measured, ca.SX.zeros(len(plant.inputs)), m.theta)[2], sizes.row)
     known = _split(state, sizes.machine)
     read = row | known | {"y": measured[:outputs]}
     if m.setup.current_sensors and m.target.driven:
         errors = measured[outputs:]
         dq = m.target.fidelity == "dq"
-        read["i"] = known["i"] + plant.drive.to_axes(known["x"]) @ errors if dq else known["i_phase"] + errors
+        turned = m.variable.drive.to_axes(known["x"]) @ errors if dq else errors
+        read["i"] = known["i" if dq else "i_phase"] + turned
     elif m.target.driven:
         read["i"] = known["i" if m.target.fidelity == "dq" else "i_phase"]
-    return named_function("read", {"state": state}, {f.name: read[f.name] for f in reading_fields(m)})
+    return {"state": state, "normals": normals}, {f.name: read[f.name] for f in reading_fields(m)}
 
 
 def _shift(m: Machine) -> ca.Function:
@@ -217,6 +296,9 @@ def _context(m: Machine, programs: Mapping[str, Program], name: str) -> dict[str
         "u_integral": "u_integral",
         "v0": "v0",
         "w": "w",
+        "par": "par",
+        "cold": "&cold",
+        "normals": "normals",
         **{f.name: f"r->{f.name}" for f in reading_fields(m)},
     }
     ff = c.feedforward
@@ -235,6 +317,8 @@ def _context(m: Machine, programs: Mapping[str, Program], name: str) -> dict[str
         "wrench": sum(f.size for f in wrench_fields(m)),
         "forces": len(c.forces),
         "volts": m.sizes.controller.get("u_integral", 0),
+        "parameters": len(m.parameters),
+        "noises": noise_channels(m),
         "at": f"x[{plant.stroke_state}]" if plant.has_stroke else c_number(ff.z_grid[0], "double"),
         "points": len(ff.z_grid),
         "z_rows": number_rows(ff.z_grid, 6, "double"),
@@ -247,6 +331,7 @@ def _context(m: Machine, programs: Mapping[str, Program], name: str) -> dict[str
         "call_begin": call_text(programs["begin"], name, places | {"x": "x"}),
         "call_substep": call_text(programs["substep"], name, places),
         "call_read": call_text(programs["read"], name, places),
-        "root": any(o.op == "SQRT" for p in programs.values() for o in p.operations),
+        **{key: ", ".join(c_number(v, "float") for v in values) for key, values in WAVES.items()},
+        "root": noise_channels(m) > 0 or any(o.op == "SQRT" for p in programs.values() for o in p.operations),
         **root_context("double"),
     }

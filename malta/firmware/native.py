@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 REALS: dict[Precision, Any] = {"double": ctypes.c_double, "float": ctypes.c_float}
+EXTRA = ("_parameters.c",)  # of a controller that is tunable
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
 
 
@@ -49,7 +50,9 @@ def compile_controller(t: Target) -> Native:
     """The controller's C, compiled. Raises InputError without a C compiler."""
     name = c_name(t.controller.name)
     files = sources(t, "", name)
-    lib = compile_files([files[f"{name}{end}"] for end in (".h", ".c", "_parts.c")])
+    lib = compile_files(
+        [files[f"{name}{end}"] for end in (".h", ".c", "_parts.c", *EXTRA) if f"{name}{end}" in files]
+    )
     real = REALS[t.precision]
 
     def record(title: str, fields: list[Field], more: tuple[tuple[str, Any], ...] = ()) -> Any:
@@ -57,7 +60,8 @@ def compile_controller(t: Target) -> Native:
         return type(title, (ctypes.Structure,), {"_fields_": [*arrays, *more]})
 
     Reference = record("Reference", reference_fields(t))
-    table = (("z", ctypes.c_void_p), ("v0", ctypes.c_void_p), ("points", ctypes.c_int32))
+    addresses = ("z", "v0", "parameters") if t.tunable else ("z", "v0")
+    table = (*((key, ctypes.c_void_p) for key in addresses), ("points", ctypes.c_int32))
     return Native(
         t,
         lib,

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from malta.firmware.calibration import law_arguments, law_symbols
 from malta.firmware.elementary import as_written
 from malta.firmware.signals import (
     Field,
@@ -57,8 +58,9 @@ def named_function(name: str, arguments: dict[str, Any], results: dict[str, Any]
 
 
 def numbers(t: Target) -> dict[str, Any]:
-    """Every number of the law and of its machine, by name, as expressions take them."""
-    return {name: ca.SX(value) for name, value in numbers_of(t.believed, t.controller, 1).items()}
+    """Every number of the law and of its machine, by name, as expressions take them; symbols of what is tunable."""
+    values = {name: ca.SX(value) for name, value in numbers_of(t.believed, t.controller, 1).items()}
+    return values | law_symbols(t)
 
 
 def sense_function(t: Target) -> ca.Function:
@@ -146,6 +148,7 @@ def decide_function(t: Target) -> ca.Function:
         "v0": v0,
         **({"table": table} if t.look_ups else {}),
         **read,
+        **law_arguments(t),
     }
     results = {(f"{name}_next" if name in state else name): value for name, value in results.items()}
     return named_function("decide", arguments, results)
@@ -263,7 +266,8 @@ def currents(t: Target, place: Any, v: Any, table: Any) -> tuple[Any, Any]:
         wanted = ca.SX(t.believed.currents(place, v))
     if found:
         wanted = ca.substitute(wanted, ca.vertcat(*(one.values for one in found)), table)
-    return wanted, limited_currents(t.believed, wanted, ca.SX(ca.DM(t.controller.limits.current)))
+    limit = law_symbols(t).get("current_limit", ca.SX(ca.DM(t.controller.limits.current)))
+    return wanted, limited_currents(t.believed, wanted, limit)
 
 
 def drive_currents(
@@ -284,6 +288,10 @@ def drive_currents(
     V = ca.if_else(usable, read["link"], state["link_last"])
     machine = {"i_phase": i, "i": i, "link": V, "x": ca.SX.zeros(len(plant.states))}
     loops = {name: state[name] for name in ("u_integral", "u_limited")}
+    if (
+        t.tunable
+    ):  # the record has the product of gain and sample time: rounded once, as where it is a constant
+        g = g | {"control_time": ca.SX(1)}
     command, after, _ = control_currents(
         Loop(plant, c, t.setup, g), Signals(machine, loops, {}), current, known, None, sums.add_to_voltages
     )

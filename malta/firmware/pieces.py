@@ -20,6 +20,7 @@ from typing import Any
 
 import casadi as ca
 
+from malta.firmware.calibration import law_arguments
 from malta.firmware.lowering import lower
 from malta.firmware.parts import (
     Sums,
@@ -84,11 +85,13 @@ def _law_pieces(t: Target) -> list[ca.Function]:
         named_function("positions", some("y"), {"q": plant.position_of(x["y"])}),
         named_function("feedforward", reference, {"v_ff": feedforward(t, p, dp, ddp)}),
         named_function("reference_states", {"p": p, "dp": dp}, {"states": known}),
-        named_function("filter", {**some("xi_pred", "y"), "p": p}, {"xi_hat": xi_hat}),
+        named_function(
+            "filter", {**some("xi_pred", "y"), "p": p, **law_arguments(t, "L")}, {"xi_hat": xi_hat}
+        ),
         named_function("sum_errors", {**some("e", "frozen", "y"), "p": p, "dp": dp}, {"e_next": e}),
         named_function(
             "law",
-            some("xi_hat", "e", "xi_ref", "v_ff", "v0"),
+            some("xi_hat", "e", "xi_ref", "v_ff", "v0") | law_arguments(t, "K", "Ki", "force_limit"),
             {"v": v, "saturated": saturated, "xi_pred_next": following},
         ),
     ]
@@ -99,7 +102,7 @@ def _current_pieces(t: Target) -> list[ca.Function]:
     c, plant = t.controller, t.believed
     y, v = ca.SX.sym("y", len(c.measurements)), ca.SX.sym("v", len(c.forces))
     table, current = ca.SX.sym("table", table_size(t)), ca.SX.sym("current", len(plant.actuator.coils))
-    read = {"table": table} if t.look_ups else {}
+    read = ({"table": table} if t.look_ups else {}) | law_arguments(t, "current_limit")
     found = [named_function("currents", {"y": y, "v": v, **read}, {"current": currents(t, y, v, table)[1]})]
     if t.look_ups:
         found.append(named_function("places", {"y": y}, {"table_at": places_in_table(t, y)}))
@@ -124,7 +127,7 @@ def _current_control(t: Target, current: Any) -> ca.Function:
     after = {f"{name}_next": value for name, value in (after | sums.rests).items()}
     return named_function(
         "current_control",
-        {"current": current, "states": known, **state, **read},
+        {"current": current, "states": known, **state, **read, **law_arguments(t, "Kp", "Ki_current")},
         {"command": command, **after},
     )
 

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
-from malta.firmware.cost import CLOCK, PROCESSORS, costs, operations
+import numpy as np
+
+from malta.firmware.calibration import LEAST, Parameter, gain_lines, parameters_of
+from malta.firmware.cost import CLOCK, PROCESSORS, Cost, costs, operations
 from malta.firmware.export import comment, render
 from malta.firmware.misra import DEVIATIONS
 from malta.firmware.parts import LINK_RANGE
 from malta.firmware.rounding import SAMPLES, rounded_margin, rounding_noise, smallest_error
 from malta.firmware.signals import Target, reading_ranges
-from malta.firmware.supervisor import reference_limits
+from malta.firmware.supervisor import ReferenceLimits, reference_limits
 from malta.firmware.watch import watch_lines
 
 FILES = {
@@ -26,6 +30,8 @@ FILES = {
     "CMakeLists.txt": "the same with CMake",
     "_supervisor.h": "states, monitors and their reactions",
     "_supervisor.c": "the supervisor, from current offsets to landing",
+    "_parameters.c": "gains, limits, references and monitors that the target may change",
+    ".a2l": "their names, units and ranges for a calibration tool, ASAP2 1.7",
     "_supervisor_test.c": "a walk through its states",
 }
 
@@ -68,12 +74,35 @@ def report_text(
                 for s, most in zip(t.controller.measurements, reading_ranges(t.believed), strict=True)
             ],
             "watched": watch_lines(t),
+            **(_tunable_context(t, found) if t.tunable else {}),
             "references": [
                 {"name": comment(s.name), "unit": s.unit, "position": p, "speed": v, "acceleration": a}
                 for s, p, v, a in zip(t.controller.measurements, *reference_limits(t), strict=True)
             ],
         },
     )
+
+
+def _tunable_context(t: Target, found: list[Cost]) -> dict[str, Any]:
+    """The section about parameters that the target may change."""
+    plain = {c.processor: c for c in costs(replace(t, tunable=False))}
+    limit = f"{100 * LEAST:g} % of the design's to all of it"
+    words = dict.fromkeys(("force_limit", "current_limit", *ReferenceLimits._fields), limit)
+    words["threshold"] = "0 to those of the table of monitors"
+    return {
+        "tuned": [
+            {"name": p.field.name, "size": p.field.size, "range": words.get(p.field.name, _scatter(p))}
+            for p in parameters_of(t)
+        ],
+        "gain_text": comment(" ".join(gain_lines(t))),
+        "tunable_costs": [(c, plain[c.processor]) for c in found if c.processor in plain],
+    }
+
+
+def _scatter(p: Parameter) -> str:
+    """By how much a gain may differ."""
+    share = float(np.max(p.most - p.values) / np.max(np.abs(p.values)))
+    return f"{100 * share:.3g} % either way" if share else "that of the design"
 
 
 def _rounding_text(t: Target) -> str:

@@ -20,6 +20,7 @@ from malta.simulation.layout import Fidelity, Setup, electronics_of, fidelities
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
+    from malta.margins.tuned_gains import GainBox
     from malta.model.plant import FloatArray
 
 
@@ -50,6 +51,8 @@ class Target:
     fidelity: Fidelity = (
         "phase"  # "force" ends with currents, "dq" with voltages of axes, "phase" with duty cycles
     )
+    tunable: bool = False  # gains, limits, references and monitors from a record that the target may change
+    gains: GainBox | None = None  # what is proven of other gains; None: nothing was asked for
 
     def __post_init__(self) -> None:
         if self.precision not in ("double", "float"):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from malta.firmware.calibration import law_values
 from malta.firmware.pieces import parts_of
 from malta.firmware.program import TYPES, Program, evaluate, program_of
 from malta.firmware.signals import Target, reference_fields, state_fields
@@ -67,11 +68,12 @@ def step_of(t: Target) -> Step:
     """(state, reference, readings) -> (state, outputs): one step, by the names of signals.py."""
     sense, decide = programs_of(t)["sense"], programs_of(t)["decide"]
     none = {f.name: np.zeros(0) for f in state_fields(t) if not f.size}
+    law = law_values(t)
 
     def step(
         state: Vectors, reference: Mapping[str, Any], readings: Mapping[str, Any]
     ) -> tuple[Vectors, Vectors]:
-        known = {**none, **state, **reference, **readings}
+        known = {**none, **state, **reference, **readings, **law}
         sensed = evaluate(sense, known, t.precision)
         table = read_table(t, sensed.pop("table_at", None))
         decided = evaluate(

@@ -14,7 +14,7 @@ from malta.errors import InputError
 from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
 from malta.firmware.flight import Step, engine_of_c
-from malta.firmware.native import REALS, Native, compile_controller, compile_files, view
+from malta.firmware.native import EXTRA, REALS, Native, compile_controller, compile_files, view
 from malta.firmware.signals import Target
 from malta.firmware.supervisor import FLYING, STATES, State
 from malta.firmware.supervisor_text import (
@@ -48,12 +48,13 @@ def compile_supervised(t: Target) -> Supervised:
     """The C of controller and supervisor, compiled. Raises InputError without a C compiler."""
     own = compile_controller(t)
     files = sources(t, "", own.name) | supervisor_sources(t, own.name)
-    order = (".h", "_supervisor.h", ".c", "_parts.c", "_supervisor.c")
-    lib = compile_files([files[f"{own.name}{end}"] for end in order])
+    order = (".h", "_supervisor.h", ".c", "_parts.c", *EXTRA, "_supervisor.c")
+    lib = compile_files([files[f"{own.name}{end}"] for end in order if f"{own.name}{end}" in files])
     kinds: dict[str, Any] = {
         "int32_t": ctypes.c_int32,
         "real": REALS[t.precision],
         "reference": own.Reference,
+        "parameters": ctypes.c_void_p,
     }
 
     def record(title: str, members: Sequence[Member]) -> Any:

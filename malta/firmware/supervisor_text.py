@@ -51,7 +51,7 @@ MOST_MISSED = 1_000_000  # steps that count as missed
 class Member(NamedTuple):
     """A member of a record: a number, an array of them, or another record."""
 
-    kind: Literal["int32_t", "real", "times", "reference"]
+    kind: Literal["int32_t", "real", "times", "reference", "parameters"]
     name: str
     size: int  # 0: no array
     meaning: str
@@ -125,6 +125,8 @@ def supervisor_members(t: Target) -> list[Member]:
         Member("real", "d1", p, ""),
         Member("real", "d2", p, ""),
     ]
+    if t.tunable:
+        members.append(Member("parameters", "parameters", 0, "those of the controller's last step"))
     if t.driven:
         members.append(Member("real", "offset", len(current_readings(t)), "A, of the current sensors"))
         members.append(Member("real", "current", len(t.believed.actuator.coils), "A, commanded"))
@@ -167,6 +169,7 @@ def _context(t: Target, name: str) -> dict[str, Any]:
     times = TIMES if t.driven else TIMES._replace(offsets=0)
     off = _off_command(t)
     return {
+        "tunable": t.tunable,
         "name": name,
         "NAME": name.upper(),
         "title": comment(c.name),
@@ -324,6 +327,8 @@ def _records(t: Target, name: str) -> list[dict[str, Any]]:
 def _line(member: Member, name: str) -> str:
     """A member of a struct, with its meaning."""
     kind = member.kind if member.kind == "int32_t" else f"{name}_{member.kind}"
+    if member.kind == "parameters":
+        kind = f"const {kind} *"
     size = f"[{member.size}]" if member.size else ""
     text = f"{kind} {member.name}{size};"
     return f"{text} /* {member.meaning} */" if member.meaning else text

@@ -1,4 +1,4 @@
-"""A unit of co-simulation: the controller, its machine, or both, as variables and C that knows nothing of FMI.
+"""A unit of co-simulation: the controller, with its supervisor, its machine, or both, as variables and C without FMI.
 
 A step takes the inputs at its beginning and leaves the outputs at its end. A master that lets the controller step first
 hands its commands to the machine in the same sample, and the machine delays them (`late`). A master that lets both step
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib.metadata import version
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError, on_one_line
+from malta.firmware.calibration import parameters_of
 from malta.firmware.ctext import c_name, c_number
 from malta.firmware.export import comment, render, sources
 from malta.firmware.machine import (
@@ -24,17 +25,30 @@ from malta.firmware.machine import (
     command_field,
     machine_functions,
     machine_sources,
+    noise_channels,
+    parameter_field,
     reading_fields,
     state_field,
     wrench_fields,
 )
 from malta.firmware.signals import Field, Target, input_fields, output_fields, reference_fields
+from malta.firmware.supervisor import STATES
+from malta.firmware.supervisor_text import request_members, supervisor_sources
 from malta.model.plant import Signal
 from malta.simulation.period import initial_state
 
-Part = Literal["controller", "machine", "loop"]
+Part = Literal["controller", "supervised", "machine", "loop"]
 PARTS: tuple[Part, ...] = get_args(Part)
+SWITCH = (0.0, 1.0)  # least and most of what is on or off
+COLD = Field("cold", (Signal("", "1"),), "1: starts without current, 0: with the currents that hold it")
+NOISE = Field("noise", (Signal("", "1"),), "of the sensors, in multiples of the machine's own")
+SEED = Field("seed", (Signal("", "1"),), "whole number, of the noise: that of simulations with this seed")
+FLYING = Field(
+    "flying", (Signal("", "1"),), "1: the machine flies at its reference at the start, 0: it rests"
+)
 LATE = Field("late", (Signal("", "1"),), "1: commands act a delay later, 0: at once")
+LARGEST = 1e30  # of a parameter without a limit
+MOST_NOISE, MOST_SEED = 1e6, 2.0**53
 _WORDS = ("valid ", "refused ", "limited ")  # before the names of signals that belong to others
 
 
@@ -48,6 +62,8 @@ class Variable(NamedTuple):
     start: float | None
     description: str
     reference: int
+    least: float | None = None  # of a parameter that has a range
+    most: float | None = None
 
     @property
     def initial(self) -> str:
@@ -56,8 +72,13 @@ class Variable(NamedTuple):
 
     @property
     def role(self) -> str:
-        """One letter for the C text: t time, i input, p parameter, o output or local."""
-        return {"independent": "t", "input": "i", "parameter": "p"}.get(self.causality, "o")
+        """One letter for the C text: t time, i input, p parameter, q one that may change, o output or local."""
+        letters = {
+            "independent": "t",
+            "input": "i",
+            "parameter": "q" if self.variability == "tunable" else "p",
+        }
+        return letters.get(self.causality, "o")
 
 
 class Group(NamedTuple):
@@ -67,6 +88,8 @@ class Group(NamedTuple):
     causality: str
     variability: str
     start: Any = None  # numbers, or one for all
+    least: Any = None  # of parameters, likewise
+    most: Any = None
 
 
 class Unit(NamedTuple):
@@ -83,34 +106,38 @@ class Unit(NamedTuple):
     def has_controller(self) -> bool:
         return self.part != "machine"
 
+    @property
+    def is_supervised(self) -> bool:
+        return self.part == "supervised"
+
 
 def unit_of(t: Target, part: Part) -> Unit:
     """A unit and its variables. Raises InputError for an unknown part."""
     if part not in PARTS:
         raise InputError("export", "part", repr(part), "one of " + ", ".join(PARTS))
-    if part != "controller" and t.look_ups:
+    m = Machine(t) if part in ("machine", "loop") and not t.look_ups else None
+    if part in ("machine", "loop") and m is None:
         found = f"a {t.believed.name} whose currents come from a table"
         raise InputError("export", part, found, "the controller alone, or a coil model without a table")
     variables = [Variable("time", "independent", "continuous", "s", None, "simulation time", 0)]
     at: dict[str, int] = {}
-    m = None if part == "controller" else Machine(t)
     for group in _groups(t, part, m):
         at[group.field.name] = len(variables)
-        starts = (
-            [None] * group.field.size
-            if group.start is None
-            else np.broadcast_to(group.start, group.field.size)
-        )
-        for signal, label, start in zip(group.field.signals, _labels(group.field), starts, strict=True):
+        size = group.field.size
+        numbers = (np.broadcast_to(v, size) for v in (group.start, group.least, group.most))
+        for signal, label, *known in zip(group.field.signals, _labels(group.field), *numbers, strict=True):
+            start, least, most = (None if v is None else float(v) for v in known)
             variables.append(
                 Variable(
                     label,
                     group.causality,
                     group.variability,
                     "" if signal.unit == "SI" else signal.unit,
-                    None if start is None else float(start),
+                    start,
                     on_one_line(f"{group.field.meaning}{': ' if signal.name else ''}{signal.name}"),
                     len(variables),
+                    least,
+                    most,
                 )
             )
     return Unit(t, part, tuple(variables), at, c_name(t.controller.name), m)
@@ -121,6 +148,8 @@ def _groups(t: Target, part: Part, m: Machine | None) -> Iterator[Group]:
     if part != "machine":
         for f in reference_fields(t):
             yield Group(f._replace(name=f"{f.name}_ref"), "input", "continuous", 0.0)
+    if part == "supervised":
+        yield Group(request_field(), "input", "discrete", 0.0)
     if m is None:
         for f in input_fields(t):
             valid = f.name.endswith("_valid")
@@ -130,18 +159,62 @@ def _groups(t: Target, part: Part, m: Machine | None) -> Iterator[Group]:
         yield Group(command_field(t), "input", "discrete", _command_at_rest(m))
     for f in wrench_fields(m) if m is not None else []:
         yield Group(f, "input", "continuous", 0.0)
-    if m is not None and part == "machine":
-        yield Group(state_field(m, "x_start", "at the start"), "parameter", "fixed", _at_rest(m))
-        if m.setup.delay:
-            yield Group(LATE, "parameter", "fixed", 1.0)
-    elif m is not None:
-        meaning = "at the start, beyond what the reference gives"
-        yield Group(state_field(m, "offset", meaning), "parameter", "fixed", 0.0)
+    if part == "supervised":
+        yield Group(FLYING, "parameter", "fixed", 0.0, *SWITCH)
+        rest = Field("rest", t.controller.measurements, "readings of the machine where it lands, if it flies")
+        yield Group(rest, "parameter", "fixed", 0.0)
+    if m is not None:
+        yield from _machine_parameters(m, part)
+    for p in parameters_of(t):
+        yield Group(p.field, "parameter", "tunable", p.values, p.least, p.most)
     if part != "machine":
         for f in output_fields(t):
             yield Group(f, "output", "discrete")
+    if part == "supervised":
+        yield Group(supervision_field(), "output", "discrete")
     for f in reading_fields(m) if m is not None else []:
         yield Group(f, "local" if f.name == "x" else "output", "continuous")
+
+
+def _machine_parameters(m: Machine, part: Part) -> Iterator[Group]:
+    """How a machine starts, with what noise, and what it is."""
+    if part == "machine":
+        yield Group(state_field(m, "x_start", "at the start"), "parameter", "fixed", _at_rest(m))
+        yield Group(COLD, "parameter", "fixed", 0.0, *SWITCH)
+        if m.setup.delay:
+            yield Group(LATE, "parameter", "fixed", 1.0, *SWITCH)
+    else:
+        meaning = "at the start, beyond what the reference gives"
+        yield Group(state_field(m, "offset", meaning), "parameter", "fixed", 0.0)
+    if noise_channels(m):
+        yield Group(NOISE, "parameter", "tunable", 0.0, 0.0, MOST_NOISE)
+        yield Group(SEED, "parameter", "fixed", 0.0, 0.0, MOST_SEED)
+    values = [getattr(m.plant.parameters, name) for name in m.parameters]
+    least, most = zip(*(_range(m, name) for name in m.parameters), strict=True)
+    yield Group(parameter_field(m), "parameter", "tunable", values, least, most)
+
+
+def _range(m: Machine, name: str) -> tuple[float, float]:
+    """The least and the largest value of a parameter that its record accepts."""
+    known = next(f.metadata for f in fields(m.plant.parameters) if f.name == name)
+    above, least, below = (known[key] for key in ("above", "at_least", "below"))
+    if above is not None:
+        least = np.finfo(float).tiny if above == 0 else np.nextafter(above, np.inf)
+    most = LARGEST if below is None else np.nextafter(below, -np.inf)
+    return float(-LARGEST if least is None else least), float(most)
+
+
+def request_field() -> Field:
+    """What a supervisor is asked for, beside its reference."""
+    members = [member for member in request_members() if member.kind == "int32_t"]
+    return Field("request", tuple(Signal(member.name, "1") for member in members), "request")
+
+
+def supervision_field() -> Field:
+    """What a supervisor says."""
+    words = ", ".join(f"{k} {state.lower()}" for k, state in enumerate(STATES))
+    names = ("state", "enable", "monitor", "reaction")
+    return Field("supervisor", tuple(Signal(name, "1") for name in names), f"states: {words}")
 
 
 def _labels(field: Field) -> list[str]:
@@ -182,6 +255,8 @@ def unit_sources(u: Unit, sha256: str, token: str) -> dict[str, str]:
     files: dict[str, str] = {}
     if u.has_controller:
         files |= sources(u.target, sha256, f"{u.name}_controller")
+    if u.is_supervised:
+        files |= supervisor_sources(u.target, f"{u.name}_controller")
     if u.machine is not None:
         more = ("place", "shift") if u.has_controller else ()
         files |= machine_sources(u.machine, f"{u.name}_machine", ("begin", "substep", "read", *more))
@@ -209,7 +284,17 @@ def _context(u: Unit, token: str) -> dict[str, Any]:
         "name": f"{u.name}_controller",
         "plant": f"{u.name}_machine",
         "token": token,
+        "NAME": f"{u.name}_controller".upper(),
         "controller": u.has_controller,
+        "supervised": u.is_supervised,
+        "tunable": t.tunable,
+        "tuned": places([p.field for p in parameters_of(t)]),
+        "default_record": f"{u.name}_controller_default_parameters",
+        "requests": [signal.name for signal in request_field().signals],
+        "supervision": [signal.name for signal in supervision_field().signals],
+        "limits": [(v.reference, v.least, v.most) for v in u.variables if v.least is not None],
+        "noises": 0 if m is None else noise_channels(m),
+        "rests": len(c.measurements),
         "machine": m is not None,
         "variables": u.variables,
         "at": u.at,

@@ -21,9 +21,18 @@ GAMMA = 0x9E3779B97F4A7C15
 TOGETHER = 4  # samples whose noise the engine draws at once
 _SIGN = np.uint32(0x80000000)
 # log(1 + f) / f, cos(pi a) and sin(pi a) / a of a^2: minimax, errors about 1e-7
-_LOG = (0.99999992, -0.50000344, 0.33335607, -0.24971558, 0.19884252, -0.17212471, 0.16338027, -0.10378417)
-_COSINE = (0.99999995, -4.93479283, 4.05841135, -1.33187657, 0.21968961)
-_SINE = (3.14159264, -5.1677101, 2.5500775, -0.59829129, 0.07765766)
+LOGARITHM = (
+    0.99999992,
+    -0.50000344,
+    0.33335607,
+    -0.24971558,
+    0.19884252,
+    -0.17212471,
+    0.16338027,
+    -0.10378417,
+)
+COSINE = (0.99999995, -4.93479283, 4.05841135, -1.33187657, 0.21968961)
+SINE = (3.14159264, -5.1677101, 2.5500775, -0.59829129, 0.07765766)
 
 
 def keys(seed: int, indices: NDArray[np.int64]) -> NDArray[np.uint64]:
@@ -46,7 +55,7 @@ def normals(key: np.uint64, samples: int, channels: int) -> FloatArray:
     radius = (radius.view(np.uint32) ^ (low & _SIGN)).view(np.float32)
     square = half_turns * half_turns
     drawn = np.stack(
-        [radius * _polynomial(square, _COSINE), radius * (half_turns * _polynomial(square, _SINE))], axis=1
+        [radius * _polynomial(square, COSINE), radius * (half_turns * _polynomial(square, SINE))], axis=1
     )
     return drawn.astype(float).reshape(-1, channels)[:samples]
 
@@ -56,7 +65,7 @@ def _log_of_share(whole: NDArray[np.uint32]) -> NDArray[np.float32]:
     u = (whole | np.uint32(1)).astype(np.float32).view(np.int32)
     k = (u - np.int32(0x3F3504F3)) >> np.int32(23)
     f = (u - (k << np.int32(23))).view(np.float32) - np.float32(1)
-    return f * _polynomial(f, _LOG) + np.float32(0.69314718) * (k - np.int32(32)).astype(np.float32)
+    return f * _polynomial(f, LOGARITHM) + np.float32(0.69314718) * (k - np.int32(32)).astype(np.float32)
 
 
 def _polynomial(x: NDArray[np.float32], coefficients: tuple[float, ...]) -> NDArray[np.float32]:

@@ -73,6 +73,9 @@ void {{ name }}_init({{ name }}_state *s) {
   s->points = {{ points }};
   s->z = own_z;
   s->v0 = own_v0;
+{% if tunable %}
+  s->parameters = &{{ name }}_default_parameters;
+{% endif %}
 }
 
 void {{ name }}_start({{ name }}_state *s) {
@@ -96,9 +99,15 @@ void {{ name }}_step({{ name }}_state *s, const {{ name }}_inputs *in, {{ name }
 }
 
 int32_t {{ name }}_set_reference({{ name }}_state *s, const {{ name }}_reference *r) {
+{% if tunable %}
+  const {{ name }}_real *const most = s->parameters->position;
+  const {{ name }}_real *const fastest = s->parameters->speed;
+  const {{ name }}_real *const steepest = s->parameters->acceleration;
+{% else %}
   static const {{ name }}_real most[{{ outputs }}] = { {{ limits.position }} };
   static const {{ name }}_real fastest[{{ outputs }}] = { {{ limits.speed }} };
   static const {{ name }}_real steepest[{{ outputs }}] = { {{ limits.acceleration }} };
+{% endif %}
   bool accepted = true;
   int32_t k;
   for (k = 0; k < {{ outputs }}; k++) {
@@ -116,7 +125,11 @@ int32_t {{ name }}_set_reference({{ name }}_state *s, const {{ name }}_reference
 }
 
 int32_t {{ name }}_set_v0_table({{ name }}_state *s, int32_t points, const {{ name }}_real z[], const {{ name }}_real v0[]) {
+{% if tunable and has_force_limit %}
+  const {{ name }}_real *const most = s->parameters->force_limit; /* N */
+{% else %}
   static const {{ name }}_real most[{{ forces }}] = { {{ force_limits }} }; /* N */
+{% endif %}
   bool accepted = (points >= 2) && (points <= {{ most_points }});
   int32_t k;
   for (k = 0; accepted && (k < points); k++) {

@@ -40,6 +40,25 @@ typedef struct {
 {% endfor %}
 } {{ name }}_{{ record.name }};
 {% endfor %}
+{% if tunable %}
+
+/* The parameters of the gain file, in which a state begins. */
+extern const {{ name }}_parameters {{ name }}_default_parameters;
+
+/* The checksum that belongs to a record of parameters, to be written into its member `checksum`. */
+uint32_t {{ name }}_checksum(const {{ name }}_parameters *p);
+
+/* 1 where the checksum of a record fits and every number is in its range: limits and references at most those of the gain
+   file, monitors at least as strict, and gains as follows.
+{% for line in gain_lines %}
+   {{ line }}
+{% endfor %} */
+int32_t {{ name }}_accepts_parameters(const {{ name }}_parameters *p);
+
+/* Another record, in memory of the caller, from the next step on; 1, or 0 and nothing changes where it is not accepted.
+   Change a copy, and set it between two steps: a step reads the record while it computes. */
+int32_t {{ name }}_set_parameters({{ name }}_state *s, const {{ name }}_parameters *p);
+{% endif %}
 
 /* 1 where the compiled arithmetic is that of the text, which no macro shows; 0: compile it again, without
    -funsafe-math-optimizations and what it consists of, to the nearest, with small numbers. To be called once, at the

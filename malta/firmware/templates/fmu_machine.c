@@ -2,6 +2,9 @@
 #include "{{ name }}.h"
 
 #include <stdbool.h>
+{% if noises %}
+#include <string.h>
+{% endif %}
 {% include "exact.c" %}
 
 static const {{ name }}_real own_z[{{ points }}] = {
@@ -32,7 +35,7 @@ static void look_up({{ name }}_real z, {{ name }}_real v0[{{ forces }}]) {
   }
 }
 
-void {{ name }}_start({{ name }}_state *s, const {{ name }}_real x[{{ states }}]{% if volts %}, {{ name }}_real u_integral[{{ volts }}]{% endif %}) {
+void {{ name }}_start({{ name }}_state *s, const {{ name }}_real par[{{ parameters }}], const {{ name }}_real x[{{ states }}], {{ name }}_real cold{% if volts %}, {{ name }}_real u_integral[{{ volts }}]{% endif %}) {
   {{ name }}_real v0[{{ forces }}];
   look_up({{ at }}, v0);
   {{ call_begin }};
@@ -40,7 +43,7 @@ void {{ name }}_start({{ name }}_state *s, const {{ name }}_real x[{{ states }}]
   s->substeps = 0.0;
 }
 
-void {{ name }}_step({{ name }}_state *s, const {{ name }}_real command[{{ held }}]{% if wrench %}, const {{ name }}_real w[{{ wrench }}]{% endif %}{% if delay %}, int32_t late{% endif %}) {
+void {{ name }}_step({{ name }}_state *s, const {{ name }}_real par[{{ parameters }}], const {{ name }}_real command[{{ held }}]{% if wrench %}, const {{ name }}_real w[{{ wrench }}]{% endif %}{% if delay %}, int32_t late{% endif %}) {
   {{ name }}_real until;
   {{ name }}_real acting[{{ held }}];
   int32_t k;
@@ -63,6 +66,66 @@ void {{ name }}_step({{ name }}_state *s, const {{ name }}_real command[{{ held 
   }
 }
 
-void {{ name }}_look(const {{ name }}_state *s, {{ name }}_readings *r) {
+{% if noises %}
+static uint64_t split_mix(uint64_t key, uint64_t count) {
+  uint64_t x = key + (count * 0x9e3779b97f4a7c15u);
+  x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9u;
+  x = (x ^ (x >> 27)) * 0x94d049bb133111ebu;
+  return x ^ (x >> 31);
+}
+
+static float polynomial(float x, const float *coefficients, int32_t degree) {
+  float value = coefficients[degree];
+  int32_t k;
+  for (k = degree - 1; k >= 0; k--) {
+    const float product = x * value;
+    value = coefficients[k] + product;
+  }
+  return value;
+}
+
+/* A normal number of a stream, of which each counter gives two: see malta/simulation/noise.py, whose bits these are. */
+static {{ name }}_real normal_number(uint64_t key, uint64_t number) {
+  static const float logarithm[8] = { {{ logarithm }} };
+  static const float cosine[5] = { {{ cosine }} };
+  static const float sine[5] = { {{ sine }} };
+  const uint64_t bits = split_mix(key, number / 2u);
+  const uint32_t high = (uint32_t)(bits >> 32) | 1u;
+  const uint32_t low = (uint32_t)bits;
+  const float whole = (float)high;
+  const uint32_t turned = (low << 1) ^ 0x80000000u;
+  const float half_turns = (float)((turned < 0x80000000u) ? (int64_t)turned : ((int64_t)turned - 4294967296)) * 0x1p-32f;
+  const float square = half_turns * half_turns;
+  uint32_t pattern;
+  float share;
+  float radius;
+  int32_t k = 0;
+  memcpy(&pattern, &whole, sizeof pattern);
+  while (pattern >= 0x3fb504f3u) { /* share of 2^k, from sqrt(1/2) to sqrt(2) */
+    pattern = pattern - 0x00800000u;
+    k++;
+  }
+  memcpy(&share, &pattern, sizeof share);
+  share = share - 1.0f;
+  radius = share * polynomial(share, logarithm, 7);
+  radius = radius + (0.69314718f * (float)(k - 32));
+  radius = (float){{ name }}_root((double)(-2.0f * radius));
+  radius = ((low & 0x80000000u) != 0u) ? -radius : radius;
+  return ({{ name }}_real)(((number % 2u) == 0u) ? (radius * polynomial(square, cosine, 4))
+                                                  : (radius * (half_turns * polynomial(square, sine, 4))));
+}
+
+{% endif %}
+void {{ name }}_look(const {{ name }}_state *s, const {{ name }}_real par[{{ parameters }}]{% if noises %}, {{ name }}_real noise, {{ name }}_real seed{% endif %}, {{ name }}_readings *r) {
+{% if noises %}
+  const uint64_t stream = split_mix(((uint64_t)seed * 0x9e3779b97f4a7c15u) + 1u, 0u);
+  const uint64_t key = split_mix(stream + 0xd1342543de82ef95u, 0u);
+  const uint64_t first = (uint64_t)s->samples * {{ noises }}u;
+  {{ name }}_real normals[{{ noises }}];
+  uint64_t k;
+  for (k = 0u; k < {{ noises }}u; k++) {
+    normals[k] = (noise > 0.0) ? (noise * normal_number(key, first + k)) : 0.0;
+  }
+{% endif %}
   {{ call_read }};
 }

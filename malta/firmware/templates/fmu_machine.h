@@ -25,14 +25,17 @@ typedef struct {
 {% endfor %}
 } {{ name }}_readings;
 
-/* The machine at x[{{ states }}], with the currents that make v0 there. Also what integrals of current loops hold then. */
-void {{ name }}_start({{ name }}_state *s, const {{ name }}_real x[{{ states }}]{% if volts %}, {{ name }}_real u_integral[{{ volts }}]{% endif %});
+/* The machine's parameters are par[{{ parameters }}] in each call.
+
+   At x[{{ states }}], with the currents that make v0 there, or with none where `cold` is 1. Also what integrals of current
+   loops hold then. */
+void {{ name }}_start({{ name }}_state *s, const {{ name }}_real par[{{ parameters }}], const {{ name }}_real x[{{ states }}], {{ name }}_real cold{% if volts %}, {{ name }}_real u_integral[{{ volts }}]{% endif %});
 
 /* One sample{% if delay %}; the command acts {{ delay }} later where `late` is not 0, else at once{% endif %}. */
-void {{ name }}_step({{ name }}_state *s, const {{ name }}_real command[{{ held }}]{% if wrench %}, const {{ name }}_real w[{{ wrench }}]{% endif %}{% if delay %}, int32_t late{% endif %});
+void {{ name }}_step({{ name }}_state *s, const {{ name }}_real par[{{ parameters }}], const {{ name }}_real command[{{ held }}]{% if wrench %}, const {{ name }}_real w[{{ wrench }}]{% endif %}{% if delay %}, int32_t late{% endif %});
 
-/* What is known of the machine now. */
-void {{ name }}_look(const {{ name }}_state *s, {{ name }}_readings *r);
+/* What is known of the machine now{% if noises %}, read with so many times the noise of its sensors; a seed gives the noise of simulations{% endif %}. */
+void {{ name }}_look(const {{ name }}_state *s, const {{ name }}_real par[{{ parameters }}]{% if noises %}, {{ name }}_real noise, {{ name }}_real seed{% endif %}, {{ name }}_readings *r);
 {% for text in declarations %}
 
 {{ text }};

@@ -4,7 +4,7 @@
 #include <string.h>
 {% include "exact.c" %}
 
-/* Each variable: t time, i input, p parameter, o output or local. */
+/* Each variable: t time, i input, p parameter, q parameter that may change between steps, o output or local. */
 static const char roles[] = {% for line in roles %}
 
     "{{ line }}"{% endfor %};
@@ -13,6 +13,19 @@ static const double starts[UNIT_VARIABLES] = {
 {{ starts }}
 };
 
+{% if limits %}
+/* Parameters that have a range. */
+static const struct {
+  uint32_t reference;
+  double least;
+  double most;
+} limits[{{ limits | length }}] = {
+{% for reference, least, most in limits %}
+  { {{ reference }}u, {{ least }}, {{ most }} },
+{% endfor %}
+};
+
+{% endif %}
 {% macro copy(target, source, size, kind="") %}
   for (k = 0; k < {{ size }}; k++) {
     {{ target }}[k] = {{ "(" ~ kind ~ ")" if kind else "" }}{{ source }};
@@ -27,8 +40,39 @@ static int refuse(const char **message, const char *text) {
   *message = text;
   return UNIT_ERROR;
 }
+{% if tunable %}
+
+/* The controller's parameters as they are set: each has its range, and the checksum is that of all. */
+static void tune(unit_data *u) {
+  int32_t k;
+  u->parameters = {{ default_record }};
+{% for f in tuned %}
+{{ copy("u->parameters." ~ f.field, "u->value[" ~ f.at ~ " + k]", f.size, name ~ "_real") }}
+{%- endfor %}
+  u->parameters.checksum = {{ name }}_checksum(&u->parameters);
+  (void){{ name }}_set_parameters(&u->controller, &u->parameters);
+}
+{% endif %}
 {% if controller %}
 
+{% if supervised %}
+/* Requests are 1 from a half on; a number that is none is no request. */
+static int32_t whole_of(double x) {
+  return (x >= 0.5) ? (int32_t)(((x < 1e9) ? x : 1e9) + 0.5) : 0;
+}
+
+static void control(unit_data *u, {{ name }}_supervisor *sup, {{ name }}_state *s) {
+  {{ name }}_request request;
+  {{ name }}_inputs in;
+  {{ name }}_outputs out;
+  int32_t k;
+{% for key in requests %}
+  request.{{ key }} = whole_of(u->value[{{ at.request + loop.index0 }}]);
+{% endfor %}
+{% for f in reference %}
+{{ copy("request.reference." ~ f.field, "u->value[" ~ f.at ~ " + k]", f.size, name ~ "_real") }}
+{%- endfor %}
+{% else %}
 /* A reference that is out of reach changes nothing: the last one stays. */
 static int refer(unit_data *u, const char **message) {
   {{ name }}_reference r;
@@ -47,10 +91,18 @@ static void control(unit_data *u, {{ name }}_state *s) {
   {{ name }}_inputs in;
   {{ name }}_outputs out;
   int32_t k;
+{% endif %}
 {% for f in inputs %}
 {{ copy("in." ~ f.field, "u->value[" ~ f.at ~ " + k]" if f.at else one, f.size, name ~ "_real") }}
 {%- endfor %}
+{% if supervised %}
+  {{ name }}_supervisor_step(sup, s, &in, &request, &out);
+{% for key in supervision %}
+  u->value[{{ at.supervisor + loop.index0 }}] = (double)sup->{{ key }};
+{% endfor %}
+{% else %}
   {{ name }}_step(s, &in, &out);
+{% endif %}
 {% for f in outputs %}
 {{ copy("(u->value + " ~ f.at ~ ")", "out." ~ f.field ~ "[k]", f.size, "double") }}
 {%- endfor %}
@@ -61,7 +113,7 @@ static void control(unit_data *u, {{ name }}_state *s) {
 static void look(unit_data *u) {
   {{ plant }}_readings r;
   int32_t k;
-  {{ plant }}_look(&u->machine, &r);
+  {{ plant }}_look(&u->machine, u->value + {{ at.machine }}{% if noises %}, u->value[{{ at.noise }}], u->value[{{ at.seed }}]{% endif %}, &r);
 {% for f in readings %}
 {{ copy("(u->value + " ~ f.at ~ ")", "r." ~ f.field ~ "[k]", f.size) }}
 {%- endfor %}
@@ -88,15 +140,43 @@ static int start(unit_data *u, const char **message) {
 {% if controller %}
   double x[{{ states }}];
   {{ plant }}_place(u->value + {{ at.p_ref }}, u->value + {{ at.dp_ref }}, u->value + {{ at.offset }}, x);
-  {{ plant }}_start(&u->machine, x{% if volts %}, u_integral{% endif %});
+  {{ plant }}_start(&u->machine, u->value + {{ at.machine }}, x, 0.0{% if volts %}, u_integral{% endif %});
 {% else %}
-  {{ plant }}_start(&u->machine, u->value + {{ at.x_start }}{% if volts %}, u_integral{% endif %});
+  {{ plant }}_start(&u->machine, u->value + {{ at.machine }}, u->value + {{ at.x_start }}, u->value[{{ at.cold }}]{% if volts %}, u_integral{% endif %});
 {% endif %}
   look(u);
 {% endif %}
-{% if controller %}
+{% if supervised %}
+  {{ name }}_state trial;
+  {{ name }}_supervisor watching;
+  {{ name }}_init(&u->controller);
+{% if tunable %}
+  tune(u);
+{% endif %}
+  {{ name }}_supervisor_init(&u->supervisor);
+  if (u->value[{{ at.flying }}] > 0.5) {
+    {{ name }}_real rest[{{ rests }}];
+    {{ name }}_reference r;
+    int32_t k;
+{% for f in reference %}
+{{ copy("r." ~ f.field, "u->value[" ~ f.at ~ " + k]", f.size, name ~ "_real")|indent(2, true) }}
+{%- endfor %}
+{{ copy("rest", "u->value[" ~ at.rest ~ " + k]", rests, name ~ "_real")|indent(2, true) }}
+    if ({{ name }}_set_reference(&u->controller, &r) == 0) {
+      return refuse(message, "a flight that begins at a reference which is out of reach");
+    }
+    {{ name }}_start(&u->controller);
+    {{ name }}_supervisor_take_over(&u->supervisor, rest);
+  }
+  trial = u->controller;
+  watching = u->supervisor;
+  control(u, &watching, &trial);
+{% elif controller %}
   {{ name }}_state trial;
   {{ name }}_init(&u->controller);
+{% if tunable %}
+  tune(u);
+{% endif %}
   status = refer(u, message);
   {{ name }}_start(&u->controller);
 {% if machine %}
@@ -163,24 +243,32 @@ int unit_get(unit_data *u, uint32_t reference, double *value, const char **messa
 
 int unit_set(unit_data *u, uint32_t reference, double value, const char **message) {
   char role;
+{% if limits %}
+  int32_t k;
+{% endif %}
   if (reference >= UNIT_VARIABLES) {
     return refuse(message, "a value reference that no variable has");
   }
   role = roles[reference];
-  if ((role != 'i') && (role != 'p')) {
+  if ((role == 't') || (role == 'o')) {
     return refuse(message, "only inputs and parameters can be set");
   }
   if (u->phase == UNIT_ENDED) {
     return refuse(message, "a value after the end");
   }
-  if (role == 'p') {
-    if (u->phase == UNIT_RUNNING) {
-      return refuse(message, "a parameter is fixed when the initialization has ended");
-    }
-    if (is_finite(value) == 0) {
-      return refuse(message, "a parameter that is no finite number");
+  if ((role == 'p') && (u->phase == UNIT_RUNNING)) {
+    return refuse(message, "a parameter is fixed when the initialization has ended");
+  }
+  if ((role != 'i') && (is_finite(value) == 0)) {
+    return refuse(message, "a parameter that is no finite number");
+  }
+{% if limits %}
+  for (k = 0; k < {{ limits | length }}; k++) {
+    if ((limits[k].reference == reference) && !((value >= limits[k].least) && (value <= limits[k].most))) {
+      return refuse(message, "a parameter out of its range");
     }
   }
+{% endif %}
   u->value[reference] = value;
   u->changed = 1;
   return UNIT_OK;
@@ -189,14 +277,24 @@ int unit_set(unit_data *u, uint32_t reference, double value, const char **messag
 /* One sample. */
 static int sample(unit_data *u, const char **message) {
   int status = UNIT_OK;
-{% if controller %}
+{% if tunable %}
+  if (u->changed == 1) {
+    tune(u);
+    u->changed = 0;
+  }
+  u->controller.parameters = &u->parameters; /* also where the state came from elsewhere */
+{% endif %}
+{% if supervised %}
+  (void)message;
+  control(u, &u->supervisor, &u->controller);
+{% elif controller %}
   status = refer(u, message);
   control(u, &u->controller);
 {% else %}
   (void)message;
 {% endif %}
 {% if machine %}
-  {{ plant }}_step(&u->machine, u->value + {{ at.command }}{% if wrench %}, u->value + {{ at.w }}{% endif %}{% if delay %}, {{ "1" if controller else "(u->value[" ~ at.late ~ "] != 0.0) ? 1 : 0" }}{% endif %});
+  {{ plant }}_step(&u->machine, u->value + {{ at.machine }}, u->value + {{ at.command }}{% if wrench %}, u->value + {{ at.w }}{% endif %}{% if delay %}, {{ "1" if controller else "(u->value[" ~ at.late ~ "] != 0.0) ? 1 : 0" }}{% endif %});
   look(u);
 {% endif %}
   return status;

@@ -6,7 +6,7 @@
 #include <stdint.h>
 
 {% if controller %}
-#include "{{ name }}.h"
+#include "{{ name }}{{ "_supervisor" if supervised }}.h"
 {% endif %}
 {% if machine %}
 #include "{{ plant }}.h"
@@ -27,6 +27,12 @@ typedef struct {
   double value[UNIT_VARIABLES]; /* value[0]: time, s */
 {% if controller %}
   {{ name }}_state controller;
+{% if tunable %}
+  {{ name }}_parameters parameters; /* of the controller */
+{% endif %}
+{% if supervised %}
+  {{ name }}_supervisor supervisor;
+{% endif %}
 {% endif %}
 {% if machine %}
   {{ plant }}_state machine;

@@ -32,8 +32,13 @@ typedef struct {
 
 static const {{ name }}_real near_touch[OUTPUTS] = { {{ touch }} };
 static const {{ name }}_real range[OUTPUTS] = { {{ range }} };
+{% if not tunable %}
 static const {{ name }}_real fastest[OUTPUTS] = { {{ limits.speed }} };      /* of references */
 static const {{ name }}_real steepest[OUTPUTS] = { {{ limits.acceleration }} };
+{% endif %}
+{% set fastest = "sup->parameters->speed" if tunable else "fastest" %}
+{% set steepest = "sup->parameters->acceleration" if tunable else "steepest" %}
+{% set row_samples = "sup->parameters->samples[r]" if tunable else "row->samples" %}
 
 static {{ name }}_real size_of({{ name }}_real value) { return (value < {{ zero }}) ? -value : value; }
 
@@ -93,6 +98,9 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
   sup->late = {{ zero }};
   sup->samples = 0;
   sup->steady = 0;
+{% if tunable %}
+  sup->parameters = &{{ name }}_default_parameters;
+{% endif %}
   for (k = 0; k < {{ NAME }}_MONITOR_ROWS; k++) {
     sup->acted[k] = 0;
   }
@@ -262,7 +270,11 @@ static void look_at_sensors({{ name }}_supervisor *sup, {{ name }}_real level[{{
 
 /* Whether a requested reference is within its limits, and near enough to that of the sample before. */
 static int32_t is_reference(const {{ name }}_supervisor *sup, const {{ name }}_request *request) {
+{% if tunable %}
+  const {{ name }}_real *const most = sup->parameters->position;
+{% else %}
   static const {{ name }}_real most[OUTPUTS] = { {{ limits.position }} };
+{% endif %}
   const {{ name }}_reference *r = &request->reference;
   const int32_t steps = missed_of(request) + 1;
   const {{ name }}_real h = ({{ name }}_real)steps * {{ NAME }}_SAMPLE_TIME;
@@ -270,13 +282,13 @@ static int32_t is_reference(const {{ name }}_supervisor *sup, const {{ name }}_r
   int32_t k;
   for (k = 0; k < OUTPUTS; k++) {
     const int32_t here = is_within(r->p[k], most[k]);
-    const int32_t slow = is_within(r->dp[k], fastest[k]);
-    const int32_t even = is_within(r->ddp[k], steepest[k]);
+    const int32_t slow = is_within(r->dp[k], {{ fastest }}[k]);
+    const int32_t even = is_within(r->ddp[k], {{ steepest }}[k]);
     if ((here + slow + even) != 3) {
       accepted = 0;
     } else if ((sup->state == {{ NAME }}_OPERATE) && (sup->followed == 1)) {
-      const {{ name }}_real far = ({{ rounding }} * most[k]) + (fastest[k] * h);
-      const {{ name }}_real faster = ({{ rounding }} * fastest[k]) + (steepest[k] * h);
+      const {{ name }}_real far = ({{ rounding }} * most[k]) + ({{ fastest }}[k] * h);
+      const {{ name }}_real faster = ({{ rounding }} * {{ fastest }}[k]) + ({{ steepest }}[k] * h);
       if ((is_within(r->p[k] - sup->asked[k], far) + is_within(r->dp[k] - sup->asked_rate[k], faster)) != 2) {
         accepted = 0;
       }
@@ -468,17 +480,17 @@ static int32_t judge({{ name }}_supervisor *sup, {{ name }}_real level[{{ monito
       if (row->monitor == {{ NAME }}_MONITOR_UNBELIEVED) {
         now = (sup->unbelieved[k] > 0) ? {{ one }} : {{ zero }};
       }
-      if (counts && (now > row->threshold)) {
+      if (counts && (now > {{ "sup->parameters->threshold[r]" if tunable else "row->threshold" }})) {
         count = one_more(sup->count[entry]);
         if (row->reaction == {{ NAME }}_REACTION_HOLD) {
           calm = 0;
         }
-        if (count >= row->samples) {
+        if (count >= {{ row_samples }}) {
           acts = 1;
           if (row->reaction == {{ NAME }}_REACTION_IGNORE) {
             refused[k] = true;
           }
-          if (count == row->samples) {
+          if (count == {{ row_samples }}) {
             sup->monitor = row->monitor;
             sup->reaction = row->reaction;
             sup->acted[r] = one_more(sup->acted[r]);
@@ -622,7 +634,12 @@ static bool is_done(const {{ name }}_supervisor *sup, const {{ name }}_request *
 /* Whether a machine that is off may start: when it is asked to, not while it is, with the arithmetic of this text. */
 static bool is_startable(const {{ name }}_supervisor *sup, const {{ name }}_request *request) {
   const bool asked = (request->start != 0) && (sup->started == 0);
+{% if tunable %}
+  const bool ready = asked && (sup->state == {{ NAME }}_OFF) && (sup->fit == 1);
+  return ready && ({{ name }}_accepts_parameters(sup->parameters) == 1); /* they may have changed in their memory */
+{% else %}
   return asked && (sup->state == {{ NAME }}_OFF) && (sup->fit == 1);
+{% endif %}
 }
 
 /* Whether nothing forbids torque. */
@@ -658,7 +675,7 @@ static void stop_output({{ name }}_supervisor *sup, int32_t k, {{ name }}_real p
   const {{ name }}_real speed = size_of(dp);
   const {{ name }}_real ahead = (dp > {{ zero }}) ? (near_touch[k] - p) : (near_touch[k] + p);
   const {{ name }}_real shortest = {{ shortest }} * {{ NAME }}_SAMPLE_TIME;
-  const {{ name }}_real least = ({{ three_halves }} * speed) / steepest[k];
+  const {{ name }}_real least = ({{ three_halves }} * speed) / {{ steepest }}[k];
   {{ name }}_real lasts = ({{ three_halves }} * speed) / stopping[k];
   if (lasts < shortest) {
     lasts = shortest;
@@ -678,7 +695,7 @@ static void return_output({{ name }}_supervisor *sup, int32_t k, {{ name }}_real
   const {{ name }}_real ahead = (dp > {{ zero }}) ? (near_touch[k] - p) : (near_touch[k] + p);
   const {{ name }}_real most = {{ half }} * ahead;
   if (({{ passing }} * (speed * sup->stops[k])) > most) {
-    const {{ name }}_real least = ({{ fade_rate }} * speed) / steepest[k]; /* with all the acceleration that there is */
+    const {{ name }}_real least = ({{ fade_rate }} * speed) / {{ steepest }}[k]; /* with all the acceleration that there is */
     const {{ name }}_real room = most / ({{ passing }} * speed);
     sup->stops[k] = (room > least) ? room : least;
     sup->stops[k] = (sup->stops[k] > {{ NAME }}_SAMPLE_TIME) ? sup->stops[k] : {{ NAME }}_SAMPLE_TIME;
@@ -699,14 +716,14 @@ static void goal_of(const {{ name }}_supervisor *sup, const {{ name }}_request *
 }
 
 /* The time of a way within three quarters of its limits, v = 15/8 d / T, a = 5.8 d / T^2. */
-static {{ name }}_real time_of({{ name }}_real way, int32_t k) {
-  {{ name }}_real T = ({{ fade_speed }} * way) / fastest[k];
+static {{ name }}_real time_of({{ "const %s_supervisor *sup, "|format(name) if tunable }}{{ name }}_real way, int32_t k) {
+  {{ name }}_real T = ({{ fade_speed }} * way) / {{ fastest }}[k];
   int32_t doubling;
   if (T < ({{ shortest }} * {{ NAME }}_SAMPLE_TIME)) {
     T = {{ shortest }} * {{ NAME }}_SAMPLE_TIME;
   }
   for (doubling = 0; doubling < 8; doubling++) {
-    if (({{ fade_acceleration }} * way) > (steepest[k] * (T * T))) {
+    if (({{ fade_acceleration }} * way) > ({{ steepest }}[k] * (T * T))) {
       T = {{ two }} * T;
     }
   }
@@ -739,7 +756,7 @@ static void begin({{ name }}_supervisor *sup, const {{ name }}_state *s, const {
     }
     sup->lasts[k] = ({{ name }}_real)samples * {{ NAME }}_SAMPLE_TIME;
     if (sup->state == {{ NAME }}_OPERATE) {
-      const {{ name }}_real soonest = time_of(size_of(request->reference.p[k] - p), k);
+      const {{ name }}_real soonest = time_of({{ "sup, " if tunable }}size_of(request->reference.p[k] - p), k);
       sup->lasts[k] = (soonest > sup->lasts[k]) ? soonest : sup->lasts[k];
     }
 {% if stroke_output >= 0 %}
@@ -756,7 +773,7 @@ static void begin({{ name }}_supervisor *sup, const {{ name }}_state *s, const {
     }
 {% if stroke_output >= 0 %}
     if ((k == {{ stroke_output }}) && (sup->stops[k] < sup->lasts[k])) { /* a stroke that turns is soon back */
-      const {{ name }}_real soonest = time_of(size_of(sup->rest[k] - p), k);
+      const {{ name }}_real soonest = time_of({{ "sup, " if tunable }}size_of(sup->rest[k] - p), k);
       sup->lasts[k] = (sup->stops[k] > soonest) ? sup->stops[k] : soonest;
     }
 {% endif %}
@@ -1004,6 +1021,9 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
   int32_t reaction;
   int32_t k;
   copy_inputs(in, &seen);
+{% if tunable %}
+  sup->parameters = s->parameters;
+{% endif %}
 {% if currents %}
   if (sup->state == {{ NAME }}_OFFSETS) {
     if (sup->samples < sup->times.offsets) {
