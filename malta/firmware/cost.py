@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import tempfile
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from malta.firmware.step import programs_of
 CLOCK = 667e6  # Hz, of the Cortex-A9 of the paper's Zynq 7000
 SECONDS = 120.0  # a compiler may take at most
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fno-tree-loop-distribute-patterns")
-STEP = ("step", "sense", "decide", "look_up")  # functions that run at every sample
+STEP = ("step", "sense", "decide", "look_up")  # functions that run at every sample, with those of their blocks
 KINDS = {
     "additions": ("ADD", "SUB", "NEG"),
     "multiplications": ("MUL",),
@@ -101,16 +101,30 @@ def cost_on(p: Processor, files: Mapping[str, str], name: str) -> Cost | None:
         listing = _run([objdump, "-d", "--no-show-raw-insn", f"{name}.o"], folder) or ""
         stacks = _stacks((folder / f"{name}.su").read_text(encoding="utf-8"))
     own = {f"{name}_{function}" for function in STEP} | {"look_up"}
-    lines = _instructions(listing, own)
+    lines = _instructions(listing, lambda function: function in own or function.startswith(_blocks(name)))
     return Cost(
         p.name,
         int(sizes[0]),
         int(sizes[1]) + int(sizes[2]),
         int(state[0]),
-        stacks.get(f"{name}_step", 0) + max((stacks.get(f, 0) for f in own - {f"{name}_step"}), default=0),
+        _deepest(stacks, name),
         len(lines),
         sum("__aeabi_" in line for line in lines),
     )
+
+
+def _blocks(name: str) -> tuple[str, ...]:
+    """How the names of the functions of a step's blocks begin."""
+    return tuple(f"{name}_{function}_" for function in STEP if function != "step")
+
+
+def _deepest(stacks: Mapping[str, int], name: str) -> int:
+    """Bytes of stack of a step: its own, and those of the function and of the block that take most."""
+    deepest = stacks.get("look_up", 0)
+    for function in ("sense", "decide"):
+        blocks = [size for f, size in stacks.items() if f.startswith(f"{name}_{function}_")]
+        deepest = max(deepest, stacks.get(f"{name}_{function}", 0) + max(blocks, default=0))
+    return stacks.get(f"{name}_step", 0) + deepest
 
 
 def _run(command: list[str], folder: Path) -> str | None:
@@ -133,13 +147,13 @@ def _stacks(usage: str) -> dict[str, int]:
     return found
 
 
-def _instructions(listing: str, functions: set[str]) -> list[str]:
-    """The instructions of functions in objdump's listing."""
+def _instructions(listing: str, is_own: Callable[[str], bool]) -> list[str]:
+    """The instructions of a step's functions in objdump's listing."""
     found, inside = [], False
     for line in listing.splitlines():
         head = re.match(r"^[0-9a-f]+ <([^>]+)>:$", line)
         if head:
-            inside = head[1].split(".")[0] in functions
+            inside = is_own(head[1].split(".")[0])
         elif inside and re.match(r"^\s+[0-9a-f]+:\s+[a-z]", line) and ".word" not in line:
             found.append(line)
     return found
