@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from malta.firmware.blocks import Stage, stages
+from malta.firmware.blocks import LEAVES, Entry, Stage, named_inputs, stages
 from malta.firmware.ctext import c_number, kind, operand_text, value_text
 from malta.firmware.elementary import Precision
 from malta.firmware.program import TRUTHS, Program
-
-Entry = tuple[str, int]  # of a vector
 
 
 class Place(NamedTuple):
@@ -70,13 +68,11 @@ def blocks_text(
     places : of all arguments and results; static : whether the function is the file's own
     """
     w = _writer(p, places, prefix, precision)
-    known: dict[int, Entry] = {
-        k: (p.arguments[o.place[0]][0], o.place[1]) for k, o in enumerate(p.operations) if o.op == "INPUT"
-    }
+    known = named_inputs(p)
     functions, calls = [], []
     taken, given = set[str](), set[str]()
     for stage in w.stages:
-        body = _body(w, stage, known)
+        body = _loop_body(w, stage, known) if stage.copies else _body(w, stage, known)
         taken, given = taken | body.taken, given | body.given
         functions.append(_stage_function(w, stage, body))
         calls.append(_stage_call(w, stage, body))
@@ -118,7 +114,7 @@ def _own_parameters(p: Program, places: Mapping[str, Place]) -> list[Place]:
 
 def _writer(p: Program, places: Mapping[str, Place], prefix: str, precision: Precision) -> _Writer:
     found = stages(p)
-    given = {p.names[i] for stage in found for i, *_ in stage.outputs}
+    given = {p.names[i] for i, *_ in p.outputs}
     between = {name: size for name, size in p.between if name in given}
     for stage in found:
         if stage.handed:
@@ -187,6 +183,131 @@ def _body(w: _Writer, stage: Stage, known: dict[int, Entry]) -> _Body:
         if p.operations[k].op not in ("INPUT", "CONST"):
             known.setdefault(k, of[0])
     return body
+
+
+class _Copies:
+    """The copies of a loop: tables of what differs from one to the next.
+
+    numbers : columns of constants; steps : by how much places in vectors are further, as columns too
+    """
+
+    def __init__(self, w: _Writer, stage: Stage, known: Mapping[int, Entry]) -> None:
+        self.w, self.stage, self.known = w, stage, known
+        self.numbers: list[tuple[float, ...]] = []
+        self.steps: list[tuple[int, ...]] = []
+
+    def number(self, of: Sequence[int]) -> str | None:
+        """The name of a number that differs; None where it is the same in all copies. of : its operation in each"""
+        values = tuple(self.w.p.operations[k].value for k in of)
+        if len(set(values)) == 1:
+            return None
+        return f"numbers[k][{_column(self.numbers, values)}]"
+
+    def entry(self, of: Sequence[Entry]) -> str:
+        """An entry of a vector. of : the entry in each copy"""
+        vector, first = of[0]
+        steps = tuple(j - first for _, j in of)
+        access = self.w.places[vector].access
+        if not any(steps):
+            return f"{access}[{first}]"
+        step = f"at{_column(self.steps, steps)}"
+        return f"{access}[{step} + {first}]" if first else f"{access}[{step}]"
+
+    def lines(self) -> tuple[list[str], list[str]]:
+        """The tables, and the places at the beginning of a loop's body."""
+        tables, begin, columns = [], [], []
+        count = len(self.stage.copies)
+        for n, steps in enumerate(self.steps):
+            if steps == tuple(range(0, count * steps[1], steps[1] or 1)) and steps[1] > 0:
+                begin.append(f"    const int32_t at{n} = {f'{steps[1]} * ' if steps[1] > 1 else ''}k;")
+            else:
+                begin.append(f"    const int32_t at{n} = at[k][{len(columns)}];")
+                columns.append(steps)
+        if columns:
+            tables += _table("int32_t at", [[str(v) for v in row] for row in zip(*columns, strict=True)])
+        if self.numbers:
+            rows = [[c_number(v, self.w.precision) for v in row] for row in zip(*self.numbers, strict=True)]
+            tables += _table(f"{self.w.prefix}_real numbers", rows)
+        return tables, begin
+
+
+def _column(columns: list[Any], values: Any) -> int:
+    """The place of a column, which is added where it is new."""
+    if values not in columns:
+        columns.append(values)
+    return columns.index(values)
+
+
+def _table(head: str, rows: list[list[str]]) -> list[str]:
+    body = ",\n".join(f"    {{ {', '.join(row)} }}" for row in rows)
+    wrapped = "\n".join(
+        "\n".join(textwrap.wrap(line, 118, initial_indent="    ", subsequent_indent="      "))
+        for line in body.splitlines()
+    )
+    return [f"  static const {head}[{len(rows)}][{len(rows[0])}] = {{", wrapped, "  };"]
+
+
+def _loop_body(w: _Writer, stage: Stage, known: dict[int, Entry]) -> _Body:
+    """The statements of a loop over equal computations."""
+    p, body, tables = w.p, _Body(), _Copies(w, stage, known)
+    first, names, inner = stage.copies[0], dict[int, str](), list[str]()
+    targets: dict[int, list[int]] = {}
+    for n, (*_, k) in enumerate(first.outputs):
+        targets.setdefault(k, []).append(n)
+    ends = [tables.entry([(p.names[c.outputs[n][0]], c.outputs[n][1]) for c in stage.copies]) for n in range(len(first.outputs))]
+    taken_at = {a: n for n, k in enumerate(first.operations) for a in p.operations[k].operands}
+    before = _common_lines(w, stage, known, names, body)
+    for n, k in enumerate(first.operations):
+        own = dict(names)
+        for m, a in enumerate(p.operations[k].operands):
+            if a not in names:
+                own |= _differing(tables, a, [p.operations[c.operations[n]].operands[m] for c in stage.copies], body)
+        value = value_text(p, k, own, w.prefix, w.precision)
+        if k in targets and taken_at.get(k, -1) <= n:
+            inner.append(f"    {ends[targets[k][0]]} = {_as_number(w, k, value)};")
+            body.last += [f"    {ends[m]} = {ends[targets[k][0]]};" for m in targets[k][1:]]
+        else:
+            names[k] = f"t{len(names)}"
+            inner.append(f"    const {kind(p.operations[k], w.prefix)} {names[k]} = {value};")
+            body.last += [f"    {ends[m]} = {operand_text(p, k, names, w.precision)};" for m in targets.get(k, [])]
+    for n, (*_, k) in enumerate(first.outputs):
+        if k not in first.operations:
+            given = names if k in names else _differing(tables, k, [c.outputs[n][2] for c in stage.copies], body)
+            body.last.append(f"    {ends[n]} = {operand_text(p, k, given, w.precision)};")
+    for copy in stage.copies:
+        body.given |= {p.names[i] for i, *_ in copy.outputs}
+        for i, j, k in copy.outputs:
+            if p.operations[k].op not in LEAVES:
+                known.setdefault(k, (p.names[i], j))
+    heads, begin = tables.lines()
+    count = len(stage.copies)
+    body.lines = [*heads, *before, "  int32_t k;", f"  for (k = 0; k < {count}; k++) {{", *begin, *inner]
+    body.last.append("  }")
+    return body
+
+
+def _common_lines(
+    w: _Writer, stage: Stage, known: Mapping[int, Entry], names: dict[int, str], body: _Body
+) -> list[str]:
+    """What all copies of a loop take, before it."""
+    lines = []
+    for k in stage.common:
+        of = {a: w.text(known[a]) for a in w.p.operations[k].operands if a in known}
+        body.taken |= {known[a][0] for a in of}
+        value = value_text(w.p, k, names | of, w.prefix, w.precision)
+        names[k] = f"t{len(names)}"
+        lines.append(f"  const {kind(w.p.operations[k], w.prefix)} {names[k]} = {value};")
+    return lines
+
+
+def _differing(tables: _Copies, a: int, of: Sequence[int], body: _Body) -> dict[int, str]:
+    """The name of an operand that is no operation of the loop; none for a number that is the same in all copies."""
+    if a in tables.known:
+        entries = [tables.known[k] for k in of]
+        body.taken |= {vector for vector, _ in entries}
+        return {a: tables.entry(entries)}
+    number = tables.number(of)
+    return {} if number is None else {a: number}
 
 
 def _targets(w: _Writer, stage: Stage) -> dict[int, list[Entry]]:

@@ -115,7 +115,7 @@ def operand_text(
 ) -> str:
     """The value of an operation as a number, or as a condition. Names with brackets are entries of arrays: numbers."""
     zero, one = c_number(0.0, precision), c_number(1.0, precision)
-    if p.operations[k].op == "CONST":
+    if p.operations[k].op == "CONST" and k not in names:
         number = c_number(p.operations[k].value, precision)
         return f"({number} != {zero})" if condition else _bracketed(number)
     name = names[k]

@@ -307,7 +307,8 @@ def currents(t: Target, place: Any, v: Any, table: Any) -> tuple[Any, Any]:
         wanted = ca.SX(t.believed.currents(place, v))
     if found:
         wanted = ca.substitute(wanted, ca.vertcat(*(one.values for one in found)), table)
-    note("currents", "i_wanted: currents that make v where y_used says that the machine is", i_wanted=wanted)
+    meaning = "i_wanted: currents that make v where y_used says that the machine is"
+    note("currents", meaning, wanted.numel(), i_wanted=wanted)
     current = limited_currents(t.believed, wanted, ca.SX(ca.DM(t.controller.limits.current)))
     note("limit_currents", "current = i_wanted within limits.current and the machine's own limit", current=current)
     return wanted, current

@@ -33,6 +33,7 @@ class Block(NamedTuple):
     name: str
     equation: str
     results: tuple[str, ...]
+    times: int = 1  # of equal computations, one after the other in each result
 
 
 class Program(NamedTuple):

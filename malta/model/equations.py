@@ -17,6 +17,7 @@ class Equation(NamedTuple):
     block: str  # what the step does, as an identifier
     text: str  # the equation, in plain letters
     values: dict[str, Any]  # the results by name
+    times: int = 1  # of equal computations, one after the other in each result
 
 
 _recorded: ContextVar[list[Equation] | None] = ContextVar("_recorded", default=None)
@@ -39,11 +40,17 @@ def recorded_equations() -> Iterator[list[Equation]]:
         _recorded.reset(token)
 
 
-def note(block: str, text: str, **values: Any) -> None:
+def recording() -> bool:
+    """Whether notes are recorded."""
+    return _recorded.get() is not None
+
+
+def note(block: str, text: str, times: int = 1, /, **values: Any) -> None:
     """Say which equation gave these results; nothing happens where nobody records.
 
     block : what the step does, as an identifier; text : the equation; values : the results by name
+    times : how often the same is done with other numbers, where each result is that many equal parts
     """
     known = _recorded.get()
     if known is not None:
-        known.append(Equation(block, text, values))
+        known.append(Equation(block, text, values, times))
