@@ -75,7 +75,9 @@ def staged_function(
         raise KeyError(f"{name}: no equation gives {', '.join(sorted(set(results) - known))}")
     given = {key: ca.densify(ca.vec(ca.SX(value))) for key, value in {**results, **between}.items()}
     plain, whole = (
-        ca.Function(name, list(arguments.values()), list(given.values())[:n], list(arguments), list(given)[:n])
+        ca.Function(
+            name, list(arguments.values()), list(given.values())[:n], list(arguments), list(given)[:n]
+        )
         for n in (len(results), len(given))
     )
     return Staged(plain, whole, tuple(blocks))
@@ -110,7 +112,9 @@ def stages(p: Program) -> list[Stage]:
 
 def named_inputs(p: Program) -> dict[int, Entry]:
     """The entry of an argument that each input is."""
-    return {k: (p.arguments[o.place[0]][0], o.place[1]) for k, o in enumerate(p.operations) if o.op == "INPUT"}
+    return {
+        k: (p.arguments[o.place[0]][0], o.place[1]) for k, o in enumerate(p.operations) if o.op == "INPUT"
+    }
 
 
 def unrolled(p: Program) -> Program:
@@ -156,7 +160,9 @@ def _loops(
     for n, own in enumerate(copies):
         copy = Copy(tuple(k for k in orders[n] if uses[k] == 1), tuple(own))
         begins = {i: n * sizes[p.names[i]] // block.times for i, *_ in own}
-        forms.setdefault(_form(p, copy, {**known, **{k: ("", -k - 1) for k in common}}, begins), []).append(copy)
+        forms.setdefault(_form(p, copy, {**known, **{k: ("", -k - 1) for k in common}}, begins), []).append(
+            copy
+        )
     loops = [of for of in forms.values() if len(of) >= FEWEST]
     rest = [copy for of in forms.values() if len(of) < FEWEST for copy in of]
     left = [o for copy in rest for o in copy.outputs]

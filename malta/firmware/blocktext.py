@@ -12,6 +12,8 @@ from malta.firmware.ctext import c_number, kind, operand_text, value_text
 from malta.firmware.elementary import Precision
 from malta.firmware.program import TRUTHS, Program
 
+APART = "_APART"  # ends the name of the macro that keeps a loop a function of its own, see apart.c
+
 
 class Place(NamedTuple):
     """Where a vector is: a parameter of C functions, and how the vector is reached from it."""
@@ -85,7 +87,8 @@ def blocks_text(
         return "\n".join([_comment(stage), head, *unused, *body.lines, *body.last, "}", ""])
     lines = [f"  {w.name}_values mid;"] if w.between else []
     ends = [
-        f"  for (k = 0; k < {w.between[name]}; k++) {{\n    {to}[k] = mid.{name}[k];\n  }}" for name, to in w.late.items()
+        f"  for (k = 0; k < {w.between[name]}; k++) {{\n    {to}[k] = mid.{name}[k];\n  }}"
+        for name, to in w.late.items()
     ]
     lines += ["  int32_t k;"] if ends else []
     return "\n".join([*_record(w), *functions, head, *lines, *unused, *calls, *ends, "}", ""])
@@ -132,9 +135,11 @@ def _read_later(p: Program, found: list[Stage], places: Mapping[str, Place]) -> 
     last: dict[str, int] = {}  # by place: the last stage that reads an argument there
     first: dict[str, int] = {}  # by result: the first stage that writes it
     for n, stage in enumerate(found):
-        for k in (*(a for k in stage.operations for a in p.operations[k].operands), *(k for *_, k in stage.outputs)):
-            if p.operations[k].op == "INPUT":
-                last[places[p.arguments[p.operations[k].place[0]][0]].access] = n
+        read = {a for k in stage.operations for a in p.operations[k].operands} | {
+            k for *_, k in stage.outputs
+        }
+        vectors = {p.arguments[p.operations[k].place[0]][0] for k in read if p.operations[k].op == "INPUT"}
+        last |= {places[name].access: n for name in vectors}
         for i, *_ in stage.outputs:
             if i < len(p.results):
                 first.setdefault(p.results[i][0], n)
@@ -215,7 +220,7 @@ class _Copies:
 
     def lines(self) -> tuple[list[str], list[str]]:
         """The tables, and the places at the beginning of a loop's body."""
-        tables, begin, columns = [], [], []
+        tables, begin, columns = list[str](), list[str](), list[tuple[int, ...]]()
         count = len(self.stage.copies)
         for n, steps in enumerate(self.steps):
             if steps == tuple(range(0, count * steps[1], steps[1] or 1)) and steps[1] > 0:
@@ -254,14 +259,19 @@ def _loop_body(w: _Writer, stage: Stage, known: dict[int, Entry]) -> _Body:
     targets: dict[int, list[int]] = {}
     for n, (*_, k) in enumerate(first.outputs):
         targets.setdefault(k, []).append(n)
-    ends = [tables.entry([(p.names[c.outputs[n][0]], c.outputs[n][1]) for c in stage.copies]) for n in range(len(first.outputs))]
+    ends = [
+        tables.entry([(p.names[c.outputs[n][0]], c.outputs[n][1]) for c in stage.copies])
+        for n in range(len(first.outputs))
+    ]
     taken_at = {a: n for n, k in enumerate(first.operations) for a in p.operations[k].operands}
     before = _common_lines(w, stage, known, names, body)
     for n, k in enumerate(first.operations):
         own = dict(names)
         for m, a in enumerate(p.operations[k].operands):
             if a not in names:
-                own |= _differing(tables, a, [p.operations[c.operations[n]].operands[m] for c in stage.copies], body)
+                own |= _differing(
+                    tables, a, [p.operations[c.operations[n]].operands[m] for c in stage.copies], body
+                )
         value = value_text(p, k, own, w.prefix, w.precision)
         if k in targets and taken_at.get(k, -1) <= n:
             inner.append(f"    {ends[targets[k][0]]} = {_as_number(w, k, value)};")
@@ -269,10 +279,14 @@ def _loop_body(w: _Writer, stage: Stage, known: dict[int, Entry]) -> _Body:
         else:
             names[k] = f"t{len(names)}"
             inner.append(f"    const {kind(p.operations[k], w.prefix)} {names[k]} = {value};")
-            body.last += [f"    {ends[m]} = {operand_text(p, k, names, w.precision)};" for m in targets.get(k, [])]
+            body.last += [
+                f"    {ends[m]} = {operand_text(p, k, names, w.precision)};" for m in targets.get(k, [])
+            ]
     for n, (*_, k) in enumerate(first.outputs):
         if k not in first.operations:
-            given = names if k in names else _differing(tables, k, [c.outputs[n][2] for c in stage.copies], body)
+            given = (
+                names if k in names else _differing(tables, k, [c.outputs[n][2] for c in stage.copies], body)
+            )
             body.last.append(f"    {ends[n]} = {operand_text(p, k, given, w.precision)};")
     for copy in stage.copies:
         body.given |= {p.names[i] for i, *_ in copy.outputs}
@@ -334,7 +348,10 @@ def _as_number(w: _Writer, k: int, value: str) -> str:
 def _parameters(w: _Writer, vectors: Iterable[str]) -> list[str]:
     """The parameters where vectors are, in the order of the program's own, then that of the blocks."""
     wanted = {w.places[name].parameter for name in vectors}
-    order = [*(name for name, size in (*w.p.arguments, *w.p.results) if size and name not in w.between), *w.between]
+    order = [
+        *(name for name, size in (*w.p.arguments, *w.p.results) if size and name not in w.between),
+        *w.between,
+    ]
     return [v for v in dict.fromkeys(w.places[name].parameter for name in order) if v in wanted]
 
 
@@ -346,9 +363,11 @@ def _stage_function(w: _Writer, stage: Stage, body: _Body) -> str:
     written = {w.places[name].parameter for name in body.given}
     declared = {place.parameter: place.declared for place in w.places.values()}
     takes = [
-        declared[v] if v in written else f"const {declared[v]}" for v in _parameters(w, body.taken | body.given)
+        declared[v] if v in written else f"const {declared[v]}"
+        for v in _parameters(w, body.taken | body.given)
     ]
-    head = _wrapped(f"static void {_stage_name(w, stage)}({', '.join(takes)})")
+    apart = f"{w.prefix.upper()}{APART} " if stage.copies else ""
+    head = _wrapped(f"static {apart}void {_stage_name(w, stage)}({', '.join(takes)})")
     return "\n".join([_comment(stage), f"{head} {{", *body.lines, *body.last, "}", ""])
 
 
@@ -368,7 +387,13 @@ def _record(w: _Writer) -> list[str]:
     if not w.between:
         return []
     members = [f"  {w.prefix}_real {name}[{size}];" for name, size in w.between.items()]
-    return [f"/* What the blocks of {w.name} hand on. */", "typedef struct {", *members, f"}} {w.name}_values;", ""]
+    return [
+        f"/* What the blocks of {w.name} hand on. */",
+        "typedef struct {",
+        *members,
+        f"}} {w.name}_values;",
+        "",
+    ]
 
 
 def _wrapped(text: str) -> str:

@@ -20,7 +20,12 @@ from malta.firmware.step import programs_of
 CLOCK = 667e6  # Hz, of the Cortex-A9 of the paper's Zynq 7000
 SECONDS = 120.0  # a compiler may take at most
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fno-tree-loop-distribute-patterns")
-STEP = ("step", "sense", "decide", "look_up")  # functions that run at every sample, with those of their blocks
+STEP = (
+    "step",
+    "sense",
+    "decide",
+    "look_up",
+)  # functions that run at every sample, with those of their blocks
 KINDS = {
     "additions": ("ADD", "SUB", "NEG"),
     "multiplications": ("MUL",),
@@ -75,8 +80,17 @@ def operations(t: Target) -> dict[str, int]:
 
 def costs(t: Target) -> list[Cost]:
     """The costs on every processor whose compiler is installed."""
-    files = sources(t, "")
-    return [cost for p in PROCESSORS if (cost := cost_on(p, files, c_name(t.controller.name))) is not None]
+    name, files, straight = c_name(t.controller.name), sources(t, ""), sources(t, "", loops=False)
+    found = []
+    for p in PROCESSORS:
+        cost = cost_on(p, files, name)
+        if cost is not None and straight != files:  # a loop's instructions are executed several times
+            written_out = cost_on(p, straight, name)
+            cost = written_out and cost._replace(
+                instructions=written_out.instructions, calls=written_out.calls
+            )
+        found += [] if cost is None else [cost]
+    return found
 
 
 def cost_on(p: Processor, files: Mapping[str, str], name: str) -> Cost | None:

@@ -104,7 +104,8 @@ def value_text(p: Program, k: int, names: Mapping[int, str], prefix: str, precis
     operation = p.operations[k]
     conditions = _CONDITIONS.get(operation.op, 0)
     operands = [
-        operand_text(p, a, names, precision, condition=i < conditions) for i, a in enumerate(operation.operands)
+        operand_text(p, a, names, precision, condition=i < conditions)
+        for i, a in enumerate(operation.operands)
     ]
     form = _FORMS[operation.op]
     return form.format(*operands, zero=c_number(0.0, precision), root=f"{prefix}_root")

@@ -10,7 +10,16 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from malta.firmware.blocktext import Place, array_place, blocks_call, blocks_signature, blocks_text, member_place
+from malta.firmware.blocks import unrolled
+from malta.firmware.blocktext import (
+    APART,
+    Place,
+    array_place,
+    blocks_call,
+    blocks_signature,
+    blocks_text,
+    member_place,
+)
 from malta.firmware.ctext import c_name, c_number
 from malta.firmware.elementary import Precision
 from malta.firmware.parts import table_size
@@ -39,13 +48,16 @@ WORDS = {
 }
 
 
-def sources(t: Target, sha256: str, name: str = "") -> dict[str, str]:
+def sources(t: Target, sha256: str, name: str = "", *, loops: bool = True) -> dict[str, str]:
     """The C files of a controller by name: <name>.h, <name>.c, <name>_parts.c.
 
     sha256 : of the gain file; name : the controller's own, as a C identifier, by default
+    loops : False writes equal computations one after the other
     """
     name = name or c_name(t.controller.name)
     programs = programs_of(t)
+    if not loops:
+        programs = {key: unrolled(p) for key, p in programs.items()}
     context = context_of(t, programs, name, sha256)
     return {
         f"{name}.h": render("controller.h", context),
@@ -111,13 +123,17 @@ def _function_context(t: Target, programs: Mapping[str, Program], name: str) -> 
     )
     fused = step_places(t, name)
     pieces = {key: piece_places(p, name) for key, p in others.items()}
+    texts = {key: blocks_text(programs[key], fused, name, t.precision, static=True) for key in FUSED}
+    functions = "\n".join(
+        blocks_text(p, pieces[key], name, t.precision, static=False) for key, p in others.items()
+    )
     return {
-        **{key: blocks_text(programs[key], fused, name, t.precision, static=True) for key in FUSED},
+        **texts,
+        "functions": functions,
         "piece_records": [record for p in others.values() for record in piece_records(p)],
         "declarations": [blocks_signature(p, pieces[key], name) for key, p in others.items()],
-        "functions": "\n".join(
-            blocks_text(p, pieces[key], name, t.precision, static=False) for key, p in others.items()
-        ),
+        "loops": any(APART in text for text in texts.values()),
+        "parts_loops": APART in functions,
         "root": fused_root,
         "parts_root": parts_root,
         **{f"call_{key}": blocks_call(programs[key], fused, name) for key in FUSED},
@@ -132,9 +148,7 @@ def step_places(t: Target, name: str) -> dict[str, Place]:
     places |= {f.name: member_place(state, "s", f"reference.{f.name}") for f in reference_fields(t)}
     places |= {f.name: member_place(given, "in", f.name) for f in input_fields(t)}
     places |= {f.name: member_place(out, "out", f.name) for f in output_fields(t)}
-    reads = len(t.look_ups)
-    values = table_size(t)
-    sizes = {"v0": len(t.controller.forces), "table_at": 2 * reads, "table": values}
+    sizes = {"v0": len(t.controller.forces), "table_at": 2 * len(t.look_ups), "table": table_size(t)}
     return places | {key: array_place(key, size, name) for key, size in sizes.items()}
 
 

@@ -92,7 +92,9 @@ def call_piece(
     results = {name: np.zeros(size, dtype=real) for name, size in sizes.items()}
     vectors = [np.ascontiguousarray(value, dtype=real) for value in given.values()]
     function = getattr(native.lib, f"{native.name}_{piece}")
-    if piece_records(programs_of(native.target)[piece]):  # records have nothing but these arrays, in this order
+    if piece_records(
+        programs_of(native.target)[piece]
+    ):  # records have nothing but these arrays, in this order
         both = [np.concatenate(vectors), np.concatenate(list(results.values()))]
         function(*(v.ctypes.data_as(ctypes.c_void_p) for v in both))
         ends = np.cumsum([v.size for v in results.values()])[:-1]

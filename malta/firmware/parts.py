@@ -136,8 +136,8 @@ def decide(t: Target) -> Staged:
         if t.has_set_points:
             out["command"] = set_points(t, out["current"], place)
         elif t.driven:
-            p, dp = reference["p"], reference["dp"]
-            known = out["xi_hat"] if t.controller.tracks == "states" else state_reference(t.believed)(y, dp)
+            at_rest = state_reference(t.believed)(y, reference["dp"])
+            known = out["xi_hat"] if t.controller.tracks == "states" else at_rest
             out["command"], electric = drive_currents(t, numbers(t), state, read, out["current"], known, sums)
             after |= electric
     after |= sums.rests
@@ -310,7 +310,11 @@ def currents(t: Target, place: Any, v: Any, table: Any) -> tuple[Any, Any]:
     meaning = "i_wanted: currents that make v where y_used says that the machine is"
     note("currents", meaning, wanted.numel(), i_wanted=wanted)
     current = limited_currents(t.believed, wanted, ca.SX(ca.DM(t.controller.limits.current)))
-    note("limit_currents", "current = i_wanted within limits.current and the machine's own limit", current=current)
+    note(
+        "limit_currents",
+        "current = i_wanted within limits.current and the machine's own limit",
+        current=current,
+    )
     return wanted, current
 
 

@@ -72,7 +72,9 @@ def _law_pieces(t: Target) -> list[Staged]:
     reference = symbols(reference_fields(t))
 
     def some(*names: str) -> dict[str, Any]:
-        return {name: reference[name] if name in reference else ca.SX.sym(name, sizes[name]) for name in names}
+        return {
+            name: reference[name] if name in reference else ca.SX.sym(name, sizes[name]) for name in names
+        }
 
     def law(xi_hat: Any, e: Any, xi_ref: Any, v_ff: Any, v0: Any) -> dict[str, Any]:
         following, saturated, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
@@ -80,7 +82,9 @@ def _law_pieces(t: Target) -> list[Staged]:
 
     return [
         _piece("calibrate", some("raw", "gain", "offset"), _calibrated, "y = gain raw + offset"),
-        _piece("positions", some("y"), lambda y: {"q": plant.position_of(y)}, "q: the place at which y is read"),
+        _piece(
+            "positions", some("y"), lambda y: {"q": plant.position_of(y)}, "q: the place at which y is read"
+        ),
         _piece("feedforward", reference, lambda p, dp, ddp: {"v_ff": feedforward(t, p, dp, ddp)}),
         _piece(
             "reference_states",
@@ -100,7 +104,9 @@ def _law_pieces(t: Target) -> list[Staged]:
             lambda e, frozen, y, p, dp: {"e_next": sum_errors(g, e, freeze_moving(g, frozen, dp), y, p)},
             "e_next = e + Ts (p - y), where no axis waits",
         ),
-        _piece("law", some("xi_hat", "e", "xi_ref", "v_ff", "v0"), law, "xi_pred_next = Ad xi_hat + Bd (v - v0)"),
+        _piece(
+            "law", some("xi_hat", "e", "xi_ref", "v_ff", "v0"), law, "xi_pred_next = Ad xi_hat + Bd (v - v0)"
+        ),
     ]
 
 
@@ -166,7 +172,9 @@ def _transformations(plant: Plant) -> list[Staged]:
             lambda x, u: {"u_phase": drive.to_phases(x) @ u},
             "u_phase = T_phases u",
         ),
-        _piece("induced_voltage", {"x": x}, lambda x: {"e": drive.emf(x)}, "e: the voltages that motion induces"),
+        _piece(
+            "induced_voltage", {"x": x}, lambda x: {"e": drive.emf(x)}, "e: the voltages that motion induces"
+        ),
         _piece("hall_position", hall, _hall_position, "z = pole / pi (angle of (cosine, sine) + 2 pi turns)"),
     ]
 
@@ -190,7 +198,12 @@ def strokes() -> list[Staged]:
         return dict(zip(_SHARE, found, strict=True))
 
     return [
-        _piece("logistic", arguments, logistic, "share = (1 + tanh(2 ln(3) t / rise)) / 2, with rate and acceleration"),
+        _piece(
+            "logistic",
+            arguments,
+            logistic,
+            "share = (1 + tanh(2 ln(3) t / rise)) / 2, with rate and acceleration",
+        ),
         _piece("quintic", arguments, quintic, "share = s^3 (10 - 15 s + 6 s^2), with rate and acceleration"),
     ]
 

@@ -212,7 +212,15 @@ def _pieces(t: Target, name: str) -> dict[str, Any]:
         arguments = {of: values[starts[of] : starts[of] + size] for of, size in p.arguments}
         results = evaluate(p, arguments, t.precision)
         sums.append(checksum(np.concatenate([results[of] for of, _ in p.results])))
-        pieces.append({"name": key, "call": _call(p, name), "times": times, "results": _size(p.results), "records": bool(piece_records(p))})
+        pieces.append(
+            {
+                "name": key,
+                "call": _call(p, name),
+                "times": times,
+                "results": _size(p.results),
+                "records": bool(piece_records(p)),
+            }
+        )
     lines = [f"    0x{value:08x}u" for value in sums]
     return {
         "pieces": pieces,

@@ -46,7 +46,12 @@ def control_currents(
         read = believed.drive.to_axes(estimate) @ (i_phase + errors if s.current_sensors else i_phase)
         i = read
     error = believed.drive.command(current) - read
-    note("current_errors", "epsilon = i_axes - T_axes i, of the axes, at the estimated place", epsilon=error)
+    note(
+        "read_axes",
+        "i_axes: measured currents of the axes, T_d i and -T_q i; where epsilon has them alone, left out",
+        i_axes=read,
+    )
+    note("current_errors", "epsilon = commanded less measured currents of the axes", epsilon=error)
     Q = believed.drive.turned(believed.forces(estimate, current)) if s.turning else ca.SX.eye(len(drive.axes))
     waiting = controller["u_limited"]
     step = g["Ki_current"] * g["control_time"] * (1 - waiting) * (Q @ error)
@@ -66,7 +71,9 @@ def control_currents(
         note("phase_voltages", "u_phase = T_phases u", u_phase=u_phase)
         command, limits = inverter.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm, most=most)
         limited = ca.vertcat(*_limited_axes(drive, limits))
-        meaning = "command = 1/2 + u_phase / link_last, within 1/2 +- sigma; u_limited: of modules with one at its limit"
+        meaning = (
+            "command = 1/2 + u_phase / link_last within 1/2 +- sigma; u_limited: its group has one at a limit"
+        )
         note("duty_cycles", meaning, command=command, u_limited=limited)
         command = keep_if_missed(s, signals, command)
         T = drive.to_axes(machine["x"])  # at the true position, not at the estimate

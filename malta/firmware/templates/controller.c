@@ -12,6 +12,10 @@
 {% include "root.c" %}
 
 {% endif %}
+{% if loops %}
+{% include "apart.c" %}
+
+{% endif %}
 {{ sense }}
 {{ decide }}
 {{ state_at }}

@@ -200,8 +200,7 @@ def currents(K: Any, W: Any, weights: Any = None) -> Any:
         KK = KD @ K.T
         if not isinstance(K, ca.SX):
             return KD.T @ ca.solve(KK, W)
-        upper = ca.vertcat(*(KK[: k + 1, k] for k in range(KK.shape[0])))
-        note("normal_matrix", "KK: upper triangle of K K', column by column", upper.numel(), KK=upper)
+        note("normal_matrix", "KK = K K', column by column, its upper triangle", KK=KK)
         L = ca.chol(KK).T
         note("root", "root: lower triangle with root root' = KK, column by column", root=L)
         multipliers = ca.solve(L.T, ca.solve(L, W))

@@ -237,12 +237,20 @@ class Series:
     def note_shared(self, xs: list[Any], ys: list[Any], z: Any) -> None:
         """Name what the coils of a grid share. xs, ys : places of its rows and columns, m; z : height of all, m"""
         decays = self._decays((z,))
-        note("decays", "decays = e^(-kappa z) of the field's harmonics", len(decays), decays=ca.vertcat(*decays.values()))
+        note(
+            "decays",
+            "decays = e^(-kappa z) of the field's harmonics",
+            len(decays),
+            decays=ca.vertcat(*decays.values()),
+        )
         for name, places in (("x", xs), ("y", ys)):
             waves = [ca.vertcat(*(w for pair in self._waves(v)[1:] for w in pair)) for v in places]
             meaning = f"waves_{name} = cos, sin of 1, 2, 3 ... times k {name}, of each row of coils"
             note(f"waves_{name}", meaning, len(waves), **{f"waves_{name}": ca.vertcat(*waves)})
-        rows = [[s for _, sums in self._rows(self._waves(v), decays) for s in sums if not isinstance(s, int)] for v in ys]
+        rows = [
+            [s for _, sums in self._rows(self._waves(v), decays) for s in sums if not isinstance(s, int)]
+            for v in ys
+        ]
         meaning = "sums = harmonics of one multiple of k x: decays times waves_y, of each row of coils"
         note("sums", meaning, len(rows), sums=ca.vertcat(*(s for row in rows for s in row)))
 
