@@ -12,7 +12,8 @@ from malta.firmware.ctext import c_number, kind, operand_text, value_text
 from malta.firmware.elementary import Precision
 from malta.firmware.program import TRUTHS, Program
 
-APART = "_APART"  # ends the name of the macro that keeps a loop a function of its own, see apart.c
+APART = "_APART"  # ends the name of the macro that keeps a long loop a function of its own, see apart.c
+LONG = 40  # operations of such a loop; shorter ones take fewer registers than their call
 
 
 class Place(NamedTuple):
@@ -366,7 +367,7 @@ def _stage_function(w: _Writer, stage: Stage, body: _Body) -> str:
         declared[v] if v in written else f"const {declared[v]}"
         for v in _parameters(w, body.taken | body.given)
     ]
-    apart = f"{w.prefix.upper()}{APART} " if stage.copies else ""
+    apart = f"{w.prefix.upper()}{APART} " if stage.copies and len(stage.operations) > LONG else ""
     head = _wrapped(f"static {apart}void {_stage_name(w, stage)}({', '.join(takes)})")
     return "\n".join([_comment(stage), f"{head} {{", *body.lines, *body.last, "}", ""])
 

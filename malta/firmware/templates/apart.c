@@ -1,5 +1,5 @@
 #ifndef {{ NAME }}_APART
-/* Loops stay functions of their own: in one function with all, their numbers push those of others out of registers. */
+/* Long loops stay functions of their own: in one function with all, their numbers push those of others out of registers. */
 #if defined(__GNUC__)
 #define {{ NAME }}_APART __attribute__((noinline))
 #else

@@ -74,7 +74,12 @@ def to_phases(theta: Any) -> Any:
     """9 x 6: AXES to phase quantities, the Moore-Penrose inverse of `to_axes`."""
     T = ca.kron(_around().T @ ca.diag(ca.DM([3, 1.5, 1.5])), K_L_inverse(theta).T)
     meaning = "U_d = R' diag(3, 3/2, 3/2) x cosines, U_q the same of sines"
-    note("phases_of_axes", f"{meaning}, of a module; u_phase = U_d u_d - U_q u_q", U_d=T[:, 0::2], U_q=-T[:, 1::2])
+    note(
+        "phases_of_axes",
+        f"{meaning}, of a module; u_phase = U_d u_d - U_q u_q",
+        U_d=T[:, 0::2],
+        U_q=-T[:, 1::2],
+    )
     return T
 
 
