@@ -26,10 +26,9 @@ from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
 from malta.firmware.lowering import lower
 from malta.firmware.parts import decide_function, named_function, sense_function
-from malta.firmware.pieces import parts_of
 from malta.firmware.program import evaluate, program_of
 from malta.firmware.signals import Target, input_fields, reference_fields, state_fields
-from malta.firmware.step import look_up, started_state, step_of
+from malta.firmware.step import look_up, programs_of, started_state, step_of
 from malta.firmware.vectors import record_vectors
 from malta.synthesis.controller import commanded, estimated, gains_of
 
@@ -271,7 +270,7 @@ def cases(t: Target) -> list[Case]:
         arguments = [f.name_in(k) for k in range(f.n_in())]
         given |= {f"{f.name()}_{name}": known[name] for name in arguments}
         sizes |= {f"{f.name()}_{f.name_out(k)}": f.size1_out(k) for k in range(f.n_out())}
-        known |= evaluate(program_of(parts_of(t)[f.name()]), known, t.precision)
+        known |= evaluate(programs_of(t)[f.name()], known, t.precision)
     return [
         Case("law", t.precision, law_ways(t), small, wanted),
         Case("control period", t.precision, period_ways(t), given, sizes),

@@ -18,8 +18,7 @@ from malta.firmware.flight import differences, engine_of_c
 from malta.firmware.fmu import build_fmu
 from malta.firmware.folder import folder_files
 from malta.firmware.native import call, call_piece, compile_controller, new_state, view, write
-from malta.firmware.pieces import parts_of
-from malta.firmware.program import evaluate, program_of
+from malta.firmware.program import evaluate
 from malta.firmware.signals import Target, reading_ranges, reference_fields, state_fields
 from malta.firmware.step import look_up, programs_of, started_state, step_of, zero_reference
 from malta.simulation.compiled import compiler
@@ -49,9 +48,7 @@ def _with_compiler() -> None:
 def test_every_piece_computes_the_bits_of_its_expressions(name: str, precision: Precision) -> None:
     t = target(name, precision)
     native, rng = compile_controller(t), np.random.default_rng(3)
-    pieces = {
-        key: program_of(f) for key, f in parts_of(t).items() if key not in ("sense", "decide", "state_at")
-    }
+    pieces = {key: p for key, p in programs_of(t).items() if key not in ("sense", "decide", "state_at")}
     assert len(pieces) >= 8
     for key, p in pieces.items():
         for _ in range(4):

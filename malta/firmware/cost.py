@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import tempfile
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +23,12 @@ from malta.firmware.supervisor_text import supervisor_sources
 CLOCK = 667e6  # Hz, of the Cortex-A9 of the paper's Zynq 7000
 SECONDS = 120.0  # a compiler may take at most
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fno-tree-loop-distribute-patterns")
-STEP = ("step", "sense", "decide", "look_up")  # functions that run at every sample
+STEP = (
+    "step",
+    "sense",
+    "decide",
+    "look_up",
+)  # functions that run at every sample, with those of their blocks
 KINDS = {
     "additions": ("ADD", "SUB", "NEG"),
     "multiplications": ("MUL",),
@@ -82,8 +87,18 @@ def operations(t: Target) -> dict[str, int]:
 def costs(t: Target) -> list[Cost]:
     """The costs on every processor whose compiler is installed."""
     name = c_name(t.controller.name)
-    files = sources(t, "") | supervisor_sources(t, name)
-    return [cost for p in PROCESSORS if (cost := cost_on(p, files, name)) is not None]
+    own = supervisor_sources(t, name)
+    files, straight = (sources(t, "", loops=loops) | own for loops in (True, False))
+    found = []
+    for p in PROCESSORS:
+        cost = cost_on(p, files, name)
+        if cost is not None and straight != files:  # a loop's instructions are executed several times
+            written_out = cost_on(p, straight, name)
+            cost = written_out and cost._replace(
+                instructions=written_out.instructions, calls=written_out.calls
+            )
+        found += [] if cost is None else [cost]
+    return found
 
 
 def cost_on(p: Processor, files: Mapping[str, str], name: str) -> Cost | None:
@@ -109,13 +124,13 @@ def cost_on(p: Processor, files: Mapping[str, str], name: str) -> Cost | None:
         supervised = _supervised(p, files, name, folder)
         stacks = _stacks((folder / f"{name}.su").read_text(encoding="utf-8"))
     own = {f"{name}_{function}" for function in STEP} | {"look_up"}
-    lines = _instructions(listing, own)
+    lines = _instructions(listing, lambda function: function in own or function.startswith(_blocks(name)))
     return Cost(
         p.name,
         int(sizes[0]),
         int(sizes[1]) + int(sizes[2]),
         int(state[0]),
-        stacks.get(f"{name}_step", 0) + max((stacks.get(f, 0) for f in own - {f"{name}_step"}), default=0),
+        _deepest(stacks, name),
         len(lines),
         sum("__aeabi_" in line for line in lines),
         supervised,
@@ -131,6 +146,20 @@ def _supervised(p: Processor, files: Mapping[str, str], name: str, folder: Path)
             return 0
         listings[file] = _run([f"{p.prefix}objdump", *LISTING, listed], folder) or ""
     return longest_path(listings, files, f"{name}_supervisor_step")
+
+
+def _blocks(name: str) -> tuple[str, ...]:
+    """How the names of the functions of a step's blocks begin."""
+    return tuple(f"{name}_{function}_" for function in STEP if function != "step")
+
+
+def _deepest(stacks: Mapping[str, int], name: str) -> int:
+    """Bytes of stack of a step: its own, and those of the function and of the block that take most."""
+    deepest = stacks.get("look_up", 0)
+    for function in ("sense", "decide"):
+        blocks = [size for f, size in stacks.items() if f.startswith(f"{name}_{function}_")]
+        deepest = max(deepest, stacks.get(f"{name}_{function}", 0) + max(blocks, default=0))
+    return stacks.get(f"{name}_step", 0) + deepest
 
 
 def _run(command: list[str], folder: Path) -> str | None:
@@ -153,13 +182,13 @@ def _stacks(usage: str) -> dict[str, int]:
     return found
 
 
-def _instructions(listing: str, functions: set[str]) -> list[str]:
-    """The instructions of functions in objdump's listing."""
+def _instructions(listing: str, is_own: Callable[[str], bool]) -> list[str]:
+    """The instructions of a step's functions in objdump's listing."""
     found, inside = [], False
     for line in listing.splitlines():
         head = re.match(r"^[0-9a-f]+ <([^>]+)>:$", line)
         if head:
-            inside = head[1].split(".")[0] in functions
+            inside = is_own(head[1].split(".")[0])
         elif inside and re.match(r"^\s+[0-9a-f]+:\s+[a-z]", line) and ".word" not in line:
             found.append(line)
     return found

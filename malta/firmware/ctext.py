@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 import textwrap
+from collections.abc import Mapping
 
 import numpy as np
 
 from malta.errors import InputError
 from malta.firmware.elementary import Precision
-from malta.firmware.program import TRUTHS, Program
+from malta.firmware.program import TRUTHS, Operation, Program
 
 _FORMS = {
     "ADD": "{0} + {1}",
@@ -70,41 +71,58 @@ def signature(p: Program, prefix: str) -> str:
 
 def function_text(p: Program, prefix: str, precision: Precision, *, static: bool = False) -> str:
     """The C function of a program. All arguments are read before a result is written: they may be the same arrays."""
-    kind = f"{prefix}_real"
-    zero, one = c_number(0.0, precision), c_number(1.0, precision)
+    zero = c_number(0.0, precision)
     inputs = {k for k, o in enumerate(p.operations) if o.op == "INPUT"}
-    direct = {k: c_number(o.value, precision) for k, o in enumerate(p.operations) if o.op == "CONST"}
+    names = {k: f"t{k}" for k, o in enumerate(p.operations) if o.op != "CONST"}
     lines = []
-
-    def text(k: int, *, condition: bool = False) -> str:
-        is_truth = p.operations[k].op in TRUTHS
-        if k in direct:
-            return f"({direct[k]} != {zero})" if condition else _bracketed(direct[k])
-        if condition:
-            return f"t{k}" if is_truth else f"(t{k} != {zero})"
-        return f"(t{k} ? {one} : {zero})" if is_truth else f"t{k}"
-
     for k, operation in enumerate(p.operations):
-        if operation.op == "CONST":
-            continue
         if k in inputs:
             argument, entry = operation.place
-            value, of = f"{p.arguments[argument][0]}[{entry}]", kind
-        else:
-            conditions = _CONDITIONS.get(operation.op, 0)
-            operands = [text(a, condition=i < conditions) for i, a in enumerate(operation.operands)]
-            value = _FORMS[operation.op].format(*operands, zero=zero, root=f"{prefix}_root")
-            of = "bool" if operation.op in TRUTHS else kind
-        lines.append(f"  const {of} t{k} = {value};")
-    for i, j, k in p.outputs:
-        lines.append(f"  {p.results[i][0]}[{j}] = {text(k)};")
-    written = {(i, j) for i, j, _ in p.outputs}
+            lines.append(f"  const {prefix}_real t{k} = {p.arguments[argument][0]}[{entry}];")
+        elif operation.op != "CONST":
+            of = kind(operation, prefix)
+            lines.append(f"  const {of} t{k} = {value_text(p, k, names, prefix, precision)};")
+    own = [o for o in p.outputs if o[0] < len(p.results)]
+    for i, j, k in own:
+        lines.append(f"  {p.results[i][0]}[{j}] = {operand_text(p, k, names, precision)};")
+    written = {(i, j) for i, j, _ in own}
     for i, (name, size) in enumerate(p.results):
         lines += [f"  {name}[{j}] = {zero};" for j in range(size) if (i, j) not in written]
     head = f"{'static ' if static else ''}{signature(p, prefix)} {{"
     used = {p.operations[k].place[0] for k in inputs}
     unused = [f"  (void){name};" for i, (name, size) in enumerate(p.arguments) if size and i not in used]
     return "\n".join([head, *unused, *lines, "}", ""])
+
+
+def kind(operation: Operation, prefix: str) -> str:
+    """The type of an operation's value."""
+    return "bool" if operation.op in TRUTHS else f"{prefix}_real"
+
+
+def value_text(p: Program, k: int, names: Mapping[int, str], prefix: str, precision: Precision) -> str:
+    """An operation on operands that have these names; one without a name is a constant."""
+    operation = p.operations[k]
+    conditions = _CONDITIONS.get(operation.op, 0)
+    operands = [
+        operand_text(p, a, names, precision, condition=i < conditions)
+        for i, a in enumerate(operation.operands)
+    ]
+    form = _FORMS[operation.op]
+    return form.format(*operands, zero=c_number(0.0, precision), root=f"{prefix}_root")
+
+
+def operand_text(
+    p: Program, k: int, names: Mapping[int, str], precision: Precision, *, condition: bool = False
+) -> str:
+    """The value of an operation as a number, or as a condition. Names with brackets are entries of arrays: numbers."""
+    zero, one = c_number(0.0, precision), c_number(1.0, precision)
+    if p.operations[k].op == "CONST" and k not in names:
+        number = c_number(p.operations[k].value, precision)
+        return f"({number} != {zero})" if condition else _bracketed(number)
+    name = names[k]
+    if p.operations[k].op in TRUTHS and not name.endswith("]"):
+        return name if condition else f"({name} ? {one} : {zero})"
+    return f"({name} != {zero})" if condition else name
 
 
 def _bracketed(number: str) -> str:

@@ -10,9 +10,20 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from malta.firmware.blocks import unrolled
+from malta.firmware.blocktext import (
+    APART,
+    Place,
+    array_place,
+    blocks_call,
+    blocks_signature,
+    blocks_text,
+    member_place,
+)
 from malta.firmware.calibration import counts_of, gain_lines, law_fields, parameter_context, parameters_of
-from malta.firmware.ctext import c_name, c_number, function_text, signature
+from malta.firmware.ctext import c_name, c_number
 from malta.firmware.elementary import Precision
+from malta.firmware.parts import table_size
 from malta.firmware.program import TYPES, Program
 from malta.firmware.signals import (
     Field,
@@ -27,6 +38,7 @@ from malta.firmware.supervisor import MOST_RATE, reference_limits
 
 MOST_POINTS = 65_535  # of a table of v0(z)
 FUSED = ("sense", "decide", "state_at")  # functions that a step consists of; the others are its pieces
+MOST_PARAMETERS = 6  # of a function
 LONGEST_RISE = 1000.0  # s, of a stroke
 RISES = 6.0  # times its rise that a stroke lasts: a logistic one is then within 2e-6 of its ends
 MOST_SAMPLES = 1e9  # of a stroke: twice their number is an int32_t
@@ -37,13 +49,16 @@ WORDS = {
 }
 
 
-def sources(t: Target, sha256: str, name: str = "") -> dict[str, str]:
+def sources(t: Target, sha256: str, name: str = "", *, loops: bool = True) -> dict[str, str]:
     """The C files of a controller by name: <name>.h, <name>.c, <name>_parts.c.
 
     sha256 : of the gain file; name : the controller's own, as a C identifier, by default
+    loops : False writes equal computations one after the other
     """
     name = name or c_name(t.controller.name)
     programs = programs_of(t)
+    if not loops:
+        programs = {key: unrolled(p) for key, p in programs.items()}
     context = context_of(t, programs, name, sha256)
     return {
         f"{name}.h": render("controller.h", context),
@@ -110,16 +125,57 @@ def _function_context(t: Target, programs: Mapping[str, Program], name: str) -> 
     fused_root, parts_root = (
         any(o.op == "SQRT" for key in keys for o in programs[key].operations) for keys in (FUSED, others)
     )
+    fused = step_places(t, name)
+    pieces = {key: piece_places(p, name) for key, p in others.items()}
+    texts = {key: blocks_text(programs[key], fused, name, t.precision, static=True) for key in FUSED}
+    functions = "\n".join(
+        blocks_text(p, pieces[key], name, t.precision, static=False) for key, p in others.items()
+    )
     return {
-        **{key: function_text(programs[key], name, t.precision, static=True) for key in FUSED},
-        "declarations": [signature(p, name) for p in others.values()],
-        "functions": "\n".join(function_text(p, name, t.precision) for p in others.values()),
-        "call_sense": call(programs["sense"], t, name),
-        "call_decide": call(programs["decide"], t, name),
-        "call_start": call(programs["state_at"], t, name),
+        **texts,
+        "functions": functions,
+        "piece_records": [record for p in others.values() for record in piece_records(p)],
+        "declarations": [blocks_signature(p, pieces[key], name) for key, p in others.items()],
+        "loops": any(APART in text for text in texts.values()),
+        "parts_loops": APART in functions,
         "root": fused_root,
         "parts_root": parts_root,
+        **{f"call_{key}": blocks_call(programs[key], fused, name) for key in FUSED},
     }
+
+
+def step_places(t: Target, name: str) -> dict[str, Place]:
+    """Where the vectors of a step are: in the records of the header; v0 and the table's values are the step's own."""
+    state, given, out = f"{name}_state", f"{name}_inputs", f"{name}_outputs"
+    places = {f.name: member_place(state, "s", f.name) for f in state_fields(t)}
+    places |= {f"{key}_next": place for key, place in places.items()}
+    places |= {f.name: member_place(state, "s", f"reference.{f.name}") for f in reference_fields(t)}
+    places |= {f.name: member_place(given, "in", f.name) for f in input_fields(t)}
+    places |= {f.name: member_place(out, "out", f.name) for f in output_fields(t)}
+    places |= {f.name: member_place(state, "s", f"parameters->{f.name}") for f in law_fields(t)}
+    sizes = {"v0": len(t.controller.forces), "table_at": 2 * len(t.look_ups), "table": table_size(t)}
+    return places | {key: array_place(key, size, name) for key, size in sizes.items()}
+
+
+def piece_places(p: Program, name: str) -> dict[str, Place]:
+    """Where the vectors of a piece are: parameters, or members of two records where these would be too many."""
+    if not piece_records(p):
+        return {key: array_place(key, size, name) for key, size in (*p.arguments, *p.results)}
+    given, found = (f"{name}_{p.name}_{of}" for of in ("given", "found"))
+    return {key: member_place(given, "given", key) for key, _ in p.arguments} | {
+        key: member_place(found, "found", key) for key, _ in p.results
+    }
+
+
+def piece_records(p: Program) -> list[dict[str, Any]]:
+    """The records of a piece with more vectors than a function has parameters; none for most."""
+    vectors = [[(key, size) for key, size in of if size] for of in (p.arguments, p.results)]
+    if len(vectors[0]) + len(vectors[1]) <= MOST_PARAMETERS - bool(p.between):
+        return []
+    return [
+        {"name": f"{p.name}_{of}", "fields": fields}
+        for of, fields in zip(("given", "found"), vectors, strict=True)
+    ]
 
 
 def _limit_context(t: Target) -> dict[str, Any]:
@@ -296,18 +352,6 @@ def _last_output(t: Target) -> str:
     if t.has_set_points:
         return "command: set points of the machine's electronics"
     return "command: duty cycles of the half-bridges" if t.driven else "current: of each coil"
-
-
-def call(p: Program, t: Target, name: str) -> str:
-    """The call of a fused function with members of the structs."""
-    places = {f.name: f"s->{f.name}" for f in state_fields(t)}
-    places |= {f"{f.name}_next": f"s->{f.name}" for f in state_fields(t)}
-    places |= {f.name: f"s->reference.{f.name}" for f in reference_fields(t)}
-    places |= {f.name: f"in->{f.name}" for f in input_fields(t)}
-    places |= {f.name: f"out->{f.name}" for f in output_fields(t)}
-    places |= {f.name: f"s->parameters->{f.name}" for f in law_fields(t)}
-    places |= {key: key for key in ("v0", "table_at", "table")}
-    return call_text(p, name, places)
 
 
 def call_text(p: Program, prefix: str, places: Mapping[str, str]) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.firmware.ctext import c_name
 from malta.firmware.elementary import Precision
-from malta.firmware.export import sources
+from malta.firmware.export import piece_records, sources
 from malta.firmware.program import TYPES
 from malta.firmware.signals import (
     Field,
@@ -23,6 +23,7 @@ from malta.firmware.signals import (
     reference_fields,
     state_fields,
 )
+from malta.firmware.step import programs_of
 from malta.simulation.compiled import library
 
 if TYPE_CHECKING:
@@ -94,9 +95,16 @@ def call_piece(
     real = TYPES[native.target.precision]
     results = {name: np.zeros(size, dtype=real) for name, size in sizes.items()}
     vectors = [np.ascontiguousarray(value, dtype=real) for value in given.values()]
+    function = getattr(native.lib, f"{native.name}_{piece}")
+    if piece_records(
+        programs_of(native.target)[piece]
+    ):  # records have nothing but these arrays, in this order
+        both = [np.concatenate(vectors), np.concatenate(list(results.values()))]
+        function(*(v.ctypes.data_as(ctypes.c_void_p) for v in both))
+        ends = np.cumsum([v.size for v in results.values()])[:-1]
+        return dict(zip(results, np.split(both[1], ends), strict=True))
     # The C has no arguments without entries.
-    places = [v.ctypes.data_as(ctypes.c_void_p) for v in (*vectors, *results.values()) if v.size]
-    getattr(native.lib, f"{native.name}_{piece}")(*places)
+    function(*(v.ctypes.data_as(ctypes.c_void_p) for v in (*vectors, *results.values()) if v.size))
     return results
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from malta.firmware.blocks import Staged, staged_function
 from malta.firmware.calibration import law_arguments, law_symbols
 from malta.firmware.elementary import as_written
 from malta.firmware.signals import (
@@ -26,6 +27,7 @@ from malta.firmware.signals import (
     reference_fields,
     state_fields,
 )
+from malta.model.equations import note, recorded_equations
 from malta.model.lookup import recorded_look_ups
 from malta.simulation.current_control import control_currents
 from malta.simulation.layout import Loop, Signals, electronics_of, numbers_of
@@ -64,6 +66,11 @@ def numbers(t: Target) -> dict[str, Any]:
 
 
 def sense_function(t: Target) -> ca.Function:
+    """`sense` without its blocks."""
+    return sense(t).plain
+
+
+def sense(t: Target) -> Staged:
     """(xi_pred, p, raw y, y_valid) -> (y_used, refused), and where the currents will read a table.
 
     A reading is refused that its sensor calls invalid, that is no number, or beyond all that the machine can reach; the
@@ -84,12 +91,17 @@ def sense_function(t: Target) -> ca.Function:
     reach = reading_ranges(t.believed)
     most = ca.DM(FAR * reach)
     bounded = ca.fmax(ca.fmin(expected, most), -most)
-    used, refused = gate(a["y"], a["y_valid"], reach, bounded)
-    results = {"y_used": used, "refused": refused}
-    if t.look_ups:
-        _, place = look_ahead(numbers(t), a["xi_pred"], used, a["dp"])
-        results["table_at"] = places_in_table(t, place)
-    return named_function("sense", a, results)
+    with recorded_equations() as equations:
+        used, refused = gate(a["y"], a["y_valid"], reach, bounded)
+        instead = "Cd xi_pred" if c.tracks == "states" else "p"
+        meaning = f"y_used = y where it may be used, else {instead} within +-{FAR:g} r; refused: not used"
+        note("gate", meaning, y_used=used, refused=refused)
+        results = {"y_used": used, "refused": refused}
+        if t.look_ups:
+            _, place = look_ahead(numbers(t), a["xi_pred"], used, a["dp"])
+            results["table_at"] = places_in_table(t, place)
+            note("places", "table_at: where the currents read their table", table_at=results["table_at"])
+    return staged_function("sense", a, results, equations)
 
 
 def gate(raw: Any, valid: Any, ranges: FloatArray, instead: Any) -> tuple[Any, Any]:
@@ -104,42 +116,34 @@ def gate(raw: Any, valid: Any, ranges: FloatArray, instead: Any) -> tuple[Any, A
 
 
 def decide_function(t: Target) -> ca.Function:
+    """`decide` without its blocks."""
+    return decide(t).plain
+
+
+def decide(t: Target) -> Staged:
     """(state, reference, y, v0, currents, link) -> (state, outputs): the rest of a control period.
 
     It consists of the functions of synthesis/controller.py and simulation/current_control.py, as a simulation does.
     """
-    c, plant = t.controller, t.believed
-    g = numbers(t)
     state, reference = symbols(state_fields(t)), symbols(reference_fields(t))
-    y, v0 = ca.SX.sym("y_used", len(c.measurements)), ca.SX.sym("v0", len(c.forces))
     read = symbols([f for f in input_fields(t) if f.name in ("i", "i_valid", "link")])
-    p, dp = reference["p"], reference["dp"]
-    after: dict[str, Any] = dict(state)
-    out: dict[str, Any] = {}
-    v_ff = feedforward(t, p, dp, reference["ddp"])
-    v_past, after["memory"] = recall(t, state.get("memory"), v_ff, p, dp)
-    xi_ref = law_reference(c, plant, g, {"p_ref": p, "dp_ref": dp, "v_past": v_past})
-    sums = Sums(t, state)
-    xi_hat = estimated(g, state["xi_pred"], filtered(c.tracks, y, p), None, sums.add_to_states)
-    frozen = freeze_moving(g, state["frozen"], dp)
-    e = sum_errors(g, state["e"], frozen, y, p, sums.add_to_errors)
-    xi_pred, saturated, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
-    xi_pred, place = look_ahead(g, sums.predict(xi_pred, xi_hat), y, dp)
+    y, v0 = ca.SX.sym("y_used", len(t.controller.measurements)), ca.SX.sym("v0", len(t.controller.forces))
     table = ca.SX.sym("table", table_size(t))
-    wanted, current = currents(t, place, v, table)
-    out |= {"xi_hat": xi_hat, "v": v, "saturated": saturated, "current": current}
-    out["met"] = ca.mmax(ca.fabs(current - wanted)) > 0
-    after |= {"xi_pred": xi_pred, "e": e, "frozen": saturated}
-    if t.has_set_points:
-        electronics = electronics_of(plant, t.setup)
-        assert electronics is not None
-        out["command"] = electronics.held(current, place)
-    elif t.driven:
-        known = xi_hat if c.tracks == "states" else state_reference(plant)(y, dp)
-        out["command"], electric = drive_currents(t, g, state, read, current, known, sums)
-        after |= electric
+    with recorded_equations() as equations:
+        sums = Sums(t, state)
+        after, out, place = _decided_forces(t, state, reference, y, v0, sums)
+        wanted, out["current"] = currents(t, place, out["v"], table)
+        out["met"] = ca.mmax(ca.fabs(out["current"] - wanted)) > 0
+        note("meet", "met: a current is not i_wanted", met=out["met"])
+        if t.has_set_points:
+            out["command"] = set_points(t, out["current"], place)
+        elif t.driven:
+            at_rest = state_reference(t.believed)(y, reference["dp"])
+            known = out["xi_hat"] if t.controller.tracks == "states" else at_rest
+            out["command"], electric = drive_currents(t, numbers(t), state, read, out["current"], known, sums)
+            after |= electric
     after |= sums.rests
-    results = {f.name: after[f.name] for f in state_fields(t)}
+    results = {f.name: after.get(f.name, state[f.name]) for f in state_fields(t)}
     results |= {f.name: out[f.name] for f in output_fields(t) if f.name in out}
     arguments = {
         **state,
@@ -151,7 +155,33 @@ def decide_function(t: Target) -> ca.Function:
         **law_arguments(t),
     }
     results = {(f"{name}_next" if name in state else name): value for name, value in results.items()}
-    return named_function("decide", arguments, results)
+    return staged_function("decide", arguments, results, equations)
+
+
+def _decided_forces(
+    t: Target, state: dict[str, Any], reference: dict[str, Any], y: Any, v0: Any, sums: Sums
+) -> tuple[dict[str, Any], dict[str, Any], Any]:
+    """The law: the state after the sample, the outputs down to forces, and the place for which currents commutate."""
+    c, plant, g = t.controller, t.believed, numbers(t)
+    p, dp = reference["p"], reference["dp"]
+    note("reference_states", "q_ref = (q*, dq*), which is at rest at p", q_ref=state_reference(plant)(p, dp))
+    v_ff = feedforward(t, p, dp, reference["ddp"])
+    v_past, memory = recall(t, state.get("memory"), v_ff, p, dp)
+    xi_ref = law_reference(c, plant, g, {"p_ref": p, "dp_ref": dp, "v_past": v_past})
+    note("law_reference", "xi_ref = (q*, dq* + rate dp, memory of forces under way)", xi_ref=xi_ref)
+    xi_hat = estimated(g, state["xi_pred"], filtered(c.tracks, y, p), None, sums.add_to_states)
+    frozen = freeze_moving(g, state["frozen"], dp)
+    e = sum_errors(g, state["e"], frozen, y, p, sums.add_to_errors)
+    xi_pred, saturated, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
+    xi_pred, place = look_ahead(g, sums.predict(xi_pred, xi_hat), y, dp)
+    ahead = "" if c.commutation is None else " + Bd lead pull dp"
+    note("predict", f"xi_pred = Ad xi_hat + Bd (v - v0){ahead}", xi_pred=xi_pred, **sums.rest("xi_rest"))
+    note("wait", "frozen = saturated", frozen=saturated)
+    after = {"xi_pred": xi_pred, "e": e, "frozen": saturated}
+    if memory is not None:
+        note("remember", "memory: forces under way are a sample older", memory=memory)
+        after["memory"] = memory
+    return after, {"xi_hat": xi_hat, "v": v, "saturated": saturated}, place
 
 
 class Sums:
@@ -166,15 +196,28 @@ class Sums:
         self.rests: dict[str, Any] = {}
 
     def add_to_errors(self, total: Any, more: Any) -> Any:
-        return self._add(total, more, "e_rest", range(total.numel()))
+        e = self._add(total, more, "e_rest", range(total.numel()))
+        note("sum_errors", "e = e + Ts (p - y_used), where no axis waits", e=e, **self.rest("e_rest"))
+        return e
 
     def add_to_voltages(self, total: Any, more: Any) -> Any:
-        return self._add(total, more, "u_rest", range(total.numel()))
+        u = self._add(total, more, "u_rest", range(total.numel()))
+        meaning = "u_integral = u_integral + Ki Ts epsilon, where the axis does not wait"
+        note("integrate_currents", meaning, u_integral=u, **self.rest("u_rest"))
+        return u
 
     def add_to_states(self, total: Any, more: Any) -> Any:
         if self.t.controller.tracks == "errors":  # its states are summed up in `predict`
-            return total + more
-        return self._add(total, more, "xi_rest", self.t.summing_states)
+            xi_hat, reading = total + more, "y_used - p"
+        else:
+            xi_hat, reading = self._add(total, more, "xi_rest", self.t.summing_states), "y_used"
+        meaning = f"xi_hat = xi_pred + L ({reading} - Cd xi_pred)"
+        note("estimate", meaning, xi_hat=xi_hat, **self.rest("xi_rest"))
+        return xi_hat
+
+    def rest(self, name: str) -> dict[str, Any]:
+        """What rounding took, by the name of its field; nothing where sums are plain."""
+        return {name: self.rests[name]} if name in self.rests else {}
 
     def predict(self, xi_pred: Any, xi_hat: Any) -> Any:
         """The states of the next sample: those of a law of errors as sums, xi_hat + (Ad - 1) xi_hat, as 1 - 1e-6 is no
@@ -210,6 +253,7 @@ def feedforward(t: Target, p: Any, dp: Any, ddp: Any) -> Any:
     if ff.position.size:
         states = state_reference(t.believed)(p, dp)
         v += ca.sparsify(ca.DM(ff.position)) @ states[: ff.position.shape[1]]
+    note("feedforward", "v_ff = inertia ddp + speed dp + position q*", v_ff=v)
     return v
 
 
@@ -266,8 +310,25 @@ def currents(t: Target, place: Any, v: Any, table: Any) -> tuple[Any, Any]:
         wanted = ca.SX(t.believed.currents(place, v))
     if found:
         wanted = ca.substitute(wanted, ca.vertcat(*(one.values for one in found)), table)
+    meaning = "i_wanted: currents that make v where y_used says that the machine is"
+    note("currents", meaning, wanted.numel(), i_wanted=wanted)
     limit = law_symbols(t).get("current_limit", ca.SX(ca.DM(t.controller.limits.current)))
-    return wanted, limited_currents(t.believed, wanted, limit)
+    current = limited_currents(t.believed, wanted, limit)
+    note(
+        "limit_currents",
+        "current = i_wanted within limits.current and the machine's own limit",
+        current=current,
+    )
+    return wanted, current
+
+
+def set_points(t: Target, current: Any, place: Any) -> Any:
+    """Set points of the machine's own electronics for coil currents, commutated for `place`."""
+    electronics = electronics_of(t.believed, t.setup)
+    assert electronics is not None
+    command = electronics.held(current, place)
+    note("set_points", "command: what the electronics hold until the next sample", command=command)
+    return command
 
 
 def drive_currents(
@@ -286,6 +347,7 @@ def drive_currents(
     low, high = (share * drive.link_voltage for share in LINK_RANGE)
     usable = ca.logic_and(read["link"] >= low, read["link"] <= high)
     V = ca.if_else(usable, read["link"], state["link_last"])
+    note("read_currents", "i_last = i, link_last = link, each where it may be used", i_last=i, link_last=V)
     machine = {"i_phase": i, "i": i, "link": V, "x": ca.SX.zeros(len(plant.states))}
     loops = {name: state[name] for name in ("u_integral", "u_limited")}
     if (
@@ -298,11 +360,21 @@ def drive_currents(
     return command, after | {"i_last": i, "link_last": V}
 
 
-def state_function(t: Target) -> ca.Function:
+def state_at(t: Target) -> Staged:
     """(p, dp, ddp, v0) -> state: the filter knows the machine to follow the reference, which has been so before."""
-    c, plant = t.controller, t.believed
     reference = symbols(reference_fields(t))
-    v0 = ca.SX.sym("v0", len(c.forces))
+    v0 = ca.SX.sym("v0", len(t.controller.forces))
+    with recorded_equations() as equations:
+        state = _state_on_reference(t, reference, v0)
+        note("rest", "all others are zero", **state)
+    return staged_function(
+        "state_at", {**reference, "v0": v0}, {f"{k}_next": v for k, v in state.items()}, equations
+    )
+
+
+def _state_on_reference(t: Target, reference: dict[str, Any], v0: Any) -> dict[str, Any]:
+    """The state by name, on a reference that has been so before."""
+    c, plant = t.controller, t.believed
     state: dict[str, Any] = {f.name: ca.SX.zeros(f.size) for f in state_fields(t)}
     p, dp = reference["p"], reference["dp"]
     if c.tracks == "states":
@@ -316,7 +388,10 @@ def state_function(t: Target) -> ca.Function:
                 *([v_ff] if c.lagging else []), *[newest] * c.delay, *([v_ff] * c.delay if c.lagging else [])
             )
         v_past, _ = recall(t, state.get("memory"), v_ff, p, dp)
+        if "memory" in state:
+            note("remember", "memory: this reference has been so before", memory=state["memory"])
         state["xi_pred"] = ca.vertcat(state_reference(plant)(p, dp), v_past)
+        note("expect", "xi_pred = (q*, dq*, memory of forces under way)", xi_pred=state["xi_pred"])
     if t.driven:
         drive, x = plant.drive, ca.SX.zeros(len(plant.states))
         q = state_reference(plant)(p, dp)
@@ -324,6 +399,8 @@ def state_function(t: Target) -> ca.Function:
             x[index] = q[k]
         i = drive.command(plant.currents(p, v0))
         state["u_integral"] = plant.actuator.R * i
+        note("hold_currents", "u_integral = R i_axes of the currents for v0", u_integral=state["u_integral"])
         state["i_last"] = drive.to_phases(x) @ i if t.fidelity == "phase" else i
+        note("flow", "i_last = T_phases i_axes", i_last=state["i_last"])
         state["link_last"] = ca.SX(drive.link_voltage)
-    return named_function("state_at", {**reference, "v0": v0}, {f"{k}_next": v for k, v in state.items()})
+    return state

@@ -15,121 +15,143 @@ logistic, quintic  shares of a stroke with their rates
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import casadi as ca
 
+from malta.firmware.blocks import Staged, staged_function
 from malta.firmware.calibration import law_arguments
-from malta.firmware.lowering import lower
 from malta.firmware.parts import (
     Sums,
     currents,
-    decide_function,
+    decide,
     drive_currents,
     feedforward,
-    named_function,
     numbers,
     places_in_table,
-    sense_function,
-    state_function,
+    sense,
+    set_points,
+    state_at,
     symbols,
     table_size,
 )
 from malta.firmware.signals import Field, Target, input_fields, reference_fields, state_fields
+from malta.model.equations import note, recorded_equations
 from malta.model.plant import Plant
 from malta.simulation import references
-from malta.simulation.layout import electronics_of
 from malta.simulation.period import state_reference
 from malta.synthesis.controller import commanded, estimated, filtered, freeze_moving, sum_errors
 
 
-def parts_of(t: Target) -> dict[str, ca.Function]:
-    """All functions of an export by name, lowered: `sense` and `decide`, then the pieces that are usable alone."""
-    functions = [sense_function(t), decide_function(t), state_function(t), *pieces(t)]
-    return {f.name(): lower(f, t.precision) for f in functions}
+def parts_of(t: Target) -> dict[str, Staged]:
+    """All functions of an export by name: `sense` and `decide`, then the pieces that are usable alone."""
+    return {s.plain.name(): s for s in (sense(t), decide(t), state_at(t), *pieces(t))}
 
 
-def pieces(t: Target) -> list[ca.Function]:
+def pieces(t: Target) -> list[Staged]:
     """The pieces of a control period that are usable alone."""
     return [*_law_pieces(t), *_current_pieces(t), *strokes(), *_transformations(t.believed)]
 
 
-def _law_pieces(t: Target) -> list[ca.Function]:
+def _piece(
+    name: str, arguments: dict[str, Any], compute: Callable[..., dict[str, Any]], equation: str = ""
+) -> Staged:
+    """A piece that computes its results from its arguments; `equation` gives those that no note names."""
+    with recorded_equations() as equations:
+        results = compute(**arguments)
+        note("result", equation, **results)
+    return staged_function(name, arguments, results, equations)
+
+
+def _law_pieces(t: Target) -> list[Staged]:
     """From readings to forces."""
-    c, plant = t.controller, t.believed
-    g = numbers(t)
+    c, plant, g = t.controller, t.believed, numbers(t)
     n, m, outputs = len(c.states), len(c.forces), len(c.measurements)
-    sizes = {
-        "raw": outputs,
-        "gain": outputs,
-        "offset": outputs,
-        "y": outputs,
-        "e": outputs,
-        "frozen": outputs,
-    }
+    sizes = dict.fromkeys(("raw", "gain", "offset", "y", "e", "frozen"), outputs)
     sizes |= {"xi_pred": n, "xi_hat": n, "xi_ref": n, "v_ff": m, "v0": m}
-    x = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     reference = symbols(reference_fields(t))
-    p, dp, ddp = reference.values()
 
     def some(*names: str) -> dict[str, Any]:
-        return {name: x[name] for name in names}
+        return {
+            name: reference[name] if name in reference else ca.SX.sym(name, sizes[name]) for name in names
+        }
 
-    following, saturated, v = commanded(g, x["xi_hat"], x["e"], x["xi_ref"], x["v_ff"], x["v0"])
-    xi_hat = estimated(g, x["xi_pred"], filtered(c.tracks, x["y"], p))
-    e = sum_errors(g, x["e"], freeze_moving(g, x["frozen"], dp), x["y"], p)
-    known = state_reference(plant)(p, dp)
+    def law(xi_hat: Any, e: Any, xi_ref: Any, v_ff: Any, v0: Any, **_: Any) -> dict[str, Any]:
+        following, saturated, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
+        return {"v": v, "saturated": saturated, "xi_pred_next": following}
+
     return [
-        named_function("calibrate", some("raw", "gain", "offset"), {"y": x["gain"] * x["raw"] + x["offset"]}),
-        named_function("positions", some("y"), {"q": plant.position_of(x["y"])}),
-        named_function("feedforward", reference, {"v_ff": feedforward(t, p, dp, ddp)}),
-        named_function("reference_states", {"p": p, "dp": dp}, {"states": known}),
-        named_function(
-            "filter", {**some("xi_pred", "y"), "p": p, **law_arguments(t, "L")}, {"xi_hat": xi_hat}
+        _piece("calibrate", some("raw", "gain", "offset"), _calibrated, "y = gain raw + offset"),
+        _piece(
+            "positions", some("y"), lambda y: {"q": plant.position_of(y)}, "q: the place at which y is read"
         ),
-        named_function("sum_errors", {**some("e", "frozen", "y"), "p": p, "dp": dp}, {"e_next": e}),
-        named_function(
+        _piece("feedforward", reference, lambda p, dp, ddp: {"v_ff": feedforward(t, p, dp, ddp)}),
+        _piece(
+            "reference_states",
+            some("p", "dp"),
+            lambda p, dp: {"states": state_reference(plant)(p, dp)},
+            "states = (q*, dq*), which is at rest at p",
+        ),
+        _piece(
+            "filter",
+            some("xi_pred", "y", "p") | law_arguments(t, "L"),
+            lambda xi_pred, y, p, **_: {"xi_hat": estimated(g, xi_pred, filtered(c.tracks, y, p))},
+            f"xi_hat = xi_pred + L ({'y - p' if c.tracks == 'errors' else 'y'} - Cd xi_pred)",
+        ),
+        _piece(
+            "sum_errors",
+            some("e", "frozen", "y", "p", "dp"),
+            lambda e, frozen, y, p, dp: {"e_next": sum_errors(g, e, freeze_moving(g, frozen, dp), y, p)},
+            "e_next = e + Ts (p - y), where no axis waits",
+        ),
+        _piece(
             "law",
             some("xi_hat", "e", "xi_ref", "v_ff", "v0") | law_arguments(t, "K", "Ki", "force_limit"),
-            {"v": v, "saturated": saturated, "xi_pred_next": following},
+            law,
+            "xi_pred_next = Ad xi_hat + Bd (v - v0)",
         ),
     ]
 
 
-def _current_pieces(t: Target) -> list[ca.Function]:
+def _calibrated(raw: Any, gain: Any, offset: Any) -> dict[str, Any]:
+    return {"y": gain * raw + offset}
+
+
+def _current_pieces(t: Target) -> list[Staged]:
     """From forces to currents, and from currents to what is commanded."""
     c, plant = t.controller, t.believed
     y, v = ca.SX.sym("y", len(c.measurements)), ca.SX.sym("v", len(c.forces))
     table, current = ca.SX.sym("table", table_size(t)), ca.SX.sym("current", len(plant.actuator.coils))
-    read = ({"table": table} if t.look_ups else {}) | law_arguments(t, "current_limit")
-    found = [named_function("currents", {"y": y, "v": v, **read}, {"current": currents(t, y, v, table)[1]})]
+    given = {"y": y, "v": v, **({"table": table} if t.look_ups else {})} | law_arguments(t, "current_limit")
+    found = [
+        _piece("currents", given, lambda y, v, table=table, **_: {"current": currents(t, y, v, table)[1]})
+    ]
     if t.look_ups:
-        found.append(named_function("places", {"y": y}, {"table_at": places_in_table(t, y)}))
-    electronics = electronics_of(plant, t.setup)
-    if electronics is not None:
-        command = electronics.held(current, y)
-        found.append(named_function("set_points", {"current": current, "y": y}, {"command": command}))
+        meaning = "table_at: where the currents at y read their table"
+        found.append(_piece("places", {"y": y}, lambda y: {"table_at": places_in_table(t, y)}, meaning))
+    if t.has_set_points:
+        given = {"current": current, "y": y}
+        found.append(_piece("set_points", given, lambda current, y: {"command": set_points(t, current, y)}))
     elif t.driven:
         found.append(_current_control(t, current))
     return found
 
 
-def _current_control(t: Target, current: Any) -> ca.Function:
+def _current_control(t: Target, current: Any) -> Staged:
     """The PI current loops alone; `states` are those of the machine's design model, estimated or of the readings."""
     names = ("u_integral", "u_limited", "i_last", "link_last", "u_rest")
     state = symbols(_chosen(state_fields(t), names))
     read = symbols(_chosen(input_fields(t), ("i", "i_valid", "link")))
     known = ca.SX.sym("states", len(t.controller.A))
-    g = numbers(t)
-    sums = Sums(t, state)
-    command, after = drive_currents(t, g, state, read, current, known, sums)
-    after = {f"{name}_next": value for name, value in (after | sums.rests).items()}
-    return named_function(
-        "current_control",
-        {"current": current, "states": known, **state, **read, **law_arguments(t, "Kp", "Ki_current")},
-        {"command": command, **after},
-    )
+
+    def control(**_: Any) -> dict[str, Any]:
+        sums = Sums(t, state)
+        command, after = drive_currents(t, numbers(t), state, read, current, known, sums)
+        return {"command": command} | {f"{name}_next": value for name, value in (after | sums.rests).items()}
+
+    own = law_arguments(t, "Kp", "Ki_current")
+    return _piece("current_control", {"current": current, "states": known, **state, **read, **own}, control)
 
 
 def _chosen(fields: Sequence[Field], names: Sequence[str]) -> list[Field]:
@@ -137,35 +159,60 @@ def _chosen(fields: Sequence[Field], names: Sequence[str]) -> list[Field]:
     return [field for field in fields if field.name in names]
 
 
-def _transformations(plant: Plant) -> list[ca.Function]:
+def _transformations(plant: Plant) -> list[Staged]:
     """Axes from phases and back, of a machine with windings, and the position of two Hall sensors half a pole apart."""
     if plant.windings is None:
         return []
     drive, x = plant.windings, ca.SX.sym("x", len(plant.states))
     i_phase, u = ca.SX.sym("i_phase", len(drive.phases)), ca.SX.sym("u", len(drive.axes))
-    sine, cosine, z, pole = (ca.SX.sym(name) for name in ("sine", "cosine", "z_last", "pole"))
-    angle = ca.atan2(sine, cosine)
-    turns = (z * math.pi / pole - angle) / (2 * math.pi)
+    hall = {name: ca.SX.sym(name) for name in ("sine", "cosine", "z_last", "pole")}
     return [
-        named_function("to_axes", {"x": x, "i_phase": i_phase}, {"i": drive.to_axes(x) @ i_phase}),
-        named_function("to_phases", {"x": x, "u": u}, {"u_phase": drive.to_phases(x) @ u}),
-        named_function("induced_voltage", {"x": x}, {"e": drive.emf(x)}),
-        named_function(
-            "hall_position",
-            {"sine": sine, "cosine": cosine, "z_last": z, "pole": pole},
-            {"z": (angle + 2 * math.pi * ca.floor(turns + 0.5)) * pole / math.pi},
+        _piece(
+            "to_axes",
+            {"x": x, "i_phase": i_phase},
+            lambda x, i_phase: {"i": drive.to_axes(x) @ i_phase},
+            "i = T_axes i_phase",
         ),
+        _piece(
+            "to_phases",
+            {"x": x, "u": u},
+            lambda x, u: {"u_phase": drive.to_phases(x) @ u},
+            "u_phase = T_phases u",
+        ),
+        _piece(
+            "induced_voltage", {"x": x}, lambda x: {"e": drive.emf(x)}, "e: the voltages that motion induces"
+        ),
+        _piece("hall_position", hall, _hall_position, "z = pole / pi (angle of (cosine, sine) + 2 pi turns)"),
     ]
 
 
-def strokes() -> list[ca.Function]:
+def _hall_position(sine: Any, cosine: Any, z_last: Any, pole: Any) -> dict[str, Any]:
+    """The position that is nearest to the last one, of two Hall sensors half a pole apart."""
+    angle = ca.atan2(sine, cosine)
+    turns = (z_last * math.pi / pole - angle) / (2 * math.pi)
+    return {"z": (angle + 2 * math.pi * ca.floor(turns + 0.5)) * pole / math.pi}
+
+
+def strokes() -> list[Staged]:
     """Shares of a stroke, with rate and acceleration, from the time since its middle: see simulation/references.py."""
-    time, rise = ca.SX.sym("t"), ca.SX.sym("rise")
-    arguments = {"t": time, "rise": rise}
-    names = ("share", "rate", "acceleration")
-    logistic = references.logistic(time, rise, ca.tanh)
-    quintic = references.quintic(time, rise, lambda u, low, high: ca.fmin(ca.fmax(u, low), high))
+    arguments = {"t": ca.SX.sym("t"), "rise": ca.SX.sym("rise")}
+
+    def logistic(t: Any, rise: Any) -> dict[str, Any]:
+        return dict(zip(_SHARE, references.logistic(t, rise, ca.tanh), strict=True))
+
+    def quintic(t: Any, rise: Any) -> dict[str, Any]:
+        found = references.quintic(t, rise, lambda u, low, high: ca.fmin(ca.fmax(u, low), high))
+        return dict(zip(_SHARE, found, strict=True))
+
     return [
-        named_function("logistic", arguments, dict(zip(names, logistic, strict=True))),
-        named_function("quintic", arguments, dict(zip(names, quintic, strict=True))),
+        _piece(
+            "logistic",
+            arguments,
+            logistic,
+            "share = (1 + tanh(2 ln(3) t / rise)) / 2, with rate and acceleration",
+        ),
+        _piece("quintic", arguments, quintic, "share = s^3 (10 - 15 s + 6 s^2), with rate and acceleration"),
     ]
+
+
+_SHARE = ("share", "rate", "acceleration")

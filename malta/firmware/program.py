@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -27,6 +27,15 @@ class Operation(NamedTuple):
     place: tuple[int, int] = (0, 0)  # of an INPUT: argument, entry
 
 
+class Block(NamedTuple):
+    """An equation and the names of what it gives."""
+
+    name: str
+    equation: str
+    results: tuple[str, ...]
+    times: int = 1  # of equal computations, one after the other in each result
+
+
 class Program(NamedTuple):
     """The operations of a function in order, each of them once."""
 
@@ -34,7 +43,14 @@ class Program(NamedTuple):
     arguments: tuple[tuple[str, int], ...]  # names and sizes
     results: tuple[tuple[str, int], ...]
     operations: tuple[Operation, ...]
-    outputs: tuple[tuple[int, int, int], ...]  # result, entry, operation
+    outputs: tuple[tuple[int, int, int], ...]  # result, or behind them one of `between`; entry, operation
+    between: tuple[tuple[str, int], ...] = ()  # what blocks hand on: names and sizes
+    blocks: tuple[Block, ...] = ()  # in which it is computed, if any
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the results, then of what blocks hand on."""
+        return [name for name, _ in (*self.results, *self.between)]
 
     @property
     def statements(self) -> int:
@@ -76,7 +92,7 @@ def program_of(f: ca.Function) -> Program:
             raise CheckError(f"firmware has no {NAMES[op]}")
     arguments = tuple((f.name_in(i), f.size1_in(i)) for i in range(f.n_in()))
     results = tuple((f.name_out(i), f.size1_out(i)) for i in range(f.n_out()))
-    return _without_unused(Program(f.name(), arguments, results, tuple(operations), tuple(outputs)))
+    return without_unused(Program(f.name(), arguments, results, tuple(operations), tuple(outputs)))
 
 
 def _shorter(operations: list[Operation], name: str, operands: tuple[int, ...]) -> Operation | None:
@@ -97,14 +113,20 @@ def _shorter(operations: list[Operation], name: str, operands: tuple[int, ...]) 
     return None
 
 
-def _without_unused(p: Program) -> Program:
-    """The program without operations on which no result depends."""
-    needed, waiting = set(), [k for *_, k in p.outputs]
+def reached(operations: Sequence[Operation], wanted: Iterable[int]) -> set[int]:
+    """The wanted operations and all on which they depend."""
+    needed, waiting = set[int](), list(wanted)
     while waiting:
         k = waiting.pop()
         if k not in needed:
             needed.add(k)
-            waiting += p.operations[k].operands
+            waiting += operations[k].operands
+    return needed
+
+
+def without_unused(p: Program) -> Program:
+    """The program without operations on which no result depends."""
+    needed = reached(p.operations, [k for *_, k in p.outputs])
     number = {k: n for n, k in enumerate(sorted(needed))}
     operations = tuple(
         p.operations[k]._replace(operands=tuple(number[a] for a in p.operations[k].operands)) for k in number
@@ -155,5 +177,6 @@ def evaluate(p: Program, given: Mapping[str, Any], precision: Precision) -> dict
     results = {name: np.zeros(size, dtype=real) for name, size in p.results}
     names = [name for name, _ in p.results]
     for i, j, k in p.outputs:
-        results[names[i]][j] = values[k]
+        if i < len(names):
+            results[names[i]][j] = values[k]
     return results

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from malta.firmware.blocks import staged_program
 from malta.firmware.calibration import law_values
 from malta.firmware.pieces import parts_of
-from malta.firmware.program import TYPES, Program, evaluate, program_of
+from malta.firmware.program import TYPES, Program, evaluate
 from malta.firmware.signals import Target, reference_fields, state_fields
 from malta.model.lookup import interpolate
 
@@ -21,7 +22,7 @@ Step = Callable[[Vectors, Mapping[str, Any], Mapping[str, Any]], tuple[Vectors, 
 @lru_cache(maxsize=16)
 def programs_of(t: Target) -> dict[str, Program]:
     """The programs of all functions of an export, by name."""
-    return {name: program_of(f) for name, f in parts_of(t).items()}
+    return {name: staged_program(s, t.precision) for name, s in parts_of(t).items()}
 
 
 def look_up(t: Target, z: Any) -> Any:

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from malta.firmware.ctext import c_number
-from malta.firmware.export import FUSED, call_text
+from malta.firmware.export import FUSED, call_text, piece_records
 from malta.firmware.program import TYPES, Program, evaluate
 from malta.firmware.sensor_loss import expected_readings
 from malta.firmware.signals import Target
@@ -212,7 +212,15 @@ def _pieces(t: Target, name: str) -> dict[str, Any]:
         arguments = {of: values[starts[of] : starts[of] + size] for of, size in p.arguments}
         results = evaluate(p, arguments, t.precision)
         sums.append(checksum(np.concatenate([results[of] for of, _ in p.results])))
-        pieces.append({"name": key, "call": _call(p, name), "times": times, "results": _size(p.results)})
+        pieces.append(
+            {
+                "name": key,
+                "call": _call(p, name),
+                "times": times,
+                "results": _size(p.results),
+                "records": bool(piece_records(p)),
+            }
+        )
     lines = [f"    0x{value:08x}u" for value in sums]
     return {
         "pieces": pieces,
@@ -239,7 +247,9 @@ class _Draws:
 
 
 def _call(p: Program, name: str) -> str:
-    """The call of a piece with places in the arrays of drawn and found numbers."""
+    """The call of a piece with places in the arrays of drawn and found numbers, or with its records."""
+    if piece_records(p):
+        return f"{name}_{p.name}(&{p.name}_given, &{p.name}_found)"
     places = {of: f"&given[{at}]" for of, at in _starts(p.arguments).items()}
     places |= {of: f"&found[{at}]" for of, at in _starts(p.results).items()}
     return call_text(p, name, places)

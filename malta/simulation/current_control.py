@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 
 from malta.model.data import plant_of
+from malta.model.equations import note
 from malta.simulation import inverter
 from malta.simulation.layout import Loop, Setup, Signals
 from malta.synthesis.controller import Add
@@ -45,21 +46,35 @@ def control_currents(
         read = believed.drive.to_axes(estimate) @ (i_phase + errors if s.current_sensors else i_phase)
         i = read
     error = believed.drive.command(current) - read
+    note(
+        "read_axes",
+        "i_axes: measured currents of the axes, T_d i and -T_q i; where epsilon has them alone, left out",
+        i_axes=read,
+    )
+    note("current_errors", "epsilon = commanded less measured currents of the axes", epsilon=error)
     Q = believed.drive.turned(believed.forces(estimate, current)) if s.turning else ca.SX.eye(len(drive.axes))
     waiting = controller["u_limited"]
     step = g["Ki_current"] * g["control_time"] * (1 - waiting) * (Q @ error)
     integral = add(controller["u_integral"], step)
     u = g["Kp"] * error + Q.T @ integral + believed.drive.emf(estimate)
+    note("current_law", "u = Kp epsilon + u_integral + emf, of the axes", u=u)
     most = inverter.largest_voltage(V, plant.actuator.voltage_limit, g["voltage_limit"])
     row: dict[str, Any] = {"link": V, "i": i}
     if s.fidelity == "dq":
         command, limited = inverter.modulation(drive, u, V, most)
+        meaning = "command = u / link_last, scaled with its group where a phase would be beyond its limit"
+        note("modulate", meaning, command=command, u_limited=limited)
         command = keep_if_missed(s, signals, command)
         row |= {"u": command * V, "force": drive.force(i)}
     else:
         u_phase = believed.drive.to_phases(estimate) @ u
+        note("phase_voltages", "u_phase = T_phases u", u_phase=u_phase)
         command, limits = inverter.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm, most=most)
         limited = ca.vertcat(*_limited_axes(drive, limits))
+        meaning = (
+            "command = 1/2 + u_phase / link_last within 1/2 +- sigma; u_limited: its group has one at a limit"
+        )
+        note("duty_cycles", meaning, command=command, u_limited=limited)
         command = keep_if_missed(s, signals, command)
         T = drive.to_axes(machine["x"])  # at the true position, not at the estimate
         true, applied = T @ i_phase, T @ ((command - 0.5) * V)

@@ -44,6 +44,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
+from malta.model.equations import note
 from malta.model.plant import Parameters, Signal, readonly
 
 if TYPE_CHECKING:
@@ -345,8 +346,11 @@ def commanded(
     """Steps 3, 4 and 6: (xi_pred, frozen, v) from the estimate and the sums of errors."""
     # The first sum is the same for all machines under one reference: engines compute it once a sample.
     wanted = (g["K"] @ xi_ref + v_ff) + (g["Ki"] @ e - g["K"] @ xi_hat) + v0
+    note("law", "w = K (xi_ref - xi_hat) + Ki e + v_ff + v0", w=wanted)
     v = ca.fmax(ca.fmin(wanted, g["force_limit"]), -g["force_limit"])
-    return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), v != wanted, v
+    saturated = v != wanted
+    note("limit_forces", "v = w within +-limits.force; saturated: v is not w", v=v, saturated=saturated)
+    return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), saturated, v
 
 
 def freeze_moving(g: Mapping[str, Any], frozen: Any, dp_ref: Any) -> Any:

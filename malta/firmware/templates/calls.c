@@ -78,6 +78,10 @@ static int32_t try_pieces(uint32_t *total) {
   };
   static {{ name }}_real given[{{ most_given }}];
   static {{ name }}_real found[{{ most_found }}];
+{% for piece in pieces if piece.records %}
+  static {{ name }}_{{ piece.name }}_given {{ piece.name }}_given;
+  static {{ name }}_{{ piece.name }}_found {{ piece.name }}_found;
+{% endfor %}
   uint32_t seed = 1u;
   int32_t failed = 0;
   int32_t k;
@@ -91,7 +95,13 @@ static int32_t try_pieces(uint32_t *total) {
 {% for place in piece.times %}
       given[{{ place }}] = {{ piece_time }};
 {% endfor %}
+{% if piece.records %}
+      (void)memcpy(&{{ piece.name }}_given, given, sizeof {{ piece.name }}_given);
       {{ piece.call }};
+      (void)memcpy(found, &{{ piece.name }}_found, sizeof {{ piece.name }}_found);
+{% else %}
+      {{ piece.call }};
+{% endif %}
       results = {{ piece.results }};
       break;
 {% endfor %}

@@ -12,6 +12,10 @@
 {% include "root.c" %}
 
 {% endif %}
+{% if loops %}
+{% include "apart.c" %}
+
+{% endif %}
 {{ sense }}
 {{ decide }}
 {{ state_at }}
@@ -81,7 +85,7 @@ void {{ name }}_init({{ name }}_state *s) {
 void {{ name }}_start({{ name }}_state *s) {
   {{ name }}_real v0[{{ forces }}];
   look_up(s, {{ start_z }}, v0);
-  {{ call_start }};
+  {{ call_state_at }};
 }
 
 void {{ name }}_step({{ name }}_state *s, const {{ name }}_inputs *in, {{ name }}_outputs *out) {

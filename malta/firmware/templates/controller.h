@@ -100,6 +100,14 @@ int32_t {{ name }}_follow_stroke({{ name }}_stroke *k, {{ name }}_reference *r);
 {% endif %}
 
 /* The pieces of a step, usable alone. */
+{% for record in piece_records %}
+typedef struct {
+{% for field, size in record.fields %}
+  {{ name }}_real {{ field }}[{{ size }}];
+{% endfor %}
+} {{ name }}_{{ record.name }};
+{% endfor %}
+
 {% for declaration in declarations %}
 {{ declaration }};
 {% endfor %}

@@ -8,6 +8,10 @@
 {% if parts_root %}
 {% include "root.c" %}
 {% endif %}
+{% if parts_loops %}
+
+{% include "apart.c" %}
+{% endif %}
 
 int32_t {{ name }}_parts_self_test(void) { return {{ name }}_is_exact(); }
 

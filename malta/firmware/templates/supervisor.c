@@ -346,8 +346,6 @@ static void infer_currents({{ name }}_supervisor *sup, {{ name }}_inputs *seen) 
 static void look_at_currents({{ name }}_supervisor *sup, const {{ name }}_inputs *in,
                              const {{ name }}_real expected[OUTPUTS],
                              {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
-  {{ name }}_real off[{{ axes }}];
-  {{ name }}_real beyond[{{ axes }}];
   int32_t k;
   for (k = 0; k < {{ currents }}; k++) {
     if ((is_within(in->i[k], {{ most }}) == 0) || !(in->i_valid[k] > {{ half }})) {
@@ -388,6 +386,8 @@ static void look_at_currents({{ name }}_supervisor *sup, const {{ name }}_inputs
       }
     }
 {% endif %}
+    {{ name }}_real off[{{ axes }}];
+    {{ name }}_real beyond[{{ axes }}];
     {{ name }}_deviation(in->i, expected, sup->current, off, beyond);
     for (k = 0; k < {{ axes }}; k++) {
       /* a link without voltage is told by its own monitor */
@@ -415,12 +415,12 @@ static int32_t is_astray(const {{ name }}_supervisor *sup, {{ name }}_real expec
   int32_t ignored = 0;
   int32_t j;
   for (j = 0; j < OUTPUTS; j++) {
-    ignored = (sup->unbelieved[j] > 0) ? (ignored + 1) : ignored;
+    if (sup->unbelieved[j] > 0) {
+      ignored = 1;
+    }
   }
-  if (is_within(expected, range[k]) == 0) {
-    return 1;
-  }
-  return ((ignored > 0) && (size_of(expected - reference) > near_touch[k])) ? 1 : 0;
+  const bool lost = (ignored == 1) && (size_of(expected - reference) > near_touch[k]);
+  return (lost || (is_within(expected, range[k]) == 0)) ? 1 : 0;
 }
 
 /* Levels of all monitors at a sample. */

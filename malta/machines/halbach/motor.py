@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from malta.model.equations import note
 from malta.simulation.substep import runge_kutta
 
 if TYPE_CHECKING:
@@ -27,7 +28,9 @@ COS, SIN = ca.DM([math.cos(p) for p in PHASES]), ca.DM([math.sin(p) for p in PHA
 
 def park(x: Any, k: Any) -> Any:
     """2 x 3: (6), phase quantities to d (horizontal) and q (vertical) at the position x."""
-    return park_of_angle(ca.cos(k * x), ca.sin(k * x))
+    cosine, sine = ca.cos(k * x), ca.sin(k * x)
+    note("wave", "cosine, sine of k y", cosine=cosine, sine=sine)
+    return park_of_angle(cosine, sine)
 
 
 def unpark(x: Any, k: Any) -> Any:

@@ -29,6 +29,7 @@ from malta.machines.planar.field import (
     Series,
     Shape,
 )
+from malta.model.equations import Equation, note, recorded_equations, recording
 from malta.model.plant import (
     readonly,
 )
@@ -85,6 +86,26 @@ def _currents_function(shape: Shape, order: int) -> ca.Function:
     return ca.Function("currents", [y, W, factors], [ca.cse(i)])
 
 
+@lru_cache(maxsize=8)
+def _noted_currents(shape: Shape, order: int) -> tuple[ca.Function, tuple[Equation, ...]]:
+    """The same with all results of its equations: (y, W, factors) -> i and these; the equations."""
+    par, factors = _symbols(shape)
+    y, W = ca.SX.sym("y", 6), ca.SX.sym("W", 6)
+    with recorded_equations() as equations:
+        i = currents(ca.cse(wrench_matrix(par, model_of_order(par, order), _place(par, y))), W)
+    results = [ca.vec(ca.densify(value)) for e in equations for value in e.values.values()]
+    return ca.Function("currents", [y, W, factors], ca.cse([i, *results])), tuple(equations)
+
+
+def _noting_currents(par: Parameters, y: Any, W: Any) -> Any:
+    """i of `_currents_function`, with a note of each equation."""
+    function, equations = _noted_currents(shape_of(par), int(par.order))
+    i, *results = function.call([y, W, factors_of(par)])
+    for e in equations:
+        note(e.block, e.text, e.times, **{name: results.pop(0) for name in e.values})
+    return i
+
+
 def _place(par: Parameters, y: Any) -> Any:
     """The position p = (x, y, height above the magnets) in states or outputs y."""
     return ca.vertcat(y[:2], par.h + y[2])
@@ -96,7 +117,13 @@ def current_law(par: Parameters, *, numbers: bool) -> Callable[[Any, Any], Any]:
     numbers : the parameters are numbers. The function of symbols raises CheckError if it needs a table.
     """
     if not par.cells:
-        return lambda y, W: _currents_function(shape_of(par), int(par.order))(y, W, factors_of(par))
+
+        def by_function(y: Any, W: Any) -> Any:
+            if isinstance(W, ca.SX) and recording():
+                return _noting_currents(par, y, W)
+            return _currents_function(shape_of(par), int(par.order))(y, W, factors_of(par))
+
+        return by_function
     if numbers:
         model = controller_model(par)
         looked_up = decoupling(par, model)
@@ -143,7 +170,7 @@ def wrench_matrix(par: Parameters, model: CoilModel, p: Any, q_r: Any = None) ->
         at = arms + check_position(par, p)
         K: FloatArray = (levers @ model(at[:, 0], at[:, 1], at[:, 2] - par.r_z)[..., None])[..., 0].T
         return K
-    columns = []
+    columns, xs, ys = [], {}, {}
     for a, b in product(STEPS, STEPS):  # parameters may be symbols here
         arm = ca.vertcat(a * par.coil_pitch, b * par.coil_pitch, par.r_z)
         rows = ca.diag(arm) if q_r is None else ca.diag(arm) @ rotation(q_r)
@@ -151,9 +178,14 @@ def wrench_matrix(par: Parameters, model: CoilModel, p: Any, q_r: Any = None) ->
         # Decays over a column's rise, a row's and the mover's height are factors, each for several coils.
         heights = (p[2] + rows[2, 2] - par.r_z, rows[0, 2], rows[1, 2])
         z: Any = heights if q_r is not None and isinstance(model, Series) else p[2] + at[2] - par.r_z
-        own = model(p[0] + at[0], p[1] + at[1], z)
+        xs[a], ys[b] = p[0] + at[0], p[1] + at[1]
+        own = model(xs[a], ys[b], z)
         columns.append(ca.vertcat(own[:3], own[3:] + ca.cross(at, own[:3])))
-    return ca.horzcat(*columns)
+    K = ca.horzcat(*columns)
+    if isinstance(model, Series) and q_r is None:
+        model.note_shared(list(xs.values()), list(ys.values()), z)
+    note("wrench_matrix", "K: wrench of 1 A in each coil, column by column", len(columns), K=K)
+    return K
 
 
 def currents(K: Any, W: Any, weights: Any = None) -> Any:
@@ -165,8 +197,15 @@ def currents(K: Any, W: Any, weights: Any = None) -> Any:
     """
     if not isinstance(K, np.ndarray):
         KD = K if weights is None else K @ ca.diag(1 / weights)
-        L = ca.chol(KD @ K.T).T if isinstance(K, ca.SX) else None
-        return KD.T @ (ca.solve(KD @ K.T, W) if L is None else ca.solve(L.T, ca.solve(L, W)))
+        KK = KD @ K.T
+        if not isinstance(K, ca.SX):
+            return KD.T @ ca.solve(KK, W)
+        note("normal_matrix", "KK = K K', column by column, its upper triangle", KK=KK)
+        L = ca.chol(KK).T
+        note("root", "root: lower triangle with root root' = KK, column by column", root=L)
+        multipliers = ca.solve(L.T, ca.solve(L, W))
+        note("solve", "KK multipliers = v", multipliers=multipliers)
+        return KD.T @ multipliers
     if not np.isfinite(W).all():
         raise InputError("planar", "W", f"{W}", "a finite wrench")
     if weights is not None and not (np.asarray(weights) > 0).all():

@@ -12,6 +12,7 @@ signs of (17)-(24). Equation numbers are those of the paper named in plant.py.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.model.equations import note
 from malta.model.plant import readonly
 
 if TYPE_CHECKING:
@@ -210,18 +212,47 @@ class Series:
             return np.stack(
                 [(X_[i] * Y_[j]) @ g for g, i, j in zip(self.G, ODD_X, ODD_Y, strict=True)], axis=-1
             )
-        X, Y = (_multiples(self.k * v, int(max(*self.m, *self.n))) for v in (x, y))
         heights = z if isinstance(z, tuple) else (z,)
-        decays = {K: math.prod(ca.exp(-K * height) for height in heights) for K in self.K.tolist()}
-        parts: list[Any] = [0] * 6
-        for m in range(int(self.m.max()) + 1):  # sums over n first: they are the same for all coils of one y
+        X, parts = self._waves(x), list[Any]([0] * 6)
+        for m, sums in self._rows(self._waves(y), self._decays(heights)):
+            parts = [part + X[m][odd] * sum_n for part, odd, sum_n in zip(parts, ODD_X, sums, strict=True)]
+        return self.scale * ca.vertcat(*parts)
+
+    def _waves(self, v: Any) -> list[tuple[Any, Any]]:
+        return _multiples(self.k * v, int(max(*self.m, *self.n)))
+
+    def _decays(self, heights: tuple[Any, ...]) -> dict[float, Any]:
+        return {K: math.prod(ca.exp(-K * height) for height in heights) for K in self.K.tolist()}
+
+    def _rows(self, Y: list[tuple[Any, Any]], decays: dict[float, Any]) -> Iterator[tuple[int, list[Any]]]:
+        """Sums over n for each m: they are the same for all coils of one y."""
+        for m in range(int(self.m.max()) + 1):
             sums: list[Any] = [0] * 6
             for h in np.flatnonzero(self.m == m):
                 waves = [decays[self.K[h]] * wave for wave in Y[int(self.n[h])]]
                 for c in np.flatnonzero(self.G[:, h]):
                     sums[c] += self.G[c, h] * waves[ODD_Y[c]]
-            parts = [part + X[m][odd] * sum_n for part, odd, sum_n in zip(parts, ODD_X, sums, strict=True)]
-        return self.scale * ca.vertcat(*parts)
+            yield m, sums
+
+    def note_shared(self, xs: list[Any], ys: list[Any], z: Any) -> None:
+        """Name what the coils of a grid share. xs, ys : places of its rows and columns, m; z : height of all, m"""
+        decays = self._decays((z,))
+        note(
+            "decays",
+            "decays = e^(-kappa z) of the field's harmonics",
+            len(decays),
+            decays=ca.vertcat(*decays.values()),
+        )
+        for name, places in (("x", xs), ("y", ys)):
+            waves = [ca.vertcat(*(w for pair in self._waves(v)[1:] for w in pair)) for v in places]
+            meaning = f"waves_{name} = cos, sin of 1, 2, 3 ... times k {name}, of each row of coils"
+            note(f"waves_{name}", meaning, len(waves), **{f"waves_{name}": ca.vertcat(*waves)})
+        rows = [
+            [s for _, sums in self._rows(self._waves(v), decays) for s in sums if not isinstance(s, int)]
+            for v in ys
+        ]
+        meaning = "sums = harmonics of one multiple of k x: decays times waves_y, of each row of coils"
+        note("sums", meaning, len(rows), sums=ca.vertcat(*(s for row in rows for s in row)))
 
     def above(self, force: float, z: float) -> Series:
         """The series without harmonics whose forces are below `force` (N/A) at the height z, and without such torques.

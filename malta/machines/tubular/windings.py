@@ -20,6 +20,8 @@ from typing import Any
 
 import casadi as ca
 
+from malta.model.equations import note
+
 AXES = ("0d", "0q", "dd", "dq", "qd", "qq")
 WEIGHT = (4.5, 4.5, 2.25, 2.25, 2.25, 2.25)  # power of a module = sum of weight u i
 TURN = 2 * math.pi / 3
@@ -35,7 +37,14 @@ def K_R(phi: Any) -> Any:
 def K_L(theta: Any) -> Any:
     """3 x 2: d and q along the machine at the electrical angle theta (rad), of the three coils along it."""
     angles = [theta - TURN * c for c in range(3)]
-    return 2 / 3 * ca.vertcat(*(ca.horzcat(ca.cos(a), -ca.sin(a)) for a in angles))
+    cosines, sines = (ca.vertcat(*(wave(a) for a in angles)) for wave in (ca.cos, ca.sin))
+    note(
+        "wave",
+        "cosines, sines of theta - 2 pi c / 3 for c = 0, 1, 2, theta = pi z / L_p",
+        cosines=cosines,
+        sines=sines,
+    )
+    return 2 / 3 * ca.horzcat(cosines, -sines)
 
 
 def K_R_inverse(phi: Any) -> Any:
@@ -55,12 +64,23 @@ def _around() -> Any:
 
 def to_axes(theta: Any) -> Any:
     """6 x 9: a module's phase quantities (x_11 x_12 x_13 x_21 ...) to AXES, phi fixed at 0 (d) and pi/2 (q)."""
-    return ca.kron(_around(), K_L(theta).T)
+    T = ca.kron(_around(), K_L(theta).T)
+    meaning = "T_d = 2/3 R x cosines, T_q = 2/3 R x sines, of a module; axes d are T_d i, axes q -T_q i"
+    note("axes_of_phases", meaning, T_d=T[0::2, :], T_q=-T[1::2, :])
+    return T
 
 
 def to_phases(theta: Any) -> Any:
     """9 x 6: AXES to phase quantities, the Moore-Penrose inverse of `to_axes`."""
-    return ca.kron(_around().T @ ca.diag(ca.DM([3, 1.5, 1.5])), K_L_inverse(theta).T)
+    T = ca.kron(_around().T @ ca.diag(ca.DM([3, 1.5, 1.5])), K_L_inverse(theta).T)
+    meaning = "U_d = R' diag(3, 3/2, 3/2) x cosines, U_q the same of sines"
+    note(
+        "phases_of_axes",
+        f"{meaning}, of a module; u_phase = U_d u_d - U_q u_q",
+        U_d=T[:, 0::2],
+        U_q=-T[:, 1::2],
+    )
+    return T
 
 
 def magnitude_and_angle(f_x: float, f_y: float, K_B: float, phi_before: float = 0.0) -> tuple[float, float]:
