@@ -16,7 +16,7 @@ noise: X then has a diagonal of ones.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy import linalg, sparse
@@ -389,7 +389,8 @@ def _rounding_of_poles(found: _Found) -> float:
     """How far rounding of A and B K may move the slowest pole of A - B K: |y'| (|A| + |B| |K|) |x| / |y'x|; a double
     pole at most."""
     A, B = found.equation[:2]
-    poles, left, right = linalg.eig(found.closed, left=True)
+    modes: Any = linalg.eig(found.closed, left=True)  # its stubs know two results
+    poles, left, right = modes
     k = int(poles.real.argmax())
     y, x = left[:, k], right[:, k]
     size = np.abs(A) + np.abs(B) @ np.abs(found.K)
