@@ -387,14 +387,17 @@ def _check(found: _Found, what: str, *, definite: bool) -> None:
 
 def _rounding_of_poles(found: _Found) -> float:
     """How far rounding of A and B K may move the slowest pole of A - B K: |y'| (|A| + |B| |K|) |x| / |y'x|; a double
-    pole at most."""
+    pole at most, and the largest pole's at least."""
     A, B = found.equation[:2]
     modes: Any = linalg.eig(found.closed, left=True)  # its stubs know two results
     poles, left, right = modes
     k = int(poles.real.argmax())
     y, x = left[:, k], right[:, k]
     size = np.abs(A) + np.abs(B) @ np.abs(found.K)
-    return float(4 * EPS * (np.abs(y) @ size @ np.abs(x)) / max(abs(y.conj() @ x), EPS**0.5))
+    moved = (np.abs(y) @ size @ np.abs(x)) / max(abs(y.conj() @ x), EPS**0.5)
+    return (
+        4 * EPS * max(float(moved), float(np.abs(poles).max()))
+    )  # eigenvalues are found to those of the largest
 
 
 def _first_sentence(error: Exception) -> str:
