@@ -395,9 +395,7 @@ def _rounding_of_poles(found: _Found) -> float:
     y, x = left[:, k], right[:, k]
     size = np.abs(A) + np.abs(B) @ np.abs(found.K)
     moved = (np.abs(y) @ size @ np.abs(x)) / max(abs(y.conj() @ x), EPS**0.5)
-    return (
-        4 * EPS * max(float(moved), float(np.abs(poles).max()))
-    )  # eigenvalues are found to those of the largest
+    return 4 * EPS * max(float(moved), float(np.abs(poles).max()))
 
 
 def _first_sentence(error: Exception) -> str:
