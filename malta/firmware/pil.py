@@ -64,7 +64,8 @@ class Replay:
 
     >>> import malta
     >>> one = malta.firmware.pil.ReplayedVector("stroke", 60, differs=-1, largest=0.0)
-    >>> malta.Replay("float", (one,), seconds=0.5, repeated=0, counts=0).samples_per_second
+    >>> found = malta.Replay("float", (one,), seconds=0.5, repeated=0, counts=0)
+    >>> found.samples_per_second
     120.0
     """
 

@@ -77,8 +77,12 @@ def _version(cc: tuple[str, ...]) -> str | None:
     return None if found is None else found[1]
 
 
-def _answer(command: list[str], seconds: float = PATIENCE) -> tuple[int, str] | None:
-    """A compiler's exit code and what it prints; None where it cannot be started, or is stopped after so long."""
+def _answer(command: list[str], seconds: float | None = None) -> tuple[int, str] | None:
+    """A compiler's exit code and what it prints; None where it cannot be started, or is stopped after so long.
+
+    seconds : None: PATIENCE
+    """
+    seconds = PATIENCE if seconds is None else seconds
     try:
         process = subprocess.Popen(
             command,
@@ -170,11 +174,12 @@ def shared_library(
     files: Mapping[str, bytes],
     flags: tuple[str, ...],
     cc: tuple[str, ...] | None = None,
-    seconds: float = PATIENCE,
+    seconds: float | None = None,
 ) -> bytes | None:
     """The shared library of C files by name, for all processors of a kind; None where no compiler can make it.
 
     cc : the compiler as a command; None: this system's, for its own kind
+    seconds : that it may take; None: PATIENCE
     """
     cc = cc or compiler()
     if cc is None:
