@@ -9,6 +9,7 @@ v0(z) is looked up between the two, see controller.c. pieces.py has each piece a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -296,7 +297,7 @@ def table_size(t: Target) -> int:
 
 def places_in_table(t: Target, place: Any) -> Any:
     """(u, v) of each reading of the table, where the currents are commutated for `place`."""
-    with recorded_look_ups() as found:
+    with recorded_look_ups() as found, recorded_equations():  # whose notes are of the symbols of this call
         t.believed.currents(place, ca.SX.sym("v", len(t.controller.forces)))
     return ca.vertcat(*(x for one in found for x in (one.u, one.v)))
 
@@ -306,7 +307,10 @@ def currents(t: Target, place: Any, v: Any, table: Any) -> tuple[Any, Any]:
 
     table : the values that are read at `places_in_table`; none for most machines
     """
-    with recorded_look_ups() as found:
+    unread = (
+        recorded_equations() if t.look_ups else nullcontext()
+    )  # notes of values before they are looked up
+    with recorded_look_ups() as found, unread:
         wanted = ca.SX(t.believed.currents(place, v))
     if found:
         wanted = ca.substitute(wanted, ca.vertcat(*(one.values for one in found)), table)
