@@ -67,9 +67,13 @@ def write_files(files: dict[str, str], folder: Path) -> list[Path]:
     return sorted(path for path in paths if path.suffix == ".c")
 
 
-@pytest.mark.parametrize("precision", [pytest.param("double", marks=pytest.mark.slow), "float"])
 @pytest.mark.parametrize(
-    "name", [n if n == "halbach" else pytest.param(n, marks=pytest.mark.slow) for n in ALL]
+    ("name", "precision"),
+    [
+        ("halbach", "float"),
+        *(pytest.param(n, "float", marks=pytest.mark.slow) for n in ALL if n != "halbach"),
+        *(pytest.param(n, "double", marks=pytest.mark.slow) for n in ("halbach", "robust", "planar_pid")),
+    ],
 )
 def test_no_object_asks_for_a_function_of_libm(name: str, precision: Precision, tmp_path: Path) -> None:
     """Whatever the flags: what compilers themselves add is all that is left, and the names of the files' own."""
