@@ -65,7 +65,8 @@ def test_a_loop_in_a_loop_and_one_of_unknown_passes() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("p", PROCESSORS, ids=lambda p: p.name)
 def test_a_supervised_step_takes_longer_than_the_controllers(p: object, tmp_path: Path) -> None:
-    """Of a step alone, which is nearly a straight line, it is what is counted there, with what calls cost."""
+    """Of a step alone, which is nearly a straight line, it is what is counted there, with the longer side of every branch
+    and what calls of its blocks cost."""
     (own,) = (one for one in PROCESSORS if one is p)
     require(f"{own.prefix}gcc", f"{own.prefix}objdump")
     files = {f: text for f, text in texts("halbach", "float").items() if f.endswith((".c", ".h"))}
@@ -77,7 +78,7 @@ def test_a_supervised_step_takes_longer_than_the_controllers(p: object, tmp_path
     step = longest_path({"halbach.c": listing}, files, "halbach_step")
     cost = cost_on(own, files, "halbach")
     assert cost is not None
-    assert cost.instructions < step < 1.25 * cost.instructions
+    assert cost.instructions < step < 1.5 * cost.instructions
     assert 2 * step < cost.supervised < 15 * step
 
 
