@@ -65,8 +65,8 @@ def test_a_loop_in_a_loop_and_one_of_unknown_passes() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("p", PROCESSORS, ids=lambda p: p.name)
 def test_a_supervised_step_takes_longer_than_the_controllers(p: object, tmp_path: Path) -> None:
-    """Of a step alone, which is nearly a straight line, it is what is counted there, with the longer side of every branch
-    and what calls of its blocks cost."""
+    """Of a step alone, nearly a straight line, it is what is counted there, with the longer side of every branch and
+    what calls of its blocks cost."""
     (own,) = (one for one in PROCESSORS if one is p)
     require(f"{own.prefix}gcc", f"{own.prefix}objdump")
     files = {f: text for f, text in texts("halbach", "float").items() if f.endswith((".c", ".h"))}
