@@ -20,7 +20,7 @@ from malta.errors import InputError
 from malta.firmware import supervised
 from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
-from malta.firmware.native import call, new_state, view
+from malta.firmware.native import call, compile_controller, new_state, view
 from malta.firmware.sensor_loss import expected_readings, gains_without, prediction_correction
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.stand_in import phase_currents
@@ -547,6 +547,17 @@ def test_references_end_at_their_limits(name: str, entry: str, k: int) -> None:
         assert bench.now == "OPERATE"
         bench.ask(entry, k, sign * np.nextafter(bound, np.inf))
         assert (bench.monitor, bench.now) == ("REFERENCE", "HOLD")
+
+
+def test_records_of_a_flight_fit_a_controller_compiled_again() -> None:
+    """A flight without supervisor follows the records of one with it, which other compilations may have followed."""
+    first = compile_supervised(TARGETS["robust"])
+    compile_controller.cache_clear()
+    compile_supervised.cache_clear()
+    again = compile_supervised(TARGETS["robust"])
+    state = new_state(again.native)
+    state.reference = first.native.Reference()
+    assert first.Supervisor is again.Supervisor
 
 
 def test_limits_of_references_are_those_of_the_machine() -> None:

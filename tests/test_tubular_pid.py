@@ -253,7 +253,7 @@ def test_the_shipped_gains_are_those_that_the_search_ends_with(spec: Spec) -> No
     assert rows["margin"].found == pytest.approx(3.0030, abs=1e-3)
     assert 0.9 < rows["peak_sensitivity"].ratio < 1
     assert rows["force_noise"].ratio > 0.96
-    assert rows["lift_off"].how == "steady-state estimator"
+    assert rows["lift_off"].how == "steady-state estimator, 4 seeds"
 
 
 # --- the design file ---

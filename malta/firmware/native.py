@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import re
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -57,8 +57,7 @@ def compile_controller(t: Target) -> Native:
     real = REALS[t.precision]
 
     def record(title: str, fields: list[Field], more: tuple[tuple[str, Any], ...] = ()) -> Any:
-        arrays = [(f.name, real * f.size) for f in fields if f.size]
-        return type(title, (ctypes.Structure,), {"_fields_": [*arrays, *more]})
+        return record_type(title, (*((f.name, real * f.size) for f in fields if f.size), *more))
 
     Reference = record("Reference", reference_fields(t))
     addresses = ("z", "v0", "parameters") if t.tunable else ("z", "v0")
@@ -72,6 +71,12 @@ def compile_controller(t: Target) -> Native:
         record("Inputs", input_fields(t)),
         record("Outputs", output_fields(t)),
     )
+
+
+@cache
+def record_type(title: str, fields: tuple[tuple[str, Any], ...]) -> Any:
+    """The ctypes structure of these fields: one type, so that a controller compiled again takes the records of before."""
+    return type(title, (ctypes.Structure,), {"_fields_": fields})
 
 
 def compile_files(texts: Sequence[str]) -> Any:

@@ -14,7 +14,7 @@ from malta.errors import InputError
 from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
 from malta.firmware.flight import Step, engine_of_c
-from malta.firmware.native import EXTRA, REALS, Native, compile_controller, compile_files, view
+from malta.firmware.native import EXTRA, REALS, Native, compile_controller, compile_files, record_type, view
 from malta.firmware.signals import Target
 from malta.firmware.supervisor import FLYING, STATES, State
 from malta.firmware.supervisor_text import (
@@ -58,8 +58,8 @@ def compile_supervised(t: Target) -> Supervised:
     }
 
     def record(title: str, members: Sequence[Member]) -> Any:
-        of = [(m.name, kinds[m.kind] * m.size if m.size else kinds[m.kind]) for m in members]
-        return type(title, (ctypes.Structure,), {"_fields_": of})
+        of = ((m.name, kinds[m.kind] * m.size if m.size else kinds[m.kind]) for m in members)
+        return record_type(title, tuple(of))
 
     kinds["times"] = record("Times", time_members())
     return Supervised(
