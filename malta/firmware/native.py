@@ -75,7 +75,7 @@ def compile_controller(t: Target) -> Native:
 
 @cache
 def record_type(title: str, fields: tuple[tuple[str, Any], ...]) -> Any:
-    """The ctypes structure of these fields: one type, so that a controller compiled again takes the records of before."""
+    """The ctypes structure of these fields: one type, so a controller compiled again takes the records of before."""
     return type(title, (ctypes.Structure,), {"_fields_": fields})
 
 
