@@ -76,7 +76,7 @@ def test_a_supervised_step_takes_longer_than_the_controllers(p: object, tmp_path
     assert done.returncode == 0, done.stderr
     listing = run([f"{own.prefix}objdump", *LISTING, "halbach.o"], tmp_path).stdout
     step = longest_path({"halbach.c": listing}, files, "halbach_step")
-    cost = cost_on(own, files, "halbach")
+    cost = cost_on(own, files, files, "halbach")
     assert cost is not None
     assert cost.instructions < step < 1.5 * cost.instructions
     assert 2 * step < cost.supervised < 15 * step

@@ -23,12 +23,7 @@ from malta.firmware.supervisor_text import supervisor_sources
 CLOCK = 667e6  # Hz, of the Cortex-A9 of the paper's Zynq 7000
 SECONDS = 120.0  # a compiler may take at most
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fno-tree-loop-distribute-patterns")
-STEP = (
-    "step",
-    "sense",
-    "decide",
-    "look_up",
-)  # functions that run at every sample, with those of their blocks
+STEP = ("step", "sense", "decide", "look_up")  # functions of every sample, with those of their blocks
 KINDS = {
     "additions": ("ADD", "SUB", "NEG"),
     "multiplications": ("MUL",),
@@ -71,9 +66,7 @@ class Cost(NamedTuple):
     stack: int  # bytes, the deepest of a step
     instructions: int  # of a step, in a straight line
     calls: int  # of these, calls of arithmetic that the processor does not have
-    supervised: (
-        int  # instructions of the supervisor's step with the controller's, at most: see longest_path.py
-    )
+    supervised: int  # instructions of the supervisor's step with the controller's, at most (longest_path.py)
 
 
 def operations(t: Target) -> dict[str, int]:
@@ -89,20 +82,12 @@ def costs(t: Target) -> list[Cost]:
     name = c_name(t.controller.name)
     own = supervisor_sources(t, name)
     files, straight = (sources(t, "", loops=loops) | own for loops in (True, False))
-    found = []
-    for p in PROCESSORS:
-        cost = cost_on(p, files, name)
-        if cost is not None and straight != files:  # a loop's instructions are executed several times
-            written_out = cost_on(p, straight, name)
-            cost = written_out and cost._replace(
-                instructions=written_out.instructions, calls=written_out.calls
-            )
-        found += [] if cost is None else [cost]
-    return found
+    found = [cost_on(p, files, straight, name) for p in PROCESSORS]
+    return [cost for cost in found if cost is not None]
 
 
-def cost_on(p: Processor, files: Mapping[str, str], name: str) -> Cost | None:
-    """The cost on one processor; None without its compiler."""
+def cost_on(p: Processor, files: Mapping[str, str], straight: Mapping[str, str], name: str) -> Cost | None:
+    """The cost on one processor; None without its compiler. straight : the same controller, its loops written out"""
     tools = [shutil.which(p.prefix + tool) for tool in ("gcc", "size", "objdump")]
     if any(tool is None for tool in tools):
         return None
@@ -111,16 +96,19 @@ def cost_on(p: Processor, files: Mapping[str, str], name: str) -> Cost | None:
         folder = Path(scratch)
         for file, text in files.items():
             (folder / file).write_text(text, encoding="utf-8")
+        # A loop's instructions are executed several times: they are counted where it is written out.
+        counted = "straight" if straight != files else name
+        (folder / f"{counted}.c").write_text(straight[f"{name}.c"], encoding="utf-8")
         (folder / "state.c").write_text(
             f'#include "{name}.h"\nconst char state_bytes[sizeof({name}_state)] = {{0}};\n', encoding="utf-8"
         )
-        for file in (f"{name}.c", "state.c"):
+        for file in dict.fromkeys((f"{name}.c", f"{counted}.c", "state.c")):
             command = [gcc, *FLAGS, *p.options, "-fstack-usage", "-c", file]
             if _run(command, folder) is None:
                 return None
         sizes = (_run([size, f"{name}.o"], folder) or "").splitlines()[-1].split()
         state = (_run([size, "state.o"], folder) or "").splitlines()[-1].split()
-        listing = _run([objdump, "-d", "--no-show-raw-insn", f"{name}.o"], folder) or ""
+        listing = _run([objdump, "-d", "--no-show-raw-insn", f"{counted}.o"], folder) or ""
         supervised = _supervised(p, files, name, folder)
         stacks = _stacks((folder / f"{name}.su").read_text(encoding="utf-8"))
     own = {f"{name}_{function}" for function in STEP} | {"look_up"}

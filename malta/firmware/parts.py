@@ -354,9 +354,8 @@ def drive_currents(
     note("read_currents", "i_last = i, link_last = link, each where it may be used", i_last=i, link_last=V)
     machine = {"i_phase": i, "i": i, "link": V, "x": ca.SX.zeros(len(plant.states))}
     loops = {name: state[name] for name in ("u_integral", "u_limited")}
-    if (
-        t.tunable
-    ):  # the record has the product of gain and sample time: rounded once, as where it is a constant
+    # A tunable record has the product of gain and sample time: rounded once, as where it is a constant.
+    if t.tunable:
         g = g | {"control_time": ca.SX(1)}
     command, after, _ = control_currents(
         Loop(plant, c, t.setup, g), Signals(machine, loops, {}), current, known, None, sums.add_to_voltages
