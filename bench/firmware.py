@@ -313,7 +313,8 @@ def agree(case: Case) -> None:
 
 def whole_step(t: Target) -> int | None:
     """Instructions of the exported step on the paper's processor, as an export reports them; None without compiler."""
-    cost = cost_on(A9, sources(t, ""), c_name(t.controller.name))
+    files = sources(t, "", loops=False)
+    cost = cost_on(A9, files, files, c_name(t.controller.name))
     return None if cost is None else cost.instructions
 
 
