@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import math
 import os
 import re
@@ -70,6 +71,7 @@ def replace_files(contents: Mapping[Path, bytes]) -> None:
         for path, data in contents.items():
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
+                remove_leftovers(path.parent, glob.escape(path.name[:50]))
                 if path.exists() and not path.is_file():
                     raise IsADirectoryError(0, _obstacle(path), str(path))
                 temporary = temporary_name(path)
@@ -138,6 +140,29 @@ def json_text(content: Any) -> str:
 def temporary_name(path: Path) -> Path:
     """A hidden name beside a file that no other process takes, on this computer or on one that shares the volume."""
     return path.with_name(f".{path.name[:50]}.{writer()}.{secrets.token_hex(4)}")
+
+
+def remove_leftovers(folder: Path, names: str) -> None:
+    """Remove temporary files that killed processes of this computer have left. names : pattern of the files' names"""
+    host = writer().rpartition(".")[0]
+    for leftover in folder.glob(f".{names}.{host}.*.*"):
+        process = leftover.name.split(".")[-2]
+        if process.isdigit() and not _is_alive(int(process)):
+            with suppress(OSError):
+                leftover.unlink()
+
+
+def _is_alive(process: int) -> bool:
+    """Whether a process runs on this computer; True where that cannot be asked."""
+    if os.name != "posix":
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # of another user
+        return True
+    return True
 
 
 def writer() -> str:

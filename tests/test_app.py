@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 import malta
+from malta.app import follow
 from malta.app.files import Edit, fingerprint, open_design
 from malta.app.picture import View, picture, solve
 from malta.app.saving import TakenError, inside, save_design
@@ -28,6 +29,7 @@ from malta.app.worker import work
 from malta.errors import InputError
 from malta.files import shipped_path
 from malta.margins.travel import travel_loops, travel_margin
+from malta.processes import environment, python_module
 from malta.proof.rays import ray_bound
 from malta.tuning.outcomes import judge
 from malta.tuning.search import model_and_controller
@@ -226,12 +228,12 @@ def test_a_saved_design_makes_the_gains_of_the_page(tmp_path: Path) -> None:
         save_design(saved, Edit(), target, tmp_path, replace=False)
 
 
-def test_a_machine_of_the_page_is_saved_beside_its_design(tmp_path: Path) -> None:
+def test_a_machine_of_the_page_is_saved_beside_its_data(tmp_path: Path) -> None:
     files = open_design(copied(tmp_path))
     edit = files.edit({"machine.m": 4.0, "pid.Kp.F_x": 700.0})
     target = tmp_path / "design" / "heavy.toml"
     _, written = save_design(files, edit, target, tmp_path, replace=False)
-    assert written == ["design/heavy.toml", "design/heavy_machine.toml"]
+    assert written == ["design/heavy.toml", "data/heavy_machine.toml"]
     _, controller = model_and_controller(malta.read_design(target))
     assert np.array_equal(controller.K, solve(files.apply(edit)).controller.K)
     assert controller.parameters.m == 4.0  # type: ignore[attr-defined]
@@ -479,6 +481,65 @@ def test_entries_that_move_together_keep_units_of_their_own(tmp_path: Path) -> N
     assert y.unit == "mm"
     assert x.linked == y.linked == (x.key, y.key)
     assert y.factor / x.factor == pytest.approx(1e-3, rel=1e-12)  # 12 um in x are 0.012 mm in y
+
+
+def dying_worker(monkeypatch: pytest.MonkeyPatch, deaths: int) -> list[dict[str, Any]]:
+    """What is heard of a process that exits with code 3 at the first documents, and answers the next one."""
+    answer = "print(json.dumps({'kind': kind, 'serial': 7, 'version': 1}), flush=True)"
+    code = f"import json, sys; sys.stdin.readline(); kind = 'begin'; {answer}; "
+    started: list[int] = []
+
+    def start() -> subprocess.Popen[str]:
+        end = "sys.exit(3)" if len(started) < deaths else f"kind = 'done'; {answer}; sys.stdin.read()"
+        started.append(1)
+        command = [sys.executable, "-S", "-c", code + end]
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    monkeypatch.setattr(follow, "_start", start)
+    heard: list[dict[str, Any]] = []
+    full = threading.Event()
+
+    def hear(document: dict[str, Any]) -> None:
+        heard.append(document)
+        if document["kind"] != "notice":
+            full.set()
+
+    worker = follow.Worker(hear)
+    worker.ask({"version": 1, "serial": 7, "task": "prove"})
+    assert full.wait(60)
+    worker.close()
+    assert len(started) == 2
+    return heard
+
+
+def test_a_worker_that_dies_is_started_again_and_asked_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    notice, done = dying_worker(monkeypatch, 1)
+    assert notice["text"] == (
+        "the process that proves the margin ended by itself (exit code 3): it was started again and asked once more"
+    )
+    assert done["kind"] == "done"
+
+
+def test_a_worker_that_dies_twice_answers_that_nothing_is_proven(monkeypatch: pytest.MonkeyPatch) -> None:
+    notice, proof = dying_worker(monkeypatch, 2)
+    assert (notice["kind"], proof["kind"], proof["lower"]) == ("notice", "proof", None)
+    assert "(exit code 3), and so did the one" in proof["reason"]
+
+
+@pytest.mark.slow
+def test_what_a_machine_prints_is_no_answer_and_the_current_folder_holds_no_modules(tmp_path: Path) -> None:
+    (tmp_path / "json.py").write_text("raise SystemExit('of the current folder')", encoding="utf-8")
+    code = "from malta.app.worker import take_channel; import os; c = take_channel(); "
+    code += "print('P', flush=True); os.system('echo C'); print('A', file=c)"
+    run = (sys.executable, "-P", "-c", code)
+    done = subprocess.run(run, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=True)
+    assert done.stdout == "A\n"
+    assert sorted(done.stderr.split()) == ["C", "P"]
+    command = python_module("malta.app.worker")
+    ended = subprocess.run(
+        command, cwd=tmp_path, env=environment(), input="", capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 @pytest.mark.slow

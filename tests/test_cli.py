@@ -23,6 +23,7 @@ import malta
 from malta import gains
 from malta.cli import main as cli
 from malta.cli.assignments import GENERAL, add_own_options
+from malta.cli.inputs import design_files
 from malta.errors import InputError
 from malta.model.plant import Plant
 from malta.report.ledger import Ledger
@@ -72,6 +73,32 @@ def old_gains(folder: Path) -> dict[Path, bytes]:
     for path, content in old.items():
         path.write_bytes(content)
     return old
+
+
+# --- what is beside the command ---
+
+
+@pytest.mark.slow
+def test_a_closed_standard_error_loses_sentences_and_no_work(tmp_path: Path) -> None:
+    command = f"exec '{sys.executable}' -m malta simulate '{ROOT / CALIBRATED}' --out build 2>&-"
+    done = subprocess.run(["sh", "-c", command], cwd=tmp_path, stdout=subprocess.PIPE, text=True, check=True)
+    assert "completed" in done.stdout
+    assert list((tmp_path / "build").iterdir())
+
+
+def test_data_of_a_machine_among_designs_are_named_and_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = project(tmp_path, ("", ""))
+    shutil.copy(ROOT / "data" / "tubular.toml", file.with_name("heavy_machine.toml"))
+    monkeypatch.chdir(tmp_path)
+    assert design_files("design", None) == [Path("design/table2.toml")]
+    assert (
+        capsys.readouterr().err
+        == "malta: design/heavy_machine.toml: data of a machine, no design: left out\n"
+    )
+    named = [Path("design/heavy_machine.toml")]
+    assert design_files("design", named) == named
 
 
 # --- help ---

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,7 @@ import malta
 from malta import report
 from malta.cli.assignments import read_shares
 from malta.model.signals import outputs_of
-from malta.report import new_figure
+from malta.report import encode_figure, new_figure
 from malta.simulation.catalogue import experiments_of
 from malta.simulation.experiments import Case, Experiment
 
@@ -206,3 +207,18 @@ def test_nothing_is_wrong_with_the_figures_of_machines_of_ones_own(name: str) ->
     for experiment in experiments_of(spec.plant):
         assert defects(report.experiment_figure(malta.experiment(experiment, spec.plant, c))) == []
     assert defects(report.loads(spec.plant, c)) == []
+
+
+@pytest.mark.parametrize("end", ["png", "svg", "pdf"])
+def test_a_dollar_in_a_name_begins_no_formula(end: str) -> None:
+    r"""Names of signals come from files: `a$x_{$` is no TeX, and `\frac` is not read."""
+    figure = new_figure("a$x_{$ and $\\frac$", "found $_{$")
+    axes = figure.add_subplot()
+    axes.loglog([1.0, 1e3], [1.0, 10.0], label="y$^{$")
+    axes.set_ylabel("y$^{$ [m]")
+    axes.legend()
+    content = encode_figure(figure, Path(f"figure.{end}"))
+    assert len(content) > 1000
+    if end == "svg":
+        assert "a$x_{$ and $\\frac$" in content.decode()
+        assert ">$\\mathdefault" not in content.decode()  # ticks are drawn as powers

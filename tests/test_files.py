@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import re
 import stat
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from conftest import refusal
 
 import malta
 from malta.campaigns.store import read_manifest
-from malta.files import read_file, replace_files, temporary_name
+from malta.files import read_file, replace_files, temporary_name, writer
 from malta.proof.certificate import checked_file
 from malta.simulation.force_log import read_log
 from malta.tables import load_toml
@@ -53,6 +55,28 @@ def test_files_may_be_read_by_everyone(tmp_path: Path) -> None:
     path = tmp_path / "x.bin"
     replace_files({path: b"1"})
     assert path.stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.skipif(os.name != "posix", reason="asks for a process by its number")
+def test_what_killed_processes_left_is_removed(tmp_path: Path) -> None:
+    """Of this computer, of a process that is gone, of the file that is written; nothing else."""
+    ended = subprocess.Popen([sys.executable, "-S", "-c", ""])
+    ended.wait()
+    host, own = writer().rsplit(".", 1)
+    left = tmp_path / f".a.json.{host}.{ended.pid}.0123abcd"
+    others = [
+        tmp_path / f".{name}.{process}.0123abcd"
+        for name, process in (
+            ("a.json", f"{host}.{own}"),
+            ("a.json", f"elsewhere.{ended.pid}"),
+            ("b.json", f"{host}.{ended.pid}"),
+        )
+    ]
+    for file in (left, *others):
+        file.touch()
+    replace_files({tmp_path / "a.json": b"new"})
+    assert not left.exists()
+    assert all(file.exists() for file in others)
 
 
 @pytest.mark.parametrize("place", [0, 1, 2])

@@ -18,10 +18,11 @@ from page_checks import cells_of, read_page
 import malta
 from malta.cli.report import read_subject
 from malta.margins.verify import verify
+from malta.report.figures.parts import printable
 from malta.report.page.analysis import Subject, analyse
 from malta.report.page.document import Page
 from malta.report.page.headline import key_figures
-from malta.report.page.inline import dark_colour, printable
+from malta.report.page.inline import dark_colour
 from malta.report.page.pdf import pdf_of
 from malta.report.page.report import page_of
 from malta.report.page.scores import scores_of

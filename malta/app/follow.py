@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
+import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
+
+from malta.processes import environment, python_module
 
 PATIENCE = 1.5  # s, from a newer design to the end of a process that still works on an older one
 
@@ -19,6 +20,8 @@ Hear = Callable[[dict[str, Any]], None]
 class Worker:
     """A process `malta.app.worker`, which works on the newest document it was sent.
 
+    A process that dies at a document is started again and asked once more; where that one dies too, its answer is that.
+
     hear : called from a thread with each document that the process answers
     """
 
@@ -27,7 +30,7 @@ class Worker:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._asked: Mapping[str, Any] = {}
-        self._begun = -1
+        self._begun, self._ended, self._died = -1, -1, -1  # serials: begun with, answered, asked again
         self._closed = False
 
     def ask(self, message: Mapping[str, Any]) -> None:
@@ -58,12 +61,32 @@ class Worker:
 
     def _listen(self, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
-        for line in process.stdout:
-            reply = json.loads(line)
-            if reply["kind"] == "begin":
-                self._begun = reply["serial"]
-            else:
-                self._hear(reply)
+        with suppress(ValueError):  # the stream was closed, or its last line is half of one
+            for line in process.stdout:
+                reply = json.loads(line)
+                if reply["kind"] == "begin":
+                    self._begun = reply["serial"]
+                elif reply["kind"] == "end":
+                    self._ended = reply["serial"]
+                else:
+                    self._hear(reply)
+        self._bury(process)
+
+    def _bury(self, process: subprocess.Popen[str]) -> None:
+        """Start a process that ended by itself again and ask once more; say where the second one ends as well."""
+        with self._lock:
+            if self._process is not process or self._closed:
+                return
+            serial = self._asked["serial"]
+            self._end()
+            self._begun = -1
+            if self._ended == serial:
+                return
+            again, self._died = self._died != serial, serial
+            asked = self._asked
+            if again:
+                self._send()
+        self._hear(_obituary(asked, _describe_end(process.returncode), again=again))
 
     def _end_if_stuck(self, serial: int) -> None:
         """End a process that has not begun with the newest document, unless it is only starting up, and ask anew."""
@@ -88,12 +111,33 @@ class Worker:
 
 def _start() -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "malta.app.worker"],
+        python_module("malta.app.worker"),
         stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,  # of answers alone; what a machine's module prints goes where the server's errors go
         text=True,
         encoding="utf-8",
-        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+        env=environment(OPENBLAS_NUM_THREADS="1"),
         start_new_session=True,  # Ctrl-C in the terminal is the server's
     )
+
+
+def _obituary(asked: Mapping[str, Any], reason: str, *, again: bool) -> dict[str, Any]:
+    """What is heard of a process that ended at a document. again : it was started again and asked once more"""
+    does = "proves the margin" if asked["task"] == "prove" else "simulates and judges the requirements"
+    sentence = f"the process that {does} ended by itself ({reason})"
+    mark = {"version": asked["version"], "serial": asked["serial"]}
+    if again:
+        return mark | {"kind": "notice", "text": f"{sentence}: it was started again and asked once more"}
+    sentence += ", and so did the one that was started in its place"
+    if asked["task"] == "prove":
+        return mark | {"kind": "proof", "lower": None, "upper": None, "frequency": None, "reason": sentence}
+    return mark | {"kind": "failed", "error": sentence}
+
+
+def _describe_end(code: int) -> str:
+    """How a process ended, for a reader who did not end it."""
+    if code == -signal.SIGKILL:
+        return "it was killed, as a computer does that has no memory left"
+    if code < 0:
+        return f"signal {signal.Signals(-code).name}"
+    return f"exit code {code}"

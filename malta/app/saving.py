@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-import sys
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,6 +20,7 @@ from malta.app.files import DesignFiles, Edit, edited_content, open_design, set_
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, replace_files
 from malta.gains import SUFFIXES
+from malta.processes import environment, python_module
 
 if TYPE_CHECKING:
     from malta.synthesis.spec import Spec
@@ -75,7 +75,7 @@ def save_design(
     if target.suffix != ".toml" or not re.fullmatch(NAME, target.stem):
         raise InputError("save", "name", repr(target.name), "NAME.toml, NAME of letters, digits, - and _")
     moved = bool(edit.machine) and edit.redesign
-    data = target.with_name(f"{target.stem}_machine.toml") if moved else files.spec.machine_file
+    data = _data_file(files.spec.machine_file, target, root) if moved else files.spec.machine_file
     texts = {target: design_text(files, edit, target, data)}
     if moved:
         texts[data] = machine_text(files, edit, data)
@@ -93,6 +93,13 @@ def save_design(
             path.unlink() if old is None else path.write_bytes(old)
         raise
     return saved, names
+
+
+def _data_file(machine_file: Path, target: Path, root: Path) -> Path:
+    """Where other parameters of a machine are saved: beside its data; beside the design where these lie outside."""
+    beside = machine_file.resolve().parent
+    folder = beside if beside.is_relative_to(root) else target.parent
+    return folder / f"{target.stem}_machine.toml"
 
 
 def design_text(files: DesignFiles, edit: Edit, target: Path, data: Path) -> str:
@@ -179,11 +186,11 @@ def save_gains(design: Path, root: Path, machine: Path | None, *, replace: bool)
     if taken and not replace:
         raise TakenError(taken)
     options = ["--out", str(gains), "--figures", str(inside(root, "build")), "--json"]
-    command = [sys.executable, "-m", "malta", "design", str(design), *options]
-    environment = os.environ | ({"MALTA_MACHINE": str(machine.resolve())} if machine else {})
+    command = python_module("malta", "design", str(design), *options)
+    own = environment(**({"MALTA_MACHINE": str(machine.resolve())} if machine else {}))
     try:
         done = subprocess.run(
-            command, cwd=root, env=environment, capture_output=True, text=True, timeout=LONGEST, check=False
+            command, cwd=root, env=own, capture_output=True, text=True, timeout=LONGEST, check=False
         )
     except subprocess.TimeoutExpired as error:
         raise CheckError(

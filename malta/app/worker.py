@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from malta.app.faults import describe_error
 from malta.app.files import DesignFiles, Edited, fingerprint, open_design
@@ -166,7 +166,14 @@ class _Inbox:
 
 def main() -> None:
     """Answer documents until the input ends."""
+    channel = take_channel()
     inbox, files = _Inbox(), dict[Any, DesignFiles]()
+
+    def say(message: Message, reply: Mapping[str, Any]) -> None:
+        """Write one document; numbers that are not finite become null before."""
+        mark = {"version": message["version"], "serial": message["serial"]}
+        print(json.dumps(mark | dict(reply), allow_nan=False, default=str), file=channel, flush=True)
+
     with suppress(AttributeError, OSError):
         os.nice(5)  # the page's own answers go first
     while True:
@@ -183,6 +190,14 @@ def main() -> None:
             continue
         except Exception as error:
             say(message, failure(message, error))
+        say(message, {"kind": "end"})
+
+
+def take_channel() -> TextIO:
+    """The standard output, for answers alone: what Python or C prints from now on goes to the standard error."""
+    channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    return channel
 
 
 def open_message(message: Message) -> DesignFiles:
@@ -192,12 +207,6 @@ def open_message(message: Message) -> DesignFiles:
 
         machine(Path(message["machine"]))
     return open_design(Path(message["path"]))
-
-
-def say(message: Message, reply: Mapping[str, Any]) -> None:
-    """Print one document; numbers that are not finite become null before."""
-    mark = {"version": message["version"], "serial": message["serial"]}
-    print(json.dumps(mark | dict(reply), allow_nan=False, default=str), flush=True)
 
 
 if __name__ == "__main__":

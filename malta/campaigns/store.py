@@ -35,7 +35,7 @@ from malta.campaigns.plan import (
     varied_names,
 )
 from malta.errors import InputError
-from malta.files import file_exists, read_file, replace_files, writer
+from malta.files import file_exists, read_file, remove_leftovers, replace_files, writer
 from malta.simulation.compiled import LANES
 from malta.simulation.digest import LARGEST_FIGURE, Batch, verdicts
 from malta.synthesis.controller import Controller
@@ -60,6 +60,7 @@ def open_folder(folder: Path, plan: Plan, block: int, gains: Path | None = None)
     try:
         for stale in folder.glob(f".*.npz.{writer()}.*"):  # left by a killed process that had the same id
             stale.unlink(missing_ok=True)
+        remove_leftovers(folder, "*.npz")
         begun = path.exists()
     except OSError as error:
         raise InputError(

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from malta.cli.assignments import GENERAL, read_assignments, read_entries
-from malta.cli.output import make_console
+from malta.cli.output import make_console, print_note
 from malta.errors import CheckError, InputError
 from malta.files import locate, shipped_path
+from malta.tables import load_toml
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
@@ -28,17 +29,34 @@ def design_files(
 
     or_shipped : where there is no folder design/ here, those that come with malta
 
+    Data of machines among them are named on the standard error and left out, unless they were named as designs.
     Raises InputError, naming the command, where design/ has none.
     """
+    if named:
+        return named
     folder = Path("design")
     if or_shipped and not folder.is_dir():
         folder = shipped_path("design")
-    files = named or sorted(folder.glob("*.toml"), reverse=reverse)
+    files = []
+    for file in sorted(folder.glob("*.toml"), reverse=reverse):
+        if _is_machine_data(file):
+            print_note(f"{file}: data of a machine, no design: left out")
+        else:
+            files.append(file)
     if not files:
         raise InputError(
             command, "", "no design files (*.toml) here", "a folder design/ with some, or their names"
         )
     return files
+
+
+def _is_machine_data(file: Path) -> bool:
+    """Whether a file has what data of machines have and designs have not; a file that cannot be read is no data."""
+    try:
+        content = load_toml(file)
+    except InputError:
+        return False
+    return "parameters" in content and not {"weights", "pid", "sample_time"} & set(content)
 
 
 def gains_folder(design_file: Path) -> Path:

@@ -120,6 +120,8 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Numeric libraries make many lasting objects; going through them again and again costs a sixth of the time.
     gc.set_threshold(200_000, 50, 50)
+    if sys.stderr is None:  # closed by whoever started this: work goes on, its sentences are lost
+        sys.stderr = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115  until the process ends
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? and goes on

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import struct
-import sys
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from typing import NamedTuple
 
 from malta.errors import CheckError, InputError
 from malta.firmware.native import FLAGS
+from malta.processes import python_module
 from malta.simulation.compiled import shared_library
 
 PATIENCE = 1800.0  # s; zig builds the C library of a system at its first use, that of Windows in minutes
@@ -72,10 +72,10 @@ def cross_compile(
         )
     made = {}
     for p in platforms:
-        cc = (sys.executable, "-m", "ziglang", "cc", "-target", p.target)
+        cc = (*python_module("ziglang", "cc"), "-target", p.target)
         binary = shared_library(files, OWN_FLAGS, cc, PATIENCE)
         if binary is None:
-            raise CheckError(f"ziglang compiled nothing for {p.name}: try {' '.join(cc[1:])} on a file of C")
+            raise CheckError(f"ziglang compiled nothing for {p.name}: try {' '.join(cc[2:])} on a file of C")
         made[p.name] = binary
     darwin = {name: binary for name, binary in made.items() if name.endswith("-darwin")}
     if fmi == 2 and len(darwin) == 2:

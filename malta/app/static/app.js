@@ -215,6 +215,7 @@ export async function mount(root, transport) {
     if (item.kind === "run") state.simulated = item;
     if (item.kind === "margin") state.picture.margin = item;
     if (item.kind === "failed") say(item.error, "error");
+    if (item.kind === "notice") say(item.text);
     if (item.kind === "run") draw();
     else { drawHeader(); drawTables(); }
   }

@@ -8,12 +8,19 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from malta.report.figures.parts import show_plain_texts
+
 
 class InlineFigure(Figure):
     """A figure that a notebook shows as the value of a cell or by `display(figure)`, with or without pyplot.
 
     pyplot does not know the figure, so no second picture follows when the cell ends.
     """
+
+    def draw(self, renderer: Any) -> None:
+        """Draw with texts as they stand: they have names from files."""
+        show_plain_texts(self)
+        super().draw(renderer)
 
     def _repr_png_(self) -> bytes:
         """The picture, as IPython asks for it."""

@@ -52,6 +52,7 @@ PAPER: dict[str, Any] = {
 DOT: dict[str, Any] = {"marker": "o", "markersize": 6, "linestyle": "none", "color": "#000000"}
 CROSS: dict[str, Any] = DOT | {"marker": "X", "markersize": 9, "markeredgecolor": "#ffffff", "clip_on": False}
 LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8, "handlelength": 2.4, "columnspacing": 1.5}
+UNPRINTABLE = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 POINTS = 3000  # of a line; a page does not resolve more
 
 
@@ -88,6 +89,21 @@ def new_figure(
     if found:
         figure.text(0.5, 1 - 0.33 / height, found, fontsize=9, color="#4a4a4a", ha="center", va="top")
     return figure
+
+
+def show_plain_texts(figure: Figure) -> None:
+    """Take the texts of a figure as they stand: a dollar in a name begins no formula, as it does in ticks."""
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        if text.get_text() and "\\mathdefault" not in text.get_text():
+            text.set_parse_math(False)
+            text.set_text(printable(text.get_text().replace(r"\$", "$")))
+
+
+def printable(text: str) -> str:
+    """A text without the characters that no page may have, as control characters: each becomes a mark."""
+    return UNPRINTABLE.sub("\ufffd", text)
 
 
 def rows_and_columns(count: int) -> tuple[int, int]:

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from malta.errors import InputError
 from malta.files import replace_files
-from malta.report.page.inline import colours_of, inline_svg, printable, style_rules
+from malta.report.figures.parts import printable
+from malta.report.page.inline import colours_of, inline_svg, style_rules
 from malta.report.page.sections import Folded, Item, Picture, Section
 from malta.report.page.sheets import polish
 

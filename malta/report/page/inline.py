@@ -9,6 +9,8 @@ import warnings
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
+from malta.report.figures.parts import printable, show_plain_texts
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
@@ -19,12 +21,6 @@ COLOUR = re.compile(r"#[0-9a-f]{6}\b")
 REFERENCE = re.compile(r"url\(#([^)]+)\)")
 NUMBER = re.compile(r"-?\d+\.\d{3,}")
 FONT = re.compile(r"font-family: [^;]*;? ?")
-UNPRINTABLE = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-
-
-def printable(text: str) -> str:
-    """A text without the characters that no page may have, as control characters: each becomes a mark."""
-    return UNPRINTABLE.sub("\ufffd", text)
 
 
 def inline_svg(figure: Figure, prefix: str, label: str, styles: dict[str, str]) -> str:
@@ -53,22 +49,12 @@ def inline_svg(figure: Figure, prefix: str, label: str, styles: dict[str, str]) 
 def _svg_bytes(figure: Figure) -> bytes:
     import matplotlib
 
-    plain_texts(figure)
+    show_plain_texts(figure)
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "malta", "svg.fonttype": "none"}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # the browser's fonts have it
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     return buffer.getvalue()
-
-
-def plain_texts(figure: Figure) -> None:
-    """Take the texts of a figure as they stand: a dollar in a name begins no formula, as it does in ticks."""
-    from matplotlib.text import Text
-
-    for text in figure.findobj(Text):
-        if text.get_text() and "\\mathdefault" not in text.get_text():
-            text.set_parse_math(False)
-            text.set_text(printable(text.get_text().replace(r"\$", "$")))
 
 
 def _references(node: ElementTree.Element) -> list[str]:
