@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 LONGEST = 300  # characters of a sentence
@@ -30,7 +31,8 @@ class InputError(ValueError):
     """Input that cannot be used: one sentence with file, field, what was found and what was expected.
 
     The sentence has at most 300 characters: what is longer is cut in its middle. The command line prints it without a
-    traceback and exits with code 2.
+    traceback and exits with code 2. Where one of several names is expected, the one that is most like what was typed is
+    asked for: did you mean 'table2'?
 
     where : the file, or the function
     field : the entry or the argument
@@ -49,11 +51,27 @@ class InputError(ValueError):
         self.where, self.field = str(where), field
         file = shorten(self.where, MOST_OF_FILE, head=0.25)
         subject = ": ".join(filter(None, (file, shorten(field, MOST_OF_FIELD))))
-        room = LONGEST - len(f"{subject}: found , expected ")
+        hint = _suggestion(field, found, expected)
+        room = LONGEST - len(f"{subject}: found , expected {hint}")
         whole = len(on_one_line(expected))
         self.found = shorten(found, max(room // 2, room - whole))
         self.expected = shorten(expected, room - len(self.found))
-        super().__init__(f"{subject}: found {self.found}, expected {self.expected}")
+        super().__init__(f"{subject}: found {self.found}, expected {self.expected}{hint}")
+
+
+def _suggestion(field: str, found: str, expected: str) -> str:
+    """The question that ends a refusal, where the expected names have one that is like the one that was typed."""
+    if not expected.startswith("one of "):
+        return ""
+    from difflib import get_close_matches  # where something is wrong already
+
+    known = {word.lower(): word for word in re.findall(r"[^\s,'\"]+", expected.removeprefix("one of ").partition(", or ")[0])}
+    quoted = re.findall(r"'([^']+)'", found)
+    for typed in [*quoted, *([] if quoted else [field.rpartition(".")[2]])]:
+        close = get_close_matches(typed.lower(), known, n=1)
+        if close and known[close[0]] != typed:
+            return f" (did you mean {known[close[0]]!r}?)"
+    return ""
 
 
 class CheckError(ArithmeticError):

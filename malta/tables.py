@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, StrictStr, ValidationError
 from pydantic import Field as Checked
@@ -74,22 +75,54 @@ def validate(model: type[_Model], content: object, where: str | Path) -> _Model:
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        raise explain(error, where) from error
+        raise explain(error, where, model) from error
 
 
-def explain(error: ValidationError, where: str | Path) -> InputError:
-    """Turn the first fault that pydantic found into one sentence; `where` is the file that it names."""
+def explain(error: ValidationError, where: str | Path, model: type[BaseModel] | None = None) -> InputError:
+    """Turn the first fault that pydantic found into one sentence.
+
+    where : the file that it names
+    model : of the whole document, whose keys it names
+    """
     first = error.errors(include_url=False)[0]
     name = ".".join(str(part) for part in first["loc"] if not str(part).startswith("function-"))
     kind, message = first["type"], first["msg"]
     if kind == "missing":
         return InputError(where, name, "nothing", "this key")
     if kind == "extra_forbidden":
-        return InputError(where, name, "an unknown key", "only the keys of its format")
+        known = [] if model is None else _keys_at(model, first["loc"][:-1])
+        return InputError(
+            where,
+            name,
+            "an unknown key",
+            f"one of {' '.join(known)}" if known else "only the keys of its format",
+        )
     if kind in ("model_type", "model_attributes_type", "dict_type"):
-        message = "a table"
+        quantity = first.get("ctx", {}).get("class_name") == "Quantity"
+        message = 'a table with its unit, as { value = 200, unit = "us" }' if quantity else "a table"
     if kind == "string_pattern_mismatch":
         message = "a name of letters, digits, - and _"
     found = repr(first["input"])
     expected = message.removeprefix("Value error, ").removeprefix("Input should be ")
     return InputError(where, name, found if len(found) <= 60 else found[:57] + "...", expected)
+
+
+def _keys_at(model: type[BaseModel], place: Sequence[int | str]) -> list[str]:
+    """The keys of a table within a document of this model; none where the table is of several kinds."""
+    at: Any = model
+    for part in place:
+        if not (isinstance(at, type) and issubclass(at, BaseModel)):
+            break  # an entry of a mapping or of a list: `at` is what the entries are
+        named = {field.alias or name: field.annotation for name, field in at.model_fields.items()}
+        kinds = _models_in(named.get(str(part)))
+        if len(kinds) != 1:
+            return []
+        at = kinds[0]
+    return [field.alias or name for name, field in at.model_fields.items()]
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    """The models of tables that an annotation speaks of, as Mapping[str, Quantity] | None of Quantity."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for argument in get_args(annotation) for model in _models_in(argument)]

@@ -384,8 +384,8 @@ def faults() -> dict[str, tuple[Edit, str, str, str]]:
         "no matrix Ad": (drop("model.Ad"), "model.Ad", "nothing", "this key"),
         "no table of gains": (drop("gains"), "gains", "nothing", "this key"),
         "no verification": (drop("verification"), "verification", "nothing", "this key"),
-        "extra matrix": (put("gains.M", [[1.0]]), "gains.M", "an unknown key", "keys"),
-        "extra table": (put("observer", {}), "observer", "an unknown key", "keys"),
+        "extra matrix": (put("gains.M", [[1.0]]), "gains.M", "an unknown key", "one of K"),
+        "extra table": (put("observer", {}), "observer", "an unknown key", "one of schema"),
         "extra parameter": (put("plant.parameters.q", {"value": 1.0, "unit": "kg"}), "plant.parameters", "q", "I_xx"),
         "parameter missing": (drop(m), "plant.parameters", "m missing", "I_xx"),
         "parameter in grams": (put(m, {"value": 360.0, "unit": "g"}), f"{m}.unit", "'g'", "'kg'"),
@@ -675,7 +675,7 @@ def test_name_with_a_null_byte_is_refused() -> None:
 def test_unknown_suffix_is_refused(tmp_path: Path, design: Design, name: str) -> None:
     (tmp_path / name).write_bytes((COMMITTED / "table2.json").read_bytes())
     assert refused(tmp_path / name).expected == "one of .json, .npz, .mat"
-    with pytest.raises(malta.InputError, match=r"found suffix '.*', expected one of \.json, \.npz, \.mat$"):
+    with pytest.raises(malta.InputError, match=r"found suffix '.*', expected one of \.json, \.npz, \.mat"):
         gains.write(design.controller, design.margins, tmp_path / name)
 
 

@@ -132,10 +132,10 @@ NO_RANGE: dict[str, Any] = {
 
 @pytest.mark.parametrize("value", NO_RANGE.values(), ids=NO_RANGE.keys())
 def test_what_is_no_range_is_said(value: Any) -> None:
-    says = r"k: found .+, expected a share above 0, or \(low, high\) about the nominal 1"
+    says = r"k: found .+, expected a share of 0 or more, or \(low, high\) about the nominal 1"
     with pytest.raises(InputError, match=r"^robust_margin: " + says):
         malta.robust_margin(motor(), [[-2.0]], {"k": value})
-    with pytest.raises(InputError, match=r"^common_margin: " + says):
+    with pytest.raises(InputError, match=r"^margin: " + says):
         common_margin([(motor(), [[-2.0]])], {"k": value})
     with pytest.raises(InputError, match=r"^margin_of_polynomial: " + says):
         malta.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": value}, {"k": 1})
@@ -148,7 +148,7 @@ def test_what_is_no_range_is_said(value: Any) -> None:
 def test_ranges_are_given_by_name(ranges: Any) -> None:
     with pytest.raises(InputError, match=r"^robust_margin: ranges: found .* as {"):
         malta.robust_margin(motor(), [[-2.0]], ranges)
-    with pytest.raises(InputError, match=r"^common_margin: ranges: found .* as {"):
+    with pytest.raises(InputError, match=r"^margin: ranges: found .* as {"):
         common_margin([(motor(), [[-2.0]])], ranges)
     with pytest.raises(InputError, match=r"^margin_of_polynomial: box: found .* as {"):
         malta.margin_of_polynomial(lambda k: [1, 1 + k], ranges)
@@ -170,7 +170,7 @@ def test_tolerance_and_time_are_numbers_above_zero(name: str, value: Any) -> Non
     says = f": {name}: found .*, expected a number above zero"
     with pytest.raises(InputError, match=r"^robust_margin" + says):
         malta.robust_margin(motor(), [[-2.0]], {"k": 0.1}, **{name: value})
-    with pytest.raises(InputError, match=r"^common_margin" + says):
+    with pytest.raises(InputError, match=r"^margin" + says):
         common_margin([(motor(), [[-2.0]])], {"k": 0.1}, **{name: value})
     with pytest.raises(InputError, match=r"^margin_of_polynomial" + says):
         malta.margin_of_polynomial(lambda k: [1, 1 + k], {"k": (1, 2)}, **{name: value})
@@ -184,7 +184,7 @@ def test_time_may_be_infinite() -> None:
 def test_a_system_is_an_uncertain_one(system: Any) -> None:
     with pytest.raises(InputError, match=r"^robust_margin: system: .* expected a malta.uncertain system"):
         malta.robust_margin(system, [[-2.0]], {"k": 0.1})
-    with pytest.raises(InputError, match=r"^common_margin: system: .* expected a malta.uncertain system"):
+    with pytest.raises(InputError, match=r"^margin: system: .* expected a malta.uncertain system"):
         common_margin([(system, [[-2.0]])], {"k": 0.1})
 
 
@@ -209,7 +209,7 @@ def test_what_is_no_law_is_said(law: Any, says: str) -> None:
 
 @pytest.mark.parametrize("places", [[], None, "ab", (motor(), [[-2.0]]), [(motor(), [[-2.0]], 1)]])
 def test_places_are_pairs(places: Any) -> None:
-    with pytest.raises(InputError, match=r"^common_margin: places: found .*, expected pairs"):
+    with pytest.raises(InputError, match=r"^margin: places: found .*, expected pairs"):
         common_margin(places, {"k": 0.1})
 
 

@@ -283,7 +283,7 @@ ONE = {"A": [[1.0]], "B": [[1.0]], "C": [[1.0]]}
         (
             {"nose": 1},
             "nose: found an unknown detail, expected one of "
-            "name states inputs outputs nominal terms limit noise dead_time",
+            "name states inputs outputs nominal terms limit noise dead_time (did you mean 'noise'?)",
         ),
     ],
 )

@@ -214,9 +214,9 @@ FAULTS = {  # old text, new text; field, found, expected
     "number for a name": ('"calibrated"', "7", "name", "7", "string"),
     "no preset": ('preset = "table1"', "", "preset", "nothing", "key"),
     "no sample time": (TS_UNIT, "", "sample_time", "nothing", "key"),
-    "unknown key": (DELAY, "delay = 0\nspeed = 3 ", "speed", "unknown", "keys"),
+    "unknown key": (DELAY, "delay = 0\nspeed = 3 ", "speed", "unknown", "one of name summary machine"),
     "no input weights": (INPUT, "", "weights.input", "nothing", "key"),
-    "unknown table of weights": (INPUT, f"{INPUT}\noutput = 3", "weights.output", "unknown", "keys"),
+    "unknown table of weights": (INPUT, f"{INPUT}\noutput = 3", "weights.output", "unknown", "one of state"),
     "too few weights": (
         INPUT, "input = { fx_B1 = 1, f_D = 1 }", "weights.input", "2 entries (fx_B1 f_D)",
         "each of the 5 inputs (fx_B1 fy_B1 fx_B2 fy_B2 f_D)",
@@ -279,7 +279,7 @@ FAULTS = {  # old text, new text; field, found, expected
     "base whose square is 0": (
         BASE_X, BASE_X.replace("52.2441", "1e-194"), "bases", "[1e-200, 5.22441", "square is a number",
     ),
-    "key of two lines": (DELAY, 'delay = 0\n"a\\nb" = 3 ', "a\nb", "an unknown key", "keys"),
+    "key of two lines": (DELAY, 'delay = 0\n"a\\nb" = 3 ', "a\nb", "an unknown key", "one of name summary machine"),
     "discretization": (SAMPLED, '"tustin" ', "discretization", "'tustin'", "'backward-euler', 'zoh'"),
     "delay of -1": (DELAY, "delay = -1 ", "delay", "-1", "greater than or equal to 0"),
     "delay of 11": (DELAY, "delay = 11 ", "delay", "11", "less than or equal to 10"),

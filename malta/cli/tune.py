@@ -65,6 +65,9 @@ def tune(
     from malta.tuning.search import Effort
 
     spec = read_design(file)
+    if not (spec.specification or spec.recovery):
+        expected = "this table: what the design has to reach, as margin = 3"
+        raise InputError(file, "specification", "nothing", expected)
     if check:
         _judge(spec, file, as_json=as_json)
         return

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
+import os
+import re
+import sysconfig
+import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
+import numpy as np
 
 from malta.errors import InputError
+from malta.files import PACKAGE
 from malta.model.parameters import symbolic_names
 
 if TYPE_CHECKING:
@@ -113,20 +120,76 @@ def check_equations(plant: Plant) -> None:
     }
     for name, question in asked.items():
         _check_size(plant, name, *question)
-    half = plant.coordinates
-    size, of = (half, "controlled positions") if half else (len(plant.controlled), "controlled states")
+        _check_expression(plant, name, question[0](), (x, u, w, y, i))
+    half, states = plant.coordinates, len(plant.controlled)
+    if not half and plant.position_of is _identity and states == 2 * len(plant.outputs):
+        found = "rates of the first half of the states that are not the second half"
+        expected = "f = (q', q'') for states (q, q'), or a `position_of` that gives all states at rest"
+        raise InputError(plant.name, "f", found, expected)
+    size, of = (half, "controlled positions") if half else (states, "controlled states")
     _check_size(plant, "position_of", lambda: plant.position_of(y), size, of)
 
 
 def _check_size(plant: Plant, name: str, evaluate: Callable[[], Any], size: int, of: str) -> None:
     try:
-        entries = ca.vertcat(evaluate()).numel()
+        found = evaluate()
+        entries = ca.vertcat(found).numel()
     except Exception as error:  # a user's function may raise anything
-        line = " ".join(str(error).split())
-        found = f"{type(error).__name__}: {line[:120]}"
-        raise InputError(plant.name, name, found, "a function of CasADi expressions") from error
+        raise fault_of(error, plant.name, name) from error
+    if isinstance(found, np.ndarray | list | tuple):
+        kind = "an array of numpy" if isinstance(found, np.ndarray) else f"a {type(found).__name__} of Python"
+        raise InputError(plant.name, name, kind, "a vector of CasADi, as ca.vertcat(...) makes it")
     if entries != size:
         raise InputError(plant.name, name, f"{entries} entries", f"{size}, one for each of the {of}")
+
+
+def _check_expression(plant: Plant, name: str, expression: Any, arguments: Sequence[Any]) -> None:
+    """Raise InputError for an expression of symbols that are no arguments, and for one that holds NaN."""
+    if not isinstance(expression, ca.SX | ca.MX):
+        return
+    known = {symbol.__hash__() for argument in arguments for symbol in ca.symvar(argument)}
+    free = [str(symbol) for symbol in ca.symvar(expression) if symbol.__hash__() not in known]
+    if free:
+        expected = "a function of its arguments and of numbers, as par.m"
+        raise InputError(plant.name, name, f"symbols of its own ({' '.join(free)})", expected)
+    if isinstance(expression, ca.SX) and _has_nan(ca.Function("expression", list(arguments), [expression])):
+        expected = "CasADi's functions, as ca.sin, in place of math's, which make NaN of a symbol"
+        raise InputError(plant.name, name, "NaN in its expression", expected)
+
+
+def _has_nan(function: ca.Function) -> bool:
+    """Whether an SX function computes with a constant that is NaN."""
+    constants = (k for k in range(function.n_instructions()) if function.instruction_id(k) == ca.OP_CONST)
+    return any(math.isnan(function.instruction_constant(k)) for k in constants)
+
+
+def fault_of(error: Exception, where: str, field: str) -> InputError:
+    """What is wrong with a function of a machine's module that raised an error: its line, and what to change."""
+    text = " ".join(re.sub(r"\S*casadi/\S+:\d+:", "", str(error)).split())
+    expected = "a function of CasADi expressions"
+    if "truth value" in text:
+        expected = "ca.fmax, ca.fmin or ca.if_else in place of max, min, if, and, or"
+    elif "overloaded function" in text or "loop of ufunc" in text:
+        text = text.partition(" Possible prototypes")[0]
+        expected = "CasADi's functions, as ca.sin and ca.vertcat, in place of math's and numpy's"
+    line = line_of(error)
+    return InputError(
+        where, field, f"{type(error).__name__}: {text[:100]}{line and f', at {line}'}", expected
+    )
+
+
+def line_of(error: BaseException) -> str:
+    """The line of a user's module in which an error arose, as `ball.py:40`; "" for one that arose in no such line."""
+    places = traceback.extract_tb(error.__traceback__)
+    own = [place for place in places if not _is_library(place.filename)]
+    return f"{Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
+
+
+def _is_library(file: str) -> bool:
+    """Whether a file is of malta, of Python or of an installed package."""
+    kinds = ("stdlib", "platstdlib", "purelib", "platlib")
+    folders = (str(PACKAGE), *(sysconfig.get_path(kind) for kind in kinds))
+    return file.startswith(("<", *(folder + os.sep for folder in folders)))
 
 
 def check_symbols(plant: Plant) -> None:

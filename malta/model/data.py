@@ -20,16 +20,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from pydantic import Field as Checked
 from pydantic import StrictStr
 
-from malta.errors import InputError
+from malta.errors import CheckError, InputError
 from malta.files import locate
-from malta.model.checks import check_plant
+from malta.model.checks import check_plant, line_of
 from malta.model.machines import file_of, machine, machine_names, name_of
 from malta.model.parameters import check_range
+from malta.model.plant import Plant
 from malta.tables import Quantity, Record, entry, load_toml, validate
 from malta.units import to_si
 
 if TYPE_CHECKING:
-    from malta.model.plant import Parameters, Plant
+    from malta.model.plant import Parameters
 
 
 class Sourced(Quantity):
@@ -89,7 +90,7 @@ def read(path: str | Path, preset: str | None = None) -> Any:
     for table, entries in tables.items():  # every preset is checked, the chosen one is used
         for key, given in entries.items():
             if key not in known:
-                raise InputError(path, f"{table}.{key}", "an unknown parameter", ", ".join(known))
+                raise InputError(path, f"{table}.{key}", "an unknown parameter", "one of " + " ".join(known))
             unit = known[key].metadata["unit"]
             value = to_si(given.value, given.unit, unit, path, f"{table}.{key}")
             check_range(known[key], value, path, f"{table}.{key}")
@@ -160,8 +161,18 @@ def _plant_of(parameters: Any) -> Plant:
     build: Callable[[Any], Plant] | None = getattr(module, "plant", None)
     if build is None:
         raise InputError(module.__name__, "plant", "nothing", "a function of Parameters -> Plant beside them")
-    plant = build(parameters)
     name = name_of(module)
+    try:
+        plant = build(parameters)
+    except (InputError, CheckError):
+        raise
+    except Exception as error:  # a user's function may raise anything
+        found = f"{type(error).__name__}: {error}{(line := line_of(error)) and f', at {line}'}"
+        raise InputError(f"{name}.py", "plant", found, "a function that makes a Plant") from error
+    if not isinstance(plant, Plant):
+        raise InputError(
+            f"{name}.py", "plant", f"a function that returns {plant!r}", "one that returns a Plant"
+        )
     if file_of(name) is not None and plant.name != name:
         raise InputError(f"{name}.py", "plant: name", repr(plant.name), f"{name!r}, as the file is called")
     check_plant(plant)

@@ -136,7 +136,7 @@ def box_of(
         for limit, rate in ((low, down[i]), (high, up[i])):
             if rate > 0 and abs(limit - nominal) / rate < most:
                 most, ends = abs(limit - nominal) / rate, f"{name} reaches its limit {limit:g}"
-    if not ranges and not empty:
+    if not (down + up).any() and not empty:
         raise InputError(caller, "ranges", "no parameters", "at least one uncertain parameter")
     return Box(names, at, down, up, fixed, most, ends=ends)
 
@@ -168,10 +168,10 @@ def _checked_sides(caller: str, name: str, value: Any, nominal: float) -> tuple[
     low = high = math.nan
     if is_pair(value) and all(is_number(v) for v in value):
         low, high = (float(v) for v in value)
-    elif is_number(value) and value > 0:
+    elif is_number(value) and value >= 0:
         low, high = nominal - abs(nominal) * float(value), nominal + abs(nominal) * float(value)
-    if not (low <= nominal <= high and low < high):
-        wanted = f"a share above 0, or (low, high) about the nominal {nominal:g}"
+    if not low <= nominal <= high:
+        wanted = f"a share of 0 or more, or (low, high) about the nominal {nominal:g}"
         raise InputError(caller, name, describe(value), wanted)
     if max(-low, high) > LARGEST:
         raise InputError(caller, name, describe(value), f"values between -{LARGEST:g} and {LARGEST:g}")

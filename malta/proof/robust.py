@@ -122,17 +122,17 @@ def common_margin(
 
     Raises InputError for loops that differ in parameters or sample times.
     """
-    effort = Effort(tolerance, time, MOST_CELLS, progress, "common_margin")
-    loops = [(system, law_of(system, law, "common_margin")) for system, law in _pairs(places)]
+    effort = Effort(tolerance, time, MOST_CELLS, progress, "margin")
+    loops = [(system, law_of(system, law, "margin")) for system, law in _pairs(places)]
     first, law = loops[0]
     for system, other in loops[1:]:
         same = system.names == first.names and np.array_equal(system.nominal, first.nominal)
         if not (same and other.sample_time == law.sample_time and system.sample_time == first.sample_time):
             raise InputError(
-                "common_margin", "places", "loops of different parameters or clocks", "alike ones"
+                "margin", "places", "loops of different parameters or clocks", "alike ones"
             )
     outside = {} if over is None else over
-    box = box_of(first.names, first.nominal, first.limits, ranges, outside, caller="common_margin")
+    box = box_of(first.names, first.nominal, first.limits, ranges, outside, caller="margin")
     for system, _ in loops:
         box = within_branches(box, system.positive)
     return margin_of(OfSeveral(tuple(problem_of(*loop) for loop in loops)), box, effort)
@@ -143,7 +143,7 @@ def _pairs(places: Any) -> list[tuple[UncertainSystem, Any]]:
     found = list(places) if isinstance(places, Iterable) and not isinstance(places, str) else []
     if not found or not all(is_pair(place) for place in found):
         wanted = "pairs of a system and its compensator, at least one"
-        raise InputError("common_margin", "places", describe(places), wanted)
+        raise InputError("margin", "places", describe(places), wanted)
     return [(system, law) for system, law in found]
 
 

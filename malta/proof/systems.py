@@ -151,7 +151,9 @@ def _trace(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: s
     except (TypeError, ValueError) as error:
         found = "a function whose parameters cannot be read"
         raise InputError(caller, "source", found, "one of the parameters " + " ".join(names)) from error
-    wanted = [q.name for q in own if q.kind in (q.POSITIONAL_OR_KEYWORD, q.KEYWORD_ONLY)]
+    named = [q for q in own if q.kind in (q.POSITIONAL_OR_KEYWORD, q.KEYWORD_ONLY)]
+    # An argument with a default that is no parameter here keeps it.
+    wanted = [q.name for q in named if q.default is q.empty or q.name in names]
     try:
         if set(wanted) == set(names):
             return source(**symbols)

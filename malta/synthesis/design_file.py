@@ -131,7 +131,9 @@ def spec_of(
         raise InputError(path, "preset", str(error), "a machine that can be controlled") from error
     for name in content.uncertainty:
         if name not in units_of(par):
-            raise InputError(path, f"uncertainty.{name}", "an unknown parameter", ", ".join(units_of(par)))
+            raise InputError(
+                path, f"uncertainty.{name}", "an unknown parameter", "one of " + " ".join(units_of(par))
+            )
     spec = Spec(
         name=content.name,
         summary=content.summary,

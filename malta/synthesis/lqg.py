@@ -42,6 +42,7 @@ from malta.synthesis.controller import (
 from malta.synthesis.feedforward import commutate_ahead, machine_part
 from malta.synthesis.kalman import kalman as kalman
 from malta.synthesis.kalman import positions_from, sampled_filter
+from malta.synthesis.obstacles import obstacle
 from malta.synthesis.pid import pid
 from malta.synthesis.riccati import (
     add_integrals,
@@ -247,7 +248,11 @@ def lqg(
     _check_sizes(model, weights)
     lag = model.plant.actuator.crossover if current_lag else None
     _require_lag(model, lag, discretization)
-    found = gains(model, weights, Ts, discretization, delay, lag)
+    try:
+        found = gains(model, weights, Ts, discretization, delay, lag)
+    except CheckError as error:
+        reason = obstacle(model, weights, Ts)
+        raise CheckError(f"{str(error).partition(' (')[0]}: {reason}" if reason else str(error)) from error
     if not all(np.isfinite(M).all() for M in found):
         raise CheckError("lqg: the gains overflow")
     plant = model.plant

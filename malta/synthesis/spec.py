@@ -380,6 +380,9 @@ def pid_signals(plant: Plant, axes: PidAxes = "decentralized") -> dict[str, list
         names = [s.name for s in plant.design_states[: plant.coordinates]]
         units = {"Kp": "1/s^2", "Ki": "1/s^3", "Kd": "1/s", "filters": "s"}
         return {table: [Signal(name, unit) for name in names] for table, unit in units.items()}
+    if len(plant.inputs) != len(plant.outputs):
+        found = f"{len(plant.inputs)} forces and {len(plant.outputs)} measurements"
+        raise InputError(plant.name, "pid", found, "as many of both: a PID has one of each for every axis")
     pairs = list(zip(plant.inputs, plant.outputs, strict=True))
     return {
         "Kp": [Signal(i.name, f"({i.unit}) / ({o.unit})") for i, o in pairs],
@@ -431,7 +434,8 @@ def place_of(
     }
     if coordinates == "positions":
         tables["noise.correlation"] = ("correlation", [Signal(s.name, "1") for s in integrals], False)
-    for name, gains in pid_signals(plant, axes).items():
+    pairs = len(plant.inputs) == len(plant.outputs) or axes != "decentralized"
+    for name, gains in pid_signals(plant, axes).items() if pairs else ():
         tables[f"pid.{name}"] = ("filter" if name == "filters" else name, gains, False)
     if entry == "pid.filter":
         return "filter", (), "s", False
