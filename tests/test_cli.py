@@ -313,7 +313,7 @@ def test_figures_that_cannot_be_written_leave_old_gains(run: Run, tmp_path: Path
     blocked = tmp_path / "file" / "figures"
     code, out, err = run("design", BALL, "--out", tmp_path / "gains", "--figures", blocked)
     assert (code, out) == (2, "")
-    assert one_sentence(err).startswith(f"{blocked}/ball_stroke.png: found ")
+    assert one_sentence(err).startswith(f"{blocked}/ball_hold.png: found ")
     assert {path: path.read_bytes() for path in old} == old
     assert sorted(path.name for path in (tmp_path / "gains").iterdir()) == list(BALLS)
 
@@ -321,12 +321,12 @@ def test_figures_that_cannot_be_written_leave_old_gains(run: Run, tmp_path: Path
 def test_gains_that_cannot_be_written_leave_the_old_figure(run: Run, tmp_path: Path) -> None:
     figures = tmp_path / "figures"
     figures.mkdir()
-    (figures / "ball_stroke.png").write_bytes(b"old")
+    (figures / "ball_hold.png").write_bytes(b"old")
     (tmp_path / "gains" / "ball.mat").mkdir(parents=True)
     code, _, err = run("design", BALL, "--out", tmp_path / "gains", "--figures", figures)
     assert code == 2
     assert one_sentence(err).startswith(f"{tmp_path / 'gains' / 'ball.mat'}: found a folder of that name")
-    assert (figures / "ball_stroke.png").read_bytes() == b"old"
+    assert (figures / "ball_hold.png").read_bytes() == b"old"
     assert [path.name for path in (tmp_path / "gains").iterdir()] == ["ball.mat"]
 
 
