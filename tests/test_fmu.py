@@ -162,7 +162,6 @@ FLIGHTS = [
             ("halbach", None, 2),
             ("robust", None, 3),
             ("robust", "dq", 2),
-            ("robust", "force", 3),
             ("tubular_pid", None, 2),
             ("planar", None, 3),
         )
