@@ -6,8 +6,6 @@ import glob
 import math
 import os
 import re
-import secrets
-import socket
 import stat
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -139,7 +137,7 @@ def json_text(content: Any) -> str:
 
 def temporary_name(path: Path) -> Path:
     """A hidden name beside a file that no other process takes, on this computer or on one that shares the volume."""
-    return path.with_name(f".{path.name[:50]}.{writer()}.{secrets.token_hex(4)}")
+    return path.with_name(f".{path.name[:50]}.{writer()}.{os.urandom(4).hex()}")
 
 
 def remove_leftovers(folder: Path, names: str) -> None:
@@ -167,6 +165,8 @@ def _is_alive(process: int) -> bool:
 
 def writer() -> str:
     """Computer and process, as they stand in temporary names."""
+    import socket  # here, because `malta --help` must not wait for it
+
     return f"{re.sub('[^A-Za-z0-9-]', '_', socket.gethostname())[:40]}.{os.getpid()}"
 
 

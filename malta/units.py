@@ -71,14 +71,92 @@ def _is_unit(text: str) -> bool:
     return not text.strip() or re.fullmatch(_PRODUCT, text) is not None
 
 
+# The symbols that nearly every file has, as UNITS defines them, for which nobody waits for pint: by scales of which the
+# root units of gram, meter, second, ampere and radian are a product, and by the powers of these.
+_PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6, "G": 1e9}
+_ROOTS = ("gram", "meter", "second", "ampere", "radian")
+_KILO, _Symbol = ((1e3, 1),), tuple[tuple[tuple[float, int], ...], tuple[int, ...]]
+_SYMBOLS: dict[str, _Symbol] = {
+    "g": ((), (1,)),
+    "m": ((), (0, 1)),
+    "s": ((), (0, 0, 1)),
+    "A": ((), (0, 0, 0, 1)),
+    "rad": ((), (0, 0, 0, 0, 1)),
+    "Hz": ((), (0, 0, -1)),
+    "N": (_KILO, (1, 1, -2)),
+    "J": (_KILO, (1, 2, -2)),
+    "W": (_KILO, (1, 2, -3)),
+    "V": (_KILO, (1, 2, -3, -1)),
+    "H": (_KILO, (1, 2, -2, -2)),
+    "Wb": (_KILO, (1, 2, -2, -1)),
+    "T": (_KILO, (1, 0, -2, -1)),
+    "ohm": (_KILO, (1, 2, -3, -2)),
+    "F": (((1e3, -1),), (-1, -2, 4, 2)),
+}
+_WHOLE: dict[str, _Symbol] = {  # names without a prefix
+    "1": ((), ()),
+    "%": (((0.01, 1),), ()),
+    "percent": (((0.01, 1),), ()),
+    "deg": (((0.017453292519943295, 1),), (0, 0, 0, 0, 1)),
+    "rpm": (((6.283185307179586, 1), (60.0, -1)), (0, 0, -1, 0, 1)),
+}
+
+
+_TOKEN = r"[()/*]|[^\W\d_]+(?:\^-?\d)?|\S"
+
+
+def _known(name: str) -> _Symbol | None:
+    """A symbol of the tables, with its prefix as the first scale; None for any other name."""
+    found = _SYMBOLS.get(name) or _WHOLE.get(name)
+    if found is None and name[:1] in _PREFIXES and name[1:] in _SYMBOLS:
+        scales, powers = _SYMBOLS[name[1:]]
+        return ((_PREFIXES[name[0]], 1), *scales), powers
+    return found
+
+
+def _plain_root_units(unit: str) -> tuple[float, dict[str, int]] | None:
+    """Factor and root units of a product of known symbols; None for other names, and for parentheses in parentheses."""
+    exponents: dict[str, int] = {}
+    sign, group = 1, 1  # of the next factor, and of the parentheses that it stands in
+    unit = re.sub(r"\(\s*([^\W\d_]+)\s*\)", r"\1", unit)  # a name in parentheses
+    for token in re.findall(_TOKEN, re.sub(r"\s*(?:\*\*|\^)\s*", "^", unit)):
+        if token == "(":
+            if group != 1:
+                return None
+            group, sign = sign, 1
+        elif token in (")", "*", "/"):
+            group, sign = (1, 1) if token == ")" else (group, -1 if token == "/" else 1)
+        else:
+            name, _, power = token.partition("^")
+            if _known(name) is None:
+                return None
+            exponents[name] = exponents.get(name, 0) + group * sign * int(power or 1)
+            sign = 1
+    factor, root = 1.0, dict.fromkeys(_ROOTS, 0)
+    for name, exponent in exponents.items():
+        scales, powers = _known(name) or ((), ())
+        for scale, power in scales if exponent else ():
+            factor *= scale ** (power * exponent)
+        for base, power in zip(_ROOTS, powers, strict=False):
+            root[base] += power * exponent
+    return factor, {base: power for base, power in root.items() if power}
+
+
 @cache
-def _root_units(unit: str) -> Any:
+def _root_units(unit: str) -> tuple[float, dict[str, int]]:
+    """The factor of a unit, and the powers of the root units."""
     if not _is_unit(unit):
         raise ValueError("a text that is no product of units")
-    factor, root = _units().get_root_units(_units().parse_units(unit))
+    found = _plain_root_units(unit)
+    factor, root = _pint_root_units(unit) if found is None else found
     if not 1 / HUGE < factor < HUGE:
         raise ValueError("a unit beyond all measure")
-    return float(factor), root
+    return factor, root
+
+
+def _pint_root_units(unit: str) -> tuple[float, dict[str, int]]:
+    factor, root = _units().get_root_units(_units().parse_units(unit))
+    return float(factor), dict(root._units)
 
 
 def _quoted(unit: str) -> str:
@@ -132,8 +210,7 @@ def unit_factor(unit: str, name: str) -> float:
     """The size of one `unit` in SI units: 0.001 for "ms". Raises InputError, which names the key `name`."""
     try:
         factor, root = _root_units("" if unit == "1" else unit)
-        grams = _units().get_dimensionality(root).get("[mass]", 0)  # pint's root of mass is the gram
-        return float(factor / 1000.0 ** float(grams))
+        return float(factor / 1000.0 ** float(root.get("gram", 0)))  # the root of mass is the gram
     except Exception as error:  # pint raises many kinds, tokenizer errors among them
         raise InputError("data", name, _quoted(unit), "a unit") from error
 
@@ -148,5 +225,5 @@ def base_exponents(unit: str) -> Mapping[str, int]:
     symbols = {"gram": "kg", "meter": "m", "second": "s", "ampere": "A", "radian": "rad"}
     unit_factor(unit, "unit")
     _, root = _root_units("" if unit == "1" else unit)
-    powers = {symbols[name]: int(power) for name, power in root._units.items()}
+    powers = {symbols[name]: int(power) for name, power in root.items()}
     return dict(sorted(powers.items()))

@@ -9,6 +9,7 @@ import math
 import os
 import pickle
 import re
+import shutil
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -23,6 +24,7 @@ from rich.console import Console
 import malta
 from malta.cli import main as cli
 from malta.files import replace_files
+from malta.firmware import cost
 from malta.machines.tubular import plant as tubular
 from malta.model.published import published as read_published
 from malta.proof import robust
@@ -41,12 +43,17 @@ if TYPE_CHECKING:
 # As in the program: numeric libraries make many lasting objects, and going through them again and again costs time.
 gc.set_threshold(200_000, 50, 50)
 
-hypothesis.settings.register_profile("untimed", deadline=None)  # a loaded computer fails no test
-hypothesis.settings.load_profile("untimed")
+# A loaded computer fails no test; `make test` tries fewer cases than all tests together.
+hypothesis.settings.register_profile("untimed", deadline=None)
+hypothesis.settings.register_profile("fast", deadline=None, max_examples=30)
 
 os.environ.pop("COLUMNS", None)  # which workers of pytest may have: tables have the width of a file
 ROOT = Path(__file__).parents[1]
 DESIGNS = ("table2", "calibrated")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    hypothesis.settings.load_profile("fast" if config.option.markexpr == "not slow" else "untimed")
 
 
 class Design(NamedTuple):
@@ -194,6 +201,23 @@ def _remembering(answers: Answers) -> Iterator[None]:
 def _answers(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Answers:
     folder = tmp_path_factory.getbasetemp()
     return Answers((folder.parent if hasattr(request.config, "workerinput") else folder) / "answers")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _counted_once(_answers: Answers) -> Iterator[None]:
+    """Reports of exports count a text's instructions once: compilers of three processors take seconds for it."""
+    count = cost.cost_on
+
+    def cost_on(p: cost.Processor, *of: Any) -> cost.Cost | None:
+        tools = [shutil.which(p.prefix + tool) for tool in ("gcc", "size", "objdump")]
+        found: cost.Cost | None = _answers.of(
+            pickle.dumps((p, tools, of)), lambda: count(p, *of), lambda _: True
+        )
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cost, "cost_on", cost_on)
+        yield
 
 
 @pytest.fixture(scope="module")

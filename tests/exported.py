@@ -6,12 +6,13 @@ import shutil
 import subprocess
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 from conftest import ROOT
 
 import malta
+from malta.firmware import report
 from malta.firmware.elementary import Precision
 from malta.firmware.export import render, root_context
 from malta.firmware.folder import folder_files
@@ -19,8 +20,20 @@ from malta.firmware.signals import Target, fidelity_of
 from malta.synthesis.controller import Controller
 
 PRECISIONS: tuple[Precision, ...] = ("double", "float")
+# A shipped design of each kind of law and machine, in one precision each, by turns; the smallest in both. The text of
+# table2 is that of calibrated with other numbers.
+KINDS: tuple[tuple[str, Precision], ...] = (
+    *(("halbach", "double"), ("halbach", "float"), ("halbach_late", "float"), ("halbach_pid", "double")),
+    *(("robust", "double"), ("calibrated", "float"), ("robust_observer", "float"), ("tubular_pid", "double")),
+    *(("planar", "float"), ("planar_pid", "double")),
+)
 EXACT = ("-std=c99", "-ffp-contract=off", "-fno-math-errno")
 START = Path(__file__).parent / "targets"  # of a program on a Cortex-M
+
+
+def of_each_kind(*fast: str) -> list[Any]:
+    """Parameters (name, precision) of KINDS: those of the designs that are named are fast, the others slow."""
+    return [pytest.param(*kind, marks=[] if kind[0] in fast else [pytest.mark.slow]) for kind in KINDS]
 
 
 class Processor(NamedTuple):
@@ -63,8 +76,10 @@ def target(name: str, precision: Precision) -> Target:
 
 @cache
 def texts(name: str, precision: Precision) -> dict[str, str]:
-    """The files of an export by name."""
-    return folder_files(target(name, precision), "0" * 64, proof=False)
+    """The files of an export by name, as where no compiler counts what a step costs: that takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "costs", lambda _: [])
+        return folder_files(target(name, precision), "0" * 64, proof=False)
 
 
 def write_folder(name: str, precision: Precision, folder: Path) -> Path:

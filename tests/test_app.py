@@ -34,6 +34,8 @@ from malta.proof.rays import ray_bound
 from malta.tuning.outcomes import judge
 from malta.tuning.search import model_and_controller
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 HALBACH = shipped_path("design", "halbach_pid.toml")
 ROBUST = shipped_path("design", "robust.toml")
 BALL = shipped_path("examples", "ball", "design", "ball.toml")
@@ -190,7 +192,9 @@ def test_every_field_moves_the_design_or_says_why_not(design: Path, tmp_path: Pa
         else:
             values = [3] if field.kind == "integer" else [1.1 * field.value or 1e-6]
         for value in values:
-            for redesign in (True, False) if key.startswith("machine.") else (True,):
+            # A machine that changes under the same controller: fields of the small ones say what all others would.
+            small = design in (BALL, ROTOR)
+            for redesign in (True, False) if small and key.startswith("machine.") else (True,):
                 number += 1
                 found = client.ask("evaluate", number=number, values={key: value}, redesign=redesign)
                 assert "poles" in found or "defect" not in found["error"], (key, value, redesign, found)

@@ -284,6 +284,7 @@ def test_a_killed_campaign_goes_on_where_it_was(run: Run, tmp_path: Path) -> Non
     assert {name: found[name] for name in kept} == kept
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_and_shows_what_is_done(tmp_path: Path) -> None:
     process = _malta("campaign", GAINS, *MANY, "--out", tmp_path)
     _wait_for_block(process, tmp_path)

@@ -26,6 +26,8 @@ from malta.proof.certificate.check import Verdict, check
 from malta.proof.machine.windings import CurrentLoops
 from malta.report.tables.certificate import claim_share
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 ROOT = Path(__file__).parents[1]
 HALBACH = ROOT / "design" / "gains" / "halbach.json"
 BOX = {"m": 0.1, "A": 0.1, "b": 0.2, "R": 0.2}  # of its gain file

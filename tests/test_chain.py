@@ -51,7 +51,8 @@ STAGES = ["LQR", "LQI", "LQG", "LQGI", "+ current loops", "sampled", "machine"]
 DESIGNS = ("table2", "calibrated")
 
 
-CHAINED = (pytest.param("table2", marks=[pytest.mark.slow, pytest.mark.xdist_group("chain")]), "calibrated")
+SLOW = (pytest.mark.slow, pytest.mark.xdist_group("chain"))  # in one worker, which computes each chain once
+CHAINED = [pytest.param(name, marks=SLOW) for name in DESIGNS]
 
 
 @cache
@@ -74,7 +75,6 @@ def _sampled(name: str, z: float = 0.0) -> tuple[UncertainSystem, Compensator]:
     return uncertain(plant, list(BOX), at={"z": z}), machine_law(plant, c, "lag")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CHAINED)
 def test_margins_go_where_the_chain_says(name: str) -> None:
     found = chain_of(name)
@@ -107,6 +107,8 @@ def test_places_stand_for_both_sides_of_the_travel(name: str) -> None:
     assert places[-1].margin.upper >= (chain_of(name).travel.lower or 0)
 
 
+@pytest.mark.slow
+@pytest.mark.xdist_group("chain")
 def test_what_is_proven_over_the_travel_is_proven_at_its_places() -> None:
     """The loss that is found beside the travel's witness is that of a search at the place alone."""
     c = gains.read("design/gains/calibrated.json")
@@ -345,6 +347,8 @@ def _texts(figure: Figure) -> list[str]:
     return [text.get_text() for text in figure.findobj(matplotlib.text.Text)]
 
 
+@pytest.mark.slow
+@pytest.mark.xdist_group("chain")
 def test_the_figure_names_what_it_shows() -> None:
     found = chain_of("calibrated")
     worst = {"x1": Gain(2.4, 2.41, 500.0, {}, 1, 0.0), "z": Gain(1.9, 1.91, 90.0, {}, 1, 0.0)}
@@ -372,6 +376,8 @@ def test_the_figure_names_what_it_shows() -> None:
     assert max(widths) < left.get_xlim()[1]
 
 
+@pytest.mark.slow
+@pytest.mark.xdist_group("chain")
 def test_unstable_loops_and_unproven_margins_are_drawn() -> None:
     found = chain_of("calibrated")
     c = gains.read("design/gains/calibrated.json")

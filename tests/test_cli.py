@@ -36,6 +36,8 @@ TABLE2, CALIBRATED = "design/gains/table2.json", "design/gains/calibrated.json"
 WIDTH = 100
 HEAVY = ("casadi", "control", "matplotlib", "numpy", "pint", "scipy")
 NAMES = ("table2.json", "table2.mat", "table2.npz")
+BALL = "examples/ball/design/ball.toml"  # designed in a tenth of the time
+BALLS = ("ball.json", "ball.mat", "ball.npz")
 
 TS = 'sample_time = { value = 50, unit = "us" }'
 INPUT_BASES = 'input = "SI"'
@@ -66,10 +68,10 @@ def forces(value: str) -> str:
     return "{ " + ", ".join(f'{name} = {{ value = {value}, unit = "N" }}' for name in FORCES) + " }"
 
 
-def old_gains(folder: Path) -> dict[Path, bytes]:
+def old_gains(folder: Path, names: tuple[str, ...] = NAMES) -> dict[Path, bytes]:
     """Files in the place of gain files, and what is in them."""
     folder.mkdir(parents=True)
-    old = {folder / name: f"old {name}".encode() for name in NAMES}
+    old = {folder / name: f"old {name}".encode() for name in names}
     for path, content in old.items():
         path.write_bytes(content)
     return old
@@ -333,26 +335,26 @@ def test_failing_design_leaves_old_gains(
 
 
 def test_figures_that_cannot_be_written_leave_old_gains(run: Run, tmp_path: Path) -> None:
-    old = old_gains(tmp_path / "gains")
+    old = old_gains(tmp_path / "gains", BALLS)
     (tmp_path / "file").write_bytes(b"not a folder")
     blocked = tmp_path / "file" / "figures"
-    code, out, err = run("design", "design/table2.toml", "--out", tmp_path / "gains", "--figures", blocked)
+    code, out, err = run("design", BALL, "--out", tmp_path / "gains", "--figures", blocked)
     assert (code, out) == (2, "")
-    assert one_sentence(err).startswith(f"{blocked}/table2_stroke.png: found ")
+    assert one_sentence(err).startswith(f"{blocked}/ball_hold.png: found ")
     assert {path: path.read_bytes() for path in old} == old
-    assert sorted(path.name for path in (tmp_path / "gains").iterdir()) == list(NAMES)
+    assert sorted(path.name for path in (tmp_path / "gains").iterdir()) == list(BALLS)
 
 
 def test_gains_that_cannot_be_written_leave_the_old_figure(run: Run, tmp_path: Path) -> None:
     figures = tmp_path / "figures"
     figures.mkdir()
-    (figures / "table2_stroke.png").write_bytes(b"old")
-    (tmp_path / "gains" / "table2.mat").mkdir(parents=True)
-    code, _, err = run("design", "design/table2.toml", "--out", tmp_path / "gains", "--figures", figures)
+    (figures / "ball_hold.png").write_bytes(b"old")
+    (tmp_path / "gains" / "ball.mat").mkdir(parents=True)
+    code, _, err = run("design", BALL, "--out", tmp_path / "gains", "--figures", figures)
     assert code == 2
-    assert one_sentence(err).startswith(f"{tmp_path / 'gains' / 'table2.mat'}: found a folder of that name")
-    assert (figures / "table2_stroke.png").read_bytes() == b"old"
-    assert [path.name for path in (tmp_path / "gains").iterdir()] == ["table2.mat"]
+    assert one_sentence(err).startswith(f"{tmp_path / 'gains' / 'ball.mat'}: found a folder of that name")
+    assert (figures / "ball_hold.png").read_bytes() == b"old"
+    assert [path.name for path in (tmp_path / "gains").iterdir()] == ["ball.mat"]
 
 
 @pytest.mark.slow
@@ -384,14 +386,14 @@ def test_gains_are_replaced_by_a_design_that_ends_well_and_by_no_other(run: Run,
 
 
 def test_two_designs_of_one_name_do_not_overwrite_each_other(run: Run, tmp_path: Path) -> None:
-    first = project(tmp_path, ("", ""))
+    first = shutil.copytree(ROOT / "examples" / "ball", tmp_path, dirs_exist_ok=True) / "design" / "ball.toml"
     second = first.with_name("second.toml")
-    second.write_text(first.read_text(encoding="utf-8").replace("value = 50,", "value = 40,"))
+    second.write_text(first.read_text(encoding="utf-8").replace("value = 200,", "value = 160,"))
     code, out, err = run("design", first, second, "--json", "--figures", tmp_path / "figures")
     assert code == 2
-    assert one_sentence(err) == f"{second}: name: found 'table2', expected another name than that of {first}"
-    assert [result["design"] for result in json.loads(out)["designs"]] == ["table2"]
-    assert gains.read(tmp_path / "design" / "gains" / "table2.json").sample_time == 50e-6
+    assert one_sentence(err) == f"{second}: name: found 'ball', expected another name than that of {first}"
+    assert [result["design"] for result in json.loads(out)["designs"]] == ["ball"]
+    assert gains.read(tmp_path / "design" / "gains" / "ball.json").sample_time == 200e-6
 
 
 @pytest.mark.slow
@@ -801,7 +803,7 @@ def test_claims_prints_the_ledger(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
         ("design nothing.toml", "nothing.toml: found no such file", "a TOML file"),
         ("design design", "design: found Is a directory", "a readable TOML file"),
         ("design data/tubular.toml", "data/tubular.toml: name: found nothing", "this key"),
-        ("design design/table2.toml --out pyproject.toml/gains", "pyproject.toml/gains/table2.json", "a place"),
+        (f"design {BALL} --out pyproject.toml/gains", "pyproject.toml/gains/ball.json", "a place"),
         ("verify nothing.json", "nothing.json: found no such file", "a gain file"),
         ("verify nothing.txt", "nothing.txt: found suffix '.txt'", "one of .json, .npz, .mat"),
         ("verify pyproject.toml", "pyproject.toml: found suffix '.toml'", "one of .json, .npz, .mat"),
@@ -885,18 +887,16 @@ def test_edited_gain_file_is_refused(run: Run, tmp_path: Path) -> None:
 
 
 def test_design_that_cannot_be_written_leaves_old_gains(run: Run, tmp_path: Path) -> None:
-    old = old_gains(tmp_path / "gains")
-    blocked = tmp_path / "gains" / "table2.mat"
+    old = old_gains(tmp_path / "gains", BALLS)
+    blocked = tmp_path / "gains" / "ball.mat"
     blocked.unlink()
     blocked.mkdir()
     del old[blocked]
-    code, out, err = run(
-        "design", "design/table2.toml", "--out", tmp_path / "gains", "--figures", tmp_path / "f"
-    )
+    code, out, err = run("design", BALL, "--out", tmp_path / "gains", "--figures", tmp_path / "f")
     assert (code, out) == (2, "")
     assert one_sentence(err).startswith(f"{blocked}: found a folder of that name, expected a place")
     assert {path: path.read_bytes() for path in old} == old
-    assert sorted(path.name for path in (tmp_path / "gains").iterdir()) == list(NAMES)
+    assert sorted(path.name for path in (tmp_path / "gains").iterdir()) == list(BALLS)
 
 
 def test_no_design_files_at_all(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ import pytest
 from conftest import refusal
 
 import malta
+from malta import units
 from malta.machines.tubular import plant as tubular
 from malta.model.parameters import units_of
 from malta.model.published import published as read_published
@@ -270,6 +271,19 @@ def test_text_that_is_no_product_of_units_is_refused_at_once(unit: str) -> None:
 )
 def test_units_are_products_with_powers(unit: str, factor: float) -> None:
     assert unit_factor(unit, "name") == pytest.approx(factor, rel=1e-12)
+
+
+def test_known_symbols_are_the_units_of_pint() -> None:
+    """Each with each prefix, bit by bit; in products, whose factors round by their order, nearly so."""
+    single = [prefix + symbol for prefix in ("", *units._PREFIXES) for symbol in units._SYMBOLS]
+    tails = ("/s^2", "/(V)^2", " m / (rad/ms)", "/(kg m)", "^2/V", "*s**-1", " / m / rad")
+    for unit in [*single, *units._WHOLE, *(one + tail for one in single for tail in tails)]:
+        found, (factor, root) = units._plain_root_units(unit), units._pint_root_units(unit)
+        assert found is not None, unit
+        assert found[1] == root, unit
+        assert found[0] == (factor if unit in single else pytest.approx(factor, rel=1e-15, abs=0)), unit
+    for unit in ("min", "inch", "meter", "Nm", "m/((s/A))", "(m s)^2", "newtons"):
+        assert units._plain_root_units(unit) is None, unit
 
 
 # --- files that are wrong ---

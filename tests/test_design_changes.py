@@ -11,6 +11,8 @@ from conftest import Run, one_sentence
 
 from malta.cli.inputs import _name_of, read_changed_design
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 FILE = Path("design/calibrated.toml")
 
 

@@ -16,6 +16,8 @@ from hypothesis import strategies as st
 import malta
 from malta.display import COLUMNS, LINES, Curves, Description, quantity, svg
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 BALL = "examples/ball/design/ball.toml"
 SHORT: dict[str, Any] = {"duration": 0.02}  # s
 

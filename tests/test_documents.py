@@ -17,6 +17,8 @@ from malta.identifiers import distinct, identifier, unit_suffix
 from malta.report.ledger import Claim, Ledger
 from malta.units import unit_factor
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 TABLE2 = "design/gains/table2.json"
 SI = re.compile(r"(_(1|s2?|m2?|A|rad|Hz|N|J|W|V|kg|share|per|samples))+$")
 
@@ -141,13 +143,19 @@ def test_the_others(run: Run, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gains", ["calibrated", "halbach", "planar"])
-def test_every_scenario(run: Run, gains: str) -> None:
+def test_every_scenario(run: Run, gains: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from malta import gains as gain_files
     from malta.model.data import plant_of
-    from malta.simulation.catalogue import experiments_of
+    from malta.simulation import catalogue
 
+    def quick(name: str, plant: Any, c: Any, **options: Any) -> Any:
+        few = {"capture": {"points": 5}, "supervised-faults": {"only": "stuck"}}.get(name, {})
+        return experiment(name, plant, c, **(options | few))
+
+    experiment = catalogue.experiment
+    monkeypatch.setattr(catalogue, "experiment", quick)
     file = f"design/gains/{gains}.json"
-    for name in experiments_of(plant_of(gain_files.read(file).parameters)):
+    for name in catalogue.experiments_of(plant_of(gain_files.read(file).parameters)):
         found = document(run("simulate", file, "--scenario", name, "--json", "--yes"), "simulate-output")
         assert found["scenario"] == name
 

@@ -22,6 +22,8 @@ from public import all_names, docstring_of, public_names, value_of
 import malta
 from malta.model import machines
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("data", "design", "examples")  # that examples read
 # The examples that take longest, compilers included; the others together take some two seconds of processor time.

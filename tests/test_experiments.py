@@ -415,6 +415,7 @@ def test_every_estimator_lifts_the_mover(design: Design, flown: Flown) -> None:
         assert 20e-3 < _merit(case.merits, "within 20 um after") < 60e-3
 
 
+@pytest.mark.slow
 def test_an_observer_that_knows_nothing_pays_for_the_start(flown: Flown) -> None:
     """Cold, the steady-state filter takes the mover to fly: table2 overshoots by a third of the clearance, calibrated
     needs three times the current. The Kalman filters begin with a measurement, and wait longer before they lift."""

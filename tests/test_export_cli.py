@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from conftest import ROOT, one_sentence
+from exported import of_each_kind
 
 import malta
 from malta.firmware.ctext import c_name
@@ -25,6 +26,10 @@ from malta.simulation import compiled
 
 if TYPE_CHECKING:
     from conftest import Run
+
+    from malta.firmware.elementary import Precision
+
+pytestmark = pytest.mark.usefixtures("proven_once")
 
 GAINS = "design/gains/halbach.json"
 
@@ -242,21 +247,18 @@ def test_names_of_other_files_and_targets_are_left_to_them(tmp_path: Path) -> No
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [file.stem for file in sorted((ROOT / "design" / "gains").glob("*.json"))])
-def test_every_shipped_design_exports_in_both_precisions(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "precision"), of_each_kind())
+def test_a_design_of_each_kind_exports(name: str, precision: Precision, tmp_path: Path) -> None:
     """Vectors pass, the example moves and lands; in single precision the margin of rounded coefficients is proven."""
-    gains = ROOT / "design" / "gains" / f"{name}.json"
-    for precision in ("double", "float"):
-        out = tmp_path / precision
-        malta.export_c(gains, out, precision=precision, proof=precision == "float")
-        if compiled.compiler() is not None:
-            assert build_and_test(out).splitlines()[-1].startswith("pass: ")
-            example = subprocess.run([str(out / f"{name}_example")], check=False, timeout=60)
-            assert example.returncode == 0  # it has moved and landed
-    report = (out / "REPORT.md").read_text(encoding="utf-8")
-    assert "With the coefficients that single precision holds" in report
-    assert "% is proven" in report
+    gains, single = ROOT / "design" / "gains" / f"{name}.json", precision == "float"
+    malta.export_c(gains, tmp_path, precision=precision, proof=single)
+    if compiled.compiler() is not None:
+        assert build_and_test(tmp_path).splitlines()[-1].startswith("pass: ")
+        example = subprocess.run([str(tmp_path / f"{name}_example")], check=False, timeout=60)
+        assert example.returncode == 0  # it has moved and landed
+    report = (tmp_path / "REPORT.md").read_text(encoding="utf-8")
+    assert ("With the coefficients that single precision holds" in report) == single
+    assert ("% is proven" in report) == single
 
 
 def test_the_report_counts_by_the_clock_of_the_processor(tmp_path: Path, run: Run) -> None:

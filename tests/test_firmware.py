@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from exported import PRECISIONS, controller, target
+from exported import PRECISIONS, controller, of_each_kind, target
 
 import malta
 from malta.firmware.elementary import Precision
@@ -23,13 +23,6 @@ from malta.firmware.signals import Target, reading_ranges, reference_fields, sta
 from malta.firmware.step import look_up, programs_of, started_state, step_of, zero_reference
 from malta.simulation.compiled import compiler
 
-NAMES = [
-    *("robust", "halbach_late"),
-    *(
-        pytest.param(n, marks=pytest.mark.slow)
-        for n in ("tubular_pid", "halbach", "table2", "robust_observer", "planar", "planar_pid")
-    ),
-]
 WARNINGS = (
     *("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-Werror", "-Wall", "-Wextra", "-Wpedantic"),
     *("-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Wstrict-prototypes", "-Wmissing-prototypes"),
@@ -43,8 +36,7 @@ def _with_compiler() -> None:
         pytest.skip("no C compiler")
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "precision"), of_each_kind("robust", "halbach_late"))
 def test_every_piece_computes_the_bits_of_its_expressions(name: str, precision: Precision) -> None:
     t = target(name, precision)
     native, rng = compile_controller(t), np.random.default_rng(3)
@@ -60,8 +52,7 @@ def test_every_piece_computes_the_bits_of_its_expressions(name: str, precision: 
                 assert np.array_equal(found[of], values), (key, of)
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "precision"), of_each_kind("robust", "halbach_late"))
 def test_steps_compute_the_bits_of_their_expressions(name: str, precision: Precision) -> None:
     """The whole state and all outputs, sample after sample, with readings that are none among them."""
     t = target(name, precision)

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from exported import EXACT, HERE, PRECISIONS, require, run, run_test, target, write_folder
+from exported import EXACT, HERE, of_each_kind, require, run, run_test, target, write_folder
 
 from malta.firmware.elementary import Precision
 from malta.firmware.supervisor import AWAKE, MONITORS, TRANSITIONS, absent_monitors, monitors_of
@@ -14,13 +14,9 @@ from malta.firmware.trials import out_of_reach
 from malta.firmware.watch import watch_table
 
 LINES = 95.0  # % of each file that a run executes
-DESIGNS = ["halbach", "halbach_late", "halbach_pid", "calibrated", "robust", "robust_observer", "table2"]
-DESIGNS += ["tubular_pid", "planar", "planar_pid"]
-NAMES = [n if n == "halbach" else pytest.param(n, marks=pytest.mark.slow) for n in DESIGNS]
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "precision"), of_each_kind("halbach"))
 def test_it_reaches_what_the_design_has(name: str, precision: Precision, tmp_path: Path) -> None:
     """Lines of the law, the pieces and the supervisor; each monitor by its name, or why it is not there."""
     require("gcc", "gcov")

@@ -66,7 +66,7 @@ def test_nothing_uncertain_is_the_norm_of_python_control() -> None:
 
 @pytest.mark.parametrize("at", ["sensors", "forces"])
 def test_no_machine_of_the_box_exceeds_what_is_proven(at: Any) -> None:
-    """The flagship anywhere in its travel: 200 machines at corners and within, on a grid of frequencies."""
+    """The flagship anywhere in its travel: 60 machines at corners and within, on a grid of frequencies."""
     c = gains.read("design/gains/robust.json")
     plant = plant_of(c.parameters)
     box = {"m": 0.2, "K_A": 0.2, "K_D": 0.2, "K_B": 0.2}
@@ -76,7 +76,7 @@ def test_no_machine_of_the_box_exceeds_what_is_proven(at: Any) -> None:
     assert m.lower <= m.upper <= 1.04 * m.lower
     assert law.sample_time is not None
     rng, w, worst = np.random.default_rng(1), np.geomspace(100, math.pi / law.sample_time, 200), 0.0
-    for _ in range(200):
+    for _ in range(60):
         p = s.nominal * (1 + np.array([*box.values(), 0]) * np.clip(rng.uniform(-2, 2, 5), -1, 1))
         p[-1] = rng.uniform(-plant.travel, plant.travel)
         P, _, _, F = responses(s, law, p, w)

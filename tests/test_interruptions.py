@@ -70,10 +70,12 @@ COMMANDS: tuple[tuple[tuple[str, ...], str], ...] = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("arguments", "sentence"), COMMANDS)
-@pytest.mark.parametrize("wait", [0.15, 0.7, 1.7, 4.0])
+@pytest.mark.parametrize(
+    ("wait", "arguments", "sentence"),
+    [(0.15, *COMMANDS[0]), *((wait, *command) for wait in (0.7, 4.0) for command in COMMANDS)],
+)
 def test_ctrl_c_says_what_stands(
-    arguments: tuple[str, ...], sentence: str, wait: float, tmp_path: Path
+    wait: float, arguments: tuple[str, ...], sentence: str, tmp_path: Path
 ) -> None:
     code, said = interrupted(wait, *(str(tmp_path) if a == "OUT" else a for a in arguments))
     assert code == 130

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from malta.model.plant import Plant
     from malta.simulation.trajectory import Trajectory
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 GAINS = "design/gains/calibrated.json"
 Ts = 50e-6
 

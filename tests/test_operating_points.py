@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from malta.model.plant import FloatArray, Plant
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 
 DIFFERENT = {"C": 1.2, "g0": 0.85, "m": 1.2}  # what a controller may believe instead, relative
 

@@ -15,6 +15,8 @@ from malta import gains
 from malta.model.data import plant_of
 from malta.simulation.payload import STEP, flown_payload, held_payload, payload
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 
 @pytest.mark.slow
 def test_statics_by_hand() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +41,7 @@ PLOTS = (
 )
 
 
+@cache
 def shipped(name: str) -> LoopCurves:
     controller = malta.gains.read(GAINS / f"{name}.json")
     return loop_curves(malta.plant_of(controller.parameters), controller)

@@ -27,6 +27,8 @@ from malta.simulation.scenario import Scenario
 from malta.tuning.search import Journal
 from malta.units import to_si
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 TABLE2 = "design/gains/table2.json"
 LONG = "w" * 5000
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from conftest import assert_folds, printed
+from conftest import DESIGNS, assert_folds, printed
 from rich.console import Console
 
 import malta
@@ -216,14 +216,16 @@ def test_every_experiment_has_a_figure_that_says_what_drew_it(
 
 
 LONG = ("commissioning", "supervised-faults", "record-v0", "lift-off", "capture")  # of many flights each
-FLOWN = [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in EXPERIMENTS]
 
 
-@pytest.mark.parametrize("design", ["table2", "calibrated"])
-@pytest.mark.parametrize("name", FLOWN)
-def test_nothing_in_a_figure_overlaps_or_is_cut_off(name: str, design: str, pictured: Pictured) -> None:
-    """Panels, axis labels, titles and legends: none lies on another, none leaves the page."""
-    figure, _ = pictured(design, name)
+QUICK = [name for name in EXPERIMENTS if name not in LONG]
+FLOWN = [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in EXPERIMENTS if name in LONG)]
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_nothing_in_a_figure_overlaps_or_is_cut_off(name: str, pictured: Pictured) -> None:
+    """Panels, axis labels, titles and legends: none lies on another, none leaves the page. See test_figures, too."""
+    figure, _ = pictured("table2", name)
     texts = [*figure.texts, *figure.legends]
     boxes: list[tuple[str, int | None, Any]] = [(str(text), None, text.get_window_extent()) for text in texts]
     for n, axes in enumerate(figure.axes):
@@ -317,7 +319,7 @@ def test_touchdowns_are_marked(flown: Flown, published: dict[str, Any]) -> None:
     assert {"touchdown", "axial end stop"} <= set(marked)
 
 
-@pytest.mark.parametrize("name", [one for one in FLOWN if one.values != ("drive-limits",)])
+@pytest.mark.parametrize("name", [one for one in FLOWN if one != "drive-limits"])
 def test_runs_that_end_early_are_drawn(
     name: str, designs: dict[str, Design], published: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -374,7 +376,7 @@ def test_experiments_are_saved_where_a_path_is_given(
     flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    report.experiment(flown("table2", "lift-off"))
+    report.experiment(flown("table2", "payload"))
     assert not list(tmp_path.iterdir())
     for name in "ab":
         report.experiment(flown("table2", "hold"), tmp_path / f"{name}.svg")
@@ -392,8 +394,13 @@ def test_importing_the_report_does_not_wait_for_matplotlib() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-@pytest.mark.parametrize("design", ["table2", "calibrated"])
-@pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.parametrize(
+    ("design", "name"),
+    [
+        *((design, name) for name in QUICK for design in DESIGNS),
+        *(pytest.param("calibrated", name, marks=pytest.mark.slow) for name in EXPERIMENTS if name in LONG),
+    ],
+)
 def test_the_table_of_an_experiment_fits_and_names_its_merits(
     name: str, design: str, flown: Flown, published: dict[str, Any]
 ) -> None:

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from malta.report.page.analysis import Analysis
     from malta.synthesis.controller import Controller
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 HOSTILE = '<script>alert("x")</script>$a_b$\\frac{\x0b'
 # of a letter in a figure and of the page, as "rgb(0, 0, 0)"
 COLOURS = """return [getComputedStyle(document.querySelector("svg text")).fill,

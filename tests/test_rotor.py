@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
     from malta.synthesis.controller import Controller
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 FOLDER = ROOT / "examples" / "rotor"
 DESIGNS = ("rotor", "rotor_pid")
 

@@ -24,6 +24,8 @@ from malta.gains.encodings import decode
 from malta.schemas import SCHEMAS, schema
 from malta.tables import load_toml
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 DESIGN_FILES = [*(ROOT / "design").glob("*.toml"), *ROOT.glob("examples/*/design/*.toml")]
 DATA_FILES = [*(ROOT / "data").glob("*.toml"), *ROOT.glob("examples/*/*.toml")]
 GAIN_FILES = [
@@ -188,11 +190,10 @@ def test_what_the_schema_refuses_the_reader_refuses(name: str, stem: str, tmp_pa
         ("design", "halbach_pid"),
         ("data", "tubular"),
         ("gain", "linear"),
-        ("gain", "table2"),
     ],
 )
 def test_whatever_the_schema_refuses_the_reader_refuses(name: str, stem: str, tmp_path: Path) -> None:
-    assert check_edits(name, stem, 300, tmp_path) > 60
+    assert check_edits(name, stem, 200, tmp_path) > 40
 
 
 def test_schemas_of_a_machine_know_its_names() -> None:

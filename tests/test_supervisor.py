@@ -42,6 +42,8 @@ from malta.firmware.watch import UNWATCHED, watch_lines, watch_table
 from malta.machines.tubular.experiments.contact import SOFT
 from malta.simulation.compiled import compiler
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 
 @pytest.fixture(autouse=True)
 def _with_compiler() -> None:

@@ -53,6 +53,8 @@ if TYPE_CHECKING:
     from malta.synthesis.spec import Spec
     from malta.tuning.tune import Tuned
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 HALBACH = """
 name = "motor_pid"
 summary = "PID"

@@ -17,6 +17,8 @@ from malta.proof.groups import groups, loop_of
 from malta.proof.uncertain import closed_loop, instability
 from malta.synthesis.controller import Controller
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 BOX = {"m": 0.2, "K_A": 0.2, "K_D": 0.2, "K_B": 0.2}
 
 

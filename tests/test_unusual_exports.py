@@ -14,6 +14,8 @@ from malta.firmware.folder import folder_files
 from malta.firmware.signals import Target
 from malta.simulation.layout import fidelities
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 STRICT = ("-Wall", "-Wextra", "-Werror")
 DESIGNS = {
     "one axis": "examples/ball/design/ball.toml",

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
     from conftest import Design
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 
 def test_stages_cost_sensitivity(design: Design) -> None:
     """Lags and delay make it worse. PI controllers may be better than their lag, which is slower."""

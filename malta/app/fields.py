@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeGuard, get_args
 
 from malta.errors import InputError
 from malta.proof.uncertain import is_commutated
@@ -18,7 +18,7 @@ from malta.synthesis.spec import Discretization, Place
 from malta.units import to_si
 
 if TYPE_CHECKING:
-    from malta.app.files import DesignFiles
+    from malta.synthesis.spec import Spec
 
 MACHINE = (
     "machine."  # the keys of machine parameters; those of the design file are its own, as "bases.state.x"
@@ -74,7 +74,18 @@ class Field:
     note: str = ""
 
 
-def fields_of(files: DesignFiles) -> tuple[Field, ...]:
+class Files(Protocol):
+    """What fields are made of: a design file and its machine's data file."""
+
+    @property
+    def spec(self) -> Spec: ...
+    @property
+    def content(self) -> dict[str, Any]: ...
+    def expand(self, table: str) -> dict[str, Any]: ...
+    def machine_entry(self, name: str) -> dict[str, Any] | None: ...
+
+
+def fields_of(files: Files) -> tuple[Field, ...]:
     """All fields of a design, in the order of its file; the machine's parameters come last."""
     return (
         *_law_fields(files),
@@ -84,7 +95,7 @@ def fields_of(files: DesignFiles) -> tuple[Field, ...]:
     )
 
 
-def _law_fields(files: DesignFiles) -> Iterator[Field]:
+def _law_fields(files: Files) -> Iterator[Field]:
     """Weights, bases, noise, and the gains of a PID."""
     variables = {entry: v for v in files.spec.search for entry in v.entries}
     for table in ("weights", "bases", "noise", "pid"):
@@ -131,7 +142,7 @@ def _range(value: float, *, zero: bool, share: bool) -> tuple[float, float, Kind
     return (0.0, 0.0, "number") if value == 0 else (-NARROW * abs(value), NARROW * abs(value), "linear")
 
 
-def _sampling_fields(files: DesignFiles) -> Iterator[Field]:
+def _sampling_fields(files: Files) -> Iterator[Field]:
     """Sample time, delay, and the switches of the design model."""
     content, group, lqg = files.content, "Sampling", files.spec.pid is None
     time = content["sample_time"]
@@ -167,7 +178,7 @@ def _sampling_fields(files: DesignFiles) -> Iterator[Field]:
         )
 
 
-def _place_fields(files: DesignFiles) -> Iterator[Field]:
+def _place_fields(files: Files) -> Iterator[Field]:
     """The operating point and the box of the uncertainty."""
     plant, content = files.spec.plant, files.content
     for name, q in content["operating_point"].items():
@@ -184,7 +195,7 @@ def _place_fields(files: DesignFiles) -> Iterator[Field]:
         )
 
 
-def _machine_fields(files: DesignFiles) -> Iterator[Field]:
+def _machine_fields(files: Files) -> Iterator[Field]:
     """The parameters of the machine in the units of its data file, with their sources as notes."""
     par = files.spec.parameters
     for f in fields(par):

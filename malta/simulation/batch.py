@@ -40,7 +40,7 @@ from malta.simulation.digest import (
     recorder_function,
     verdicts,
 )
-from malta.simulation.engines import BLOCK, EngineChoice, compiled_period, evaluate, library_of, shape_of
+from malta.simulation.engines import BLOCK, EngineChoice, engine_text, evaluate, library_of, shape_of
 from malta.simulation.inputs import Inputs, initial_values, inputs_of
 from malta.simulation.layout import electronics_of, flatten, layout_of, noise_scales, numbers_of, with_symbols
 from malta.simulation.noise import TOGETHER, advance_keys, keys, starts_of_parts
@@ -48,7 +48,6 @@ from malta.simulation.period import initial_state, period_of
 from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of, steps_of
 from malta.simulation.simulate import EngineOf, simulate
 from malta.simulation.trajectory import Trajectory, stroke_figures, trajectory_of
-from malta.simulation.translate import source
 from malta.simulation.workers import Work, run_groups
 from malta.synthesis.controller import Controller
 
@@ -281,7 +280,7 @@ def functions_text(plant: Plant, controller: Controller, scenario: Scenario) -> 
     """The functions that `simulate_many` runs as text: in C, or as CasADi stores those that have no form in C."""
     shape = shape_of(plant, controller, setup_of(plant, controller, scenario))
     if not plant_of(controller.parameters).tabulated:
-        return source(compiled_period(shape), digest_function(shape), cruise_functions(shape))
+        return engine_text(shape, digest_function(shape), cruise_functions(shape))
     period = period_of(plant, controller, shape.setup, numbers_of(plant, controller, 1), constant=True)
     return "\n".join(f.serialize() for f in (period.sense, period.decide, period.substep))
 

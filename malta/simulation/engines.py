@@ -112,14 +112,19 @@ def library_of(
     digest : the function that updates a run's digest; for several lanes
     cruise : see digest.cruise_functions
     """
-    c = shape.controller
-    if plant_of(c.parameters).tabulated:
+    if plant_of(shape.controller.parameters).tabulated:
         return None
-    p = compiled_period(shape)
-    lib = library(source(p, digest, cruise), lanes)
-    return None if lib is None else (lib, p)
+    lib = library(engine_text(shape, digest, cruise), lanes)
+    return None if lib is None else (lib, compiled_period(shape))
 
 
+@lru_cache(maxsize=32)
+def engine_text(shape: Shape, digest: ca.Function | None = None, cruise: tuple[ca.Function, ...] = ()) -> str:
+    """The C text of a shape's engine; digest and cruise as in `library_of`."""
+    return source(compiled_period(shape), digest, cruise)
+
+
+@lru_cache(maxsize=32)
 def compiled_period(shape: Shape) -> Period:
     """The functions of a control period as they are compiled: with numbers as arguments, without what drops out."""
     plant, c, setup = shape.plant, shape.controller, shape.setup

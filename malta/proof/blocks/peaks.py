@@ -13,7 +13,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy import optimize
 
 from malta.model.plant import readonly
 
@@ -99,6 +98,8 @@ def climb(
 
 def _uphill(value: Value, place: Peak, sides: FloatArray, top: float, until: float) -> Peak:
     """Ascend from a place to the next maximum, by L-BFGS in parameters and log frequency, then in frequency alone."""
+    from scipy import optimize  # here: it takes long to import, and few commands need it
+
     free = np.flatnonzero(sides[:, 1] > sides[:, 0])
     low, width = sides[free, 0], sides[free, 1] - sides[free, 0]
     best = place

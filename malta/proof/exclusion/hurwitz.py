@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat
-from scipy.optimize import linear_sum_assignment
 
 from malta.proof.expressions import NotAnalytic, exact
 from malta.proof.polynomial.characteristic import pair
@@ -308,6 +307,8 @@ def _determinant_degree(degrees: list[int]) -> int:
         k = n - 2 * j + i
         if 0 <= k <= n and degrees[k] >= 0:
             weight[i - 1, j - 1] = degrees[k]
+    from scipy.optimize import linear_sum_assignment  # here: it takes long to import, and few loops need it
+
     rows, columns = linear_sum_assignment(weight, maximize=True)
     return max(0, round(float(weight[rows, columns].sum())))
 
