@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
 
-from malta.campaigns.yields import Yields, main_yields
+from malta.campaigns.yields import Yields, main_campaign, yields_of
 from malta.loops.loop import loop_of_model
 from malta.loops.recovery import PLACES, Deviation, recovery
 from malta.machines.tubular.experiments.rest import hold
@@ -44,7 +44,8 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant
 
 EXPERIMENT_NAMES = ("stroke", "hold", "tilt", "payload", "thermal")
-MACHINES, FEW = 10_000, 200  # of the yields, with and without a C compiler
+MACHINES, FEW = 4_000, 200  # of the yields, with and without a C compiler
+UNSETTLED = 0.25  # share of them that fly without rest before, too
 SEEDS = 16  # of rests: the motion of a slow design moves by a fifth from one to the next
 IMPLIED_RATIO = 4.0  # K1 / k at which the LQR stands the published 300 % of a 20 % box
 
@@ -63,7 +64,8 @@ class Evidence:
     braked: float  # m/s, published speed from which the mover is braked into the DC link
     growth: float  # m, thermal growth of the published arm
     published: Mapping[str, Any]
-    yields: Yields  # of MACHINES that differ, in the stroke
+    strokes: Strokes  # of MACHINES that differ, after SETTLE at rest
+    unsettled: Strokes  # of fewer, from the first sample on
     rests: Mapping[str, float]  # figures of merit of the hold, SI: root mean squares over SEEDS
 
 
@@ -75,6 +77,7 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
     v0[:, plant.thrust_input] = 0
     without = replace(controller, feedforward=replace(controller.feedforward, v0=v0))
     slow = simulate(plant, without, Scenario("stroke", 0.4, partial(delayed_stroke, wait=0.0)))
+    machines = MACHINES if compiler() else FEW
     return Evidence(
         spec,
         model,
@@ -86,9 +89,28 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
         published_value(published, "dc_link.speed"),
         published_value(published, "thermal.length") * published_value(published, "thermal.strain"),
         published,
-        main_yields(controller, spec, published, machines=MACHINES if compiler() else FEW),
+        strokes_of(controller, spec, published, machines=machines, settle=True),
+        strokes_of(controller, spec, published, machines=round(UNSETTLED * machines), settle=False),
         rests_of_seeds(plant, controller, range(SEEDS)),
     )
+
+
+class Strokes(NamedTuple):
+    """Strokes of many machines: yields, and the largest radial deviation of each that completed it, m."""
+
+    yields: Yields
+    median: float
+    largest: float
+
+
+def strokes_of(
+    controller: Controller, spec: Spec, published: Mapping[str, Any], *, machines: int, settle: bool
+) -> Strokes:
+    """The strokes of machines drawn from the design's uncertainty, after a rest or from the first sample on."""
+    flown = main_campaign(controller, spec, machines, settle=settle)
+    axis = spec.plant.stroke_output
+    radial = np.delete(flown.batch.deviation[flown.completed], axis, axis=1).max(axis=1)
+    return Strokes(yields_of(flown, published, spec), float(np.median(radial)), float(radial.max()))
 
 
 def rests_of_seeds(plant: Plant, controller: Controller, seeds: Sequence[int]) -> dict[str, float]:
@@ -177,7 +199,13 @@ def link_rise(e: Evidence) -> float:
 
 def yield_share(kind: str, e: Evidence) -> float:
     """A share of the machines that differ, by a field of Yields; NaN without bounds."""
-    found: Rate | None = getattr(e.yields, kind)
+    found: Rate | None = getattr(e.strokes.yields, kind)
+    return math.nan if found is None else found.share
+
+
+def unsettled_share(e: Evidence) -> float:
+    """The share of machines that keep every published bound without rest before; NaN without bounds."""
+    found = e.unsettled.yields.published
     return math.nan if found is None else found.share
 
 

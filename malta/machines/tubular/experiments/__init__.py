@@ -39,6 +39,7 @@ from malta.machines.tubular.experiments.strokes import (
     stroke,
     stroke_cases,
 )
+from malta.machines.tubular.experiments.strokes import SETTLE as SETTLE
 from malta.simulation.experiments import (
     Experiment,
     PlannedRun,
