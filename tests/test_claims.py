@@ -398,7 +398,7 @@ VERDICTS = {
     "thermal: growth": BUILT,
     "at rest: z measured": BUILT,
     "at rest: y1 measured": BUILT,
-    "payload carried": "not reproduced: smaller, x > 1000, x 4.0; ",
+    "payload picked": "table2: not reproduced: smaller, x 1.7; calibrated: larger, x 3.7; ",
 }
 
 
@@ -632,20 +632,21 @@ def test_what_a_newton_along_z_meets_is_what_the_machine_does(found: Found) -> N
         assert 1 < ratio < 2
 
 
-def test_a_payload_is_carried_as_the_stroke_is_published(found: Found) -> None:
-    """Of 50 to 200 g: table2 carries 100 g, none of it precisely; `calibrated` all, within the bounds 50 g alone."""
-    for name, evidence, kept in zip(NAMES, found.evidence, (0.0, 0.05), strict=True):
-        errors = {
-            case.label: {merit.label: merit.value for merit in case.merits}
-            for case in evidence.experiments["payload"].cases
-        }
-        assert found.value("payload carried", name) == pytest.approx(kept)
-        within = [
-            e["stroke: axial error"] <= 0.6e-3 and e["stroke: radial deviation"] <= 20e-6
-            for e in errors.values()
-        ]
-        assert within == [kept > 0, False, False, False]
-    assert [found.value("the same without touchdown", name) for name in NAMES] == [0.1, 0.2]
+def test_a_payload_is_moved_as_the_stroke_is_published(found: Found) -> None:
+    """The largest that keeps all bounds of Figs 12 and 13, and 10 % more does not; overshoot is one of them."""
+    bounds = {"stroke: overshoot": 0.015, "stroke: axial error": 0.6e-3, "stroke: radial deviation": 20e-6}
+    for start, known in (("payload moved within", False), ("the same, its weight", True)):
+        mass, design = found.value(start, "calibrated"), found.evidence[1]
+        assert (mass > 0.2) == known
+        for share in (1.0, 1.1):
+            options: dict[str, Any] = {"masses": (share * mass,), "known": known}
+            flown = malta.experiment("payload", design.spec.plant, design.controller, **options)
+            kept = [m.value <= bounds.get(m.label, math.inf) for m in flown.cases[0].merits]
+            assert all(kept) == (share == 1.0)
+    assert found.value("payload moved within", "calibrated") == pytest.approx(0.02, abs=0.01)
+    # Without bounds the trials do not end at the published 0.2 kg.
+    carried = [found.value("payload picked", name) for name in NAMES]
+    assert carried == pytest.approx([0.116, 0.732], rel=0.05)
 
 
 def test_figures_are_those_of_the_experiments(found: Found) -> None:
@@ -657,7 +658,6 @@ def test_figures_are_those_of_the_experiments(found: Found) -> None:
             ("stroke: rise", "stroke", "rise, 10-90 %"),
             ("stroke: overshoot", "stroke", "overshoot"),
             ("stroke: axial error", "stroke", "axial error"),
-            ("the same without touchdown", "payload", "largest of these carried and moved"),
         ):
             merit = next(m for m in evidence.experiments[experiment].merits if m.label == label)
             assert found.value(start, name) == pytest.approx(in_unit(merit.value, merit.unit), rel=1e-12)
