@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
+from scipy.special import stdtrit
 
 from malta.campaigns.yields import Yields, main_campaign, yields_of
 from malta.loops.loop import loop_of_model
@@ -23,6 +24,7 @@ from malta.model.published import published_value
 from malta.proof.machine.parametric_plants import of_plant
 from malta.proof.robust import robust_margin
 from malta.report.ledger import (
+    Chance,
     proven_share,
     run_design,
 )
@@ -49,6 +51,7 @@ EXPERIMENT_NAMES = ("stroke", "hold", "tilt", "thermal")
 MACHINES, FEW = 4_000, 200  # of the yields, with and without a C compiler
 UNSETTLED = 0.25  # share of them that fly without rest before, too
 SEEDS = 16  # of rests: the motion of a slow design moves by a fifth from one to the next
+NOISY, FLIGHTS = ("tilt", "thermal"), 5  # experiments whose figures are means over seeds; how many
 IMPLIED_RATIO = 4.0  # K1 / k at which the LQR stands the published 300 % of a 20 % box
 
 
@@ -68,7 +71,8 @@ class Evidence:
     published: Mapping[str, Any]
     strokes: Strokes  # of MACHINES that differ, after SETTLE at rest
     unsettled: Strokes  # of fewer, from the first sample on
-    rests: Mapping[str, float]  # figures of merit of the hold, SI: root mean squares over SEEDS
+    rests: Mapping[str, Chance]  # figures of merit of the hold: root mean squares over SEEDS
+    flights: Mapping[tuple[str, int], Chance]  # first figures of the cases of NOISY: means over FLIGHTS seeds
 
 
 def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
@@ -94,6 +98,7 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
         strokes_of(controller, spec, published, machines=machines, settle=True),
         strokes_of(controller, spec, published, machines=round(UNSETTLED * machines), settle=False),
         rests_of_seeds(plant, controller, range(SEEDS)),
+        flights_of_seeds(plant, controller, range(FLIGHTS)),
     )
 
 
@@ -115,10 +120,33 @@ def strokes_of(
     return Strokes(yields_of(flown, published, spec), float(np.median(radial)), float(radial.max()))
 
 
-def rests_of_seeds(plant: Plant, controller: Controller, seeds: Sequence[int]) -> dict[str, float]:
-    """The figures of merit of rests with other noise, by their labels, SI: root mean squares over the seeds."""
+def mean_of_seeds(values: Sequence[float]) -> Chance:
+    """The mean of one value for each seed, with Student's interval."""
+    scatter = float(np.std(values, ddof=1)) / math.sqrt(len(values))
+    return Chance(float(np.mean(values)), float(stdtrit(len(values) - 1, 0.975)) * scatter)
+
+
+def rests_of_seeds(plant: Plant, controller: Controller, seeds: Sequence[int]) -> dict[str, Chance]:
+    """The figures of merit of rests with other noise, by their labels: root mean squares over the seeds."""
     each = [{m.label: m.value for m in hold(plant, controller, seed=seed).merits} for seed in seeds]
-    return {label: math.sqrt(sum(one[label] ** 2 for one in each) / len(each)) for label in each[0]}
+    squares = {label: mean_of_seeds([one[label] ** 2 for one in each]) for label in each[0]}
+    roots = {label: math.sqrt(square) for label, square in squares.items()}
+    return {
+        label: Chance(root, squares[label].half / (2 * root) if root else 0.0)
+        for label, root in roots.items()
+    }
+
+
+def flights_of_seeds(
+    plant: Plant, controller: Controller, seeds: Sequence[int]
+) -> dict[tuple[str, int], Chance]:
+    """The first figure of each case of NOISY, by experiment and case: means over the seeds."""
+    found: dict[tuple[str, int], Chance] = {}
+    for name in NOISY:
+        flown = [experiment(name, plant, controller, seed=seed).cases for seed in seeds]
+        for case in range(len(flown[0])):
+            found[name, case] = mean_of_seeds([cases[case].merits[0].value for cases in flown])
+    return found
 
 
 def pole(name: str, e: Evidence) -> float:
@@ -199,16 +227,13 @@ def link_rise(e: Evidence) -> float:
     return float(link_voltage(par.V_dc, par.C_dc, par.m * e.braked**2 / 2) - par.V_dc)
 
 
-def yield_share(kind: str, e: Evidence) -> float:
-    """A share of the machines that differ, by a field of Yields; NaN without bounds."""
-    found: Rate | None = getattr(e.strokes.yields, kind)
-    return math.nan if found is None else found.share
+def yield_share(kind: str, strokes: str, e: Evidence) -> Chance:
+    """A share of the machines that differ, by a field of Yields; NaN without bounds.
 
-
-def unsettled_share(e: Evidence) -> float:
-    """The share of machines that keep every published bound without rest before; NaN without bounds."""
-    found = e.unsettled.yields.published
-    return math.nan if found is None else found.share
+    strokes : "strokes" or "unsettled"
+    """
+    found: Rate | None = getattr(getattr(e, strokes).yields, kind)
+    return Chance(math.nan, math.nan) if found is None else Chance(found.share, (found.high - found.low) / 2)
 
 
 def published_stroke(e: Evidence) -> StrokeFigures:
@@ -253,14 +278,19 @@ def carried_payload(e: Evidence) -> float:
     return flown_payload(plant, e.controller, held_payload(plant))[0]
 
 
-def true_radial(e: Evidence) -> float:
+def true_radial(e: Evidence) -> Chance:
     """Largest rms of the true radial motion at rest, m."""
     return max(e.rests[f"true {name}, rms"] for name in ("x1", "y1", "x2", "y2"))
 
 
-def measured_at_rest(name: str, e: Evidence) -> float:
+def measured_at_rest(name: str, e: Evidence) -> Chance:
     """Standard deviation of an output's measurements at rest, m."""
     return e.rests[f"measured {name}, std"]
+
+
+def mean_at_rest(name: str, e: Evidence) -> Chance:
+    """Size of the mean of an output's measurements at rest, m."""
+    return e.rests[f"measured {name}, mean"]
 
 
 def noise_forces(e: Evidence) -> tuple[float, float]:
