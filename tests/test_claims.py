@@ -21,12 +21,19 @@ from malta import references
 from malta.loops.sampled_loops import machine_loop
 from malta.machines.tubular import claims as tubular
 from malta.machines.tubular import evidence as tubular_evidence
-from malta.machines.tubular.evidence import EXPERIMENT_NAMES, SEEDS, Evidence, is_solved_for_ratio
+from malta.machines.tubular.evidence import (
+    EXPERIMENT_NAMES,
+    SEEDS,
+    Evidence,
+    is_solved_for_ratio,
+    mean_of_seeds,
+)
 from malta.machines.tubular.experiments.rest import RESTING
 from malta.model.data import plant_of
 from malta.model.published import published_value
 from malta.report import ledger as claims
 from malta.report.ledger import Claim, Ledger, Row
+from malta.simulation.compiled import compiler
 from malta.simulation.experiments import REAL
 from malta.simulation.responses import step_wrench
 from malta.simulation.scenario import Scenario
@@ -398,7 +405,7 @@ VERDICTS = {
     "thermal: growth": BUILT,
     "at rest: z measured": BUILT,
     "at rest: y1 measured": BUILT,
-    "payload carried": "not reproduced: smaller, x > 1000, x 4.0; ",
+    "payload picked": "table2: not reproduced: smaller, x 1.7; calibrated: larger, x 3.7; ",
 }
 
 
@@ -632,20 +639,21 @@ def test_what_a_newton_along_z_meets_is_what_the_machine_does(found: Found) -> N
         assert 1 < ratio < 2
 
 
-def test_a_payload_is_carried_as_the_stroke_is_published(found: Found) -> None:
-    """Of 50 to 200 g: table2 carries 100 g, none of it precisely; `calibrated` all, within the bounds 50 g alone."""
-    for name, evidence, kept in zip(NAMES, found.evidence, (0.0, 0.05), strict=True):
-        errors = {
-            case.label: {merit.label: merit.value for merit in case.merits}
-            for case in evidence.experiments["payload"].cases
-        }
-        assert found.value("payload carried", name) == pytest.approx(kept)
-        within = [
-            e["stroke: axial error"] <= 0.6e-3 and e["stroke: radial deviation"] <= 20e-6
-            for e in errors.values()
-        ]
-        assert within == [kept > 0, False, False, False]
-    assert [found.value("the same without touchdown", name) for name in NAMES] == [0.1, 0.2]
+def test_a_payload_is_moved_as_the_stroke_is_published(found: Found) -> None:
+    """The largest that keeps all bounds of Figs 12 and 13, and 10 % more does not; overshoot is one of them."""
+    bounds = {"stroke: overshoot": 0.015, "stroke: axial error": 0.6e-3, "stroke: radial deviation": 20e-6}
+    for start, known in (("payload moved within", False), ("the same, its weight", True)):
+        mass, design = found.value(start, "calibrated"), found.evidence[1]
+        assert (mass > 0.2) == known
+        for share in (1.0, 1.1):
+            options: dict[str, Any] = {"masses": (share * mass,), "known": known}
+            flown = malta.experiment("payload", design.spec.plant, design.controller, **options)
+            kept = [m.value <= bounds.get(m.label, math.inf) for m in flown.cases[0].merits]
+            assert all(kept) == (share == 1.0)
+    assert found.value("payload moved within", "calibrated") == pytest.approx(0.02, abs=0.01)
+    # Without bounds the trials do not end at the published 0.2 kg.
+    carried = [found.value("payload picked", name) for name in NAMES]
+    assert carried == pytest.approx([0.116, 0.732], rel=0.05)
 
 
 def test_figures_are_those_of_the_experiments(found: Found) -> None:
@@ -657,7 +665,6 @@ def test_figures_are_those_of_the_experiments(found: Found) -> None:
             ("stroke: rise", "stroke", "rise, 10-90 %"),
             ("stroke: overshoot", "stroke", "overshoot"),
             ("stroke: axial error", "stroke", "axial error"),
-            ("the same without touchdown", "payload", "largest of these carried and moved"),
         ):
             merit = next(m for m in evidence.experiments[experiment].merits if m.label == label)
             assert found.value(start, name) == pytest.approx(in_unit(merit.value, merit.unit), rel=1e-12)
@@ -668,9 +675,44 @@ def test_figures_are_those_of_the_experiments(found: Found) -> None:
         ):
             case = evidence.experiments[experiment].cases[number]
             assert case.label == label
-            assert found.value(start, name) == pytest.approx(case.merits[0].value * 1e6)
+            figure = evidence.flights[experiment, number]  # the experiment is that of one of the seeds
+            assert found.value(start, name) == pytest.approx(1e6 * figure)
+            assert case.merits[0].value == pytest.approx(figure, abs=5 * figure.half)
         assert "largest deviation" in evidence.experiments["thermal"].cases[0].merits[0].label
         assert evidence.experiments["tilt"].cases[0].merits[0].label == "SP2: largest deviation, true"
+
+
+def test_figures_of_chance_show_their_interval(found: Found) -> None:
+    """Student's interval of a mean, and of a mean square; what is no chance has none."""
+    values = [3.0, 4.0, 5.0]
+    figure = mean_of_seeds(values)
+    assert (figure, figure.half) == pytest.approx((4.0, 4.302653 / math.sqrt(3)), rel=1e-6)
+    (row,) = [c for c in found.ledger.claims if c.subject.startswith("at rest: radial motion")]
+    for cell, e in zip(row.ours, found.evidence, strict=True):
+        rest = max(e.rests[f"true {name}, rms"] for name in ("x1", "y1", "x2", "y2"))
+        assert cell == f"{1e6 * rest:.3f} ±{1e6 * rest.half:.3f}"
+        assert 0 < rest.half < 0.3 * rest
+    shares = [c for c in found.ledger.claims if c.subject.startswith("machines ±20 %: stroke")]
+    assert all(" ±" in cell for c in shares for cell in c.ours if cell != "–")
+    (poles,) = [c for c in found.ledger.claims if c.subject.startswith("change of the poles")]
+    assert not any("±" in cell for cell in poles.ours)
+
+
+def test_a_rest_before_the_stroke_takes_radial_deviations_off(found: Found) -> None:
+    """`calibrated`: a third in the median; table2, whose integrals take minutes, loses more of its machines instead."""
+    first, second = found.evidence
+    assert second.strokes.median < 0.4 * second.unsettled.median
+    assert first.strokes.yields.completed.share < first.unsettled.yields.completed.share
+
+
+def test_releases_are_those_of_the_experiment(found: Found) -> None:
+    """The force limit decides, not the gains: 0.91 of what it allows, and every start inside the bearings returns."""
+    if compiler() is None:
+        pytest.skip("needs a C compiler")
+    for name in NAMES:
+        assert found.value("released downwards: share", name) == pytest.approx(91.5, abs=1.5)
+        assert found.value("released anywhere", name) == 100
+        assert found.value("released aside, downwards", name) < found.value("released aside, along x", name)
 
 
 def test_rests_are_those_of_many_seeds(found: Found) -> None:
@@ -725,7 +767,5 @@ def test_means_at_rest_are_of_the_order_that_the_paper_prints(
     for name, size in printed.items():
         assert found.value(f"at rest, mean of {name}", "calibrated") < 1
         assert size < 1
-        merit = next(
-            m for m in found.evidence[1].experiments["hold"].merits if m.label == f"measured {name}, mean"
-        )
-        assert found.value(f"at rest, mean of {name}", "calibrated") == pytest.approx(abs(merit.value) * 1e6)
+        mean = found.evidence[1].rests[f"measured {name}, mean"]
+        assert found.value(f"at rest, mean of {name}", "calibrated") == pytest.approx(1e6 * mean)

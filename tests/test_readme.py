@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 
 import pytest
 from conftest import ROOT
@@ -11,6 +12,7 @@ from scipy.stats import binomtest
 import malta
 from malta.campaigns.yields import main_yields
 from malta.machines.tubular.claims import SOURCE
+from malta.machines.tubular.evidence import UNSETTLED
 from malta.report.markdown import find_tables
 
 pytestmark = pytest.mark.usefixtures("proven_once")
@@ -23,8 +25,8 @@ DESIGNS = {
 }
 OBSERVED = ("robust_observer",)  # a table of its own on the page of its machine
 PAGES = {name: (ROOT / "docs" / "claims" / f"{name}.md").read_text(encoding="utf-8") for name in DESIGNS}
-DRAWN = "machines ±20 %"  # rows that are shares of machines drawn at random
-FEW = 1000  # machines in the fast test
+DRAWN = "machines ±20 %"  # rows of machines drawn at random: shares, and deviations
+FEW = 240  # machines in the fast test
 TIMED = "K(p) and pseudo-inverse"  # rows that are measured on the computer that computes them
 # Rows of a limit cycle's size: the last bit of the arithmetic decides which part of it the samples meet (92 to 109).
 CYCLES = "three times as fast, filter without"
@@ -91,7 +93,7 @@ def _is_noisy(machine: str, subject: str) -> bool:
 def test_the_table_of_claims_is_computed(
     machine: str, designs: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Yields, of 10 000 machines on the pages, are computed of FEW: they lie within the interval of these."""
+    """Yields, of 4000 machines on the pages, are computed of FEW: they lie within the interval of these."""
     monkeypatch.setattr("malta.machines.tubular.evidence.MACHINES", FEW)
     specs = [malta.read_design(f"design/{name}.toml") for name in designs]
     ledger = malta.ledger(specs, malta.published(f"data/{machine}.toml"))
@@ -104,8 +106,9 @@ def test_the_table_of_claims_is_computed(
             continue
         numbers = [[_number(cell) for cell in row[1:-1]] for row in (shown[subject], cells)]
         if subject.startswith(DRAWN):
-            assert shown[subject][-1] == cells[-1]
-            assert [_is_of_sample(*pair) for pair in zip(*numbers, strict=True)] == [True] * len(numbers[0])
+            count = round(UNSETTLED * FEW) if "no rest before" in subject else FEW
+            within = partial(_is_of_sample, count) if "[%]" in subject else _is_as_large
+            assert [within(*pair) for pair in zip(*numbers, strict=True)] == [True] * len(numbers[0])
             continue
         if _is_noisy(machine, subject) and None not in numbers[0]:
             # A mean of noise around zero has no size of its own, but that of its scatter.
@@ -118,31 +121,37 @@ def test_the_table_of_claims_is_computed(
             assert shown[subject][1:] == cells[1:]
 
 
-def _is_of_sample(shown: float | None, found: float | None) -> bool:
-    """Whether a share in percent lies in the interval, 99.9 %, of a share of FEW machines; no share, no sample."""
+def _is_as_large(shown: float | None, found: float | None) -> bool:
+    """Whether a median or a largest deviation is about that of fewer machines, whose largest is smaller."""
+    return shown is not None and found is not None and 0.3 * shown <= found <= 1.5 * shown
+
+
+def _is_of_sample(count: int, shown: float | None, found: float | None) -> bool:
+    """Whether a share in percent lies in the interval, 99.9 %, of a share of `count` machines; no share, no sample."""
     if shown is None or found is None:
         return shown is found
-    low, high = binomtest(round(found / 100 * FEW), FEW).proportion_ci(0.999, method="exact")
+    low, high = binomtest(round(found / 100 * count), count).proportion_ci(0.999, method="exact")
     return bool(low - 1e-3 <= shown / 100 <= high + 1e-3)
 
 
 @pytest.mark.slow
-def test_yields_are_those_of_ten_thousand_machines() -> None:
+def test_yields_of_the_flagship_are_those_of_all_machines() -> None:
     """All of them; the last digits of the arithmetic decide for machines at a bound."""
     shown = _shown(f"tubular, {SOURCE}", DESIGNS["tubular"])
     published = malta.published("data/tubular.toml")
-    for k, name in enumerate(DESIGNS["tubular"]):
+    for name in ("robust",):
+        k = DESIGNS["tubular"].index(name)
         controller = malta.gains.read(f"design/gains/{name}.json")
         found = main_yields(controller, malta.read_design(f"design/{name}.toml"), published)
         within = shown[f"{DRAWN}: stroke within the published bounds [%]"][1 + k]
         assert found.published is not None
-        assert float(within) == pytest.approx(100 * found.published.share, abs=0.2)
+        assert _number(within) == pytest.approx(100 * found.published.share, abs=0.2)
         completed = shown[f"{DRAWN}: stroke without touchdown [%]"][1 + k]
-        assert float(completed) == pytest.approx(100 * found.completed.share, abs=0.2)
+        assert _number(completed) == pytest.approx(100 * found.completed.share, abs=0.2)
 
 
 def _number(cell: str) -> float | None:
     try:
-        return float(cell)
+        return float(cell.partition(" ±")[0])  # with or without an interval
     except ValueError:
         return None

@@ -370,6 +370,14 @@ def test_the_front_trades_margin_for_noise(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["robust_observer", "planar_pid"])
+def test_other_shipped_designs_hold_all_that_is_asked_for(name: str) -> None:
+    """`robust`, `tubular_pid` and `halbach_pid` have tests of their own; no verdict is "undecided" either."""
+    rows = judge(malta.read_design(f"design/{name}.toml"))
+    assert [row.name for row in rows if row.asked is not None and not row.holds] == []
+
+
+@pytest.mark.slow
 def test_a_poor_start_finds_its_way(spec: Spec) -> None:
     """From the middle of every range, where the loop has a margin of a third of what is asked for, or none."""
     middle = [math.sqrt(v.low * v.high) for v in spec.search]
@@ -378,8 +386,8 @@ def test_a_poor_start_finds_its_way(spec: Spec) -> None:
     poor = replace(spec.vary(middle), delays=(0,), specification=asked)
     found = tuned(poor, effort=Effort(generations=15, polish=30, front=0))
     # All at once is at the edge of what can be had: a search from elsewhere ends within some percent of it.
-    linear = {(r.name, r.how): r.ratio for r in found.requirements if r.how != "simulated hold"}
-    assert max(linear.values()) < 1.06, max(linear, key=linear.__getitem__)
+    ratios = {(r.name, r.how): r.ratio for r in found.requirements}
+    assert max(ratios.values()) < 1.06, max(ratios, key=ratios.__getitem__)
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from malta import gains
 from malta.campaigns.plan import Plan
 from malta.campaigns.run import campaign
 from malta.campaigns.yields import main_yields, runs_within_specification, specified_bounds, yields_of
+from malta.machines.tubular.experiments.strokes import SETTLE
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,7 +33,7 @@ def spec() -> Spec:
 
 @pytest.fixture(scope="module")
 def flown() -> Campaign:
-    return campaign(Plan(gains.read(LOADS), "stroke", BOX, samples=256))
+    return campaign(Plan(gains.read(LOADS), "stroke", BOX, samples=256, options={"settle": SETTLE}))
 
 
 def test_bounds_of_a_design_are_those_of_its_file(flown: Campaign, spec: Spec) -> None:

@@ -257,8 +257,12 @@ def _are_possible(columns: Mapping[str, Any], plan: Plan, count: int) -> bool:
         if columns[name].dtype != np.float64 or columns[name].shape != (count, *shape):
             return False
     verdict, completed = columns["verdict"], columns["completed"]
-    longest = planned_run(plan).scenario.duration + plan.controller.sample_time
-    ranges = {"duration": (0, longest), "saturated": (0, 1), "verdict": (0, len(verdicts(plan.plant)) - 1)}
+    Ts, scenario = plan.controller.sample_time, planned_run(plan).scenario
+    ranges = {
+        "duration": (-scenario.settling_samples(Ts) * Ts, scenario.duration + Ts),
+        "saturated": (0, 1),
+        "verdict": (0, len(verdicts(plan.plant)) - 1),
+    }
     inside = [
         ((columns[name] >= low) & (columns[name] <= high)).all() for name, (low, high) in ranges.items()
     ]

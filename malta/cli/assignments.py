@@ -136,9 +136,11 @@ def read_uncertainty(
     return box
 
 
-def scenario_options(distance: float | None, rise: float | None, **others: Any) -> dict[str, Any]:
-    """The options of a scenario that are not None, in SI: `distance` comes in mm, `rise` in ms."""
-    scaled = {"distance": distance, "rise": rise}
+def scenario_options(
+    distance: float | None, rise: float | None, settle: float | None, **others: Any
+) -> dict[str, Any]:
+    """The options of a scenario that are not None, in SI: `distance` comes in mm, `rise` and `settle` in ms."""
+    scaled = {"distance": distance, "rise": rise, "settle": settle}
     options = {name: None if value is None else value * 1e-3 for name, value in scaled.items()} | others
     return {name: value for name, value in options.items() if value is not None}
 

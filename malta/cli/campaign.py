@@ -12,6 +12,7 @@ from malta.cli.completion import scenarios
 from malta.cli.inputs import change_machine, design_of, print_scenarios, read_controller
 from malta.cli.options import (
     SCENARIOS,
+    SETTLE,
     AsJson,
     Bearing,
     BearingAxes,
@@ -75,6 +76,10 @@ def campaign(
     change: Changes = None,
     distance: Distance = None,
     rise: Rise = None,
+    settle: Annotated[
+        float | None,
+        typer.Option(help=f"{SETTLE} [300 where yields of MALTA's strokes are counted, else 0]"),
+    ] = None,
     profile: ProfileName = None,
     option: OwnOptions = None,
     fidelity: FidelityName = None,
@@ -159,7 +164,7 @@ def campaign(
     from malta.campaigns.survey import summarize
     from malta.model.data import plant_of
     from malta.model.published import published_figures
-    from malta.simulation.catalogue import main_job
+    from malta.simulation.catalogue import main_job, settling
 
     controller = read_controller(gains, machine)
     parameters = change_machine(controller.parameters, change)
@@ -173,6 +178,7 @@ def campaign(
     options = scenario_options(
         distance,
         rise,
+        settle,
         profile=profile,
         fidelity=fidelity,
         noise=noise,
@@ -186,6 +192,8 @@ def campaign(
         substeps=substeps,
     )
     options = add_own_options(options, option, scenario, plant)
+    if rare is None:
+        options = settling(scenario, plant) | options
     plan = Plan(
         controller,
         scenario,

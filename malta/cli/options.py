@@ -42,6 +42,8 @@ SCENARIOS = "`--scenario help` lists them. [the first]"
 # Options of a run, in `simulate` and in `campaign`.
 Distance = Annotated[float | None, typer.Option(help="Length of a stroke [mm]. [the scenario's]")]
 Rise = Annotated[float | None, typer.Option(help="Its rise, 10-90 % [ms]. [the scenario's]")]
+SETTLE = "Rest before it begins, of which no figure tells [ms]."
+Settle = Annotated[float | None, typer.Option(help=f"{SETTLE} [0]")]
 OwnOptions = Annotated[
     list[str] | None,
     typer.Option(

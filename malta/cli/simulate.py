@@ -37,6 +37,7 @@ from malta.cli.options import (
     Rise,
     Scheduled,
     Seed,
+    Settle,
     Substeps,
     Yes,
 )
@@ -68,6 +69,7 @@ def simulate(
     change: Changes = None,
     distance: Distance = None,
     rise: Rise = None,
+    settle: Settle = None,
     profile: ProfileName = None,
     during: Annotated[
         str | None, typer.Option(help="Faults strike during a stroke or a hold. [the scenario's]")
@@ -139,6 +141,7 @@ def simulate(
     options = scenario_options(
         distance,
         rise,
+        settle,
         profile=profile,
         during=during,
         fidelity=fidelity,

@@ -114,6 +114,21 @@ def run_design(spec: Spec, names: Sequence[str], progress: Progress | None = Non
     return DesignRuns(model, controller, verify(model, controller, spec.uncertainty), experiments)
 
 
+class Chance(float):
+    """A figure of chance: a float with half of its 95 % interval, SI, which is shown behind it.
+
+    >>> Chance(0.14, 0.01).half
+    0.01
+    """
+
+    half: float
+
+    def __new__(cls, value: float, half: float) -> Chance:
+        figure = super().__new__(cls, value)
+        figure.half = half
+        return figure
+
+
 class Row(NamedTuple):
     """A figure that the paper publishes, and the function of a design's evidence that computes ours."""
 
@@ -172,8 +187,9 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
 def _claim(row: Row, found: Sequence[Evidence], published: Mapping[str, Any]) -> Claim:
     """The line of the ledger for a row and the evidence of all designs."""
     judged = [e for e in found if not (row.of_lqg and e.spec.pid)]
-    values = [in_unit(row.value(e), row.unit) if e in judged else math.nan for e in found]
-    ours = tuple("–" if math.isnan(value) else row.form.format(value) for value in values)
+    figures = [row.value(e) if e in judged else math.nan for e in found]
+    values = [in_unit(figure, row.unit) for figure in figures]
+    ours = tuple(_shown(row, figure) for figure in figures)
     unit = {"1": "", "percent": " [%]", "um": " [µm]", "urad": " [µrad]", "deg": " [°]"}.get(
         row.unit, f" [{row.unit}]"
     )
@@ -192,6 +208,15 @@ def _claim(row: Row, found: Sequence[Evidence], published: Mapping[str, Any]) ->
     built = [row.by_construction(e) if callable(row.by_construction) else row.by_construction for e in judged]
     verdict = _verdict(row, target, own, [e.spec.name for e in judged], built)
     return Claim(subject, mark + printed, ours, verdict)
+
+
+def _shown(row: Row, figure: float) -> str:
+    """A figure in the row's form, with its interval if it is one of chance; "–" for none."""
+    if math.isnan(figure):
+        return "–"
+    text = row.form.format(in_unit(figure, row.unit))
+    half = in_unit(figure.half, row.unit) if isinstance(figure, Chance) else None
+    return text if half is None else f"{text} ±{row.form.format(half)}"
 
 
 def _verdict(

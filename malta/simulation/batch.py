@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
@@ -38,6 +38,7 @@ from malta.simulation.digest import (
     digest_sizes,
     first_digest,
     recorder_function,
+    restart,
     verdicts,
 )
 from malta.simulation.engines import BLOCK, EngineChoice, engine_text, evaluate, library_of, shape_of
@@ -117,13 +118,17 @@ def simulate_many(
     if compiled is None:
         return _simulate_one_by_one(alone, variation, progress)
     inputs, shared, lanes, parts = _prepare(simulation, variation)
-    digest = first_digest(plant, inputs.motion.p)
+    digest, sizes = first_digest(plant, inputs.motion.p), digest_sizes(plant)
     groups, runs = len(lanes.states), variation.runs
     lanes = lanes._replace(digests=arrange_in_lanes(digest[None], groups))
     shared = shared._replace(foreseen=foresee_samples(compiled[0], lanes, shared))
+    settled = scenario.settling_samples(controller.sample_time)
+    if settled:
+        sensors = lanes.sigma.shape[1]
+        parts = _split(parts, settled, sensors, partial(restart, first=digest, sizes=sizes))
     run_groups(compiled[0], Work(lanes, shared, parts), workers or os.cpu_count() or 1, progress)
     ends = lanes.digests.swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
-    return batch_of(ends, len(inputs.t), controller.sample_time, digest_sizes(plant))
+    return batch_of(ends, len(inputs.t), controller.sample_time, sizes, settled)
 
 
 class Variation(NamedTuple):
@@ -166,6 +171,24 @@ def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shar
     ff = controller.feedforward
     shared = Shared(inputs.given, feedforward_table(ff.z_grid, ff.v0), count, plant.uniform)
     return inputs, shared, lanes, parts
+
+
+def _split(
+    parts: Sequence[Part], sample: int, sensors: int, then: Callable[[FloatArray], None]
+) -> list[Part]:
+    """The parts, of which one ends in front of `sample`, an even number, and is followed by `then`."""
+    split: list[Part] = []
+    for part in parts:
+        first, last = part.samples.start, part.samples.stop
+        if first < sample < last:
+            keys = np.ascontiguousarray(advance_keys(part.keys, sample - first, sensors))
+            split += [
+                part._replace(samples=slice(first, sample), then=then),
+                Part(slice(sample, last), keys),
+            ]
+        else:
+            split.append(part._replace(then=then) if last == sample else part)
+    return split
 
 
 def record_run(
@@ -211,7 +234,7 @@ def record_run(
     rows = np.empty((len(inputs.t), width))
     last = np.zeros((1, TOGETHER * width, LANES))
     sensors = len(noise_scales(plant, simulation.setup))
-    for samples, streams in parts:
+    for samples, streams, _ in parts:
         for k in range(samples.start, samples.stop, TOGETHER):
             given = inputs.given[k : min(k + TOGETHER, samples.stop)]
             now = lanes._replace(keys=advance_keys(streams, k - samples.start, sensors), digests=last)

@@ -15,6 +15,7 @@ and, where they differ from the defaults,
     WORDS         the machine's words for its "stroke" and "thrust", and by unit ("m", "rad", "N", "N m") for its other
                   outputs and inputs; without a word the names of the signals are used
     RISE          s, 10-90 %, of a stroke without a rise of its own
+    SETTLE        s at rest before the main job, where yields are counted
     STROKE_UNIT   unit in which deviations along the stroke are displayed, if not um
     bounds        (scenario, options) -> bounds that the paper prints for this scenario, as keys of data/published/:
                   "rise" and "overshoot" of the stroke, largest deviations "stroke" along it, "m" and "rad" of others
@@ -62,6 +63,12 @@ def series_of(plant: Plant) -> Mapping[str, Callable[..., list[PlannedRun]]]:
 def main_job(plant: Plant) -> str:
     """The name of the experiment that every design has to complete."""
     return next(iter(experiments_of(plant)))
+
+
+def settling(name: str, plant: Plant) -> dict[str, float]:
+    """The option with which yields of an experiment are counted: the machine's SETTLE before its main job."""
+    seconds = float(setting(plant, "SETTLE", 0.0)) if name == main_job(plant) else 0.0
+    return {"settle": seconds} if seconds else {}
 
 
 def experiment(

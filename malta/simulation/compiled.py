@@ -17,7 +17,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
@@ -287,6 +287,7 @@ class Part(NamedTuple):
 
     samples: slice
     keys: NDArray[np.uint64]  # groups x LANES
+    then: Callable[[FloatArray], None] | None = None  # what is done with the digests after it, in place
 
 
 def run_many(
@@ -304,7 +305,7 @@ def run_many(
     substeps, uniform = ctypes.c_long(shared.substeps), ctypes.c_long(shared.uniform)
     table = address_of(shared.table)
     ahead = foresee_samples(lib, lanes, shared) if shared.foreseen is None else shared.foreseen
-    for samples, keys in parts or [Part(slice(None), lanes.keys)]:
+    for samples, keys, then in parts or [Part(slice(None), lanes.keys)]:
         given = shared.given[samples]
         lib.run_many(
             groups,
@@ -321,3 +322,5 @@ def run_many(
             address_of(keys[chosen]),
             digests,
         )
+        if then is not None:
+            then(lanes.digests[chosen])

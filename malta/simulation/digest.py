@@ -27,7 +27,7 @@ LARGEST_FIGURE = 1e30  # of a run that was completed, SI
 class Batch:
     """Figures of each run of a batch, a row for each. SI.
 
-    duration : s, until the end or the first contact
+    duration : s, until the end or the first contact; below 0 for a run that ended while it settled
     completed : 1 or 0
     deviation : runs x outputs, largest `|p - p*|`
     rms : runs x outputs, root mean square of p - p*
@@ -114,6 +114,20 @@ def first_digest(plant: Plant, p_ref: FloatArray) -> FloatArray:
     known = {"alive": 1.0, "start": start, "scale": scale, "reached": -1.0, "touched": -1.0, "culprit": -1.0}
     sizes = digest_sizes(plant)
     return np.repeat([known.get(name, 0.0) for name in sizes], [*sizes.values()])
+
+
+def restart(digests: FloatArray, first: FloatArray, sizes: Mapping[str, int]) -> None:
+    """Begin the figures of runs anew at t = 0, after they have settled, in place: groups x numbers x LANES.
+
+    Runs that ended before keep theirs; samples are counted on.
+
+    first : from `first_digest`
+    """
+    rows = dict(zip(sizes, np.split(np.arange(len(first)), np.cumsum([*sizes.values()])[:-1]), strict=True))
+    lasting = ("alive", "samples", "resting", "touching", "touched", "culprit")
+    anew = np.concatenate([rows[name] for name in sizes if name not in lasting])
+    flying = digests[:, rows["alive"]] == 1
+    digests[:, anew] = np.where(flying, first[anew, None], digests[:, anew])
 
 
 @lru_cache(maxsize=16)
@@ -213,13 +227,17 @@ def recorder_function(shape: Any) -> ca.Function:
     return ca.Function("digest", arguments, [ca.vertcat(kept[width:], row)])
 
 
-def batch_of(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) -> Batch:
-    """The batch of digests after the last sample, runs x numbers."""
+def batch_of(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int], settled: int = 0) -> Batch:
+    """The batch of digests after the last sample, runs x numbers.
+
+    samples, settled : of each run, and those of them before t = 0
+    """
     columns = dict(zip(sizes, np.split(kept, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
     count = columns["samples"][:, 0]
     resting, touching, touched = (columns[name][:, 0] for name in ("resting", "touching", "touched"))
     held = np.where(resting == 1, touching == 0, touched < 0)
     completed = (columns["alive"][:, 0] == 1) & np.isfinite(kept).all(axis=1) & (count == samples) & held
+    flown = np.maximum(np.where(count > settled, count - settled, count), 1)[:, None]
     end = np.where((count == samples) & (resting == 0) & (touched >= 0), touched, np.maximum(count - 1, 0))
     reached, below, above = (columns[name] for name in ("reached", "below", "above"))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -234,10 +252,10 @@ def batch_of(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]
         1,
     )
     return Batch(
-        duration=np.where(completed, samples, end) * Ts,
+        duration=(np.where(completed, samples, end) - settled) * Ts,
         completed=completed,
         deviation=columns["deviation"],
-        rms=np.sqrt(columns["squares"] / np.maximum(count, 1)[:, None]),
+        rms=np.sqrt(columns["squares"] / flown),
         force=columns["force"],
         contact=columns["contact"],
         rise=np.where(completed, (last - first) * Ts, np.nan),
@@ -246,7 +264,7 @@ def batch_of(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]
             np.maximum(columns["largest_share"][:, 0] - 1, 0),
             np.nan,
         ),
-        saturated=columns["limited"] / np.maximum(count, 1)[:, None],
+        saturated=columns["limited"] / flown,
         verdict=verdict,
         last=columns["last"],
     )

@@ -174,7 +174,7 @@ def fly_all(
 ) -> tuple[tuple[Case, ...], bool]:
     """`fly` for runs with different machines and controllers. Raises InputError for more than LONGEST samples."""
     cases: list[Case] = []
-    samples = sum(one.scenario.duration / controller.sample_time for _, controller, one in flights)
+    samples = sum(one.scenario.samples(controller.sample_time) for _, controller, one in flights)
     if samples > LONGEST:
         where, found = (
             f"scenario {flights[0][2].scenario.name}",

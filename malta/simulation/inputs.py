@@ -42,11 +42,15 @@ class Inputs(NamedTuple):
 def inputs_of(run: Simulation) -> Inputs:
     """The inputs of every sample of a simulation. Raises InputError for more than LONGEST samples."""
     scenario, Ts = run.scenario, run.controller.sample_time
-    samples = max(1, round(scenario.duration / Ts))
+    samples = scenario.samples(Ts)
     if samples > LONGEST:
         raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
-    t = np.arange(samples) * Ts
-    motion = motion_of(scenario, run.plant, run.controller, t)
+    before = scenario.settling_samples(Ts)
+    t = np.arange(-before, samples - before) * Ts
+    motion = motion_of(scenario, run.plant, run.controller, np.maximum(t, 0.0))
+    if before:  # at rest before the reference begins
+        rest = t[:, None] < 0
+        motion = motion._replace(dp=np.where(rest, 0.0, motion.dp), ddp=np.where(rest, 0.0, motion.ddp))
     return Inputs(t, motion, sample_inputs(run, motion, t))
 
 

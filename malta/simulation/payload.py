@@ -9,6 +9,7 @@ The mass margin of the linear loop (margins/stages.py) knows no limits of forces
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -87,11 +88,14 @@ def flown_payload(plant: Plant, controller: Controller, most: float) -> tuple[fl
     def carries(mass: float) -> bool:
         return experiment(EXPERIMENT, plant, controller, masses=(mass,)).cases[0].run.verdict.completed
 
-    most = most if math.isfinite(most) else HEAVIEST
-    low, high = 0.0, math.inf
+    return largest_mass(carries, most if math.isfinite(most) else HEAVIEST)
+
+
+def largest_mass(carries: Callable[[float], bool], most: float) -> tuple[float, float]:
+    """Find the largest mass, kg, up to `most` that is carried, by bisection, and the smallest that is not."""
     if carries(most):
-        return most, high
-    high = most
+        return most, math.inf
+    low, high = 0.0, most
     while high - low > STEP * high and high > 1e-6 * most:
         middle = (low + high) / 2
         low, high = (middle, high) if carries(middle) else (low, middle)

@@ -104,5 +104,5 @@ def stages_of(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Pl
                 )
         before = stages[-1][1]
         par: Any = replace(before.parameters, **values)
-        stages.append((max(0, round(at / Ts)), before.variant(par)))
+        stages.append((max(0, round(at / Ts) + scenario.settling_samples(Ts)), before.variant(par)))
     return stages

@@ -75,6 +75,8 @@ class Scenario:
     name : of the scenario, for figures and errors
     duration : s
     reference : plant -> reference, as `malta.references.hold`
+    settle : s at rest on the reference's first outputs before it begins. t = 0 is its beginning: duration, figures and
+        time series are from there on. Only a run that ends earlier has times below 0, and its samples up to there.
     start : states (SI) that do not start on the reference
     cold : starts without current, with the observer at zero
     disturbance : t (s, shape (k,)) -> wrench, k x disturbances, N and N m; None: none
@@ -136,6 +138,7 @@ class Scenario:
     open_loop: bool = False
     electronics: Any = None
     changes: tuple[tuple[float, Mapping[str, float]], ...] = ()
+    settle: float = 0.0
 
     def replace(self, **fields: Any) -> Scenario:
         """Return the scenario with other fields.
@@ -158,6 +161,7 @@ class Scenario:
         where = f"scenario {self.name}"
         for name, low, whole in (
             ("duration", 1e-12, False),
+            ("settle", 0, False),
             ("noise", 0, False),
             ("substeps", 1, True),
             ("delay", 0, True),
@@ -197,6 +201,20 @@ class Scenario:
         if self.real_pwm and self.fidelity != "phase":
             raise InputError(where, "real_pwm", f"fidelity {self.fidelity}", "fidelity phase")
 
+    def settling_samples(self, sample_time: float) -> int:
+        """Samples before t = 0: an even number, as noise is drawn for two samples at once.
+
+        sample_time : of the controller, s
+        """
+        return 2 * round(self.settle / (2 * sample_time))
+
+    def samples(self, sample_time: float) -> int:
+        """All samples that are simulated, those before t = 0 among them.
+
+        sample_time : of the controller, s
+        """
+        return self.settling_samples(sample_time) + max(1, round(self.duration / sample_time))
+
     @classmethod
     def stroke(
         cls,
@@ -205,6 +223,7 @@ class Scenario:
         rise: float | None = None,
         profile: Profile = "logistic",
         duration: float | None = None,
+        settle: float = 0.0,
         **options: Any,
     ) -> Scenario:
         """A stroke, symmetric about the middle.
@@ -213,13 +232,15 @@ class Scenario:
         rise : s, 10-90 %; None: the machine's own, RISE of its experiments
         profile : "logistic" or "quintic"
         duration : s; None: six times the rise, at least 0.1 s, so that the move fits
+        settle : s at rest before, in which errors of v0 and integrals settle, as on a bench
         options : fields of the scenario, as noise=1.0
 
         Raises InputError for a distance of 0 m, or a rise that no stroke may have.
 
         >>> import malta
-        >>> malta.Scenario.stroke(20e-3, rise=30e-3, noise=1.0).duration
-        0.18
+        >>> stroke = malta.Scenario.stroke(20e-3, rise=30e-3, noise=1.0, settle=0.3)
+        >>> stroke.duration, stroke.samples(5e-5), stroke.settling_samples(5e-5)
+        (0.18, 9600, 6000)
         """
         if rise is not None:
             references.check_rise(rise)
@@ -235,7 +256,7 @@ class Scenario:
             centre=duration / 2,
             profile=profile,
         )
-        return cls("stroke", duration, reference, **options)
+        return cls("stroke", duration, reference, settle=settle, **options)
 
 
 class Simulation(NamedTuple):

@@ -39,7 +39,7 @@ class Trajectory:
     scenario : the scenario
     verdict : its name, as "completed", and its time (s)
     engine : which simulated it: "compiled" or "virtual machine"
-    t : k, s
+    t : k, s; from 0 on, but for a run that ended while it settled
     reference : k x p
     p : k x p, true outputs
     y : k x p, measured
@@ -178,6 +178,9 @@ def label_rows(
     columns = columns_of_row(plant, controller, setup)
     if setup.bearing and (verdict is None or verdict.name in plant.contacts):
         verdict = bearing_verdict(plant, rows[:, columns["contact"]], t) or verdict
+    before = scenario.settling_samples(controller.sample_time)
+    kept = slice(before if done > before else 0, done)
+    rows = rows[kept.start :]
     none = slice(0, 0)  # of a signal that this fidelity does not have
     return Trajectory(
         plant,
@@ -185,8 +188,8 @@ def label_rows(
         scenario,
         verdict or Verdict("completed", scenario.duration),
         kind,
-        t=t[:done],
-        reference=given[:done, : len(plant.outputs)],
+        t=t[kept],
+        reference=given[kept, : len(plant.outputs)],
         **{name: rows[:, columns.get(name, none)] for name in SERIES},
     )
 

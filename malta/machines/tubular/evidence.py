@@ -6,12 +6,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
+from scipy.special import stdtrit
 
-from malta.campaigns.yields import Yields, main_yields
+from malta.campaigns.yields import Yields, main_campaign, yields_of
 from malta.loops.loop import loop_of_model
 from malta.loops.recovery import PLACES, Deviation, recovery
 from malta.machines.tubular.experiments.rest import hold
@@ -23,12 +24,15 @@ from malta.model.published import published_value
 from malta.proof.machine.parametric_plants import of_plant
 from malta.proof.robust import robust_margin
 from malta.report.ledger import (
+    Chance,
     proven_share,
     run_design,
 )
+from malta.simulation.catalogue import experiment
 from malta.simulation.compiled import compiler
 from malta.simulation.experiments import Experiment, Progress
 from malta.simulation.inverter import link_voltage, open_loop_gain
+from malta.simulation.payload import flown_payload, held_payload, largest_mass
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import StrokeFigures, stroke_figures
@@ -43,9 +47,11 @@ if TYPE_CHECKING:
     from malta.campaigns.result import Rate
     from malta.model.plant import FloatArray, Plant
 
-EXPERIMENT_NAMES = ("stroke", "hold", "tilt", "payload", "thermal")
-MACHINES, FEW = 10_000, 200  # of the yields, with and without a C compiler
+EXPERIMENT_NAMES = ("stroke", "hold", "tilt", "thermal")
+MACHINES, FEW = 4_000, 200  # of the yields, with and without a C compiler
+UNSETTLED = 0.25  # share of them that fly without rest before, too
 SEEDS = 16  # of rests: the motion of a slow design moves by a fifth from one to the next
+NOISY, FLIGHTS = ("tilt", "thermal"), 5  # experiments whose figures are means over seeds; how many
 IMPLIED_RATIO = 4.0  # K1 / k at which the LQR stands the published 300 % of a 20 % box
 
 
@@ -63,8 +69,10 @@ class Evidence:
     braked: float  # m/s, published speed from which the mover is braked into the DC link
     growth: float  # m, thermal growth of the published arm
     published: Mapping[str, Any]
-    yields: Yields  # of MACHINES that differ, in the stroke
-    rests: Mapping[str, float]  # figures of merit of the hold, SI: root mean squares over SEEDS
+    strokes: Strokes  # of MACHINES that differ, after SETTLE at rest
+    unsettled: Strokes  # of fewer, from the first sample on
+    rests: Mapping[str, Chance]  # figures of merit of the hold: root mean squares over SEEDS
+    flights: Mapping[tuple[str, int], Chance]  # first figures of the cases of NOISY: means over FLIGHTS seeds
 
 
 def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
@@ -75,6 +83,7 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
     v0[:, plant.thrust_input] = 0
     without = replace(controller, feedforward=replace(controller.feedforward, v0=v0))
     slow = simulate(plant, without, Scenario("stroke", 0.4, partial(delayed_stroke, wait=0.0)))
+    machines = MACHINES if compiler() else FEW
     return Evidence(
         spec,
         model,
@@ -86,15 +95,58 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
         published_value(published, "dc_link.speed"),
         published_value(published, "thermal.length") * published_value(published, "thermal.strain"),
         published,
-        main_yields(controller, spec, published, machines=MACHINES if compiler() else FEW),
+        strokes_of(controller, spec, published, machines=machines, settle=True),
+        strokes_of(controller, spec, published, machines=round(UNSETTLED * machines), settle=False),
         rests_of_seeds(plant, controller, range(SEEDS)),
+        flights_of_seeds(plant, controller, range(FLIGHTS)),
     )
 
 
-def rests_of_seeds(plant: Plant, controller: Controller, seeds: Sequence[int]) -> dict[str, float]:
-    """The figures of merit of rests with other noise, by their labels, SI: root mean squares over the seeds."""
+class Strokes(NamedTuple):
+    """Strokes of many machines: yields, and the largest radial deviation of each that completed it, m."""
+
+    yields: Yields
+    median: float
+    largest: float
+
+
+def strokes_of(
+    controller: Controller, spec: Spec, published: Mapping[str, Any], *, machines: int, settle: bool
+) -> Strokes:
+    """The strokes of machines drawn from the design's uncertainty, after a rest or from the first sample on."""
+    flown = main_campaign(controller, spec, machines, settle=settle)
+    axis = spec.plant.stroke_output
+    radial = np.delete(flown.batch.deviation[flown.completed], axis, axis=1).max(axis=1)
+    return Strokes(yields_of(flown, published, spec), float(np.median(radial)), float(radial.max()))
+
+
+def mean_of_seeds(values: Sequence[float]) -> Chance:
+    """The mean of one value for each seed, with Student's interval."""
+    scatter = float(np.std(values, ddof=1)) / math.sqrt(len(values))
+    return Chance(float(np.mean(values)), float(stdtrit(len(values) - 1, 0.975)) * scatter)
+
+
+def rests_of_seeds(plant: Plant, controller: Controller, seeds: Sequence[int]) -> dict[str, Chance]:
+    """The figures of merit of rests with other noise, by their labels: root mean squares over the seeds."""
     each = [{m.label: m.value for m in hold(plant, controller, seed=seed).merits} for seed in seeds]
-    return {label: math.sqrt(sum(one[label] ** 2 for one in each) / len(each)) for label in each[0]}
+    squares = {label: mean_of_seeds([one[label] ** 2 for one in each]) for label in each[0]}
+    roots = {label: math.sqrt(square) for label, square in squares.items()}
+    return {
+        label: Chance(root, squares[label].half / (2 * root) if root else 0.0)
+        for label, root in roots.items()
+    }
+
+
+def flights_of_seeds(
+    plant: Plant, controller: Controller, seeds: Sequence[int]
+) -> dict[tuple[str, int], Chance]:
+    """The first figure of each case of NOISY, by experiment and case: means over the seeds."""
+    found: dict[tuple[str, int], Chance] = {}
+    for name in NOISY:
+        flown = [experiment(name, plant, controller, seed=seed).cases for seed in seeds]
+        for case in range(len(flown[0])):
+            found[name, case] = mean_of_seeds([cases[case].merits[0].value for cases in flown])
+    return found
 
 
 def pole(name: str, e: Evidence) -> float:
@@ -175,10 +227,13 @@ def link_rise(e: Evidence) -> float:
     return float(link_voltage(par.V_dc, par.C_dc, par.m * e.braked**2 / 2) - par.V_dc)
 
 
-def yield_share(kind: str, e: Evidence) -> float:
-    """A share of the machines that differ, by a field of Yields; NaN without bounds."""
-    found: Rate | None = getattr(e.yields, kind)
-    return math.nan if found is None else found.share
+def yield_share(kind: str, strokes: str, e: Evidence) -> Chance:
+    """A share of the machines that differ, by a field of Yields; NaN without bounds.
+
+    strokes : "strokes" or "unsettled"
+    """
+    found: Rate | None = getattr(getattr(e, strokes).yields, kind)
+    return Chance(math.nan, math.nan) if found is None else Chance(found.share, (found.high - found.low) / 2)
 
 
 def published_stroke(e: Evidence) -> StrokeFigures:
@@ -197,29 +252,45 @@ def carried_weight(e: Evidence) -> float:
     return float(v[1] + v[3])
 
 
-def precise_payload(e: Evidence) -> float:
-    """The largest payload, kg, with which the stroke keeps the bounds of Figs 12 and 13; 0: none of those tried."""
+def precise_payload(known: bool, e: Evidence) -> float:
+    """The largest payload, kg, with which the stroke keeps the bounds of Figs 12 and 13, by bisection.
+
+    known : the controller feeds its weight and inertia forward
+    """
     bounds = {
+        "stroke: overshoot": published_value(e.published, "figure_12.overshoot"),
         "stroke: axial error": published_value(e.published, "figure_12.axial_error"),
         "stroke: radial deviation": published_value(e.published, "figure_13.radial_deviation"),
     }
-    kept = [
-        case.run.scenario.changes[0][1]["m"] - case.run.plant.mass
-        for case in e.experiments["payload"].cases
-        if case.run.verdict.completed
-        and all(merit.value <= bounds.get(merit.label, math.inf) for merit in case.merits)
-    ]
-    return max(kept, default=0.0)
+    plant, controller = e.model.plant, e.controller
+
+    def kept(mass: float) -> bool:
+        (case,) = experiment("payload", plant, controller, masses=(mass,), known=known).cases
+        within = (merit.value <= bounds.get(merit.label, math.inf) for merit in case.merits)
+        return bool(case.run.verdict.completed and all(within))
+
+    return largest_mass(kept, held_payload(plant))[0]
 
 
-def true_radial(e: Evidence) -> float:
+def carried_payload(e: Evidence) -> float:
+    """The largest payload, kg, that is picked, carried and moved without touchdown, by bisection."""
+    plant = e.model.plant
+    return flown_payload(plant, e.controller, held_payload(plant))[0]
+
+
+def true_radial(e: Evidence) -> Chance:
     """Largest rms of the true radial motion at rest, m."""
     return max(e.rests[f"true {name}, rms"] for name in ("x1", "y1", "x2", "y2"))
 
 
-def measured_at_rest(name: str, e: Evidence) -> float:
+def measured_at_rest(name: str, e: Evidence) -> Chance:
     """Standard deviation of an output's measurements at rest, m."""
     return e.rests[f"measured {name}, std"]
+
+
+def mean_at_rest(name: str, e: Evidence) -> Chance:
+    """Size of the mean of an output's measurements at rest, m."""
+    return e.rests[f"measured {name}, mean"]
 
 
 def noise_forces(e: Evidence) -> tuple[float, float]:

@@ -39,6 +39,7 @@ from malta.machines.tubular.experiments.strokes import (
     stroke,
     stroke_cases,
 )
+from malta.machines.tubular.experiments.strokes import SETTLE as SETTLE
 from malta.simulation.experiments import (
     Experiment,
     PlannedRun,
@@ -93,7 +94,7 @@ OPTION_UNITS = {
 
 def check(name: str, option: str, value: Any) -> None:
     """Raise InputError for a number that is zero or not finite. Strokes and logs check their own options."""
-    if option in ("distance", "rise", "profile", "during", "only", "log"):
+    if option in ("distance", "rise", "profile", "during", "only", "log", "known"):
         return
     if option == "way" and not SHORTEST <= value <= LONGEST:
         raise InputError(

@@ -130,17 +130,20 @@ def payload(
     controller: Controller,
     *,
     masses: tuple[float, ...] = (0.05, 0.1, 0.15, 0.2),
+    known: bool = False,
     progress: Progress | None = None,
     **options: Any,
 ) -> Experiment:
     """A mass (kg) picked at the centre of gravity after 50 ms of a hold, carried, and moved through the stroke.
 
-    The controller does not learn of it. The integrals have 0.45 s before the stroke begins.
+    The controller does not learn of it, unless the mass is known: then its weight and its inertia are fed forward from
+    the pick on, and gains stay. The integrals have 0.45 s before the stroke begins.
     """
     reference = partial(delayed_stroke, wait=WAIT)
     wanted = []
     for extra in masses:
-        own = {"changes": ((PICKED, {"m": plant.mass + extra}),), "bearing": True}
+        own: dict[str, Any] = {"changes": ((PICKED, {"m": plant.mass + extra}),), "bearing": True}
+        own |= {"anticipated": partial(payload_wrench, plant=plant, extra=extra)} if known else {}
         scenario = scenario_of("payload", WAIT + 0.15, reference, own | options)
         wanted.append(PlannedRun(f"{extra * 1e3:.0f} g", scenario, _payload_merits))
     cases, cut = fly(plant, controller, wanted, progress, options)
@@ -152,13 +155,27 @@ def payload(
 PICKED, WAIT = 0.05, 0.5  # s: the mass is picked, the stroke begins
 
 
+def payload_wrench(t: FloatArray, plant: Plant, extra: float) -> FloatArray:
+    """The load that a mass (kg) adds on the published stroke, from the pick on: F_y = -m g, F_z = -m z*''."""
+    names = [s.name for s in plant.disturbances]
+    par: Any = plant.parameters
+    wrench, picked = np.zeros((len(t), len(names))), np.asarray(t) >= PICKED
+    wrench[:, names.index("F_y")] = -extra * par.g * picked
+    along = delayed_stroke(plant, WAIT)(np.asarray(t)).ddp[:, plant.stroke_output]
+    wrench[:, names.index("F_z")] = -extra * along * picked
+    return wrench
+
+
 def _payload_merits(run: Trajectory) -> tuple[Merit, ...]:
-    """Sag after the pick, and the errors of the stroke."""
+    """Sag after the pick, and overshoot and errors of the stroke."""
     error, axis = np.abs(run.p - run.reference), run.plant.stroke_output
     carrying, moving = (run.t >= PICKED) & (run.t < WAIT), run.t >= WAIT
     radial = [k for k in range(error.shape[1]) if k != axis]
+    start, end = run.reference[[0, -1], axis]
+    beyond = (run.p[moving, axis] - end) / (end - start)
     return (
         Merit("largest sag after the pick", float(error[carrying][:, radial].max(initial=0.0)), "um"),
+        Merit("stroke: overshoot", max(float(beyond.max(initial=0.0)), 0.0), "percent"),
         Merit("stroke: axial error", float(error[moving][:, axis].max(initial=0.0)), "mm"),
         Merit("stroke: radial deviation", float(error[moving][:, radial].max(initial=0.0)), "um"),
     )
