@@ -39,6 +39,7 @@ from malta.report.ledger import (
 )
 
 SOURCE = "L. C. Díaz-Pérez et al., Actuators 7(4), 2018"
+REPRODUCING = ("halbach_pid",)
 
 
 MOTOR: tuple[Row, ...] = (
@@ -415,4 +416,5 @@ def _lift() -> list[Row]:
 
 def rows() -> list[Row]:
     """All claims of the paper, in the order of the ledger."""
-    return [*MOTOR, *ELECTRONICS, *OPEN_LOOP, *CLOSED_LOOP, *LIFT, *_lift()]
+    motor = [row._replace(of_machine=True) for row in (*MOTOR, *ELECTRONICS, *OPEN_LOOP)]
+    return [*motor, *CLOSED_LOOP, *LIFT, *_lift()]

@@ -34,6 +34,7 @@ from malta.report.ledger import (
 )
 
 SOURCE = "F. Xing et al., 2017"
+REPRODUCING = ("planar_pid",)
 
 
 WRENCH = (("F_x", "N"), ("F_y", "N"), ("F_z", "N"), ("T_x", "N m"), ("T_y", "N m"), ("T_z", "N m"))
@@ -379,4 +380,5 @@ LOOP: tuple[Row, ...] = (
 
 def rows() -> list[Row]:
     """All claims of the paper, in the order of the ledger."""
-    return [*COIL, *TABLE, *MOVER, *STEPS, *_step_rows(), *_ahead_rows(), *LOOP]
+    model = [row._replace(of_machine=True) for row in (*COIL, *TABLE, *MOVER)]
+    return [*model, *STEPS, *_step_rows(), *_ahead_rows(), *LOOP]
