@@ -304,6 +304,16 @@ def test_a_hover_corrects_what_the_model_misses(flown: dict[str, Experiment]) ->
         assert merits(flown["errors"], model)["hover: force to correct"] == pytest.approx(force, abs=0.01)
 
 
+def test_coils_further_apart_have_the_torques_that_the_paper_prints(paper: dict[str, Any]) -> None:
+    """22/3 tau_n: 1.615, 1.615 and 1.604 N m at 3 A, 4, 5 and 13 % below; the arm of F_z is half the pitch, 65 mm."""
+    par: Any = malta.read("data/planar.toml", preset="pitch_22_3")
+    x, y = np.meshgrid(*[np.linspace(0, 2 * par.tau_n, 141)] * 2, indexing="ij")
+    found = np.abs(models.coil_wrench(par, coils.exact_model(par), 3.0, x, y)).max(axis=(0, 1))
+    assert found[3:] == pytest.approx([1.6152, 1.6152, 1.6041], abs=1e-3)
+    printed = [published_value(paper, f"model.amplitude.{name}") for name in ("F_z", "T_x")]
+    assert printed[1] / printed[0] == pytest.approx(par.coil_pitch / 2, rel=0.01)
+
+
 def test_a_coil_off_the_centre_has_arms(lqg: Design) -> None:
     """T about the centre of gravity is the coil's own and arm x F, as in K(p)."""
     par = motions.parameters_of(lqg.plant)
@@ -379,6 +389,9 @@ def test_the_ledger(
     words = {
         "one coil at 3 A: F_x [N]": "by construction; B_r and the corner radius",
         "one coil at 3 A: F_z [N]": "reproduced; 4 % less",
+        "the same with coils 22/3 τ_n apart: T_x [N m]": "reproduced",
+        "the same with coils 22/3 τ_n apart: T_y [N m]": "reproduced",
+        "the same with coils 22/3 τ_n apart: T_z [N m]": "within 13 %",
         "largest force [N]": "by construction; an input",
         "control period [us]": "by construction; an input",
         "table of τ_n/35, error of F_z [N]": "smaller, x 9.6",
@@ -402,6 +415,7 @@ def test_the_ledger(
         assert found[subject].verdict.startswith("not reproduced")
         assert reason in found[subject].verdict
     assert found["the same with 4 τ_n"].ours == ("inf",)
+    assert found["width of the coils, 22/3 τ_n apart [mm]"].ours == ("454",)
     assert found["step of the table that errs by the printed F_x [mm]"].ours == ("1.93",)
     assert found["step of the table that errs by the printed F_z [mm]"].ours == ("1.57",)
 

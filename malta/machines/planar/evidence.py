@@ -13,7 +13,7 @@ from malta.machines.planar import coils, commutation
 from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments.jumps import SOFT, jump
-from malta.machines.planar.experiments.models import CURRENT
+from malta.machines.planar.experiments.models import CURRENT, coil_wrench
 from malta.machines.planar.experiments.motions import steps_ahead
 from malta.margins.verify import Margins
 from malta.model.published import published_value
@@ -115,6 +115,20 @@ def condition(ratio: float, e: Evidence) -> float:
     """Worst condition of K(p) for a coil pitch of `ratio` tau_n."""
     par = replace(e.parameters, coil_pitch=ratio * e.parameters.tau_n)
     return float(commutation.conditioning(par, coils.simulation_model(par)).max())
+
+
+def coil_torque(ratio: float, name: str, e: Evidence) -> float:
+    """Amplitude of a torque, N m, of an inner coil at the paper's 3 A for a coil pitch of `ratio` tau_n."""
+    par = replace(e.parameters, coil_pitch=ratio * e.parameters.tau_n)
+    x, y = np.meshgrid(*[np.linspace(0, 2 * par.tau_n, 141)] * 2, indexing="ij")
+    wrench = coil_wrench(par, coils.exact_model(par), CURRENT, x, y)
+    return float(np.abs(wrench[..., [s.name for s in e.spec.plant.inputs].index(name)]).max())
+
+
+def coils_width(ratio: float, e: Evidence) -> float:
+    """Width of the 4 x 4 coils, m, for a coil pitch of `ratio` tau_n."""
+    par = e.parameters
+    return 3 * ratio * par.tau_n + par.l_c + par.w_c
 
 
 def residual(e: Evidence) -> float:
