@@ -153,7 +153,7 @@ print(f"the laser makes {rms['laser'] / rms['current noise']:.3f} of the current
 # %% [markdown]
 # **Summary.** Noise of the current sensors decides, and the rolling mean leaves it: within the current loops what
 # counts is its density, not its rms. The laser is a few percent of it, the PWM nothing. The whole ledger, computed:
-# `malta claims design/halbach.toml`.
+# `malta claims design/halbach_pid.toml`.
 
 # %%
 fig, ax = plt.subplots()

@@ -170,7 +170,7 @@ assert left_at_rest["with, 2 x"] < 1e-9 < 30e-6 < left_at_rest["without, 2 x"]
 # fundamental misses less than half a percent, and what moves the mover is the torque of rectangles that overlap at the
 # corners. The exact series needs 22 harmonics and less time than the table, see `malta simulate
 # design/gains/planar.json --scenario timing`. What is left with the exact model no coil model mends: currents that were
-# right for where the mover was 200 us ago. Every printed number beside ours: `malta claims design/planar.toml`.
+# right for where the mover was 200 us ago. Every printed number beside ours: `malta claims design/planar_pid.toml`.
 
 # %%
 shares = [np.abs(errors["fitted"][..., k]).max() / largest[k] for k in (0, 2)]

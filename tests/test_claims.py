@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -264,9 +264,15 @@ def test_what_was_not_reached_is_not_reproduced(relation: str) -> None:
     assert claims._word(_row(relation), 1.0, math.nan) == "not reproduced"
 
 
+def _judge(row: Row, values: Sequence[float], built: Sequence[bool] = (False,) * 3) -> str:
+    """The verdict on figures of designs a, b, c, whose published value is 1."""
+    words = [claims._word(row, 1.0, v, by_construction=one) for v, one in zip(values, built, strict=False)]
+    return claims._verdict(row, words, "abc"[: len(values)])
+
+
 def test_the_verdict_of_several_designs() -> None:
     def verdict(*values: float, note: str = "", why: str = "") -> str:
-        return claims._verdict(_row(note=note, why=why), 1.0, values, ["a", "b", "c"][: len(values)])
+        return _judge(_row(note=note, why=why), values)
 
     assert verdict(1.0, 1.01) == "reproduced"
     assert verdict(1.0, note="read so") == "reproduced; read so"
@@ -278,16 +284,55 @@ def test_the_verdict_of_several_designs() -> None:
         "a: reproduced; b: within 10 %; c: not reproduced; so; bad"
     )
     assert verdict(math.nan, 1.0) == "a: not reproduced; b: reproduced"
-    built = claims._verdict(_row(note="so"), 1.0, (1.0, 1.0, 2.0), "abc", (True, False, True))
+    built = _judge(_row(note="so"), (1.0, 1.0, 2.0), (True, False, True))
     assert built == "a: by construction; b: reproduced; c: not reproduced; so"
 
     def bound(*values: float) -> str:
-        return claims._verdict(_row("at most"), 1.0, values, ["a", "b"])
+        return _judge(_row("at most"), values)
 
     assert bound(0.5, 0.125) == "smaller, x 2.0, x 8.0"
     assert bound(0.5, 0.99) == "a: smaller, x 2.0; b: reproduced"
     assert bound(4.0, 2.0) == "not reproduced: larger, x 4.0, x 2.0"
     assert bound(0.5, 2.0) == "a: smaller, x 2.0; b: not reproduced: larger, x 2.0"
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "word"),
+    [
+        (["reproduced"], "reproduced"),
+        (["reproduced", "within 7 %"], "near"),
+        (["smaller, x 19", "reproduced"], "kept"),
+        (["on the other side of zero"], "kept"),
+        (["by construction", "by construction, within 7 %"], "input"),
+        (["by construction", "reproduced"], "reproduced"),
+        (["not compared"], "beside"),
+        (["not reproduced", "not reproduced: larger, x 3.1"], "differs"),
+        (["not reproduced", "by construction"], "partly"),
+    ],
+)
+def test_a_claim_has_one_word(verdicts: list[str], word: str) -> None:
+    assert claims.word_of(verdicts) == word
+
+
+def test_only_designs_that_are_meant_to_reproduce_a_paper_are_judged(published: dict[str, Any]) -> None:
+    """The figures of the others stand there; of the machine alone, of inputs and beside, any design is judged."""
+    found: Any = [SimpleNamespace(spec=SimpleNamespace(name=name, pid=None)) for name in ("table2", "robust")]
+    values = {"table2": 16.2e-3, "robust": 20e-3}
+    row = Row("rise", "ms", "{:.1f}", lambda e: values[e.spec.name], "figure_12.rise_time", why="so")
+
+    def claim(names: Sequence[str], meant: Sequence[str] = ("table2",), **changes: Any) -> tuple[str, str]:
+        chosen = [e for e in found if e.spec.name in names]
+        line = claims._claim(row._replace(**changes), chosen, published, meant)
+        assert line.ours == tuple(f"{1e3 * values[name]:.1f}" for name in names)
+        return line.verdict, line.word
+
+    assert claim(["table2", "robust"]) == ("reproduced", "reproduced")
+    assert claim(["robust"], note="noted") == ("of another design; noted", "other")
+    assert claim(["robust"], of_machine=True) == ("not reproduced; so", "differs")
+    assert claim(["robust"], by_construction=True) == ("not reproduced; so", "differs")
+    assert claim(["robust"], relation="beside") == ("not compared", "beside")
+    assert claim(["table2", "robust"], designs=("robust",)) == ("not reproduced; so", "differs")
+    assert claim(["table2", "robust"], ("table2", "robust"))[1] == "partly"
 
 
 @pytest.mark.slow
@@ -296,19 +341,21 @@ def test_a_claim_shows_its_figures(found: Found, published: dict[str, Any]) -> N
 
     def claim(**changes: Any) -> Claim:
         row = Row("rise", "ms", "{:.2f}", lambda _: next(values), "figure_12.rise_time")
-        return claims._claim(row._replace(**changes), found.evidence, published)
+        return claims._claim(row._replace(**changes), found.evidence, published, NAMES)
 
     assert claim() == Claim(
-        "rise [ms]", "16.2", ("16.20", "–"), "table2: reproduced; calibrated: not reproduced"
+        "rise [ms]", "16.2", ("16.20", "–"), "table2: reproduced; calibrated: not reproduced", "partly"
     )
     at_most = claim(relation="at most", published="figure_13.radial_deviation", unit="um", form="{:.0f}")
-    assert at_most == Claim("rise [µm]", "≤ 20", ("17000", "17000"), "not reproduced: larger, x 850")
+    assert at_most == Claim(
+        "rise [µm]", "≤ 20", ("17000", "17000"), "not reproduced: larger, x 850", "differs"
+    )
     values = iter([0.5, 0.25] * 3)
     assert claim(published=None, unit="percent", note="so") == Claim(
-        "rise [%]", "–", ("50.00", "25.00"), "ours: so"
+        "rise [%]", "–", ("50.00", "25.00"), "ours: so", "ours"
     )
     assert claim(published=0.5, unit="1", relation="equal", form="±{:.1f}") == Claim(
-        "rise", "±0.5", ("±0.5", "±0.2"), "table2: reproduced; calibrated: not reproduced"
+        "rise", "±0.5", ("±0.5", "±0.2"), "table2: reproduced; calibrated: not reproduced", "partly"
     )
     assert claim(published=None, unit="deg").ours == (f"{math.degrees(0.5):.2f}", f"{math.degrees(0.25):.2f}")
 
@@ -316,7 +363,7 @@ def test_a_claim_shows_its_figures(found: Found, published: dict[str, Any]) -> N
 def test_a_figure_that_is_not_published_is_missed(found: Found) -> None:
     row = next(r for r in tubular.rows() if r.published == "figure_12.rise_time")
     with pytest.raises(malta.InputError) as caught:
-        claims._claim(row, found.evidence, {"figure_12": {}})
+        claims._claim(row, found.evidence, {"figure_12": {}}, NAMES)
     assert (caught.value.where, caught.value.field) == ("data/published", "figure_12.rise_time")
 
 

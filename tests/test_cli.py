@@ -780,7 +780,11 @@ def test_claims_prints_the_ledger(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     assert out.startswith("Published numbers and ours: tubular, S. Miric et al.")
     assert "table2" in out
     assert "±218.92" in out
-    assert "not reproduced" in out
+    assert "not reproduced" not in out
+    assert len(out.splitlines()) == 4 + len(computed[0].claims)
+    code, out, err = run("claims", "design/table2.toml", "--why")
+    assert max(map(len, out.splitlines())) <= WIDTH
+    assert "  not reproduced; " in out
     code, out, err = run("claims", "design/table2.toml", "--json")
     assert (code, err) == (0, "")
     (ledger,) = json.loads(out)["ledgers"]

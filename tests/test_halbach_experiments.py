@@ -18,17 +18,17 @@ import numpy as np
 import peer_halbach as peer
 import pytest
 from conftest import ROOT, Run
-from scipy.linalg import solve_discrete_lyapunov
+from scipy.linalg import expm, solve_discrete_lyapunov
 
 import malta
 from malta.machines.halbach import claims as claims
 from malta.machines.halbach import electronics, motor
 from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.electronics import IDEAL, Options
-from malta.machines.halbach.evidence import Evidence
+from malta.machines.halbach.evidence import Evidence, open_loop_dip, rise_of_dip
 from malta.machines.halbach.experiments.lift import FAULTS, LAWS, lift_force, move_reference
 from malta.machines.halbach.experiments.motions import steps_reference
-from malta.machines.halbach.experiments.open_loop import positions_at_rest
+from malta.machines.halbach.experiments.open_loop import fit_servo, positions_at_rest, servo_step
 from malta.machines.halbach.plant import Parameters
 from malta.model.plant import Plant
 from malta.model.published import published_value
@@ -301,12 +301,57 @@ def test_no_fault_explains_figure_10(
 def test_linear_servo_against_the_motor_on_a_step_of_2_mm(preset: str) -> None:
     par: Parameters = malta.read("data/halbach.toml", preset=preset)
     e = experiment("identify", halbach.plant(par), controller_of("halbach"))
-    rms, first, secant, tangent = (merit.value for merit in e.merits)
+    rms, first, secant, tangent, *fitted = (merit.value for merit in e.merits)
+    # Fitted as the paper did: a line of known stiffness for what is a sine costs 1.8 and 1.3 %, not in the intervals.
+    assert fitted == pytest.approx([3.684, 0.018, 9.29, 0.076, 5.6e-6], rel=0.02)
+    assert abs(fitted[0] - 3.75) > 3 * fitted[1]
     assert 0.005e-3 < rms < first < 0.03e-3
     assert secant == pytest.approx(204.8, abs=0.5)
     assert tangent == pytest.approx(211.0, abs=0.05)
     A, _ = motor.servo(par, 1.0, 2e-3)
     assert np.linalg.eigvals(A).real == pytest.approx([-9.41 / 3.75 / 2] * 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("b", [0.5, 9.41, 2 * math.sqrt(205 * 3.75), 80.0])
+def test_a_servo_is_found_in_its_step(b: float) -> None:
+    """With little friction, the critical one and more: the matrix exponential's step gives m and b back."""
+    A, B = np.array([[0, 1], [-205 / 3.75, -b / 3.75]]), np.array([[0], [205 / 3.75]])
+    t = np.arange(110) * 0.055
+    x = np.array([(np.linalg.solve(A, expm(A * at) - np.eye(2)) @ B)[0, 0] for at in t]) * 2e-3
+    np.testing.assert_allclose(servo_step(t, 3.75, b, 205.0, 2e-3), x, rtol=0, atol=1e-12)
+    fit = fit_servo(t, x, 2e-3, 205.0)
+    assert (fit.m, fit.b) == pytest.approx((3.75, b), rel=1e-5)
+
+
+def test_intervals_of_a_fit_hold_what_they_promise() -> None:
+    """Of 200 records with white noise of the laser's size times 100, 95 % of the intervals hold m, and b."""
+    t, rng = np.arange(110) * 0.055, np.random.default_rng(0)
+    x, held = servo_step(t, 3.75, 9.41, 205.0, 2e-3), np.zeros(2)
+    for _ in range(200):
+        fit = fit_servo(t, x + rng.uniform(-20e-6, 20e-6, len(t)), 2e-3, 205.0)
+        held += abs(fit.m - 3.75) < fit.m_half, abs(fit.b - 9.41) < fit.b_half
+    assert (held > 0.9 * 200).all()
+
+
+def test_records_that_are_no_steps_are_refused() -> None:
+    t = np.arange(110) * 0.055
+    with pytest.raises(malta.InputError, match="7 readings at 7 times, expected 8 or more"):
+        fit_servo(t[:7], t[:7], 2e-3, 205.0)
+    for x, K in ((t * np.nan, 205.0), (t, -1.0)):
+        with pytest.raises(malta.InputError, match="finite ones, K above 0"):
+            fit_servo(t, x, 2e-3, K)
+    with pytest.raises(malta.CheckError, match="no servo of 205 N/m fits the record"):
+        fit_servo(t[:10], servo_step(t[:10], 3.75, 9.41, 205.0, 2e-3), 2e-3, 205.0)
+
+
+def test_the_open_loop_dips_as_its_reference_is_quick() -> None:
+    """At once by 1 - cos(k 5 mm), not at all for the slowest; the rise of -18 % is between."""
+    plant = halbach.plant(malta.read("data/halbach.toml"))
+    assert open_loop_dip(plant, 1e-3) == pytest.approx(math.cos(211.0001 * 5e-3) - 1, abs=5e-3)
+    assert abs(open_loop_dip(plant, 2.0)) < 1e-4
+    rise = rise_of_dip(plant, -0.18)
+    assert rise == pytest.approx(0.1257, abs=1e-3)
+    assert open_loop_dip(plant, rise) == pytest.approx(-0.18, abs=1e-4)
 
 
 def test_lqg_of_a_mass_with_friction_falls_into_a_limit_cycle() -> None:
@@ -373,6 +418,7 @@ def test_every_row_of_the_ledger_has_its_verdict(
         "smallest motion, high-resolution PWM [µm]",
         "Fig. 10: open loop, steady change [%]",
         "Fig. 10: position control, steady change [%]",
+        "Fig. 10 as a transient: open loop, lowest [%]",
     }
     for name in missed:
         assert rows[name].verdict.startswith("not reproduced; ")  # with a reason
@@ -385,9 +431,12 @@ def test_every_row_of_the_ledger_has_its_verdict(
         "duty cycle at −2.1 A [%]",
         "duty cycle at +2.1 A [%]",
         "current sensor: step [A]",
+        "step of 2 mm: mass [kg]",
+        "step of 2 mm: friction [N s/m]",
         "Fig. 8: way at constant speed [mm]",
         "Fig. 9: step [µm]",
     }
+    assert rows["Fig. 10 as a transient: position control, highest [%]"].verdict.startswith("within 10 %")
     assert rows["pole of the motor between readings"].ours[0].startswith("0.509")
     assert all("–" not in claim.ours for claim in rows.values())
 

@@ -43,7 +43,7 @@ Some words with 12 figures of speech.
 
 
 def _ledger(machine: str, *designs: str) -> Ledger:
-    claim = Claim("new", "4", ("5",) * len(designs), "within 7 %")
+    claim = Claim("new", "4", ("5",) * len(designs), "within 7 %", "near")
     return Ledger(machine, "an author", designs, (claim, claim, claim))
 
 

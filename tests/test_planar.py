@@ -93,6 +93,7 @@ def test_every_printed_value_is_tagged_so(par: planar.Parameters, paper: dict[st
     assert printed == {*paper["table_1"]["parameters"], "F_max"}
     assert par.coil_pitch == pytest.approx(16 / 3 * par.tau_n, rel=1e-12)
     assert malta.read(FILE, preset="pitch_14_3").coil_pitch == pytest.approx(14 / 3 * par.tau_n, rel=1e-12)
+    assert malta.read(FILE, preset="pitch_22_3").coil_pitch == pytest.approx(22 / 3 * par.tau_n, rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -399,6 +400,11 @@ def test_the_coil_pitch_decides(par: planar.Parameters, truth: Series) -> None:
     for preset, worst in (("pitch_14_3", 2.11), ("pitch_16_3", 2.44)):
         lever = replace(malta.read(FILE, preset=preset), I_x=par.m * 0.1**2)
         assert commutation.conditioning(lever, truth, 16).max() == pytest.approx(worst, abs=0.01)
+    wide = malta.read(FILE, preset="pitch_22_3")
+    assert commutation.check_pitch(wide, truth) == pytest.approx(2.884, abs=2e-3)
+    span = 3 * wide.coil_pitch + wide.l_c + wide.w_c
+    assert span > wide.w_m
+    assert span == pytest.approx(0.4543, abs=1e-6)
     for turns in (4, 5, 6):
         with pytest.raises(malta.CheckError, match=rf"= {turns} tau_n, K\(p\) is singular"):
             commutation.check_pitch(replace(par, coil_pitch=turns * par.tau_n), truth)

@@ -528,19 +528,48 @@ def test_numbers_are_written_without_exponents(value: float, digits: int, text: 
     assert figures.number(value, digits) == text
 
 
-def test_the_ledger_fits() -> None:
-    claims = (
+LEDGER = Ledger(
+    "tubular",
+    "A. Author, 2021",
+    ("table2", "calibrated", "a_design_of_a_long_name"),
+    (
         Claim(
             "poles of x, y [rad/s]",
             "±218.92",
-            ("±218.92", "±218.92"),
-            "reproduced; " + "said at length, " * 9,
+            ("±218.92", "±218.93", "1"),
+            "not reproduced; " + "said at length, " * 9,
+            "differs",
         ),
-        Claim("a claim whose subject takes more than one line of the table", "–", ("1", "2"), "ours"),
-    )
-    text = printed(
-        report.claims_table(Ledger("tubular", "A. Author, 2021", ("table2", "calibrated"), claims))
-    )
-    assert "±218.92" in text
-    assert "calibrated" in text
-    assert text.startswith("Published numbers and ours: tubular, A. Author, 2021")
+        Claim(
+            "a claim with a subject that is longer than its line [N m/rad]",
+            "–",
+            ("1", "2", "3"),
+            "ours",
+            "ours",
+        ),
+    ),
+)
+
+
+@pytest.mark.parametrize("width", [80, 100, 200])
+def test_a_claim_is_one_line_of_the_terminal(width: int) -> None:
+    def lines(*, why: bool) -> list[str]:
+        console = Console(width=width, record=True, file=io.StringIO())
+        console.print(report.claims_table(LEDGER, why=why))
+        return console.export_text().splitlines()
+
+    found = lines(why=False)
+    assert found[0] == "Published numbers and ours: tubular, A. Author, 2021"
+    assert max(map(len, found)) <= width
+    blocks = 1 if width > 80 else 2  # of designs beside each other
+    assert len(found) == 1 + blocks * (3 + len(LEDGER.claims))
+    assert next(line for line in found if line.startswith("poles")).split()[5] == "±218.92"
+    assert [line.split()[-1] for line in found if line.startswith(("poles", "a claim"))] == [
+        "differs",
+        "ours",
+    ] * blocks
+    assert all(line.split()[-2] in "123" and "rad] " in line for line in found if line.startswith("a claim"))
+    assert "said" not in "".join(found)
+    whole = " ".join(" ".join(lines(why=True)).split())
+    assert whole.count(LEDGER.claims[0].verdict.strip()) == blocks
+    assert "a claim with a subject that is longer than its line [N m/rad]" in whole

@@ -23,9 +23,13 @@ def claims(
     designs: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Design files; all of design/ if none is named.", autocompletion=complete_designs
+            help="Design files; of design/ those meant to reproduce a paper if none is named.",
+            autocompletion=complete_designs,
         ),
     ] = None,
+    why: Annotated[
+        bool, typer.Option("--why", help="Print below each line the whole verdict, with its reason.")
+    ] = False,
     markdown: Annotated[
         bool, typer.Option("--markdown", help="Print the tables as the pages of claims hold them.")
     ] = False,
@@ -38,9 +42,11 @@ def claims(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Print the ledger: every number that a machine's paper publishes, ours for each design, and a verdict.
+    """Print the ledger, a line a claim: what a machine's paper publishes, ours for each design, and a verdict.
 
-    One table for each machine, all of it computed now: models, gains, margins, experiments on the simulated machine.
+    All of it is computed now: models, gains, margins, experiments on the simulated machine. A verdict is one word:
+    reproduced, near (within 20 %), kept (a bound, by far), input, differs, partly (of some designs), beside (of
+    another method), ours (the paper prints no such number) or other (no design that is meant to reproduce it).
 
     \b
     Example:  malta claims design/table2.toml
@@ -54,7 +60,7 @@ def claims(
 
     specs = [read_design(file) for file in design_files("claims", designs, reverse=True, or_shipped=True)]
     if not designs:
-        specs.sort(key=lambda spec: bool(spec.search))  # the paper's own designs first
+        specs = [spec for spec in specs if _is_meant(spec)] or specs
     with progress_bar("claims") as progress:
         ledgers = _compute_ledgers(specs, progress)
     if as_json:
@@ -67,7 +73,14 @@ def claims(
         from malta import report
 
         for one in ledgers:
-            make_console().print(report.claims_table(one))
+            make_console().print(report.claims_table(one, why=why))
+
+
+def _is_meant(spec: Spec) -> bool:
+    """Whether a design is meant to reproduce the paper on its machine."""
+    from malta.model.machines import require_part
+
+    return spec.name in getattr(require_part("claims", spec.plant.name), "REPRODUCING", (spec.name,))
 
 
 def _compute_ledgers(specs: Sequence[Spec], progress: Callable[[float], None] | None) -> list[Ledger]:

@@ -10,10 +10,13 @@ margins, and the experiments on the simulated machine. A verdict follows from th
     not compared        ours is of something else: another method, or another computer
     not reproduced      else, with the reason
 
-Where the designs differ, each has its verdict; where the paper leaves a definition open, the verdict names the one that
-we use. The claims on a machine are in the module `claims` beside its plant, which has
+Only designs that are meant to reproduce the paper are judged, and any design on a row of the machine alone or of an
+input; the figures of other designs stand there without a verdict. Where the designs differ, each has its verdict; where
+the paper leaves a definition open, the verdict names the one that we use. Each claim has one word as well, for a line
+of a terminal: see WORDS. The claims on a machine are in the module `claims` beside its plant, which has
 
     SOURCE        the paper
+    REPRODUCING   names of the designs that are meant to reproduce it; without it all are
     evidence      (spec, published, progress) -> Evidence of a design, with all that the rows need besides
     rows          () -> list[Row]
 """
@@ -23,7 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 from malta.errors import InputError
 from malta.margins.verify import ZONES, Margins, verify
@@ -43,6 +46,18 @@ if TYPE_CHECKING:
 CLOSE, NEAR = 0.05, 0.2  # largest relative differences that are "reproduced" and "within x %"
 FACTOR, FAR = ", x ", 1000.0  # in front of a factor from a bound, and the largest one that is shown
 ROUNDING = 1e-9
+OTHER = "of another design"  # no design of the ledger is meant to reproduce the row
+LQG_ONLY = "of an LQG only"
+Word = Literal["reproduced", "near", "kept", "input", "differs", "partly", "beside", "ours", "other"]
+# Words of claims and the beginnings of verdicts that they stand for, the first that counts first; see word_of.
+WORDS: dict[Word, tuple[str, ...]] = {
+    "differs": ("not reproduced",),
+    "near": ("within",),
+    "kept": ("smaller", "larger", "on the other side", "other than"),
+    "reproduced": ("reproduced",),
+    "input": ("by construction",),
+    "beside": ("not compared",),
+}
 ZONE_NOTE = f"ISO 14839-3 zone {ZONES[0][1]} ends at {ZONES[0][0]:g}"
 
 
@@ -52,7 +67,8 @@ class Claim(NamedTuple):
     subject: str
     published: str
     ours: tuple[str, ...]  # for each design
-    verdict: str
+    verdict: str  # with notes and reasons
+    word: Word  # the verdict in one
 
 
 @dataclass(frozen=True)
@@ -63,6 +79,7 @@ class Ledger:
     source: str  # the paper
     designs: tuple[str, ...]
     claims: tuple[Claim, ...]
+    reproducing: tuple[str, ...] = ()  # those of the designs that are meant to reproduce the paper
 
     @property
     def title(self) -> str:
@@ -147,6 +164,8 @@ class Row(NamedTuple):
     of_lqg: bool = False  # a PID has no such figure: it shows a dash, and no verdict
     # Whether the figure restates an input, or what a design was solved for; of the machine's evidence.
     by_construction: bool | Callable[[Any], bool] = False
+    of_machine: bool = False  # no design changes the figure: any is judged
+    designs: tuple[str, ...] = ()  # that are meant to reproduce the row, where it is not REPRODUCING
 
 
 def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progress | None = None) -> Ledger:
@@ -180,36 +199,55 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
         paper.evidence(spec, published, progress_of_part(progress, n, len(specs)))
         for n, spec in enumerate(specs)
     ]
-    claims = [_claim(row, found, published) for row in paper.rows()]
-    return Ledger(machine, paper.SOURCE, tuple(e.spec.name for e in found), tuple(claims))
+    names = tuple(e.spec.name for e in found)
+    meant = tuple(name for name in names if name in getattr(paper, "REPRODUCING", names))
+    claims = [_claim(row, found, published, meant) for row in paper.rows()]
+    return Ledger(machine, paper.SOURCE, names, tuple(claims), meant)
 
 
+<<<<<<< HEAD
 def _claim(row: Row, found: Sequence[Evidence], published: Mapping[str, Any]) -> Claim:
     """The line of the ledger for a row and the evidence of all designs."""
     judged = [e for e in found if not (row.of_lqg and e.spec.pid)]
     figures = [row.value(e) if e in judged else math.nan for e in found]
     values = [in_unit(figure, row.unit) for figure in figures]
     ours = tuple(_shown(row, figure) for figure in figures)
+=======
+def _claim(
+    row: Row, found: Sequence[Evidence], published: Mapping[str, Any], reproducing: Sequence[str]
+) -> Claim:
+    """The line of the ledger for a row and the evidence of all designs.
+
+    reproducing : names of the designs that are meant to reproduce the paper
+    """
+    shown = [e for e in found if not (row.of_lqg and e.spec.pid)]
+    values = [in_unit(row.value(e), row.unit) if e in shown else math.nan for e in found]
+    ours = tuple("–" if math.isnan(value) else row.form.format(value) for value in values)
+>>>>>>> h-c
     unit = {"1": "", "percent": " [%]", "um": " [µm]", "urad": " [µrad]", "deg": " [°]"}.get(
         row.unit, f" [{row.unit}]"
     )
     subject = row.subject + unit
     if row.published is None:
-        return Claim(subject, "–", ours, "ours" + (f": {row.note}" if row.note else ""))
+        return Claim(subject, "–", ours, "ours" + (f": {row.note}" if row.note else ""), "ours")
     target = in_unit(
         published_value(published, row.published) if isinstance(row.published, str) else row.published,
         row.unit,
     )
     printed = row.form.format(target) if row.relation == "equal" else f"{target:.4g}"
     mark = {"at most": "≤ ", "at least": "≥ "}.get(row.relation, "")
+    judged = [e for e in shown if _is_judged(row, e.spec.name, reproducing)]
     if not judged:
-        return Claim(subject, mark + printed, ours, "of an LQG only")
+        note = f"; {row.note}" if row.note and shown else ""
+        return Claim(subject, mark + printed, ours, (OTHER if shown else LQG_ONLY) + note, "other")
     own = [value for value, e in zip(values, found, strict=True) if e in judged]
     built = [row.by_construction(e) if callable(row.by_construction) else row.by_construction for e in judged]
-    verdict = _verdict(row, target, own, [e.spec.name for e in judged], built)
-    return Claim(subject, mark + printed, ours, verdict)
+    words = [_word(row, target, value, by_construction=one) for value, one in zip(own, built, strict=True)]
+    verdict = _verdict(row, words, [e.spec.name for e in judged])
+    return Claim(subject, mark + printed, ours, verdict, word_of(words))
 
 
+<<<<<<< HEAD
 def _shown(row: Row, figure: float) -> str:
     """A figure in the row's form, with its interval if it is one of chance; "–" for none."""
     if math.isnan(figure):
@@ -223,11 +261,27 @@ def _verdict(
     row: Row, target: float, values: Sequence[float], names: Sequence[str], built: Sequence[bool] = ()
 ) -> str:
     """The verdict on the figures of all designs.
+=======
+def _is_judged(row: Row, name: str, reproducing: Sequence[str]) -> bool:
+    """Whether a design is meant to reproduce a row; of the machine alone, of an input and beside it every design is."""
+    if row.of_machine or row.by_construction is True or row.relation == "beside":
+        return True
+    return name in (row.designs or reproducing)
+>>>>>>> h-c
 
-    built : for each design whether its figure is so by construction
+
+def word_of(verdicts: Sequence[str]) -> Word:
+    """The one word of a claim, a key of WORDS or "partly", from the verdicts on the designs that are judged.
+
+    >>> word_of(["within 7 %"]), word_of(["reproduced", "not reproduced: larger, x 3.1"])
+    ('near', 'partly')
     """
-    judged = zip(values, built or [False] * len(values), strict=True)
-    words = [_word(row, target, value, by_construction=one) for value, one in judged]
+    words = {next(w for w, begins in WORDS.items() if verdict.startswith(begins)) for verdict in verdicts}
+    return "partly" if "differs" in words and len(words) > 1 else next(w for w in WORDS if w in words)
+
+
+def _verdict(row: Row, words: Sequence[str], names: Sequence[str]) -> str:
+    """The verdict on the figures of all designs that are judged, from that on each, with notes and reasons."""
     note = f"; {row.note}" if row.note else ""
     kinds = {word.partition(FACTOR)[0] for word in words}
     if len(set(words)) == 1:

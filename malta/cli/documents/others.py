@@ -9,6 +9,7 @@ from pydantic import Field
 from malta.cli.documents.loops import RequirementPart, requirement_part
 from malta.cli.documents.parts import Files, Number, Part
 from malta.identifiers import identifier
+from malta.report.ledger import Word
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -115,7 +116,8 @@ class ClaimPart(Part):
     subject: str
     published: str
     ours: list[str]
-    verdict: str
+    verdict: str = Field(description="with notes and reasons")
+    word: Word = Field(description="the verdict in one word")
 
 
 class LedgerPart(Part):
@@ -124,6 +126,9 @@ class LedgerPart(Part):
     machine: str
     source: str
     designs: list[str]
+    reproducing: list[str] = Field(
+        description="designs that are meant to reproduce the paper: these are judged"
+    )
     claims: list[ClaimPart]
 
 
@@ -199,8 +204,15 @@ def claims_output(ledgers: Sequence[Ledger]) -> ClaimsOutput:
                 machine=one.machine,
                 source=one.source,
                 designs=list(one.designs),
+                reproducing=list(one.reproducing),
                 claims=[
-                    ClaimPart(subject=c.subject, published=c.published, ours=list(c.ours), verdict=c.verdict)
+                    ClaimPart(
+                        subject=c.subject,
+                        published=c.published,
+                        ours=list(c.ours),
+                        verdict=c.verdict,
+                        word=c.word,
+                    )
                     for c in one.claims
                 ],
             )

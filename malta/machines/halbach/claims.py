@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import fields
 from functools import partial
+from typing import Any
 
 import numpy as np
 
+from malta.files import shipped_path
 from malta.machines.halbach import electronics
 from malta.machines.halbach.electronics import MEAN_OF
 from malta.machines.halbach.evidence import (
@@ -23,6 +25,7 @@ from malta.machines.halbach.evidence import (
     pwm_step_of,
     ramp_distance,
     rest_in_dead_ends,
+    rise_of_dip,
     sampled_pole,
     samples_of_range,
 )
@@ -30,6 +33,7 @@ from malta.machines.halbach.evidence import evidence as evidence
 from malta.machines.halbach.experiments.lift import FAULTS, LAWS
 from malta.machines.halbach.experiments.open_loop import positions_at_rest
 from malta.machines.halbach.plant import Parameters
+from malta.model.data import read
 from malta.report.ledger import (
     Row,
     case_merit,
@@ -39,6 +43,7 @@ from malta.report.ledger import (
 )
 
 SOURCE = "L. C. Díaz-Pérez et al., Actuators 7(4), 2018"
+REPRODUCING = ("halbach_pid",)
 
 
 MOTOR: tuple[Row, ...] = (
@@ -363,6 +368,7 @@ CLOSED_LOOP: tuple[Row, ...] = (
 
 
 WHY = "no steady change follows from the motor law, and no fault below has both signs and 0 under vector control"
+TRANSIENT = "largest change on the way, of the sign that the paper prints"
 LIFT: tuple[Row, ...] = (
     Row(
         "Fig. 10: open loop, steady change",
@@ -373,19 +379,46 @@ LIFT: tuple[Row, ...] = (
         why=WHY,
     ),
     Row(
-        "Fig. 10: open loop, dip",
-        "percent",
-        "{:.1f}",
-        partial(case_merit, "force", "open loop", 1),
-        note="back within 5 s",
-    ),
-    Row(
         "Fig. 10: position control, steady change",
         "percent",
         "{:.2f}",
         partial(case_merit, "force", "position control", 0),
         "figure_10.position_controller",
         why=WHY,
+    ),
+    Row(
+        "Fig. 10 as a transient: open loop, lowest",
+        "percent",
+        "{:.1f}",
+        partial(case_merit, "force", "open loop", "lowest"),
+        "figure_10.open_loop",
+        note=f"{TRANSIENT}; back within 5 s",
+        why="a jump of 5 mm is 1 − cos(k 5 mm) = 51 %, all at once: a slower command or a slow load cell sees less",
+        of_machine=True,
+    ),
+    Row(
+        "the same with a quintic: rise that dips by as much",
+        "s",
+        "{:.3f}",
+        lambda e: rise_of_dip(e.spec.plant, e.value("figure_10.open_loop")),
+        note="solved; from 10 to 90 % of the 5 mm, without electronics",
+        of_machine=True,
+    ),
+    Row(
+        "Fig. 10 as a transient: position control, highest",
+        "percent",
+        "{:.1f}",
+        partial(case_merit, "quick", "position control", "highest"),
+        "figure_10.position_controller",
+        note=f"{TRANSIENT}; with the same quintic, at the assumed limit of 2 N; 0.3 s makes 1.4 %",
+    ),
+    Row(
+        "the same under vector control",
+        "percent",
+        "{:.1f}",
+        partial(case_merit, "quick", "vector control", "highest"),
+        note="currents are commutated for a reading that is up to 55 ms old, with current loops and without; the paper "
+        "finds its transient smoother",
     ),
     Row(
         "Fig. 10: vector control, steady change",
@@ -413,6 +446,34 @@ def _lift() -> list[Row]:
     return found
 
 
+FITTED = (
+    "fitted to the laser's readings of a simulated record with K known, as Sec. 2.3 does; the record's motor has the "
+    "printed figure"
+)
+
+
+def _fitted() -> list[Row]:
+    """Rows of mass and friction as the paper identified them; their printed figures stand in the machine's data."""
+    printed: Any = read(shipped_path("data", "halbach.toml"))
+    found: list[Row] = []
+    for name, unit, value, note in (
+        ("mass", "kg", printed.m, f"{FITTED}: (5) is a line where the motor has a sine, which costs 2 %"),
+        ("friction", "N s/m", printed.b, FITTED),
+    ):
+        fit, half = (
+            partial(merit, "identify", f"{name}, {what}") for what in ("fitted", "half of its interval")
+        )
+        found += [
+            Row(f"step of 2 mm: {name}", unit, "{:.2f}", fit, value, note=note, by_construction=True),
+            Row(f"step of 2 mm: {name}, half of its interval", unit, "{:.2f}", half, note=INTERVAL),
+        ]
+    return found
+
+
+INTERVAL = "95 %; residuals that are correlated over a period, of a K that is taken as exact"
+
+
 def rows() -> list[Row]:
     """All claims of the paper, in the order of the ledger."""
-    return [*MOTOR, *ELECTRONICS, *OPEN_LOOP, *CLOSED_LOOP, *LIFT, *_lift()]
+    motor = [row._replace(of_machine=True) for row in (*MOTOR, *_fitted(), *ELECTRONICS, *OPEN_LOOP)]
+    return [*motor, *CLOSED_LOOP, *LIFT, *_lift()]

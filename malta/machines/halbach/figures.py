@@ -234,14 +234,16 @@ def budget_figure(e: Experiment, _: Published | None = None) -> Figure:
 
 
 def identify_figure(e: Experiment, _: Published | None = None) -> Figure:
-    """The motor's step beside the linear servo's, and their difference. Sec. 2.3."""
+    """The motor's step beside the linear servo's, printed and fitted, and their differences. Sec. 2.3."""
     run, linear = e.run, e.curves["linear"]
-    text = ", ".join(f"{m.label.replace(', ', ' ')} {merit_phrase(m)}" for m in e.merits)
+    text = ", ".join(f"{m.label.replace(', ', ' ')} {merit_phrase(m)}" for m in e.merits[:4])
     figure = new_page([run], f"a step of the open loop{ending_text(run)}", micro(text), hspace=0.2)
     position, difference = figure.subplots(2, 1, sharex=True)
     draw_line(position, run.t, 1e3 * run.p[:, 0], label="motor", **STYLES[0])
     draw_line(position, run.t, 1e3 * linear, label="linear servo, eq. (5)", **ASKED)
-    draw_line(difference, run.t, 1e3 * (linear - run.p[:, 0]), **STYLES[0])
+    draw_line(difference, run.t, 1e3 * (linear - run.p[:, 0]), **ASKED)
+    fitted = 1e3 * (e.curves["fitted"] - run.p[:, 0])
+    draw_line(difference, run.t, fitted, label="m and b fitted to the laser's readings", **STYLES[1])
     finish_axes(position, "", "position [mm]")
     finish_axes(difference, "time [s]", "linear servo less motor [mm]")
     add_shared_legend(figure)

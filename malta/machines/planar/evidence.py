@@ -12,7 +12,8 @@ import numpy as np
 from malta.machines.planar import coils, commutation
 from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
-from malta.machines.planar.experiments.models import CURRENT
+from malta.machines.planar.experiments.jumps import SOFT, jump
+from malta.machines.planar.experiments.models import CURRENT, coil_wrench
 from malta.machines.planar.experiments.motions import steps_ahead
 from malta.margins.verify import Margins
 from malta.model.published import published_value
@@ -29,7 +30,10 @@ from malta.synthesis.spec import Spec
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
-EXPERIMENT_NAMES = ("step", "errors", "timing", "delay")
+EXPERIMENT_NAMES = ("step", "jump", "errors", "timing", "delay")
+SLOWER = (
+    49.6  # 1/s, rate of approach of Kp = 1.2 N/um with the Kd of planar_pid: how far torques depend on gains
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,17 +45,19 @@ class Evidence:
     parameters: planar.Parameters
     controller: Controller
     margins: Margins
-    experiments: Mapping[str, Experiment]  # with "ahead"; without "delay" for a PID, which predicts nothing
+    experiments: Mapping[
+        str, Experiment
+    ]  # with "ahead" and "slower"; without "delay" for a PID, which predicts nothing
 
 
 def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
     """Design a controller, prove its margins and run the experiments."""
-    found = run_design(spec, EXPERIMENT_NAMES[: 3 if spec.pid is not None else 4], progress)
+    found = run_design(spec, EXPERIMENT_NAMES[: -1 if spec.pid is not None else None], progress)
     par: Any = spec.parameters
-    ahead = steps_ahead(
-        spec.plant, found.controller, engine="virtual machine"
-    )  # two runs, and nothing to compile
-    experiments = found.experiments | {"ahead": ahead}
+    # A few runs, and nothing to compile.
+    ahead = steps_ahead(spec.plant, found.controller, engine="virtual machine")
+    slower = jump(spec.plant, found.controller, rate=SLOWER, engine="virtual machine")
+    experiments = found.experiments | {"ahead": ahead, "slower": slower}
     return Evidence(spec, published, par, found.controller, found.margins, experiments)
 
 
@@ -111,6 +117,20 @@ def condition(ratio: float, e: Evidence) -> float:
     return float(commutation.conditioning(par, coils.simulation_model(par)).max())
 
 
+def coil_torque(ratio: float, name: str, e: Evidence) -> float:
+    """Amplitude of a torque, N m, of an inner coil at the paper's 3 A for a coil pitch of `ratio` tau_n."""
+    par = replace(e.parameters, coil_pitch=ratio * e.parameters.tau_n)
+    x, y = np.meshgrid(*[np.linspace(0, 2 * par.tau_n, 141)] * 2, indexing="ij")
+    wrench = coil_wrench(par, coils.exact_model(par), CURRENT, x, y)
+    return float(np.abs(wrench[..., [s.name for s in e.spec.plant.inputs].index(name)]).max())
+
+
+def coils_width(ratio: float, e: Evidence) -> float:
+    """Width of the 4 x 4 coils, m, for a coil pitch of `ratio` tau_n."""
+    par = e.parameters
+    return 3 * ratio * par.tau_n + par.l_c + par.w_c
+
+
 def residual(e: Evidence) -> float:
     """Largest relative error of the wrench K i of the computed currents, over a period."""
     par = e.parameters
@@ -123,8 +143,12 @@ def residual(e: Evidence) -> float:
 
 
 def flight(model: str, e: Evidence) -> Trajectory:
-    """The steps with a coil model, from the place without symmetry; with AHEAD in the label the predicted ones."""
-    cases = (*e.experiments["step"].cases, *e.experiments["ahead"].cases)
+    """The steps with a coil model, from the place without symmetry: by quintics, or as the label's end says.
+
+    AHEAD: with currents for the predicted place; SOFT: by jumps, with soft gains.
+    """
+    names = ("jump",) if model.endswith(SOFT) else ("step", "ahead")
+    cases = (case for name in names for case in e.experiments[name].cases)
     return next(case.run for case in cases if case.label.startswith(model))
 
 
@@ -151,6 +175,17 @@ def largest_deviation(model: str, name: str, e: Evidence) -> float:
 def phi_ratio(e: Evidence) -> float:
     """Motion in phi by the analytical model over that by the table."""
     return merit("step", "analytical moves phi by", e) / merit("step", "table moves phi by", e)
+
+
+def jump_ratio(e: Evidence) -> float:
+    """Largest motion in phi under jumps by the analytical model over that by the table, with soft gains."""
+    return largest_deviation(f"analytical, {SOFT}", "phi", e) / largest_deviation(f"table, {SOFT}", "phi", e)
+
+
+def slower_torque(model: str, of: Callable[[FloatArray], Any], e: Evidence) -> float:
+    """Smallest or largest T_x under jumps with a rate of approach of SLOWER, N m."""
+    run = next(case.run for case in e.experiments["slower"].cases if case.label == f"{model}, {SOFT}")
+    return float(of(run.v[:, [s.name for s in run.plant.inputs].index("T_x")]))
 
 
 def angles_at_rest(label: str, e: Evidence) -> float:

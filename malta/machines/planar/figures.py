@@ -76,6 +76,35 @@ def step_figure(e: Experiment, published: Published | None = None) -> Figure:
     return figure
 
 
+def jump_figure(e: Experiment, published: Published | None = None) -> Figure:
+    """The same as jumps of the reference: motion and forces as designed and softened, torque and tilt by coil model."""
+    designed, soft = e.cases[0], [case for case in e.cases[1:] if case.label != "exact, soft"]
+    figure = new_page(
+        runs_of(e),
+        "jumps of the reference in z and y: gains as designed, and soft in y and z",
+        ", ".join(f"{c.label}: y off by {merit_phrase(c.merits[0])}" for c in (designed, *soft[:1])),
+        wspace=0.3,
+        left=0.075,
+        hspace=0.2,
+    )
+    (motion, forces), (torque, tilt) = figure.subplots(2, 2, sharex=True)
+    for case, style in zip((designed, *soft[:1]), (STYLES[1], STYLES[0]), strict=False):
+        run, text = case.run, case.label.split(", ")[-1]
+        draw_line(motion, run.t * 1e3, (run.p[:, 1] - run.reference[0, 1]) * 1e3, label=f"y, {text}", **style)
+        mark_end(motion, run, run.t * 1e3, (run.p[:, 1] - run.reference[0, 1]) * 1e3)
+        draw_line(forces, run.t * 1e3, run.v[:, 1], label=f"F_y, {text}", **style)
+    draw_published(forces, published, "steps.force_limit", "N", "published limit", both=True)
+    for case, style in zip(soft, STYLES, strict=False):
+        run = case.run
+        draw_line(torque, run.t * 1e3, run.v[:, 3], label=case.label, **style)
+        draw_line(tilt, run.t * 1e3, (run.p - run.reference)[:, 3] * 1e6, label=case.label, **style)
+    finish_axes(motion, "", "moved [mm]", legend=2)
+    finish_axes(forces, "", "commanded force [N]", legend=2)
+    finish_axes(torque, "time [ms]", "commanded T_x [N m]", legend=2)
+    finish_axes(tilt, "time [ms]", "phi, off reference [µrad]")
+    return figure
+
+
 def errors_figure(e: Experiment, published: Published | None = None) -> Figure:
     """Figs 7, 8 and 13: maps of the models' errors, errors over the table's step, and errors along x."""
     from matplotlib.ticker import FixedLocator, NullLocator
@@ -210,6 +239,7 @@ def timing_figure(e: Experiment, published: Published | None = None) -> Figure:
 
 FIGURES: dict[str, Callable[[Experiment, Published | None], Figure]] = {
     "step": step_figure,
+    "jump": jump_figure,
     "errors": errors_figure,
     "delay": delay_figure,
     "timing": timing_figure,

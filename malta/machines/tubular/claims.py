@@ -44,6 +44,7 @@ from malta.report.ledger import (
 )
 
 SOURCE = "S. Miric et al., IEEE Trans. Ind. Electron. 68(1), 2021"
+REPRODUCING = ("table2", "calibrated")
 
 
 PLAIN = "printed weights as plain SI are next to nothing beside (2 K_A)^2"

@@ -91,6 +91,15 @@ def force(
     return Experiment("force", "Does a move disturb the vertical force?", cases, (), interrupted=cut)
 
 
+def sound_moves(plant: Plant, controller: Controller, rise: float) -> Experiment:
+    """The moves of `force` of the sound machine alone, with another rise (s) of the quintics."""
+    own = {"electronics": Options("fine")}
+    cases, cut = fly_all(
+        [_flight(plant, controller, "sound", law, MOVE, rise, own) for law in LAWS], None, {}
+    )
+    return Experiment("force", "Does a quick move disturb the vertical force?", cases, (), interrupted=cut)
+
+
 def _flight(
     plant: Plant,
     controller: Controller,

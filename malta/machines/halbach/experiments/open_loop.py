@@ -1,14 +1,16 @@
-"""The Halbach motor without feedback: stairs beside those under position control, and the linear servo."""
+"""The Halbach motor without feedback: stairs beside those under position control, and the linear servo, fitted too."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from malta.errors import CheckError, InputError
 from malta.machines.halbach import electronics, motor
 from malta.machines.halbach.electronics import IDEAL, Pwm
 from malta.machines.halbach.experiments.lift import FASTER, move_reference
@@ -107,7 +109,10 @@ def identify(
     progress: Progress | None = None,
     **options: Any,
 ) -> Experiment:
-    """A step of the open loop at a vertical force of `F_z` (N), beside the linear servo (5) that was fitted to one."""
+    """A step of the open loop at a vertical force of `F_z` (N), beside the linear servo (5) that was fitted to one.
+
+    Mass and friction are fitted to what the laser reads of it, as the paper fitted them: see `fit_servo`.
+    """
     par: Any = plant.parameters
     believed: Any = controller.parameters
     fast = controller.sample_time / FASTER
@@ -131,20 +136,118 @@ def identify(
     for _ in case.run.t[1:]:
         states.append(E @ states[-1] + G[:, 0] * distance)
     linear = np.array(states)[:, 0]
-    off = linear - case.run.p[:, 0]
+    off, K = linear - case.run.p[:, 0], motor.stiffness(par, F_z, distance)
+    fit = _fit_to_readings(case.run, distance, K)
+    fitted = (
+        servo_step(case.run.t, fit.m, fit.b, K, distance) if fit.m > 0 else np.full(len(linear), math.nan)
+    )
     merits = (
         Merit("linear servo off by, rms", rms(off), "mm"),
         Merit(
             "the same in the first 2 s", rms(off[case.run.t < 2]), "mm", key="linear_servo_off_by_rms_early"
         ),
-        Merit("secant stiffness", motor.stiffness(par, F_z, distance), "N/m", "servo.K"),
+        Merit("secant stiffness", K, "N/m", "servo.K"),
         Merit("tangent stiffness", motor.stiffness(par, F_z), "N/m"),
+        Merit("mass, fitted", fit.m, "kg"),
+        Merit("mass, half of its interval", fit.m_half, "kg"),
+        Merit("friction, fitted", fit.b, "N s/m"),
+        Merit("friction, half of its interval", fit.b_half, "N s/m"),
+        Merit("fitted servo off by, rms", fit.rms, "um"),
     )
     return Experiment(
         "identify",
         "Is the motor a linear servo?",
         (case._replace(merits=merits),),
         merits,
-        {"linear": linear},
+        {"linear": linear, "fitted": fitted},
         cut,
     )
+
+
+def _fit_to_readings(run: Trajectory, distance: float, K: float) -> ServoFit:
+    """The servo fitted to what the laser reads of a run; NaN where none fits, as of a run that ended early."""
+    try:
+        return fit_servo(run.t[::FASTER], run.y[::FASTER, 0], distance, K)
+    except (CheckError, InputError):
+        return ServoFit(*[math.nan] * 5)
+
+
+class ServoFit(NamedTuple):
+    """Mass and friction of the linear servo (5), fitted to a record of a step."""
+
+    m: float  # kg
+    m_half: float  # kg, half of its interval of 95 %
+    b: float  # N s/m
+    b_half: float  # N s/m
+    rms: float  # m, what the fit leaves of the record
+
+
+def fit_servo(t: FloatArray, x: FloatArray, distance: float, K: float) -> ServoFit:
+    """Fit m and b of the linear servo (5), m x'' + b x' + K x = K x_eq, to its step from rest. Least squares.
+
+    t : n times after the step, s
+    x : n positions that were read, m, before the step 0
+    distance : of the step of x_eq, m
+    K : stiffness, N/m, which is known, as in Sec. 2.3. A step tells m / K and b / K alone.
+
+    Returns a ServoFit. What a linear servo leaves of a motor's record is no white noise but a wave of its own period:
+    the intervals are the wider of those of white residuals and of residuals that are correlated over a period (Newey
+    and West, Econometrica 55, 1987). They know of no error of K.
+
+    Raises InputError for fewer than 8 readings or numbers that are not finite, CheckError where nothing fits.
+
+    >>> import numpy as np
+    >>> t = np.arange(100) * 0.055
+    >>> fit = fit_servo(t, servo_step(t, 3.75, 9.41, 205.0, 2e-3), 2e-3, 205.0)
+    >>> round(fit.m, 6), round(fit.b, 6)
+    (3.75, 9.41)
+    """
+    from scipy.optimize import least_squares
+
+    if len(t) < FEWEST or len(t) != len(x):
+        raise InputError(
+            "fit_servo", "x", f"{len(x)} readings at {len(t)} times", f"{FEWEST} or more, of one each"
+        )
+    if not (np.isfinite([*t, *x, distance, K]).all() and distance and K > 0):
+        raise InputError("fit_servo", "t, x, distance, K", "a number that is none", "finite ones, K above 0")
+
+    def off(logs: FloatArray) -> FloatArray:
+        m, b = np.exp(logs)
+        return (servo_step(t, m, b, K, distance) - x) / distance
+
+    crossing = int(np.argmax(x / distance > 0.5))  # a mass that is late by a sixth of its period
+    w = np.pi / 3 / max(t[crossing], t[1])
+    found = least_squares(off, np.log([K / w**2, K / w]), x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    m, b = np.exp(found.x)
+    period = 2 * np.pi * np.sqrt(m / K)
+    if not (found.success and period < t[-1] - t[0]):
+        raise CheckError(f"fit_servo: no servo of {K:g} N/m fits the record of {t[-1] - t[0]:g} s")
+    lags = int(np.ceil(period / (t[1] - t[0])))
+    shares = NORMAL * np.sqrt(_variances(np.asarray(found.jac), found.fun, lags))
+    rest = abs(distance) * rms(found.fun)
+    return ServoFit(float(m), float(m * shares[0]), float(b), float(b * shares[1]), rest)
+
+
+def _variances(J: FloatArray, off: FloatArray, lags: int) -> FloatArray:
+    """Variances of fitted numbers from the residuals: the larger of those of white ones and of ones that correlate."""
+    scores = J * off[:, None]
+    inner = scores.T @ scores
+    for lag in range(1, min(lags, len(off) - 1)):
+        cross = scores[lag:].T @ scores[:-lag]
+        inner += (1 - lag / lags) * (cross + cross.T)
+    outer = np.linalg.inv(J.T @ J)
+    white = outer * (off @ off) / (len(off) - J.shape[1])
+    return np.asarray(np.maximum(np.diag(outer @ inner @ outer), np.diag(white)))
+
+
+FEWEST, NORMAL = 8, 1.96  # readings; standard deviations of an interval of 95 %
+
+
+def servo_step(t: FloatArray, m: float, b: float, K: float, distance: float) -> FloatArray:
+    """Positions, m, of the linear servo (5) at times t (s) after a step of x_eq by `distance` (m) from rest."""
+    decay = b / (2 * m)
+    w = np.sqrt(complex(K / m - decay**2))  # imaginary where friction leaves no oscillation
+    w = w if abs(w) > 1e-6 * decay else 1e-6 * decay  # poles that meet: the limit, to 1e-12
+    first, second = -decay + 1j * w, -decay - 1j * w
+    left = (first * np.exp(second * t) - second * np.exp(first * t)) / (first - second)
+    return np.asarray(distance * (1 - left.real))

@@ -1,6 +1,7 @@
 """The experiments on the planar motor.
 
-step     the paper's steps in z and y, Figs 9 to 12, with each coil model in the controller
+step     the paper's steps in z and y, Figs 9 to 12, as quintics, with each coil model in the controller
+jump     the same as the paper commands them, jumps that saturate, with gains that settle
 errors   errors of the coil models against the exact wrench, Figs 7, 8 and 13
 delay    filters with the sample of computation in their model, and without
 timing   K(p) and its pseudo-inverse within the control period, Table 2
@@ -15,6 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 from malta.errors import InputError
+from malta.machines.planar.experiments.jumps import jump
 from malta.machines.planar.experiments.models import errors
 from malta.machines.planar.experiments.motions import delay, step, step_cases
 from malta.machines.planar.experiments.timings import timing
@@ -25,6 +27,7 @@ from malta.simulation.experiments import (
 
 EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "step": step,
+    "jump": jump,
     "errors": errors,
     "delay": delay,
     "timing": timing,
@@ -41,12 +44,14 @@ WORDS = {
     "N": "F_x and F_z",
     "N m": "torques",
 }
-OPTION_UNITS = {"place": "m", "gap": "m", "lift": "m", "distance": "m", "current": "A"}
+OPTION_UNITS = {"place": "m", "gap": "m", "lift": "m", "distance": "m", "rate": "1/s", "current": "A"}
 
 
 def check(name: str, option: str, value: Any) -> None:
     """Raise InputError for a number outside the range of an option. `steps_reference` checks positions."""
     numbers = value if isinstance(value, tuple | list) else (value,)
+    if option == "rate" and not 0 <= value <= 1000:
+        raise InputError("simulate", f"{name}: rate", repr(value), "0 to 1000 1/s")
     if option in ("cells", "speeds", "current") and not all(math.isfinite(v) and v > 0 for v in numbers):
         raise InputError("simulate", f"{name}: {option}", repr(value), "finite, above 0")
     if option == "cells" and value != int(value):
