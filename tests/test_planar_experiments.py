@@ -20,7 +20,7 @@ from malta.machines.planar import coils, commutation
 from malta.machines.planar import experiments as experiments
 from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments import models, motions, timings
-from malta.margins.verify import Margins
+from malta.margins.loop_report import LoopReport
 from malta.model.published import published as read_published
 from malta.model.published import published_value
 from malta.report.figures import experiment_figure
@@ -45,7 +45,7 @@ class Design(NamedTuple):
     spec: Spec
     plant: Plant
     controller: Controller
-    margins: Margins
+    margins: LoopReport
 
 
 def made(name: str) -> Design:

@@ -19,23 +19,18 @@ from malta.app.runs import planned_run
 from malta.errors import CheckError, InputError
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.loop import Loop, loop_of_model
+from malta.loops.noise import noise_of
 from malta.loops.sampled_loops import continuous_poles
+from malta.margins.figures import BANDWIDTHS, zone
+from malta.margins.loop_report import Stage
 from malta.margins.travel import travel_loops
-from malta.margins.verify import (
-    BANDWIDTHS,
-    Stage,
-    bandwidths_of,
-    controller_poles,
-    stage_of,
-    zone,
-)
+from malta.margins.verify import bandwidths_of, controller_poles, stage_of
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.proof.rays import RayBound, ray_bound
 from malta.simulation.linear_run import linear_run
 from malta.synthesis.lqg import synthesize
 from malta.synthesis.riccati import eigenvalues
-from malta.tuning.noise import noise_of
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Plant

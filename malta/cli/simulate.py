@@ -253,7 +253,7 @@ def _save_gains(simulation: Simulation, gains: Path, folder: Path) -> list[Path]
     """Verify the controller that an experiment has found, over the uncertainty of the gain file, and write it."""
     from malta import gains as gain_files
     from malta.gains.file import content_of
-    from malta.margins.verify import verify
+    from malta.margins.verify import linear_report
     from malta.model.data import plant_of
     from malta.model.linearize import linearize
 
@@ -262,7 +262,7 @@ def _save_gains(simulation: Simulation, gains: Path, folder: Path) -> list[Path]
         return []
     plant = plant_of(controller.parameters)
     robust = content_of(gains)[0].verification.robust
-    margins = verify(
+    margins = linear_report(
         linearize(plant, plant.point(controller.operating_point[0])),
         controller,
         {} if robust is None else robust.uncertainty,

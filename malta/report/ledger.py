@@ -26,7 +26,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from malta.errors import InputError
-from malta.margins.verify import ZONES, Margins, verify
+from malta.margins.figures import ZONES
+from malta.margins.loop_report import LoopReport
+from malta.margins.verify import linear_report
 from malta.model.linearize import LinearModel, linearize
 from malta.model.machines import require_part
 from malta.model.published import published_value
@@ -85,7 +87,7 @@ class Evidence(Protocol):
     @property
     def controller(self) -> Controller: ...
     @property
-    def margins(self) -> Margins: ...
+    def margins(self) -> LoopReport: ...
     @property
     def experiments(self) -> Mapping[str, Experiment]: ...
 
@@ -95,7 +97,7 @@ class DesignRuns(NamedTuple):
 
     model: LinearModel
     controller: Controller
-    margins: Margins
+    margins: LoopReport
     experiments: dict[str, Experiment]
 
 
@@ -111,7 +113,7 @@ def run_design(spec: Spec, names: Sequence[str], progress: Progress | None = Non
         name: experiment(name, plant, controller, progress=progress_of_part(progress, n, len(names)))
         for n, name in enumerate(names)
     }
-    return DesignRuns(model, controller, verify(model, controller, spec.uncertainty), experiments)
+    return DesignRuns(model, controller, linear_report(model, controller, spec.uncertainty), experiments)
 
 
 class Row(NamedTuple):

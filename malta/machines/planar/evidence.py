@@ -14,7 +14,7 @@ from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments.models import CURRENT
 from malta.machines.planar.experiments.motions import steps_ahead
-from malta.margins.verify import Margins
+from malta.margins.loop_report import LoopReport
 from malta.model.published import published_value
 from malta.report.ledger import (
     case_merit,
@@ -40,7 +40,7 @@ class Evidence:
     published: Mapping[str, Any]
     parameters: planar.Parameters
     controller: Controller
-    margins: Margins
+    margins: LoopReport
     experiments: Mapping[str, Experiment]  # with "ahead"; without "delay" for a PID, which predicts nothing
 
 

@@ -87,8 +87,8 @@ def _stairs_merits(run: Trajectory, distance: float) -> tuple[Merit, ...]:
     """Heights of the stairs, the largest error of a stair, and the largest motion on one."""
     stands, swings = positions_at_rest(run)
     return (
-        Merit("smallest stair", float(np.diff(stands).min()), "um"),
-        Merit("largest stair", float(np.diff(stands).max()), "um"),
+        Merit("smallest stair", float(np.diff(stands).min()), "um", better="high"),
+        Merit("largest stair", float(np.diff(stands).max()), "um", better=""),
         Merit("off its stair by", float(np.abs(stands - distance * np.arange(LEVELS)).max()), "um"),
         Merit("swing, peak to peak", float(swings.max()), "um"),
     )
@@ -137,8 +137,8 @@ def identify(
         Merit(
             "the same in the first 2 s", rms(off[case.run.t < 2]), "mm", key="linear_servo_off_by_rms_early"
         ),
-        Merit("secant stiffness", motor.stiffness(par, F_z, distance), "N/m", "servo.K"),
-        Merit("tangent stiffness", motor.stiffness(par, F_z), "N/m"),
+        Merit("secant stiffness", motor.stiffness(par, F_z, distance), "N/m", "servo.K", better="high"),
+        Merit("tangent stiffness", motor.stiffness(par, F_z), "N/m", better="high"),
     )
     return Experiment(
         "identify",
