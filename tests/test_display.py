@@ -44,7 +44,7 @@ RESULTS: dict[str, tuple[Callable[[malta.Spec, malta.Controller], Any], str]] = 
     "margins": (lambda s, c: malta.verify(malta.linearize(s.plant, s.plant.at()), c), "delay margin, smallest [µs]"),
     "margin": (lambda s, c: malta.loop(s.plant, c).margin({"m": 0.2}), "proven 3"),
     "recovery": (lambda s, c: malta.recovery(s.plant, c, {"push": {"w": 0.01}})[0], "y  moves"),
-    "stages": (lambda s, c: malta.verify(s.plant, c, {"m": 0.2}, stages=True), "margin of parameters, proven"),
+    "stages": (lambda s, c: malta.verify(s.plant, c, {"m": 0.2}, stages=True), "proven 3"),
     "run": (lambda s, c: malta.experiment("disturbance", s.plant, c, size=0.1, **SHORT).run, "completed at 20 ms"),
     "experiment": (lambda s, c: malta.experiment("disturbance", s.plant, c, size=0.1, **SHORT), "y moves by"),
     "campaign": (lambda _, c: malta.campaign(_plan(c), workers=1), "8 of 8: 100 %"),

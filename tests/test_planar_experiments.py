@@ -449,7 +449,7 @@ def test_a_campaign(lqg: Design, tmp_path: Path) -> None:
         (("--option", "gap=0mm"), 1, "touchdown on the magnets at 0 s"),
         (("--option", "cells=0"), 2, "finite, above 0"),
         (("--option", "cells=3.5"), 2, "a whole number"),
-        (("--fidelity", "dq"), 2, "one of force for a planar"),
+        (("--option", "fidelity=dq"), 2, "one of force for a planar"),
         (("--scenario", "errors", "--option", "place=0,0,0"), 2, "3 numbers"),
         (("--scenario", "errors", "--option", "current=0"), 2, "finite, above 0"),
         (("--scenario", "delay", "--option", "speeds=1,-2"), 2, "finite, above 0"),

@@ -177,7 +177,7 @@ def test_the_command_lifts_off_with_a_pids_gain_file(run: Run) -> None:
     code, text, err = run("simulate", GAINS, "--scenario", "lift-off")
     assert (code, "steady-state" in text) == (0, True)
     assert "kalman" not in text + err
-    code, _, err = run("simulate", GAINS, "--scenario", "lift-off", "--estimator", "extended")
+    code, _, err = run("simulate", GAINS, "--scenario", "lift-off", "--option", "estimator=extended")
     assert code == 2
     assert "estimator extended: found a PID" in one_sentence(err)
 

@@ -91,7 +91,7 @@ def verify(
     """
     if isinstance(loop, str | Path):
         stages = True if stages is None else stages
-        uncertainty = _uncertainty_of(loop) if uncertainty is None else uncertainty
+        uncertainty = content_of(locate(loop))[0].uncertainty if uncertainty is None else uncertainty
         loop = read(loop)
     model, controller = _model_and_controller(loop, controller)
     if not stages:
@@ -130,12 +130,6 @@ def judged(found: LoopReport, spec: Spec | None, *, proof: bool, flights: bool) 
             raise
         return replace(found, notes=(*found.notes, f"the requirements were not judged: {error}"))
     return replace(found, requirements=outcomes)
-
-
-def _uncertainty_of(gains: str | Path) -> Mapping[str, float]:
-    """The uncertain parameters that a gain file names; none where it names none."""
-    robust = content_of(locate(gains))[0].verification.robust
-    return {} if robust is None else robust.uncertainty
 
 
 def _model_and_controller(

@@ -132,7 +132,7 @@ class DesignPointPart(Part):
 
 
 class RareOutput(HeadPart):
-    """What `malta campaign --rare LIMIT --json` prints."""
+    """What `malta campaign --study rare --json` prints."""
 
     kind: Literal["malta-rare-output"] = Field(default="malta-rare-output", alias="schema")
     version: Literal[1] = 1
@@ -166,7 +166,7 @@ Indices = dict[str, IndexPart] | None
 
 
 class SobolOutput(HeadPart):
-    """What `malta campaign --sobol --json` prints."""
+    """What `malta campaign --study sensitivity --json` prints."""
 
     kind: Literal["malta-sobol-output"] = Field(default="malta-sobol-output", alias="schema")
     version: Literal[1] = 1
@@ -190,7 +190,7 @@ class SpreadPart(Part):
 
 
 class ToleranceOutput(HeadPart):
-    """What `malta campaign --tolerance YIELD --json` prints."""
+    """What `malta campaign --study tolerances --json` prints."""
 
     kind: Literal["malta-tolerance-output"] = Field(default="malta-tolerance-output", alias="schema")
     version: Literal[1] = 1
