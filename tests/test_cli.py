@@ -23,6 +23,7 @@ import malta
 from malta import gains
 from malta.cli import main as cli
 from malta.cli.assignments import GENERAL, read_options
+from malta.cli.command import renew
 from malta.errors import InputError
 from malta.model.plant import Plant
 from malta.report.ledger import Ledger
@@ -598,6 +599,16 @@ def test_the_scenarios_of_the_machine_are_listed(run: Run) -> None:
         assert [line.split()[0] for line in own.splitlines()[4:] if line[:2].strip()] == list(names)
         assert [line.split()[0] for line in general.splitlines()[1:]] == list(GENERAL)
     assert "radius=0.0002 m" in out
+
+
+def test_options_of_the_version_before_become_what_replaces_them(capsys: pytest.CaptureFixture[str]) -> None:
+    old = ["g.json", "--distance", "5", "--rise=3", "--no-quantize", "--tolerance", "99%", "--delay"]
+    new = ["--option", "distance=5mm", "--option", "rise=3ms", "--option", "quantize=false"]
+    assert renew(old) == ["g.json", *new, "--study", "tolerances", "--keep", "99%", "--delay"]
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "malta: --distance goes with the next version: write --option distance=5mm"
+    assert len(said) == 4
+    assert renew(["g.json", "--sobol", "--json"]) == ["g.json", "--study", "sensitivity", "--json"]
 
 
 OLD = {

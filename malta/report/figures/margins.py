@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from malta.errors import InputError
 from malta.margins.figures import ZONES
 from malta.report.figures.parts import (
     BOUND,
@@ -46,6 +47,8 @@ def chain_figure(found: LoopReport) -> Figure:
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
+    Raises InputError for a report without stages.
+
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
@@ -54,6 +57,8 @@ def chain_figure(found: LoopReport) -> Figure:
     >>> [axes.get_xlabel() for axes in figure.axes]
     ['proven margin without loads [% of the box]', 'peak |S| [-], zones of ISO 14839-3']
     """
+    if not found.chain:
+        raise InputError(found.controller.name, "stages", "none", "a report of malta.verify with stages=True")
     box = ", ".join(f"{key} ±{100 * share:g} %" for key, share in found.uncertainty.items())
     figure = new_figure(
         f"{found.controller.name}: where the margin goes",

@@ -34,7 +34,7 @@ def loop_tables(
 ) -> Iterator[Table | Paragraph]:
     """Tabulate all that is known of a loop, as `malta verify` prints it.
 
-    found : from `malta.verify`, with `stages`
+    found : from `malta.verify`; without `stages` what is linear alone
     published : figures of the machine's paper, from `malta.published`; None: none
     spec : the design file, whose requirements were judged; None: none
 
@@ -55,6 +55,8 @@ def loop_tables(
     yield sensitivity_table(found)
     if found.recovery:
         yield recovery_table(found.recovery, found.plant)
+    if not found.chain:
+        return
     yield Paragraph(f"Uncertainty: {box}\n")
     yield chain_table(found)
     if missing := found.left_out:
@@ -336,7 +338,7 @@ def tolerance_table(found: LoopReport) -> Table:
     table = new_table(
         f"One at a time, proven {where}".rstrip(), "parameter", "down to", "up to", "share in the margin"
     )
-    shares = found.chain[-1].margin.sensitivity
+    shares = found.chain[-1].margin.sensitivity if found.chain else {}
     for name, (down, up) in found.tolerance.items():
         cells = []
         for margin, sign in ((down, -1), (up, 1)):
