@@ -48,27 +48,30 @@ def loop_tables(
     >>> rich.print(tables[-1])
     Requirements of examples/ball/design/ball.toml: 6 of 6 hold
     """
-    box = "  ".join(f"{name} +-{100 * share:g} %" for name, share in found.uncertainty.items())
-    bounds = "\n".join(open_bounds(found))
     yield loop_poles_table(found)
     yield bandwidth_table(found, published)
     yield sensitivity_table(found)
     if found.recovery:
         yield recovery_table(found.recovery, found.plant)
-    if not found.chain:
-        return
-    yield Paragraph(f"Uncertainty: {box}\n")
-    yield chain_table(found)
-    if missing := found.left_out:
-        yield Paragraph(f"Not in the last stage: {missing}\n")
-    if bounds:
-        yield Paragraph(f"{bounds}\n")
-    for tabulate in (disk_table, gang_table, tolerance_table, places_table):
-        yield tabulate(found)
+    if found.chain:
+        yield from _margin_tables(found)
     if found.worst:
         yield worst_case_table(found.worst)
     if spec is not None:
         yield from _requirements(found, spec)
+
+
+def _margin_tables(found: LoopReport) -> Iterator[Table | Paragraph]:
+    """The margins of the stages, over the travel and of each parameter, and what they leave open."""
+    box = "  ".join(f"{name} +-{100 * share:g} %" for name, share in found.uncertainty.items())
+    yield Paragraph(f"Uncertainty: {box}\n")
+    yield chain_table(found)
+    if missing := found.left_out:
+        yield Paragraph(f"Not in the last stage: {missing}\n")
+    if bounds := open_bounds(found):
+        yield Paragraph("\n".join(bounds) + "\n")
+    for tabulate in (disk_table, gang_table, tolerance_table, places_table):
+        yield tabulate(found)
 
 
 def _requirements(found: LoopReport, spec: Spec) -> Iterator[Table | Paragraph]:
@@ -338,7 +341,7 @@ def tolerance_table(found: LoopReport) -> Table:
     table = new_table(
         f"One at a time, proven {where}".rstrip(), "parameter", "down to", "up to", "share in the margin"
     )
-    shares = found.chain[-1].margin.sensitivity if found.chain else {}
+    shares = found.chain[-1].margin.sensitivity
     for name, (down, up) in found.tolerance.items():
         cells = []
         for margin, sign in ((down, -1), (up, 1)):
