@@ -286,9 +286,8 @@ def stages() -> Figure:
     figure, (axes,) = new_figure(height=3.2)
     for n, name in enumerate(("calibrated", "robust")):
         law = malta.gains.read(f"design/gains/{name}.json")
-        chain = malta.robustness(
-            malta.plant_of(law.parameters), law, dict.fromkeys(("m", "K_A", "K_D", "K_B"), 0.2)
-        ).chain
+        box = dict.fromkeys(("m", "K_A", "K_D", "K_B"), 0.2)
+        chain = malta.verify(law, uncertainty=box, stages=True, worst_case=False).chain
         proven = [
             0.0 if link.margin is None or link.margin.lower is None else 100 * link.margin.lower
             for link in chain

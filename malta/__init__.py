@@ -6,6 +6,8 @@ data -> plant -> linearize -> synthesize -> verify -> export -> simulate -> repo
 from __future__ import annotations
 
 import re
+import warnings
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,10 +41,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.loops.loop_systems import loop_systems as loop_systems
     from malta.loops.recovery import Recovery as Recovery
     from malta.loops.recovery import recovery as recovery
-    from malta.margins.stages import Robustness as Robustness
-    from malta.margins.stages import robustness as robustness
-    from malta.margins.verify import Margins as Margins
-    from malta.margins.verify import verify as verify
+    from malta.margins.loop_report import LoopReport as LoopReport
     from malta.model.data import plant_of as plant_of
     from malta.model.data import read as read
     from malta.model.equilibrium import trim as trim
@@ -94,6 +93,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.synthesis.spec import Weights as Weights
     from malta.synthesis.state_space import controller_of as controller_of
     from malta.tuning.tune import tune as tune
+    from malta.tuning.verify import verify as verify
     from malta.units import in_unit as in_unit
 
 # The lines above are the one list: a name is looked for where they say, at its first use.
@@ -105,10 +105,19 @@ _PLACES = {
 }
 _MODULES = ("gains", "references", "report", "schemas")
 
+_OLD = {  # names that go with the next minor version, and what to write for them
+    "Margins": "malta.LoopReport",
+    "Robustness": "malta.LoopReport",
+    "robustness": "malta.verify(plant, controller, uncertainty, stages=True)",
+}
+
 __all__ = [*_PLACES]
 
 
 def __getattr__(name: str) -> Any:
+    if name in _OLD:
+        warnings.warn(f"malta.{name} goes: write {_OLD[name]}", DeprecationWarning, stacklevel=2)
+        return partial(__getattr__("verify"), stages=True) if name.islower() else __getattr__("LoopReport")
     if name not in _PLACES:
         raise AttributeError(f"module 'malta' has no attribute {name!r}")
     place = _PLACES[name]

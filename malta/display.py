@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 import math
+import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
@@ -99,6 +100,20 @@ def quantity(value: float, unit: str) -> str:
         if power in PREFIXES and (unit != "rad" or power < 0):
             value, prefix = value / 1000.0**power, PREFIXES[power]
     return f"{value:.3g}" + ("" if unit == "1" else f" {prefix}{unit}")
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number with so many significant digits, without exponent; "-" for NaN."""
+    if not math.isfinite(value):
+        return "-" if math.isnan(value) else f"{value}"
+    decimals = digits - 1 - math.floor(math.log10(abs(value))) if value else 0
+    text = f"{value:.{min(max(decimals, 0), digits + 1)}f}"
+    return text if float(text) else "0"
+
+
+def micro(text: str) -> str:
+    """A text with µm for um, and other units alike."""
+    return re.sub(r"\bu(?=(?:rad|[msANV])\b)", "µ", text)
 
 
 def svg(curves: Curves) -> str:

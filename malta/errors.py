@@ -65,7 +65,10 @@ def _suggestion(field: str, found: str, expected: str) -> str:
         return ""
     from difflib import get_close_matches  # where something is wrong already
 
-    known = {word.lower(): word for word in re.findall(r"[^\s,'\"]+", expected.removeprefix("one of ").partition(", or ")[0])}
+    known = {
+        word.lower(): word
+        for word in re.findall(r"[^\s,'\"]+", expected.removeprefix("one of ").partition(", or ")[0])
+    }
     quoted = re.findall(r"'([^']+)'", found)
     for typed in [*quoted, *([] if quoted else [field.rpartition(".")[2]])]:
         close = get_close_matches(typed.lower(), known, n=1)

@@ -38,9 +38,12 @@ plant = malta.plant_of(controllers["robust"].parameters)
 # frequency. Every red mark is a set of parameters that does, by the eigenvalues of the loop.
 
 # %%
-found = {name: malta.robustness(plant, controller, BOX) for name, controller in controllers.items()}
+found = {
+    name: malta.verify(plant, controller, BOX, stages=True, worst_case=False)
+    for name, controller in controllers.items()
+}
 for name, result in found.items():
-    display(malta.report.robustness(result, name, BOX, f"build/04_{name}_margins.png", "position z"))
+    display(malta.report.robustness(result, f"build/04_{name}_margins.png"))
     print(name)
     for link in result.chain:
         print(f"  {link.name:16} {link.margin};  peak |S| {link.peak:.2f} at the {link.broken_at}")

@@ -33,7 +33,7 @@ from malta.proof.problem import OfLoop, OfSeveral, Problem
 from malta.proof.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
-    from malta.margins.verify import Margins
+    from malta.margins.loop_report import LoopReport
     from malta.model.linearize import LinearModel
     from malta.model.plant import Plant
     from malta.proof.box import Box
@@ -63,7 +63,7 @@ class Design(NamedTuple):
     plant: Plant
     model: LinearModel
     controller: Controller
-    margins: Margins
+    margins: LoopReport
 
 
 def refusal(read: Callable[[], object], where: Path) -> malta.InputError:

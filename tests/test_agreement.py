@@ -16,11 +16,11 @@ from malta.gains.encodings import content_sha256
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.margins.verify import Margins
+    from malta.margins.loop_report import LoopReport
 
 
 @pytest.fixture
-def margins(designs: dict[str, Design]) -> Margins:
+def margins(designs: dict[str, Design]) -> LoopReport:
     design = designs["calibrated"]
     return malta.verify(design.model, design.controller)
 
@@ -44,7 +44,7 @@ def edited(path: Path, edit: str, share: float) -> Path:
     ("model.Ad", 1e-8, False), ("feedforward.v0", 1e-8, False),
 ])  # fmt: skip
 def test_last_digits_and_provenance_are_no_reason(
-    designs: dict[str, Design], margins: Margins, tmp_path: Path, edit: str, share: float, same: bool
+    designs: dict[str, Design], margins: LoopReport, tmp_path: Path, edit: str, share: float, same: bool
 ) -> None:
     controller, path = designs["calibrated"].controller, tmp_path / "mine.json"
     malta.gains.write(controller, margins, path)
@@ -53,7 +53,7 @@ def test_last_digits_and_provenance_are_no_reason(
 
 
 def test_a_missing_or_damaged_file_is_written_anew(
-    designs: dict[str, Design], margins: Margins, tmp_path: Path
+    designs: dict[str, Design], margins: LoopReport, tmp_path: Path
 ) -> None:
     controller, path = designs["calibrated"].controller, tmp_path / "mine.json"
     assert not agrees(controller, margins, path)
@@ -63,7 +63,7 @@ def test_a_missing_or_damaged_file_is_written_anew(
 
 
 def test_bounds_that_contradict_or_are_narrower_are_written(
-    designs: dict[str, Design], margins: Margins, tmp_path: Path
+    designs: dict[str, Design], margins: LoopReport, tmp_path: Path
 ) -> None:
     """A proof that ran out of time is no reason; a better one is, and one that contradicts the file."""
     controller, path = designs["calibrated"].controller, tmp_path / "mine.json"

@@ -182,4 +182,6 @@ def test_a_range_of_no_width_and_arguments_with_defaults_are_fine() -> None:
     pull = [[2.0]]
     alone = malta.robust_margin(spring, pull, {"k": 0.1})
     for width in (0, (1, 1)):
-        assert malta.robust_margin(spring, pull, {"k": 0.1, "m": width}).lower == pytest.approx(alone.lower, rel=1e-3)
+        assert malta.robust_margin(spring, pull, {"k": 0.1, "m": width}).lower == pytest.approx(
+            alone.lower, rel=1e-3
+        )

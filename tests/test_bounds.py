@@ -19,8 +19,8 @@ from flint import Ordering, arb, fmpq, fmpq_mpoly_ctx
 from tampering import claiming
 
 import malta
+from malta.margins.loop_report import Stage
 from malta.margins.stages import _smallest
-from malta.margins.verify import Stage
 from malta.proof.box import below
 from malta.proof.certificate import certificate, check, checked_file, checked_loop
 from malta.proof.exclusion import exclusion

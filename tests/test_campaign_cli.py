@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("proven_once")
 
 GAINS = "design/gains/calibrated.json"
 SHAKY = "design/gains/table2.json"
-QUICK = ("--fidelity", "force", "--rise", "3")
+QUICK = ("--option", "fidelity=force", "--option", "rise=3ms")
 
 
 @pytest.fixture
@@ -132,15 +132,16 @@ def test_options_of_the_run_reach_it(run: Run, tmp_path: Path) -> None:
     run(
         *("campaign", GAINS, "--samples", "2", "--scenario", "tilt", "--case", "feedforward attraction"),
         *(
-            "--fidelity",
-            "force",
-            "--noise",
-            "2",
-            "--quantize",
-            "--delay",
-            "2",
-            "--substeps",
-            "2",
+            "--option",
+            "fidelity=force",
+            "--option",
+            "noise=2",
+            "--option",
+            "quantize=true",
+            "--option",
+            "delay=2",
+            "--option",
+            "substeps=2",
             "--seed",
             "7",
         ),
@@ -174,7 +175,10 @@ REFUSED: dict[str, tuple[tuple[str, ...], str]] = {
     "no scenario": (("--scenario", "loop"), "found 'loop', expected one of stroke"),
     "no sampler": (("--sampler", "dice"), "sampler: found 'dice', expected one of latin-hypercube, sobol"),
     "no case": (("--case", "third"), "stroke: case: found 'third', expected one of stroke"),
-    "another's option": (("--scenario", "hold", "--rise", "3"), "rise: found an option of another scenario"),
+    "another's option": (
+        ("--scenario", "hold", "--option", "rise=3ms"),
+        "rise: found an option of another scenario",
+    ),
     "no workers": (("--workers", "0"), "workers: found 0, expected at least 1"),
     "workers of two kinds": (
         ("--workers", "2", "--cluster", "tcp://127.0.0.1:1"),
@@ -190,7 +194,7 @@ def test_what_cannot_be_flown_is_one_sentence(
     run: Run, tmp_path: Path, options: tuple[str, ...], sentence: str
 ) -> None:
     out = () if "--out" in options else ("--out", str(tmp_path / "out"))
-    code, shown, err = run("campaign", GAINS, "--samples", "8", "--fidelity", "force", *out, *options)
+    code, shown, err = run("campaign", GAINS, "--samples", "8", "--option", "fidelity=force", *out, *options)
     assert (code, shown) == (2, "")
     assert sentence in _sentence(err)
     assert not (tmp_path / "out").exists()
@@ -222,7 +226,10 @@ REPLAYS: dict[str, tuple[tuple[str, ...], str]] = {
     "no number": (("{}:last",), "expected FOLDER:RUN"),
     "beyond the last": (("{}:2",), "run: found 2, expected 0 to 1"),
     "no such folder": (("{}/nowhere:0",), "no such file"),
-    "other options": (("{}:0", "--noise", "2", "--set", "m=0.4"), "found --noise, --set too, expected none"),
+    "other options": (
+        ("{}:0", "--option", "noise=2", "--set", "m=0.4"),
+        "found --option, --set too, expected none",
+    ),
     "another scenario": (("{}:0", "--scenario", "stroke"), "found --scenario too"),
     "no engine": (("{}:0", "--engine", "steam"), "engine: found 'steam'"),
 }
@@ -262,14 +269,14 @@ def _wait_for_block(process: subprocess.Popen[Any], folder: Path) -> None:
     raise AssertionError("no block within a minute")
 
 
-MANY = ("--samples", "10240", "--fidelity", "force", "--spread", "20%", "--sensor", "gain_x1=2%")
+MANY = ("--samples", "10240", "--option", "fidelity=force", "--spread", "20%", "--sensor", "gain_x1=2%")
 
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.slow
 def test_a_killed_campaign_goes_on_where_it_was(run: Run, tmp_path: Path) -> None:
     """SIGKILL in the middle, then the same command: bit for bit what an undisturbed one finds."""
-    arguments = ("campaign", GAINS, *MANY, "--quantize", "--out")
+    arguments = ("campaign", GAINS, *MANY, "--option", "quantize=true", "--out")
     process = _malta(*arguments, tmp_path / "killed")
     _wait_for_block(process, tmp_path / "killed")
     process.send_signal(signal.SIGKILL)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.usefixtures("proven_once")
 GAINS = "design/gains/calibrated.json"
 SHAKY = "design/gains/table2.json"
-COMMON = ("--samples", "40", "--fidelity", "force", "--rise", "3", "--spread", "20%")
+COMMON = ("--samples", "40", "--option", "fidelity=force", "--option", "rise=3ms", "--spread", "20%")
 
 
 @pytest.fixture
@@ -157,7 +157,7 @@ def test_what_has_no_status_is_one_sentence(run: Run, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_campaign_is_looked_at_while_it_runs(run: Run, tmp_path: Path) -> None:
     """Blocks come and no look disturbs them: what it says only grows, and the end is that of any other campaign."""
-    many = ("--samples", "10240", "--fidelity", "force", "--spread", "20%")
+    many = ("--samples", "10240", "--option", "fidelity=force", "--spread", "20%")
     command = [sys.executable, "-m", "malta", "campaign", GAINS, *many, "--out", str(tmp_path), "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     seen = []

@@ -525,7 +525,7 @@ def test_ctrl_c_prints_what_stands(run: Run, monkeypatch: pytest.MonkeyPatch) ->
         bounds(1.5, 1.75)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("malta.margins.stages.robustness", interrupted)
+    monkeypatch.setattr("malta.tuning.verify.staged_report", interrupted)
     code, out, err = run("verify", str(HALBACH))
     assert (code, out) == (130, "")
     assert err == "malta: interrupted; proven 150.00 %, lost at 175.00 %\n"

@@ -27,10 +27,13 @@ from malta.loops.classical import (
     disk_margin,
     nominal_loop,
 )
-from malta.loops.sampled_loops import loaded_loop, machine_law, machine_system
-from malta.margins.stages import MACHINE, SAMPLED, Robustness, compensators, robustness
+from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
+from malta.margins.loop_report import LoopReport
+from malta.margins.stages import MACHINE, SAMPLED, compensators, staged_report
 from malta.margins.travel import place_margin
+from malta.margins.verify import linear_report
 from malta.model.data import plant_of
+from malta.model.linearize import linearize
 from malta.proof.blocks.gain import Gain
 from malta.proof.responses import responses
 from malta.proof.robust import robust_margin
@@ -39,9 +42,13 @@ from malta.proof.uncertain import Compensator, UncertainSystem, closed_loop, ins
 from malta.report.figures.margins import chain_figure
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from matplotlib.figure import Figure
+
+    from malta.model.plant import Plant
+    from malta.synthesis.controller import Controller
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -55,8 +62,14 @@ SLOW = (pytest.mark.slow, pytest.mark.xdist_group("chain"))  # in one worker, wh
 CHAINED = [pytest.param(name, marks=SLOW) for name in DESIGNS]
 
 
+def robustness(plant: Plant, c: Controller, box: Mapping[str, float], **options: Any) -> LoopReport:
+    """The margins of all stages, without what else `malta.verify` computes."""
+    model = linearize(plant, plant.point(c.operating_point[0]))
+    return staged_report(linear_report(model, c, None, options.pop("current_loops", LAST)), box, **options)
+
+
 @cache
-def chain_of(name: str) -> Robustness:
+def chain_of(name: str) -> LoopReport:
     c = gains.read(f"design/gains/{name}.json")
     steps: list[float] = []
     found = robustness(plant_of(c.parameters), c, BOX, progress=steps.append)
@@ -337,7 +350,7 @@ def test_no_parameters_and_unknown_current_loops_are_refused() -> None:
     with pytest.raises(InputError, match="no parameters"):
         robustness(plant_of(c.parameters), c, {})
     with pytest.raises(InputError, match="expected lag or pi"):
-        robustness(plant_of(c.parameters), c, BOX, current_loops="dq")  # type: ignore[arg-type]
+        robustness(plant_of(c.parameters), c, BOX, current_loops="dq")
 
 
 # The figure
@@ -352,7 +365,7 @@ def _texts(figure: Figure) -> list[str]:
 def test_the_figure_names_what_it_shows() -> None:
     found = chain_of("calibrated")
     worst = {"x1": Gain(2.4, 2.41, 500.0, {}, 1, 0.0), "z": Gain(1.9, 1.91, 90.0, {}, 1, 0.0)}
-    figure = chain_figure(found, "calibrated", BOX, worst=worst)
+    figure = chain_figure(replace(found, worst=worst))
     figure.draw_without_rendering()
     texts = _texts(figure)
     assert "calibrated: where the margin goes" in texts
@@ -382,9 +395,9 @@ def test_unstable_loops_and_unproven_margins_are_drawn() -> None:
     found = chain_of("calibrated")
     c = gains.read("design/gains/calibrated.json")
     unstable = robustness(plant_of(replace(c.parameters, K_A=3e4)), c, BOX)
-    chain_figure(unstable, "unstable", BOX).draw_without_rendering()
+    chain_figure(unstable).draw_without_rendering()
     nothing = replace(found.travel, lower=None, upper=float("inf"), reason="not settled")
-    figure = chain_figure(replace(found, travel=nothing), "unproven", BOX)
+    figure = chain_figure(replace(found, robust=nothing))
     figure.draw_without_rendering()
     assert "none" in _texts(figure)
 

@@ -22,7 +22,8 @@ from typer.testing import CliRunner
 import malta
 from malta import gains
 from malta.cli import main as cli
-from malta.cli.assignments import GENERAL, add_own_options
+from malta.cli.assignments import GENERAL, read_options
+from malta.cli.command import renew
 from malta.cli.inputs import design_files
 from malta.errors import InputError
 from malta.model.plant import Plant
@@ -164,7 +165,7 @@ except SystemExit as ended:
     late = {"control", "filterpy", "matplotlib.pyplot", "scipy.signal", "scipy.stats"}
     print("exit", ended.code, "loaded", *sorted(set(sys.modules) & late))
 """
-    command = [sys.executable, "-c", program, "simulate", TABLE2, "--fidelity", "force"]
+    command = [sys.executable, "-c", program, "simulate", TABLE2, "--option", "fidelity=force"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.splitlines()[-1] == "exit 0 loaded"
 
@@ -542,7 +543,7 @@ def test_simulate_wraps_long_texts_and_keeps_paths(run: Run, tmp_path: Path) -> 
 
 
 def test_simulate_as_json_holds_finite_numbers(run: Run) -> None:
-    code, out, err = run("simulate", TABLE2, "--json", "--noise", "1", "--quantize")
+    code, out, err = run("simulate", TABLE2, "--json", "--option", "noise=1", "--option", "quantize=true")
     assert (code, err) == (0, "")
     result = json.loads(out)
     found = numbers(result)
@@ -592,7 +593,7 @@ def test_change_with_a_unit_is_the_same_change(run: Run) -> None:
 
 
 def test_noise_repeats_with_its_seed(run: Run) -> None:
-    noisy = ("simulate", CALIBRATED, "--json", "--noise", "1", "--seed")
+    noisy = ("simulate", CALIBRATED, "--json", "--option", "noise=1", "--seed")
     assert run(*noisy, "3") == run(*noisy, "3")
     assert run(*noisy, "3") != run(*noisy, "4")
 
@@ -605,12 +606,15 @@ def test_options_of_the_stroke_are_taken(run: Run) -> None:
         return found
 
     plain = stroke()
-    assert stroke("--rise", "16.2", "--distance", "10", "--profile", "logistic") == plain
-    assert stroke("--rise", "32.4")["rise_s"] == pytest.approx(2 * plain["rise_s"], rel=0.1)
-    assert stroke("--distance", "5")["force_N"] == pytest.approx(plain["force_N"] / 2, rel=0.1)
-    assert stroke("--profile", "quintic")["force_N"] != plain["force_N"]
-    assert stroke("--delay", "1") == plain  # the machine's own
-    assert stroke("--delay", "6")["error_along"] > 1.01 * plain["error_along"]
+    assert (
+        stroke("--option", "rise=16.2ms", "--option", "distance=10mm", "--option", "profile=logistic")
+        == plain
+    )
+    assert stroke("--option", "rise=32.4ms")["rise_s"] == pytest.approx(2 * plain["rise_s"], rel=0.1)
+    assert stroke("--option", "distance=5mm")["force_N"] == pytest.approx(plain["force_N"] / 2, rel=0.1)
+    assert stroke("--option", "profile=quintic")["force_N"] != plain["force_N"]
+    assert stroke("--option", "delay=1") == plain  # the machine's own
+    assert stroke("--option", "delay=6")["error_along"] > 1.01 * plain["error_along"]
 
 
 def test_the_scenarios_of_the_machine_are_listed(run: Run) -> None:
@@ -626,19 +630,41 @@ def test_the_scenarios_of_the_machine_are_listed(run: Run) -> None:
     assert "radius=0.0002 m" in out
 
 
+def test_options_of_the_version_before_become_what_replaces_them(capsys: pytest.CaptureFixture[str]) -> None:
+    old = ["g.json", "--distance", "5", "--rise=3", "--no-quantize", "--tolerance", "99%", "--delay"]
+    new = ["--option", "distance=5mm", "--option", "rise=3ms", "--option", "quantize=false"]
+    assert renew(old) == ["g.json", *new, "--study", "tolerances", "--keep", "99%", "--delay"]
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "malta: --distance goes with the next version: write --option distance=5mm"
+    assert len(said) == 4
+    assert renew(["g.json", "--sobol", "--json"]) == ["g.json", "--study", "sensitivity", "--json"]
+
+
+OLD = {
+    "estimator": "kalman",
+    "feedforward": "attraction",
+    "bearing_axes": "turning",
+    "delay": "2",
+    "substeps": "3",
+}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", GENERAL)
 def test_a_general_option_is_that_of_its_old_flag(run: Run, name: str) -> None:
-    """--option delay=2 for --delay 2; flags that the help no longer lists work as before."""
-    value = {"feedforward": "attraction", "bearing_axes": "turning", "delay": "2", "substeps": "3"}.get(name)
+    """--option delay=2 for --delay 2: options of the version before work, and say what to write."""
+    value = (OLD | {"fidelity": "dq", "noise": "2"}).get(name)
     flag = f"--{name.replace('_', '-')}"
-    case = ("--fidelity", "phase" if name == "real_pwm" else "force")
+    case = (
+        () if name == "fidelity" else ("--option", f"fidelity={'phase' if name == 'real_pwm' else 'force'}")
+    )
     old = (flag,) if value is None else (flag, value)
     new = ("--option", f"{name}={value or 'true'}")
     command = ("simulate", CALIBRATED, "--json", "--scenario", "hold", *case)
     found = [run(*command, *given) for given in (old, new)]
-    assert found[0] == found[1]
+    assert found[0][:2] == found[1][:2]
     assert found[0].code == 0
+    assert one_sentence(found[0].err) == f"{flag} goes with the next version: write {' '.join(new)}"
 
 
 @pytest.mark.parametrize(
@@ -647,10 +673,10 @@ def test_a_general_option_is_that_of_its_old_flag(run: Run, name: str) -> None:
      ("feedforward=attraction", "attraction"), ("bearing_axes=turning", "turning")],
 )  # fmt: skip
 def test_every_scenario_takes_general_options(plant: Plant, text: str, value: object) -> None:
-    assert add_own_options({}, [text], "hold", plant) == {text.partition("=")[0]: value}
+    assert read_options([text], "hold", plant) == {text.partition("=")[0]: value}
     for wrong in (text, f"{text.partition('=')[0]}="):
         with pytest.raises(InputError):
-            add_own_options({text.partition("=")[0]: value}, [wrong], "hold", plant)
+            read_options([text, wrong], "hold", plant)
 
 
 @pytest.mark.parametrize("command", [c.__name__ for group in cli.GROUPS.values() for c in group])
@@ -672,12 +698,21 @@ def test_options_of_a_scenario_come_with_their_units(run: Run) -> None:
         return found
 
     assert [case["label"] for case in lifted("masses=50g, 0.12")["cases"]] == ["50 g", "120 g"]
-    quick = ("simulate", CALIBRATED, "--json", "--scenario", "tilt", "--feedforward", "axial", "--option")
+    quick = (
+        "simulate",
+        CALIBRATED,
+        "--json",
+        "--scenario",
+        "tilt",
+        "--option",
+        "feedforward=axial",
+        "--option",
+    )
     circles = [run(*quick, f"radius={radius}")[1] for radius in ("0.1mm", "1e-4", "100 um")]
     assert circles == [circles[0]] * 3
     assert circles[0] != run(*quick, "radius=0.2mm")[1]
     held = run("simulate", CALIBRATED, "--json", "--scenario", "faults", "--option", "during=hold")
-    assert held == run("simulate", CALIBRATED, "--json", "--scenario", "faults", "--during", "hold")
+    assert held == run("simulate", CALIBRATED, "--json", "--scenario", "faults", "--option", "during=hold")
 
 
 def test_a_scenario_of_several_runs_writes_each_and_one_figure(run: Run, tmp_path: Path) -> None:
@@ -697,7 +732,7 @@ def test_findings_are_no_failures(run: Run) -> None:
     assert cases["200 g"]["verdict"]["name"].startswith("touchdown")
     assert cases["50 g"]["verdict"]["name"] == "completed"
     code, _, err = run(
-        "simulate", TABLE2, "--scenario", "lift-off", "--estimator", "kalman", "--set", "I_max=0.5"
+        "simulate", TABLE2, "--scenario", "lift-off", "--option", "estimator=kalman", "--set", "I_max=0.5"
     )
     assert code == 1
     assert "lift-off: not lifted at 0.1499 s" in one_sentence(err)
@@ -714,7 +749,7 @@ def test_sensor_errors_are_taken(run: Run) -> None:
 
 
 def test_the_number_of_substeps_comes_with_an_error(run: Run) -> None:
-    code, out, _ = run("simulate", CALIBRATED, "--fidelity", "force", "--substeps", "1")
+    code, out, _ = run("simulate", CALIBRATED, "--option", "fidelity=force", "--option", "substeps=1")
     assert code == 0
     estimate = re.search(r"integration error, estimated: (\S+) m", out)
     assert estimate is not None
@@ -814,21 +849,21 @@ def test_claims_prints_the_ledger(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
         ("verify TABLE2 --set K_A=-1", "--set: K_A: found -1", "a finite number of at least 0 in N/m"),
         ("simulate nothing.json", "nothing.json: found no such file", "a gain file"),
         ("simulate TABLE2 --scenario orbit", "scenario: found 'orbit'", "one of stroke, hold, tilt"),
-        ("simulate TABLE2 --scenario hold --rise 3", "hold: rise: found an option of another scenario", "none"),
-        ("simulate TABLE2 --scenario faults --during lunch", "faults: during: found 'lunch'", "stroke or hold"),
+        ("simulate TABLE2 --scenario hold --option rise=3ms", "rise: found an option of another scenario", "none"),
+        ("simulate TABLE2 --scenario faults --option during=lunch", "faults: during: found 'lunch'", "stroke or hold"),
         ("simulate TABLE2 --option foo=1", "stroke: foo: found an unknown option", "distance profile rise"),
         ("simulate TABLE2 --option masses=50g", "stroke: masses: found an option of another scenario", "distance"),
         ("simulate TABLE2 --option distance", "--option: found 'distance'", "NAME=VALUE"),
         ("simulate TABLE2 --option distance=far", "--option: distance: found 'far'", "a number"),
         ("simulate TABLE2 --option distance=3kg", "--option: distance.unit: found 'kg'", "a unit of m"),
-        ("simulate TABLE2 --distance 5 --option distance=5mm", "distance: found '5mm' for the second", "it once"),
+        ("simulate TABLE2 --option rise=5ms --option rise=6ms", "rise: found '6ms' for the second", "it once"),
         ("simulate TABLE2 --scenario orbit --option a=1", "scenario: found 'orbit'", "one of stroke, hold, tilt"),
         ("campaign TABLE2 --scenario hold --option radius=1", "radius: found an option of another", "none of its"),
-        ("simulate TABLE2 --fidelity exact", "fidelity: found 'exact'", "one of force, dq, phase"),
-        ("simulate TABLE2 --estimator ukf", "estimator: found 'ukf'", "one of steady-state, kalman, extended"),
+        ("simulate TABLE2 --option fidelity=exact", "fidelity: found 'exact'", "one of force, dq, phase"),
+        ("simulate TABLE2 --option estimator=ukf", "estimator: found 'ukf'", "one of steady-state, kalman, extended"),
         ("simulate TABLE2 --engine jit", "engine: found 'jit'", "one of auto, compiled, virtual machine"),
-        ("simulate TABLE2 --real-pwm", "real_pwm: found fidelity dq", "fidelity phase"),
-        ("simulate TABLE2 --substeps 0", "substeps: found 0", "a number above 0"),
+        ("simulate TABLE2 --option real_pwm=true", "real_pwm: found fidelity dq", "fidelity phase"),
+        ("simulate TABLE2 --option substeps=0", "substeps: found 0", "a number above 0"),
         ("simulate TABLE2 --sensor gain_q=1", "--sensor: gain_q: found an unknown sensor error", "gain_x1"),
         ("simulate TABLE2 --sensor gain_x1=1mm", "--sensor: gain_x1.unit: found 'mm'", "no unit, or %"),
         ("claims nothing.toml", "nothing.toml: found no such file", "a TOML file"),
@@ -843,18 +878,18 @@ def test_claims_prints_the_ledger(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
         ("simulate TABLE2 --set m=-1", "--set: m: found -1", "a finite number above 0 in kg"),
         ("simulate TABLE2 --set m=0", "--set: m: found 0", "a finite number above 0 in kg"),
         ("simulate TABLE2 --set m=1e999", "--set: m: found inf kg", "a finite number above 0 in kg"),
-        ("simulate TABLE2 --profile cubic", "profile: found 'cubic'", "one of logistic, quintic"),
-        ("simulate TABLE2 --rise 0", "rise: found 0.0 s", "a time from 1e-6 to 1e6 s"),
-        ("simulate TABLE2 --rise nan", "rise: found nan s", "a time from 1e-6 to 1e6 s"),
-        ("simulate TABLE2 --rise 1e-300", "rise: found 1.0", "a time from 1e-6 to 1e6 s"),
-        ("simulate TABLE2 --rise 1e300", "rise: found 1e+297 s", "a time from 1e-6 to 1e6 s"),
-        ("simulate TABLE2 --rise -16.2", "rise: found -0.0162 s", "a time from 1e-6 to 1e6 s"),
-        ("simulate TABLE2 --distance 40", "start: found -0.02 m", "travel of +-0.015 m"),
-        ("simulate TABLE2 --distance nan", "distance: found nan m", "a finite distance other than 0 m"),
-        ("simulate TABLE2 --distance 0", "distance: found 0.0 m", "a finite distance other than 0 m"),
-        ("simulate TABLE2 --noise inf", "noise: found inf", "0 or more"),
-        ("simulate TABLE2 --noise -1", "noise: found -1.0", "0 or more"),
-        ("simulate TABLE2 --delay -1", "delay: found -1", "0 or more"),
+        ("simulate TABLE2 --option profile=cubic", "profile: found 'cubic'", "one of logistic, quintic"),
+        ("simulate TABLE2 --option rise=0ms", "rise: found 0.0 s", "a time from 1e-6 to 1e6 s"),
+        ("simulate TABLE2 --option rise=nanms", "rise: found 'nanms'", "a number"),
+        ("simulate TABLE2 --option rise=1e-300ms", "rise: found 1.0", "a time from 1e-6 to 1e6 s"),
+        ("simulate TABLE2 --option rise=1e300ms", "rise: found 1e+297 s", "a time from 1e-6 to 1e6 s"),
+        ("simulate TABLE2 --option rise=-16.2ms", "rise: found -0.0162 s", "a time from 1e-6 to 1e6 s"),
+        ("simulate TABLE2 --option distance=40mm", "start: found -0.02 m", "travel of +-0.015 m"),
+        ("simulate TABLE2 --option distance=nanmm", "distance: found 'nanmm'", "a number"),
+        ("simulate TABLE2 --option distance=0mm", "distance: found 0.0 m", "a finite distance other than 0 m"),
+        ("simulate TABLE2 --option noise=inf", "noise: found 'inf'", "a number"),
+        ("simulate TABLE2 --option noise=-1", "noise: found -1.0", "0 or more"),
+        ("simulate TABLE2 --option delay=-1", "delay: found -1", "0 or more"),
         ("simulate TABLE2 --seed -1", "seed: found -1", "0 or more"),
         ("simulate TABLE2 --set z_max=1mm", "start: found -0.005 m", "travel of +-0.001 m"),
         ("simulate TABLE2 --out pyproject.toml/x", "pyproject.toml/x/table2_stroke.npz: found", "a place"),
@@ -914,9 +949,7 @@ def test_no_design_files_at_all(run: Run, tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ("simulate TABLE2 --noise loud", "'--noise'"),
         ("simulate TABLE2 --seed one", "'--seed'"),
-        ("simulate TABLE2 --delay 1.5", "'--delay'"),
         ("simulate TABLE2 --speed 3", "--speed"),
         ("simulate TABLE2 --set", "--set"),
         ("verify", "GAINS"),

@@ -84,7 +84,16 @@ def loopback(tmp_path: Path) -> Iterator[Loopback]:
 
 
 def _malta(folder: Path, samples: int, *options: str) -> subprocess.Popen[str]:
-    box = ("--fidelity", "force", "--spread", "20%", "--sensor", "gain_x1=2%", "--quantize")
+    box = (
+        "--option",
+        "fidelity=force",
+        "--spread",
+        "20%",
+        "--sensor",
+        "gain_x1=2%",
+        "--option",
+        "quantize=true",
+    )
     command = [sys.executable, "-m", "malta", "campaign", GAINS, "--samples", str(samples), *box]
     command += ["--out", str(folder), *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -17,11 +17,11 @@ from rich.console import Console
 from test_report_page import HOSTILE, STRANGE, cart_controller
 
 from malta.cli.documents.pages import compare_output
-from malta.margins.verify import verify
+from malta.margins.figures import MEANINGS, LoopFigure, best_of, four_digits
+from malta.margins.verify import linear_report
 from malta.report.page.analysis import Subject
 from malta.report.page.compared import comparison_page
 from malta.report.page.comparison import Comparison, Row, compare, names_of
-from malta.report.page.scores import MEANINGS, Score, best_of, four_digits
 from malta.report.tables.comparison import comparison_tables
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def text_of(found: Comparison, width: int) -> str:
 
 def test_figures_are_those_of_verify_and_the_better_is_marked(carts: Comparison) -> None:
     for name, a in zip(carts.names, carts.designs, strict=True):
-        margins = verify(a.model, a.subject.controller)
+        margins = linear_report(a.report.model, a.subject.controller)
         k = carts.names.index(name)
         for key, of in (("bandwidth_sigma_max_T_rad_per_s", margins.bandwidth["sigma_max_T"]),
                         ("peak_sensitivity", margins.peak_sensitivity[STRANGE])):  # fmt: skip
@@ -111,8 +111,8 @@ def test_names_stay_distinguishable() -> None:
     assert found[1:3] == ("b/one.json (1)", "b/one.json (2)")
 
 
-def score(value: float, kind: str = "peak_s") -> Score:
-    return Score(kind, "key", "label", value, "1", 1.0)
+def score(value: float, kind: str = "peak_s") -> LoopFigure:
+    return LoopFigure(kind, "key", "label", value, "1", 1.0)
 
 
 def test_the_best_is_better_in_digits_that_are_shown() -> None:

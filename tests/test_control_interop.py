@@ -290,7 +290,7 @@ def test_an_h_infinity_controller_is_verified(ball: Plant, h_infinity: Controlle
     )
     radius = malta.verify(malta.linearize(lost, lost.at()), h_infinity).stages[-1].spectral_radius
     assert radius == pytest.approx(1, abs=1e-7)
-    stages = malta.robustness(ball, h_infinity, {"k": 0.2}, proof=False).chain
+    stages = malta.verify(ball, h_infinity, {"k": 0.2}, stages=True, proof=False).chain
     assert [link.name for link in stages] == ["sampled"]
 
 

@@ -11,6 +11,7 @@ import pytest
 from conftest import Run
 from jsonschema import Draft202012Validator
 
+import malta
 from malta.cli.documents.published import ALL_SCHEMAS, MODELS
 from malta.cli.documents.published import schema_of as schema
 from malta.identifiers import distinct, identifier, unit_suffix
@@ -71,6 +72,37 @@ def test_verify(run: Run, gains: str) -> None:
     assert all(disk["phase_rad"] < 3.15 for disk in found["robust"]["disks"])
 
 
+def test_verify_as_json_and_as_tables_has_the_figures_of_the_record(run: Run) -> None:
+    """Figures of a shipped design, as they were when each document copied them by hand."""
+    gains = "design/gains/halbach.json"
+    found = document(run("verify", gains, "--no-proof", "--json"), "verify-output")
+    record = malta.verify(gains, proof=False)
+    robust = found["robust"]
+    assert found["bandwidth_rad_per_s"] == {
+        k: pytest.approx(v, rel=1e-9) for k, v in record.bandwidth.items()
+    }
+    assert found["bandwidth_rad_per_s"]["sigma_max_T"] == pytest.approx(21.488148, rel=1e-6)
+    peaks = [link["peak_sensitivity"] for link in robust["chain"]]
+    assert peaks == pytest.approx([link.peak for link in record.chain], rel=1e-9)
+    assert peaks == pytest.approx([1.0, 1.278983, 1.3213626, 1.8511865], rel=1e-6)
+    assert [link["stage"] for link in robust["chain"]] == ["LQR", "LQG", "+ current loops", "sampled"]
+    disk = {"size": 0.2645143, "gain": 1.3048303, "phase_rad": 0.2629880, "frequency_rad_per_s": 7.819372}
+    assert robust["disks"][0] == {"channels": "forces"} | {
+        k: pytest.approx(v, rel=1e-5) for k, v in disk.items()
+    }
+    gang = {"S": 1.8509999, "T": 1.0, "SP": 2.2279695, "FS": 4396.68}
+    assert robust["gang_of_four"]["x"] == {"unit": "m"} | {
+        k: pytest.approx(v, rel=1e-5) for k, v in gang.items()
+    }
+    assert robust["delay_s"] == {"x": pytest.approx(0.07315808, rel=1e-5)}
+    (moved,) = [one["outputs"]["x"] for one in found["recovery"][:1]]
+    assert (moved["settled_s"], moved["largest"]) == pytest.approx((0.825, 1.44345e-3), rel=1e-4)
+    assert moved["left"][1] == {"after_s": 0.3, "value": pytest.approx(9.5567e-4, rel=1e-4)}
+    tables = run("verify", gains, "--no-proof").out
+    for text in ("21.5", "1.28 A", "0.265", "73158 us", "0.825"):
+        assert text in tables
+
+
 def test_verify_of_an_unstable_loop_has_nulls(run: Run) -> None:
     said = run("verify", TABLE2, "--set", "K_A=5e4", "--no-proof", "--json")
     assert said.code == 1
@@ -118,10 +150,13 @@ def test_claims(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        ("rare-output", ["--rare", "touchdown", "--spread", "60%", "--samples", "100"]),
-        ("rare-output", ["--rare", "touchdown", "--spread", "1%", "--samples", "100"]),
-        ("sobol-output", ["--sobol", "--spread", "60%", "--samples", "128"]),
-        ("tolerance-output", ["--tolerance", "90%", "--spread", "20%", "--samples", "64"]),
+        ("rare-output", ["--study", "rare", "--limit", "touchdown", "--spread", "60%", "--samples", "100"]),
+        ("rare-output", ["--study", "rare", "--limit", "touchdown", "--spread", "1%", "--samples", "100"]),
+        ("sobol-output", ["--study", "sensitivity", "--spread", "60%", "--samples", "128"]),
+        (
+            "tolerance-output",
+            ["--study", "tolerances", "--keep", "90%", "--spread", "20%", "--samples", "64"],
+        ),
     ],
 )
 def test_studies(run: Run, tmp_path: Path, name: str, arguments: list[str]) -> None:
@@ -151,7 +186,8 @@ def test_every_scenario(run: Run, gains: str, monkeypatch: pytest.MonkeyPatch) -
     from malta.simulation import catalogue
 
     def quick(name: str, plant: Any, c: Any, **options: Any) -> Any:
-        few = {"capture": {"points": 5}, "supervised-faults": {"only": "stuck"}}.get(name, {})
+        short: dict[str, dict[str, Any]] = {"capture": {"points": 5}, "supervised-faults": {"only": "stuck"}}
+        few = short.get(name, {})
         return experiment(name, plant, c, **(options | few))
 
     experiment = catalogue.experiment

@@ -29,7 +29,6 @@ FOLDERS = ("data", "design", "examples")  # that examples read
 # The examples that take longest, compilers included; the others together take some two seconds of processor time.
 SLOW = {
     "malta.app_widget",
-    "malta.Robustness",
     "malta.engine_of_c",
     "malta.export_c",
     "malta.export_fmu",
@@ -49,6 +48,7 @@ SLOW = {
     "malta.report.gang_table",
     "malta.report.load_response",
     "malta.report.loads",
+    "malta.report.loop_tables",
     "malta.report.open_bounds",
     "malta.report.places_table",
     "malta.report.rare_event_sentence",
@@ -63,7 +63,6 @@ SLOW = {
     "malta.report.tolerance_sentence",
     "malta.report.tolerance_table",
     "malta.report.worst_figure",
-    "malta.robustness",
     "malta.sensitivity",
     "malta.tune",
 }

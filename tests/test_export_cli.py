@@ -155,7 +155,7 @@ def test_names_in_a_gain_file_are_only_comments() -> None:
 def test_simulate_flies_the_c(run: Run) -> None:
     if compiled.compiler() is None:
         pytest.skip("no C compiler")
-    gains, given = "design/gains/robust.json", ("--noise", "1", "--controller", "c")
+    gains, given = "design/gains/robust.json", ("--option", "noise=1", "--controller", "c")
     code, out, err = run("simulate", gains, *given)
     assert code == 0, err
     rows = dict(re.findall(r"^ ?(\w+) +\S+ +(\S+) +\S+ *$", out, flags=re.MULTILINE))
@@ -175,8 +175,11 @@ def test_simulate_flies_the_c(run: Run) -> None:
             ("--controller", "c", "--engine", "compiled"),
             "compiled beside --controller c, expected one of the two",
         ),
-        (("--controller", "c", "--scheduled"), "scheduled: found a law that is not exported"),
-        (("--controller", "c", "--estimator", "kalman"), "estimator: found a law that is not exported"),
+        (("--controller", "c", "--option", "scheduled=true"), "scheduled: found a law that is not exported"),
+        (
+            ("--controller", "c", "--option", "estimator=kalman"),
+            "estimator: found a law that is not exported",
+        ),
     ],
 )
 def test_what_cannot_fly_is_a_sentence(run: Run, arguments: tuple[str, ...], sentence: str) -> None:

@@ -618,6 +618,8 @@ def test_campaign_of_a_few_machines(run: Run, tmp_path: Path) -> None:
     content = json.loads(said.out)
     assert content["runs"] == 50
     assert content["ends"] == {"completed": 50}
-    refused = run("campaign", GAINS, "--samples", "5", "--fidelity", "phase", "--out", tmp_path / "other")
+    refused = run(
+        "campaign", GAINS, "--samples", "5", "--option", "fidelity=phase", "--out", tmp_path / "other"
+    )
     assert refused.code == 2
     assert "expected force in a campaign of a halbach" in refused.err

@@ -17,7 +17,7 @@ from malta import gains
 from malta.loops.machine_laws import sampled_law
 from malta.loops.sampled_loops import machine_loop, machine_system, sampled_loop
 from malta.margins.travel import travel_margin
-from malta.margins.verify import controller_poles, unstable_gain, verify
+from malta.margins.verify import controller_poles, linear_report, unstable_gain
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel
 from malta.model.plant import Plant
@@ -284,7 +284,7 @@ def test_a_pid_is_judged_on_its_machine() -> None:
 @pytest.mark.slow
 def test_a_pid_has_a_margin_on_its_machine() -> None:
     model = _model("halbach")
-    found = verify(model, pid(model, TERMS, 55e-3), {"m": 0.2})
+    found = linear_report(model, pid(model, TERMS, 55e-3), {"m": 0.2})
     assert found.stable
     assert found.poles.regulator.size == 0
     assert found.robust is not None
@@ -322,7 +322,7 @@ def test_gain_files_come_back_as_they_were(kind: str, suffix: str, tmp_path: Pat
     else:
         model, c = _model(kind), _controller(kind, 0 if kind == "halbach" else 1)
     path = tmp_path / f"mine{suffix}"
-    gains.write(c, verify(model, c), path)
+    gains.write(c, linear_report(model, c), path)
     again = gains.read(path)
     for name in ("A", "B", "C", "Ad", "Bd", "Cd", "K", "Ki", "L"):
         assert np.array_equal(getattr(again, name), getattr(c, name)), name
@@ -592,7 +592,7 @@ def test_an_observer_that_knows_the_start_sees_no_disturbance(machine: str, star
 def test_a_gain_file_with_two_kinds_of_integrals_is_refused(tmp_path: Path) -> None:
     c, model = _controller("halbach", 0), _model("halbach")
     path = tmp_path / "both.json"
-    margins = verify(model, c)
+    margins = linear_report(model, c)
     gains.write(replace(c, Ki=np.array([[1.0]])), margins, path)
     with pytest.raises(malta.InputError, match=r"gains.Ki: found sums of errors beside"):
         gains.read(path)
@@ -605,7 +605,7 @@ def test_a_machine_that_cannot_be_controlled_is_refused_by_its_file(tmp_path: Pa
 
     c, model = _controller("planar", 1), _model("planar")
     path = tmp_path / "pitch.json"
-    gains.write(c, verify(model, c), path)
+    gains.write(c, linear_report(model, c), path)
     content = json.loads(path.read_text(encoding="utf-8"))
     content["plant"]["parameters"]["coil_pitch"]["value"] = 0.1
     content["sha256"] = content_sha256(content)

@@ -226,7 +226,7 @@ def test_what_needs_positions_and_rates_says_so(motor: Plant, driven: Controller
 
 
 def test_robustness_finds_every_stage(motor: Plant, driven: Controller) -> None:
-    found = malta.robustness(motor, driven, {"k": 0.2}, proof=False)
+    found = malta.verify(motor, driven, {"k": 0.2}, stages=True, proof=False)
     assert [link.name for link in found.chain] == ["LQR", "LQI", "LQG", "LQGI", "sampled"]
     assert found.chain[0].peak == pytest.approx(1, abs=1e-6)  # Kalman's inequality
 

@@ -208,12 +208,12 @@ def test_the_gang_of_four_of_angles_says_its_units(toy: Plant) -> None:
 
     angles = replace(toy, outputs=(Signal("x1", "m"), Signal("a", "rad")))
     gang = {"x1": (1.0, 1.0, 2e-6, 3e6), "a": (1.0, 1.0, 4e-6, 5e6)}
-    found: Any = SimpleNamespace(gang=gang, extent=NOWHERE)
-    text = printed(report.gang_table(found, angles))
+    found: Any = SimpleNamespace(gang=gang, extent=NOWHERE, plant=angles)
+    text = printed(report.gang_table(found))
     for cell in ("2.0 um/N", "3.000 N/um", "4.0 urad/(N m)", "5.000 N m/urad"):
         assert cell in text
-    found = SimpleNamespace(gang={"x1": gang["x1"]}, extent=NOWHERE)
-    assert "from force |SP| [um/N]" in printed(report.gang_table(found, toy))
+    found = SimpleNamespace(gang={"x1": gang["x1"]}, extent=NOWHERE, plant=toy)
+    assert "from force |SP| [um/N]" in printed(report.gang_table(found))
 
 
 def test_poles_of_damped_and_of_stable_machines(designs: dict[str, Design]) -> None:

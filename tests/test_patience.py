@@ -83,8 +83,8 @@ def test_the_commands_refuse_and_obey(
     monkeypatch.setattr(patience, "LONGEST", 1e-9)
     monkeypatch.setattr("malta.simulation.workers.LOOK", 1e-3)
     own = {
-        "simulate": ("--substeps", "500", "--fidelity", "force", "--out", tmp_path),
-        "campaign": ("--samples", "1024", "--fidelity", "force", "--spread", "1%", "--out", tmp_path),
+        "simulate": ("--option", "substeps=500", "--option", "fidelity=force", "--out", tmp_path),
+        "campaign": ("--samples", "1024", "--option", "fidelity=force", "--spread", "1%", "--out", tmp_path),
     }[command]
     said = run(command, GAINS, *own)
     assert said.code == 2
@@ -94,7 +94,7 @@ def test_the_commands_refuse_and_obey(
 
 
 def test_too_many_substeps_are_named(run: Run) -> None:
-    said = run("simulate", GAINS, "--substeps", "100000")
+    said = run("simulate", GAINS, "--option", "substeps=100000")
     assert said.code == 2
     assert one_sentence(said.err) == "scenario stroke: substeps: found 100000, expected at most 10000"
 

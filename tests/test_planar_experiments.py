@@ -20,7 +20,7 @@ from malta.machines.planar import coils, commutation
 from malta.machines.planar import experiments as experiments
 from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments import jumps, models, motions, timings
-from malta.margins.verify import Margins
+from malta.margins.loop_report import LoopReport
 from malta.model.published import published as read_published
 from malta.model.published import published_value
 from malta.report.figures import experiment_figure
@@ -45,7 +45,7 @@ class Design(NamedTuple):
     spec: Spec
     plant: Plant
     controller: Controller
-    margins: Margins
+    margins: LoopReport
 
 
 def made(name: str) -> Design:
@@ -507,7 +507,7 @@ def test_a_campaign(lqg: Design, tmp_path: Path) -> None:
         (("--option", "gap=0mm"), 1, "touchdown on the magnets at 0 s"),
         (("--option", "cells=0"), 2, "finite, above 0"),
         (("--option", "cells=3.5"), 2, "a whole number"),
-        (("--fidelity", "dq"), 2, "one of force for a planar"),
+        (("--option", "fidelity=dq"), 2, "one of force for a planar"),
         (("--scenario", "errors", "--option", "place=0,0,0"), 2, "3 numbers"),
         (("--scenario", "jump", "--option", "place=6mm"), 2, "found 1 numbers, expected x and y"),
         (("--scenario", "jump", "--option", "rate=-1"), 2, "0 to 1000 1/s"),

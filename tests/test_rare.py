@@ -266,22 +266,24 @@ def test_a_touchdown_of_one_in_a_million() -> None:
 
 @pytest.mark.slow
 def test_the_command(run: Run, tmp_path: Path) -> None:
-    quick = ("--spread", "9%", "--fidelity", "force", "--samples", "200")
+    quick = ("--spread", "9%", "--option", "fidelity=force", "--samples", "200")
     common = ("campaign", SHAKY, *quick, "--out", tmp_path)
-    code, out, err = run(*common, "--rare", "touchdown")
+    code, out, err = run(*common, "--study", "rare", "--limit", "touchdown")
     assert (code, err) == (0, "")
     assert f"--replay {tmp_path}:rare_touchdown" in out
     assert {path.name for path in tmp_path.iterdir()} == {"campaign.json", "rare_touchdown.json"}
-    document = json.loads(run(*common, "--rare", "touchdown", "--json").out)
+    document = json.loads(run(*common, "--study", "rare", "--limit", "touchdown", "--json").out)
     assert document["low"] < document["probability"] < document["high"]
     assert f"{document['probability']:.3g}" in out
     code, _, err = run("simulate", SHAKY, "--replay", f"{tmp_path}:rare_touchdown")
     assert code == 1
     assert document["design_point"]["end"] in err
-    code, out, _ = run(*common, "--rare", "help")
+    code, out, _ = run(*common, "--study", "rare", "--limit", "help")
     assert code == 0
     assert "deviation-y1=VALUE" in out
-    code, out, err = run(*common[:3], "3%", *common[4:-1], tmp_path / "b", "--rare", "deviation-y1=0.8mm")
+    code, out, err = run(
+        *common[:3], "3%", *common[4:-1], tmp_path / "b", "--study", "rare", "--limit", "deviation-y1=0.8mm"
+    )
     assert code == 0
     assert "below" in out
     assert "no run failed: deviation y1 above 800 um or an earlier end has a probability below" in err
@@ -290,14 +292,25 @@ def test_the_command(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (("--rare", "deviation-y1=20kg"), "--rare: deviation-y1.unit: found 'kg'"),
-        (("--rare", "deviation-y1=far"), "expected a number with its unit"),
-        (("--rare", "collision"), "--rare: found 'collision', expected one of touchdown"),
-        (("--rare", "touchdown", "--sobol"), "found --rare and --sobol, expected one of them"),
-        (("--rare", "touchdown", "--limit", "published"), "--limit: found 'published'"),
-        (("--rare", "touchdown", "--cluster", "tcp://x:1"), "--cluster too"),
-        (("--rare", "touchdown", "--spread", "m=0%", "--noise", "0"), "nothing random"),
-        (("--tolerance", "0%"), "expected a yield above 0 %"),
+        (("--study", "rare", "--limit", "deviation-y1=20kg"), "--limit: deviation-y1.unit: found 'kg'"),
+        (("--study", "rare", "--limit", "deviation-y1=far"), "expected a number with its unit"),
+        (
+            ("--study", "rare", "--limit", "collision"),
+            "--limit: found 'collision', expected one of touchdown",
+        ),
+        (
+            ("--rare", "touchdown", "--sobol"),
+            "found --rare and --sobol, expected one study",
+        ),
+        (("--limit", "published"), "--limit: found 'published', expected it with --study"),
+        (("--study", "many"), "--study: found 'many', expected one of rare, sensitivity, tolerances"),
+        (("--study", "tolerances"), "found no --keep"),
+        (("--study", "rare", "--limit", "touchdown", "--cluster", "tcp://x:1"), "--cluster too"),
+        (
+            ("--study", "rare", "--limit", "touchdown", "--spread", "m=0%", "--option", "noise=0"),
+            "nothing random",
+        ),
+        (("--study", "tolerances", "--keep", "0%"), "expected a yield above 0 %"),
     ],
 )
 def test_a_study_that_is_none_is_one_sentence(

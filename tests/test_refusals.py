@@ -127,7 +127,7 @@ def test_a_design_whose_machine_has_no_possible_name_is_refused(tmp_path: Path, 
 @pytest.mark.parametrize(
     ("arguments", "found"),
     [
-        (["simulate", TABLE2, "--delay", "1000000000"], "delay: found 1000000000 samples"),
+        (["simulate", TABLE2, "--option", "delay=1000000000"], "delay: found 1000000000 samples"),
         (["simulate", TABLE2, "--set", "T_d=1"], "machine: dead time: found 20000 samples"),
         (["verify", TABLE2, "--set", "T_d=1", "--no-proof"], "machine: dead time: found 20000 samples"),
         (["verify", TABLE2, "--set", "T_s=1", "--no-proof"], "dead time of its sensors: found 20000 samples"),
@@ -146,7 +146,7 @@ def test_what_would_not_end_is_refused(run: Run, arguments: list[str], found: st
 
 def test_the_longest_delay_is_simulated(run: Run) -> None:
     assert MOST_DELAY == 100
-    code, _, err = run("simulate", TABLE2, "--delay", str(MOST_DELAY + 1))
+    code, _, err = run("simulate", TABLE2, "--option", f"delay={MOST_DELAY + 1}")
     assert code == 2
     assert one_sentence(err).endswith("found 101 samples, expected at most 100")
 
@@ -170,7 +170,7 @@ def test_a_run_of_countless_digits_is_refused(run: Run, digits: str) -> None:
 
 def test_a_refused_campaign_leaves_nothing(run: Run, tmp_path: Path) -> None:
     folder = tmp_path / "campaign"
-    command = ["campaign", TABLE2, "--samples", "8", "--out", folder, "--profile", "cubic"]
+    command = ["campaign", TABLE2, "--samples", "8", "--out", folder, "--option", "profile=cubic"]
     code, out, err = run(*command)
     assert (code, out) == (2, "")
     assert "profile: found 'cubic'" in one_sentence(err)

@@ -17,7 +17,7 @@ from page_checks import cells_of, read_page
 
 import malta
 from malta.cli.report import read_subject
-from malta.margins.verify import verify
+from malta.margins.verify import linear_report
 from malta.report.figures.parts import printable
 from malta.report.page.analysis import Subject, analyse
 from malta.report.page.document import Page
@@ -25,7 +25,6 @@ from malta.report.page.headline import key_figures
 from malta.report.page.inline import dark_colour
 from malta.report.page.pdf import pdf_of
 from malta.report.page.report import page_of
-from malta.report.page.scores import scores_of
 
 if TYPE_CHECKING:
     from malta.report.page.analysis import Analysis
@@ -80,7 +79,7 @@ def test_a_page_is_whole_in_itself_and_names_stay_text(page: Page) -> None:
 
 def test_the_key_figures_are_those_of_verify(cart: Analysis, page: Page) -> None:
     controller = cart.subject.controller
-    margins = verify(cart.model, controller, {"k": 0.2})
+    margins = linear_report(cart.report.model, controller, {"k": 0.2})
     shown = {figure.label: figure.value for figure in key_figures(cart)}
     peak = max(value for name, value in margins.peak_sensitivity.items() if name != "sigma_max")
     assert margins.robust is not None
@@ -91,7 +90,7 @@ def test_the_key_figures_are_those_of_verify(cart: Analysis, page: Page) -> None
     assert shown["Bandwidth"] == f"{margins.bandwidth['sigma_max_T'] / (2 * np.pi):.1f} Hz"
     for value in shown.values():
         assert f'<dd class="value">{value}</dd>' in page.html
-    found = {score.key: score.value for score in scores_of(cart)}
+    found = {score.key: score.value for score in cart.figures}
     assert found["peak_sensitivity"] == peak
     assert found["bandwidth_sigma_max_T_rad_per_s"] == margins.bandwidth["sigma_max_T"]
     assert found["stable"] == 1.0

@@ -23,9 +23,9 @@ import malta
 from malta import report
 from malta.campaigns.statistics import figures_of
 from malta.margins.extent import NOWHERE, Extent, extent_of, positions_of
-from malta.margins.stages import robustness
+from malta.margins.figures import zone
+from malta.margins.loop_report import LoopReport
 from malta.margins.travel import travel_loops, travel_margin
-from malta.margins.verify import Margins, zone
 from malta.model import machines
 from malta.model.checks import check_plant
 from malta.model.machines import machine
@@ -232,7 +232,7 @@ def test_words_say_what_a_proof_covers(plant: Plant, controllers: dict[str, Cont
     assert str(Extent("z", 0.01, {"a": (0, 1)}, {"a": "1"})) == "over the travel and for all a in 0 .. 1"
     found = malta.verify(malta.linearize(plant, plant.at()), controllers["rotor_pid"], {"k_i": 0.1})
     assert f"robust {speed}: proven 440." in str(found)
-    nowhere: Margins = replace(found, extent=NOWHERE)
+    nowhere: LoopReport = replace(found, extent=NOWHERE)
     assert "robust: proven 440." in str(nowhere)
 
 
@@ -241,14 +241,14 @@ def test_tables_of_a_machine_without_a_travel(
     plant: Plant, controllers: dict[str, Controller], par: Any, tmp_path: Path
 ) -> None:
     box = {"k_i": 0.1}
-    found = robustness(plant, controllers["rotor_pid"], box, proof=False)
+    found = malta.verify(plant, controllers["rotor_pid"], box, stages=True, proof=False)
     assert [place.position for place in found.places] == [0, par.Omega, par.Omega_max]
     tables = (
         report.chain_table(found),
-        report.disk_table(found, 1e-4),
-        report.gang_table(found, plant),
-        report.tolerance_table(found, box),
-        report.places_table(found, 1e-4),
+        report.disk_table(found),
+        report.gang_table(found),
+        report.tolerance_table(found),
+        report.places_table(found),
     )
     text = " ".join(" ".join(map(printed, tables)).split())
     for words in (
@@ -260,7 +260,7 @@ def test_tables_of_a_machine_without_a_travel(
     ):
         assert words in text
     assert "travel" not in text
-    assert not report.open_bounds(found, {})  # nothing was asked
+    assert not report.open_bounds(found)  # nothing was asked
     lost = Margin(None, 2.0, None, None, {}, {}, (), 0.0, "time was up")
     ends = Margin(4.0, math.inf, None, None, {}, {}, (), 0.0)
     unproven = replace(
@@ -268,22 +268,21 @@ def test_tables_of_a_machine_without_a_travel(
         chain=(replace(found.chain[0], margin=lost), replace(found.chain[0], name="end", margin=ends)),
         places=tuple(replace(place, margin=lost) for place in found.places),
         tolerance={"k_i": (lost, ends)},
+        worst={"x": Gain(1.0, None, 2.0, {}, 3, 4.0, "why")},
     )
-    assert report.open_bounds(unproven, {"x": Gain(1.0, None, 2.0, {}, 3, 4.0, "why")}) == [
+    assert report.open_bounds(unproven) == [
         f"{found.chain[0].name}, at 0, at 1047, at 2094: nothing proven (time was up), lost at 200.00 %",
         "end: proven 400.00 %; no unstable machine found",
         "k_i down: nothing proven (time was up)",
         "|S| of x: 1 at 2 rad/s, nothing proven (why)",
     ]
-    report.robustness(found, "rotor_pid", box, tmp_path / "margins.png")
+    report.robustness(found, tmp_path / "margins.png")
     assert (tmp_path / "margins.png").stat().st_size > 10_000
     point = replace(found, extent=NOWHERE, places=found.places[1:2])
-    text = "\n".join(
-        printed(table) for table in (report.chain_table(point), report.places_table(point, 1e-4))
-    )
+    text = "\n".join(printed(table) for table in (report.chain_table(point), report.places_table(point)))
     assert "Omega" not in text
     assert "travel" not in text
-    report.chain_figure(point, "rotor_pid", box).draw_without_rendering()
+    report.chain_figure(point).draw_without_rendering()
 
 
 def test_intervals_have_to_be_some(plant: Plant, par: Any) -> None:

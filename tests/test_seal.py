@@ -174,7 +174,18 @@ def test_changed_outcomes_are_named_and_not_reported(
 ) -> None:
     """`completed` zeroed, with and without a verdict that no run has: the yield stays, without a traceback."""
     monkeypatch.setattr("malta.cli.campaign._draw", lambda *_: [])
-    command = ("campaign", GAINS, "--samples", "8", "--fidelity", "force", "--rise", "3", "--out", tmp_path)
+    command = (
+        "campaign",
+        GAINS,
+        "--samples",
+        "8",
+        "--option",
+        "fidelity=force",
+        "--option",
+        "rise=3ms",
+        "--out",
+        tmp_path,
+    )
     path, wanted = tmp_path / block_name(0), run(*command)
     zeroed = {"completed": np.zeros(8)}
     for more in ({}, {"verdict": np.full(8, 7.0)}, {"saturated": np.full((8, 5), np.nan)}):

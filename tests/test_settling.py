@@ -133,11 +133,11 @@ def test_what_may_settle() -> None:
 
 def test_commands_settle(run: Run, tmp_path: Path) -> None:
     """Yields after 300 ms at rest unless another rest is asked for; rare events and single runs without."""
-    code, out, _ = run("simulate", ROBUST, "--settle", "20", "--set", "m=0.4", "--json")
+    code, out, _ = run("simulate", ROBUST, "--option", "settle=20ms", "--set", "m=0.4", "--json")
     assert code == 0
     assert json.loads(out)["verdict"]["time_s"] == 0.1
-    quick = ("campaign", TABLE2, "--samples", "8", "--fidelity", "force", "--spread", "1%")
-    for options, rest in (((), 0.3), (("--settle", "0"), 0), (("--settle", "20"), 0.02)):
+    quick = ("campaign", TABLE2, "--samples", "8", "--option", "fidelity=force", "--spread", "1%")
+    for options, rest in (((), 0.3), (("--option", "settle=0"), 0), (("--option", "settle=20ms"), 0.02)):
         folder = tmp_path / f"rest_{rest}"
         assert run(*quick, *options, "--out", folder)[0] == 0
         asked = json.loads((folder / "campaign.json").read_text())["scenario"]["options"]

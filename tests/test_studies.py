@@ -23,7 +23,7 @@ from malta.campaigns.tolerance import ALL, Tolerances, spread_of, tolerances
 
 BOX = ("m", "K_A", "K_B")
 SHAKY = "design/gains/table2.json"
-QUICK = ("--spread", "10%", "--fidelity", "force")
+QUICK = ("--spread", "10%", "--option", "fidelity=force")
 
 
 def shaky(samples: int, spread: float = 0.1, **options: object) -> Plan:
@@ -131,7 +131,7 @@ def test_noise_is_a_factor() -> None:
 
 def test_the_commands(run: Run, tmp_path: Path) -> None:
     common = ("campaign", SHAKY, *QUICK, "--out", tmp_path)
-    code, out, err = run(*common, "--samples", "512", "--sobol")
+    code, out, err = run(*common, "--samples", "512", "--study", "sensitivity")
     assert code == 0
     assert (
         err == "malta: figures that some runs have no value of, as they were not completed, have no indices\n"
@@ -146,7 +146,19 @@ def test_the_commands(run: Run, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_tolerance_by_command(run: Run, tmp_path: Path) -> None:
-    common = ("campaign", SHAKY, *QUICK, "--samples", "64", "--out", tmp_path, "--tolerance", "90%")
+    common = (
+        "campaign",
+        SHAKY,
+        *QUICK,
+        "--samples",
+        "64",
+        "--out",
+        tmp_path,
+        "--study",
+        "tolerances",
+        "--keep",
+        "90%",
+    )
     code, out, err = run(*common)
     assert (code, err) == (0, "")
     assert "Largest spreads that keep 90 % without touchdown" in out

@@ -15,6 +15,7 @@ from malta.loops.sampled_loops import machine_loop
 from malta.machines.tubular import claims as tubular
 from malta.machines.tubular.evidence import axial_deviation, axis_coupling, load_deviation, noise_forces
 from malta.machines.tubular.evidence import evidence as evidence_of
+from malta.margins.loop_report import Outcome
 from malta.report import ledger as claims
 from malta.report.ledger import Row
 from malta.simulation.catalogue import experiment
@@ -22,7 +23,7 @@ from malta.simulation.trajectory import stroke_figures
 from malta.synthesis.controller import law
 from malta.synthesis.pid import axes_of, pid
 from malta.synthesis.spec import Pid
-from malta.tuning.outcomes import Outcome, SynthesizedDesign, judge
+from malta.tuning.outcomes import SynthesizedDesign, judge
 from malta.tuning.pid import close_loop, loads_of, loop_figures, parts_of, whole_machine
 from malta.tuning.pid_estimates import BETWEEN, estimates_of, name_of, outputs_of
 from malta.tuning.search import model_and_controller
@@ -176,7 +177,7 @@ def test_the_command_lifts_off_with_a_pids_gain_file(run: Run) -> None:
     code, text, err = run("simulate", GAINS, "--scenario", "lift-off")
     assert (code, "steady-state" in text) == (0, True)
     assert "kalman" not in text + err
-    code, _, err = run("simulate", GAINS, "--scenario", "lift-off", "--estimator", "extended")
+    code, _, err = run("simulate", GAINS, "--scenario", "lift-off", "--option", "estimator=extended")
     assert code == 2
     assert "estimator extended: found a PID" in one_sentence(err)
 

@@ -17,9 +17,11 @@ from conftest import ROOT, Run, refusal
 
 import malta
 from malta import gains, report
+from malta.loops.noise import noise_of, noise_variance
 from malta.loops.sampled_loops import machine_loop
 from malta.machines.tubular.requirements import DRIVE
-from malta.margins.verify import BANDWIDTHS
+from malta.margins.figures import BANDWIDTHS
+from malta.margins.loop_report import Outcome
 from malta.simulation.catalogue import experiment
 from malta.synthesis.controller import linear_law, linear_law_of
 from malta.synthesis.requirements import requirements_for
@@ -28,8 +30,7 @@ from malta.tuning import lqg as tune_lqg
 from malta.tuning.design_text import design_text
 from malta.tuning.groups import figures_of
 from malta.tuning.lqg import _clusters, _search, _worst
-from malta.tuning.noise import noise_of, noise_variance
-from malta.tuning.outcomes import Outcome, judge
+from malta.tuning.outcomes import judge
 from malta.tuning.search import (
     Effort,
     Journal,
@@ -42,7 +43,7 @@ from malta.tuning.tune import Tuned, problem_sha256
 from malta.tuning.tune import tune as tuned
 
 if TYPE_CHECKING:
-    from malta.margins.verify import Margins
+    from malta.margins.loop_report import LoopReport
     from malta.model.linearize import LinearModel
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
@@ -60,7 +61,7 @@ def spec() -> Spec:
 
 
 @pytest.fixture(scope="module")
-def flagship(spec: Spec) -> tuple[LinearModel, Controller, Margins]:
+def flagship(spec: Spec) -> tuple[LinearModel, Controller, LoopReport]:
     """The shipped gains, as a machine would read them, and what verify finds."""
     model = malta.linearize(spec.plant, spec.plant.at())
     controller = gains.read(ROOT / "design" / "gains" / "robust.json")
@@ -98,7 +99,7 @@ def test_the_flagship_holds_all_that_is_asked_for(
     assert [name for (name, _), r in requirements.items() if not r.holds] == []
 
 
-def test_its_margin_is_proven_over_the_travel(flagship: tuple[LinearModel, Controller, Margins]) -> None:
+def test_its_margin_is_proven_over_the_travel(flagship: tuple[LinearModel, Controller, LoopReport]) -> None:
     """350 % of the 20 % box on m, K_A, K_D and K_B: they all may vary by 70 %."""
     robust = flagship[2].robust
     assert robust is not None
@@ -108,7 +109,7 @@ def test_its_margin_is_proven_over_the_travel(flagship: tuple[LinearModel, Contr
 
 @pytest.mark.parametrize("z", [-15e-3, -7e-3, 0.0, 4e-3, 15e-3])
 def test_every_corner_at_350_percent_is_stable(
-    z: float, spec: Spec, flagship: tuple[LinearModel, Controller, Margins]
+    z: float, spec: Spec, flagship: tuple[LinearModel, Controller, LoopReport]
 ) -> None:
     """With its PI current loops: eigenvalues, and one corner that is lost beyond."""
     par, controller = spec.parameters, flagship[1]
@@ -127,7 +128,7 @@ def test_every_corner_at_350_percent_is_stable(
     assert max(radius(3.75, tuple(corner)) for corner in corners.tolist()) > 1
 
 
-def test_its_sensitivity_and_bandwidth(flagship: tuple[LinearModel, Controller, Margins]) -> None:
+def test_its_sensitivity_and_bandwidth(flagship: tuple[LinearModel, Controller, LoopReport]) -> None:
     margins = flagship[2]
     for sensor in ("x1", "y1", "x2", "y2", "z"):
         assert margins.peak_sensitivity[sensor] <= 2
@@ -136,7 +137,7 @@ def test_its_sensitivity_and_bandwidth(flagship: tuple[LinearModel, Controller, 
         assert margins.bandwidth[definition] >= 400, definition
 
 
-def test_its_noise_by_two_ways(spec: Spec, flagship: tuple[LinearModel, Controller, Margins]) -> None:
+def test_its_noise_by_two_ways(spec: Spec, flagship: tuple[LinearModel, Controller, LoopReport]) -> None:
     """The covariance, the integral of |T|^2 over all frequencies, and the simulated machine with its steps of 1 um."""
     model, controller, _ = flagship
     machine = machine_loop(model, controller)
@@ -158,7 +159,7 @@ def test_its_noise_by_two_ways(spec: Spec, flagship: tuple[LinearModel, Controll
 
 
 def test_its_observer_has_the_states_of_the_machine_and_of_its_current_loops(
-    flagship: tuple[LinearModel, Controller, Margins],
+    flagship: tuple[LinearModel, Controller, LoopReport],
 ) -> None:
     c = flagship[1]
     assert [s.name for s in c.states[10:]] == [f"{s.name}[i]" for s in c.forces]
@@ -166,7 +167,7 @@ def test_its_observer_has_the_states_of_the_machine_and_of_its_current_loops(
 
 
 def test_its_gains_are_those_of_its_file(
-    spec: Spec, flagship: tuple[LinearModel, Controller, Margins]
+    spec: Spec, flagship: tuple[LinearModel, Controller, LoopReport]
 ) -> None:
     model, committed, _ = flagship
     made = malta.synthesize(spec, model)
@@ -177,7 +178,7 @@ def test_its_gains_are_those_of_its_file(
 
 
 def test_what_the_attraction_asks_of_a_tilt_is_fed_forward(
-    flagship: tuple[LinearModel, Controller, Margins],
+    flagship: tuple[LinearModel, Controller, LoopReport],
 ) -> None:
     """G v = -k q*; K1 / k differs between x and beta, so that without it sensor plane 2 would follow the tilt."""
     model, c, _ = flagship
@@ -197,7 +198,7 @@ def test_what_the_attraction_asks_of_a_tilt_is_fed_forward(
 
 
 def test_the_law_of_gains_is_the_controllers(
-    spec: Spec, flagship: tuple[LinearModel, Controller, Margins]
+    spec: Spec, flagship: tuple[LinearModel, Controller, LoopReport]
 ) -> None:
     from malta.synthesis.lqg import gains as gains_of
 
@@ -214,7 +215,7 @@ def test_the_law_of_gains_is_the_controllers(
 
 
 def test_quick_figures_are_those_of_verify(
-    spec: Spec, flagship: tuple[LinearModel, Controller, Margins], requirements: Any
+    spec: Spec, flagship: tuple[LinearModel, Controller, LoopReport], requirements: Any
 ) -> None:
     clusters = _clusters(spec)
     assert [len(c.variables) for c in clusters] == [8, 5]

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from malta.margins.verify import Margins
+    from malta.margins.loop_report import LoopReport
     from malta.model.linearize import LinearModel
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
@@ -351,7 +351,7 @@ def test_bandwidth_and_margin_are_judge(motor: Spec, monkeypatch: pytest.MonkeyP
     asked = {**motor.specification, "bandwidth": 8.0, "margin": 1.0}
     spec = replace(motor, specification=asked, uncertainty={"m": 0.1})
 
-    def proven(model: LinearModel, controller: Controller, box: Mapping[str, float]) -> Margins:
+    def proven(model: LinearModel, controller: Controller, box: Mapping[str, float]) -> LoopReport:
         assert box == {"m": 0.1}
         bound: Any = SimpleNamespace(lower=1.25)
         return replace(malta.verify(model, controller), robust=bound)

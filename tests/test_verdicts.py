@@ -6,7 +6,8 @@ import json
 import math
 import re
 from functools import partial
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from conftest import ROOT
 import malta
 from malta.app.worker import outcome_document
 from malta.gains.file import read
+from malta.margins.loop_report import Outcome
 from malta.report.page.headline import _requirements as headline
 from malta.report.tables.tuning import found_text, requirements_table
 from malta.synthesis.requirements import (
@@ -25,7 +27,7 @@ from malta.synthesis.requirements import (
     mean_over_seeds,
     reached_with_every_seed,
 )
-from malta.tuning.outcomes import Outcome, SynthesizedDesign, judge, outcomes_of, unflown
+from malta.tuning.outcomes import SynthesizedDesign, judge, outcomes_of, unflown
 from malta.tuning.search import model_and_controller
 
 if TYPE_CHECKING:
@@ -131,10 +133,9 @@ def test_undecided_is_no_pass_anywhere() -> None:
 
 
 def test_the_headline_of_a_report_counts_undecided_requirements() -> None:
-    class Page:
-        outcomes = (OPEN, Outcome("margin", 3.0, 3.5, "1", "proof", at_least=True))
-
-    (key,) = headline(Page())  # type: ignore[arg-type]
+    outcomes = (OPEN, Outcome("margin", 3.0, 3.5, "1", "proof", at_least=True))
+    page: Any = SimpleNamespace(report=SimpleNamespace(requirements=outcomes))
+    (key,) = headline(page)
     assert "1 of 2 hold, 1 undecided" in str(key)
     assert "good" not in str(key)
 

@@ -11,7 +11,8 @@ import pytest
 
 import malta
 from malta.loops.sampled_loops import machine_loop, sampled_loop
-from malta.margins.verify import BANDWIDTHS, require_stable, zone
+from malta.margins.figures import BANDWIDTHS, zone
+from malta.margins.loop_report import require_stable
 from malta.synthesis.riccati import eigenvalues
 
 if TYPE_CHECKING:
@@ -182,3 +183,30 @@ def test_an_unstable_design_is_for_no_file(designs: dict[str, Design], tmp_path:
         with pytest.raises(malta.CheckError, match="unstable"):
             malta.gains.write(design.controller, margins, tmp_path / f"a{suffix}")
     assert not list(tmp_path.iterdir())
+
+
+def test_names_of_the_version_before_say_what_to_write() -> None:
+    spec = malta.read_design("examples/ball/design/ball.toml")
+    controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    with pytest.warns(DeprecationWarning, match=r"malta\.Margins goes: write malta\.LoopReport"):
+        assert malta.Margins is malta.LoopReport
+    with pytest.warns(DeprecationWarning, match="stages=True"):
+        found = malta.robustness(spec.plant, controller, {"m": 0.2}, proof=False)
+    assert [link.name for link in found.chain] == ["LQR", "LQI", "LQG", "LQGI", "sampled"]
+
+
+def test_a_loop_is_verified_by_its_file_its_controller_or_its_machine() -> None:
+    gains = "design/gains/halbach.json"
+    controller = malta.gains.read(gains)
+    plant = malta.plant_of(controller.parameters)
+    ways = [
+        malta.verify(gains, stages=False, proof=False),
+        malta.verify(controller),
+        malta.verify(plant, controller),
+    ]
+    assert len({way.peak_sensitivity["x"] for way in ways}) == 1
+    for wrong in ((plant,), (controller, controller)):
+        with pytest.raises(
+            malta.InputError, match="a gain file, a controller, or a machine and its controller"
+        ):
+            malta.verify(*wrong)

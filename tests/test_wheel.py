@@ -37,10 +37,10 @@ SHORTER = {  # commands of the page that take minutes, or a target, as the same 
     "malta simulate design/gains/calibrated.json --replay FOLDER:17": "malta simulate design/gains/calibrated.json "
     "--replay campaign:17",
     "malta campaign --status FOLDER": "malta campaign --status campaign",
-    "malta campaign design/gains/table2.json --spread 5.5% --rare touchdown": "malta campaign design/gains/table2.json "
-    "--spread 10% --rare touchdown --samples 400",
-    "malta campaign design/gains/robust.json --tolerance 99% --limit published": "malta campaign "
-    "design/gains/robust.json --tolerance 99% --limit published --samples 64",
+    "malta campaign design/gains/table2.json --spread 5.5% --study rare": "malta campaign design/gains/table2.json "
+    "--spread 10% --study rare --limit touchdown --samples 400",
+    "malta campaign design/gains/robust.json --study tolerances --keep 99% --limit published": "malta campaign "
+    "design/gains/robust.json --study tolerances --keep 99% --limit published --samples 64",
     "malta export design/gains/robust.json --to fmu --platforms all": "malta export design/gains/robust.json --to fmu",
     "malta pil design/gains/robust.json --port /dev/ttyUSB0": "malta pil --help",
     "malta claims": "malta claims design/table2.toml",
@@ -123,8 +123,8 @@ def test_the_readmes_lines_and_all_commands(program: Path, tmp_path: Path) -> No
             assert_serves(program, tmp_path, *line.split())
             continue
         done = run(program, tmp_path, *SHORTER.get(line, line).split())
-        apart = "--sobol" in line and "pip install 'malta[sensitivity]'" in done.stderr  # an extra
-        assert done.returncode == (2 if apart else 0), (line, done.stderr)
+        extra = "--study sensitivity" in line and "pip install 'malta[sensitivity]'" in done.stderr
+        assert done.returncode == (2 if extra else 0), (line, done.stderr)
         assert "Traceback" not in done.stderr
     assert (tmp_path / "design" / "gains" / "table2.json").is_file()
     assert (tmp_path / "build" / "robust_margins.png").is_file()

@@ -19,23 +19,18 @@ from malta.app.runs import planned_run
 from malta.errors import CheckError, InputError
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.loop import Loop, loop_of_model
+from malta.loops.noise import noise_of
 from malta.loops.sampled_loops import continuous_poles
+from malta.margins.figures import BANDWIDTHS, MEANINGS, zone
+from malta.margins.loop_report import Stage
 from malta.margins.travel import travel_loops
-from malta.margins.verify import (
-    BANDWIDTHS,
-    Stage,
-    bandwidths_of,
-    controller_poles,
-    stage_of,
-    zone,
-)
+from malta.margins.verify import bandwidths_of, controller_poles, stage_of
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.proof.rays import RayBound, ray_bound
 from malta.simulation.linear_run import linear_run
 from malta.synthesis.lqg import synthesize
 from malta.synthesis.riccati import eigenvalues
-from malta.tuning.noise import noise_of
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Plant
@@ -212,13 +207,20 @@ def margin_document(bound: RayBound) -> dict[str, Any]:
 
 
 class Merit(NamedTuple):
-    """A figure of the comparison: which side is better is +1 (larger), -1 (smaller) or 0."""
+    """A figure of the comparison, of a kind of MEANINGS."""
 
     label: str
     value: float
     unit: str
-    better: int
+    kind: str
     note: str = ""
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The figure for the page: which side is better is +1 (larger), -1 (smaller) or 0."""
+        shown = {"label": self.label, "value": self.value, "unit": self.unit, "note": self.note}
+        better = {"high": 1, "low": -1, "": 0}[MEANINGS[self.kind].better]
+        return shown | {"value": self.value if math.isfinite(self.value) else None, "better": better}
 
 
 def _figures(
@@ -228,12 +230,12 @@ def _figures(
     poles = problem.poles
     damping = float((-poles.real / np.maximum(np.abs(poles), 1e-300)).min(initial=1.0))
     merits = [
-        Merit("least damping", damping, "1", 1),
-        Merit("slowest pole", float(-poles.real.max(initial=-math.inf)), "rad/s", 1),
+        Merit("least damping", damping, "1", "damping"),
+        Merit("slowest pole", float(-poles.real.max(initial=-math.inf)), "rad/s", "slowest_pole"),
     ]
     if problem.stage.stable:
         merits = [*_stable_merits(problem), *_time_merits(problem, run, load), *merits]
-    return [m._asdict() | {"value": m.value if math.isfinite(m.value) else None} for m in merits]
+    return [merit.document for merit in merits]
 
 
 def _stable_merits(problem: Problem) -> list[Merit]:
@@ -244,18 +246,18 @@ def _stable_merits(problem: Problem) -> list[Merit]:
     bandwidths = bandwidths_of(problem.model, problem.controller, loop, stable=True)
     delay = min(problem.curves.margins, key=lambda m: m.delay)
     phase = min(problem.curves.margins, key=lambda m: m.phase)
-    noise = noise_of(loop, problem.plant)
+    noise, inputs = noise_of(loop, problem.plant), problem.plant.inputs
     alone = "smallest of the sensors, the others closed"
     return [
-        Merit("peak |S|", sensors[worst], "1", -1, f"at {worst}, zone {zone(sensors[worst])}"),
+        Merit("peak |S|", sensors[worst], "1", "peak_s", f"at {worst}, zone {zone(sensors[worst])}"),
         *(
-            Merit(f"bandwidth, {short}", bandwidths[key], "rad/s", 1, BANDWIDTHS[key])
+            Merit(f"bandwidth, {short}", bandwidths[key], "rad/s", "bandwidth", BANDWIDTHS[key])
             for key, short in (("sigma_max_T", "T"), ("crossover_max", "L"))
         ),
-        Merit("phase margin", math.degrees(phase.phase), "deg", 1, f"{phase.channel}, {alone}"),
-        Merit("delay margin", delay.delay, "s", 1, f"{delay.channel}, {alone}"),
-        *_worst_by_unit("motion at rest, rms", noise.motion, problem.plant.outputs),
-        *_worst_by_unit("command noise, rms", noise.force[: len(problem.plant.inputs)], problem.plant.inputs),
+        Merit("phase margin", math.degrees(phase.phase), "deg", "phase_margin", f"{phase.channel}, {alone}"),
+        Merit("delay margin", delay.delay, "s", "delay_margin", f"{delay.channel}, {alone}"),
+        *_worst_by_unit("motion", "motion at rest, rms", noise.motion, problem.plant.outputs),
+        *_worst_by_unit("command", "command noise, rms", noise.force[: len(inputs)], inputs),
     ]
 
 
@@ -266,19 +268,19 @@ def _time_merits(
     outputs, merits = problem.plant.outputs, []
     if run is not None:
         error = np.abs(np.array(run["p"]) - np.array(run["reference"])).max(axis=1)
-        merits += _worst_by_unit(f"error, {run['name']}", error, outputs)
+        merits += _worst_by_unit("job_lower", f"error, {run['name']}", error, outputs)
     if load is not None:
-        merits += _worst_by_unit(f"moved by {load['name']}", np.array(load["largest"]), outputs)
+        merits += _worst_by_unit("load_moves", f"moved by {load['name']}", np.array(load["largest"]), outputs)
     return merits
 
 
-def _worst_by_unit(label: str, values: FloatArray, signals: Sequence[Any]) -> list[Merit]:
+def _worst_by_unit(kind: str, label: str, values: FloatArray, signals: Sequence[Any]) -> list[Merit]:
     """The largest of the values of each unit."""
     worst: dict[str, tuple[float, str]] = {}
     for value, s in zip(values.tolist(), signals, strict=True):
         worst[s.unit] = max(worst.get(s.unit, (0.0, s.name)), (value, s.name))
     return [
-        Merit(label if len(worst) == 1 else f"{label} [{unit}]", value, unit, -1, f"largest at {name}")
+        Merit(label if len(worst) == 1 else f"{label} [{unit}]", value, unit, kind, f"largest at {name}")
         for unit, (value, name) in worst.items()
         if value > 0
     ]

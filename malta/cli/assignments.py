@@ -23,6 +23,14 @@ class GeneralOption(NamedTuple):
 
 # Fields of Scenario; each may be given as `--option NAME=VALUE`.
 GENERAL: Mapping[str, GeneralOption] = {
+    "fidelity": GeneralOption(
+        "", "force, dq (PI loops on the windings) or phase; the scenario's own without it"
+    ),
+    "noise": GeneralOption(0.0, "of the sensors, in multiples"),
+    "settle": GeneralOption(
+        0.0, "rest before the reference, of which no figure tells; yields of strokes have one"
+    ),
+    "estimator": GeneralOption("steady-state", "steady-state, kalman (time-varying) or extended"),
     "quantize": GeneralOption(False, "sensors with the machine's resolution"),
     "bearing": GeneralOption(False, "touchdown bearings push back, or a touchdown ends the run"),
     "scheduled": GeneralOption(False, "C(z) of the measured z in the filter"),
@@ -34,6 +42,7 @@ GENERAL: Mapping[str, GeneralOption] = {
     "delay": GeneralOption(0, "samples between measurement and command"),
     "substeps": GeneralOption(0, "Runge-Kutta steps a sample; the error is estimated"),
 }
+LENGTHS = {"distance": "m", "rise": "s", "settle": "s"}  # units of options that many machines have
 NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)"  # a number, and the unit that may follow it
 EXAMPLES = {"--set": "m=0.56 or l_B=45mm", "--spread": "20% or m=10%"}  # in the errors of these options
 EXAMPLE = "gain_x1=0.02 or offset_y2=5um"  # of the others
@@ -136,27 +145,16 @@ def read_uncertainty(
     return box
 
 
-def scenario_options(
-    distance: float | None, rise: float | None, settle: float | None, **others: Any
-) -> dict[str, Any]:
-    """The options of a scenario that are not None, in SI: `distance` comes in mm, `rise` and `settle` in ms."""
-    scaled = {"distance": distance, "rise": rise, "settle": settle}
-    options = {name: None if value is None else value * 1e-3 for name, value in scaled.items()} | others
-    return {name: value for name, value in options.items() if value is not None}
-
-
-def add_own_options(
-    options: Mapping[str, Any], texts: list[str] | None, scenario: str, plant: Plant
-) -> dict[str, Any]:
-    """Add the scenario's own options and general ones, `--option NAME=VALUE`, in SI and of the type of their defaults.
+def read_options(texts: list[str] | None, scenario: str, plant: Plant) -> dict[str, Any]:
+    """Read the scenario's own options and general ones, `--option NAME=VALUE`, in SI and of the type of their defaults.
 
     Raises InputError for an unknown option, one that is given twice, or a value of another type.
     """
     from malta.simulation.catalogue import option_of
     from malta.simulation.experiments import setting
 
-    units = setting(plant, "OPTION_UNITS", {})
-    merged = dict(options)
+    units = LENGTHS | setting(plant, "OPTION_UNITS", {})
+    merged: dict[str, Any] = {}
     for text in texts or ():
         name, value = _split(text)
         if not (name and value):

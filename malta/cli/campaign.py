@@ -7,29 +7,18 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from malta.cli.assignments import add_own_options, read_sensor_errors, read_shares, scenario_options
+from malta.cli.assignments import read_options, read_sensor_errors, read_shares
 from malta.cli.completion import scenarios
 from malta.cli.inputs import change_machine, design_of, print_scenarios, read_controller
 from malta.cli.options import (
+    MACHINE,
+    RUN,
     SCENARIOS,
-    SETTLE,
     AsJson,
-    Bearing,
-    BearingAxes,
     Changes,
-    Delay,
-    Distance,
-    Feedforward,
-    FidelityName,
     GainFileOrNone,
     MachineFile,
     OwnOptions,
-    ProfileName,
-    Quantize,
-    RealPwm,
-    Rise,
-    Scheduled,
-    Substeps,
     Yes,
 )
 from malta.cli.output import (
@@ -49,20 +38,19 @@ if TYPE_CHECKING:
     from malta.campaigns.plan import Law, Sampler
     from malta.campaigns.summary import Summary
 
+STUDY = "A study in place of plain runs"  # a panel of the help
+
 
 def campaign(
     ctx: typer.Context,
     gains: GainFileOrNone = None,
-    samples: Annotated[int, typer.Option(help="Machines; of --rare in each level.")] = 10_000,
-    scenario: Annotated[
-        str | None, typer.Option(help=f"What each one does: {SCENARIOS}", autocompletion=scenarios)
-    ] = None,
-    case: Annotated[str | None, typer.Option(help="Of a scenario of several runs. [the first]")] = None,
+    samples: Annotated[int, typer.Option(help="How many.", rich_help_panel=MACHINE)] = 10_000,
     spread: Annotated[
         list[str] | None,
         typer.Option(
             metavar="[NAME=]SHARE",
             help="Of parameters: 20%, m=10%. [the gain file's]",
+            rich_help_panel=MACHINE,
         ),
     ] = None,
     sensor: Annotated[
@@ -70,57 +58,55 @@ def campaign(
         typer.Option(
             metavar="NAME=VALUE",
             help="How far sensors err: gain_x1=2%, offset_y2=5um, ...",
+            rich_help_panel=MACHINE,
         ),
     ] = None,
-    sampler: Annotated[str, typer.Option(help="latin-hypercube or sobol.")] = "latin-hypercube",
+    sampler: Annotated[
+        str, typer.Option(help="latin-hypercube or sobol.", rich_help_panel=MACHINE)
+    ] = "latin-hypercube",
+    seed: Annotated[int, typer.Option(help="Of machines and noise.", rich_help_panel=MACHINE)] = 0,
     change: Changes = None,
-    distance: Distance = None,
-    rise: Rise = None,
-    settle: Annotated[
-        float | None,
-        typer.Option(help=f"{SETTLE} [300 where yields of MALTA's strokes are counted, else 0]"),
+    machine: MachineFile = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option(help=f"Their job: {SCENARIOS}", autocompletion=scenarios, rich_help_panel=RUN),
     ] = None,
-    profile: ProfileName = None,
+    case: Annotated[
+        str | None, typer.Option(help="Of a scenario of several runs. [the first]", rich_help_panel=RUN)
+    ] = None,
     option: OwnOptions = None,
-    fidelity: FidelityName = None,
-    noise: Annotated[float, typer.Option(help="Of the sensors, in multiples.")] = 1.0,
-    quantize: Quantize = None,
-    bearing: Bearing = None,
-    scheduled: Scheduled = None,
-    feedforward: Feedforward = None,
-    bearing_axes: BearingAxes = None,
-    real_pwm: RealPwm = None,
-    delay: Delay = None,
-    substeps: Substeps = None,
-    seed: Annotated[int, typer.Option(help="Seed of machines and noise.")] = 0,
     law: Annotated[
         str,
-        typer.Option("--controller", help="own; or c, c-float: the exported C flies."),
+        typer.Option(
+            "--controller",
+            help="own; or c, c-float: the exported C flies.",
+            show_default=False,
+            rich_help_panel=RUN,
+        ),
     ] = "own",
+    study: Annotated[
+        str | None,
+        typer.Option(
+            help="rare (probability), sensitivity (Sobol indices) or tolerances.",
+            rich_help_panel=STUDY,
+        ),
+    ] = None,
+    limit: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIMIT",
+            help="[touchdown] or deviation-y1=40um, ...: `help` lists them.",
+            rich_help_panel=STUDY,
+        ),
+    ] = None,
+    keep: Annotated[
+        str | None, typer.Option(metavar="YIELD", help="Of tolerances: 99%.", rich_help_panel=STUDY)
+    ] = None,
     workers: Annotated[int | None, typer.Option(help="Threads. [one for each core]")] = None,
     cluster: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Workers of a Dask scheduler: tcp://host:8786."),
     ] = None,
-    rare: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LIMIT",
-            help="Probability of a rare event: touchdown, deviation-y1=40um; `help` lists them.",
-        ),
-    ] = None,
-    sobol: Annotated[
-        bool, typer.Option("--sobol", help="Which parameter costs yield: Sobol indices.")
-    ] = False,
-    tolerance: Annotated[
-        str | None,
-        typer.Option(metavar="YIELD", help="The largest spreads that keep a yield: 99%."),
-    ] = None,
-    limit: Annotated[
-        str | None,
-        typer.Option(metavar="LIMIT", help="Of --sobol and --tolerance, as in --rare. [touchdown]"),
-    ] = None,
-    worst: Annotated[int, typer.Option(min=0, max=1000, help="Runs to list.")] = 5,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder of blocks and figures. [build/campaigns/]"),
@@ -132,8 +118,7 @@ def campaign(
             help="Design file whose [specification] counts too.",
         ),
     ] = None,
-    machine: MachineFile = None,
-    yes: Yes = False,
+    worst: Annotated[int, typer.Option(min=0, max=1000, help="Runs to list.")] = 5,
     status: Annotated[
         Path | None,
         typer.Option(
@@ -141,17 +126,18 @@ def campaign(
             help="Show how far the campaign in a folder is.",
         ),
     ] = None,
+    yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
     """Simulate many machines that differ, each with noise of its own: the yield, and what goes wrong where.
 
     The folder keeps every block of runs: the same command goes on where it was ended. Whatever the yield is, the exit
-    code is 0. --rare, --sobol and --tolerance study the same box in place of plain runs.
+    code is 0. A study of the same box takes the place of plain runs.
 
     \b
     Example:  malta campaign design/gains/calibrated.json --spread 20%
               malta campaign --status build/campaigns/calibrated_stroke_1a2b3c4d
-              malta campaign design/gains/table2.json --rare touchdown
+              malta campaign design/gains/table2.json --study rare
     """
     if status is not None:
         show_status(ctx, status, gains, StatusOptions(design, machine, worst, as_json))
@@ -174,25 +160,9 @@ def campaign(
         raise typer.Exit
     scenario = scenario or main_job(plant)
     published = published_figures(plant.name)
-    study = study_of(rare, tolerance, limit, cluster, sobol=sobol)
-    options = scenario_options(
-        distance,
-        rise,
-        settle,
-        profile=profile,
-        fidelity=fidelity,
-        noise=noise,
-        quantize=quantize,
-        bearing=bearing,
-        scheduled=scheduled,
-        feedforward=feedforward,
-        bearing_axes=bearing_axes,
-        real_pwm=real_pwm,
-        delay=delay,
-        substeps=substeps,
-    )
-    options = add_own_options(options, option, scenario, plant)
-    if rare is None:
+    asked = study_of(study, limit, keep, cluster)
+    options = {"noise": 1.0} | read_options(option, scenario, plant)
+    if study != "rare":
         options = settling(scenario, plant) | options
     plan = Plan(
         controller,
@@ -209,8 +179,8 @@ def campaign(
     )
     bounds = Bounds(published, design_of(gains, controller, design))
     folder = out or Path("build") / "campaigns" / f"{controller.name}_{scenario}_{plan.identity[:8]}"
-    if study is not None:
-        run_study(study, Setting(gains, plan, bounds, folder, workers, as_json, yes))
+    if asked is not None:
+        run_study(asked, Setting(gains, plan, bounds, folder, workers, as_json, yes))
         return
     session = Session(workers, cluster)
     with campaign_folder(plan, folder, session, gains), progress_bar(scenario, insists=False) as bar:

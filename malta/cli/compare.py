@@ -37,7 +37,7 @@ def compare(
     \b
     Example:  malta compare design/gains/table2.json design/gains/robust.json
     """
-    from malta.margins.verify import require_stable
+    from malta.margins.loop_report import require_stable
     from malta.report.page.comparison import compare as compare_subjects
     from malta.report.page.comparison import require_count
     from malta.report.page.document import SUFFIXES, require_suffix
@@ -64,4 +64,4 @@ def compare(
         console.print(comparison_tables(found, console.width))
         print_written(console, written)
     for file, design in zip(files, found.designs, strict=True):
-        require_stable(design.margins, str(file))
+        require_stable(design.report, str(file))

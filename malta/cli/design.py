@@ -17,7 +17,7 @@ from malta.files import replace_files
 
 if TYPE_CHECKING:
     from malta.cli.documents.simulations import DesignPart
-    from malta.margins.verify import Margins
+    from malta.margins.loop_report import LoopReport
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
@@ -76,7 +76,7 @@ class Made(NamedTuple):
 
     name: str
     page: Any
-    margins: Margins
+    margins: LoopReport
     result: Experiment
     paths: Sequence[Path]  # gain files
     picture: Path
@@ -97,8 +97,8 @@ def _run_design(
     over a gain file then.
     """
     from malta import gains, report
-    from malta.margins.verify import require_stable
-    from malta.margins.verify import verify as compute_margins
+    from malta.margins.loop_report import require_stable
+    from malta.margins.verify import linear_report
     from malta.model.linearize import linearize
     from malta.model.published import published_beside
     from malta.simulation.catalogue import main_job
@@ -114,7 +114,7 @@ def _run_design(
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model)
     note("margins")
-    margins = compute_margins(model, controller, spec.uncertainty)
+    margins = linear_report(model, controller, spec.uncertainty)
     require_stable(margins, str(file))
     note(job)
     result = _simulate_gain_file(file, spec, controller, margins, job)
@@ -149,7 +149,7 @@ def _print_design(made: Made) -> None:
 
 
 def _simulate_gain_file(
-    file: Path, spec: Spec, controller: Controller, margins: Margins, job: str
+    file: Path, spec: Spec, controller: Controller, margins: LoopReport, job: str
 ) -> Experiment:
     """Simulate the main job with a gain file that is written for it alone, before a good one is replaced.
 

@@ -21,6 +21,7 @@ from malta.cli.app import app as live_page
 from malta.cli.campaign import campaign
 from malta.cli.check import check
 from malta.cli.claims import claims
+from malta.cli.command import Command
 from malta.cli.compare import compare
 from malta.cli.design import design
 from malta.cli.export import export
@@ -94,7 +95,7 @@ app = typer.Typer(
     Exit codes: 0 fine; 1 a check failed (unstable, touched down), old gain files stand; 2 bad input; 130 Ctrl-C.""",
 )
 for command in chain.from_iterable(GROUPS.values()):
-    app.command()(command)
+    app.command(cls=Command)(command)
 
 
 def _print_version(asked: bool) -> None:

@@ -10,6 +10,7 @@ import typer
 from malta.cli.completion import gain_files, parameters
 from malta.files import locate
 
+MACHINE = "Machine"  # a panel of a help
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")]
 Changes = Annotated[
     list[str] | None,
@@ -17,6 +18,7 @@ Changes = Annotated[
         "--set",
         metavar="NAME=VALUE",
         help="Change a parameter: m=0.56 (SI) or l_B=45mm.",
+        rich_help_panel=MACHINE,
         autocompletion=parameters,
     ),
 ]
@@ -39,33 +41,18 @@ Uncertain = Annotated[
     ),
 ]
 SCENARIOS = "`--scenario help` lists them. [the first]"
-# Options of a run, in `simulate` and in `campaign`.
-Distance = Annotated[float | None, typer.Option(help="Length of a stroke [mm]. [the scenario's]")]
-Rise = Annotated[float | None, typer.Option(help="Its rise, 10-90 % [ms]. [the scenario's]")]
-SETTLE = "Rest before it begins, of which no figure tells [ms]."
-Settle = Annotated[float | None, typer.Option(help=f"{SETTLE} [0]")]
+RUN = "Run"  # panels of a help
 OwnOptions = Annotated[
     list[str] | None,
     typer.Option(
         "--option",
         metavar="NAME=VALUE",
-        help="Others that `--scenario help` lists: delay=2.",
+        help="Of the scenario, as `--scenario help` lists them: distance=5mm, noise=1, fidelity=phase, delay=2.",
+        rich_help_panel=RUN,
     ),
 ]
-FidelityName = Annotated[str | None, typer.Option(help="force, dq (PI loops), phase. [the scenario's]")]
-Noise = Annotated[float | None, typer.Option(help="Of the sensors, in multiples. [the scenario's]")]
-# What `--option` takes too, and the help leaves to `--scenario help`.
-ProfileName = Annotated[str | None, typer.Option(hidden=True)]
-Quantize = Annotated[bool | None, typer.Option(hidden=True)]
-Bearing = Annotated[bool | None, typer.Option(hidden=True)]
-Scheduled = Annotated[bool | None, typer.Option(hidden=True)]
-Feedforward = Annotated[str | None, typer.Option(hidden=True)]
-BearingAxes = Annotated[str | None, typer.Option(hidden=True)]
-RealPwm = Annotated[bool | None, typer.Option(hidden=True)]
-Delay = Annotated[int | None, typer.Option(hidden=True)]
-Substeps = Annotated[int | None, typer.Option(hidden=True)]
 Yes = Annotated[bool, typer.Option("--yes", help="Start work of more than ten minutes too.")]
-Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]")]
+Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]", rich_help_panel=RUN)]
 DesignFile = Annotated[
     Path | None,
     typer.Option(
@@ -97,6 +84,7 @@ MachineFile = Annotated[
         metavar="FILE",
         envvar="MALTA_MACHINE",
         help="Module of a machine of your own, as rotor.py.",
+        rich_help_panel=MACHINE,
         show_envvar=True,
     ),
 ]

@@ -63,7 +63,7 @@ def report(
     \b
     Example:  malta report design/gains/robust.json --out build/robust.html --pdf
     """
-    from malta.margins.verify import require_stable
+    from malta.margins.loop_report import require_stable
     from malta.report.page.document import SUFFIXES, require_suffix
     from malta.report.page.pdf import pdf_of
     from malta.report.page.report import report_work
@@ -86,7 +86,7 @@ def report(
         print_written(make_console(), contents)
     for note in analysis.notes:
         print_note(note)
-    require_stable(analysis.margins, str(gains))
+    require_stable(analysis.report, str(gains))
 
 
 @contextmanager

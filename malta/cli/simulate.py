@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from malta.cli.assignments import add_own_options, read_sensor_errors, scenario_options
+from malta.cli.assignments import read_options, read_sensor_errors
 from malta.cli.completion import scenarios
 from malta.cli.exported import (
     compare_flights,
@@ -18,27 +18,15 @@ from malta.cli.exported import (
 )
 from malta.cli.inputs import change_machine, print_scenarios, read_controller
 from malta.cli.options import (
+    MACHINE,
+    RUN,
     SCENARIOS,
     AsJson,
-    Bearing,
-    BearingAxes,
     Changes,
-    Delay,
-    Distance,
-    Feedforward,
-    FidelityName,
     GainFile,
     MachineFile,
-    Noise,
     OwnOptions,
-    ProfileName,
-    Quantize,
-    RealPwm,
-    Rise,
-    Scheduled,
     Seed,
-    Settle,
-    Substeps,
     Yes,
 )
 from malta.cli.output import make_console, print_document, print_note, print_text, print_written, progress_bar
@@ -64,43 +52,29 @@ class Simulation(NamedTuple):
 def simulate(
     gains: GainFile,
     scenario: Annotated[
-        str | None, typer.Option(help=f"What to simulate: {SCENARIOS}", autocompletion=scenarios)
+        str | None,
+        typer.Option(help=f"What to simulate: {SCENARIOS}", autocompletion=scenarios, rich_help_panel=RUN),
     ] = None,
     change: Changes = None,
-    distance: Distance = None,
-    rise: Rise = None,
-    settle: Settle = None,
-    profile: ProfileName = None,
-    during: Annotated[
-        str | None, typer.Option(help="Faults strike during a stroke or a hold. [the scenario's]")
-    ] = None,
     option: OwnOptions = None,
-    fidelity: FidelityName = None,
-    noise: Noise = None,
-    quantize: Quantize = None,
     sensor: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=VALUE",
             help="An error of the sensors: gain_x1=0.02, offset_y2=5um, hall_amplitude=0.01, hall_phase=2deg, ...",
+            rich_help_panel=MACHINE,
         ),
     ] = None,
-    bearing: Bearing = None,
-    estimator: Annotated[
-        str | None, typer.Option(help="steady-state, kalman (time-varying) or extended. [steady-state]")
-    ] = None,
-    scheduled: Scheduled = None,
-    feedforward: Feedforward = None,
-    bearing_axes: BearingAxes = None,
-    real_pwm: RealPwm = None,
-    delay: Delay = None,
-    substeps: Substeps = None,
     seed: Seed = None,
-    engine: Annotated[str, typer.Option(help="auto, compiled or virtual-machine.")] = "auto",
+    engine: Annotated[
+        str, typer.Option(help="auto, compiled or virtual-machine.", rich_help_panel=RUN)
+    ] = "auto",
     law: Annotated[
         str,
         typer.Option(
-            "--controller", help="own; or c: the exported C flies, compared with the own law and in float."
+            "--controller",
+            help="own; or c: the exported C flies, compared with the own law and in float.",
+            rich_help_panel=RUN,
         ),
     ] = "own",
     out: Annotated[
@@ -114,6 +88,7 @@ def simulate(
         typer.Option(
             metavar="FOLDER:RUN",
             help="One run of a campaign again, or a rare event's design point: its machine, sensors and noise.",
+            rich_help_panel=RUN,
         ),
     ] = None,
     machine: MachineFile = None,
@@ -138,39 +113,25 @@ def simulate(
         raise typer.Exit
     require_controller(law, engine)
     chosen, choice = scenario or main_job(plant), _engine_choice(law, engine)
-    options = scenario_options(
-        distance,
-        rise,
-        settle,
-        profile=profile,
-        during=during,
-        fidelity=fidelity,
-        noise=noise,
-        quantize=quantize,
-        sensor_errors=read_sensor_errors(sensor, plant) or None,
-        bearing=bearing,
-        estimator=estimator,
-        scheduled=scheduled,
-        feedforward=feedforward,
-        bearing_axes=bearing_axes,
-        real_pwm=real_pwm,
-        delay=delay,
-        substeps=substeps,
-        seed=seed,
-    )
-    options = add_own_options(options, option, chosen, plant)
+    errors = read_sensor_errors(sensor, plant)
+    options = read_options(option, chosen, plant)
+    options |= {"sensor_errors": errors} if errors else {}
+    options |= {} if seed is None else {"seed": seed}
+    substeps = options.get("substeps")
     times = (3.0 if substeps else 1.0) * (
         10.0 if law == "c" else 1.0
     )  # own law, double and float: see exported.py
     with progress_bar(chosen, insists=False) as bar:
-        # With --substeps a second run, with twice as many, follows for the estimate of the error.
+        # With substeps a second run, with twice as many, follows for the estimate of the error.
         progress = limit_time(bar, chosen, agreed=yes, times=times)
 
         def fly(engine: Any) -> Simulation:
             if replay is None:
                 result = experiment(chosen, plant, controller, progress=progress, engine=engine, **options)
                 return Simulation(chosen, result, f"{controller.name}_{chosen}")
-            others = [*options, *(["scenario"] if scenario else []), *(["set"] if change else [])]
+            given = {"--option": option, "--sensor": sensor, "--scenario": scenario, "--set": change}
+            others = [name for name, value in given.items() if value]
+            others += [] if seed is None else ["--seed"]
             return _replay(replay, controller, others, engine, progress)
 
         simulation = fly(choice)
@@ -228,8 +189,9 @@ def _replay(
         expected = "FOLDER:RUN, as build/campaigns/mine:17 or build/campaigns/mine:rare_touchdown"
         raise InputError("--replay", "", repr(text), expected)
     if others:
-        names = ", ".join("--" + name.replace("_", "-") for name in others)
-        raise InputError("--replay", "", f"{names} too", "none of them: the campaign says how it runs")
+        raise InputError(
+            "--replay", "", f"{', '.join(others)} too", "none of them: the campaign says how it runs"
+        )
     plan = read_plan(folder, controller)
     if event:
         point = read_design_point(Path(folder) / f"{run}.json", plan)
@@ -256,20 +218,12 @@ def _save_gains(simulation: Simulation, gains: Path, folder: Path) -> list[Path]
     """Verify the controller that an experiment has found, over the uncertainty of the gain file, and write it."""
     from malta import gains as gain_files
     from malta.gains.file import content_of
-    from malta.margins.verify import verify
-    from malta.model.data import plant_of
-    from malta.model.linearize import linearize
+    from malta.tuning.verify import verify
 
     controller = simulation.experiment.controller
     if controller is None:
         return []
-    plant = plant_of(controller.parameters)
-    robust = content_of(gains)[0].verification.robust
-    margins = verify(
-        linearize(plant, plant.point(controller.operating_point[0])),
-        controller,
-        {} if robust is None else robust.uncertainty,
-    )
+    margins = verify(controller, uncertainty=content_of(gains)[0].uncertainty)
     paths = [folder / f"{controller.name}{suffix}" for suffix in gain_files.SUFFIXES]
     gain_files.write(controller, margins, *paths)
     return paths

@@ -1,4 +1,4 @@
-"""Studies of `malta campaign` on its box, in place of plain runs: --rare, --sobol and --tolerance."""
+"""Studies of `malta campaign` on its box, in place of plain runs: rare events, sensitivity and tolerances."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 
 class Study(NamedTuple):
-    """A study and its option."""
+    """A study of STUDIES."""
 
-    option: str  # "--rare", "--sobol" or "--tolerance"
+    name: str
     limit: str  # "touchdown", "deviation-y1=20um", "help"
     wanted: float = 1.0  # yield to keep
 
@@ -51,34 +51,28 @@ class Setting(NamedTuple):
     yes: bool  # to work of any length
 
 
-def study_of(
-    rare: str | None, tolerance: str | None, limit: str | None, cluster: str | None, *, sobol: bool
-) -> Study | None:
+def study_of(name: str | None, limit: str | None, keep: str | None, cluster: str | None) -> Study | None:
     """The study that the options ask for; None for a plain campaign.
 
-    Raises InputError for several studies, for a cluster, and for a limit or a yield that is none.
+    Raises InputError for an unknown study, for a cluster, and for a limit or a yield that is none or has no study.
     """
-    chosen = [
-        option
-        for option, given in (("--rare", rare), ("--sobol", sobol), ("--tolerance", tolerance))
-        if given
-    ]
-    if len(chosen) > 1:
-        raise InputError("malta campaign", "", " and ".join(chosen), "one of them")
-    if limit is not None and chosen not in (["--sobol"], ["--tolerance"]):
-        raise InputError("--limit", "", repr(limit), "it with --sobol or --tolerance")
-    if not chosen:
+    if name is None:
+        for option, given in (("--limit", limit), ("--keep", keep)):
+            if given is not None:
+                raise InputError(option, "", repr(given), "it with --study")
         return None
+    if name not in STUDIES:
+        raise InputError("--study", "", repr(name), "one of " + ", ".join(STUDIES))
     if cluster is not None:
-        raise InputError(chosen[0], "", "--cluster too", "it without: it runs on this machine")
-    if rare is not None:
-        return Study("--rare", rare)
-    if tolerance is None:
-        return Study("--sobol", limit or "touchdown")
-    wanted = read_assignments("--tolerance", [f"yield={tolerance}"], {"yield": "1"})["yield"]
+        raise InputError("--study", name, "--cluster too", "it without: it runs on this machine")
+    if (keep is None) == (name == "tolerances"):
+        raise InputError(
+            "--study", name, f"{'no ' if keep is None else ''}--keep", "it with tolerances alone, as 99%"
+        )
+    wanted = 1.0 if keep is None else read_assignments("--keep", [f"yield={keep}"], {"yield": "1"})["yield"]
     if not 0 < wanted <= 1:
-        raise InputError("--tolerance", "", repr(tolerance), "a yield above 0 % and up to 100 %, as 99%")
-    return Study("--tolerance", limit or "touchdown", wanted)
+        raise InputError("--keep", "", repr(keep), "a yield above 0 % and up to 100 %, as 99%")
+    return Study(name, limit or "touchdown", wanted)
 
 
 class Outcome(NamedTuple):
@@ -98,17 +92,16 @@ def run_study(study: Study, setting: Setting) -> None:
     from malta.campaigns.run import Session, campaign_folder
     from malta.simulation.batch import is_compiled
 
-    option = "--rare" if study.option == "--rare" else "--limit"
     if study.limit == "help":
         _print_limits(setting.plan)
         raise typer.Exit
-    limit = read_limit(option, study.limit, setting.plan, setting.bounds)
-    what, session = f"{setting.plan.scenario} {study.option}", Session(setting.workers)
+    limit = read_limit(study.limit, setting.plan, setting.bounds)
+    what, session = f"{setting.plan.scenario}, {study.name}", Session(setting.workers)
     folder = campaign_folder(setting.plan, setting.folder, session, setting.gains)
     with folder, progress_bar(what, insists=False) as bar:
         progress = limit_time(bar, what, agreed=setting.yes)
         try:
-            outcome = STUDIES[study.option](limit, study.wanted, setting, progress)
+            outcome = STUDIES[study.name](limit, study.wanted, setting, progress)
         except KeyboardInterrupt:
             raise interruption(f"nothing is known of {what}; {setting.folder} stands as it was") from None
     if setting.as_json:
@@ -187,7 +180,7 @@ def _head(setting: Setting, files: list[Path]) -> dict[str, Any]:
     return {"gains": gains, "folder": folder, "files": names, "manifest": setting.plan.manifest}
 
 
-STUDIES = {"--rare": _rare, "--sobol": _sobol, "--tolerance": _tolerance}
+STUDIES = {"rare": _rare, "sensitivity": _sobol, "tolerances": _tolerance}
 
 
 def _write(setting: Setting, name: str, document: dict[str, Any]) -> Path:
@@ -196,10 +189,10 @@ def _write(setting: Setting, name: str, document: dict[str, Any]) -> Path:
     return path
 
 
-def read_limit(option: str, text: str, plan: Plan, bounds: Bounds) -> Limit:
+def read_limit(text: str, plan: Plan, bounds: Bounds) -> Limit:
     """Read a limit: "touchdown", "published", "specification", or a merit with its bound, as "deviation-y1=20um".
 
-    A bound without a unit is in SI. Raises InputError, which names the option, for any other text.
+    A bound without a unit is in SI. Raises InputError for any other text.
     """
     from malta.campaigns.limits import limit_of, merits_of, slug
     from malta.units import to_si, unit_factor
@@ -210,16 +203,16 @@ def read_limit(option: str, text: str, plan: Plan, bounds: Bounds) -> Limit:
         if sign:
             number = re.fullmatch(NUMBER, value)
             if number is None:
-                raise InputError(option, name, repr(value), "a number with its unit, as 20um")
+                raise InputError("--limit", name, repr(value), "a number with its unit, as 20um")
             _, shown = merits_of(plan).get(slug(name), ("", "percent"))
             bound = float(number[1])
             if number[2]:
                 unit = number[2].replace("%", "percent")
-                bound = to_si(bound, unit, shown, option, name) * unit_factor(shown, name)
+                bound = to_si(bound, unit, shown, "--limit", name) * unit_factor(shown, name)
         return limit_of(plan, name, bound, bounds)
     except InputError as error:
         raise InputError(
-            option, error.field.removeprefix("limit").strip(), error.found, error.expected
+            "--limit", error.field.removeprefix("limit").strip(), error.found, error.expected
         ) from None
 
 

@@ -14,8 +14,8 @@ from malta.cli.output import interruption, make_console, print_document, print_w
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
+    from malta.margins.loop_report import Outcome
     from malta.synthesis.spec import Spec
-    from malta.tuning.outcomes import Outcome
     from malta.tuning.search import Effort
     from malta.tuning.tune import Tuned
 
@@ -96,10 +96,10 @@ def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:
     with working(f"judging {spec.name}"):
         requirements = judge(spec)
     if as_json:
-        from malta.cli.documents.loops import requirement_part
+        from malta.cli.documents.loops import RequirementPart
         from malta.cli.documents.others import TuneOutput
 
-        parts = [requirement_part(one) for one in requirements]
+        parts = [RequirementPart.of(one) for one in requirements]
         print_document(TuneOutput(design=spec.name, requirements=parts))
     else:
         make_console().print(report.requirements_table(requirements))

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -24,51 +23,9 @@ from malta.cli.output import (
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
-    from malta.cli.documents.loops import VerifyOutput
-    from malta.loops.recovery import Recovery
-    from malta.margins.stages import Robustness
-    from malta.margins.verify import Margins
-    from malta.model.linearize import LinearModel
-    from malta.model.plant import Plant
-    from malta.proof.blocks.gain import Gain
+    from malta.margins.loop_report import LoopReport
     from malta.proof.machine.windings import CurrentLoops
-    from malta.proof.margin import Margin
-    from malta.report.tables.layout import Paragraph
-    from malta.simulation.payload import Payload
-    from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
-    from malta.tuning.outcomes import Outcome
-
-
-MOST = 0.5  # of the time of a verification, which the margins take
-NEAREST = 3  # requirements that are named though they hold
-
-
-class Subject(NamedTuple):
-    """A gain file on its machine, and the uncertainty that the margins count in."""
-
-    gains: Path
-    controller: Controller
-    plant: Plant
-    model: LinearModel
-    box: Mapping[str, float]  # parameter -> share, either way, at margin 1
-    current_loops: CurrentLoops
-    spec: Spec | None  # of the machine with its changes; None: no design file
-
-
-class Analysis(NamedTuple):
-    """All that is computed of a loop."""
-
-    margins: Margins
-    robustness: Robustness
-    worst: Mapping[str, Gain]  # the largest |S| of each sensor; empty where it was not asked for
-    recovered: Sequence[
-        Recovery
-    ]  # of each disturbance; none of an unstable loop, or where no load acts from outside
-    payload: Payload | None  # None for an unstable loop, and for a machine without a mass m
-    outcomes: Sequence[Outcome]  # of the requirements that no flight measures; none without a design file
 
 
 def verify(
@@ -113,34 +70,44 @@ def verify(
     \b
     Example:  malta verify design/gains/calibrated.json --set m=0.56
     """
-    from malta.margins.verify import require_stable
+    from malta.margins.loop_report import require_stable
     from malta.model.data import plant_of
-    from malta.model.linearize import linearize
     from malta.model.published import published_figures
+    from malta.tuning.verify import verify as verify_loop
 
     controller = read_controller(gains, machine)
     plant = plant_of(change_machine(controller.parameters, change))
-    model = linearize(plant, plant.point(controller.operating_point[0]))
     published = published_figures(plant.name)
     box = read_uncertainty(gains, uncertain, plant.parameters, published)
     _require_options(time, certificate, proof=not no_proof)
-    spec = _spec_of(gains, controller, design, plant)
-    subject = Subject(gains, controller, plant, model, box, cast("CurrentLoops", current_loops), spec)
-    analysis = _analyse(subject, time, proof=not no_proof, worst_case=worst_case)
+    spec = design_of(gains, controller, design)
+    try:
+        with margin_progress("margins") as (progress, bounds):
+            found = verify_loop(
+                plant, controller, box, stages=True, spec=spec, current_loops=cast("CurrentLoops", current_loops),
+                proof=not no_proof, worst_case=worst_case, time=time, progress=progress, bounds=bounds,
+            )  # fmt: skip
+    except CheckError as error:
+        raise CheckError(f"{gains}: {error}") from error
+    for note in found.notes:
+        print_note(note)
     files: list[Path] = []
     refusal: InputError | CheckError | None = None
     if certificate is not None:
         try:
-            files.append(_write_certificate(certificate, subject, analysis.robustness.travel))
+            files.append(_write_certificate(certificate, gains, found))
         except (InputError, CheckError) as error:
             refusal = error  # the tables come first
     if out is not None:
-        files += _draw(subject, analysis, out)
+        files += _draw(found, out)
     if as_json:
-        print_document(_document(subject, analysis, files))
+        from malta.cli.documents.loops import verify_output
+
+        print_document(verify_output(gains, found, files))
     else:
-        _print_tables(subject, analysis, published, change or (), files)
-    require_stable(analysis.margins, str(gains))
+        _print_tables(gains, found, spec, published, change or ())
+        print_written(make_console(), files)
+    require_stable(found, str(gains))
     if refusal is not None:
         raise refusal
 
@@ -153,180 +120,43 @@ def _require_options(time: float | None, certificate: Path | None, *, proof: boo
         raise InputError("--certificate", "", "--no-proof", "one of them")
 
 
-def _analyse(subject: Subject, time: float | None, *, proof: bool, worst_case: bool | None) -> Analysis:
-    """Compute the margins of a loop behind a progress bar.
-
-    time : s, longest search of a margin over the travel
-    worst_case : whether the largest |S| is searched; None: where one proof covers the travel
-
-    Raises CheckError, naming the gain file, when a result fails its own check.
-    """
-    from malta.loops.recovery import recovery
-    from malta.margins.stages import robustness
-    from malta.margins.travel import covers_travel, worst_sensitivities
-    from malta.margins.verify import verify as compute_margins
-    from malta.simulation.payload import payload
-
-    plant, controller, box, current_loops = (
-        subject.plant,
-        subject.controller,
-        subject.box,
-        subject.current_loops,
-    )
-    try:
-        with margin_progress("margins") as (progress, bounds):
-            margins = compute_margins(subject.model, controller)
-            robust = robustness(
-                plant, controller, box,
-                current_loops=current_loops, progress=lambda share: progress(MOST * share), bounds=bounds,
-                time=time, proof=proof,
-            )  # fmt: skip
-            if worst_case is None:
-                worst_case = proof and covers_travel(plant, controller, tuple(box), current_loops)
-            worst = (
-                worst_sensitivities(plant, controller, box, current_loops, time=time) if worst_case else {}
-            )
-            progress(0.5 * (1 + MOST))
-            recovered = recovery(plant, controller) if margins.stable and plant.disturbances else ()
-            carried = payload(plant, controller) if margins.stable and proof else None
-            outcomes = _judge(subject, margins, robust, proof=proof)
-    except CheckError as error:
-        raise CheckError(f"{subject.gains}: {error}") from error
-    return Analysis(margins, robust, worst, recovered, carried, outcomes)
-
-
-def _spec_of(gains: Path, controller: Controller, named: Path | None, plant: Plant) -> Spec | None:
-    """The design file of a gain file, on the machine that is verified; None where there is none."""
-    spec = design_of(gains, controller, named)
-    return None if spec is None else replace(spec, parameters=plant.parameters)
-
-
-def _judge(subject: Subject, margins: Margins, robust: Robustness, *, proof: bool) -> Sequence[Outcome]:
-    """Judge the requirements that no flight measures, by the margins that are known; a margin if it is proven."""
-    from malta.tuning.outcomes import judge, unflown
-
-    spec = subject.spec
-    if spec is None:
-        return ()
-    names = [name for name in unflown(spec) if proof or name != "margin"]
-    same = subject.current_loops == "pi" and dict(subject.box) == dict(spec.uncertainty)
-    verified = replace(margins, robust=robust.travel) if same or "margin" not in names else None
-    try:
-        return judge(spec, subject.controller, names=names, verified=verified)
-    except InputError as error:
-        print_note(f"the requirements were not judged: {error}")
-        return ()
-
-
-def _write_certificate(path: Path, subject: Subject, margin: Margin) -> Path:
+def _write_certificate(path: Path, gains: Path, found: LoopReport) -> Path:
     """Write the certificate of the margin over the travel."""
     from malta.gains.certified import origin_of
     from malta.margins.travel import travel_loops
     from malta.proof.certificate import certificate
 
-    places, over = travel_loops(subject.plant, subject.controller, tuple(subject.box), subject.current_loops)
-    origin = origin_of(subject.gains, subject.plant, subject.controller, subject.current_loops, len(places))
-    return certificate.write(path, places, subject.box, over, margin, origin)
+    plant, controller, box, stage = found.plant, found.controller, found.uncertainty, found.current_loops
+    places, over = travel_loops(plant, controller, tuple(box), stage)
+    origin = origin_of(gains, plant, controller, stage, len(places))
+    return certificate.write(path, places, box, over, found.travel, origin)
 
 
-def _draw(subject: Subject, analysis: Analysis, folder: Path) -> list[Path]:
+def _draw(found: LoopReport, folder: Path) -> list[Path]:
     """Draw the margins stage by stage and over the travel, and how loads are carried where there are any."""
     from malta import report
 
-    name = subject.controller.name
-    picture, position = folder / f"{name}_margins.png", f"position {subject.plant.stroke}"
-    report.robustness(analysis.robustness, name, subject.box, picture, position, analysis.worst)
-    files = [picture]
-    if analysis.recovered:
-        files.append(folder / f"{name}_loads.png")
-        report.loads(subject.plant, subject.controller, files[-1], analysis.recovered)
+    files = [folder / f"{found.controller.name}_margins.png"]
+    report.robustness(found, files[0])
+    if found.recovery:
+        files.append(folder / f"{found.controller.name}_loads.png")
+        report.loads(found.plant, found.controller, files[-1], found.recovery)
     return files
 
 
-def _document(subject: Subject, analysis: Analysis, files: Sequence[Path]) -> VerifyOutput:
-    """The JSON document of a verification."""
-    from malta.cli.documents.loops import (
-        VerifyOutput,
-        loop_fields,
-        payload_part,
-        recovery_part,
-        requirement_part,
-        robust_part,
-    )
-    from malta.proof.machine.windings import left_out
-
-    units = {signal.name: signal.unit for signal in subject.plant.outputs}
-    return VerifyOutput(
-        gains=str(subject.gains),
-        design=subject.controller.name,
-        files=[str(file) for file in files],
-        recovery=[recovery_part(one) for one in analysis.recovered],
-        robust=robust_part(analysis.robustness, subject.box, analysis.worst, units),
-        payload=payload_part(analysis.payload),
-        left_out=left_out(subject.plant, subject.controller, subject.current_loops),
-        requirements=[requirement_part(one) for one in analysis.outcomes],
-        **loop_fields(analysis.margins),
-    )
-
-
 def _print_tables(
-    subject: Subject,
-    analysis: Analysis,
+    gains: Path,
+    found: LoopReport,
+    spec: Spec | None,
     published: Mapping[str, Any] | None,
     changes: Sequence[str],
-    files: Sequence[Path],
 ) -> None:
     """Print the tables of a verification; poles of a changed machine stand beside no published ones."""
     from malta import report
-    from malta.proof.machine.windings import left_out
 
-    controller, margins, robust = subject.controller, analysis.margins, analysis.robustness
-    missing = left_out(subject.plant, controller, subject.current_loops)
-    open_bounds = report.open_bounds(robust, analysis.worst)
-    box = "  ".join(f"{name} +-{100 * share:g} %" for name, share in subject.box.items())
-    console = make_console()
+    controller, console = found.controller, make_console()
     preset = f"{controller.parameters.preset} {' '.join(changes)}".rstrip()
-    print_text(console, f"{subject.gains}: {controller.name}, {subject.plant.name}, preset {preset}")
-    for table in (
-        report.poles_table(subject.model, None if changes else published),
-        report.loop_poles_table(margins),
-        report.bandwidth_table(margins, published),
-        report.sensitivity_table(margins),
-        *([report.recovery_table(analysis.recovered, subject.plant)] if analysis.recovered else []),
-        report.Paragraph(f"Uncertainty: {box}\n"),
-        report.chain_table(robust),
-        *([report.Paragraph(f"Not in the last stage: {missing}\n")] if missing else []),
-        *([report.Paragraph("\n".join(open_bounds) + "\n")] if open_bounds else []),
-        report.disk_table(robust, controller.sample_time),
-        report.gang_table(robust, subject.plant),
-        report.tolerance_table(robust, subject.box, analysis.payload),
-        report.places_table(robust, controller.sample_time),
-        *([report.worst_case_table(analysis.worst)] if analysis.worst else []),
-        *_requirements(subject, analysis),
-    ):
+    print_text(console, f"{gains}: {controller.name}, {found.plant.name}, preset {preset}")
+    console.print(report.poles_table(found.model, None if changes else published))
+    for table in report.loop_tables(found, published, spec):
         console.print(table)
-    print_written(console, files)
-
-
-def _requirements(subject: Subject, analysis: Analysis) -> Iterator[Table | Paragraph]:
-    """The requirements of the design file that do not hold, then how many do; nothing without a design file."""
-    from malta import report
-
-    spec, asked = subject.spec, [one for one in analysis.outcomes if one.asked is not None]
-    if spec is None or not asked:
-        return
-    failed = [one for one in asked if not one.holds]
-    if failed:
-        yield report.requirements_table(failed)
-    held = sorted((one for one in asked if one.holds), key=lambda one: -one.ratio)
-    near = ", ".join(f"{one.name.replace('_', ' ')} {100 * one.ratio:.1f} %" for one in held[:NEAREST])
-    text = f"Requirements of {spec.path}: {len(held)} of {len(asked)} hold"
-    if held:
-        text += f"; nearest their limits {near}"
-    judged = {one.name for one in analysis.outcomes}
-    others = [name.replace("_", " ") for name in spec.specification if name not in judged]
-    if others:
-        text += f". Not judged here: {', '.join(others)} (malta tune {spec.path} --check)"
-    if spec.sha256 != subject.controller.spec_sha256:
-        text += ". The design file was changed after the gain file was written"
-    yield report.Paragraph(f"{text}.\n")

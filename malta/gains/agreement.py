@@ -18,7 +18,7 @@ from malta.errors import InputError
 from malta.gains.file import content_of, document
 
 if TYPE_CHECKING:
-    from malta.margins.verify import Margins
+    from malta.margins.loop_report import LoopReport
     from malta.synthesis.controller import Controller
 
 CLOSE = 1e-9  # of the largest number in the same array
@@ -27,7 +27,7 @@ NARROWER = 1.01  # largest ratio by which the new bounds of a margin may be tigh
 APART = {"provenance", "sha256", "verification"}  # tables that are not compared with CLOSE
 
 
-def agrees(controller: Controller, margins: Margins, *paths: str | Path) -> bool:
+def agrees(controller: Controller, margins: LoopReport, *paths: str | Path) -> bool:
     """Compare gain files with a controller and its margins: files whose numbers agree need not be written again.
 
     Each array has to agree to 1e-9 of its largest entry, poles and bandwidths to 1e-6. The bounds of the margin must

@@ -44,7 +44,8 @@ from malta.gains.encodings import SUFFIXES as SUFFIXES
 from malta.gains.encodings import content_sha256, decode, encode
 from malta.gains.linear import LINEAR, linear_table, signal_tables
 from malta.gains.schema import GainFile
-from malta.margins.verify import require_stable, unstable_gain
+from malta.margins.loop_report import require_stable
+from malta.margins.verify import unstable_gain
 from malta.model.data import plant_of
 from malta.model.linear import is_linear
 from malta.model.parameters import units_of, values_of
@@ -54,13 +55,13 @@ from malta.synthesis.controller import (
 from malta.tables import validate
 
 if TYPE_CHECKING:
-    from malta.margins.verify import Margins
+    from malta.margins.loop_report import LoopReport
 
 
 SCHEMA = "malta-gains"
 
 
-def document(controller: Controller, margins: Margins) -> dict[str, Any]:
+def document(controller: Controller, margins: LoopReport) -> dict[str, Any]:
     """Make the content of a controller's gain file, as plain tables, lists and numbers.
 
     controller : the controller
@@ -115,7 +116,7 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
         **({"commutation": _table(c.commutation, "lead", "pull")} if ahead else {}),
         "limits": _table(c.limits, "current", "voltage", "force"),
         "verification": {
-            "poles": margins.poles.pairs(),
+            "poles": margins.poles.pairs,
             "bandwidth": dict(margins.bandwidth),
             "peak_sensitivity": dict(margins.peak_sensitivity),
             "robust": _robust(margins),
@@ -139,7 +140,7 @@ def _table(record: Any, *keys: str, later: tuple[str, ...] = ()) -> dict[str, An
     return {key: getattr(record, key) for key in keys + used}
 
 
-def _robust(margins: Margins) -> dict[str, Any] | None:
+def _robust(margins: LoopReport) -> dict[str, Any] | None:
     """Bounds of the margin: lower is null if nothing is proven, upper is null without a witness."""
     margin = margins.robust
     if margin is None:
@@ -152,7 +153,7 @@ def _robust(margins: Margins) -> dict[str, Any] | None:
     }
 
 
-def write(controller: Controller, margins: Margins, *paths: str | Path) -> None:
+def write(controller: Controller, margins: LoopReport, *paths: str | Path) -> None:
     """Write a controller to gain files.
 
     All files are completed beside their targets before any is renamed into place, so a failure leaves the old ones.
@@ -178,7 +179,7 @@ def write(controller: Controller, margins: Margins, *paths: str | Path) -> None:
     replace_files(file_contents(controller, margins, *paths))
 
 
-def file_contents(controller: Controller, margins: Margins, *paths: str | Path) -> dict[Path, bytes]:
+def file_contents(controller: Controller, margins: LoopReport, *paths: str | Path) -> dict[Path, bytes]:
     """Make the contents of the gain files that `malta.gains.write` writes.
 
     controller : the controller

@@ -260,3 +260,8 @@ class GainFile(Record):
     verification: Verification = entry("poles, bandwidth, peaks and margin")
     provenance: Provenance = entry("versions of what computed the gains")
     sha256: StrictStr = entry("sha256 of the rest as compact JSON with sorted keys")
+
+    @property
+    def uncertainty(self) -> dict[str, float]:
+        """The uncertain parameters that the file names; none where it names none."""
+        return {} if self.verification.robust is None else dict(self.verification.robust.uncertainty)

@@ -25,11 +25,9 @@ from typing import Literal
 
 import numpy as np
 
-from malta.display import Description, display
 from malta.errors import InputError
 from malta.loops.classical import (
     Classical,
-    Disk,
     Nominal,
     classical_margins,
     nominal_loop,
@@ -37,7 +35,8 @@ from malta.loops.classical import (
     worst_of,
 )
 from malta.loops.sampled_loops import LAST, machine_law
-from malta.margins.extent import NOWHERE, Extent, extent_of, own_position
+from malta.margins.extent import Extent, extent_of, own_position
+from malta.margins.loop_report import Link, LoopReport, Place
 from malta.margins.travel import (
     EACH,
     PLACES,
@@ -63,87 +62,6 @@ from malta.threads import on_one_thread
 
 SAMPLED = "sampled"  # with first-order lags
 MACHINE = "machine"  # with PI controllers on the windings: the last stage of a machine that has some
-
-
-@dataclass(frozen=True, eq=False)
-class Link:
-    """One stage of the chain, with its margin and its peak sensitivity."""
-
-    name: str
-    margin: Margin
-    peak: float  # largest |S_ii|; NaN where unstable
-    broken_at: Literal["forces", "sensors"]  # where S is taken
-    loaded: bool = False  # whether S is that of the machine under its loads
-
-
-@dataclass(frozen=True)
-class Place:
-    """Figures at a place of the stroke: each is the worse of +position and -position.
-
-    A machine without a stroke has its places along the first parameter of `plant.over`, as the speed of a rotor.
-    """
-
-    position: float  # m, or the SI unit of the parameter
-    margin: Margin
-    peak: float
-    disk: float  # size of the disk margin of all forces and sensors at once
-    delay: float  # s, smallest delay margin; NaN where unstable, as peak and disk
-
-
-def _bound(margin: Margin) -> str:
-    """The proven multiple of a range."""
-    return "nothing" if margin.lower is None else f"{margin.lower:.4g}"
-
-
-@display
-@dataclass(frozen=True, eq=False)
-class Robustness:
-    """What `malta.robustness` finds: margins of a loop stage by stage, along the travel, and of each parameter.
-
-    chain : the stages from LQR to the machine's loop, each with its margin and its largest `|S|`
-    travel : the margin of the machine's loop, anywhere in `extent`, in multiples of the uncertainty
-    disks : disk margins of forces, sensors, both, and each sensor alone: the worst of all places; empty where unstable
-    delay : s, delay margin of each sensor's loop, the others closed: the worst of all places; NaN where unstable
-    gang : by sensor the largest `|S|`, `|T|`, `|S P|` (m/N) and `|F S|` (N/m): the worst of all places
-    tolerance : margins of each parameter alone, down and up, anywhere in `extent`, in multiples of its range
-    mass : margin of the linear loop in kg on top of the mass m; None for a machine without a parameter m
-    places : figures along the course, each the worse of +z and -z
-    extent : the intervals that the proofs cover beside the uncertainty
-
-    >>> import malta
-    >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
-    >>> [link.name for link in found.chain]
-    ['LQR', 'LQI', 'LQG', 'LQGI', 'sampled']
-    >>> down, up = found.tolerance["m"]
-    >>> f"the sphere may lose {down.lower * 0.2:.0%} of its mass"
-    'the sphere may lose 78% of its mass'
-    """
-
-    chain: tuple[Link, ...]
-    travel: Margin
-    disks: tuple[Disk, ...]
-    delay: Mapping[str, float]
-    gang: Mapping[str, tuple[float, ...]]
-    tolerance: Mapping[str, tuple[Margin, Margin]]
-    mass: Margin | None
-    places: tuple[Place, ...]
-    extent: Extent = NOWHERE
-
-    @property
-    def description(self) -> Description:
-        """The margin of each stage of the chain, then what bounds the last."""
-        rows = [
-            (link.name, f"{_bound(link.margin)} proven, largest |S| {link.peak:.3g}") for link in self.chain
-        ]
-        alone = ", ".join(
-            f"{name} -{_bound(down)} +{_bound(up)}" for name, (down, up) in self.tolerance.items()
-        )
-        disks = ", ".join(f"{disk.channels} {disk.size:.3g}" for disk in self.disks)
-        rows += [("one at a time", alone), ("disk margins", disks)]
-        where = f"{self.extent}, ".lstrip(", ")
-        return Description(f"Robustness: {where}{self.travel}", tuple(rows))
 
 
 def compensators(
@@ -196,7 +114,7 @@ def compensators(
 
 @dataclass(frozen=True, eq=False)
 class _Question:
-    """The arguments of `robustness`, and results that its parts share."""
+    """The arguments of `staged_report`, and results that its parts share."""
 
     plant: Plant
     controller: Controller
@@ -262,68 +180,55 @@ class _Question:
 
 
 @on_one_thread
-def robustness(
-    plant: Plant,
-    controller: Controller,
+def staged_report(
+    found: LoopReport,
     uncertainty: Mapping[str, float],
     *,
-    current_loops: CurrentLoops = LAST,
     progress: Callable[[float], None] | None = None,
     bounds: Progress | None = None,
     time: float | None = None,
     proof: bool = True,
-) -> Robustness:
-    """Analyse the margins of a controller on a machine: parametric ones with proof, and the classical ones.
+) -> LoopReport:
+    """Add what `malta verify` shows beside the linear figures: parametric margins with proof, and the classical ones.
 
     The margin over the travel is the largest t for which all parameters may deviate by t times their range at once.
 
-    plant : the machine
-    controller : its controller
+    found : the linear figures, whose `current_loops` is that of the last stage
     uncertainty : relative half range of each parameter, as {"m": 0.2} for +-20 %; margins are multiples of it
-    current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; "lag" ends at the
-        stage `sampled`, with first-order lags at the crossover
     progress : called with the share of the work that is done, 0 to 1
     bounds : called with the lower and upper bound of the margin over the travel so far
     time : s, longest search of the margin over the travel; None: 120
     proof : False: without parametric margins, in a fraction of the time
 
-    Returns a Robustness.
-
     Raises InputError for unknown parameters or none.
-
-    >>> import malta
-    >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2, "C": 0.2})
-    >>> f"proven {found.travel.lower:.2f}, lost at {found.travel.upper:.2f} times the box"
-    'proven 3.21, lost at 3.21 times the box'
-    >>> f"delay margin {found.delay['y'] * 1e3:.2f} ms"
-    'delay margin 2.72 ms'
     """
     if not uncertainty:
-        raise InputError("robustness", "uncertainty", "no parameters", 'some, as {"m": 0.2}')
+        raise InputError("verify", "uncertainty", "no parameters", 'some, as {"m": 0.2}')
     steps, total = itertools.count(1), 9 + 2 * len(uncertainty) + len(PLACES)
 
     def report() -> None:
         if progress is not None:
             progress(min(1.0, next(steps) / total))
 
+    plant, controller, current_loops = found.plant, found.controller, found.current_loops
     question = _Question(plant, controller, uncertainty, current_loops, time, proof, report)
-    travel = question.margin_over(uncertainty, time, bounds) if proof else NOT_PROVEN
+    travel = question.margin_over(uncertainty, time, bounds) if proof else None
     links = _links(question)
     tolerance, mass = _tolerances(question) if proof else ({}, None)
     places, worst = _places(question)
     sensors = [s.name for s in plant.outputs]
-    return Robustness(
-        links,
-        travel,
-        worst.disks if worst else (),
-        worst.delay if worst else dict.fromkeys(sensors, float("nan")),
-        worst.gang if worst else {},
-        tolerance,
-        mass,
-        places,
-        question.extent,
+    return replace(
+        found,
+        uncertainty=dict(uncertainty),
+        robust=travel,
+        extent=question.extent,
+        chain=links,
+        disks=worst.disks if worst else (),
+        delay=worst.delay if worst else dict.fromkeys(sensors, float("nan")),
+        gang=worst.gang if worst else {},
+        tolerance=tolerance,
+        mass=mass,
+        places=places,
     )
 
 

@@ -5,26 +5,27 @@ The loops and their signals are those of loops.py; at the sensors S = (I - P F)^
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from malta.display import Description, display
 from malta.errors import CheckError
 from malta.loops.loop import loop_of_model
 from malta.loops.sampled_loops import (
+    LAST,
     SampledLoop,
     commanded_model,
     continuous_poles,
     sampled_loop,
     sorted_poles,
 )
-from malta.margins.extent import NOWHERE, Extent, extent_of
-from malta.margins.travel import NOT_BETWEEN, travel_margin
+from malta.margins.extent import extent_of
+from malta.margins.figures import BANDWIDTHS
+from malta.margins.loop_report import LoopReport, Poles, Stage
+from malta.margins.travel import travel_margin
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.proof.margin import Margin
 from malta.proof.responses import crossing, find_peaks
 from malta.synthesis.controller import Controller
 from malta.synthesis.riccati import add_integrals, eigenvalues
@@ -35,118 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from malta.model.plant import ComplexArray, FloatArray
-
-# ISO 14839-3: upper limits of the peak sensitivity
-ZONES = ((3.0, "A"), (4.0, "B"), (5.0, "C"), (np.inf, "D"))
-
-
-@dataclass(frozen=True, eq=False)
-class Poles:
-    """Poles in rad/s; of sampled systems ln(lambda) / Ts, without the poles of pure delay."""
-
-    open_loop: ComplexArray  # of the continuous model
-    regulator: ComplexArray  # of the controller's own sampled model with K, Ki; empty for a PID
-    filter: ComplexArray  # of the controller's own sampled observer; empty for a PID
-    closed_loop: ComplexArray  # of the machine: hold, delay, current loops, controller
-
-    def pairs(self) -> dict[str, list[list[float]]]:
-        """Each set as rows [re, im]."""
-        return {f.name: [[float(p.real), float(p.imag)] for p in getattr(self, f.name)] for f in fields(self)}
-
-
-@dataclass(frozen=True)
-class Stage:
-    """The peak sensitivity and stability of one loop, from the ideal one to the machine's."""
-
-    name: str
-    peak_sensitivity: Mapping[str, float]  # by sensor, and sigma_max of all
-    peak_frequency: float  # rad/s, of sigma_max
-    spectral_radius: float  # of the closed loop; stable below 1
-
-    @property
-    def stable(self) -> bool:
-        return self.spectral_radius < 1
-
-
-@display
-@dataclass(frozen=True, eq=False)
-class Margins:
-    """What `malta.verify` finds: poles, peak sensitivities, bandwidths and the robust margin of a loop.
-
-    The last stage is the machine's loop: hold, delay and current loops. ISO 14839-3 sorts its peak sensitivities into
-    zones: A below 3 (9.5 dB), B below 4, C below 5, D above.
-
-    poles : open loop, regulator, filter and closed loop, rad/s; of sampled systems ln(lambda) / Ts
-    stages : peak sensitivities and spectral radius of the loop as designed, with current loops, and of the machine
-    bandwidth : rad/s, by definition
-    uncertainty : relative half range of each parameter
-    robust : the margin in multiples of these ranges, anywhere in `extent`; None without ranges
-    extent : the intervals that the margin covers beside the ranges
-
-    >>> import malta
-    >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> model = malta.linearize(spec.plant, spec.plant.at())
-    >>> margins = malta.verify(model, malta.synthesize(spec, model), {"m": 0.2})
-    >>> f"{margins.peak_sensitivity['y']:.2f}, {margins.robust.lower:.2f}"
-    '1.57, 3.91'
-    """
-
-    poles: Poles
-    stages: tuple[Stage, ...]
-    bandwidth: Mapping[str, float]
-    uncertainty: Mapping[str, float]
-    robust: Margin | None
-    extent: Extent = NOWHERE
-
-    @property
-    def stable(self) -> bool:
-        """Whether the machine's loop is stable."""
-        return self.stages[-1].stable
-
-    @property
-    def peak_sensitivity(self) -> Mapping[str, float]:
-        """The peak sensitivity of the machine's loop, by sensor and as sigma_max."""
-        return self.stages[-1].peak_sensitivity
-
-    def __str__(self) -> str:
-        lines = [f"{'stable' if self.stable else 'UNSTABLE'} with hold, delay and current loops"]
-        for stage in self.stages:
-            peaks = "  ".join(
-                f"{k} {v:.2f} {zone(v)}" for k, v in stage.peak_sensitivity.items() if k != "sigma_max"
-            )
-            largest = stage.peak_sensitivity["sigma_max"]
-            lines.append(
-                f"peak |S|, {stage.name}: {peaks}  all {largest:.2f} ({20 * np.log10(largest):.1f} dB)"
-            )
-        for key, value in self.bandwidth.items():
-            lines.append(f"bandwidth, {BANDWIDTHS[key]}: {value:.1f} rad/s ({value / (2 * np.pi):.2f} Hz)")
-        if self.uncertainty:
-            box = "  ".join(f"{name} +-{share * 100:g} %" for name, share in self.uncertainty.items())
-            everywhere = self.robust is None or NOT_BETWEEN not in self.robust.reason
-            where = str(self.extent) if everywhere else "in the middle and at the end of the travel"
-            lines += [f"uncertainty: {box}", f"{f'robust {where}'.rstrip()}: {self.robust}"]
-        return "\n".join(lines)
-
-    @property
-    def description(self) -> Description:
-        """The sentences of `str`."""
-        first, *rest = str(self).splitlines()
-        parts = (line.partition(": ") for line in rest)
-        return Description(f"Margins: {first}", tuple((label, text) for label, _, text in parts))
-
-
-BANDWIDTHS = {
-    "sigma_max_T": "last -3 dB of sigma_max(T)",
-    "sigma_min_T": "first -3 dB of sigma_min(T)",
-    "crossover_max": "last 0 dB of sigma_max(L)",
-    "w_n_max": "regulator's fastest natural frequency",
-    "w_n_min": "regulator's slowest natural frequency",
-}
-
-
-def zone(peak: float) -> str:
-    """ISO 14839-3 zone of a peak sensitivity: A below 3 (9.5 dB), B below 4, C below 5, D above."""
-    return next(name for limit, name in ZONES if peak < limit or limit == np.inf)
+    from malta.proof.machine.windings import CurrentLoops
 
 
 def controller_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
@@ -183,46 +73,34 @@ def unstable_gain(c: Controller) -> tuple[str, float] | None:
 
 
 @on_one_thread
-def verify(
-    model: LinearModel, controller: Controller, uncertainty: Mapping[str, float] | None = None
-) -> Margins:
-    """Verify a controller on a machine's linear model: poles, peak sensitivities, bandwidths, and the robust margin.
+def linear_report(
+    model: LinearModel,
+    controller: Controller,
+    uncertainty: Mapping[str, float] | None = None,
+    current_loops: CurrentLoops = LAST,
+    *,
+    time: float | None = None,
+) -> LoopReport:
+    """Report what is linear: poles, peak sensitivities, bandwidths, and the robust margin over an uncertainty.
 
     Stages: the sampled loop as designed; with the current loops; the machine. The robust margin covers the travel and
     the intervals of `plant.over`. The peak sensitivities of an unstable loop are NaN; instability raises nothing.
 
-    model : the machine's linear model, from `malta.linearize`
-    controller : its controller
-    uncertainty : relative half range of each parameter, the unit of the robust margin, as {"m": 0.2}; None: no margin
-
-    Returns a Margins, which prints as a short table.
-
     Raises CheckError when numbers overflow or no input holds the machine.
-
-    >>> import malta
-    >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> model = malta.linearize(spec.plant, spec.plant.at())
-    >>> print(malta.verify(model, malta.synthesize(spec, model), spec.uncertainty))
-    stable with hold, delay and current loops
-    peak |S|, sampled: y 1.71 A  all 1.71 (4.7 dB)
-    peak |S|, + current loops: y 1.71 A  all 1.71 (4.7 dB)
-    peak |S|, machine: y 1.57 A  all 1.57 (3.9 dB)
-    bandwidth, last -3 dB of sigma_max(T): 652.0 rad/s (103.76 Hz)
-    bandwidth, first -3 dB of sigma_min(T): 652.0 rad/s (103.76 Hz)
-    bandwidth, last 0 dB of sigma_max(L): 290.8 rad/s (46.29 Hz)
-    bandwidth, regulator's fastest natural frequency: 247.4 rad/s (39.37 Hz)
-    bandwidth, regulator's slowest natural frequency: 247.4 rad/s (39.37 Hz)
-    uncertainty: m +-20 %  C +-20 %
-    robust: proven 320... %, lost at 320.61 % at 1047 rad/s
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            return _verify(model, controller, dict(uncertainty or {}))
+            found = _nominal_report(model, controller, current_loops)
+            if not uncertainty:
+                return found
+            robust = travel_margin(model.plant, controller, uncertainty, current_loops, time=time)
     except np.linalg.LinAlgError as error:
         raise CheckError(f"{controller.name}: the loop cannot be computed ({error})") from error
+    extent = extent_of(model.plant, uncertainty)
+    return replace(found, uncertainty=dict(uncertainty), robust=robust, extent=extent)
 
 
-def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str, float]) -> Margins:
+def _nominal_report(model: LinearModel, controller: Controller, current_loops: CurrentLoops) -> LoopReport:
     whole = loop_of_model(model, controller)
     machine = whole.sampled
     loops = {
@@ -241,17 +119,10 @@ def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str
         closed_loop=whole.poles,
     )
     bandwidths = bandwidths_of(model, controller, machine, stable=stages[-1].stable)
-    robust = travel_margin(model.plant, controller, uncertainty) if uncertainty else None
-    return Margins(poles, stages, bandwidths, uncertainty, robust, extent_of(model.plant, uncertainty))
-
-
-def require_stable(margins: Margins, name: str) -> None:
-    """Raise CheckError when a stage is unstable: such gains are not written to files."""
-    for stage in margins.stages:
-        if not stage.stable:
-            raise CheckError(
-                f"{name}: the loop ({stage.name}) is unstable, |lambda| = {stage.spectral_radius:.6f}"
-            )
+    extent = extent_of(model.plant)
+    return LoopReport(
+        model, controller, poles, stages, bandwidths, extent=extent, current_loops=current_loops
+    )
 
 
 def _grid(Ts: float) -> FloatArray:

@@ -79,6 +79,11 @@ class Margin:
         """Whether no loss of stability was found within the limits of the parameters (a mass above zero)."""
         return math.isinf(self.upper)
 
+    @property
+    def cells(self) -> int:
+        """How many cells the proof has."""
+        return sum(proof.cells for proof in self.certificate)
+
     def __str__(self) -> str:
         low = f"proven {100 * self.lower:.2f} %" if self.lower else unproven(self.reason)
         if self.exhausted:

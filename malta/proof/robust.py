@@ -128,9 +128,7 @@ def common_margin(
     for system, other in loops[1:]:
         same = system.names == first.names and np.array_equal(system.nominal, first.nominal)
         if not (same and other.sample_time == law.sample_time and system.sample_time == first.sample_time):
-            raise InputError(
-                "margin", "places", "loops of different parameters or clocks", "alike ones"
-            )
+            raise InputError("margin", "places", "loops of different parameters or clocks", "alike ones")
     outside = {} if over is None else over
     box = box_of(first.names, first.nominal, first.limits, ranges, outside, caller="margin")
     for system, _ in loops:

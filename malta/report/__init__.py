@@ -44,6 +44,7 @@ from malta.report.tables.layout import Paragraph as Paragraph
 from malta.report.tables.margins import chain_table as chain_table
 from malta.report.tables.margins import disk_table as disk_table
 from malta.report.tables.margins import gang_table as gang_table
+from malta.report.tables.margins import loop_tables as loop_tables
 from malta.report.tables.margins import open_bounds as open_bounds
 from malta.report.tables.margins import places_table as places_table
 from malta.report.tables.margins import tolerance_table as tolerance_table

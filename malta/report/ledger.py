@@ -29,7 +29,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 from malta.errors import InputError
-from malta.margins.verify import ZONES, Margins, verify
+from malta.margins.figures import ZONES
+from malta.margins.loop_report import LoopReport
+from malta.margins.verify import linear_report
 from malta.model.linearize import LinearModel, linearize
 from malta.model.machines import require_part
 from malta.model.published import published_value
@@ -102,7 +104,7 @@ class Evidence(Protocol):
     @property
     def controller(self) -> Controller: ...
     @property
-    def margins(self) -> Margins: ...
+    def margins(self) -> LoopReport: ...
     @property
     def experiments(self) -> Mapping[str, Experiment]: ...
 
@@ -112,7 +114,7 @@ class DesignRuns(NamedTuple):
 
     model: LinearModel
     controller: Controller
-    margins: Margins
+    margins: LoopReport
     experiments: dict[str, Experiment]
 
 
@@ -128,7 +130,7 @@ def run_design(spec: Spec, names: Sequence[str], progress: Progress | None = Non
         name: experiment(name, plant, controller, progress=progress_of_part(progress, n, len(names)))
         for n, name in enumerate(names)
     }
-    return DesignRuns(model, controller, verify(model, controller, spec.uncertainty), experiments)
+    return DesignRuns(model, controller, linear_report(model, controller, spec.uncertainty), experiments)
 
 
 class Chance(float):
@@ -205,14 +207,6 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
     return Ledger(machine, paper.SOURCE, names, tuple(claims), meant)
 
 
-<<<<<<< HEAD
-def _claim(row: Row, found: Sequence[Evidence], published: Mapping[str, Any]) -> Claim:
-    """The line of the ledger for a row and the evidence of all designs."""
-    judged = [e for e in found if not (row.of_lqg and e.spec.pid)]
-    figures = [row.value(e) if e in judged else math.nan for e in found]
-    values = [in_unit(figure, row.unit) for figure in figures]
-    ours = tuple(_shown(row, figure) for figure in figures)
-=======
 def _claim(
     row: Row, found: Sequence[Evidence], published: Mapping[str, Any], reproducing: Sequence[str]
 ) -> Claim:
@@ -221,9 +215,9 @@ def _claim(
     reproducing : names of the designs that are meant to reproduce the paper
     """
     shown = [e for e in found if not (row.of_lqg and e.spec.pid)]
-    values = [in_unit(row.value(e), row.unit) if e in shown else math.nan for e in found]
-    ours = tuple("–" if math.isnan(value) else row.form.format(value) for value in values)
->>>>>>> h-c
+    figures = [row.value(e) if e in shown else math.nan for e in found]
+    values = [in_unit(figure, row.unit) for figure in figures]
+    ours = tuple(_shown(row, figure) for figure in figures)
     unit = {"1": "", "percent": " [%]", "um": " [µm]", "urad": " [µrad]", "deg": " [°]"}.get(
         row.unit, f" [{row.unit}]"
     )
@@ -247,7 +241,6 @@ def _claim(
     return Claim(subject, mark + printed, ours, verdict, word_of(words))
 
 
-<<<<<<< HEAD
 def _shown(row: Row, figure: float) -> str:
     """A figure in the row's form, with its interval if it is one of chance; "–" for none."""
     if math.isnan(figure):
@@ -257,17 +250,11 @@ def _shown(row: Row, figure: float) -> str:
     return text if half is None else f"{text} ±{row.form.format(half)}"
 
 
-def _verdict(
-    row: Row, target: float, values: Sequence[float], names: Sequence[str], built: Sequence[bool] = ()
-) -> str:
-    """The verdict on the figures of all designs.
-=======
 def _is_judged(row: Row, name: str, reproducing: Sequence[str]) -> bool:
     """Whether a design is meant to reproduce a row; of the machine alone, of an input and beside it every design is."""
     if row.of_machine or row.by_construction is True or row.relation == "beside":
         return True
     return name in (row.designs or reproducing)
->>>>>>> h-c
 
 
 def word_of(verdicts: Sequence[str]) -> Word:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from rich.console import Group
 
 from malta.loops.recovery import recovery
-from malta.margins.verify import Margins
+from malta.margins.loop_report import LoopReport
 from malta.model.linearize import LinearModel
 from malta.report.figures import (
     distributions_figure,
@@ -27,7 +27,6 @@ from malta.report.figures.sensitivity import sensitivity_figure
 from malta.report.tables.design import bandwidth_table, loop_poles_table, poles_table, sensitivity_table
 from malta.report.tables.experiments import experiment_table
 from malta.report.tables.layout import Paragraph
-from malta.report.tables.margins import is_of_whole_travel
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.lqg import continuous_poles
 from malta.synthesis.spec import Spec
@@ -39,16 +38,14 @@ if TYPE_CHECKING:
     from malta.campaigns.sensitivity import Sensitivity
     from malta.campaigns.summary import Summary
     from malta.loops.recovery import Recovery
-    from malta.margins.stages import Robustness
     from malta.model.plant import Plant
-    from malta.proof.blocks.gain import Gain
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
     from malta.tuning.tune import Tuned
 
 
 def design_page(
-    spec: Spec, model: LinearModel, margins: Margins, flown: Experiment, published: Published | None
+    spec: Spec, model: LinearModel, margins: LoopReport, flown: Experiment, published: Published | None
 ) -> Group:
     """Make the page of a design for a terminal: its loop, its margins, and the machine's main experiment.
 
@@ -91,11 +88,11 @@ def design_page(
     )
 
 
-def _margin_text(margins: Margins) -> Paragraph:
+def _margin_text(margins: LoopReport) -> Paragraph:
     box_text = " ".join(f"{name} +-{100 * share:g} %" for name, share in margins.uncertainty.items())
     assert margins.robust is not None
     where = str(margins.extent).replace("the travel", "the whole travel")
-    if not is_of_whole_travel(margins.robust):
+    if not margins.covers_travel:
         where = "in the middle and at the end of the travel"
     return Paragraph(f"{f'Parametric margin {where}'.rstrip()} ({box_text}): {margins.robust}\n")
 
@@ -175,22 +172,11 @@ def experiment(e: Experiment, path: str | Path | None = None, published: Publish
     return _save_figure(experiment_figure(e, published), path)
 
 
-def robustness(
-    found: Robustness,
-    name: str,
-    uncertainty: Mapping[str, float],
-    path: str | Path | None = None,
-    position: str = "position",
-    worst: Mapping[str, Gain] | None = None,
-) -> Figure:
+def robustness(found: LoopReport, path: str | Path | None = None) -> Figure:
     """Draw the margins of a design stage by stage, and save the figure where a path is given.
 
-    found : from `malta.robustness`
-    name : of the design
-    uncertainty : half-widths of the box, as shares
+    found : from `malta.verify`, with `stages`
     path : .png, .svg or .pdf file; None: nothing is written
-    position : the machine's word for its travel, as "position z"
-    worst : the largest `|S|` of each sensor over the uncertainty, from `malta.worst_case_gain`; None: none
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -199,13 +185,12 @@ def robustness(
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> box = {"m": 0.2}
-    >>> found = malta.robustness(spec.plant, controller, box)
-    >>> figure = malta.report.robustness(found, "ball", box)
+    >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
+    >>> figure = malta.report.robustness(found)
     >>> figure.axes[0].get_xlabel()
     'proven margin without loads [% of the box]'
     """
-    return _save_figure(chain_figure(found, name, uncertainty, position, worst), path)
+    return _save_figure(chain_figure(found), path)
 
 
 def loads(

@@ -17,6 +17,7 @@ import numpy as np
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.identifiers import identifier
+from malta.margins.figures import Better
 from malta.model.machines import attribute_of
 from malta.model.plant import Plant
 from malta.simulation.inputs import LONGEST
@@ -38,7 +39,7 @@ QUIET: dict[str, Any] = {"noise": 0.0, "quantize": False, "sensor_errors": None}
 
 
 class Merit(NamedTuple):
-    """A figure of merit: value in SI, unit for display, and the key of the paper's value."""
+    """A figure of merit: value in SI, unit for display, the key of the paper's value, and which way is better."""
 
     label: str
     value: float
@@ -46,6 +47,7 @@ class Merit(NamedTuple):
     published: str = ""  # key of data/published/
     relation: str = "about"  # of ours to the published: "about" or "at most"
     key: str = ""  # its name in documents, without a unit; "": the words of the label
+    better: Better = "low"  # "high", or "" where neither is
 
     @property
     def identifier(self) -> str:

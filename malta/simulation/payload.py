@@ -11,12 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import brentq
 
 from malta.errors import CheckError
+from malta.margins.loop_report import Payload
 from malta.model.equilibrium import balance
 from malta.model.parameters import units_of
 from malta.simulation.catalogue import experiment
@@ -31,14 +32,6 @@ PLACES = (-1.0, 0.0, 1.0)  # of the travel
 HEAVIEST = 1e6  # kg; what holds that is not limited by its forces
 UNREACHED = 2.0  # share of a limit, beyond it, where no command makes the forces
 STEP = 0.02  # of a mass: how finely the flight is bisected
-
-
-class Payload(NamedTuple):
-    """How much a machine carries beside its mover, kg."""
-
-    held: float  # by the forces at rest; inf: its weight loads no input
-    carried: float  # the largest that was flown; NaN: the machine has no experiment of it
-    dropped: float  # the smallest that was dropped; inf: none
 
 
 def payload(plant: Plant, controller: Controller) -> Payload | None:

@@ -238,7 +238,9 @@ class Controller:
         object.__setattr__(self, "operating_point", (readonly(x), readonly(u)))
         if len(self.forces) != len(self.measurements):
             found = f"{len(self.forces)} forces and {len(self.measurements)} measurements"
-            expected = "as many of both: let `currents` share one force among coils that act alike, or measure less"
+            expected = (
+                "as many of both: let `currents` share one force among coils that act alike, or measure less"
+            )
             raise InputError("Controller", "forces", found, expected)
 
     def __repr__(self) -> str:

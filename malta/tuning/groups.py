@@ -22,6 +22,7 @@ import numpy as np
 from scipy import sparse
 
 from malta.errors import CheckError, InputError
+from malta.loops.noise import covariance, noise_variance
 from malta.loops.sampled_loops import disturbance_map, push_through
 from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
@@ -46,7 +47,6 @@ from malta.synthesis.sampled import gain_at_rest
 from malta.synthesis.spec import Spec, Weights
 from malta.synthesis.step_response import step_response
 from malta.tuning.corners import STEP, SampledMachine, corner_margins
-from malta.tuning.noise import covariance, noise_variance
 
 if TYPE_CHECKING:
     from malta.model.linearize import LinearModel

@@ -6,22 +6,23 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from malta.errors import InputError
 from malta.loops.loop import Loop, loop_of_model
+from malta.loops.noise import noise_of
 from malta.loops.recovery import bounded_deviation, worst_along
-from malta.margins.verify import BANDWIDTHS, verify
+from malta.margins.figures import BANDWIDTHS
+from malta.margins.loop_report import LoopReport, Outcome
+from malta.margins.verify import linear_report
 from malta.model.linearize import linearize
 from malta.simulation.catalogue import experiment
 from malta.simulation.simulate import simulate
-from malta.synthesis.requirements import Figure, Noise, Requirement, judge_figure, ratio_of, requirements_for
-from malta.tuning.noise import noise_of
+from malta.synthesis.requirements import Figure, Noise, Requirement, requirements_for
 from malta.tuning.pid import loads_of, loop_figures, whole_machine
 from malta.tuning.search import base_of, model_and_controller
 
 if TYPE_CHECKING:
-    from malta.margins.verify import Margins
     from malta.model.linearize import LinearModel
     from malta.model.plant import Parameters, Plant
     from malta.simulation.experiments import Experiment
@@ -29,47 +30,7 @@ if TYPE_CHECKING:
     from malta.simulation.trajectory import Trajectory
     from malta.synthesis.controller import Controller
     from malta.synthesis.recovery import RecoveryBound
-    from malta.synthesis.requirements import Verdict
     from malta.synthesis.spec import Spec
-
-
-class Outcome(NamedTuple):
-    """What is asked for and what was found, SI."""
-
-    name: str
-    asked: float | None  # None: as little as the others leave
-    found: float
-    unit: str
-    how: str  # where the figure comes from
-    at_least: bool = False  # asked for from below
-    interval: tuple[float, float] | None = None  # 95 % confidence of a simulated figure
-
-    @property
-    def ratio(self) -> float:
-        """How near its limit: at most 1 where it holds."""
-        asked = math.inf if self.asked is None else self.asked
-        return ratio_of(asked, self.found, at_least=self.at_least)
-
-    @property
-    def verdict(self) -> Verdict:
-        """Whether the bound holds; "undecided" where the interval of a simulated figure has the bound within."""
-        return judge_figure(Figure(self.found, self.how, self.interval), self.asked, at_least=self.at_least)
-
-    @property
-    def holds(self) -> bool:
-        """Whether the figure is within its bound; not where that is undecided."""
-        return self.verdict == "holds"
-
-    def __str__(self) -> str:
-        unit = "" if self.unit == "1" else f" {self.unit}"
-        if self.asked is None:
-            return f"{self.name} is {self.found:.4g}{unit}, asked for little"
-        bound = "at least" if self.at_least else "at most"
-        text = f"{self.name} is {self.found:.4g}{unit}, asked for {bound} {self.asked:.4g}{unit}"
-        if self.verdict != "undecided" or self.interval is None:
-            return text
-        low, high = self.interval
-        return f"{text}, undecided between {low:.4g} and {high:.4g}{unit}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +40,7 @@ class SynthesizedDesign:
     spec: Spec
     model: LinearModel
     controller: Controller
-    verified: Margins | None = None  # where it is known: with the margin over the spec's own uncertainty
+    verified: LoopReport | None = None  # where it is known: with the margin over the spec's own uncertainty
 
     @property
     def plant(self) -> Plant:
@@ -92,12 +53,12 @@ class SynthesizedDesign:
         return loop_of_model(self.model, self.controller)
 
     @cached_property
-    def margins(self) -> Margins:
+    def margins(self) -> LoopReport:
         """The verified loop, with the proven robust margin where one is asked for."""
         if self.verified is not None:
             return self.verified
         box = self.spec.uncertainty if "margin" in self.spec.specification else None
-        return verify(self.model, self.controller, box)
+        return linear_report(self.model, self.controller, box)
 
     @property
     def bandwidth(self) -> Figure:
@@ -144,7 +105,7 @@ def judge(
     controller: Controller | None = None,
     *,
     names: Collection[str] | None = None,
-    verified: Margins | None = None,
+    verified: LoopReport | None = None,
 ) -> tuple[Outcome, ...]:
     """Measure requirements of a design: proven margin, verified loop, covariance, simulated experiments.
 

@@ -27,6 +27,7 @@ from scipy import optimize, sparse
 
 from malta.errors import InputError
 from malta.loops.loop import loop_of_model
+from malta.loops.noise import covariance
 from malta.loops.sampled_loops import SampledLoop
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim
@@ -39,7 +40,6 @@ from malta.synthesis.pid import Axes, axes_of, law_of_outputs, pid_gains
 from malta.synthesis.requirements import ratio_of
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Loads, Pid, Spec, pid_signals
-from malta.tuning.noise import covariance
 from malta.tuning.pid_estimates import estimates_of, name_of, outputs_of
 from malta.tuning.search import (
     UNSTABLE,

@@ -21,8 +21,8 @@ from malta.tuning.search import DIGITS, Effort, Journal, apply_trial
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from malta.margins.loop_report import Outcome
     from malta.synthesis.spec import Spec
-    from malta.tuning.outcomes import Outcome
     from malta.tuning.search import Progress, Trial
 
 

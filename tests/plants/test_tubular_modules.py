@@ -367,8 +367,8 @@ def test_set_on_the_command_line(run: Run) -> None:
 @pytest.mark.slow
 def test_spread_on_the_command_line(run: Run, tmp_path: Path) -> None:
     said = run(
-        "campaign", GAINS, "--samples", "8", "--spread", "dK_A=3%", "--spread", "e_x=10um", "--fidelity", "force",
-        "--out", tmp_path, "--json",
+        "campaign", GAINS, "--samples", "8", "--spread", "dK_A=3%", "--spread", "e_x=10um",
+        "--option", "fidelity=force", "--out", tmp_path, "--json",
     )  # fmt: skip
     assert said.code == 0, said.err
     assert json.loads(said.out)["manifest"]["spread"] == {"dK_A": 0.03, "e_x": 1e-5}

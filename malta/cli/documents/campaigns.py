@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from malta.cli.documents.parts import Files, Number, Part, ShareOfRuns, share_of, with_keys, words_of
+from malta.cli.documents.parts import Files, Number, Part, ShareOfRuns, with_keys, words_of
 from malta.identifiers import distinct, identifier
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ class PercentilesPart(Part):
 
 class DistributionPart(Part):
     """A figure of merit over the completed runs, SI."""
+
+    READS: ClassVar = {"smallest": "sketch.smallest"}
 
     p5: Number
     p50: Number
@@ -89,6 +91,8 @@ class CampaignOutput(RunsPart):
 class BlocksPart(Part):
     """Blocks in the folder of a campaign."""
 
+    READS: ClassVar = {"done": "blocks", "all": "of", "runs": "size", "bytes": "stored"}
+
     done: int
     all: int
     runs: int = Field(description="in a block")
@@ -128,7 +132,7 @@ class DesignPointPart(Part):
 
 
 class RareOutput(HeadPart):
-    """What `malta campaign --rare LIMIT --json` prints."""
+    """What `malta campaign --study rare --json` prints."""
 
     kind: Literal["malta-rare-output"] = Field(default="malta-rare-output", alias="schema")
     version: Literal[1] = 1
@@ -162,7 +166,7 @@ Indices = dict[str, IndexPart] | None
 
 
 class SobolOutput(HeadPart):
-    """What `malta campaign --sobol --json` prints."""
+    """What `malta campaign --study sensitivity --json` prints."""
 
     kind: Literal["malta-sobol-output"] = Field(default="malta-sobol-output", alias="schema")
     version: Literal[1] = 1
@@ -186,7 +190,7 @@ class SpreadPart(Part):
 
 
 class ToleranceOutput(HeadPart):
-    """What `malta campaign --tolerance YIELD --json` prints."""
+    """What `malta campaign --study tolerances --json` prints."""
 
     kind: Literal["malta-tolerance-output"] = Field(default="malta-tolerance-output", alias="schema")
     version: Literal[1] = 1
@@ -212,7 +216,7 @@ def runs_fields(found: Summary, worst: int) -> dict[str, Any]:
         "runs": found.runs,
         "interrupted": found.interrupted,
         "engines": list(found.engines),
-        "share": share_of(completed),
+        "share": ShareOfRuns.of(completed),
         "within_published": None if within is None else within.passed,
         "within_specification": None if specified is None else specified.passed,
         "ends": with_keys(found.ends),
@@ -225,7 +229,7 @@ def runs_fields(found: Summary, worst: int) -> dict[str, Any]:
 def status_fields(found: Status) -> dict[str, Any]:
     """How far a campaign is."""
     return {
-        "blocks": BlocksPart(done=found.blocks, all=found.of, runs=found.size, bytes=found.stored),
+        "blocks": BlocksPart.of(found),
         "damaged": [str(file) for file in found.summary.damaged],
         "running": found.running,
         "pace_s": found.pace,
@@ -241,13 +245,7 @@ def rare_fields(event: RareEvent) -> dict[str, Any]:
     document = event_document(event)
     point = event.design_point
     if point is not None:
-        document["design_point"] = DesignPointPart(
-            values=dict(point.values),
-            distance=point.distance,
-            noise=list(point.noise),
-            end=point.end,
-            time_s=point.time,
-        )
+        document["design_point"] = DesignPointPart.of(point)
     return {name: value for name, value in document.items() if name not in ("schema", "version")}
 
 
@@ -256,14 +254,14 @@ def sobol_fields(found: Sensitivity) -> dict[str, Any]:
 
     def part(indices: tuple[Index, ...]) -> Indices:
         rows = zip(found.factors, indices, strict=True) if indices else ()
-        return {name: IndexPart(**index._asdict()) for name, index in rows} or None
+        return {name: IndexPart.of(index) for name, index in rows} or None
 
     names = distinct(identifier(label, "1") for label in found.of_merits)
     return {
         "limit": found.limit.name,
         "factors": list(found.factors),
         "runs": found.runs,
-        "within": share_of(found.within),
+        "within": ShareOfRuns.of(found.within),
         "of_yield": part(found.of_yield),
         "merits": {name: part(one) for name, one in zip(names, found.of_merits.values(), strict=True)},
     }
@@ -276,14 +274,10 @@ def tolerance_fields(found: Tolerances) -> dict[str, Any]:
     return {
         "limit": found.limit.name,
         "wanted": found.wanted,
-        "today": share_of(found.today),
+        "today": ShareOfRuns.of(found.today),
         "spreads": {
-            words_of(spread.name): SpreadPart(
-                factor=spread.factor,
-                spread=spread_of(found, spread),
-                within=None if spread.within is None else share_of(spread.within),
-                at_least=spread.factor == spread.widest,
-                monotone=spread.monotone,
+            words_of(spread.name): SpreadPart.of(
+                spread, spread=spread_of(found, spread), at_least=spread.factor == spread.widest
             )
             for spread in found.spreads
         },
@@ -292,13 +286,7 @@ def tolerance_fields(found: Tolerances) -> dict[str, Any]:
 
 def _distribution(merit: Merit) -> DistributionPart:
     marks = merit.percentiles((5, 50, 95, 99, 100)).tolist()
-    return DistributionPart(
-        **dict(zip(("p5", "p50", "p95", "p99", "largest"), marks, strict=True)),
-        smallest=merit.sketch.smallest,
-        mean=merit.mean,
-        standard_deviation=merit.standard_deviation,
-        published=merit.published,
-    )
+    return DistributionPart.of(merit, **dict(zip(("p5", "p50", "p95", "p99", "largest"), marks, strict=True)))
 
 
 def _run_part(found: Summary, runs: Runs, row: int) -> RunPart:

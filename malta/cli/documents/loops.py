@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from malta.cli.documents.parts import Files, Number, Part, Shares, with_keys
+from malta.cli.documents.parts import UNIT, Files, Number, Part, Shares, with_keys
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
     from malta.loops.recovery import Deviation, Recovery
-    from malta.margins.stages import Robustness
-    from malta.margins.verify import Margins
-    from malta.proof.blocks.gain import Gain
-    from malta.proof.margin import Margin
-    from malta.simulation.payload import Payload
-    from malta.tuning.outcomes import Outcome
+    from malta.margins.loop_report import LoopReport
 
 Poles = list[tuple[float, float]]
 
@@ -32,6 +29,8 @@ class PolesPart(Part):
 
 class LoopPart(Part):
     """Stability, poles, bandwidths and peak sensitivities of a loop."""
+
+    READS: ClassVar = {"poles_rad_per_s": "poles.pairs"}
 
     stable: bool
     poles_rad_per_s: PolesPart
@@ -55,8 +54,13 @@ class MarginPart(Part):
     time_up: bool = Field(description="the search ended as its time was up: more time may prove more")
 
 
+OF_MARGIN = {key: f"margin.{UNIT.sub('', key)}" for key in MarginPart.model_fields}
+
+
 class LinkPart(MarginPart):
     """A stage from the ideal loop to the machine's."""
+
+    READS: ClassVar = OF_MARGIN | {"stage": "name", "peak_sensitivity": "peak", "at": "broken_at"}
 
     stage: str
     peak_sensitivity: Number
@@ -66,6 +70,8 @@ class LinkPart(MarginPart):
 
 class PlacePart(MarginPart):
     """The machine's loop at a place of its travel, or at a value of a parameter."""
+
+    READS: ClassVar = OF_MARGIN | {"peak_sensitivity": "peak"}
 
     position: float
     unit: str = Field(description="SI unit of the position")
@@ -104,6 +110,8 @@ class TolerancePart(Part):
 class GainPart(Part):
     """The largest gain over the uncertainty."""
 
+    READS: ClassVar = {"found": "lower", "proven": "upper"}
+
     found: Number
     frequency_rad_per_s: Number
     proven: Number = Field(description="upper bound")
@@ -112,6 +120,8 @@ class GainPart(Part):
 
 class RobustPart(Part):
     """Margins over an uncertainty and over the travel."""
+
+    READS: ClassVar = {"worst_sensitivity": "worst"}
 
     uncertainty: Shares
     chain: list[LinkPart]
@@ -186,6 +196,8 @@ class RequirementPart(Part):
 class VerifyOutput(LoopPart):
     """What `malta verify --json` prints."""
 
+    READS: ClassVar = LoopPart.READS | {"design": "controller.name"}
+
     kind: Literal["malta-verify-output"] = Field(default="malta-verify-output", alias="schema")
     version: Literal[1] = 1
     gains: str
@@ -200,132 +212,35 @@ class VerifyOutput(LoopPart):
     )
 
 
-def requirement_part(outcome: Outcome) -> RequirementPart:
-    """A requirement and what is reached of it."""
-    return RequirementPart(
-        name=outcome.name,
-        asked=outcome.asked,
-        found=outcome.found,
-        unit=outcome.unit,
-        how=outcome.how,
-        ratio=outcome.ratio,
-        holds=outcome.holds,
-        verdict=outcome.verdict,
-        interval=outcome.interval,
-    )
-
-
-def loop_fields(margins: Margins) -> dict[str, Any]:
+def loop_fields(found: LoopReport) -> dict[str, Any]:
     """The fields of a LoopPart."""
-    peaks = {stage.name: dict(stage.peak_sensitivity) for stage in margins.stages}
-    return {
-        "stable": margins.stable,
-        "poles_rad_per_s": margins.poles.pairs(),
-        "bandwidth_rad_per_s": dict(margins.bandwidth),
-        "peak_sensitivity": with_keys(peaks),
-    }
+    peaks = {stage.name: stage.peak_sensitivity for stage in found.stages}
+    return LoopPart.fields_of(found) | {"peak_sensitivity": with_keys(peaks)}
 
 
-def recovery_part(found: Recovery) -> RecoveryPart:
+def verify_output(gains: Path, found: LoopReport, files: Sequence[Path]) -> VerifyOutput:
+    """The document of a verification."""
+    units, unit = {signal.name: signal.unit for signal in found.plant.outputs}, found.extent.unit
+    robust = RobustPart.of(
+        found,
+        gang_of_four={
+            name: GangPart(**dict(zip(("S", "T", "SP", "FS"), gang, strict=True)), unit=units[name])
+            for name, gang in found.gang.items()
+        },
+        tolerance={name: {"down": down, "up": up} for name, (down, up) in found.tolerance.items()},
+        places=[PlacePart.of(place, unit=unit) for place in found.places],
+    )
+    own = {"gains": str(gains), "files": [str(file) for file in files], "robust": robust}
+    return VerifyOutput.of(found, **loop_fields(found) | own, recovery=[_recovery(r) for r in found.recovery])
+
+
+def _recovery(found: Recovery) -> RecoveryPart:
     """The answer to a constant load, by output."""
 
     def deviation(d: Deviation) -> DeviationPart:
-        return DeviationPart(
-            unit=d.unit,
-            largest=d.largest,
-            left=[LeftPart(after_s=t, value=left) for t, left in zip(found.after, d.left, strict=True)],
-            settled_s=d.settled,
-            final=d.final,
-            compliance=CompliancePart(peak=d.compliance, frequency_rad_per_s=d.frequency),
+        left = [{"after_s": t, "value": value} for t, value in zip(found.after, d.left, strict=True)]
+        return DeviationPart.of(
+            d, left=left, compliance={"peak": d.compliance, "frequency_rad_per_s": d.frequency}
         )
 
-    return RecoveryPart(load=dict(found.load), outputs={d.output: deviation(d) for d in found.outputs})
-
-
-def payload_part(found: Payload | None) -> PayloadPart | None:
-    """The payload of a machine."""
-    if found is None:
-        return None
-    return PayloadPart(held_kg=found.held, carried_kg=found.carried, dropped_kg=found.dropped)
-
-
-def robust_part(
-    found: Robustness, box: Mapping[str, float], worst: Mapping[str, Gain], units: Mapping[str, str]
-) -> RobustPart:
-    """Margins over an uncertainty and over the travel.
-
-    worst : the largest |S| of each sensor; empty where it was not asked for
-    units : of the sensors
-    """
-    along = "m" if found.extent.stroke else found.extent.unit
-    return RobustPart(
-        uncertainty=dict(box),
-        chain=[
-            LinkPart(
-                stage=link.name,
-                peak_sensitivity=link.peak,
-                at=link.broken_at,
-                loaded=link.loaded,
-                **_margin_fields(link.margin),
-            )
-            for link in found.chain
-        ],
-        travel=margin_part(found.travel),
-        disks=[
-            DiskPart(
-                channels=disk.channels,
-                size=disk.size,
-                gain=disk.gain,
-                phase_rad=disk.phase,
-                frequency_rad_per_s=disk.frequency,
-            )
-            for disk in found.disks
-        ],
-        delay_s=dict(found.delay),
-        gang_of_four={
-            name: GangPart(S=S, T=T, SP=SP, FS=FS, unit=units[name])
-            for name, (S, T, SP, FS) in found.gang.items()
-        },
-        tolerance={
-            name: TolerancePart(down=margin_part(down), up=margin_part(up))
-            for name, (down, up) in found.tolerance.items()
-        },
-        mass_kg=None if found.mass is None else margin_part(found.mass),
-        places=[
-            PlacePart(
-                position=place.position,
-                unit=along,
-                peak_sensitivity=place.peak,
-                disk=place.disk,
-                delay_s=place.delay,
-                **_margin_fields(place.margin),
-            )
-            for place in found.places
-        ],
-        worst_sensitivity={name: _gain_part(gain) for name, gain in worst.items()},
-    )
-
-
-def margin_part(margin: Margin) -> MarginPart:
-    """A margin in multiples of the uncertainty."""
-    return MarginPart(**_margin_fields(margin))
-
-
-def _margin_fields(margin: Margin) -> dict[str, Any]:
-    return {
-        "lower": margin.lower,
-        "upper": None if margin.exhausted else margin.upper,
-        "frequency_rad_per_s": margin.frequency,
-        "witness": None if margin.witness is None else dict(margin.witness),
-        "sensitivity": dict(margin.sensitivity),
-        "cells": sum(proof.cells for proof in margin.certificate),
-        "reason": margin.reason,
-        "searched": margin.searched,
-        "time_up": margin.time_up,
-    }
-
-
-def _gain_part(gain: Gain) -> GainPart:
-    return GainPart(
-        found=gain.lower, frequency_rad_per_s=gain.frequency, proven=gain.upper, reason=gain.reason
-    )
+    return RecoveryPart.of(found, outputs={d.output: deviation(d) for d in found.outputs})

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from malta.cli.documents.loops import RequirementPart, requirement_part
+from malta.cli.documents.loops import RequirementPart
 from malta.cli.documents.parts import Files, Number, Part
 from malta.identifiers import identifier
 from malta.report.ledger import Word
@@ -191,7 +191,7 @@ def tune_output(spec: Spec, tuned: Tuned, files: Sequence[Path]) -> TuneOutput:
     return TuneOutput(
         design=spec.name,
         files=[str(path) for path in files],
-        requirements=[requirement_part(r) for r in tuned.requirements],
+        requirements=[RequirementPart.of(r) for r in tuned.requirements],
         search=search,
     )
 

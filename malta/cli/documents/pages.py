@@ -60,9 +60,7 @@ class CompareOutput(Part):
 
 def report_output(gains: Path, analysis: Analysis, files: Iterable[Path]) -> ReportOutput:
     """The document of a report."""
-    from malta.report.page.scores import scores_of
-
-    figures: dict[str, float | None] = {score.key: score.value for score in scores_of(analysis)}
+    figures: dict[str, float | None] = {score.key: score.value for score in analysis.figures}
     name = analysis.subject.controller.name
     return ReportOutput(gains=str(gains), design=name, figures=figures, files=list(map(str, files)))
 
@@ -70,7 +68,7 @@ def report_output(gains: Path, analysis: Analysis, files: Iterable[Path]) -> Rep
 def compare_output(found: Comparison, files: Iterable[Path]) -> CompareOutput:
     """The document of a comparison."""
     designs = [
-        ComparedDesign(name=name, gains=a.subject.source, machine=a.plant.name, stable=a.margins.stable)
+        ComparedDesign(name=name, gains=a.subject.source, machine=a.plant.name, stable=a.report.stable)
         for name, a in zip(found.names, found.designs, strict=True)
     ]
     figures = [

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from operator import attrgetter
+from typing import Annotated, Any, ClassVar, Protocol, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from malta.identifiers import distinct
-
-if TYPE_CHECKING:
-    from malta.campaigns.result import Rate
-    from malta.simulation.verdict import Verdict
 
 Number = Annotated[float | None, Field(description="null where it is not finite, or where there is none")]
 Files = Annotated[list[str], Field(description="files that the command wrote")]
@@ -24,12 +21,37 @@ Shares = Annotated[
 ]
 
 
+UNIT = re.compile(r"_(?:rad_per_s|rad|share|kg|s|N|A)$")  # at the end of a key
+
+
 class Part(BaseModel):
-    """A table of a document."""
+    """A table of a document, which renders a record: a key has the record's field of its name, without its unit."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, populate_by_name=True, json_schema_serialization_defaults_required=True
     )
+    READS: ClassVar[Mapping[str, str]] = {}  # keys of other names -> the field, as "run.verdict"
+
+    @classmethod
+    def fields_of(cls, record: Any) -> dict[str, Any]:
+        """What a record has of the keys."""
+        found = {}
+        for key in cls.model_fields:
+            path = cls.READS.get(key) or (key if hasattr(record, key) else UNIT.sub("", key))
+            if key in cls.READS or hasattr(record, path):
+                value = attrgetter(path)(record)
+                found[key] = value.tolist() if hasattr(value, "tolist") else value  # an array
+        return found
+
+    @classmethod
+    def of(cls, record: Any, **given: Any) -> Self:
+        """The table of a record; `given` are keys that it does not have, or has in another form."""
+        return cls.model_validate(cls.fields_of(record) | given)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, record: Any) -> Any:
+        return record if isinstance(record, Mapping | Part) else cls.fields_of(record)
 
 
 class End(Part):
@@ -59,16 +81,6 @@ class Labelled(Protocol):
     @property
     def value(self) -> float:
         """SI."""
-
-
-def end_of(verdict: Verdict) -> End:
-    """The end of a run."""
-    return End(name=verdict.name, time_s=verdict.time)
-
-
-def share_of(rate: Rate) -> ShareOfRuns:
-    """A share of runs."""
-    return ShareOfRuns(**rate._asdict())
 
 
 def merits_of(merits: Iterable[Labelled]) -> dict[str, Number]:

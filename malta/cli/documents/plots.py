@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -27,6 +27,14 @@ POINTS = 500  # of a line over time
 
 class MarginsPart(Part):
     """The margins of one channel with the others closed; null where nothing bounds them, or the loop is unstable."""
+
+    READS: ClassVar = {
+        "phase_at_rad_per_s": "phase_frequency",
+        "delay_at_rad_per_s": "delay_frequency",
+        "disk": "disk.size",
+        "disk_at_rad_per_s": "disk.frequency",
+        "peak_sensitivity_at_rad_per_s": "peak_frequency",
+    }
 
     channel: str
     stable: bool
@@ -91,6 +99,8 @@ class PolesPart(Part):
 
 class AnswerPart(Part):
     """The answer of an output to a unit step, and what is read off."""
+
+    READS: ClassVar = {"peak_at_s": "peak_time"}
 
     rise_s: Number
     overshoot_share: Number
@@ -219,24 +229,13 @@ def _indices(curves: LoopCurves, channels: Sequence[str] | None, at: Place) -> d
 
 
 def _margins_part(found: ChannelMargins) -> MarginsPart:
-    return MarginsPart(
-        channel=found.channel,
-        stable=found.stable,
-        gain_lower=found.gain[0],
-        gain_lower_at_rad_per_s=found.gain_frequency[0],
-        gain_upper=found.gain[1],
-        gain_upper_at_rad_per_s=found.gain_frequency[1],
-        phase_rad=found.phase,
-        phase_at_rad_per_s=found.phase_frequency,
-        delay_s=found.delay,
-        delay_at_rad_per_s=found.delay_frequency,
-        disk=found.disk.size,
-        disk_at_rad_per_s=found.disk.frequency,
-        modulus=found.modulus,
-        peak_sensitivity=found.peak_sensitivity,
-        peak_sensitivity_at_rad_per_s=found.peak_frequency,
-        encirclements=found.encirclements,
-        unstable_poles=found.unstable_poles,
+    (lower, upper), (lower_at, upper_at) = found.gain, found.gain_frequency
+    return MarginsPart.of(
+        found,
+        gain_lower=lower,
+        gain_lower_at_rad_per_s=lower_at,
+        gain_upper=upper,
+        gain_upper_at_rad_per_s=upper_at,
     )
 
 
@@ -296,27 +295,14 @@ def _line(answer: StepResponse, output: int, column: int) -> dict[str, Any]:
     end = 1.6 * found.settling if 0 < found.settling < math.inf else float(answer.t[-1])
     last = min(int(np.searchsorted(answer.t, end)) + 1, len(answer.t))
     k = np.unique(np.searchsorted(answer.t[:last], np.linspace(0, answer.t[last - 1], POINTS)))
-    return {
-        "rise_s": found.rise,
-        "overshoot_share": found.overshoot,
-        "settling_s": found.settling,
-        "peak": found.peak,
-        "peak_at_s": found.peak_time,
-        "final": found.final,
-        "time_s": answer.t[k].tolist(),
-        "value": answer.y[k, output, column].tolist(),
-    }
+    line = {"time_s": answer.t[k].tolist(), "value": answer.y[k, output, column].tolist()}
+    return AnswerPart.fields_of(found) | line
 
 
 def _locus_part(found: RootLocus) -> LocusPart:
-    return LocusPart(
-        name=found.name,
-        parameter=found.parameter,
-        channel=found.channel,
-        unit=found.unit,
-        nominal=found.nominal,
+    return LocusPart.of(
+        found,
         stability_changes=list(found.changes),
-        values=found.values.tolist(),
-        branches_rad_per_s=[[[*pair] for pair in _pairs(branch)] for branch in found.poles.T],
+        branches_rad_per_s=[_pairs(branch) for branch in found.poles.T],
         nominal_rad_per_s=_pairs(found.nominal_poles),
     )

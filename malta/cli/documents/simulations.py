@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from malta.cli.documents.loops import LoopPart, loop_fields
-from malta.cli.documents.parts import End, Files, Number, Part, end_of, merits_of
+from malta.cli.documents.parts import End, Files, Number, Part, merits_of
 from malta.identifiers import identifier
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from malta.firmware.elementary import Precision
     from malta.firmware.flight import Difference
-    from malta.margins.verify import Margins
+    from malta.margins.loop_report import LoopReport
     from malta.simulation.experiments import Experiment
 
 MERITS = "figures of merit; a key ends in its SI unit, and in _share where 0.01 is 1 %"
@@ -24,6 +24,8 @@ MERITS = "figures of merit; a key ends in its SI unit, and in _share where 0.01 
 
 class CasePart(Part):
     """A run of an experiment."""
+
+    READS: ClassVar = {"verdict": "run.verdict", "limits": "run.limits"}
 
     label: str
     verdict: End
@@ -33,6 +35,8 @@ class CasePart(Part):
 
 class StrokePart(Part):
     """Figures of a stroke, as papers publish them."""
+
+    READS: ClassVar = {"error_along": "axial_error"}
 
     rise_s: Number = Field(description="10 to 90 % of the stroke")
     overshoot_share: Number
@@ -44,6 +48,13 @@ class StrokePart(Part):
 
 class ExperimentPart(Part):
     """Verdicts, limits and figures of merit of each run of an experiment."""
+
+    READS: ClassVar = {
+        "engine": "run.engine",
+        "fidelity": "run.scenario.fidelity",
+        "interrupted": "cut",
+        "verdict": "run.verdict",
+    }
 
     engine: str
     fidelity: str
@@ -100,22 +111,9 @@ class DesignOutput(Part):
 
 def experiment_fields(experiment: Experiment) -> dict[str, Any]:
     """The fields of an ExperimentPart."""
-    run = experiment.run
-    return {
-        "engine": run.engine,
-        "fidelity": run.scenario.fidelity,
-        "interrupted": experiment.cut,
-        "verdict": end_of(run.verdict),
+    return ExperimentPart.fields_of(experiment) | {
         "merits": merits_of(experiment.merits),
-        "cases": [
-            CasePart(
-                label=case.label,
-                verdict=end_of(case.run.verdict),
-                limits=list(case.run.limits),
-                merits=merits_of(case.merits),
-            )
-            for case in experiment.cases
-        ],
+        "cases": [CasePart.of(case, merits=merits_of(case.merits)) for case in experiment.cases],
         "stroke": _stroke(experiment) if experiment.name == "stroke" else None,
     }
 
@@ -125,14 +123,8 @@ def _stroke(experiment: Experiment) -> StrokePart:
 
     run = experiment.run
     found, units = stroke_figures(run), {signal.name: signal.unit for signal in run.plant.outputs}
-    return StrokePart(
-        rise_s=found.rise,
-        overshoot_share=found.overshoot,
-        error_along=found.axial_error,
-        errors_across={identifier(name, units[name]): value for name, value in found.radial.items()},
-        force_N=found.force,
-        current_A=found.current,
-    )
+    across = {identifier(name, units[name]): value for name, value in found.radial.items()}
+    return StrokePart.of(found, errors_across=across)
 
 
 def flights(found: Mapping[str, Mapping[Precision, Sequence[Difference]]]) -> list[FlightPart]:
@@ -141,7 +133,7 @@ def flights(found: Mapping[str, Mapping[Precision, Sequence[Difference]]]) -> li
         FlightPart(
             case=label,
             precision=precision,
-            signals={d.name: SignalPart(largest=d.largest, range=d.range) for d in rows},
+            signals={d.name: SignalPart.of(d) for d in rows},
         )
         for label, by_precision in found.items()
         for precision, rows in by_precision.items()
@@ -149,7 +141,7 @@ def flights(found: Mapping[str, Mapping[Precision, Sequence[Difference]]]) -> li
 
 
 def design_part(
-    name: str, files: Sequence[Path], changes: Sequence[str], margins: Margins, flown: Experiment
+    name: str, files: Sequence[Path], changes: Sequence[str], margins: LoopReport, flown: Experiment
 ) -> DesignPart:
     """A design with its loop and its main job."""
     return DesignPart(

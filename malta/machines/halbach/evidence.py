@@ -14,7 +14,7 @@ from malta.machines.halbach.experiments.lift import LAWS, MOVE, move_reference, 
 from malta.machines.halbach.experiments.motions import COUNT, PAUSE, STEP, responses
 from malta.machines.halbach.experiments.open_loop import positions_at_rest
 from malta.machines.halbach.plant import Parameters
-from malta.margins.verify import Margins
+from malta.margins.loop_report import LoopReport
 from malta.model.linearize import LinearModel
 from malta.model.published import published_value
 from malta.report.ledger import case_merit, run_design
@@ -38,7 +38,7 @@ class Evidence:
     published: Mapping[str, Any]
     model: LinearModel
     controller: Controller
-    margins: Margins
+    margins: LoopReport
     experiments: Mapping[str, Experiment]  # with "quick": moves of "force" with the rise of rise_of_dip
 
     @property

@@ -15,7 +15,7 @@ from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments.jumps import SOFT, jump
 from malta.machines.planar.experiments.models import CURRENT, coil_wrench
 from malta.machines.planar.experiments.motions import steps_ahead
-from malta.margins.verify import Margins
+from malta.margins.loop_report import LoopReport
 from malta.model.published import published_value
 from malta.report.ledger import (
     case_merit,
@@ -44,10 +44,9 @@ class Evidence:
     published: Mapping[str, Any]
     parameters: planar.Parameters
     controller: Controller
-    margins: Margins
-    experiments: Mapping[
-        str, Experiment
-    ]  # with "ahead" and "slower"; without "delay" for a PID, which predicts nothing
+    margins: LoopReport
+    # experiments : with "ahead" and "slower"; without "delay" for a PID, which predicts nothing
+    experiments: Mapping[str, Experiment]
 
 
 def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:

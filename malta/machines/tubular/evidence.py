@@ -14,11 +14,12 @@ from scipy.special import stdtrit
 
 from malta.campaigns.yields import Yields, main_campaign, yields_of
 from malta.loops.loop import loop_of_model
+from malta.loops.noise import noise_of
 from malta.loops.recovery import PLACES, Deviation, recovery
 from malta.machines.tubular.experiments.rest import hold
 from malta.machines.tubular.experiments.strokes import delayed_stroke
+from malta.margins.loop_report import LoopReport
 from malta.margins.stages import compensators
-from malta.margins.verify import Margins
 from malta.model.linearize import LinearModel, linearize
 from malta.model.published import published_value
 from malta.proof.machine.parametric_plants import of_plant
@@ -41,7 +42,6 @@ from malta.synthesis.controller import Controller
 from malta.synthesis.lqg import lqr
 from malta.synthesis.riccati import add_integrals
 from malta.synthesis.spec import Spec
-from malta.tuning.noise import noise_of
 
 if TYPE_CHECKING:
     from malta.campaigns.result import Rate
@@ -62,7 +62,7 @@ class Evidence:
     spec: Spec
     model: LinearModel
     controller: Controller
-    margins: Margins
+    margins: LoopReport
     K: FloatArray | None  # gain of the LQR without integrals; None: a PID
     experiments: Mapping[str, Experiment]
     uncompensated: StrokeFigures  # of the stroke with cogging left out of v0(z)

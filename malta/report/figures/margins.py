@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.margins.verify import ZONES
+from malta.errors import InputError
+from malta.margins.figures import ZONES
 from malta.report.figures.parts import (
     BOUND,
     DOT,
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.margins.stages import Robustness
+    from malta.margins.loop_report import LoopReport
     from malta.proof.blocks.gain import Gain
     from malta.proof.margin import Margin
 
@@ -37,38 +38,30 @@ NO_WITNESS: dict[str, Any] = {"marker": ">", "markersize": 7, "linestyle": "none
 CROWDED = 12.0  # peak |S| up to which the names of the zones have room
 
 
-def chain_figure(
-    found: Robustness,
-    name: str,
-    uncertainty: Mapping[str, float],
-    position: str = "position",
-    worst: Mapping[str, Gain] | None = None,
-) -> Figure:
+def chain_figure(found: LoopReport) -> Figure:
     """Draw margins and peak sensitivities of all stages as bars, and below them both along the travel.
 
     A machine without a travel has the first parameter that its proofs cover in its place, or nothing below.
 
-    found : from `malta.robustness`
-    name : of the design
-    uncertainty : half-widths of the box, as shares
-    position : the machine's word for its travel, as "position z"
-    worst : the largest `|S|` of each sensor over the uncertainty and all that the margin covers, from
-        `malta.worst_case_gain`; None: none
+    found : from `malta.verify`, with `stages`
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for a report without stages.
 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> box = {"m": 0.2}
-    >>> found = malta.robustness(spec.plant, controller, box)
-    >>> figure = malta.report.chain_figure(found, "ball", box)
+    >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
+    >>> figure = malta.report.chain_figure(found)
     >>> [axes.get_xlabel() for axes in figure.axes]
     ['proven margin without loads [% of the box]', 'peak |S| [-], zones of ISO 14839-3']
     """
-    box = ", ".join(f"{key} ±{100 * share:g} %" for key, share in uncertainty.items())
+    if not found.chain:
+        raise InputError(found.controller.name, "stages", "none", "a report of malta.verify with stages=True")
+    box = ", ".join(f"{key} ±{100 * share:g} %" for key, share in found.uncertainty.items())
     figure = new_figure(
-        f"{name}: where the margin goes",
+        f"{found.controller.name}: where the margin goes",
         f"100 %: {box}, all at once",
         left=0.21,
         right=0.97,
@@ -84,13 +77,14 @@ def chain_figure(
     _draw_stages(left, right, found)
     if extent.course:
         along = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
-        _draw_along_course(*along, found, _bound(worst))
+        _draw_along_course(*along, found, _bound(found.worst))
         for axes in along:
-            axes.set_xlabel(f"{position} [mm]" if extent.stroke else f"{extent.course} [{extent.unit}]")
+            along_travel = f"position {extent.stroke} [mm]"
+            axes.set_xlabel(along_travel if extent.stroke else f"{extent.course} [{extent.unit}]")
     return figure
 
 
-def _draw_stages(left: Axes, right: Axes, found: Robustness) -> None:
+def _draw_stages(left: Axes, right: Axes, found: LoopReport) -> None:
     """Bars of all stages: the proven margin with its witness, and the peak sensitivity with the zones of its limits."""
     from matplotlib.patches import Patch
 
@@ -152,7 +146,7 @@ def _draw_margin(axes: Axes, row: int, margin: Margin) -> float:
     return witness if witness < 1.3 * proven else proven
 
 
-def _draw_along_course(left: Axes, right: Axes, found: Robustness, bound: float) -> None:
+def _draw_along_course(left: Axes, right: Axes, found: LoopReport, bound: float) -> None:
     """Margin and peak sensitivity over the position; each value is the worse of +z and -z, so both sides are alike."""
     places, even = found.places, bool(found.extent.stroke)
     z = np.array([p.position for p in places]) * (1e3 if even else 1.0)
@@ -196,9 +190,9 @@ def _draw_along_course(left: Axes, right: Axes, found: Robustness, bound: float)
         draw_grid(axes)
 
 
-def _bound(worst: Mapping[str, Gain] | None) -> float:
+def _bound(worst: Mapping[str, Gain]) -> float:
     """The proven upper bound of |S| of all sensors; NaN where a sensor has none."""
-    found = [gain.upper for gain in (worst or {}).values()]
+    found = [gain.upper for gain in worst.values()]
     return max([bound for bound in found if bound is not None]) if found and None not in found else math.nan
 
 

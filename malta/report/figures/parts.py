@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from malta.display import micro as micro
+from malta.display import number as number
+from malta.margins.figures import ROOTS
 from malta.model.plant import Plant
 from malta.model.published import published_value
 from malta.simulation.trajectory import Trajectory
@@ -308,15 +311,6 @@ def published_in_unit(published: Published, key: str, unit: str) -> float:
     return in_unit(published_value(published, key), unit)
 
 
-def number(value: float, digits: int = 4) -> str:
-    """A number with so many significant digits, without exponent; "-" for NaN."""
-    if not math.isfinite(value):
-        return "-" if math.isnan(value) else f"{value}"
-    decimals = digits - 1 - math.floor(math.log10(abs(value))) if value else 0
-    text = f"{value:.{min(max(decimals, 0), digits + 1)}f}"
-    return text if float(text) else "0"
-
-
 def merit_phrase(merit: Merit, digits: int = 3) -> str:
     """The value of a figure of merit with its unit, for a sentence."""
     unit = {"percent": " %", "1": ""}.get(merit.unit, f" {micro(merit.unit)}")
@@ -329,16 +323,10 @@ def merits_phrase(cases: Sequence[Case], which: int) -> str:
     return micro(f"{cases[0].merits[which].label.replace(': ', ', ')}: {found}")
 
 
-def micro(text: str) -> str:
-    """A text with µm for um, and other units alike."""
-    return re.sub(r"\bu(?=(?:rad|[msANV])\b)", "µ", text)
-
-
 UNITS = {
     "m": (1e6, "um"),
     "rad": (1e6, "urad"),
-    "m s^0.5": (1e6, "um s^0.5"),
-    "rad s^0.5": (1e6, "urad s^0.5"),
+    **ROOTS,
     "rad/s": (1.0, "rad/s"),
     "N": (1.0, "N"),
     "N m": (1.0, "N m"),

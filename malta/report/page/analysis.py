@@ -1,47 +1,37 @@
-"""All that the pages show of a loop, computed once: margins, loads, noise, the machine's main job, requirements."""
+"""What a page shows of a design: the record of its loop, the machine's main job, campaigns."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from malta.errors import CheckError, InputError
-from malta.loops.classical import Classical
 from malta.loops.curves import loop_curves
-from malta.loops.loop import Loop, loop_along
-from malta.loops.recovery import recovery
 from malta.loops.sampled_loops import LAST
-from malta.margins.stages import robustness
-from malta.margins.travel import covers_travel, worst_sensitivities
-from malta.margins.verify import verify
+from malta.margins.figures import figure
+from malta.margins.loop_report import in_groups
 from malta.model.data import plant_of
-from malta.model.linearize import linearize
 from malta.simulation.catalogue import experiment, main_job
-from malta.simulation.payload import payload
-from malta.tuning.noise import noise_of
-from malta.tuning.outcomes import judge
+from malta.simulation.experiments import progress_of_part
+from malta.tuning.verify import judged, verify
 
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
     from malta.loops.curves import LoopCurves
-    from malta.loops.recovery import Recovery
-    from malta.margins.stages import Robustness
-    from malta.margins.verify import Margins
-    from malta.model.linearize import LinearModel
+    from malta.margins.figures import LoopFigure
+    from malta.margins.loop_report import LoopReport
     from malta.model.plant import Parameters, Plant
-    from malta.proof.blocks.gain import Gain
     from malta.proof.machine.windings import CurrentLoops
-    from malta.proof.margin import Margin
     from malta.simulation.experiments import Experiment
-    from malta.simulation.payload import Payload
     from malta.synthesis.controller import Controller
-    from malta.synthesis.requirements import Noise
     from malta.synthesis.spec import Spec
-    from malta.tuning.outcomes import Outcome
 
 Share = Callable[[float], None]  # takes the share of the work that is done, 0 to 1
+JOBS = {"low": "job_lower", "high": "job_higher", "": "job"}  # kinds of figures by which way is better
 
 
 class Subject(NamedTuple):
@@ -71,44 +61,31 @@ class Subject(NamedTuple):
         """The machine."""
         return plant_of(self.parameters)
 
-    @property
-    def model(self) -> LinearModel:
-        """The machine's linear model at the controller's operating point."""
-        plant = self.plant
-        return linearize(plant, plant.point(self.controller.operating_point[0]))
-
-    @property
-    def loop(self) -> Loop:
-        """The machine's loop at the controller's operating point."""
-        return loop_along(self.plant, self.controller, current_loops=self.current_loops)
-
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """The results for one subject. What an unstable loop or a machine does not have is None or empty."""
+    """What is shown of one subject."""
 
     subject: Subject
-    plant: Plant
-    model: LinearModel
-    margins: Margins
-    robust: Robustness | None  # None without uncertain parameters
-    margin: (
-        Margin | None
-    )  # of all parameters at once, anywhere in the travel; None where it was not asked for
-    classical: Classical | None  # at the operating point
-    worst: Mapping[str, Gain]
-    recovered: Sequence[Recovery]
-    payload: Payload | None
-    noise: Noise | None
-    job: Experiment | None
-    outcomes: Sequence[Outcome]
+    report: LoopReport
+    job: Experiment | None  # None where it could not be simulated
     campaigns: Sequence[Summary]
     notes: Sequence[str]  # what could not be computed, and why
+
+    @property
+    def plant(self) -> Plant:
+        """The machine."""
+        return self.report.plant
 
     @cached_property
     def curves(self) -> LoopCurves:
         """The curves of the machine's loop."""
-        return loop_curves(self.subject.loop)
+        return loop_curves(self.report.loop)
+
+    @cached_property
+    def figures(self) -> tuple[LoopFigure, ...]:
+        """The figures of merit of the loop and of the main job, in the order of their groups."""
+        return in_groups([*self.report.figures, *_job_figures(self.job)])
 
 
 def analyse(
@@ -128,66 +105,17 @@ def analyse(
 
     Raises CheckError when numbers overflow or no input holds the machine.
     """
-    plant, model, controller = subject.plant, subject.model, subject.controller
-    steps = _Steps(progress)
-    margins = verify(model, controller, subject.box if proof and not stages else None)
-    robust = _robust(subject, steps.part(0.0, 0.5), proof=proof and stages)
-    steps.reach(0.5)
-    covered = stages and proof and bool(subject.box)
-    covered = covered and covers_travel(plant, controller, tuple(subject.box), subject.current_loops)
-    worst = worst_sensitivities(plant, controller, subject.box, subject.current_loops) if covered else {}
-    carried = payload(plant, controller) if margins.stable and stages and proof else None
-    steps.reach(0.7)
-    notes: list[str] = []
-    job = _main_job(subject, notes, steps.part(0.7, 0.8))
-    margin = margins.robust if robust is None or not stages else robust.travel if proof else None
-    outcomes = _outcomes(subject, replace(margins, robust=margin), notes)
-    steps.reach(1.0)
-    return Analysis(
-        subject,
-        plant,
-        model,
-        margins,
-        robust,
-        margin=margin,
-        classical=subject.loop.classical if margins.stable else None,
-        worst=worst,
-        recovered=recovery(plant, controller) if margins.stable and plant.disturbances else (),
-        payload=carried,
-        noise=noise_of(subject.loop.sampled, plant) if margins.stable else None,
-        job=job,
-        outcomes=outcomes,
-        campaigns=tuple(campaigns),
-        notes=tuple(notes),
-    )
-
-
-class _Steps(NamedTuple):
-    """The work of an analysis, in parts that each take about their share of the time."""
-
-    progress: Share | None
-
-    def reach(self, share: float) -> None:
-        """Say that a share of the work is done."""
-        if self.progress is not None:
-            self.progress(share)
-
-    def part(self, low: float, high: float) -> Share:
-        """The function that takes the share done of a part of the work."""
-        return lambda share: self.reach(low + (high - low) * share)
-
-
-def _robust(subject: Subject, progress: Share, *, proof: bool) -> Robustness | None:
-    """Margins of the parameters and along the travel; None without uncertain parameters."""
-    if not subject.box:
-        return None
-    return robustness(
-        subject.plant, subject.controller, subject.box,
-        current_loops=subject.current_loops, progress=progress, proof=proof,
+    found = verify(
+        subject.plant, subject.controller, subject.box, stages=stages, proof=proof,
+        current_loops=subject.current_loops, progress=progress_of_part(progress, 0, 2),
     )  # fmt: skip
+    notes: list[str] = []
+    job = _main_job(subject, notes, progress_of_part(progress, 1, 2))
+    found = judged(found, subject.spec, proof=proof, flights=True)
+    return Analysis(subject, found, job, tuple(campaigns), (*notes, *found.notes))
 
 
-def _main_job(subject: Subject, notes: list[str], progress: Share) -> Experiment | None:
+def _main_job(subject: Subject, notes: list[str], progress: Share | None) -> Experiment | None:
     """The machine's main job; None, with a note, where it cannot be simulated."""
     plant = subject.plant
     name = main_job(plant)
@@ -201,18 +129,16 @@ def _main_job(subject: Subject, notes: list[str], progress: Share) -> Experiment
     return found
 
 
-def _outcomes(subject: Subject, margins: Margins, notes: list[str]) -> tuple[Outcome, ...]:
-    """What the design file asks for, measured with the gains of the gain file; none without a design file.
-
-    margins : of the subject, with the margin over its uncertainty where that is proven
-    """
-    if subject.spec is None:
-        return ()
-    spec = replace(subject.spec, parameters=subject.parameters)
-    same = subject.current_loops == LAST and dict(subject.box) == dict(spec.uncertainty)
-    verified = margins if same and margins.robust is not None else None
-    try:
-        return judge(spec, subject.controller, verified=verified)
-    except (InputError, CheckError) as error:
-        notes.append(f"the requirements were not judged: {error}")
-        return ()
+def _job_figures(job: Experiment | None) -> Iterator[LoopFigure]:
+    if job is None:
+        return
+    several = len(job.cases) > 1
+    rows = [("", merit) for merit in job.merits]
+    if several and [m.label for m in job.merits] == [m.label for m in job.cases[0].merits]:
+        rows = [(case.label, merit) for case in job.cases for merit in case.merits]
+    completed = float(np.mean([case.run.verdict.completed for case in job.cases]))
+    yield figure("job_higher", f"{job.name} completed", f"{job.name}: runs completed", completed, "percent")
+    for case, merit in rows:
+        label = f"{case}: {merit.label}" if case else merit.label
+        name = f"{job.name} {case} {merit.key or merit.label}"
+        yield figure(JOBS[merit.better], name, label, merit.value, merit.unit)

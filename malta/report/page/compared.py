@@ -43,13 +43,13 @@ def _heads(found: Comparison) -> list[KeyFigure]:
     heads = []
     for k, (name, a) in enumerate(zip(found.names, found.designs, strict=True)):
         better = sum(row.best[k] for row in found.rows)
-        margin = a.margin
+        margin = a.report.robust
         proven = (
             f"margin {100 * margin.lower:.1f} %, " if margin is not None and margin.lower is not None else ""
         )
-        stable = "stable" if a.margins.stable else "UNSTABLE"
+        stable = "stable" if a.report.stable else "UNSTABLE"
         note = f"{proven}better in {better} of {len(found.rows)} figures"
-        heads.append(KeyFigure(name, stable, note, "good" if a.margins.stable else "bad"))
+        heads.append(KeyFigure(name, stable, note, "good" if a.report.stable else "bad"))
     return heads
 
 

@@ -10,8 +10,8 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from malta.errors import InputError
+from malta.margins.figures import LoopFigure, best_of
 from malta.report.page.design import GROUPS, Entry, design_entries, display_unit
-from malta.report.page.scores import Score, best_of, scores_of
 from malta.simulation.experiments import progress_of_part
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class Row(NamedTuple):
     group: str
     key: str
     heading: str
-    scores: tuple[Score | None, ...]
+    scores: tuple[LoopFigure | None, ...]
     best: tuple[bool, ...]  # better than some other design
 
     @property
@@ -121,7 +121,7 @@ class Comparison:
     @cached_property
     def rows(self) -> tuple[Row, ...]:
         """The figures of merit that make sense beside each other."""
-        found = [{score.key: score for score in scores_of(a)} for a in self.designs]
+        found = [{score.key: score for score in a.figures} for a in self.designs]
         rows = []
         for key in dict.fromkeys(key for scores in found for key in scores):
             scores = tuple(of.get(key) for of in found)
@@ -183,15 +183,15 @@ class Comparison:
             )
         for name, a in zip(self.names, self.designs, strict=True):
             found += [f"{name}: {note}" for note in a.notes]
-            if not a.margins.stable:
+            if not a.report.stable:
                 found.append(f"{name}: the loop is UNSTABLE on its machine.")
         return tuple(found)
 
-    def _is_shown(self, score: Score) -> bool:
+    def _is_shown(self, score: LoopFigure) -> bool:
         """Whether a figure means the same in all designs, or at least something beside the others."""
         return self.one_machine or score.meaning.scope != "machine"
 
-    def _is_judged(self, score: Score) -> bool:
+    def _is_judged(self, score: LoopFigure) -> bool:
         """Whether one of the designs can be better by this figure."""
         return score.meaning.scope != "box" or self.one_box
 

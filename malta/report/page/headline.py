@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from malta.margins.verify import BANDWIDTHS, zone
+from malta.margins.figures import BANDWIDTHS, zone
 from malta.model.signals import FINE
 from malta.report.figures.parts import merit_phrase, micro, number
 from malta.report.page.design import kind_of
@@ -36,34 +36,34 @@ def key_figures(a: Analysis) -> list[KeyFigure]:
 
 
 def _stability(a: Analysis) -> Iterator[KeyFigure]:
-    stable = a.margins.stable
-    largest = a.margins.stages[-1].spectral_radius
+    stable = a.report.stable
+    largest = a.report.stages[-1].spectral_radius
     note = "with hold, delay and current loops" if stable else f"a pole at |λ| = {largest:.6f}"
     yield KeyFigure("Loop", "stable" if stable else "UNSTABLE", note, "good" if stable else "bad")
 
 
 def _margin(a: Analysis) -> Iterator[KeyFigure]:
-    label = "Margin of the parameters"
+    label, margin = "Margin of the parameters", a.report.robust
     if not a.subject.box:
         yield KeyFigure(label, "not asked", "the gain file names no uncertain parameters")
-    elif not a.margins.stable:
+    elif not a.report.stable:
         yield KeyFigure(label, "none", "the loop is unstable already", "bad")
-    elif a.margin is None:
+    elif margin is None:
         yield KeyFigure(label, "not proven", "left out by --no-proof")
-    elif a.margin.lower is None:
-        yield KeyFigure(label, "nothing proven", a.margin.reason, "bad")
+    elif margin.lower is None:
+        yield KeyFigure(label, "nothing proven", margin.reason, "bad")
     else:
         box = ", ".join(f"{name} ±{100 * share:g} %" for name, share in a.subject.box.items())
-        state = "good" if a.margin.lower >= 1 else "bad"
-        where = f" {a.margins.extent}" if str(a.margins.extent) else ""
-        more = "at least " if a.margin.exhausted else ""
-        yield KeyFigure("Proven margin", f"{more}{100 * a.margin.lower:.1f} %", f"of {box}{where}", state)
+        state = "good" if margin.lower >= 1 else "bad"
+        where = f" {a.report.extent}" if str(a.report.extent) else ""
+        more = "at least " if margin.exhausted else ""
+        yield KeyFigure("Proven margin", f"{more}{100 * margin.lower:.1f} %", f"of {box}{where}", state)
 
 
 def _peak(a: Analysis) -> Iterator[KeyFigure]:
-    if not a.margins.stable:
+    if not a.report.stable:
         return
-    peaks = {name: peak for name, peak in a.margins.peak_sensitivity.items() if name != "sigma_max"}
+    peaks = {name: peak for name, peak in a.report.peak_sensitivity.items() if name != "sigma_max"}
     name = max(peaks, key=lambda sensor: peaks[sensor])
     found = zone(peaks[name])
     state = {"A": "good", "B": "near"}.get(found, "bad")
@@ -73,18 +73,19 @@ def _peak(a: Analysis) -> Iterator[KeyFigure]:
 
 def _bandwidth(a: Analysis) -> Iterator[KeyFigure]:
     key = "sigma_max_T"
-    value = a.margins.bandwidth.get(key, math.nan)
+    value = a.report.bandwidth.get(key, math.nan)
     if math.isfinite(value):
         note = f"{number(value)} rad/s, {BANDWIDTHS[key]}"
         yield KeyFigure("Bandwidth", f"{number(value / (2 * math.pi), 3)} Hz", note)
 
 
 def _noise(a: Analysis) -> Iterator[KeyFigure]:
-    if a.noise is None or not (np.any(a.noise.motion) or np.any(a.noise.force)):
+    noise = a.report.noise
+    if noise is None or not (np.any(noise.motion) or np.any(noise.force)):
         return
     for values, signals, label in (
-        (a.noise.motion, a.plant.outputs, "Motion at rest"),
-        (a.noise.force, a.plant.inputs, "Commands at rest"),
+        (noise.motion, a.plant.outputs, "Motion at rest"),
+        (noise.force, a.plant.inputs, "Commands at rest"),
     ):
         largest: dict[str, tuple[float, str]] = {}  # by unit
         for signal, value in zip(signals, values.tolist(), strict=True):
@@ -112,7 +113,7 @@ def _job(a: Analysis) -> Iterator[KeyFigure]:
 
 
 def _requirements(a: Analysis) -> Iterator[KeyFigure]:
-    asked = [one for one in a.outcomes if one.asked is not None]
+    asked = [one for one in a.report.requirements if one.asked is not None]
     if asked:
         held = sum(one.holds for one in asked)
         open_ = sum(one.verdict == "undecided" for one in asked)
@@ -156,7 +157,7 @@ def summary_sentences(a: Analysis) -> list[str]:
         sentences.append(
             f"The machine is changed: {', '.join(a.subject.changes)}; the controller is not told."
         )
-    if not a.margins.stable:
+    if not a.report.stable:
         sentences.append("The loop is UNSTABLE on this machine: it has no sensitivities, margins or noise.")
     return sentences
 

@@ -26,7 +26,7 @@ def overlaid(found: Comparison) -> Iterator[Item]:
     """The figures of a comparison: sensitivities, Nyquist plots, singular values, loads, the main job."""
     named = dict(zip(found.names, found.designs, strict=True))
     loops = {name: a.curves for name, a in named.items()}
-    stable = {name: loops[name] for name, a in named.items() if a.margins.stable}
+    stable = {name: loops[name] for name, a in named.items() if a.report.stable}
     panels = distinct_channels(loops)
     if stable and found.one_machine:
         shown = distinct_channels(stable)

@@ -123,16 +123,10 @@ def subject_of(
     path = locate(gains)
     controller = read(path)
     file, _ = content_of(path)
-    box = dict(uncertainty_of(file) if uncertainty is None else uncertainty)
+    box = file.uncertainty if uncertainty is None else dict(uncertainty)
     return Subject(
         controller, parameters or controller.parameters, box, spec, str(gains), changes, provenance_of(file)
     )
-
-
-def uncertainty_of(file: GainFile) -> Mapping[str, float]:
-    """The uncertain parameters that a gain file names; none where it names none."""
-    robust = file.verification.robust
-    return {} if robust is None else robust.uncertainty
 
 
 def provenance_of(file: GainFile) -> tuple[tuple[str, str], ...]:

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from malta.loops.noise import budget_of
+from malta.margins.figures import four_digits
 from malta.model.plant import Signal
 from malta.model.published import published_figures
 from malta.model.signals import FINE
-from malta.proof.margin import NOT_PROVEN
 from malta.report.figures.parts import UNITS
 from malta.report.page.channels import distinct_channels
 from malta.report.page.design import design_entries, display_unit
 from malta.report.page.headline import summary_sentences
-from malta.report.page.scores import four_digits, requirement_words
 from malta.report.page.sheets import Sheet, matrix_sheets, plain_sheet, sheets_of
 from malta.report.tables.campaign import box_text, campaign_tables, run_text
 from malta.report.tables.design import bandwidth_table, loop_poles_table, poles_table, sensitivity_table
@@ -35,14 +35,14 @@ from malta.report.tables.margins import (
 )
 from malta.report.tables.recovery import recovery_table
 from malta.report.tables.tuning import found_text
-from malta.tuning.noise import budget_of
 from malta.units import in_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from malta.loops.classical import Classical
+    from malta.margins.loop_report import LoopReport, Outcome
     from malta.report.page.analysis import Analysis
-    from malta.tuning.outcomes import Outcome
 
 NARROW = 3  # columns of a table
 NEAR = 0.95  # of a bound: a requirement holds, but hardly
@@ -114,12 +114,12 @@ def _design(a: Analysis) -> Iterator[Item]:
 
 
 def _requirements(a: Analysis) -> Iterator[Item]:
-    if not a.outcomes:
+    if not a.report.requirements:
         return
     if a.subject.written_from is None:
         yield "The design file was changed after the gain file was written: these are its present requirements."
     rows, marks = [], []
-    for one in a.outcomes:
+    for one in a.report.requirements:
         state, word = _light(one)
         scale, unit = UNITS.get(one.unit, (1.0, ""))
         shown = f" {unit}" if unit else ""
@@ -128,7 +128,7 @@ def _requirements(a: Analysis) -> Iterator[Item]:
             sign = ">=" if one.at_least else "<="
             asked = f"{sign} {one.asked * scale:.4g}{shown}"
         of = "" if one.asked is None else f"{100 * one.ratio:.1f} %"
-        rows.append([word, requirement_words(one.name), asked, found_text(one), of, one.how])
+        rows.append([word, one.words, asked, found_text(one), of, one.how])
         marks.append((state, "", "", "", "", ""))
     heads = ("", "requirement", "asked", "found", "of the limit", "from")
     sheet = plain_sheet("[specification] of the design file, measured with these gains", heads, rows)
@@ -159,47 +159,45 @@ def _poles(a: Analysis) -> Iterator[Item]:
     )
     changed = a.subject.parameters != a.subject.controller.parameters
     published = None if changed else published_figures(a.plant.name)
-    yield from sheets_of([poles_table(a.model, published), loop_poles_table(a.margins)])
+    yield from sheets_of([poles_table(a.report.model, published), loop_poles_table(a.report)])
 
 
 def _margins(a: Analysis) -> Iterator[Item]:
-    c, robust = a.subject.controller, a.robust
-    if robust is not None:
+    found = a.report
+    if found.chain:
         from malta.report.figures.margins import chain_figure
 
-        position = f"position {a.plant.stroke}"
-        if robust.travel is not NOT_PROVEN:
+        if found.robust is not None:
             yield Picture(
-                lambda: chain_figure(robust, c.name, a.subject.box, position, a.worst),
+                lambda: chain_figure(found),
                 "Margins stage by stage, from full state feedback to the machine's own loop, and the peak sensitivity "
                 "of each stage with the zones of ISO 14839-3.",
             )
-        yield from sheets_of([chain_table(robust)])
-        if missing := a.subject.loop.left_out:
+        yield from sheets_of([chain_table(found)])
+        if missing := found.left_out:
             yield f"Not in the last stage: {missing}."
-        yield from open_bounds(robust, a.worst)
-        yield from sheets_of([disk_table(robust, c.sample_time)])
-        if robust.tolerance:
-            yield from sheets_of([tolerance_table(robust, a.subject.box, a.payload)])
-        yield from sheets_of([places_table(robust, c.sample_time)])
-    elif a.classical is not None:
+        yield from open_bounds(found)
+        yield from sheets_of([disk_table(found)])
+        if found.tolerance:
+            yield from sheets_of([tolerance_table(found)])
+        yield from sheets_of([places_table(found)])
+    elif found.classical is not None:
         yield "The gain file names no uncertain parameters, so that no margin of parameters is shown."
-        yield _classical_sheet(a)
-    if a.worst:
-        yield from sheets_of([worst_case_table(a.worst)])
+        yield _classical_sheet(found, found.classical)
+    if found.worst:
+        yield from sheets_of([worst_case_table(found.worst)])
 
 
-def _classical_sheet(a: Analysis) -> Sheet:
+def _classical_sheet(found: LoopReport, classical: Classical) -> Sheet:
     """Disk and delay margins of a machine without uncertain parameters."""
-    assert a.classical is not None
-    Ts, rows = a.subject.controller.sample_time, []
-    for disk in a.classical.disks:
+    Ts, rows = found.controller.sample_time, []
+    for disk in classical.disks:
         gain = f"{1 / disk.gain:.2f} .. {disk.gain:.2f}"
         phase = f"+-{np.degrees(disk.phase):.1f}"
         rows.append([disk.channels, f"{disk.size:.3f}", gain, phase, f"{disk.frequency:.4g}"])
-    for name, delay in a.classical.delay.items():
-        found = f"{delay * 1e6:.0f} us, {delay / Ts:.1f} samples" if np.isfinite(delay) else "any"
-        rows.append([f"delay at {name} alone", found, "", "", ""])
+    for name, delay in classical.delay.items():
+        samples = f"{delay * 1e6:.0f} us, {delay / Ts:.1f} samples" if np.isfinite(delay) else "any"
+        rows.append([f"delay at {name} alone", samples, "", "", ""])
     return plain_sheet(
         "Disk and delay margins of the sampled loop",
         ("factor in", "disk", "gain", "phase [deg]", "rad/s"),
@@ -227,33 +225,33 @@ def _loop(a: Analysis) -> Iterator[Item]:
         ),
         (plots.gang_of_four, "Gang of four: what noise, references and forces do at each sensor."),
     ]
-    for draw, caption in [sensitivity, *drawn] if a.margins.stable else drawn[:2]:
+    for draw, caption in [sensitivity, *drawn] if a.report.stable else drawn[:2]:
         yield Picture(partial(draw, loops, channel=panels.channels), f"{caption}{panels.note}")
-    if a.margins.stable:
+    if a.report.stable:
         yield Picture(partial(plots.sigma, loops), "Singular values of L, S and T with all sensors at once.")
     published = published_figures(a.plant.name)
-    tables: list[Any] = [sensitivity_table(a.margins), bandwidth_table(a.margins, published)]
+    tables: list[Any] = [sensitivity_table(a.report), bandwidth_table(a.report, published)]
     yield from sheets_of(tables)
-    if a.robust is not None and a.robust.gang:
-        yield from sheets_of([gang_table(a.robust, a.plant)])
-    elif a.classical is not None:
-        rows = [[name, *(f"{value:.4g}" for value in gang)] for name, gang in a.classical.gang.items()]
+    if a.report.gang:
+        yield from sheets_of([gang_table(a.report)])
+    elif a.report.classical is not None:
+        rows = [[name, *(f"{value:.4g}" for value in gang)] for name, gang in a.report.classical.gang.items()]
         heads = ("sensor", "|S|", "|T|", "from force |SP|, SI", "to force |FS|, SI")
         yield plain_sheet("Gang of four, largest over frequency", heads, rows)
 
 
 def _loads(a: Analysis) -> Iterator[Item]:
-    if not a.recovered:
+    if not a.report.recovery:
         return
     from malta.report.figures.recovery import recovery_figure
 
     c = a.subject.controller
     yield Picture(
-        lambda: recovery_figure(a.plant, c, a.recovered),
+        lambda: recovery_figure(a.plant, c, a.report.recovery),
         "Deviation after a unit step of each load from outside, and compliance over frequency, of the output that "
         "the load moves furthest.",
     )
-    yield from sheets_of([recovery_table(a.recovered, a.plant)])
+    yield from sheets_of([recovery_table(a.report.recovery, a.plant)])
 
 
 def _job_title(a: Analysis) -> str:
@@ -278,20 +276,21 @@ def _job(a: Analysis) -> Iterator[Item]:
 
 
 def _noise(a: Analysis) -> Iterator[Item]:
-    if a.noise is None:
+    noise = a.report.noise
+    if noise is None:
         return
-    budget = budget_of(a.subject.loop.sampled, a.plant)
+    budget = budget_of(a.report.loop.sampled, a.plant)
     names = [s.name for s in a.plant.outputs]
     for signals, totals, shares, title in (
         (
             a.plant.outputs,
-            a.noise.motion,
+            noise.motion,
             budget.motion,
             "True motion at rest, rms, and the sensors that cause it",
         ),
         (
             a.plant.inputs,
-            a.noise.force,
+            noise.force,
             budget.force,
             "Commands at rest, rms, and the sensors that cause them",
         ),
@@ -306,7 +305,7 @@ def _noise(a: Analysis) -> Iterator[Item]:
             rows.append([head, four_digits(in_unit(float(totals[k]), fine)), *parts])
         heads = ("signal", "rms", *(f"from {name}" for name in names))
         yield plain_sheet(f"{title}, as shares of the variance", heads, rows)
-    if not np.any(a.noise.motion):
+    if not np.any(noise.motion):
         yield "The machine's sensors have no noise and no steps: at rest nothing moves."
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.loops.curves import LoopCurves
-from malta.margins.verify import ZONES, zone
+from malta.margins.figures import ZONES, zone
 from malta.report.figures.parts import new_figure
 from malta.report.plots.parts import (
     PLACES,

@@ -10,12 +10,8 @@ import numpy as np
 from rich.table import Table
 from scipy import sparse
 
-from malta.margins.verify import (
-    BANDWIDTHS,
-    ZONES,
-    Margins,
-    zone,
-)
+from malta.margins.figures import BANDWIDTHS, ZONES, zone
+from malta.margins.loop_report import LoopReport
 from malta.model.linearize import LinearModel
 from malta.model.published import published_value
 from malta.report.figures.parts import Published, published_in_unit
@@ -70,7 +66,7 @@ def publishes(published: Published | None, table: str, key: str) -> TypeGuard[Pu
     return published is not None and key in published.get(table, {})
 
 
-def loop_poles_table(margins: Margins, continuous: Mapping[str, ComplexArray] | None = None) -> Table:
+def loop_poles_table(margins: LoopReport, continuous: Mapping[str, ComplexArray] | None = None) -> Table:
     """Tabulate poles of the continuous design, if given, and of the sampled loop as ln(lambda) / Ts, rad/s.
 
     margins : from `malta.verify`
@@ -105,7 +101,7 @@ def loop_poles_table(margins: Margins, continuous: Mapping[str, ComplexArray] | 
     return table
 
 
-def bandwidth_table(margins: Margins, published: Published | None) -> Table:
+def bandwidth_table(margins: LoopReport, published: Published | None) -> Table:
     """Tabulate the bandwidth by each definition; a paper may print one figure without saying which it is.
 
     margins : from `malta.verify`
@@ -143,7 +139,7 @@ def bandwidth_table(margins: Margins, published: Published | None) -> Table:
     return table
 
 
-def sensitivity_table(margins: Margins) -> Table:
+def sensitivity_table(margins: LoopReport) -> Table:
     """Tabulate peak sensitivities at each sensor with their ISO 14839-3 zones, for each stage of the analysis.
 
     margins : from `malta.verify`

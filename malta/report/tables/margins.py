@@ -3,41 +3,112 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from malta.margins.travel import NOT_BETWEEN
-from malta.margins.verify import zone
+from malta.margins.figures import zone
 from malta.model.signals import axis_units
 from malta.proof.margin import NOT_PROVEN, unproven
+from malta.report.tables.design import bandwidth_table, loop_poles_table, sensitivity_table
+from malta.report.tables.layout import Paragraph
 from malta.report.tables.parts import add_row, new_table
+from malta.report.tables.recovery import recovery_table
+from malta.report.tables.tuning import requirements_table
 
 if TYPE_CHECKING:
     from malta.margins.extent import Extent
-    from malta.margins.stages import Robustness
-    from malta.model.plant import Plant
+    from malta.margins.loop_report import LoopReport
     from malta.proof.blocks.gain import Gain
     from malta.proof.margin import Margin
-    from malta.simulation.payload import Payload
+    from malta.report.figures.parts import Published
+    from malta.synthesis.spec import Spec
 
 WAYS = ("down", "up")
+NEAREST = 3  # requirements that are named though they hold
 
 
-def chain_table(found: Robustness) -> Table:
+def loop_tables(
+    found: LoopReport, published: Published | None = None, spec: Spec | None = None
+) -> Iterator[Table | Paragraph]:
+    """Tabulate all that is known of a loop, as `malta verify` prints it.
+
+    found : from `malta.verify`; without `stages` what is linear alone
+    published : figures of the machine's paper, from `malta.published`; None: none
+    spec : the design file, whose requirements were judged; None: none
+
+    Returns an iterator of what `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True, spec=spec)
+    >>> tables = list(malta.report.loop_tables(found, None, spec))
+    >>> rich.print(tables[-1])
+    Requirements of examples/ball/design/ball.toml: 6 of 6 hold
+    """
+    yield loop_poles_table(found)
+    yield bandwidth_table(found, published)
+    yield sensitivity_table(found)
+    if found.recovery:
+        yield recovery_table(found.recovery, found.plant)
+    if found.chain:
+        yield from _margin_tables(found)
+    if found.worst:
+        yield worst_case_table(found.worst)
+    if spec is not None:
+        yield from _requirements(found, spec)
+
+
+def _margin_tables(found: LoopReport) -> Iterator[Table | Paragraph]:
+    """The margins of the stages, over the travel and of each parameter, and what they leave open."""
+    box = "  ".join(f"{name} +-{100 * share:g} %" for name, share in found.uncertainty.items())
+    yield Paragraph(f"Uncertainty: {box}\n")
+    yield chain_table(found)
+    if missing := found.left_out:
+        yield Paragraph(f"Not in the last stage: {missing}\n")
+    if bounds := open_bounds(found):
+        yield Paragraph("\n".join(bounds) + "\n")
+    for tabulate in (disk_table, gang_table, tolerance_table, places_table):
+        yield tabulate(found)
+
+
+def _requirements(found: LoopReport, spec: Spec) -> Iterator[Table | Paragraph]:
+    """The requirements of the design file that do not hold, then how many do; nothing where none was judged."""
+    asked = [one for one in found.requirements if one.asked is not None]
+    if not asked:
+        return
+    failed = [one for one in asked if not one.holds]
+    if failed:
+        yield requirements_table(failed)
+    held = sorted((one for one in asked if one.holds), key=lambda one: -one.ratio)
+    near = ", ".join(f"{one.name.replace('_', ' ')} {100 * one.ratio:.1f} %" for one in held[:NEAREST])
+    text = f"Requirements of {spec.path}: {len(held)} of {len(asked)} hold"
+    if held:
+        text += f"; nearest their limits {near}"
+    judged = {one.name for one in found.requirements}
+    others = [name.replace("_", " ") for name in spec.specification if name not in judged]
+    if others:
+        text += f". Not judged here: {', '.join(others)} (malta tune {spec.path} --check)"
+    if spec.sha256 != found.controller.spec_sha256:
+        text += ". The design file was changed after the gain file was written"
+    yield Paragraph(f"{text}.\n")
+
+
+def chain_table(found: LoopReport) -> Table:
     """Tabulate the parametric margin and the peak sensitivity of each stage, from the ideal loop to the machine's.
 
     Margins are without the loads; `|S|` of the last stage is that of the machine under its loads.
 
-    found : from `malta.robustness`
+    found : from `malta.verify`, with `stages`
 
     Returns a rich Table, which `rich.print` prints.
 
     >>> import malta, rich
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
+    >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
     >>> rich.print(malta.report.chain_table(found))
     Where the margin goes: multiples of the uncertainty that no parameter set may
     exceed
@@ -80,17 +151,16 @@ def chain_table(found: Robustness) -> Table:
     return table
 
 
-def open_bounds(found: Robustness, worst: Mapping[str, Gain]) -> list[str]:
+def open_bounds(found: LoopReport) -> list[str]:
     """Say why a bound is not proven, and where a search ended that found no unstable machine: a line for each.
 
-    found : from `malta.robustness`
-    worst : by sensor, from `malta.worst_case_gain`; may be empty
+    found : from `malta.verify`, with `stages`
 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
-    >>> malta.report.open_bounds(found, {})[0].rpartition("; ")[2]
+    >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
+    >>> malta.report.open_bounds(found)[0].rpartition("; ")[2]
     'no unstable machine found up to t = 5, where m reaches its limit 0'
     """
     margins = [(link.name, link.margin) for link in found.chain]
@@ -105,16 +175,16 @@ def open_bounds(found: Robustness, worst: Mapping[str, Gain]) -> list[str]:
     alone += [] if found.mass is None else [("mass margin", found.mass)]
     said = [(name, str(m)) for name, m in margins if m is not NOT_PROVEN and (m.lower is None or m.exhausted)]
     said += [(name, unproven(m.reason)) for name, m in alone if m.lower is None]
-    said += [(f"|S| of {name}", str(gain)) for name, gain in worst.items() if gain.upper is None]
+    said += [(f"|S| of {name}", str(gain)) for name, gain in found.worst.items() if gain.upper is None]
     together: dict[str, list[str]] = {}  # margins of loops that do not depend on the place are the same
     for name, text in said:
         together.setdefault(text, []).append(name)
     return [f"{', '.join(names)}: {text}" for text, names in together.items()]
 
 
-def _coverage_text(found: Robustness) -> str:
+def _coverage_text(found: LoopReport) -> str:
     """The positions and parameters that the margin over the extent covers, as a row of a table."""
-    if not is_of_whole_travel(found.travel):
+    if not found.covers_travel:
         return "middle and end of it"
     parts = ["all of the travel"] if found.extent.stroke else []
     return ", ".join([*parts, found.extent.values] if found.extent.over else parts)
@@ -143,19 +213,18 @@ def _limiting_parameters(margin: Margin) -> str:
     )
 
 
-def disk_table(found: Robustness, Ts: float) -> Table:
+def disk_table(found: LoopReport) -> Table:
     """Tabulate disk margins of the machine's loop, and the delay margin of each sensor's loop.
 
-    found : from `malta.robustness`
-    Ts : sample time, s
+    found : from `malta.verify`, with `stages`
 
     Returns a rich Table, which `rich.print` prints.
 
     >>> import malta, rich
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
-    >>> rich.print(malta.report.disk_table(found, controller.sample_time))
+    >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
+    >>> rich.print(malta.report.disk_table(found))
     Margins of the sampled loop without parameters
     <BLANKLINE>
      factor in               disk           gain   phase [deg]   rad/s
@@ -185,11 +254,11 @@ def disk_table(found: Robustness, Ts: float) -> Table:
             f"{disk.frequency:.4g}",
         )
     for name, delay in found.delay.items():
-        add_row(table, f"delay at {name} alone", *_delay_cells(delay, Ts), "", "")
+        add_row(table, f"delay at {name} alone", *_delay_cells(delay, found.controller.sample_time), "", "")
     return table
 
 
-def _places_text(found: Robustness) -> str:
+def _places_text(found: LoopReport) -> str:
     """The end of a title: the places of which a table has the smallest value."""
     course = found.extent.course
     along = "along the travel" if found.extent.stroke else f"of {len(found.places)} values of {course}"
@@ -203,19 +272,18 @@ def _delay_cells(delay: float, Ts: float) -> tuple[str, str]:
     return (f"{delay * 1e6:.0f} us", f"{delay / Ts:.1f} samples") if math.isfinite(delay) else ("any", "")
 
 
-def gang_table(found: Robustness, plant: Plant) -> Table:
+def gang_table(found: LoopReport) -> Table:
     """Tabulate the gang of four: the largest gains of S, T, PS and FS at each sensor.
 
-    found : from `malta.robustness`
-    plant : the machine
+    found : from `malta.verify`, with `stages`
 
     Returns a rich Table, which `rich.print` prints.
 
     >>> import malta, rich
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
-    >>> rich.print(malta.report.gang_table(found, spec.plant))
+    >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
+    >>> rich.print(malta.report.gang_table(found))
     Gang of four, largest over frequency
     <BLANKLINE>
      sensor    |S|    |T|   from force |SP| [um/N]   to force |FS| [N/um]
@@ -223,7 +291,7 @@ def gang_table(found: Robustness, plant: Plant) -> Table:
      y        1.57   1.72                    430.5                  0.034
     <BLANKLINE>
     """
-    pairs = zip(plant.outputs, plant.inputs, strict=False)
+    pairs = zip(found.plant.outputs, found.plant.inputs, strict=False)
     units = {output.name: axis_units(output.unit, force.unit) for output, force in pairs}
     one = next(iter(units.values())) if len(set(units.values())) == 1 else None
     heads = (f" [{unit}]" for unit in one[:2]) if one else ("", "")
@@ -245,24 +313,20 @@ def _course_text(extent: Extent) -> str:
     return "travel" if extent.stroke else extent.course
 
 
-def tolerance_table(
-    found: Robustness, uncertainty: Mapping[str, float], payload: Payload | None = None
-) -> Table:
+def tolerance_table(found: LoopReport) -> Table:
     """Tabulate the proven range of each parameter alone, and its share in the margin of all together.
 
     The mass margin is that of the linear loop; the payload below it is bounded by limits of forces and by flight.
 
-    found : from `malta.robustness`
-    uncertainty : half-widths of the box, as shares
-    payload : masses that the machine carries, kg; None: no rows of it
+    found : from `malta.verify`, with `stages`
 
     Returns a rich Table, which `rich.print` prints.
 
     >>> import malta, rich
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
-    >>> rich.print(malta.report.tolerance_table(found, {"m": 0.2}))
+    >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
+    >>> rich.print(malta.report.tolerance_table(found))
     One at a time, proven
     <BLANKLINE>
      parameter                  down to       up to   share in the margin
@@ -273,7 +337,7 @@ def tolerance_table(
     """
     anywhere = ["anywhere in the travel"] if found.extent.stroke else []
     anywhere += [f"for {found.extent.values}"] if found.extent.over else []
-    where = " and ".join(anywhere) if is_of_whole_travel(found.travel) else "in its middle and at its end"
+    where = " and ".join(anywhere) if found.covers_travel else "in its middle and at its end"
     table = new_table(
         f"One at a time, proven {where}".rstrip(), "parameter", "down to", "up to", "share in the margin"
     )
@@ -282,7 +346,7 @@ def tolerance_table(
         cells = []
         for margin, sign in ((down, -1), (up, 1)):
             t = margin.lower
-            change = "nothing proven" if t is None else f"{100 * sign * t * uncertainty[name]:+.1f} %"
+            change = "nothing proven" if t is None else f"{100 * sign * t * found.uncertainty[name]:+.1f} %"
             cells.append(f"{change} and further" if t is not None and margin.exhausted else change)
         add_row(table, name, *cells, f"{100 * shares.get(name, 0):.0f} %")
     if found.mass is not None:
@@ -290,6 +354,7 @@ def tolerance_table(
         more = " and more" if found.mass.exhausted else ""
         shown = "nothing proven" if t is None else f"{t:.3g} kg{more}"
         add_row(table, "mass margin, linear loop", "", shown, "")
+    payload = found.payload
     if payload is not None:
         held = "any" if math.isinf(payload.held) else f"{payload.held:.2g} kg"
         add_row(table, "payload held at rest", "", held, "")
@@ -328,21 +393,20 @@ def worst_case_table(gains: Mapping[str, Gain]) -> Table:
     return table
 
 
-def places_table(found: Robustness, Ts: float) -> Table:
+def places_table(found: LoopReport) -> Table:
     """Tabulate margins of the machine's loop along the travel, where each holds at a position and at its negative.
 
     A machine without a travel has the first parameter that its proofs cover in its place.
 
-    found : from `malta.robustness`
-    Ts : sample time, s
+    found : from `malta.verify`, with `stages`
 
     Returns a rich Table, which `rich.print` prints.
 
     >>> import malta, rich
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
-    >>> rich.print(malta.report.places_table(found, controller.sample_time))
+    >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
+    >>> rich.print(malta.report.places_table(found))
     The machine's loop: margins without the loads, the rest under them
     <BLANKLINE>
                                               peak  disk,
@@ -354,7 +418,7 @@ def places_table(found: Robustness, Ts: float) -> Table:
     extent = found.extent
     if not extent.stroke:
         title = f"Along {extent.course}" if extent.course else "The machine's loop"
-    elif is_of_whole_travel(found.travel):
+    elif found.covers_travel:
         title = "Along the travel, either way"
     else:
         title = "In the middle of the travel and at its ends (margin: at the positive one)"
@@ -377,7 +441,7 @@ def places_table(found: Robustness, Ts: float) -> Table:
             *_margin_cells(place.margin),
             peak,
             "none" if math.isnan(place.disk) else f"{place.disk:.3f}",
-            ", ".join(cell for cell in _delay_cells(place.delay, Ts) if cell),
+            ", ".join(cell for cell in _delay_cells(place.delay, found.controller.sample_time) if cell),
         )
     return table
 
@@ -387,8 +451,3 @@ def _position_text(extent: Extent, position: float) -> str:
     if extent.stroke:
         return f"{position * 1e3:.1f}"
     return f"{position:.4g}" if extent.course else "its values"
-
-
-def is_of_whole_travel(margin: Margin) -> bool:
-    """Whether a margin of the travel holds at every position, and not only at some."""
-    return NOT_BETWEEN not in margin.reason

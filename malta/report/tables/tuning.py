@@ -12,7 +12,7 @@ from malta.report.tables.parts import add_row, new_table
 from malta.synthesis.requirements import Trade, requirements_for
 
 if TYPE_CHECKING:
-    from malta.tuning.outcomes import Outcome
+    from malta.margins.loop_report import Outcome
     from malta.tuning.tune import Tuned
 
 

@@ -169,7 +169,7 @@ def _move_merits(run: Trajectory, begin: float, printed: str) -> tuple[Merit, ..
         moved = float(run.p[late, 0].mean() - run.p[earlier, 0].mean())
     return (
         Merit("steady change", steady, "percent", printed),
-        Merit("lowest", lowest, "percent"),
+        Merit("lowest", lowest, "percent", better="high"),
         Merit("highest", highest, "percent"),
-        Merit("moved", moved, "mm"),
+        Merit("moved", moved, "mm", better=""),
     )

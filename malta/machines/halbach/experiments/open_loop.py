@@ -89,8 +89,8 @@ def _stairs_merits(run: Trajectory, distance: float) -> tuple[Merit, ...]:
     """Heights of the stairs, the largest error of a stair, and the largest motion on one."""
     stands, swings = positions_at_rest(run)
     return (
-        Merit("smallest stair", float(np.diff(stands).min()), "um"),
-        Merit("largest stair", float(np.diff(stands).max()), "um"),
+        Merit("smallest stair", float(np.diff(stands).min()), "um", better="high"),
+        Merit("largest stair", float(np.diff(stands).max()), "um", better=""),
         Merit("off its stair by", float(np.abs(stands - distance * np.arange(LEVELS)).max()), "um"),
         Merit("swing, peak to peak", float(swings.max()), "um"),
     )
@@ -146,11 +146,11 @@ def identify(
         Merit(
             "the same in the first 2 s", rms(off[case.run.t < 2]), "mm", key="linear_servo_off_by_rms_early"
         ),
-        Merit("secant stiffness", K, "N/m", "servo.K"),
-        Merit("tangent stiffness", motor.stiffness(par, F_z), "N/m"),
-        Merit("mass, fitted", fit.m, "kg"),
+        Merit("secant stiffness", K, "N/m", "servo.K", better="high"),
+        Merit("tangent stiffness", motor.stiffness(par, F_z), "N/m", better="high"),
+        Merit("mass, fitted", fit.m, "kg", better=""),
         Merit("mass, half of its interval", fit.m_half, "kg"),
-        Merit("friction, fitted", fit.b, "N s/m"),
+        Merit("friction, fitted", fit.b, "N s/m", better=""),
         Merit("friction, half of its interval", fit.b_half, "N s/m"),
         Merit("fitted servo off by, rms", fit.rms, "um"),
     )

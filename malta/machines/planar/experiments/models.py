@@ -77,7 +77,7 @@ def errors(
             Merit(f"{s.name}, amplitude", float(a), s.unit, f"model.amplitude.{s.name}")
             for s, a in zip(plant.inputs, amplitude, strict=True)
         ),
-        Merit("fitted C of the analytical model", coils.compensation(par, truth), "1"),
+        Merit("fitted C of the analytical model", coils.compensation(par, truth), "1", better=""),
         Merit(
             "error of the table, each halving of its step", _error_ratio(curves), "1", key="table_error_ratio"
         ),

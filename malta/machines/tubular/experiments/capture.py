@@ -98,7 +98,7 @@ def capture(
     curves = axes | maps | _clearances(plant) | {f"bound {' '.join(plane)}": b for plane, b in bounds.items()}
     merits = (
         *_merits(found, allowed),
-        Merit("starts inside the clearance that return", inside.mean(), "percent"),
+        Merit("starts inside the clearance that return", inside.mean(), "percent", better="high"),
     )
     return Experiment("capture", "From where does it return?", cases, merits, curves, interrupted=cut)
 
@@ -241,8 +241,8 @@ def _merits(found: Mapping[str, float], allowed: Mapping[str, float]) -> tuple[M
     for ray, (state, _) in RAYS.items():
         unit = "mrad" if state in ("alpha", "beta") else "mm"
         merits += [
-            Merit(f"{ray}: furthest start that returns", found[ray], unit),
-            Merit(f"{ray}: furthest that the force limit allows", allowed[ray], unit),
-            Merit(f"{ray}: their ratio", found[ray] / allowed[ray], "percent"),
+            Merit(f"{ray}: furthest start that returns", found[ray], unit, better="high"),
+            Merit(f"{ray}: furthest that the force limit allows", allowed[ray], unit, better="high"),
+            Merit(f"{ray}: their ratio", found[ray] / allowed[ray], "percent", better="high"),
         ]
     return tuple(merits)

@@ -197,7 +197,7 @@ def _fault_merits(run: Trajectory) -> tuple[Merit, ...]:
     return (
         Merit("largest deviation", float(np.abs(run.p[run.t >= AT][:, others]).max(initial=0.0)), "um"),
         Merit("contact after", at - AT, "ms"),
-        Merit("its speed", speed, "mm/s", key="contact_speed"),
+        Merit("its speed", speed, "mm/s", key="contact_speed", better=""),
     )
 
 
@@ -212,5 +212,5 @@ def _counts(cases: list[Case]) -> tuple[Merit, ...]:
         Merit(
             f"touchdowns with supervisor, of {len(supervised)}", still, "1", key="touchdowns_with_supervisor"
         ),
-        Merit("slow landings with supervisor", float(landed), "1"),
+        Merit("slow landings with supervisor", float(landed), "1", better="high"),
     )

@@ -43,7 +43,7 @@ def faults(
     wanted = planned_faults("faults", plant, controller, during, options)
     cases, cut = fly(plant, controller, wanted, progress, options)
     survived = float(sum(case.run.verdict.completed for case in cases))
-    merit = Merit(f"survived, of {len(cases)}", survived, "1", key="survived")
+    merit = Merit(f"survived, of {len(cases)}", survived, "1", key="survived", better="high")
     return Experiment("faults", "What does it survive?", cases, (merit,), interrupted=cut)
 
 

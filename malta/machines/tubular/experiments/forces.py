@@ -42,7 +42,7 @@ def disturbance(
     found = (
         Merit("largest compliance, x1 to F_x", float(curve[worst]), "um/N", key="largest_compliance"),
         Merit("at", float(w[worst] / (2 * math.pi)), "Hz", key="compliance_frequency"),
-        Merit("smallest dynamic stiffness", float(1 / curve[worst]), "N/um"),
+        Merit("smallest dynamic stiffness", float(1 / curve[worst]), "N/um", better="high"),
     )
     curves = {
         "frequency": w / (2 * math.pi),

@@ -148,7 +148,9 @@ def payload(
         wanted.append(PlannedRun(f"{extra * 1e3:.0f} g", scenario, _payload_merits))
     cases, cut = fly(plant, controller, wanted, progress, options)
     carried = max((m for m, c in zip(masses, cases, strict=False) if c.run.verdict.completed), default=0.0)
-    merit = Merit("largest of these carried and moved", carried, "kg", "position_controller.payload")
+    merit = Merit(
+        "largest of these carried and moved", carried, "kg", "position_controller.payload", better="high"
+    )
     return Experiment("payload", "What can it pick and move?", cases, (merit,), interrupted=cut)
 
 

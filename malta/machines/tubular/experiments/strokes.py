@@ -80,14 +80,15 @@ def stroke_merits(run: Trajectory, *, published: bool = True) -> tuple[Merit, ..
             "N/A",
             "figure_12.drive_constant",
             key="drive_constant",
+            better="",
         ),
         Merit("heat in the windings", float(run.copper_loss.sum()) * run.controller.sample_time, "J"),
     ]
     if run.u.size:
         merits += [
-            Merit("efficiency while it accelerates", efficiency(run), "percent"),
+            Merit("efficiency while it accelerates", efficiency(run), "percent", better="high"),
             Merit("largest voltage of an axis", float(np.abs(run.u).max()), "V"),
-            Merit("lowest voltage of the DC link", float(run.link.min()), "V"),
+            Merit("lowest voltage of the DC link", float(run.link.min()), "V", better="high"),
         ]
     return tuple(merits) if published else tuple(merit._replace(published="") for merit in merits)
 
@@ -138,8 +139,10 @@ def drive_limits(
         Merit("current limit used", current_share * plant.actuator.current_limit, "A"),
         Merit("voltage limit used", voltage_share * plant.actuator.voltage_limit, "V"),
         Merit("fastest stroke, from rest to rest", best.duration, "ms"),
-        Merit("rise, sigmoid over fastest", sigmoid.rise / best.rise, "1"),
-        Merit("travel, sigmoid over fastest", sigmoid.travel_time(1e-3) / best.travel_time(1e-3), "1"),
+        Merit("rise, sigmoid over fastest", sigmoid.rise / best.rise, "1", better=""),
+        Merit(
+            "travel, sigmoid over fastest", sigmoid.travel_time(1e-3) / best.travel_time(1e-3), "1", better=""
+        ),
     )
     curves = {"t": best.t, "z": best.z, "u": best.u, "i": best.i}
     return Experiment("drive-limits", "How fast could it be?", cases, merits, curves, interrupted=cut)
@@ -194,9 +197,13 @@ def drive_limit_cases(
 def _limit_merits(run: Trajectory, found: FastestStroke | SigmoidStroke) -> tuple[Merit, ...]:
     """Rise and travel time of the reference, and the figures of the stroke."""
     return (
-        Merit("reference: rise, 10-90 %", found.rise, "ms"),
+        Merit("reference: rise, 10-90 %", found.rise, "ms", better=""),
         Merit(
-            "reference: 0.1 to 99.9 % of travel", found.travel_time(1e-3), "ms", key="reference_travel_time"
+            "reference: 0.1 to 99.9 % of travel",
+            found.travel_time(1e-3),
+            "ms",
+            key="reference_travel_time",
+            better="",
         ),
         *stroke_merits(run, published=False),
     )

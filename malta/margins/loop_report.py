@@ -1,0 +1,427 @@
+"""The record of what is known of a loop: what `malta verify` finds, and every page, table and document shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from malta.display import Curves, Description, display
+from malta.errors import CheckError
+from malta.identifiers import distinct
+from malta.loops.loop import Loop, loop_of_model
+from malta.loops.noise import noise_of
+from malta.loops.recovery import Recovery, furthest, recovery
+from malta.loops.sampled_loops import LAST
+from malta.margins.extent import NOWHERE, Extent
+from malta.margins.figures import BANDWIDTHS, GROUPS, LoopFigure, figure, zone
+from malta.margins.travel import NOT_BETWEEN
+from malta.model.signals import FINE
+from malta.proof.machine.windings import left_out
+from malta.proof.margin import NOT_PROVEN
+from malta.synthesis.requirements import Figure, judge_figure, ratio_of
+
+if TYPE_CHECKING:
+    from malta.loops.classical import Classical, Disk
+    from malta.model.linearize import LinearModel
+    from malta.model.plant import ComplexArray, Plant
+    from malta.proof.blocks.gain import Gain
+    from malta.proof.machine.windings import CurrentLoops
+    from malta.proof.margin import Margin
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.requirements import Noise, Verdict
+
+CURVE = 120  # points of a curve in a notebook
+FIRST = (
+    "disk",
+    "delay_margin",
+    "peak_s",
+    "peak_t",
+    "damping",
+    "requirements",
+)  # kinds that a reader looks for
+
+
+@dataclass(frozen=True, eq=False)
+class Poles:
+    """Poles in rad/s; of sampled systems ln(lambda) / Ts, without the poles of pure delay."""
+
+    open_loop: ComplexArray  # of the continuous model
+    regulator: ComplexArray  # of the controller's own sampled model with K, Ki; empty for a PID
+    filter: ComplexArray  # of the controller's own sampled observer; empty for a PID
+    closed_loop: ComplexArray  # of the machine: hold, delay, current loops, controller
+
+    @property
+    def pairs(self) -> dict[str, list[list[float]]]:
+        """Each set as rows [re, im]."""
+        return {f.name: [[float(p.real), float(p.imag)] for p in getattr(self, f.name)] for f in fields(self)}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The peak sensitivity and stability of one loop, from the ideal one to the machine's."""
+
+    name: str
+    peak_sensitivity: Mapping[str, float]  # by sensor, and sigma_max of all
+    peak_frequency: float  # rad/s, of sigma_max
+    spectral_radius: float  # of the closed loop; stable below 1
+
+    @property
+    def stable(self) -> bool:
+        return self.spectral_radius < 1
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """One stage of the chain, with its margin and its peak sensitivity."""
+
+    name: str
+    margin: Margin
+    peak: float  # largest |S_ii|; NaN where unstable
+    broken_at: Literal["forces", "sensors"]  # where S is taken
+    loaded: bool = False  # whether S is that of the machine under its loads
+
+
+@dataclass(frozen=True)
+class Place:
+    """Figures at a place of the stroke: each is the worse of +position and -position.
+
+    A machine without a stroke has its places along the first parameter of `plant.over`, as the speed of a rotor.
+    """
+
+    position: float  # m, or the SI unit of the parameter
+    margin: Margin
+    peak: float
+    disk: float  # size of the disk margin of all forces and sensors at once
+    delay: float  # s, smallest delay margin; NaN where unstable, as peak and disk
+
+
+class Payload(NamedTuple):
+    """How much a machine carries beside its mover, kg."""
+
+    held: float  # by the forces at rest; inf: its weight loads no input
+    carried: float  # the largest that was flown; NaN: the machine has no experiment of it
+    dropped: float  # the smallest that was dropped; inf: none
+
+
+class Outcome(NamedTuple):
+    """What is asked for and what was found, SI."""
+
+    name: str
+    asked: float | None  # None: as little as the others leave
+    found: float
+    unit: str
+    how: str  # where the figure comes from
+    at_least: bool = False  # asked for from below
+    interval: tuple[float, float] | None = None  # 95 % confidence of a simulated figure
+
+    @property
+    def ratio(self) -> float:
+        """How near its limit: at most 1 where it holds."""
+        asked = math.inf if self.asked is None else self.asked
+        return ratio_of(asked, self.found, at_least=self.at_least)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the bound holds; "undecided" where the interval of a simulated figure has the bound within."""
+        return judge_figure(Figure(self.found, self.how, self.interval), self.asked, at_least=self.at_least)
+
+    @property
+    def holds(self) -> bool:
+        """Whether the figure is within its bound; not where that is undecided."""
+        return self.verdict == "holds"
+
+    @property
+    def words(self) -> str:
+        """Its name, with that of its signal or load as it is: "peak sensitivity", "recovery F_x left"."""
+        base, space, rest = self.name.partition(" ")
+        return base.replace("_", " ") + space + rest
+
+    def __str__(self) -> str:
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        if self.asked is None:
+            return f"{self.name} is {self.found:.4g}{unit}, asked for little"
+        bound = "at least" if self.at_least else "at most"
+        text = f"{self.name} is {self.found:.4g}{unit}, asked for {bound} {self.asked:.4g}{unit}"
+        if self.verdict != "undecided" or self.interval is None:
+            return text
+        low, high = self.interval
+        return f"{text}, undecided between {low:.4g} and {high:.4g}{unit}"
+
+
+@display
+@dataclass(frozen=True, eq=False)
+class LoopReport:
+    """What is known of a loop, from `malta.verify`; terminal, JSON, pages and comparisons show this record.
+
+    The last of `stages` is the machine's loop: hold, delay and current loops. ISO 14839-3 sorts its peak sensitivities
+    into zones: A below 3 (9.5 dB), B below 4, C below 5, D above. Margins are multiples of `uncertainty`.
+
+    model : the machine's linear model
+    controller : its controller
+    poles : open loop, regulator, filter and closed loop, rad/s; of sampled systems ln(lambda) / Ts
+    stages : peak sensitivities and spectral radius of the loop as designed, with current loops, and of the machine
+    bandwidth : rad/s, by definition
+    uncertainty : relative half range of each parameter
+    robust : the margin anywhere in `extent`; None where it was not asked for
+    extent : the intervals that proofs cover beside the uncertainty
+    current_loops : of the last stage of the chain: "pi" or "lag"
+    chain : the stages from LQR to the machine's loop, each with its margin and its largest `|S|`
+    disks : disk margins of forces, sensors, both, and each sensor alone: the worst of all places; empty where unstable
+    delay : s, delay margin of each sensor's loop, the others closed: the worst of all places; NaN where unstable
+    gang : by sensor the largest `|S|`, `|T|`, `|S P|` (m/N) and `|F S|` (N/m): the worst of all places
+    tolerance : margins of each parameter alone, down and up, anywhere in `extent`, in multiples of its range
+    mass : margin of the linear loop in kg on top of the mass m; None for a machine without a parameter m
+    places : figures along the course, each the worse of +z and -z
+    worst : the largest `|S|` of each sensor over the uncertainty, with its proven bound
+    payload : kg that the forces hold and the mover carries in flight; None for a machine without a mass m
+    requirements : of the design file, with what was found
+    notes : what could not be computed, and why
+
+    The fields from `chain` on are empty but with `stages=True`. `figures` lists all of it: each figure of merit with
+    its unit, its meaning, which way is better, and its bound.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> found = malta.verify(model, malta.synthesize(spec, model), {"m": 0.2})
+    >>> f"{found.peak_sensitivity['y']:.2f}, {found.robust.lower:.2f}"
+    '1.57, 3.91'
+    >>> peak = next(one for one in found.figures if one.key == "peak_sensitivity")
+    >>> peak.heading, f"{peak.value:.2f}", peak.meaning.better
+    ('peak |S| of the worst sensor', '1.57', 'low')
+    """
+
+    model: LinearModel
+    controller: Controller
+    poles: Poles
+    stages: tuple[Stage, ...]
+    bandwidth: Mapping[str, float]
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+    robust: Margin | None = None
+    extent: Extent = NOWHERE
+    current_loops: CurrentLoops = LAST
+    chain: tuple[Link, ...] = ()
+    disks: tuple[Disk, ...] = ()
+    delay: Mapping[str, float] = field(default_factory=dict)
+    gang: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    tolerance: Mapping[str, tuple[Margin, Margin]] = field(default_factory=dict)
+    mass: Margin | None = None
+    places: tuple[Place, ...] = ()
+    worst: Mapping[str, Gain] = field(default_factory=dict)
+    payload: Payload | None = None
+    requirements: tuple[Outcome, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def plant(self) -> Plant:
+        """The machine."""
+        return self.model.plant
+
+    @property
+    def loop(self) -> Loop:
+        """The machine's loop, as simulations fly it."""
+        return loop_of_model(self.model, self.controller)
+
+    @property
+    def left_out(self) -> str:
+        """What the machine has and the last stage of the chain has not, in words; "": nothing."""
+        return left_out(self.plant, self.controller, self.current_loops)
+
+    @property
+    def stable(self) -> bool:
+        """Whether the machine's loop is stable."""
+        return self.stages[-1].stable
+
+    @property
+    def peak_sensitivity(self) -> Mapping[str, float]:
+        """The peak sensitivity of the machine's loop, by sensor and as sigma_max."""
+        return self.stages[-1].peak_sensitivity
+
+    @property
+    def travel(self) -> Margin:
+        """The margin anywhere in `extent`, `NOT_PROVEN` where it was not asked for."""
+        return NOT_PROVEN if self.robust is None else self.robust
+
+    @property
+    def covers_travel(self) -> bool:
+        """Whether the margin holds at every position of the travel, and not only at some."""
+        return NOT_BETWEEN not in self.travel.reason
+
+    @property
+    def classical(self) -> Classical | None:
+        """Disk and delay margins and gang of four at the operating point; None for an unstable loop."""
+        return self.loop.classical if self.stable else None
+
+    @cached_property
+    def recovery(self) -> tuple[Recovery, ...]:
+        """The answer to each disturbance; none of an unstable loop, or where no load acts from outside."""
+        return recovery(self.loop) if self.stable and self.plant.disturbances else ()
+
+    @cached_property
+    def noise(self) -> Noise | None:
+        """Motion and commands at rest, rms; None for an unstable loop."""
+        return noise_of(self.loop.sampled, self.plant) if self.stable else None
+
+    @cached_property
+    def figures(self) -> tuple[LoopFigure, ...]:
+        """The figures of merit, in the order of their groups."""
+        parts = (_margins, _sensitivities, _bandwidths, _noise, _loads, _requirements)
+        return in_groups([found for part in parts for found in part(self)])
+
+    def __str__(self) -> str:
+        lines = [f"{'stable' if self.stable else 'UNSTABLE'} with hold, delay and current loops"]
+        for stage in self.stages:
+            peaks = "  ".join(
+                f"{k} {v:.2f} {zone(v)}" for k, v in stage.peak_sensitivity.items() if k != "sigma_max"
+            )
+            largest = stage.peak_sensitivity["sigma_max"]
+            lines.append(
+                f"peak |S|, {stage.name}: {peaks}  all {largest:.2f} ({20 * np.log10(largest):.1f} dB)"
+            )
+        for key, value in self.bandwidth.items():
+            lines.append(f"bandwidth, {BANDWIDTHS[key]}: {value:.1f} rad/s ({value / (2 * np.pi):.2f} Hz)")
+        if self.uncertainty:
+            box = "  ".join(f"{name} +-{share * 100:g} %" for name, share in self.uncertainty.items())
+            where = str(self.extent) if self.covers_travel else "in the middle and at the end of the travel"
+            lines += [f"uncertainty: {box}", f"{f'robust {where}'.rstrip()}: {self.robust}"]
+        return "\n".join(lines)
+
+    @property
+    def description(self) -> Description:
+        """What a reader looks for first, then every figure of merit."""
+        state = "stable" if self.stable else "UNSTABLE"
+        at = f"{self.controller.name!r} on {self.plant.name!r}"
+        box = ", ".join(f"{name} ±{share * 100:g} %" for name, share in self.uncertainty.items())
+        rows = [("margin", f"{self.robust} of {box}")] if self.robust is not None else []
+        shown = sorted(self.figures[1:], key=lambda one: one.kind not in FIRST)
+        rows += [(one.heading, one.text) for one in shown]
+        return Description(
+            f"Loop of {at}: {state} with hold, delay and current loops", tuple(rows), self._curves
+        )
+
+    @property
+    def _curves(self) -> Curves | None:
+        """The largest singular values of S and T over frequency; None for an unstable loop."""
+        if not self.stable:
+            return None
+        w = np.geomspace(1.0, np.pi / self.controller.sample_time, CURVE)
+        S = self.loop.sensitivity(w)
+        sizes = {
+            name: np.linalg.norm(G, 2, axis=(1, 2)) for name, G in (("S", S), ("T", np.eye(S.shape[-1]) - S))
+        }
+        return Curves(w, "frequency [rad/s]", sizes, "largest singular value [1]", logarithmic=True)
+
+
+def in_groups(figures: Sequence[LoopFigure]) -> tuple[LoopFigure, ...]:
+    """Figures in the order of their groups, with keys of which none comes twice."""
+    found = sorted(figures, key=lambda one: GROUPS.index(one.meaning.group))
+    keys = distinct(one.key for one in found)
+    return tuple(one._replace(key=key) for one, key in zip(found, keys, strict=True))
+
+
+def require_stable(found: LoopReport, name: str) -> None:
+    """Raise CheckError when a stage is unstable: such gains are not written to files."""
+    for stage in found.stages:
+        if not stage.stable:
+            raise CheckError(
+                f"{name}: the loop ({stage.name}) is unstable, |lambda| = {stage.spectral_radius:.6f}"
+            )
+
+
+def _margins(a: LoopReport) -> Iterator[LoopFigure]:
+    yield figure("stable", "stable", "stable on the machine", float(a.stable))
+    if a.robust is not None:
+        where = f", {a.extent}" if str(a.extent) else ""
+        lower = a.robust.lower or 0.0
+        yield figure("margin_proven", "margin_proven", f"margin of parameters, proven{where}", lower)
+        yield figure("margin_lost_at", "margin_lost_at", "lost at", a.robust.upper)
+    classical = a.classical
+    if classical is None:
+        return
+    for disk in classical.disks:
+        signal = disk.channels.removesuffix(" alone") if disk.channels.endswith(" alone") else ""
+        words = f"disk margin, {disk.channels}"
+        kind = "disk_of" if signal else "disk"
+        yield figure(kind, f"disk_margin {disk.channels}", words, disk.size, signal=signal)
+    yield figure("delay_margin", "delay_margin", "delay margin, smallest", min(classical.delay.values()))
+    if a.mass is not None and a.robust is not None:
+        yield figure("mass_margin", "mass_margin", "mass margin, linear loop", a.mass.lower or 0.0)
+    if a.payload is not None:
+        yield figure("payload", "payload_held", "payload held at rest", a.payload.held)
+        if not math.isnan(a.payload.carried):
+            yield figure("payload", "payload_carried", "payload in flight", a.payload.carried)
+
+
+def _sensitivities(a: LoopReport) -> Iterator[LoopFigure]:
+    peaks = a.peak_sensitivity
+    sensors = {name: peak for name, peak in peaks.items() if name != "sigma_max"}
+    worst = max(sensors.values()) if a.stable else math.nan
+    yield figure("peak_s", "peak_sensitivity", "peak |S| of the worst sensor", worst)
+    yield figure("peak_s", "peak_sensitivity_sigma_max", "peak sigma_max(S)", peaks["sigma_max"])
+    for name, peak in sensors.items():
+        yield figure("peak_s_of", f"peak_sensitivity {name}", f"peak |S| at {name}", peak, signal=name)
+    if a.classical is not None:
+        largest = max(gang[1] for gang in a.classical.gang.values())
+        yield figure("peak_t", "peak_complementary", "peak |T| of the worst sensor", largest)
+
+
+def _bandwidths(a: LoopReport) -> Iterator[LoopFigure]:
+    for key, value in a.bandwidth.items():
+        kind = "natural" if key.startswith("w_n") else "bandwidth"
+        yield figure(kind, f"bandwidth_{key}", BANDWIDTHS[key], value)
+    if len(a.poles.closed_loop) and a.stable:
+        yield from pole_figures(a.poles.closed_loop)
+
+
+def pole_figures(poles: ComplexArray) -> Iterator[LoopFigure]:
+    """The slowest decay and the smallest damping of a closed loop's poles, rad/s."""
+    yield figure("slowest_pole", "slowest_pole", "decay of the slowest pole", -poles.real.max())
+    damping = -poles.real / np.maximum(np.abs(poles), 1e-300)
+    yield figure("damping", "smallest_damping", "smallest damping ratio", damping.min())
+
+
+def _noise(a: LoopReport) -> Iterator[LoopFigure]:
+    if a.noise is None:
+        return
+    for signal, value in zip(a.plant.outputs, a.noise.motion, strict=True):
+        fine, words = FINE.get(signal.unit, signal.unit), f"motion {signal.name}, rms"
+        yield figure("motion", f"motion {signal.name} rms", words, value, fine, signal.name)
+    for signal, value in zip(a.plant.inputs, a.noise.force, strict=True):
+        words = f"command {signal.name}, rms"
+        yield figure("command", f"command {signal.name} rms", words, value, signal.unit, signal.name)
+
+
+def _loads(a: LoopReport) -> Iterator[LoopFigure]:
+    units = {s.name: s.unit for s in a.plant.disturbances}
+    for load, output in furthest(a.recovery):
+        fine, name = FINE.get(output.unit, output.unit), f"load {load.name}"
+        size = f"1 {units[load.name]} {load.name}".replace("1 1 ", "1 ")
+        settled = f"{size}: within 1 % after"
+        peak = f"{size}: largest over frequency"
+        moved = f"{size}: largest deviation"
+        yield figure("load_moves", f"{name} largest", moved, output.largest, fine, load.name)
+        yield figure("load_settles", f"{name} settles", settled, output.settled, signal=load.name)
+        yield figure("compliance", f"{name} compliance", peak, output.compliance, fine, load.name)
+
+
+def _requirements(a: LoopReport) -> Iterator[LoopFigure]:
+    asked = [one for one in a.requirements if one.asked is not None]
+    if asked:
+        kept = sum(one.holds for one in asked) / len(asked)
+        yield figure("requirements", "requirements_held", "requirements held", kept, "percent")
+        undecided = sum(one.verdict == "undecided" for one in asked) / len(asked)
+        if undecided:
+            name, words = "requirements_undecided", "requirements undecided"
+            yield figure("undecided", name, words, undecided, "percent")
+    for one in a.requirements:
+        several = sum(other.name == one.name for other in a.requirements) > 1
+        name, words = f"requirement {one.name}", one.words
+        if several:
+            name, words = f"{name} {one.how}", f"{words}, {one.how}"
+        kind = "at_least" if one.at_least else "at_most"
+        yield figure(kind, name, words, one.found, FINE.get(one.unit, one.unit), bound=one.asked)
