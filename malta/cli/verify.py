@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from malta.cli.documents.loops import VerifyOutput
+    from malta.identification.data_file import IdentifiedData
     from malta.loops.recovery import Recovery
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
@@ -97,6 +98,13 @@ def verify(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the figures (.png).")] = None,
     design: DesignFile = None,
+    identified: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="A data file of malta identify: its machine, its 95 % intervals as the uncertainty.",
+        ),
+    ] = None,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -119,10 +127,12 @@ def verify(
     from malta.model.published import published_figures
 
     controller = read_controller(gains, machine)
-    plant = plant_of(change_machine(controller.parameters, change))
+    measured = None if identified is None else _read_identified(identified, controller, change, uncertain)
+    parameters = controller.parameters if measured is None else measured.parameters
+    plant = plant_of(change_machine(parameters, change))
     model = linearize(plant, plant.point(controller.operating_point[0]))
     published = published_figures(plant.name)
-    box = read_uncertainty(gains, uncertain, plant.parameters, published)
+    box = measured.shares if measured else read_uncertainty(gains, uncertain, plant.parameters, published)
     _require_options(time, certificate, proof=not no_proof)
     spec = _spec_of(gains, controller, design, plant)
     subject = Subject(gains, controller, plant, model, box, cast("CurrentLoops", current_loops), spec)
@@ -143,6 +153,27 @@ def verify(
     require_stable(analysis.margins, str(gains))
     if refusal is not None:
         raise refusal
+
+
+def _read_identified(
+    path: Path, controller: Controller, change: list[str] | None, uncertain: list[str] | None
+) -> IdentifiedData:
+    """The machine and the intervals of a data file. Raises InputError beside options that say the same."""
+    from malta.identification.data_file import read_identified
+
+    if change or uncertain:
+        other = "--set" if change else "--uncertain"
+        raise InputError(
+            "--identified", "", f"{other} too", "one of them: the file says machine and intervals"
+        )
+    data = read_identified(path)
+    if type(data.parameters) is not type(controller.parameters):
+        raise InputError(path, "machine", "another machine", "that of the gain file")
+    joint = 100 * data.joint
+    print_note(
+        f"{path}: margins count in 95 % intervals; all parameters together are within {joint:.0f} % of them"
+    )
+    return data
 
 
 def _require_options(time: float | None, certificate: Path | None, *, proof: bool) -> None:
