@@ -40,7 +40,7 @@ def test_a_log_says_nothing_of_the_truth(log: malta.Log, tmp_path: Path) -> None
 
 
 def test_currents_are_those_that_the_sensors_read() -> None:
-    par = replace(CONTROLLER.parameters, s_i=5e-3, q_i=1e-3)  # type: ignore[type-var]
+    par = replace(CONTROLLER.parameters, s_i=5e-3, q_i=1e-3)
     scenario = malta.Scenario("hold", 0.05, malta.references.hold, noise=1.0)
     run = malta.simulate(malta.plant_of(par), CONTROLLER, scenario)
     off = malta.log_of(run).columns["i"] - run.i

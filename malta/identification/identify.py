@@ -157,8 +157,8 @@ def identify(
 
     controller : the gain file that flew; its machine's parameters are where the search starts
     log : with measured currents and an excitation of whole periods
-    parameters : names of the machine's record or of its sensors' errors; (): those that the log tells to 20 %, but for masses and lengths,
-        which are held
+    parameters : names of the machine's record or of its sensors' errors; (): those that the log tells to 20 %, but for
+        masses and lengths, which are held
     known : parameters with values that were weighed or measured otherwise, SI
     start : values from which the search starts, SI
 
@@ -248,6 +248,9 @@ class Spectrum(NamedTuple):
     harmonics: IntArray  # multiples of 1 / period that were not excited, in the band of the lines
     rate: float  # rad/s of a bin
     source: str  # the log's
+    weight: (
+        FloatArray  # of each output: 1 over the size of its coefficients above the lines, where nothing moves
+    )
 
 
 def _spectrum(log: Log) -> Spectrum:
@@ -283,8 +286,19 @@ def _spectrum(log: Log) -> Spectrum:
     nearest = np.argsort(np.abs(free - lines[:, None]), axis=1)[:, :NEIGHBOURS]
     harmonics = np.setdiff1d(np.arange(lines[0], lines[-1] + 1, periods), lines)
     rate = 2 * np.pi / (N * log.sample_time)
+    quiet = np.median(np.abs(outputs[len(outputs) // 2 :]), axis=0)
+    weight = 1 / np.maximum(quiet, 1e-300)
     return Spectrum(
-        outputs, currents, lines, axis, pulse / np.abs(pulse), free[nearest], harmonics, rate, log.source
+        outputs,
+        currents,
+        lines,
+        axis,
+        pulse / np.abs(pulse),
+        free[nearest],
+        harmonics,
+        rate,
+        log.source,
+        weight,
     )
 
 
@@ -304,21 +318,44 @@ def _whole(log: Log, group: str) -> FloatArray:
     return np.column_stack([np.interp(t, log.t[np.isfinite(c)], c[np.isfinite(c)]) for c in table.T])
 
 
-def _residuals(model: ResponseModel, s: Spectrum, theta: FloatArray, bins: IntArray) -> ComplexArray:
-    """e = Y - G I at some bins, bins x p."""
-    G = model.response(theta, s.rate * bins)
-    return np.asarray(s.outputs[bins] - np.einsum("kpm,km->kp", G, s.currents[bins]))
+class Residuals(NamedTuple):
+    """e = Y - G I - T c at some bins, with the c of least squares at lines and between them: bins x p each."""
+
+    lines: ComplexArray
+    between: ComplexArray  # lines x NEIGHBOURS x p
+    harmonics: ComplexArray
 
 
-def _covariances(model: ResponseModel, s: Spectrum, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _residuals(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Residuals:
+    """The residuals of parameters theta.
+
+    What noise leaves in the states from the begin of the record to its end acts at all bins alike. It is fitted and
+    taken off, as it would correlate the residuals of all lines.
+    """
+    kinds = (s.lines, s.between.ravel(), s.harmonics)
+    bins = np.concatenate(kinds)
+    G, T = model.responses(theta, s.rate * bins)
+    e = s.outputs[bins] - np.einsum("kpm,km->kp", G, s.currents[bins])
+    fitted = len(bins) - len(s.harmonics)
+    rows = (T[:fitted] * s.weight[:, None]).reshape(-1, T.shape[2])
+    size = np.linalg.norm(rows, axis=0)
+    rows = rows / np.where(size > 0, size, 1.0)
+    right = (e[:fitted] * s.weight).ravel()
+    normal, moments = (rows.conj().T @ rows).real, (rows.conj().T @ right).real
+    c = np.linalg.lstsq(normal, moments, rcond=1e-12)[0] / np.where(size > 0, size, 1.0)
+    e = e - T @ c
+    lines, between, harmonics = np.split(e, np.cumsum([len(kind) for kind in kinds])[:2])
+    return Residuals(lines, between.reshape(*s.between.shape, -1), harmonics)
+
+
+def _covariances(between: ComplexArray) -> tuple[ComplexArray, FloatArray]:
     """Covariances of e at the lines, from the bins between them, and the number of bins behind each."""
-    e = _residuals(model, s, theta, s.between.ravel()).reshape(*s.between.shape, -1)
-    each = np.einsum("kma,kmb->kab", e, e.conj())
+    each = np.einsum("kma,kmb->kab", between, between.conj())
     sums = np.concatenate([np.zeros_like(each[:1]), each.cumsum(axis=0)])
     k = np.arange(len(each))
     first, last = np.maximum(k - WINDOW, 0), np.minimum(k + WINDOW + 1, len(each))
-    counts = s.between.shape[1] * (last - first)
-    return (sums[last] - sums[first]) / counts[:, None, None], counts
+    counts = between.shape[1] * (last - first)
+    return (sums[last] - sums[first]) / counts[:, None, None], counts.astype(float)
 
 
 def _whitened(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexArray:
@@ -326,16 +363,16 @@ def _whitened(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexAr
 
     The inverse of a covariance that is estimated from n bins is too large by n / (n - p).
     """
-    C, counts = _covariances(model, s, theta)
+    e = _residuals(model, s, theta)
+    C, counts = _covariances(e.between)
     p = C.shape[1]
-    e = _residuals(model, s, theta, s.lines)
-    white = np.linalg.solve(np.linalg.cholesky(C), e[..., None])[..., 0]
+    white = np.linalg.solve(np.linalg.cholesky(C), e.lines[..., None])[..., 0]
     return np.asarray(white * np.sqrt((counts - p) / counts)[:, None])
 
 
 def _information(model: ResponseModel, s: Spectrum) -> FloatArray:
     """The Fisher information at the start, with the noise that the start leaves between the lines."""
-    C, _ = _covariances(model, s, model.start)
+    C, _ = _covariances(_residuals(model, s, model.start).between)
     variance = np.einsum("kpp->kp", C).real
     power = (np.abs(s.outputs[s.lines]) ** 2 / variance).max(axis=1)
     if np.median(power) < QUIET:
@@ -434,8 +471,8 @@ def _distortion(model: ResponseModel, s: Spectrum, theta: FloatArray) -> float:
     """The mean power of e at harmonics that were not excited, over that of the noise; NaN where there are none."""
     if not len(s.harmonics):
         return float("nan")
-    C, _ = _covariances(model, s, theta)
+    e = _residuals(model, s, theta)
+    C, _ = _covariances(e.between)
     nearest = np.abs(s.lines - s.harmonics[:, None]).argmin(axis=1)
-    e = _residuals(model, s, theta, s.harmonics)
-    solved = np.linalg.solve(C[nearest], e[..., None])[..., 0]
-    return float((e.conj() * solved).real.sum() / e.size)
+    solved = np.linalg.solve(C[nearest], e.harmonics[..., None])[..., 0]
+    return float((e.harmonics.conj() * solved).real.sum() / e.harmonics.size)

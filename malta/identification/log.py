@@ -220,7 +220,7 @@ def log_of(run: Trajectory) -> Log:
     plant, scenario = run.plant, run.scenario
     axes = plant.actuator.coils if not run.i.size else plant.drive.axes
     excitation = np.zeros_like(run.v) if scenario.excitation is None else scenario.excitation(run.t)
-    flags = np.hstack([run.saturated, run.met]) > 0
+    flags = (np.hstack([run.saturated, run.met]) > 0).astype(float)
     limits = [Signal(f"{s.name}_limit", "1") for s in plant.inputs]
     met = [Signal("current_limit" if k == 0 else f"limit_{k}", "1") for k in range(run.met.shape[1])]
     columns = {"y": run.y, "v": run.v, "i": _read_currents(run), "u": run.u}

@@ -66,6 +66,14 @@ class ResponseModel:
         theta : parameters, SI
         w : k frequencies, rad/s
         """
+        return self.responses(theta, w)[0]
+
+    def responses(self, theta: FloatArray, w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """The same G, and what a unit of each state leaves that a record has more at its end than at its begin.
+
+        The second one is k x p x states: over a record of N samples the coefficients of outputs and currents obey
+        Y = G I + T (x_0 - x_N) / N with the states x_0 and x_N at both ends.
+        """
         A, B, C, late = (np.array(M) for M in self._matrices(theta))
         n, m, Ts = len(A), B.shape[1], self.sample_time
         held = np.isinf(self.plant.actuator.crossover)
@@ -75,8 +83,10 @@ class ResponseModel:
         at, growing = E[:n, n : n + m], E[:n, n + m :]
         z = np.exp(1j * np.asarray(w) * Ts)[:, None, None]
         into = at + 0 * z if held else (at - growing) + z * growing
-        found = C @ np.linalg.solve(z * np.eye(n) - E[:n, :n], into)
-        return np.asarray(found * np.exp(-1j * np.asarray(w) * late.item())[:, None, None])
+        ends = z * np.eye(n)
+        found = C @ np.linalg.solve(z * np.eye(n) - E[:n, :n], np.concatenate([into, ends], axis=2))
+        found *= np.exp(-1j * np.asarray(w) * late.item())[:, None, None]
+        return found[:, :, :m], found[:, :, m:]
 
     def slopes(self, theta: FloatArray, w: FloatArray) -> ComplexArray:
         """dG per parameter in units of its scale, parameters x k x p x currents, by central differences."""

@@ -114,7 +114,7 @@ def interleaved_multisine(
             "excitation", "lines", found, f"at least {wanted}, {lines} of each of {inputs} inputs"
         )
     chosen = _spread_lines(first, last, wanted)
-    axis = np.arange(wanted) % inputs
+    axis = np.arange(wanted, dtype=float) % inputs
     phase = np.zeros(wanted)
     random = np.random.default_rng(seed)
     for j in range(inputs):
