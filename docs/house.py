@@ -31,7 +31,7 @@ ORDER = (
         "simulation",
         "firmware",
     ),
-    *("campaigns", "tuning", "report", "app", "machines", "cli"),
+    *("campaigns", "tuning", "identification", "report", "app", "machines", "cli"),
 )
 
 

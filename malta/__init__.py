@@ -33,6 +33,18 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.firmware.flight import engine_of_c as engine_of_c
     from malta.firmware.pil import Replay as Replay
     from malta.firmware.pil import replay_on_target as replay_on_target
+    from malta.identification.excite import ExcitationPlan as ExcitationPlan
+    from malta.identification.excite import excite as excite
+    from malta.identification.identify import Identified as Identified
+    from malta.identification.identify import identify as identify
+    from malta.identification.learn import Learned as Learned
+    from malta.identification.learn import learn as learn
+    from malta.identification.log import Log as Log
+    from malta.identification.log import log_of as log_of
+    from malta.identification.log import read_log as read_log
+    from malta.identification.log import write_log as write_log
+    from malta.identification.replay import LawReplay as LawReplay
+    from malta.identification.replay import replay_law as replay_law
     from malta.loops.curves import LoopCurves as LoopCurves
     from malta.loops.curves import loop_curves as loop_curves
     from malta.loops.loop import Loop as Loop
@@ -73,6 +85,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.simulation.batch import simulate_many as simulate_many
     from malta.simulation.catalogue import experiment as experiment
     from malta.simulation.digest import Batch as Batch
+    from malta.simulation.excitation import Multisine as Multisine
     from malta.simulation.experiments import Experiment as Experiment
     from malta.simulation.scenario import Fault as Fault
     from malta.simulation.scenario import Scenario as Scenario

@@ -140,6 +140,7 @@ def machine_text(files: DesignFiles, edit: Edit, data: Path) -> str:
             entry = preset[name] if name in preset else document["parameters"][name]
             entry["value"] = value
             entry["tag"], entry["source"] = "assumed", "changed in malta app"
+            entry.pop("interval", None)
         else:
             unit = files.fields[MACHINE + name].unit or "1"
             made = {"value": value, "unit": unit, "tag": "assumed", "source": "changed in malta app"}

@@ -77,6 +77,18 @@ def read_controller(gains: Path, machine_file: Path | None) -> Controller:
     return gain_files.read(gains)
 
 
+def verify_and_write(controller: Controller, gains: Path, folder: Path) -> list[Path]:
+    """Verify a controller over the uncertainty of the gain file that it comes from, and write it in all encodings."""
+    from malta import gains as gain_files
+    from malta.gains.file import content_of
+    from malta.tuning.verify import verify
+
+    margins = verify(controller, uncertainty=content_of(gains)[0].uncertainty)
+    paths = [folder / f"{controller.name}{suffix}" for suffix in gain_files.SUFFIXES]
+    gain_files.write(controller, margins, *paths)
+    return paths
+
+
 def design_of(gains: Path, controller: Controller, named: Path | None) -> Spec | None:
     """The design of a gain file: the file that was named, else NAME.toml beside its folder; None where there is none.
 

@@ -24,11 +24,16 @@ from malta.cli.claims import claims
 from malta.cli.command import Command
 from malta.cli.compare import compare
 from malta.cli.design import design
+from malta.cli.excite import excite
 from malta.cli.export import export
+from malta.cli.identify import identify
+from malta.cli.learn import learn
+from malta.cli.log import log
 from malta.cli.new import new
 from malta.cli.output import interruption, print_error, print_note, silence
 from malta.cli.pil import pil
 from malta.cli.plot import plot
+from malta.cli.replay import replay
 from malta.cli.report import report
 from malta.cli.schema import schema
 from malta.cli.simulate import simulate
@@ -80,6 +85,7 @@ def _first_line(command: Callable[..., None]) -> str:
 
 GROUPS: dict[str, tuple[Callable[..., None], ...]] = {  # the order of the help
     "Commands": (design, verify, check, simulate, campaign, tune),
+    "From the bench": (excite, log, identify, learn, replay),
     "Pages and pictures": (plot, report, compare, live_page, claims),
     "For other programs": (export, pil, schema),
     "A machine of your own": (new,),

@@ -16,7 +16,7 @@ from malta.cli.exported import (
     require_controller,
     titles,
 )
-from malta.cli.inputs import change_machine, print_scenarios, read_controller
+from malta.cli.inputs import change_machine, print_scenarios, read_controller, verify_and_write
 from malta.cli.options import (
     MACHINE,
     RUN,
@@ -83,6 +83,13 @@ def simulate(
             help="Folder for the figure (.png), the time series (.npz) and, of record-v0, the gain files."
         ),
     ] = None,
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write what a bench would log of the first run: .csv, .npz or .mat.",
+        ),
+    ] = None,
     replay: Annotated[
         str | None,
         typer.Option(
@@ -138,6 +145,10 @@ def simulate(
         compared = compare_flights(lambda e: fly(e).experiment, simulation.experiment) if law == "c" else {}
     published = published_figures(plant.name)
     files = [] if out is None else _save(simulation, out, published) + _save_gains(simulation, gains, out)
+    if log is not None:
+        from malta.identification.log import log_of, write_log
+
+        files.append(write_log(log_of(simulation.experiment.run), log))
     if as_json:
         from malta.cli.documents.simulations import SimulateOutput, experiment_fields, flights
 
@@ -215,18 +226,9 @@ def _save(simulation: Simulation, folder: Path, published: Mapping[str, Any] | N
 
 
 def _save_gains(simulation: Simulation, gains: Path, folder: Path) -> list[Path]:
-    """Verify the controller that an experiment has found, over the uncertainty of the gain file, and write it."""
-    from malta import gains as gain_files
-    from malta.gains.file import content_of
-    from malta.tuning.verify import verify
-
+    """Verify the controller that an experiment has found, and write it."""
     controller = simulation.experiment.controller
-    if controller is None:
-        return []
-    margins = verify(controller, uncertainty=content_of(gains)[0].uncertainty)
-    paths = [folder / f"{controller.name}{suffix}" for suffix in gain_files.SUFFIXES]
-    gain_files.write(controller, margins, *paths)
-    return paths
+    return [] if controller is None else verify_and_write(controller, gains, folder)
 
 
 def _slug(label: str) -> str:

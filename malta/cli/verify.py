@@ -23,8 +23,10 @@ from malta.cli.output import (
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
+    from malta.identification.data_file import IdentifiedData
     from malta.margins.loop_report import LoopReport
     from malta.proof.machine.windings import CurrentLoops
+    from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 
 
@@ -54,6 +56,13 @@ def verify(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the figures (.png).")] = None,
     design: DesignFile = None,
+    identified: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="A data file of malta identify: its machine, its 95 % intervals as the uncertainty.",
+        ),
+    ] = None,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -76,9 +85,11 @@ def verify(
     from malta.tuning.verify import verify as verify_loop
 
     controller = read_controller(gains, machine)
-    plant = plant_of(change_machine(controller.parameters, change))
+    measured = None if identified is None else _read_identified(identified, controller, change, uncertain)
+    parameters = controller.parameters if measured is None else measured.parameters
+    plant = plant_of(change_machine(parameters, change))
     published = published_figures(plant.name)
-    box = read_uncertainty(gains, uncertain, plant.parameters, published)
+    box = measured.shares if measured else read_uncertainty(gains, uncertain, plant.parameters, published)
     _require_options(time, certificate, proof=not no_proof)
     spec = design_of(gains, controller, design)
     try:
@@ -110,6 +121,27 @@ def verify(
     require_stable(found, str(gains))
     if refusal is not None:
         raise refusal
+
+
+def _read_identified(
+    path: Path, controller: Controller, change: list[str] | None, uncertain: list[str] | None
+) -> IdentifiedData:
+    """The machine and the intervals of a data file. Raises InputError beside options that say the same."""
+    from malta.identification.data_file import read_identified
+
+    if change or uncertain:
+        other = "--set" if change else "--uncertain"
+        raise InputError(
+            "--identified", "", f"{other} too", "one of them: the file says machine and intervals"
+        )
+    data = read_identified(path)
+    if type(data.parameters) is not type(controller.parameters):
+        raise InputError(path, "machine", "another machine", "that of the gain file")
+    joint = 100 * data.joint
+    print_note(
+        f"{path}: margins count in 95 % intervals; all parameters together are within {joint:.0f} % of them"
+    )
+    return data
 
 
 def _require_options(time: float | None, certificate: Path | None, *, proof: bool) -> None:

@@ -33,6 +33,7 @@ from malta.simulation.layout import (
 )
 from malta.simulation.period import Period, period_of
 from malta.simulation.prepared import Prepared
+from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import sensor_errors_of
 from malta.synthesis.controller import Controller
 
@@ -102,7 +103,7 @@ def _engine(
     """The engine of a machine; one run has one state of the controller, also where the machine changes on the way."""
     simulation, inputs = ready.simulation, ready.inputs
     c, setup = simulation.controller, simulation.setup
-    _require_exported(simulation.scenario.name, setup)
+    _require_exported(simulation.scenario, setup)
     native = compile_controller(_target(c, precision, setup.fidelity))
     sizes = layout_of(simulation.plant, c, setup)
     if id(inputs) not in sessions:
@@ -127,7 +128,7 @@ def _target(c: Controller, precision: Precision, fidelity: Any) -> Target:
     return Target(c, precision, fidelity)
 
 
-def _require_exported(scenario: str, s: Setup) -> None:
+def _require_exported(scenario: Scenario, s: Setup) -> None:
     """InputError for a setup whose law is not the exported one."""
     for name, found in (
         ("estimator", s.outside),
@@ -135,10 +136,11 @@ def _require_exported(scenario: str, s: Setup) -> None:
         ("bearing_axes", s.turning),
         ("anticipated", s.anticipated),
         ("open_loop", s.open_loop),
+        ("excitation", scenario.excitation is not None),
     ):
         if found:
             raise InputError(
-                f"scenario {scenario}", name, "a law that is not exported", "the gain file's own law"
+                f"scenario {scenario.name}", name, "a law that is not exported", "the gain file's own law"
             )
 
 

@@ -3,8 +3,9 @@
     data/tubular.toml -> read() -> the Parameters record of the machine that the file names
 
 A parameter stands in the file as `{ value = 0.360, unit = "kg", tag = "printed", source = "Table IV" }`.
-`tag` says how far to trust it: printed (in the source), computed (from what is printed) or assumed
-(ours). The unit may be any of the right dimension; it is converted to SI here.
+`tag` says how far to trust it: printed (in the source), computed (from what is printed), assumed (ours)
+or identified (from a log, with its 95 % interval). The unit may be any of the right dimension; it is converted to SI
+here.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from malta.model.checks import check_plant, line_of
 from malta.model.machines import file_of, machine, machine_names, name_of
 from malta.model.parameters import check_range
 from malta.model.plant import Plant
-from malta.tables import Quantity, Record, entry, load_toml, validate
+from malta.tables import Finite, Quantity, Record, entry, load_toml, validate
 from malta.units import to_si
 
 if TYPE_CHECKING:
@@ -36,10 +37,24 @@ if TYPE_CHECKING:
 class Sourced(Quantity):
     """A quantity with its source and how far to trust it."""
 
-    tag: Literal["printed", "computed", "assumed"] = entry(
-        "how far to trust it: in the source, from what the source prints, or ours"
+    tag: Literal["printed", "computed", "assumed", "identified"] = entry(
+        "how far to trust it: in the source, from what the source prints, ours, or from a log"
     )
     source: StrictStr = entry("where the number comes from")
+    interval: list[Finite] | None = entry(
+        "low and high end of the 95 % interval, in the unit beside the value", default=None
+    )
+
+
+class IdentifiedTable(Record):
+    """What a data file says of the identification that its parameters come from."""
+
+    log: StrictStr = entry("the log")
+    sha256: StrictStr = entry("of the log's file")
+    chi2: Finite = entry("of the residuals over their degrees of freedom")
+    joint: Finite = entry("times the intervals: the box that holds all parameters together with 95 %")
+    names: list[StrictStr] = entry("the identified parameters")
+    correlation: list[list[Finite]] = entry("of the parameters, in the order of names")
 
 
 class MachineFile(Record):
@@ -53,6 +68,7 @@ class MachineFile(Record):
     presets: dict[str, dict[str, Sourced]] = entry(
         "by name: parameters that replace those of parameters", default={}
     )
+    identified: IdentifiedTable | None = entry("written by malta identify", default=None)
 
 
 def read(path: str | Path, preset: str | None = None) -> Any:

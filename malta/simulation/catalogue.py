@@ -42,7 +42,10 @@ from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
 # Fields of a scenario that the experiment itself decides. All others are options, and so is the engine.
-MADE = {"name", "reference", "start", "cold", "disturbance", "anticipated", "faults", "correction", "changes"}
+MADE = {
+    *("name", "reference", "start", "cold", "disturbance", "anticipated", "excitation"),
+    *("faults", "correction", "changes"),
+}
 OPTIONS = {f.name for f in fields(Scenario)} - MADE | {"engine"}
 
 

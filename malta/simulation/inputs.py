@@ -79,6 +79,8 @@ def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> 
     if past.shape[1]:
         parts["v_past"] = past
     sizes = layout_of(plant, c, setup).given
+    if scenario.excitation is not None:  # after v_past: the filter knows these forces, the reference does not
+        parts["v_ff"] = v_ff + _excitation(plant, scenario, t)
     if scenario.disturbance is not None:
         parts["w"] = _wrench(plant, scenario, "disturbance", t)
     if scenario.anticipated is not None:
@@ -160,6 +162,17 @@ def _wrench(
         found = f"shape {wrench.shape}"
         raise InputError(f"scenario {scenario.name}", name, found, f"finite, shape {shape}")
     return wrench
+
+
+def _excitation(plant: Plant, scenario: Scenario, t: FloatArray) -> FloatArray:
+    """The scenario's excitation at t, k x inputs. Raises InputError for another shape, or NaN."""
+    assert scenario.excitation is not None
+    forces = np.asarray(scenario.excitation(t), dtype=float)
+    shape = (len(t), len(plant.inputs))
+    if forces.shape != shape or not np.isfinite(forces).all():
+        found = f"shape {forces.shape}"
+        raise InputError(f"scenario {scenario.name}", "excitation", found, f"finite, shape {shape}")
+    return forces
 
 
 def _active_samples(fault: Fault, t: FloatArray) -> FloatArray:

@@ -79,7 +79,7 @@ def is_repeatable(s: Scenario) -> bool:
         reference = reference.func
     own = str(getattr(reference, "__module__", "")).partition(".")[0] == __name__.partition(".")[0]
     plain = all(isinstance(value, int | float | str | None) for value in arguments)
-    functions = s.disturbance or s.anticipated or s.correction or s.electronics
+    functions = s.disturbance or s.anticipated or s.excitation or s.correction or s.electronics
     written = s.faults or s.start or s.changes or s.sensor_errors
     return own and plain and not functions and not written
 

@@ -81,6 +81,7 @@ class Scenario:
     cold : starts without current, with the observer at zero
     disturbance : t (s, shape (k,)) -> wrench, k x disturbances, N and N m; None: none
     anticipated : likewise: what the controller knows of the disturbance in advance
+    excitation : t (s, shape (k,)) -> forces beside the law's, k x inputs, N; the filter knows them as sent. None: none
     noise : standard deviation of the sensors in multiples of the plant's
     quantize : sensors with the plant's resolution
     sensor_errors : errors by name, SI; those that are left out are 0; None: y = p exactly
@@ -119,6 +120,7 @@ class Scenario:
     cold: bool = False
     disturbance: Callable[[FloatArray], FloatArray] | None = None
     anticipated: Callable[[FloatArray], FloatArray] | None = None
+    excitation: Callable[[FloatArray], FloatArray] | None = None
     noise: float = 0.0
     quantize: bool = False
     sensor_errors: Mapping[str, float] | None = None
@@ -257,6 +259,29 @@ class Scenario:
             profile=profile,
         )
         return cls("stroke", duration, reference, settle=settle, **options)
+
+    @classmethod
+    def excited(
+        cls, excitation: Callable[[FloatArray], FloatArray], duration: float, **options: Any
+    ) -> Scenario:
+        """The machine held at its place while forces excite it, with sensors as built: a run for identification.
+
+        excitation : t (s, shape (k,)) -> forces beside the law's, k x inputs, N, as a `malta.Multisine`
+        duration : s
+        options : fields of the scenario, as reference=..., seed=1; noise is 1.0 and quantize True unless they differ
+
+        Raises InputError as Scenario does.
+
+        >>> import malta
+        >>> controller = malta.gains.read("design/gains/robust.json")
+        >>> plant = malta.plant_of(controller.parameters)
+        >>> plan = malta.excite(malta.loop(plant, controller), force=0.5, period=0.5)
+        >>> scenario = malta.Scenario.excited(plan.signal, 0.1)
+        >>> malta.simulate(plant, controller, scenario).verdict.name
+        'completed'
+        """
+        given: dict[str, Any] = {"reference": references.hold, "noise": 1.0, "quantize": True}
+        return cls("excited", duration, excitation=excitation, **given | options)
 
 
 class Simulation(NamedTuple):

@@ -13,6 +13,13 @@ from malta.cli.documents.campaigns import (
     StatusOutput,
     ToleranceOutput,
 )
+from malta.cli.documents.identification import (
+    ExciteOutput,
+    IdentifyOutput,
+    LearnOutput,
+    LogOutput,
+    ReplayOutput,
+)
 from malta.cli.documents.loops import VerifyOutput
 from malta.cli.documents.others import CheckOutput, ClaimsOutput, ExportOutput, PilOutput, TuneOutput
 from malta.cli.documents.pages import CompareOutput, ReportOutput
@@ -34,6 +41,11 @@ MODELS: dict[str, type[Part]] = {
     "sobol-output": SobolOutput,
     "tolerance-output": ToleranceOutput,
     "tune-output": TuneOutput,
+    "excite-output": ExciteOutput,
+    "log-output": LogOutput,
+    "identify-output": IdentifyOutput,
+    "learn-output": LearnOutput,
+    "replay-output": ReplayOutput,
     "plot-output": PlotOutput,
     "report-output": ReportOutput,
     "compare-output": CompareOutput,

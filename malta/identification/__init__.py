@@ -1,0 +1,1 @@
+"""From the bench back to the design: logs, excitation, parameters with intervals, and what a stroke teaches."""

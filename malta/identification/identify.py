@@ -1,0 +1,478 @@
+"""Parameters of a machine from a log under excitation, with intervals: maximum likelihood at the excited lines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import chi2 as chi2_distribution
+
+from malta.display import Description, display
+from malta.errors import CheckError, InputError
+from malta.identification.log import Log
+from malta.identification.response import (
+    ResponseModel,
+    acting,
+    candidates,
+    deviations,
+    information,
+    require_parameters,
+    units_of_model,
+    well_found,
+)
+from malta.model.data import plant_of
+from malta.model.parameters import symbolic_names, twins_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.synthesis.controller import Controller
+
+    IntArray = NDArray[np.integer[Any]]
+
+NEIGHBOURS = 16  # bins between lines, nearest to a line, that tell the noise there
+WINDOW = 3  # lines to either side whose bins are taken together
+EXCITED = 1e-6  # of the largest line of an excitation: what is above is a line
+FEWEST = 3  # periods
+SIGMA = 1.959963984540054  # half of a 95 % interval
+SHARE = 0.2  # of its value: a parameter that is found worse is not asked for by itself
+LOST = 1.0  # of its value: a combination of parameters that is found worse is not found
+LIKELY = 1e-6  # probability below which chi2 refuses the model
+SLACK = 1.1  # factor of chi2: the noise's covariance is estimated too
+WHITE = 5.0  # standard deviations of the correlation between neighbouring lines
+REPAIRED = 1e-3  # of the samples that may be missing
+QUIET = (
+    4.0  # power at the lines over the noise, of the output that moves most, without which nothing was excited
+)
+
+
+@display
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """Parameters that were identified from a log.
+
+    log : from which
+    plant : the machine with these parameters
+    names : of the parameters
+    values : SI
+    start : SI, with which the search began: those of the gain file
+    covariance : of the values, SI
+    held : parameters that act too and were taken as known, SI
+    chi2 : of the residuals at the lines over their degrees of freedom; 1 where the model is right
+    limit : of chi2 over its degrees of freedom, above which the model is refused
+    dof : degrees of freedom
+    whiteness : correlation of neighbouring lines' residuals in standard deviations
+    distortion : power at multiples of 1 / period that were not excited, over the noise; 1 of a linear machine
+    by_output : chi2 of each output
+    dropped : parameters that this log does not tell by themselves, with their standard deviation as a share
+    """
+
+    log: Log
+    plant: Plant
+    names: tuple[str, ...]
+    values: FloatArray
+    start: FloatArray
+    covariance: FloatArray
+    held: Mapping[str, float]
+    chi2: float
+    limit: float
+    dof: int
+    whiteness: float
+    distortion: float
+    by_output: Mapping[str, float]
+    dropped: Mapping[str, float]
+
+    @property
+    def half_widths(self) -> FloatArray:
+        """Half of each 95 % interval, SI."""
+        return np.asarray(SIGMA * np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """The 95 % interval of each parameter, SI."""
+        low, high = self.values - self.half_widths, self.values + self.half_widths
+        return dict(zip(self.names, zip(low.tolist(), high.tolist(), strict=True), strict=True))
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Of the values."""
+        sigma = np.sqrt(np.diag(self.covariance))
+        return np.asarray(self.covariance / np.outer(sigma, sigma))
+
+    @property
+    def joint(self) -> float:
+        """By how much the box of the intervals grows until it holds the 95 % ellipsoid of all parameters together."""
+        return float(np.sqrt(chi2_distribution.ppf(0.95, len(self.names))) / SIGMA)
+
+    @property
+    def refusal(self) -> str:
+        """Why the model does not explain the log; "": it does."""
+        worst = max(self.by_output, key=lambda name: self.by_output[name])
+        if self.chi2 > self.limit:
+            return (
+                f"chi2 / dof is {self.chi2:.3g}, at most {self.limit:.3g} is noise: the machine's model does not "
+                f"explain the log, {worst} least ({self.by_output[worst]:.3g})"
+            )
+        if abs(self.whiteness) > WHITE:
+            return (
+                f"residuals of neighbouring lines are correlated by {self.whiteness:.1f} standard deviations, at "
+                f"most {WHITE:g} is noise: the machine's model lacks something"
+            )
+        return ""
+
+    @property
+    def description(self) -> Description:
+        """The values with their intervals, and how well they explain the log."""
+        units = units_of_model(self.plant)
+        rows = [
+            (name, f"{value:.5g} +- {half:.2g} {units[name]}")
+            for name, value, half in zip(self.names, self.values, self.half_widths, strict=True)
+        ]
+        rows.append(("chi2 / dof", f"{self.chi2:.3f} of {self.dof}, at most {self.limit:.3f}"))
+        return Description(f"Identified from {self.log.source!r}", tuple(rows))
+
+
+def identify(
+    controller: Controller,
+    log: Log,
+    *,
+    parameters: Sequence[str] = (),
+    known: Mapping[str, float] | None = None,
+    start: Mapping[str, float] | None = None,
+) -> Identified:
+    """Identify parameters of a machine from a log under a periodic excitation, with intervals.
+
+    At the excited lines k the measured currents I and outputs Y obey e_k = Y_k - G(theta, w_k) I_k, where e is noise of
+    the sensors alone, in closed loop too. The estimate minimizes
+
+        sum over k of e_k^H C_k(theta)^-1 e_k,      C_k: covariance of the same e between the lines
+
+    in which C moves with theta: so the noise that the loop feeds back into the currents does not bias the result
+    (maximum likelihood with errors in the variables; Pintelon and Schoukens, System Identification, 2nd ed., ch. 9).
+    Loads act at the place where the log was made, with the mean currents there.
+
+    controller : the gain file that flew; its machine's parameters are where the search starts
+    log : with measured currents and an excitation of whole periods
+    parameters : names of the machine's record or of its sensors' errors; (): those that the log tells to 20 %, but for
+        masses and lengths, which are held
+    known : parameters with values that were weighed or measured otherwise, SI
+    start : values from which the search starts, SI
+
+    Returns an Identified, also where its `refusal` says that the model does not explain the log.
+
+    Raises InputError for unknown parameters and another machine's signals; CheckError for a log that tells nothing:
+    too short, without excitation, another sample time, a stuck or clipped sensor, parameters that only act together.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/robust.json")
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> plan = malta.excite(malta.loop(plant, controller), period=0.5, periods=4, band=(4, 400))
+    >>> heavier = plant.variant(malta.read("data/tubular.toml").__class__(**{**vars(plant.parameters), "K_A": 9000.0}))
+    >>> run = malta.simulate(heavier, controller, malta.Scenario.excited(plan.signal, plan.duration))
+    >>> found = malta.identify(controller, malta.log_of(run), parameters=["K_A", "K_B"])
+    >>> found.refusal, bool(abs(found.values[0] - 9000) < 20)
+    ('', True)
+    """
+    plant = _known_plant(plant_of(controller.parameters), known or {}, start or {})
+    _require_machine(controller, plant, log)
+    spectrum = _spectrum(log)
+    names = require_parameters(plant, parameters) or candidates(plant)
+    names = tuple(name for name in names if name not in (known or {}))
+    i, y = spectrum.currents[0].real, spectrum.outputs[0].real
+    model = ResponseModel(plant, names, tuple(log.names("i")), y, i, log.sample_time)
+    dropped: dict[str, float] = {}
+    F = _information(model, spectrum)
+    if not parameters:
+        left = well_found(F, names, SHARE / SIGMA)
+        sigma = deviations(F)
+        dropped = {n: float(sigma[k]) for k, n in enumerate(names) if k not in left and np.isfinite(sigma[k])}
+        model = replace(model, names=tuple(names[k] for k in left))
+        F = F[np.ix_(left, left)]
+    _require_identifiable(model, F, log.source)
+    return _estimate(model, spectrum, log, dropped)
+
+
+def _known_plant(plant: Plant, known: Mapping[str, float], start: Mapping[str, float]) -> Plant:
+    """The machine with what is known of it."""
+    values = {**start, **known}
+    require_parameters(plant, list(values))
+    if not values:
+        return plant
+    return _changed(plant, values)
+
+
+def _changed(plant: Plant, values: Mapping[str, float]) -> Plant:
+    """The machine with these parameters; those that are alike by declaration stay alike. Errors of sensors are none."""
+    par: Any = plant.parameters
+    own = {name: float(value) for name, value in values.items() if name in symbolic_names(par)}
+    alike = {name: own[twin] for name, twin in twins_of(par).items() if twin in own}
+    return plant_of(replace(par, **alike | own))
+
+
+def _require_machine(controller: Controller, plant: Plant, log: Log) -> None:
+    """Raise for a log of another machine, of another sample time, or with sensors that failed."""
+    if log.machine and log.machine != plant.name:
+        raise CheckError(
+            f"{log.source}: a log of a {log.machine}, but the gain file's machine is a {plant.name}"
+        )
+    names = [s.name for s in plant.outputs]
+    log.table("y", names)
+    if not log.names("i"):
+        raise InputError(log.source, "i", "no measured currents", "a column for each axis, as i_dd1 [A]")
+    Ts = controller.sample_time
+    if abs(log.sample_time / Ts - 1) > 1e-3:
+        raise CheckError(f"{log.source}: samples of {log.sample_time:.6g} s, but the law's are {Ts:.6g} s")
+    found = log.survey
+    for what, of in (("stuck", found.stuck), ("clipped", found.clipped)):
+        for name, count in of.items():
+            raise CheckError(f"{log.source}: sensor {name} is {what} in {count} of {log.samples} samples")
+    if found.jitter > 0.01 * Ts:
+        raise CheckError(
+            f"{log.source}: its samples jitter by {found.jitter:.3g} s, more than 1 % of {Ts:g} s"
+        )
+
+
+class Spectrum(NamedTuple):
+    """Fourier coefficients of a log over whole periods, of bins 0 to half of the samples, with the lines."""
+
+    outputs: ComplexArray
+    currents: ComplexArray
+    lines: IntArray  # bins that were excited
+    axis: IntArray  # of each line, the input that it excites most
+    turn: ComplexArray  # of each line, the excitation's phase as a number of size 1
+    between: IntArray  # lines x NEIGHBOURS: the nearest bins with noise alone
+    harmonics: IntArray  # multiples of 1 / period that were not excited, in the band of the lines
+    rate: float  # rad/s of a bin
+    source: str  # the log's
+    weight: (
+        FloatArray  # of each output: 1 over the size of its coefficients above the lines, where nothing moves
+    )
+
+
+def _spectrum(log: Log) -> Spectrum:
+    """The spectra of the last whole periods of a log. Raises CheckError for a log that tells nothing."""
+    excitation = _whole(log, "excitation")
+    if not excitation.size or not np.abs(excitation).max(initial=0.0):
+        raise CheckError(f"{log.source}: nothing was excited: its columns exc.* are missing or zero")
+    if not log.period:
+        raise CheckError(
+            f"{log.source}: no period of the excitation is given: a line '# period 1.0 s' in a .csv"
+        )
+    each = round(log.period / log.sample_time)
+    periods = log.samples // each
+    if periods > FEWEST:
+        periods -= 1  # the first one, in which the loop settles
+    if periods < FEWEST:
+        found = f"{log.samples * log.sample_time:.4g} s are {periods} periods of {log.period:g} s"
+        raise CheckError(f"{log.source}: too short: {found}, at least {FEWEST} and one to settle are needed")
+    N = each * periods
+    last = slice(log.samples - N, None)
+    outputs, currents, D = (
+        np.fft.rfft(table[last], axis=0) / N for table in (_whole(log, "y"), _whole(log, "i"), excitation)
+    )
+    size = np.abs(D[1:])
+    lines = 1 + np.flatnonzero((size > EXCITED * size.max()).any(axis=1))
+    if (lines % periods).any():
+        raise CheckError(
+            f"{log.source}: the excitation has not the period of {log.period:g} s that the log names"
+        )
+    axis = np.abs(D[lines]).argmax(axis=1)  # the input that a line excites most
+    pulse = D[lines, axis]
+    free = np.setdiff1d(np.arange(1, lines[-1] + 4 * periods), np.arange(0, len(D), periods))
+    nearest = np.argsort(np.abs(free - lines[:, None]), axis=1)[:, :NEIGHBOURS]
+    harmonics = np.setdiff1d(np.arange(lines[0], lines[-1] + 1, periods), lines)
+    rate = 2 * np.pi / (N * log.sample_time)
+    quiet = np.median(np.abs(outputs[len(outputs) // 2 :]), axis=0)
+    weight = 1 / np.maximum(quiet, 1e-300)
+    return Spectrum(
+        outputs,
+        currents,
+        lines,
+        axis,
+        pulse / np.abs(pulse),
+        free[nearest],
+        harmonics,
+        rate,
+        log.source,
+        weight,
+    )
+
+
+def _whole(log: Log, group: str) -> FloatArray:
+    """The columns of a group with missing samples between their neighbours. Raises CheckError for many of them."""
+    table = log.columns.get(group, np.zeros((log.samples, 0)))
+    steps = np.diff(log.t) / log.sample_time
+    missing = int((np.round(steps) - 1).sum()) + int((~np.isfinite(table)).any(axis=1).sum())
+    if missing > REPAIRED * log.samples:
+        share = 100 * missing / log.samples
+        raise CheckError(
+            f"{log.source}: {share:.3g} % of the samples of {group} are missing, at most 0.1 % may be"
+        )
+    if not missing:
+        return table
+    t = log.t[0] + log.sample_time * np.arange(1 + round((log.t[-1] - log.t[0]) / log.sample_time))
+    return np.column_stack([np.interp(t, log.t[np.isfinite(c)], c[np.isfinite(c)]) for c in table.T])
+
+
+class Residuals(NamedTuple):
+    """e = Y - G I - T c at some bins, with the c of least squares at lines and between them: bins x p each."""
+
+    lines: ComplexArray
+    between: ComplexArray  # lines x NEIGHBOURS x p
+    harmonics: ComplexArray
+
+
+def _residuals(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Residuals:
+    """The residuals of parameters theta.
+
+    What noise leaves in the states from the begin of the record to its end acts at all bins alike. It is fitted and
+    taken off, as it would correlate the residuals of all lines.
+    """
+    kinds = (s.lines, s.between.ravel(), s.harmonics)
+    bins = np.concatenate(kinds)
+    G, T = model.responses(theta, s.rate * bins)
+    e = s.outputs[bins] - np.einsum("kpm,km->kp", G, s.currents[bins])
+    fitted = len(bins) - len(s.harmonics)
+    rows = (T[:fitted] * s.weight[:, None]).reshape(-1, T.shape[2])
+    size = np.linalg.norm(rows, axis=0)
+    rows = rows / np.where(size > 0, size, 1.0)
+    right = (e[:fitted] * s.weight).ravel()
+    normal, moments = (rows.conj().T @ rows).real, (rows.conj().T @ right).real
+    c = np.linalg.lstsq(normal, moments, rcond=1e-12)[0] / np.where(size > 0, size, 1.0)
+    e = e - T @ c
+    lines, between, harmonics = np.split(e, np.cumsum([len(kind) for kind in kinds])[:2])
+    return Residuals(lines, between.reshape(*s.between.shape, -1), harmonics)
+
+
+def _covariances(between: ComplexArray) -> tuple[ComplexArray, FloatArray]:
+    """Covariances of e at the lines, from the bins between them, and the number of bins behind each."""
+    each = np.einsum("kma,kmb->kab", between, between.conj())
+    sums = np.concatenate([np.zeros_like(each[:1]), each.cumsum(axis=0)])
+    k = np.arange(len(each))
+    first, last = np.maximum(k - WINDOW, 0), np.minimum(k + WINDOW + 1, len(each))
+    counts = between.shape[1] * (last - first)
+    return (sums[last] - sums[first]) / counts[:, None, None], counts.astype(float)
+
+
+def _whitened(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexArray:
+    """Residuals at the lines in standard deviations, lines x p; squares sum up to chi2 with twice as many entries.
+
+    The inverse of a covariance that is estimated from n bins is too large by n / (n - p).
+    """
+    e = _residuals(model, s, theta)
+    C, counts = _covariances(e.between)
+    p = C.shape[1]
+    white = np.linalg.solve(np.linalg.cholesky(C), e.lines[..., None])[..., 0]
+    return np.asarray(white * np.sqrt((counts - p) / counts)[:, None])
+
+
+def _information(model: ResponseModel, s: Spectrum) -> FloatArray:
+    """The Fisher information at the start, with the noise that the start leaves between the lines."""
+    C, _ = _covariances(_residuals(model, s, model.start).between)
+    variance = np.einsum("kpp->kp", C).real
+    power = (np.abs(s.outputs[s.lines]) ** 2 / variance).max(axis=1)
+    if np.median(power) < QUIET:
+        raise CheckError(
+            f"{s.source}: the excitation does not rise above the noise: at half of the lines the outputs move by "
+            f"less than {np.sqrt(np.median(power)):.2g} standard deviations"
+        )
+    slopes = model.slopes(model.start, s.rate * s.lines)
+    return information(slopes, s.currents[s.lines], variance)
+
+
+def _require_identifiable(model: ResponseModel, F: FloatArray, source: str) -> None:
+    """Raise CheckError where parameters are not told, alone or together, and say which combination it is."""
+    if not model.names:
+        raise CheckError(f"{source}: no parameter is told by this log to 20 %: name some, or excite more")
+    blind = [name for name, f in zip(model.names, np.diag(F), strict=True) if f <= 0]
+    if blind:
+        raise CheckError(f"{source}: {' '.join(blind)} do not act on the response at all")
+    values, vectors = np.linalg.eigh(F)
+    if values[0] > 1 / LOST**2 and values[0] > 1e-12 * values[-1]:
+        return
+    along = vectors[:, 0] / vectors[np.abs(vectors[:, 0]).argmax(), 0]
+    parts = [(n, a) for n, a in zip(model.names, along, strict=True) if abs(a) > 0.02]
+    text = ", ".join(f"{name} {100 * a:+.0f} %" for name, a in parts)
+    if len(parts) == 1:
+        raise CheckError(f"{source}: {parts[0][0]} is not told by this log: excite more, or name it as known")
+    if all(abs(a - 1) < 0.02 for _, a in parts):
+        one = next((n for n, _ in parts if units_of_model(model.plant)[n] == "kg"), parts[0][0])
+        names = " ".join(name for name, _ in parts)
+        raise CheckError(
+            f"{source}: only ratios of {names} are identifiable: all of them larger by one factor make the same "
+            f"response. Name one as known, as --known {one}={_starting(model, one):g}"
+        )
+    raise CheckError(
+        f"{source}: these parameters are not identifiable together: {text} make the same response. Name one as known"
+    )
+
+
+def _starting(model: ResponseModel, name: str) -> float:
+    return float(model.start[model.names.index(name)])
+
+
+def _estimate(model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str, float]) -> Identified:
+    """The most likely parameters, their covariance, and how white the residuals are."""
+    scale, start = model.scale, model.start
+
+    def residuals(moved: FloatArray) -> FloatArray:
+        try:
+            e = np.sqrt(2) * _whitened(model, s, start + scale * moved).ravel()
+        except (np.linalg.LinAlgError, ValueError):
+            return np.full(2 * s.lines.size * s.outputs.shape[1], 1e6)
+        return np.concatenate([e.real, e.imag])
+
+    found = least_squares(residuals, np.zeros(len(scale)), method="lm", x_scale="jac", xtol=1e-7)
+    theta = start + scale * found.x
+    white = _whitened(model, s, theta)
+    dof = 2 * white.size - len(scale)
+    chi2 = float(2 * (np.abs(white) ** 2).sum() / dof)
+    spread = max(1.0, chi2)
+    slopes_of_e = np.asarray(found.jac)
+    covariance = spread * np.linalg.pinv(slopes_of_e.T @ slopes_of_e) * np.outer(scale, scale)
+    outputs = (np.abs(white) ** 2).mean(axis=0).tolist()
+    par, plant = model.plant.parameters, model.plant
+    others = replace(model, names=tuple(n for n in acting(plant) if n not in model.names))
+    slopes = others.slopes(others.start, s.rate * s.lines)
+    held = {n: float(getattr(par, n)) for n, slope in zip(others.names, slopes, strict=True) if slope.any()}
+    return Identified(
+        log=log,
+        plant=_changed(plant, dict(zip(model.names, theta.tolist(), strict=True))),
+        names=model.names,
+        values=theta,
+        start=start,
+        covariance=covariance,
+        held=held,
+        chi2=chi2,
+        limit=float(SLACK * chi2_distribution.isf(LIKELY, dof) / dof),
+        dof=dof,
+        whiteness=_whiteness(white, s),
+        distortion=_distortion(model, s, theta),
+        by_output=dict(zip([o.name for o in plant.outputs], outputs, strict=True)),
+        dropped=dropped,
+    )
+
+
+def _whiteness(white: ComplexArray, s: Spectrum) -> float:
+    """The correlation of neighbouring lines of one axis, over its standard deviation where they are independent."""
+    total, count = 0.0, 0
+    for axis in np.unique(s.axis):
+        own = white[s.axis == axis] / s.turn[s.axis == axis][:, None]
+        total += float((own[1:].conj() * own[:-1]).real.sum())
+        count += own[1:].size
+    return total / float(np.sqrt(max(count, 1) / 2))
+
+
+def _distortion(model: ResponseModel, s: Spectrum, theta: FloatArray) -> float:
+    """The mean power of e at harmonics that were not excited, over that of the noise; NaN where there are none."""
+    if not len(s.harmonics):
+        return float("nan")
+    e = _residuals(model, s, theta)
+    C, _ = _covariances(e.between)
+    nearest = np.abs(s.lines - s.harmonics[:, None]).argmin(axis=1)
+    solved = np.linalg.solve(C[nearest], e.harmonics[..., None])[..., 0]
+    return float((e.harmonics.conj() * solved).real.sum() / e.harmonics.size)

@@ -1,0 +1,170 @@
+"""What one stroke teaches about the next: the thrust that the drive makes of a command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from malta.display import Description, display
+from malta.errors import CheckError, InputError
+from malta.identification.log import Log
+from malta.model.data import plant_of
+from malta.model.parameters import symbolic_names
+from malta.simulation.engines import evaluate
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray, Plant
+    from malta.synthesis.controller import Controller
+
+SMALLEST = 0.05  # of the thrust's limit, that a stroke has to take
+FACTORS = (0.5, 2.0)  # of the thrust, beyond which something else is wrong
+
+
+@display
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """What a stroke taught.
+
+    factor : command that was needed over the command that the law's machine needs; above 1 where the drive is weaker
+    deviation : standard deviation of the factor by the noise of the position sensor
+    parameter : the force constant of the thrust, by name
+    before, after : its value in the gain file, and the value that the log tells, SI
+    controller : the law with that value
+    """
+
+    factor: float
+    deviation: float
+    parameter: str
+    before: float
+    after: float
+    controller: Controller
+
+    @property
+    def description(self) -> Description:
+        """The factor and the force constant."""
+        rows = (
+            (
+                "thrust",
+                f"{self.factor:.4f} +- {1.96 * self.deviation:.2g} times the command that was expected",
+            ),
+            (self.parameter, f"{self.before:.5g} -> {self.after:.5g}"),
+        )
+        return Description(f"Learned for {self.controller.name!r}", rows)
+
+
+def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
+    """Learn one factor of the thrust from the log of a stroke, and write it into what the law believes.
+
+        g = sum of (f - v0) a_ref / (m sum of z'' a_ref)
+
+    with the thrust f that the law believes the measured currents to make (without currents in the log: its command),
+    the force v0(z) that holds the mover at its reading, and the acceleration a_ref of the reference, which is an
+    instrument: neither noise nor the error of the stroke biases g. The sum of z'' a_ref is that of z a_ref'', by parts.
+    The law commutates with a force constant K, and its filter predicts from the force that it believes to send; so
+    K / g corrects both, where another inertia in the feedforward corrects only one.
+
+    controller : the gain file that flew
+    log : of a stroke
+    parameter : the force constant of the thrust; "": found by its effect on the machine
+
+    Returns a Learned; its controller has the new constant.
+
+    Raises InputError for a machine without a stroke, and for a log without one; CheckError for a factor out of reason.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/robust.json")
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> weak = plant.variant(type(plant.parameters)(**{**vars(plant.parameters), "K_D": 4.68}))  # 10 % less
+    >>> stroke = malta.Scenario.stroke(10e-3, noise=1.0)
+    >>> found = malta.learn(controller, malta.log_of(malta.simulate(weak, controller, stroke)))
+    >>> found.parameter, f"{found.factor:.2f}"
+    ('K_D', '1.11')
+    """
+    believed = plant_of(controller.parameters)
+    if not believed.has_stroke:
+        raise InputError(
+            "learn", "machine", f"a {believed.name}, which has no stroke", "a machine with a stroke"
+        )
+    name = parameter or thrust_constant(believed)
+    if name not in symbolic_names(believed.parameters):
+        known = " ".join(symbolic_names(believed.parameters))
+        raise InputError("learn", name, "an unknown parameter", f"one of {known}")
+    a, curved, along, beyond = _stroke(controller, believed, log)
+    m = believed.mass
+    factor = float(beyond @ a / (m * (1 + along) * (a @ a)))
+    noise = float(np.array(believed.noise)[believed.stroke_output])
+    deviation = factor * noise * float(np.linalg.norm(curved)) / float(a @ a)
+    if not FACTORS[0] < factor < FACTORS[1]:
+        found = f"{log.source}: the stroke took {factor:.3g} times the thrust that was expected"
+        raise CheckError(f"{found}: more than a force constant is wrong")
+    before = float(getattr(believed.parameters, name))
+    par: Any = replace(controller.parameters, **{name: before / factor})
+    taught = replace(controller, name=f"{controller.name}_learned", parameters=par)
+    return Learned(factor, deviation, name, before, before / factor, taught)
+
+
+def thrust_constant(plant: Plant) -> str:
+    """The parameter that scales the thrust of a current and no other force. Raises InputError where there is none."""
+    own, k = np.array(plant.actuator.force_constant), plant.thrust_input
+    for name in symbolic_names(plant.parameters):
+        value = float(getattr(plant.parameters, name))
+        if not value or not len(own):
+            continue
+        try:
+            par: Any = replace(plant.parameters, **{name: 1.01 * value})
+            ratio = np.array(plant.variant(par).actuator.force_constant) / own
+        except (InputError, CheckError):  # a value that the machine cannot have
+            continue
+        wanted = np.where(np.arange(len(own)) == k, 1.01, 1.0)
+        if np.allclose(ratio, wanted, rtol=1e-9):
+            return name
+    raise InputError(
+        "learn", "parameter", "no parameter that scales the thrust alone", "its name: --parameter"
+    )
+
+
+def _stroke(
+    controller: Controller, believed: Plant, log: Log
+) -> tuple[FloatArray, FloatArray, float, FloatArray]:
+    """a_ref (m/s2), a_ref'' (m/s4), the part of z'' - a_ref along a_ref as a share of it, and f - v0 (N).
+
+    Raises InputError for a log without a stroke, and CheckError for missing samples.
+    """
+    stroke, thrust, Ts = believed.stroke, believed.thrust_input, controller.sample_time
+    z_ref, z = log.table("reference", [stroke])[:, 0], log.table("y", [stroke])[:, 0]
+    f = _thrust(believed, log)
+    if not (np.isfinite(z).all() and np.isfinite(f).all()) or log.survey.gaps:
+        raise CheckError(f"{log.source}: samples are missing")
+    t = Ts * np.arange(len(z_ref))
+    spline = make_interp_spline(t, z_ref, k=5)
+    a = spline(t, 2)
+    largest = float(np.abs(a).max())
+    if believed.mass * largest < SMALLEST * controller.limits.force[thrust]:
+        found = f"{largest:.3g} m/s2 at most in ref.{stroke}"
+        raise InputError(log.source, "reference", found, "a stroke that takes 5 % of the thrust's limit")
+    # By parts: a_ref and its slope vanish at both ends of a stroke.
+    curved = make_interp_spline(t, a, k=5)(t, 2)
+    along = float((z - z_ref) @ curved / (a @ a))
+    table = controller.feedforward
+    return a, curved, along, f - np.interp(z, table.z_grid, table.v0[:, thrust])
+
+
+def _thrust(believed: Plant, log: Log) -> FloatArray:
+    """The thrust that the law believes the measured currents to make, N; its command where no current is measured."""
+    if believed.windings is None or not log.names("i"):
+        return np.asarray(log.table("v", [believed.thrust])[:, 0])
+    axes = [s.name for s in believed.drive.axes]
+    whole = np.zeros((log.samples, len(axes)))
+    for k, name in enumerate(log.names("i")):
+        if name not in axes:
+            raise InputError(
+                log.source, name, "a current that the machine has not", "one of " + " ".join(axes)
+            )
+        whole[:, axes.index(name)] = log.columns["i"][:, k]
+    i = ca.SX.sym("i", len(axes))
+    force = ca.Function("force", [i], [ca.densify(believed.drive.force(i)[believed.thrust_input])])
+    return evaluate(force.map(len(whole)), whole)[0][:, 0]

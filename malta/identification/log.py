@@ -1,0 +1,505 @@
+"""Logs of a bench: what sensors, commands and excitation were, sample by sample, in files that other programs read."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from scipy.signal import lfilter
+
+from malta.archives import read_npz
+from malta.display import Description, display, quantity
+from malta.errors import InputError
+from malta.files import read_file, replace_files
+from malta.gains.mat import read_mat
+from malta.model.plant import Signal, readonly
+from malta.simulation.current_control import reading_errors
+from malta.simulation.excitation import Multisine
+from malta.simulation.layout import Loop
+from malta.simulation.prepared import prepare
+from malta.units import to_si
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+    from malta.simulation.trajectory import Trajectory
+
+VERSION = 1
+LARGEST = 2_000_000_000  # bytes of a log
+SUFFIXES = (".csv", ".npz", ".mat")
+GROUPS = {"y": "", "v": "", "i": "", "u": "", "reference": "ref.", "excitation": "exc.", "flags": "flag."}
+"""The groups of columns, and what stands before the signal's name in a heading."""
+TEXTS = ("machine", "controller")  # of a file's head; sample_time and period are numbers, s
+
+
+@display
+@dataclass(frozen=True, eq=False)
+class Log:
+    """A log of a machine under control: k samples, SI, as sensors read them; NaN where a reading is missing.
+
+    source : the file or the run, as errors name it
+    machine : its name; "" where the file does not say
+    controller : the name of the law; likewise
+    sample_time : s
+    period : of the excitation, s; 0: none, or not periodic
+    t : k, s
+    columns : by group: y (measured outputs), v (commanded forces), i (measured currents), u (commanded voltages),
+        reference, excitation (forces beside the law's) and flags (1 while a limit is reached); k x signals each
+    signals : by group: the names and units of its columns
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/robust.json")
+    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(noise=1.0))
+    >>> log = malta.log_of(run)
+    >>> log.samples, log.names("y"), log.columns["i"].shape[1]
+    (2000, ['x1', 'y1', 'x2', 'y2', 'z'], 12)
+    """
+
+    source: str
+    machine: str
+    controller: str
+    sample_time: float
+    period: float
+    t: FloatArray
+    columns: Mapping[str, FloatArray]
+    signals: Mapping[str, tuple[Signal, ...]]
+    sha256: str = field(default="")
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "t", readonly(self.t))
+        object.__setattr__(self, "columns", {name: readonly(table) for name, table in self.columns.items()})
+
+    @property
+    def samples(self) -> int:
+        """Their number."""
+        return len(self.t)
+
+    def names(self, group: str) -> list[str]:
+        """The names of a group's signals; none of a group that the log has not."""
+        return [signal.name for signal in self.signals.get(group, ())]
+
+    def table(self, group: str, names: list[str]) -> FloatArray:
+        """The columns of a group by name, k x names. Raises InputError for a signal that the log lacks."""
+        known = self.names(group)
+        for name in names:
+            if name not in known:
+                raise InputError(
+                    self.source, GROUPS[group] + name, "no such column", f"one of {group}: {known}"
+                )
+        return np.asarray(self.columns[group][:, [known.index(name) for name in names]])
+
+    @cached_property
+    def survey(self) -> Survey:
+        """Statistics of its signals and what is wrong with its samples."""
+        return survey(self)
+
+    @property
+    def description(self) -> Description:
+        """Its length, its signals and what is wrong with it."""
+        found = self.survey
+        rows = [
+            ("of", f"{self.machine or 'an unnamed machine'} under {self.controller or 'an unnamed law'}"),
+            ("samples", f"{self.samples} of {quantity(self.sample_time, 's')}"),
+            ("excitation", f"with a period of {self.period:g} s" if self.period else "none that is periodic"),
+        ]
+        rows += [(group, " ".join(self.names(group))) for group in GROUPS if self.names(group)]
+        rows.append(("findings", "; ".join(found.findings) or "none"))
+        return Description(f"Log {self.source!r}", tuple(rows))
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a log shows at a first look.
+
+    statistics : by heading "name [unit]": least, mean, largest value and standard deviation, SI; missing ones apart
+    jitter : s, standard deviation of the intervals between samples
+    gaps : intervals longer than 1.5 samples
+    missing : by signal: readings that are not there
+    stuck : by measured output: the longest run of one and the same reading, samples, where it is suspicious
+    clipped : by measured output: samples at the end of its range, where they pile up
+    limits : by flag: share of the samples in which it was set
+    """
+
+    statistics: Mapping[str, tuple[float, float, float, float]]
+    jitter: float
+    gaps: int
+    missing: Mapping[str, int]
+    stuck: Mapping[str, int]
+    clipped: Mapping[str, int]
+    limits: Mapping[str, float]
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What is wrong, in words."""
+        found = [f"{self.gaps} gaps"] if self.gaps else []
+        found += [f"{count} readings of {name} missing" for name, count in self.missing.items()]
+        found += [f"{name} stuck for {count} samples" for name, count in self.stuck.items()]
+        found += [f"{name} clipped in {count} samples" for name, count in self.clipped.items()]
+        return (
+            *found,
+            *(f"{name} in {100 * share:.3g} % of the time" for name, share in self.limits.items()),
+        )
+
+
+STUCK = 0.02  # of a log, for which a sensor may read the same
+FEWEST = 200  # samples of a reading that is called stuck
+PILE = 0.002  # of a log at an end of a sensor's range
+STEEP = 4.0  # times as many readings at the end as beside it
+SOME = 5  # different readings, without which a sensor has no range
+
+
+def survey(log: Log) -> Survey:
+    """The statistics of a log and what is wrong with its samples."""
+    statistics: dict[str, tuple[float, float, float, float]] = {}
+    missing: dict[str, int] = {}
+    for group, table in log.columns.items():
+        for signal, values in zip(log.signals[group], table.T, strict=True):
+            there = values[np.isfinite(values)]
+            if len(there) < len(values):
+                missing[GROUPS[group] + signal.name] = len(values) - len(there)
+            numbers = (there.min(), there.mean(), there.max(), there.std()) if len(there) else (np.nan,) * 4
+            heading = f"{GROUPS[group]}{signal.name} [{signal.unit}]"
+            statistics[heading] = tuple(map(float, numbers))  # type: ignore[assignment]
+    steps = np.diff(log.t)
+    near = steps[steps < 1.5 * log.sample_time]
+    stuck, clipped = {}, {}
+    for signal, values in zip(log.signals.get("y", ()), log.columns["y"].T, strict=True):
+        longest, piled = _longest_run(values), _piled(values)
+        if longest >= max(FEWEST, STUCK * len(values)):
+            stuck[signal.name] = longest
+        elif piled:
+            clipped[signal.name] = piled
+    flags = zip(log.names("flags"), log.columns.get("flags", np.zeros((1, 0))).mean(axis=0), strict=True)
+    return Survey(
+        statistics,
+        jitter=float(near.std()) if len(near) else 0.0,
+        gaps=len(steps) - len(near),
+        missing=missing,
+        stuck=stuck,
+        clipped=clipped,
+        limits={name: float(share) for name, share in flags if share},
+    )
+
+
+def _longest_run(values: FloatArray) -> int:
+    """The number of samples of the longest run of one value."""
+    changes = np.flatnonzero(np.diff(values) != 0)
+    return int(np.diff(np.concatenate([[-1], changes, [len(values) - 1]])).max(initial=0))
+
+
+def _piled(values: FloatArray) -> int:
+    """The number of samples at an end of the range where many more pile up than beside it; 0: none do."""
+    levels, count = np.unique(values[np.isfinite(values)], return_counts=True)
+    if len(levels) < SOME:
+        return 0
+    ends = ((count[0], count[1]), (count[-1], count[-2]))
+    return int(sum(end for end, next_ in ends if end > max(PILE * len(values), STEEP * next_)))
+
+
+def log_of(run: Trajectory) -> Log:
+    """The log that a bench would write of a simulated run: what is measured and sent, and nothing of the truth.
+
+    run : a run. Currents are those of the axes that the drive's sensors read, with their noise, offset and steps; of a
+        machine without a model of its windings, those of the coils.
+
+    Returns a Log.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(noise=1.0))
+    >>> malta.log_of(run).names("flags")[-1]
+    'current_limit'
+    """
+    plant, scenario = run.plant, run.scenario
+    axes = plant.actuator.coils if not run.i.size else plant.drive.axes
+    excitation = np.zeros_like(run.v) if scenario.excitation is None else scenario.excitation(run.t)
+    flags = (np.hstack([run.saturated, run.met]) > 0).astype(float)
+    limits = [Signal(f"{s.name}_limit", "1") for s in plant.inputs]
+    met = [Signal("current_limit" if k == 0 else f"limit_{k}", "1") for k in range(run.met.shape[1])]
+    columns = {"y": run.y, "v": run.v, "i": _read_currents(run), "u": run.u}
+    columns |= {"reference": run.reference, "excitation": excitation, "flags": flags}
+    voltages = tuple(Signal(s.name.replace("i_", "u_", 1), "V") for s in axes)
+    signals = {
+        "y": plant.outputs,
+        "v": plant.inputs,
+        "i": axes,
+        "u": voltages if run.u.size else (),
+        "reference": plant.outputs,
+        "excitation": plant.inputs,
+        "flags": (*limits, *met),
+    }
+    period = scenario.excitation.period if isinstance(scenario.excitation, Multisine) else 0.0
+    Ts, names = run.controller.sample_time, (plant.name, run.controller.name)
+    return Log(f"run {scenario.name}", *names, Ts, period, run.t, columns, signals)
+
+
+def _read_currents(run: Trajectory) -> FloatArray:
+    """The currents as they are measured at the samples, A."""
+    plant, c = run.plant, run.controller
+    if not run.i.size:
+        return _lagging_currents(run)
+    ready = prepare(plant, c, run.scenario)
+    setup = ready.simulation.setup
+    if not setup.current_sensors:
+        return run.i
+    x, i = ca.SX.sym("x", run.x.shape[1]), ca.SX.sym("i", run.i.shape[1])
+    phases = ca.SX.sym("i_phase", run.i_phase.shape[1])
+    noise = ca.SX.sym("noise", len(plant.drive.phases))
+    loop = Loop(plant, c, setup, {})
+    errors = reading_errors(loop, {"x": x, "i": i, "i_phase": phases}, noise)
+    read = ca.Function("read", [x, i, phases, noise], [i + plant.drive.to_axes(x) @ errors])
+    k = len(run.t)
+    drawn = ready.noise[:k, len(plant.outputs) :]
+    return np.array(read.map(k)(run.x.T, run.i.T, run.i_phase.T, drawn.T)).T
+
+
+def _lagging_currents(run: Trajectory) -> FloatArray:
+    """Currents of the coils behind their commands: delayed, and lagging by the crossover of the current loops."""
+    actuator, Ts = run.plant.actuator, run.controller.sample_time
+    delay = actuator.delay(Ts) if run.scenario.delay is None else run.scenario.delay
+    held = np.vstack([np.repeat(run.current[:1], delay, axis=0), run.current])[: len(run.current)]
+    if not np.isfinite(actuator.crossover):
+        return np.asarray(held)
+    decay = float(np.exp(-actuator.crossover * Ts))
+    first = decay * held[:1]
+    return np.asarray(lfilter([0, 1 - decay], [1, -decay], held, axis=0, zi=first)[0])
+
+
+def without_idle(log: Log) -> Log:
+    """The log without columns of currents and voltages that are zero throughout."""
+    columns, signals = dict(log.columns), dict(log.signals)
+    for group in ("i", "u"):
+        table = columns.get(group, np.zeros((0, 0)))
+        used = [k for k in range(table.shape[1]) if table[:, k].any()]
+        columns[group], signals[group] = table[:, used], tuple(signals.get(group, ())[k] for k in used)
+    return replace(log, columns=columns, signals=signals)
+
+
+def write_log(log: Log, path: str | Path) -> Path:
+    """Write a log as .csv, .npz or .mat; docs/formats/log.md describes the files.
+
+    log : what to write
+    path : the suffix chooses the encoding
+
+    Returns the path. Raises InputError for another suffix, and for a file that cannot be written.
+
+        malta.write_log(malta.log_of(run), "stand.npz")
+    """
+    path = Path(path)
+    _require_suffix(path)
+    log = without_idle(log)
+    encode: Callable[[Log], bytes] = {".csv": _to_csv, ".npz": _to_npz, ".mat": _to_mat}[path.suffix]
+    replace_files({path: encode(log)})
+    return path
+
+
+def _require_suffix(path: Path) -> None:
+    if path.suffix not in SUFFIXES:
+        raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
+
+
+def _headings(log: Log, group: str) -> list[str]:
+    return [f"{s.name} [{s.unit}]" for s in log.signals.get(group, ())]
+
+
+def _to_csv(log: Log) -> bytes:
+    """A head of comments, a line of headings, and a line a sample."""
+    present = [group for group in GROUPS if log.names(group)]
+    head = [f"# malta log {VERSION}", f"# machine {log.machine}", f"# controller {log.controller}"]
+    head += [f"# sample_time {log.sample_time!r} s", f"# period {log.period!r} s"]
+    head.append(",".join(["t [s]", *(GROUPS[g] + name for g in present for name in _headings(log, g))]))
+    buffer = io.StringIO()
+    buffer.write("\n".join(head) + "\n")
+    table = np.column_stack([log.t, *(log.columns[group] for group in present)])
+    sent = ("reference", "excitation")  # with all digits: they are differentiated
+    formats = ["%.12g", *("%.17g" if g in sent else "%.9g" for g in present for _ in log.names(g))]
+    np.savetxt(buffer, table, fmt=formats, delimiter=",")
+    return buffer.getvalue().encode()
+
+
+def _arrays(log: Log) -> dict[str, Any]:
+    """What the binary files hold."""
+    arrays: dict[str, Any] = {"malta_log": np.array([VERSION]), "t": log.t}
+    arrays |= {"sample_time": np.array([log.sample_time]), "period": np.array([log.period])}
+    for group in GROUPS:
+        if log.names(group):
+            arrays |= {group: log.columns[group], f"{group}_columns": np.array(_headings(log, group))}
+    return arrays
+
+
+def _to_npz(log: Log) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, machine=np.array([log.machine]), controller=np.array([log.controller]), **_arrays(log))
+    return buffer.getvalue()
+
+
+def _to_mat(log: Log) -> bytes:
+    from scipy.io import savemat
+
+    buffer: Any = io.BytesIO()  # any: scipy's stubs know only file names
+    arrays = {k: a.astype(object) if a.dtype.kind == "U" else a for k, a in _arrays(log).items()}
+    arrays |= {"machine": log.machine, "controller": log.controller, "t": log.t[:, None]}
+    savemat(buffer, arrays)
+    return bytes(buffer.getvalue())
+
+
+def read_log(path: str | Path) -> Log:
+    """Read a log: a .csv, .npz or .mat of malta, or a .csv of another program with headings "name [unit]".
+
+    path : the file. Units are converted to SI; a cell that is empty or no number is a missing reading.
+
+    Returns a Log. Signals of headings without a prefix are found by their unit when the log is used: positions and
+    angles are measured outputs, forces and torques commands, currents and voltages those of the axes.
+
+    Raises InputError: no such file, another suffix, damage, headings that are no "name [unit]", times that do not rise.
+
+        log = malta.read_log("stand.csv")
+    """
+    path = Path(path)
+    _require_suffix(path)
+    content = read_file(path, "log", Path.read_bytes, LARGEST)
+    decode = {".csv": _from_csv, ".npz": _from_npz, ".mat": _from_mat}[path.suffix]
+    head, t, tables, headings = decode(content, path)
+    if len(t) < 2 or not (np.diff(t) > 0).all():
+        raise InputError(path, "t", "times that do not rise", "the times of the samples, in order")
+    columns, signals = {}, {}
+    for group in tables:
+        columns[group], signals[group] = _in_si(tables[group], headings[group], path)
+    if "y" not in columns:
+        raise InputError(path, "y", "no measured outputs", "columns of positions, as x1 [m]")
+    Ts = float(head.get("sample_time") or np.median(np.diff(t)))
+    names = (str(head.get("machine", "")), str(head.get("controller", "")))
+    period = float(head.get("period") or 0.0)
+    return Log(str(path), *names, Ts, period, t, columns, signals, sha256(content).hexdigest())
+
+
+Decoded = tuple[dict[str, Any], "FloatArray", dict[str, "FloatArray"], dict[str, list[str]]]
+"""What a file holds: its head, t, and by group a table and its headings."""
+
+
+def _from_csv(content: bytes, path: Path) -> Decoded:
+    """The head, times, tables and headings of a .csv."""
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(path, "", "bytes that are no text", "UTF-8") from error
+    lines = text.split("\n", 40)
+    comments = [line[1:].split() for line in lines if line.startswith("#")]
+    head: dict[str, Any] = {words[0]: words[1] for words in comments if len(words) > 1}
+    first = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), None)
+    if first is None:
+        raise InputError(path, "", "no line of headings", 'a line as "t [s],x1 [um],..."')
+    names = [name.strip() for name in lines[first].split(",")]
+    try:
+        rows = io.StringIO(text)
+        if re.search(r",\s*(,|$)", text, re.M):  # empty cells: missing readings
+            values = np.genfromtxt(rows, delimiter=",", skip_header=first + 1)
+        else:
+            values = np.loadtxt(rows, delimiter=",", skiprows=first + 1, comments=None, ndmin=2)
+    except ValueError as error:
+        raise InputError(path, "", f"a line that cannot be read ({str(error)[:80]})", "numbers") from error
+    if values.ndim != 2 or values.shape[1] != len(names):
+        raise InputError(path, "", f"{values.shape[-1]} cells in a line", f"{len(names)}, as headings")
+    if names[0].split()[0] != "t":
+        raise InputError(path, names[0], "the first column", "t [s]")
+    places: dict[str, list[int]] = {}
+    for k, name in enumerate(names[1:], start=1):
+        group = _group_of(name, path)
+        places.setdefault(group, []).append(k)
+    scale = to_si(1.0, _parts(names[0], path)[1], "s", path, "t")
+    tables = {group: values[:, found] for group, found in places.items()}
+    headings = {
+        group: [names[k].removeprefix(GROUPS[group]) for k in found] for group, found in places.items()
+    }
+    return head, values[:, 0] * scale, tables, headings
+
+
+def _group_of(heading: str, path: Path) -> str:
+    """The group of a column of a .csv by its prefix, or by its unit."""
+    for group, prefix in GROUPS.items():
+        if prefix and heading.startswith(prefix):
+            return group
+    name, unit = _parts(heading, path)
+    for si_unit, group in (("m", "y"), ("rad", "y"), ("N", "v"), ("N m", "v"), ("A", "i"), ("V", "u")):
+        try:
+            to_si(1.0, unit, si_unit, path, name)
+        except InputError:
+            continue
+        return group
+    raise InputError(path, heading, f"unit {unit!r}", "m, rad, N, N m, A or V, or a prefix as ref. or flag.")
+
+
+def _parts(heading: str, path: Path) -> tuple[str, str]:
+    """Name and unit of a heading."""
+    name, bracket, rest = heading.partition("[")
+    if not bracket or not rest.endswith("]") or not name.strip():
+        raise InputError(path, heading, "a heading without unit", 'one as "x1 [um]"')
+    return name.strip(), rest[:-1].strip()
+
+
+SI_UNITS = ("m", "rad", "N", "N m", "A", "V", "1")
+
+
+def _in_si(table: FloatArray, headings: list[str], path: Path) -> tuple[FloatArray, tuple[Signal, ...]]:
+    """A table in SI, and its signals."""
+    table, signals = np.array(table, dtype=float), []
+    for k, heading in enumerate(headings):
+        name, unit = _parts(heading, path)
+        for si_unit in SI_UNITS:
+            try:
+                factor = to_si(1.0, unit, si_unit, path, name)
+            except InputError:
+                continue
+            table[:, k] *= factor
+            signals.append(Signal(name, si_unit))
+            break
+        else:
+            raise InputError(path, heading, f"unit {unit!r}", "one of " + ", ".join(SI_UNITS))
+    return table, tuple(signals)
+
+
+def _from_npz(content: bytes, path: Path) -> Decoded:
+    try:
+        arrays = read_npz(content)
+    except ValueError as error:
+        found = f"a file that numpy cannot read safely ({error})"
+        raise InputError(path, "", found, "an .npz archive, not compressed") from error
+    return _from_arrays(arrays, path)
+
+
+def _from_mat(content: bytes, path: Path) -> Decoded:
+    try:
+        given = read_mat(content)
+    except ValueError as error:
+        raise InputError(path, "", f"a damaged file ({error})", "a MAT-file of version 5") from error
+    arrays = {
+        name: np.array(value) if isinstance(value, str | list) else value for name, value in given.items()
+    }
+    if "t" in arrays:
+        arrays["t"] = np.ravel(arrays["t"])
+    return _from_arrays(arrays, path)
+
+
+def _from_arrays(arrays: Mapping[str, Any], path: Path) -> Decoded:
+    """Head, times, tables and headings of the arrays of a file; also those of a run of `malta simulate --out`."""
+    head = {name: np.ravel(arrays[name])[0] for name in (*TEXTS, "sample_time", "period") if name in arrays}
+    t = arrays.get("t", np.zeros(0))
+    tables, headings = {}, {}
+    for group in GROUPS:
+        if group not in arrays:
+            continue
+        table, names = arrays[group], arrays.get(f"{group}_columns")
+        if names is None or names.dtype.kind != "U":
+            raise InputError(path, f"{group}_columns", "no headings", f"those of {group}")
+        if table.dtype.kind not in "fiub" or table.shape != (len(t), len(names)):
+            found = f"an array of {table.dtype}, {table.shape}"
+            raise InputError(path, group, found, f"numbers, ({len(t)}, {len(names)})")
+        tables[group], headings[group] = table, [str(name) for name in names]
+    return head, np.asarray(t, dtype=float), tables, headings

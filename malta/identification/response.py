@@ -1,0 +1,213 @@
+"""The response of a machine from measured currents to measured outputs, in parameters by name.
+
+Between samples a current grows evenly from one measured value to the next (a first-order hold): voltages are held, and
+a sample is short against L / R. Then delay, current loops and law drop out, whatever they are, and what is left is
+
+    x' = f(x, forces(i), load(x)),   y = h(x)       linearized where the log was made, with the mean current there
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import expm
+
+from malta.errors import InputError
+from malta.model.parameters import symbolic_names, twins_of
+from malta.model.plant import Plant, symbolic
+from malta.model.sensors import with_lags
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray
+
+STEP = 1e-5  # of a scale: for derivatives by differences
+SCALES = {"1": 0.1, "m": 1e-3, "rad": 0.1, "s": 1e-4}  # of a parameter whose value is 0, SI
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseModel:
+    """A machine at a place, from some of its measured currents to its outputs, in parameters by name.
+
+    plant : the machine, with the values from which the parameters start
+    names : of the parameters: those of the machine's record, or errors of its sensors
+    currents : names of the measured currents
+    y : mean outputs, SI
+    i : mean currents, A
+    sample_time : s
+    """
+
+    plant: Plant
+    names: tuple[str, ...]
+    currents: tuple[str, ...]
+    y: FloatArray
+    i: FloatArray
+    sample_time: float
+
+    @cached_property
+    def start(self) -> FloatArray:
+        """The parameters' values in the machine's record, SI; errors of the sensors are 0."""
+        return np.array([float(getattr(self.plant.parameters, name, 0.0)) for name in self.names])
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """The size of a parameter, in which its accuracy is counted: its value, or a unit's where that is 0."""
+        units = units_of_model(self.plant)
+        sizes = [abs(v) or SCALES.get(units[n], 1.0) for n, v in zip(self.names, self.start, strict=True)]
+        return np.array(sizes)
+
+    def response(self, theta: FloatArray, w: FloatArray) -> ComplexArray:
+        """G from the sampled currents to the sampled outputs, k x p x currents.
+
+        theta : parameters, SI
+        w : k frequencies, rad/s
+        """
+        return self.responses(theta, w)[0]
+
+    def responses(self, theta: FloatArray, w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """The same G, and what a unit of each state leaves that a record has more at its end than at its begin.
+
+        The second one is k x p x states: over a record of N samples the coefficients of outputs and currents obey
+        Y = G I + T (x_0 - x_N) / N with the states x_0 and x_N at both ends.
+        """
+        A, B, C, late = (np.array(M) for M in self._matrices(theta))
+        n, m, Ts = len(A), B.shape[1], self.sample_time
+        held = np.isinf(self.plant.actuator.crossover)
+        whole = np.zeros((n + 2 * m,) * 2)
+        whole[:n, :n], whole[:n, n : n + m], whole[n : n + m, n + m :] = A, B, np.eye(m) / Ts
+        E = expm(whole * Ts)
+        at, growing = E[:n, n : n + m], E[:n, n + m :]
+        z = np.exp(1j * np.asarray(w) * Ts)[:, None, None]
+        into = at + 0 * z if held else (at - growing) + z * growing
+        ends = z * np.eye(n)
+        found = C @ np.linalg.solve(z * np.eye(n) - E[:n, :n], np.concatenate([into, ends], axis=2))
+        found *= np.exp(-1j * np.asarray(w) * late.item())[:, None, None]
+        return found[:, :, :m], found[:, :, m:]
+
+    def slopes(self, theta: FloatArray, w: FloatArray) -> ComplexArray:
+        """dG per parameter in units of its scale, parameters x k x p x currents, by central differences."""
+        steps = STEP * np.diag(self.scale)
+        return np.array(
+            [(self.response(theta + h, w) - self.response(theta - h, w)) / (2 * STEP) for h in steps]
+        )
+
+    @cached_property
+    def _matrices(self) -> ca.Function:
+        """Parameters -> A, B, C of the states of the design model and of lagging readings, and the dead time, s."""
+        plant, par = self.plant, self.plant.parameters
+        theta = ca.SX.sym("theta", len(self.names))
+        symbols = {name: theta[k] for k, name in enumerate(self.names)}
+        of_machine = {name: symbols[name] for name in self.names if name in symbolic_names(par)}
+        twins = {
+            n: symbols[twin] for n, twin in twins_of(par).items() if twin in symbols and n not in symbols
+        }
+        machine = plant.variant(symbolic(par, of_machine | twins))
+        errors = ca.vertcat(*(symbols.get(s.name, 0) for s in plant.sensor_errors))
+        x = ca.SX.sym("x", len(plant.states))
+        axes = plant.actuator.coils if plant.windings is None else plant.drive.axes
+        i = ca.SX.sym("i", len(axes))
+        forces = machine.forces(x, i) if plant.windings is None else machine.drive.force(i)
+        rate, read = machine.f(x, forces, machine.load(x)), machine.sense(x, errors)
+        keep, used = list(plant.controlled), self._places([s.name for s in axes])
+        blocks = (
+            ca.jacobian(rate, x)[keep, keep],
+            ca.jacobian(rate, i)[keep, used],
+            ca.jacobian(read, x)[:, keep],
+        )
+        late = 0 if machine.sensors is None else machine.sensors.dead_time
+        linear = [*with_lags(machine.sensors, *blocks), ca.SX(late)]
+        at = np.zeros(len(axes))
+        at[used] = self.i
+        here = ca.substitute(linear, [x, i], [ca.DM(self.place), ca.DM(at)])
+        return ca.Function("matrices", [theta], [ca.densify(M) for M in here])
+
+    @cached_property
+    def place(self) -> FloatArray:
+        """The states at rest at the mean outputs, all states."""
+        positions = np.array(ca.DM(self.plant.position_of(ca.DM(self.y)))).ravel()
+        x = np.zeros(len(self.plant.states))
+        x[list(self.plant.controlled)[: len(positions)]] = positions
+        return x
+
+    def _places(self, known: list[str]) -> list[int]:
+        for name in self.currents:
+            if name not in known:
+                raise InputError(
+                    "log", name, "a current that the machine has not", "one of " + " ".join(known)
+                )
+        return [known.index(name) for name in self.currents]
+
+
+def units_of_model(plant: Plant) -> dict[str, str]:
+    """The SI units of what may be a parameter of a response: fields of the record, and errors of the sensors."""
+    fields: dict[str, Any] = plant.parameters.__dataclass_fields__
+    units = {name: str(fields[name].metadata["unit"]) for name in symbolic_names(plant.parameters)}
+    return units | {s.name: s.unit for s in plant.sensor_errors}
+
+
+def require_parameters(plant: Plant, names: Sequence[str]) -> tuple[str, ...]:
+    """The names of parameters, each once. Raises InputError for unknown ones."""
+    known = units_of_model(plant)
+    for name in names:
+        if name not in known:
+            raise InputError("parameters", name, "an unknown parameter", "one of " + " ".join(known))
+    return tuple(dict.fromkeys(names))
+
+
+def acting(plant: Plant) -> tuple[str, ...]:
+    """The parameters of a machine that are not 0, twins apart."""
+    par, twins = plant.parameters, twins_of(plant.parameters)
+    return tuple(n for n in symbolic_names(par) if n not in twins and float(getattr(par, n)) != 0)
+
+
+def candidates(plant: Plant) -> tuple[str, ...]:
+    """The parameters that may be asked for where none are named: `acting` without masses and lengths.
+
+    Those are weighed and measured; and without one of them only ratios are told.
+    """
+    units = units_of_model(plant)
+    return tuple(name for name in acting(plant) if units[name] not in ("kg", "m"))
+
+
+def information(slopes: ComplexArray, inputs: ComplexArray, variance: FloatArray) -> FloatArray:
+    """The Fisher information of parameters in units of their scales.
+
+    F = 2 sum over k of Re (dG_k I_k)^H C^-1 (dG_k I_k)
+
+    slopes : parameters x k x p x currents
+    inputs : k x currents, Fourier coefficients of the currents
+    variance : k x p, of the noise of the outputs' Fourier coefficients
+    """
+    moved = np.einsum("nkpm,km->nkp", slopes, inputs) / np.sqrt(variance)
+    flat = moved.reshape(len(moved), -1)
+    return np.asarray(2 * (flat.conj() @ flat.T).real)
+
+
+def well_found(F: FloatArray, names: Sequence[str], share: float) -> list[int]:
+    """Indices of the parameters that are left when those with the largest standard deviation are dropped one by one.
+
+    share : of its scale, which no standard deviation exceeds in the end
+    """
+    left = [k for k in range(len(names)) if F[k, k] > 0]
+    while left:
+        sigma = deviations(F[np.ix_(left, left)])
+        worst = int(sigma.argmax())
+        if sigma[worst] <= share:
+            break
+        del left[worst]
+    return left
+
+
+def deviations(F: FloatArray) -> FloatArray:
+    """Standard deviations of all parameters together from their information; infinite for one that does not act."""
+    size = np.sqrt(np.diag(F))
+    found = np.full(len(F), np.inf)
+    act = size > 0
+    if act.any():
+        values, vectors = np.linalg.eigh(F[np.ix_(act, act)] / np.outer(size[act], size[act]))
+        found[act] = np.sqrt((vectors**2 / np.maximum(values, 1e-13)).sum(axis=1)) / size[act]
+    return found

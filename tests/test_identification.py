@@ -1,0 +1,253 @@
+"""Excitation, identification, learning: figures against the simulated truth, and every refusal."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from conftest import Run
+
+import malta
+from malta.identification.data_file import read_identified, write_data
+from malta.identification.excite import model_at, predicted_spectra
+from malta.simulation.excitation import interleaved_multisine
+
+if TYPE_CHECKING:
+    from malta.model.plant import Plant
+
+ROBUST = "design/gains/robust.json"
+TRUE = {"K_A": 9000.0, "K_B": 5.0, "K_D": 5.5}
+ASKED = ["K_A", "K_B", "K_D", "I_xx"]
+CONTROLLER = malta.gains.read(ROBUST)
+SHORT = {"period": 0.5, "periods": 4, "band": (4.0, 400.0)}
+
+
+@pytest.fixture(scope="module")
+def plant() -> Plant:
+    return malta.plant_of(CONTROLLER.parameters)
+
+
+@pytest.fixture(scope="module")
+def plan(plant: Plant) -> malta.ExcitationPlan:
+    return malta.excite(malta.loop(plant, CONTROLLER), **SHORT)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def log(plan: malta.ExcitationPlan) -> malta.Log:
+    return malta.log_of(excited(plan, TRUE))
+
+
+def changed(values: dict[str, float]) -> Plant:
+    par: Any = CONTROLLER.parameters
+    return malta.plant_of(replace(par, **values))
+
+
+def excited(plan: malta.ExcitationPlan, values: dict[str, float], **options: Any) -> malta.Trajectory:
+    scenario = malta.Scenario.excited(plan.signal, plan.duration, **options)
+    run = malta.simulate(changed(values), CONTROLLER, scenario)
+    assert run.verdict.completed
+    return run
+
+
+def with_columns(log: malta.Log, **tables: Any) -> malta.Log:
+    return replace(log, columns={**log.columns, **tables}, sha256="")
+
+
+def test_a_multisine_has_its_lines_and_no_others() -> None:
+    signal = interleaved_multisine(0.5, 4.0, 200.0, inputs=3, lines=10)
+    d = signal(np.arange(1000) * 0.5e-3)
+    size = np.abs(np.fft.rfft(d, axis=0)) / 500
+    found = np.zeros_like(size)
+    found[signal.lines.astype(int), signal.axis.astype(int)] = 1
+    assert size == pytest.approx(found, abs=1e-9)
+    # Ten cosines in phase have a crest factor of sqrt(20) = 4.5.
+    assert (signal.crest_factor < 2.2).all()
+    with pytest.raises(malta.InputError, match="multiples of 1 / period from 4 to 10 Hz"):
+        interleaved_multisine(0.5, 4.0, 10.0, inputs=3, lines=10)
+
+
+def test_the_linear_loop_predicts_the_flight(plant: Plant, plan: malta.ExcitationPlan) -> None:
+    """Motion, currents and commands at the lines, against the simulation without noise."""
+    run = excited(plan, {}, noise=0.0, quantize=False)
+    N = round(2 * plan.signal.period / CONTROLLER.sample_time)
+    bins = 2 * plan.signal.lines.astype(int)
+    loop = malta.loop(plant, CONTROLLER)
+    found = predicted_spectra(loop, model_at(loop, ("K_A",)), plan.signal)
+    for flown, predicted in ((run.p, found.y), (run.v, found.v), (run.i, found.i)):
+        measured = 2 * np.fft.rfft(flown[-N:], axis=0)[bins] / N
+        assert np.abs(measured - predicted).max() < 5e-3 * np.abs(predicted).max()
+    moved = np.abs(run.p[-N:] - run.p[-N:].mean(axis=0)).max(axis=0)
+    assert moved == pytest.approx(list(plan.motion.values()), rel=0.03)
+
+
+def test_parameters_are_within_their_intervals(log: malta.Log, plan: malta.ExcitationPlan) -> None:
+    found = malta.identify(CONTROLLER, log, parameters=ASKED)
+    truth = np.array([TRUE.get(name, 1.3805e-3) for name in ASKED])
+    assert found.refusal == ""
+    assert (np.abs(found.values - truth) < 2 * found.half_widths).all()
+    assert (found.half_widths / truth < [1e-3, 1e-3, 0.02, 2e-3]).all()
+    assert 0.7 < found.chi2 < found.limit
+    assert found.plant.parameters.I_yy == found.plant.parameters.I_xx  # type: ignore[attr-defined]
+    # What was predicted before the flight, without the parameters' correlations with others that were held.
+    assert found.half_widths[0] / truth[0] < 1.5 * plan.accuracy["K_A"]
+
+
+def test_without_names_those_are_found_that_the_log_tells(log: malta.Log) -> None:
+    found = malta.identify(CONTROLLER, log)
+    assert {"K_A", "K_B", "K_D", "I_xx"} <= set(found.names)
+    assert found.held["l_B"] == 0.04456
+    assert "R" not in found.held
+    assert found.held["m"] == 0.36
+
+
+def test_only_ratios_are_found_without_a_mass(log: malta.Log) -> None:
+    with pytest.raises(malta.CheckError, match=r"only ratios of .*Name one as known, as --known m=0.36"):
+        malta.identify(CONTROLLER, log, parameters=[*ASKED, "m", "F_c"])
+    heavier = malta.identify(
+        CONTROLLER, log, parameters=["K_A", "K_B", "K_D", "I_xx", "F_c"], known={"m": 0.45}
+    )
+    lighter = malta.identify(CONTROLLER, log, parameters=["K_A", "K_B", "K_D", "I_xx", "F_c"])
+    assert heavier.values == pytest.approx(1.25 * lighter.values, rel=1e-3)
+
+
+@pytest.mark.parametrize("known", [{"I_xx": 1.45e-3, "I_yy": 1.45e-3}, {"l_S": 0.09}, {"K_D": 5.2}])
+def test_a_wrong_model_is_refused(log: malta.Log, known: dict[str, float]) -> None:
+    found = malta.identify(CONTROLLER, log, parameters=["K_A", "K_B"], known=known)
+    assert "does not explain the log" in found.refusal
+
+
+def test_currents_that_are_a_sample_late_are_refused(log: malta.Log) -> None:
+    late = with_columns(log, i=np.roll(log.columns["i"], 1, axis=0))
+    assert malta.identify(CONTROLLER, late, parameters=ASKED).chi2 > 10
+
+
+def test_logs_that_tell_nothing_are_refused(log: malta.Log) -> None:
+    y, k = log.columns["y"], log.samples
+    stuck, clipped, missing = np.array(y), np.clip(y, -12e-6, 12e-6), np.array(y)
+    stuck[k // 2 :, 1] = stuck[k // 2, 1]
+    missing[::50] = np.nan
+    short = replace(log, t=log.t[: k // 4], columns={name: c[: k // 4] for name, c in log.columns.items()})
+    quiet = {name: log.columns[name] for name in ("v", "i")} | {"excitation": 0 * log.columns["excitation"]}
+    refused = {
+        "y1 is stuck": with_columns(log, y=stuck),
+        "x1 is clipped": with_columns(log, y=clipped),
+        "samples of y are missing": with_columns(log, y=missing),
+        "too short": short,
+        "nothing was excited": with_columns(log, **quiet),
+        "a log of a rotor": replace(log, machine="rotor"),
+        "the law's are": replace(log, sample_time=1e-4),
+        "has not the period": replace(log, period=0.45),
+    }
+    for text, bad in refused.items():
+        with pytest.raises(malta.CheckError, match=text):
+            malta.identify(CONTROLLER, bad, parameters=ASKED)
+    with pytest.raises(malta.InputError, match="unknown parameter"):
+        malta.identify(CONTROLLER, log, parameters=["K_X"])
+    with pytest.raises(malta.CheckError, match="R do not act"):
+        malta.identify(CONTROLLER, log, parameters=["K_A", "R"])
+
+
+def test_a_few_missing_samples_are_bridged(log: malta.Log) -> None:
+    y = np.array(log.columns["y"])
+    y[[1000, 5000, 5001]] = np.nan
+    whole = malta.identify(CONTROLLER, log, parameters=ASKED)
+    found = malta.identify(CONTROLLER, with_columns(log, y=y), parameters=ASKED)
+    assert (np.abs(found.values - whole.values) < 0.5 * whole.half_widths).all()
+
+
+def test_errors_of_sensors_are_parameters_too(plan: malta.ExcitationPlan) -> None:
+    run = excited(plan, {}, sensor_errors={"gain_x1": 0.02})
+    found = malta.identify(CONTROLLER, malta.log_of(run), parameters=["K_A", "gain_x1"])
+    assert found.refusal == ""
+    assert found.values[1] == pytest.approx(0.02, abs=1e-3)
+
+
+def test_the_data_file_keeps_intervals(log: malta.Log, tmp_path: Path) -> None:
+    found = malta.identify(CONTROLLER, log, parameters=ASKED)
+    path = write_data(found, tmp_path / "found.toml", gains=ROBUST, known={})
+    data = read_identified(path)
+    assert found.values[0] == data.parameters.K_A
+    assert list(data.shares) == ["I_xx", "K_A", "K_B", "K_D"]
+    assert data.shares["K_A"] == pytest.approx(found.half_widths[0] / found.values[0], rel=1e-9)
+    assert data.joint == pytest.approx(3.0802 / 1.95996, rel=1e-4)  # sqrt of chi2 of 4 at 95 %
+    with pytest.raises(malta.InputError, match="parameters with an interval"):
+        read_identified("data/tubular.toml")
+
+
+@pytest.mark.parametrize("K_D", [4.68, 5.72])
+def test_one_stroke_teaches_the_thrust(K_D: float) -> None:
+    stroke = malta.Scenario.stroke(10e-3, noise=1.0, quantize=True)
+    machine = changed({"K_D": K_D, "F_c": 0.6})
+    before = malta.simulate(machine, CONTROLLER, stroke)
+    found = malta.learn(CONTROLLER, malta.log_of(before))
+    assert found.parameter == "K_D"
+    assert found.after == pytest.approx(K_D, rel=0.01)
+    after = malta.simulate(machine, found.controller, stroke)
+    errors = [malta.stroke_figures(run).axial_error for run in (before, after)]
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_a_law_replays_its_own_log_and_no_other() -> None:
+    run = malta.simulate(changed({"m": 0.4}), CONTROLLER, malta.Scenario.stroke(10e-3, noise=1.0))
+    log = malta.log_of(run)
+    found = malta.replay_law(CONTROLLER, log)
+    assert found.same
+    assert found.rms["x1"] == pytest.approx(np.std(run.y[1000:, 0] - run.p[1000:, 0]), rel=0.3)
+    other = malta.replay_law(malta.gains.read("design/gains/calibrated.json"), log)
+    assert not other.same
+    assert other.difference["f_D"] > 0.01
+
+
+def test_excited_flights_are_replayed_too(log: malta.Log) -> None:
+    part = replace(log, t=log.t[:4000], columns={name: table[:4000] for name, table in log.columns.items()})
+    found = malta.replay_law(CONTROLLER, part)
+    assert max(found.at_once.values()) < 1e-9
+
+
+def test_exported_laws_have_no_excitation(plan: malta.ExcitationPlan) -> None:
+    scenario = malta.Scenario.excited(plan.signal, 0.01)
+    with pytest.raises(malta.InputError, match="excitation"):
+        malta.simulate(changed({}), CONTROLLER, scenario, engine=malta.engine_of_c())
+    with pytest.raises(malta.InputError, match="excitation"):
+        malta.simulate(changed({}), CONTROLLER, malta.Scenario.excited(lambda t: np.zeros((len(t), 2)), 0.01))
+
+
+def test_commands_from_excitation_to_data_file(run: Run, tmp_path: Path) -> None:
+    flown, data = tmp_path / "flown.npz", tmp_path / "found.toml"
+    short = ("--period", "0.5", "--periods", "3", "--band", "4..400", "--motion", "40um")
+    said = run(
+        "excite", ROBUST, *short, "--set", "K_A=9000", "--log", flown, "--out", tmp_path / "d.csv", "--json"
+    )
+    assert json.loads(said.out)["files"] == [str(tmp_path / "d.csv"), str(flown)]
+    said = run("identify", ROBUST, flown, "-p", "K_A", "-p", "K_B", "-o", data, "--json")
+    assert said.code == 0
+    found = json.loads(said.out)
+    assert found["parameters"]["K_A"]["low"] < 9000 + 5 < found["parameters"]["K_A"]["high"] + 10
+    said = run("identify", ROBUST, flown, "-p", "K_A", "--known", "I_xx=1.6e-3", "-o", tmp_path / "none.toml")
+    assert said.code == 1
+    assert "chi2 / dof" in said.err
+    assert not (tmp_path / "none.toml").exists()
+    assert run("verify", ROBUST, "--identified", data, "--no-proof").code == 0
+    said = run("verify", ROBUST, "--identified", data, "--uncertain", "10%", "--no-proof")
+    assert (said.code, "one of them" in said.err) == (2, True)
+
+
+@pytest.mark.slow
+def test_intervals_cover(plant: Plant) -> None:
+    """95 % intervals of 3 parameters over 14 machines: 42 of them, at least 35 hold the truth."""
+    plan = malta.excite(malta.loop(plant, CONTROLLER), **SHORT)  # type: ignore[arg-type]
+    random, inside = np.random.default_rng(7), 0
+    for k in range(14):
+        values = {
+            name: getattr(plant.parameters, name) * random.uniform(0.9, 1.1) for name in ("K_A", "K_B", "K_D")
+        }
+        found = malta.identify(
+            CONTROLLER, malta.log_of(excited(plan, values, seed=7, run=k)), parameters=list(values)
+        )
+        assert found.refusal == ""
+        inside += int((np.abs(found.values - list(values.values())) < found.half_widths).sum())
+    assert 35 <= inside <= 42

@@ -1,0 +1,114 @@
+"""Logs: what a bench would write, read back from every encoding, and what is wrong with them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Run
+
+import malta
+
+ROBUST = "design/gains/robust.json"
+CONTROLLER = malta.gains.read(ROBUST)
+
+
+@pytest.fixture(scope="module")
+def log() -> malta.Log:
+    stroke = malta.Scenario.stroke(10e-3, duration=0.02, noise=1.0, quantize=True)
+    return malta.log_of(malta.simulate(malta.plant_of(CONTROLLER.parameters), CONTROLLER, stroke))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".mat"])
+def test_a_log_is_read_as_it_was_written(log: malta.Log, suffix: str, tmp_path: Path) -> None:
+    found = malta.read_log(malta.write_log(log, tmp_path / f"log{suffix}"))
+    assert (found.machine, found.controller, found.sample_time) == ("tubular", "robust", 50e-6)
+    assert len(found.sha256) == 64
+    for group in ("y", "v", "i", "u", "reference", "excitation", "flags"):
+        table = log.table(group, found.names(group))
+        assert found.columns[group] == pytest.approx(table, rel=1e-8, abs=1e-12)
+    assert found.signals["y"] == log.signals["y"]
+
+
+def test_a_log_says_nothing_of_the_truth(log: malta.Log, tmp_path: Path) -> None:
+    heading = malta.write_log(log, tmp_path / "log.csv").read_text().split("\n")[5].split(",")
+    assert heading[:6] == ["t [s]", "x1 [m]", "y1 [m]", "x2 [m]", "y2 [m]", "z [m]"]
+    assert not any("hat" in name or "alpha" in name for name in heading)
+
+
+def test_currents_are_those_that_the_sensors_read() -> None:
+    par = replace(CONTROLLER.parameters, s_i=5e-3, q_i=1e-3)
+    scenario = malta.Scenario("hold", 0.05, malta.references.hold, noise=1.0)
+    run = malta.simulate(malta.plant_of(par), CONTROLLER, scenario)
+    off = malta.log_of(run).columns["i"] - run.i
+    # Three phases of 5 mA each, in amplitude-invariant axes: sqrt(2/3), and over three rows again sqrt(1/3) or more.
+    assert 1e-3 < off[:, 2].std() < 5e-3
+    assert abs(off[:, 2].mean()) < 3e-4
+
+
+def test_csv_of_other_programs(tmp_path: Path) -> None:
+    text = "t [ms],x1 [um],fx [N],i_a [mA],ref.x1 [mm]\n0,1,2,3,0\n0.05,,2,3,0\n0.10,3,2,3,1\n"
+    (tmp_path / "other.csv").write_text(text)
+    found = malta.read_log(tmp_path / "other.csv")
+    assert found.t.tolist() == pytest.approx([0, 50e-6, 100e-6])
+    assert found.columns["y"][[0, 2], 0].tolist() == pytest.approx([1e-6, 3e-6])
+    assert found.columns["i"][0, 0] == pytest.approx(3e-3)
+    assert found.columns["reference"][2, 0] == pytest.approx(1e-3)
+    assert found.survey.missing == {"x1": 1}
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("", "no line of headings"),
+        ("t [s],x1\n0,1\n1,2\n", "a heading without unit"),
+        ("t [s],x1 [kg]\n0,1\n1,2\n", "unit 'kg'"),
+        ("t [s],x1 [m]\n0,1\n0,2\n", "times that do not rise"),
+        ("t [s],x1 [m]\n0,1\n1,a\n", "cannot be read"),
+        ("t [s],fx [N]\n0,1\n1,2\n", "no measured outputs"),
+        ("x1 [m],t [s]\n0,1\n1,2\n", "the first column"),
+    ],
+)
+def test_what_is_no_log_is_refused(text: str, found: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.csv").write_text(text)
+    with pytest.raises(malta.InputError, match=found):
+        malta.read_log(tmp_path / "bad.csv")
+    for suffix in (".npz", ".mat", ".txt"):
+        (tmp_path / f"bad{suffix}").write_bytes(b"no archive")
+        with pytest.raises(malta.InputError):
+            malta.read_log(tmp_path / f"bad{suffix}")
+
+
+def test_gaps_stuck_and_clipped_sensors_are_seen(log: malta.Log) -> None:
+    y, t = np.array(log.columns["y"]), np.array(log.t)
+    y[:, 4] += 1e-3 * np.sin(300 * t)
+    y[100:, 0] = y[100, 0]
+    y[:, 4] = np.clip(y[:, 4], -np.inf, np.quantile(y[:, 4], 0.9))
+    y[7, 1] = np.nan
+    t[200:] += 1e-3
+    found = replace(log, t=t, columns={**log.columns, "y": y}).survey
+    assert (found.gaps, found.missing) == (1, {"y1": 1})
+    assert found.stuck == {"x1": 300}
+    assert found.clipped == {"z": pytest.approx(40, abs=2)}
+    whole = log.survey
+    assert (whole.gaps, whole.stuck, whole.clipped) == (0, {}, {})
+
+
+def test_commands_write_and_show_a_log(run: Run, tmp_path: Path) -> None:
+    file, picture = tmp_path / "stroke.csv", tmp_path / "log.png"
+    said = run("simulate", ROBUST, "--set", "K_D=4.68", "--noise", "1", "--log", file)
+    assert f"wrote {file}" in said.out
+    shown = run("log", file, "--out", picture)
+    assert shown.code == 0
+    assert "2000 samples of 50 us" in shown.out
+    assert picture.stat().st_size > 10_000
+    found = json.loads(run("log", file, "--json").out)
+    assert found["signals"]["z"]["unit"] == "m"
+    learned = run("learn", ROBUST, file, "--json")
+    assert json.loads(learned.out)["after"] == pytest.approx(4.68, rel=0.01)
+    assert run("replay", ROBUST, file).code == 0
+    other = run("replay", "design/gains/calibrated.json", file, "--json")
+    assert (other.code, json.loads(other.out)["same"]) == (1, False)
