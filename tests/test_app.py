@@ -596,3 +596,14 @@ def test_the_command_prints_an_address_and_says_what_is_unsaved(tmp_path: Path) 
         said = process.stderr.read()
     assert said == "malta: ended; not saved to halbach_pid.toml: pid.Kp.F_x\n"
     assert process.returncode == 0
+
+
+def test_news_of_an_older_version_are_dropped(tmp_path: Path) -> None:
+    session = Session(copied(tmp_path), tmp_path)
+    try:
+        newest = session.answer({"ask": "evaluate", "number": 1, "values": {}})["version"]
+        for version in (newest - 1, newest + 1, newest):
+            session._tell({"version": version, "kind": "proof", "lower": 1.0})
+        assert [item["version"] for item in session.answer({"ask": "news", "after": 0})["news"]] == [newest]
+    finally:
+        session.close()

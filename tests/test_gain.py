@@ -16,8 +16,10 @@ from malta import gains
 from malta.errors import InputError
 from malta.margins.travel import travel_loops, worst_sensitivities
 from malta.model.data import plant_of
+from malta.proof.blocks import gain
 from malta.proof.blocks.blocks import Block
-from malta.proof.blocks.peaks import frequencies, patterns
+from malta.proof.blocks.dynamic import Blocks
+from malta.proof.blocks.peaks import Peak, frequencies, patterns
 from malta.proof.blocks.transfer import transfer
 from malta.proof.blocks.weight import weight_of
 from malta.proof.polynomial.family import align, combine, family
@@ -187,3 +189,21 @@ def test_an_unstable_box_has_no_bound() -> None:
 def test_bad_input_gets_one_sentence(more: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError, match=says):
         malta.worst_case_gain(first_order(), [[-2.0]], {"k": 0.5}, **more)
+
+
+def test_a_search_that_missed_the_largest_gain_leads_to_no_bound_below_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """T = 2 k / (s + 1 + 2 k) is 0.7436 at 90 % of the way to the end of the box and 0.75 there."""
+    found = Peak(0.7438, 0.0, np.array([1.4505]))
+    monkeypatch.setattr(gain, "_largest", lambda *_: found)
+    T = malta.worst_case_gain(first_order(), [[-2.0]], {"k": 0.5}, of="complementary", tolerance=1e-4)
+    assert T.upper is None or T.upper >= 0.75
+
+
+def test_no_bound_is_proven_of_a_loop_whose_stability_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Blocks, "stable", lambda _: False)
+    T = malta.worst_case_gain(first_order(), [[-2.0]], {"k": 0.5}, of="complementary")
+    assert (T.upper, T.reason) == (None, "the nominal loop is not proven stable")
+    m = malta.dynamic_margin(first_order(), [[-2.0]], {"k": 0.5}, malta.Dynamic(0.1))
+    assert (m.lower, m.reason) == (None, "the nominal loop is not proven stable")

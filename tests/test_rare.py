@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +20,7 @@ from malta.campaigns.plan import Plan
 from malta.campaigns.rare import rare_event, read_design_point, replay_design_point, write_event
 from malta.campaigns.run import campaign
 from malta.campaigns.statistics import runs_within_bounds
-from malta.campaigns.subset import LEVELS, Subset, subset_simulation
+from malta.campaigns.subset import LEVELS, Runs, Subset, _genealogical_cov, subset_simulation
 from malta.campaigns.yields import runs_within_specification
 from malta.simulation.noise import keys
 
@@ -320,3 +321,12 @@ def test_a_study_that_is_none_is_one_sentence(
     assert (code, out) == (2, "")
     assert sentence in err
     assert err.count("\n") == 1
+
+
+def test_descendants_of_one_run_alone_say_nothing() -> None:
+    """All survivors of one first run: cov near 1; each of another one: 0."""
+    none = np.zeros((50, 0))
+    alike = Runs(none, none.astype(np.int64), np.ones(50), np.zeros(50, dtype=np.int64))
+    apart = alike._replace(ancestor=np.arange(50))
+    assert _genealogical_cov(alike, 50) == pytest.approx(math.sqrt(1 - 1 / 50))
+    assert _genealogical_cov(apart, 50) == 0

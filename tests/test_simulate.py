@@ -19,6 +19,7 @@ from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
 from malta.simulation.scenario import Scenario
 from malta.simulation.trajectory import save, stroke_figures
+from malta.simulation.verdict import Verdict, bearing_verdict
 from malta.synthesis.controller import linear_law
 
 if TYPE_CHECKING:
@@ -348,3 +349,16 @@ def test_a_run_beyond_all_memory_is_refused(designs: dict[str, Design]) -> None:
     design = designs["calibrated"]
     with pytest.raises(malta.InputError, match="duration: found 20000000 samples, expected at most 4000000"):
         malta.simulate(design.plant, design.controller, replace(_stroke(10e-3), duration=1000.0))
+
+
+def test_bearings_carry_the_mover_and_the_end_of_the_travel_does_not(design: Design) -> None:
+    """With bearings only the end of the travel ends a run; a mover that rests on them to the end has not lifted."""
+    plant, start = design.plant, {"z_dot": 3.0}
+    for bearing in (False, True):
+        scenario = Scenario("slide", 0.05, references.hold, start, fidelity="force", bearing=bearing)
+        assert malta.simulate(plant, design.controller, scenario).verdict.name == plant.contacts[2]
+    t, free, resting = np.arange(4.0), [0.2, 0.0, 0.0], [1.2, 0.0, 0.0]
+    found = bearing_verdict(plant, np.array([resting, resting, free, resting]), t)
+    assert found == Verdict("not lifted", 3.0)
+    assert bearing_verdict(plant, np.array([resting, resting, free, free]), t) is None
+    assert bearing_verdict(plant, np.array([free, resting, free, free]), t) == Verdict(plant.contacts[0], 1.0)
