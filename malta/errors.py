@@ -65,10 +65,8 @@ def _suggestion(field: str, found: str, expected: str) -> str:
         return ""
     from difflib import get_close_matches  # where something is wrong already
 
-    known = {
-        word.lower(): word
-        for word in re.findall(r"[^\s,'\"]+", expected.removeprefix("one of ").partition(", or ")[0])
-    }
+    names = expected.removeprefix("one of ").partition(", or ")[0].replace("'", "")
+    known = {name.lower(): name for name in (names.split(", ") if ", " in names else names.split())}
     quoted = re.findall(r"'([^']+)'", found)
     for typed in [*quoted, *([] if quoted else [field.rpartition(".")[2]])]:
         close = get_close_matches(typed.lower(), known, n=1)
