@@ -150,7 +150,7 @@ def disk_margins_alone(loop: Nominal, sensors: Sequence[str]) -> list[Disk]:
 
     def sizes(w: FloatArray) -> FloatArray:
         P, F = loop.response(w)
-        return np.abs(np.einsum("kii->ki", _disk_matrix(P @ F))[:, : len(sensors)])
+        return np.asarray(np.abs(np.einsum("kii->ki", _disk_matrix(P @ F))[:, : len(sensors)]))
 
     peaks = zip(*find_peaks(sizes, loop.frequencies), strict=True)
     return [

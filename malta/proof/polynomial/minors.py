@@ -164,7 +164,7 @@ class Minors:
 
     def combine(self, pi: dict[Pair, Any], beta: dict[Pair, Any], matrix: Any) -> list[Any]:
         """The coefficients a_0 ... a_N from the minors."""
-        total = 0
+        total: Any = 0
         for pair, weight in self._weights(beta, matrix).items():
             total = pi[pair] * weight + total
         return list(total.coeffs())
@@ -174,7 +174,7 @@ class Minors:
         key = id(beta), matrix, ctx.prec
         if key not in self.weighted:
             kappa = self.balls[0 if matrix is fmpq_mat else 1]
-            found = {((), ()): kappa[(), ()]}
+            found: dict[Pair, Any] = {((), ()): kappa[(), ()]}
             for S, R in itertools.product(
                 *([s for k in range(1, self.order + 1) for s in itertools.combinations(range(len(on)), k)]
                   for on in (self.outputs, self.rows))
@@ -228,8 +228,8 @@ class Minors:
         }
         if not all(math.isfinite(size) for size in beta.values()):
             raise NotAnalytic("numbers that overflow")
-        known[key] = Sizes(pi, beta)
-        return known[key]
+        known[key] = made = Sizes(pi, beta)
+        return made
 
     def majorant(self, sizes: Sizes) -> list[Any]:
         """Upper bounds of the coefficients of s or g."""
