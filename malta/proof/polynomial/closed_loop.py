@@ -138,9 +138,10 @@ def hold(matrix: Any, a: Any, b: Any, T: Any) -> tuple[Any, Any]:
         held += own[i * n : (i + 1) * n] + into[i * m : (i + 1) * m]
     both = (matrix(n + m, n + m, held + [0] * (m * (n + m))) * T).exp().entries()
     own, into = [], []
-    for i in range(0, n * (n + m), n + m):
-        own += both[i : i + n]
-        into += both[i + n : i + n + m]
+    for i in range(n):
+        row = both[i * (n + m) : (i + 1) * (n + m)]
+        own += row[:n]
+        into += row[n:]
     for i in range(0, n * n, n + 1):
         own[i] -= 1
     phi, gamma = matrix(n, n, own), matrix(n, m, into)
