@@ -20,7 +20,7 @@ from malta.proof.blocks import gain
 from malta.proof.blocks.blocks import Block
 from malta.proof.blocks.dynamic import Blocks
 from malta.proof.blocks.peaks import Peak, frequencies, patterns
-from malta.proof.blocks.transfer import transfer
+from malta.proof.blocks.transfer import Signals, transfer
 from malta.proof.blocks.weight import weight_of
 from malta.proof.polynomial.family import align, combine, family
 from malta.proof.responses import responses
@@ -98,7 +98,7 @@ def test_integrators_on_both_sides_of_a_gain_take_no_digits() -> None:
         Block("effort", "sensors", (0,), tuple(range(5)), weight_of(1.0, "test")),
     ]
     w, p = np.geomspace(1e-17, 10, 50), s.nominal * np.array([0.8, 1.2, 0])
-    M = transfer(responses(s, law, p, w), blocks)
+    M = transfer(Signals(responses(s, law, p, w)), blocks)
     S, effort = np.linalg.norm(M[:, :5, :5], axis=(1, 2)), np.linalg.norm(M[:, 5:, 5], axis=1)
     assert S.max() < 1e-3
     assert S[w < 1e-4].max() < 1e-6

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -13,6 +13,9 @@ from malta.proof.uncertain import Compensator, UncertainSystem, instability
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
+
+ROUNDS = 60  # of the balance of a matrix at most
+BALANCED = 1e-9  # relative difference of norms of rows and columns
 
 
 Response = Callable[["FloatArray"], tuple["ComplexArray", "ComplexArray"]]
@@ -93,8 +96,7 @@ def classical_margins(loop: Nominal, sensors: Sequence[str]) -> Classical:
     w = loop.frequencies
     P, F = loop.response(w)
     disks = [disk_margin(loop, kind) for kind in ("forces", "sensors", "forces and sensors")]
-    for k, name in enumerate(sensors):
-        disks.append(replace(disk_margin(loop, "sensors", only=k), channels=f"{name} alone"))
+    disks += disk_margins_alone(loop, sensors)
     delays = delay_margins(P @ F, w).tolist()
     return Classical(
         tuple(disks),
@@ -120,14 +122,8 @@ def worst_of(margins: Sequence[Classical | None]) -> Classical | None:
     )
 
 
-def disk_margin(
-    loop: Nominal,
-    kind: Literal["forces", "sensors", "forces and sensors"],
-    only: int | None = None,
-) -> Disk:
-    """The symmetric disk margin of the nominal loop: of all channels at once, each with its own factor, or of one.
-
-    kind : the channels; only : the index of a single channel, None for all
+def disk_margin(loop: Nominal, kind: Literal["forces", "sensors", "forces and sensors"]) -> Disk:
+    """The symmetric disk margin of the nominal loop, of all channels at once, each with its own factor.
 
     With the loop's positive feedback Q, factors (1 + d/2) / (1 - d/2) keep it stable while |d| < 1 / mu(M),
     M = (1 - Q)^-1 - 1/2 (Seiler, Packard, Gahinet 2020). For several channels mu is bounded above by a balanced
@@ -143,14 +139,28 @@ def disk_margin(
         else:
             zero = np.zeros((len(w), P.shape[1], P.shape[1])), np.zeros((len(w), F.shape[1], F.shape[1]))
             Q = np.block([[zero[0], P], [F, zero[1]]])
-        eye = np.eye(Q.shape[-1])
-        M = np.linalg.inv(eye - Q) - eye / 2
-        mu = _balanced_norm(M) if only is None else np.abs(M[:, only, only])
-        return np.asarray(mu[:, None])
+        return np.asarray(_balanced_norm(_disk_matrix(Q))[:, None])
 
     (mu,), (at,) = find_peaks(sizes, loop.frequencies)
-    channels = kind if only is None else f"{kind[:-1]} {only + 1}"
-    return Disk(channels, float(1 / mu), float(at))
+    return Disk(kind, float(1 / mu), float(at))
+
+
+def disk_margins_alone(loop: Nominal, sensors: Sequence[str]) -> list[Disk]:
+    """The symmetric disk margin of each sensor alone, in the order of the rows of y."""
+
+    def sizes(w: FloatArray) -> FloatArray:
+        P, F = loop.response(w)
+        return np.asarray(np.abs(np.einsum("kii->ki", _disk_matrix(P @ F))[:, : len(sensors)]))
+
+    peaks = zip(*find_peaks(sizes, loop.frequencies), strict=True)
+    return [
+        Disk(f"{name} alone", float(1 / mu), float(at)) for name, (mu, at) in zip(sensors, peaks, strict=True)
+    ]
+
+
+def _disk_matrix(Q: ComplexArray) -> ComplexArray:
+    eye = np.eye(Q.shape[-1])
+    return np.asarray(np.linalg.inv(eye - Q) - eye / 2)
 
 
 def _balanced_norm(M: ComplexArray) -> FloatArray:
@@ -158,11 +168,14 @@ def _balanced_norm(M: ComplexArray) -> FloatArray:
     size = np.abs(M)
     d = np.ones(size.shape[:2])
     off = size * (1 - np.eye(size.shape[-1]))
-    for _ in range(60):
+    for _ in range(ROUNDS):
         scaled = off * d[:, :, None] / d[:, None, :]
         rows, columns = np.sqrt((scaled**2).sum(2)), np.sqrt((scaled**2).sum(1))
         both = (rows > 0) & (columns > 0)
-        d = d * np.where(both, columns / np.where(both, rows, 1), 1) ** 0.25
+        ratio = np.where(both, columns / np.where(both, rows, 1), 1)
+        d = d * ratio**0.25
+        if np.abs(ratio - 1).max(initial=0.0) < BALANCED:
+            break
     return np.asarray(np.linalg.svd(M * d[:, :, None] / d[:, None, :], compute_uv=False)[:, 0])
 
 

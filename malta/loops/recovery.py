@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -170,11 +171,17 @@ def bounded_deviation(
     chosen = [k for k, s in enumerate(plant.outputs) if s.name in bound.outputs]
     at = position_in(plant, plant.point(controller.operating_point[0]).x) if position is None else position
     try:
-        answer = loop_along(plant, controller, position).sampled.answer().of(bound.load_at(at))
+        answer = _answer_along(plant, controller, position).of(bound.load_at(at))
     except CheckError:
         return math.inf
     reached = answer.largest if bound.after is None else answer.left(bound.after)
     return float(reached[chosen].max())
+
+
+@lru_cache(maxsize=16)  # several bounds are of the same positions; records compare by identity
+def _answer_along(plant: Plant, controller: Controller, position: float | None) -> StepResponse:
+    """The answer to unit loads at a position of the stroke. Raises CheckError for an unstable loop."""
+    return loop_along(plant, controller, position).sampled.answer()
 
 
 def worst_along(plant: Plant, controller: Controller, bound: RecoveryBound) -> tuple[float, float]:

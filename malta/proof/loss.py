@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import optimize
 
 from malta.errors import CheckError
 from malta.proof.expressions import NotAnalytic
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     Loss = tuple[float, float | None, FloatArray | None]  # t, w, p
 
 STEP = 1e-6  # of a range, for slopes of the worst root
+NARROW = 2.0**-40  # of a step of the grid, to which a loss is narrowed down
 ROUNDS = 6  # from corner to corner
 
 
@@ -79,31 +81,36 @@ def first_loss(problem: Problem, box: Box, reach: float) -> Loss:
     return best
 
 
-def loss_beside(problem: Problem, box: Box, witness: FloatArray, reach: float) -> Loss:
-    """The first loss up to `reach` towards the witness of another loop, or at a corner near it; else infinity."""
+def loss_beside(problem: Problem, box: Box, witness: FloatArray, proven: float, reach: float) -> Loss:
+    """The first loss up to `reach` towards the witness of another loop, or at a corner near it; else infinity.
+
+    proven : t up to which the box is known to be stable
+    """
     place = box.nominal_places()[0]
     d = (witness - place) / max(float(box.margin(witness)), 1e-300)
-    found = _nearer(problem, place, d, reach, (math.inf, None, None))
-    return _improve_corner(problem, box, place, found)
+    found = _nearer(problem, place, d, reach, (math.inf, None, None), proven)
+    return _improve_corner(problem, box, place, found, proven)
 
 
-def _nearer(problem: Problem, place: FloatArray, d: FloatArray, reach: float, best: Loss) -> Loss:
+def _nearer(
+    problem: Problem, place: FloatArray, d: FloatArray, reach: float, best: Loss, proven: float = 0.0
+) -> Loss:
     """The first loss along a direction if it is nearer than the best one, else that one."""
-    t = _along(problem, place, d, min(reach, best[0]))
+    t = _along(problem, place, d, min(reach, best[0]), proven)
     if not t < best[0]:
         return best
     p = place + t * d
     return t, _critical(problem, p, place), p
 
 
-def _improve_corner(problem: Problem, box: Box, place: FloatArray, best: Loss) -> Loss:
+def _improve_corner(problem: Problem, box: Box, place: FloatArray, best: Loss, proven: float = 0.0) -> Loss:
     """Move a loss to the corner that the slopes of the worst root point to, as long as t decreases."""
     for _ in range(ROUNDS):
         t, _, p = best
         if p is None or not np.isfinite(t) or is_late():
             break
         d = _uphill(problem, box, p)
-        nearer = _along(problem, place, d, t)
+        nearer = _along(problem, place, d, t, proven)
         if not nearer < t * (1 - 1e-9):
             break
         there = place + nearer * d
@@ -148,21 +155,34 @@ def _instability(problem: Problem, rows: FloatArray, unknown: float) -> FloatArr
         return np.full(len(rows), unknown)
 
 
-def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float) -> float:
-    """The first t of a grid up to `reach` at which p + t d is unstable, bisected; infinite for none."""
+def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float, proven: float = 0.0) -> float:
+    """The first t of a grid up to `reach` at which p + t d is unstable, narrowed down; infinite for none.
 
-    def unstable(t: Sequence[float] | FloatArray) -> FloatArray:
-        return np.asarray(_instability(problem, p + np.asarray(t)[:, None] * d, -math.inf) >= 0)
+    proven : t up to which the line is known to be stable
+    """
 
-    grid = np.unique(np.concatenate([np.geomspace(1e-3, 1, 24) * reach, np.linspace(0, reach, 41)[1:]]))
-    bad = unstable(grid)
+    def rates(t: FloatArray) -> FloatArray:
+        return _instability(problem, p + t[:, None] * d, -math.inf)
+
+    if proven:
+        grid = np.linspace(min(proven, reach), reach, 4)
+    else:
+        grid = np.unique(np.concatenate([np.geomspace(1e-3, 1, 24) * reach, np.linspace(0, reach, 41)[1:]]))
+    bad = rates(grid) >= 0
     if not bad.any():
         return math.inf
     k = int(bad.argmax())
-    low, high = (grid[k - 1] if k else 0.0), grid[k]
-    for _ in range(40):
-        if is_late():
-            break
-        middle = (low + high) / 2
-        low, high = (low, middle) if unstable([middle])[0] else (middle, high)
-    return float(high)
+    low, high = (float(grid[k - 1]) if k else 0.0), float(grid[k])
+    width = NARROW * (high - low)
+
+    def rate(t: float) -> float:
+        nonlocal high
+        found = float(rates(np.array([t]))[0])
+        high = min(high, t) if found >= 0 else high
+        return found if math.isfinite(found) else math.copysign(1.0, found)
+
+    if is_late():
+        return high
+    with suppress(ValueError):  # it is unstable at the lower end, too
+        optimize.brentq(rate, low, high, xtol=width, maxiter=60, disp=False)
+    return high

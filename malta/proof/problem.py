@@ -21,7 +21,7 @@ from malta.proof.expressions import (
     Program,
     exact,
 )
-from malta.proof.groups import Group, UncertainLoop
+from malta.proof.groups import Group, UncertainLoop, groups
 from malta.proof.polynomial import rounding
 from malta.proof.polynomial.characteristic import (
     Characteristic,
@@ -32,11 +32,15 @@ from malta.proof.polynomial.characteristic import (
 from malta.proof.polynomial.closed_loop import closed_loop, driven_group
 from malta.proof.polynomial.family import binary
 from malta.proof.polynomial.rational import Symbolic, TooLarge, symbolic
+from malta.proof.time_limit import TimeUp
 from malta.proof.uncertain import closed_loop as closed_matrices
 from malta.proof.uncertain import critical_frequency, instability
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
+
+SHORT = 300  # operations of matrices whose exact expressions take no time
+FEW_ROWS = 2  # of parameters, at which the poles of the whole loop take less time than those of its groups
 
 
 class Polynomial(Protocol):
@@ -99,6 +103,15 @@ class OfLoop:
             found.append((self.known[key], part.moves))
         return found
 
+    @cached_property
+    def _groups(self) -> Sequence[Group]:
+        """The states that close loops by themselves, where these are found at once; else none."""
+        if len(self.loop.program.steps) > SHORT:
+            return ()
+        with suppress(TimeUp):
+            return groups(self.loop)
+        return ()
+
     @property
     def _plain(self) -> bool:
         """Whether the loop is A, B, C alone, in continuous time or sampled."""
@@ -121,7 +134,8 @@ class OfLoop:
     def instability(self, rows: FloatArray) -> FloatArray:
         if self._plain:
             with suppress(np.linalg.LinAlgError):  # numbers that overflow at some row: each by itself
-                return instability(self.loop.system, self.loop.law, rows)
+                several = len(np.atleast_2d(rows)) > FEW_ROWS and len(self._groups) > 1
+                return instability(self.loop.system, self.loop.law, rows, self._groups if several else ())
         worst = []
         for p in np.atleast_2d(rows):
             poles = self._poles(p)

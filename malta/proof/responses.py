@@ -7,12 +7,16 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from malta.proof.uncertain import Compensator, UncertainSystem, difference_form
-from malta.synthesis.riccati import sample
+from malta.synthesis.riccati import add_lags, sample
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
+
+
+FEW = 32  # frequencies at which a system is solved as a whole
 
 
 class Responses(NamedTuple):
@@ -25,16 +29,33 @@ class Responses(NamedTuple):
 
 
 def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: FloatArray) -> Responses:
-    """The responses of system and compensator at one row of parameters p and at frequencies w, rad/s.
+    """The responses of system and compensator at frequencies w, rad/s.
+
+    p : one row of parameters, or a row for each frequency
 
     G(s) = C (s E - A)^-1 B + D behind a lag w_c / (s + w_c); of a sampled loop the exact discrete system under a
     zero-order hold at z = e^(j w T), times z^-delay. Differences (z - 1) / T keep the digits of slow modes.
     """
     A, B, C, D = _plant(system, law, np.asarray(p, dtype=float).tobytes())
     s, turned, F = _law(law, np.asarray(w, dtype=float).tobytes())
-    m, q = len(law.D), len(C) - len(law.D)
-    G = (C @ np.linalg.solve(s[:, None, None] * np.eye(len(A)) - A, B) + D) * turned[:, None, None]
+    m, q = len(law.D), C.shape[1] - len(law.D)
+    G = (C @ _resolvent(s, A, B) + D) * turned[:, None, None]
     return Responses(G[:, :q, :m], G[:, :q, m:], G[:, q:, :m], F)
+
+
+def _resolvent(s: ComplexArray, A: FloatArray, B: FloatArray) -> ComplexArray:
+    """(s - A)^-1 B at each s, of one system or of one for each s; parts of a system without couplings one by one."""
+    n = A.shape[-1]
+    found = np.zeros((len(s), n, B.shape[-1]), dtype=complex)
+    parts = [np.arange(n)]
+    if len(s) > FEW:
+        count, label = sparse.csgraph.connected_components((A != 0).any(axis=0), directed=False)
+        parts = [np.flatnonzero(label == k) for k in range(count)]
+    for x in parts:
+        used = np.flatnonzero((B[:, x] != 0).any(axis=(0, 1)))
+        own = s[:, None, None] * np.eye(len(x)) - A[:, x[:, None], x]
+        found[:, x[:, None], used] = np.linalg.solve(own, B[:, x[:, None], used])
+    return found
 
 
 Sides = tuple["FloatArray", "FloatArray", "FloatArray", "FloatArray"]
@@ -42,29 +63,31 @@ Sides = tuple["FloatArray", "FloatArray", "FloatArray", "FloatArray"]
 
 @lru_cache(maxsize=4)  # an ascent moves p or w and returns; records compare by identity
 def _plant(system: UncertainSystem, law: Compensator, p: bytes) -> Sides:
-    """A, B, C and D from commands and from forces on the plant to sensors and forces; in differences when sampled."""
-    A, B, C, *more = (np.array(M) for M in system.matrices(np.frombuffer(p)))
-    n, m = B.shape
-    D = more[0] if more else np.zeros((len(C), m))
+    """A, B, C and D from commands and from forces on the plant to sensors and forces; in differences when sampled.
+
+    They are stacks, for each row of parameters.
+    """
+    names = len(system.names)
+    A, B, C, *more = system.every(np.frombuffer(p).reshape(-1, names) if names else np.zeros((1, 0)))
+    rows, n, m = B.shape
+    D = more[0] if more else np.zeros((rows, C.shape[1], m))
     if len(more) > 1:
-        both = np.linalg.solve(more[1], np.hstack([A, B]))
-        A, B = both[:, :n], both[:, n:]
-    k, q = n if law.lag is None else n + m, len(C)
-    into, out, through = np.zeros((k, 2 * m)), np.zeros((q + m, k)), np.zeros((q + m, 2 * m))
-    into[:n, m:], out[:q, :n], through[:q, m:] = B, C, D
+        both = np.linalg.solve(more[1], np.concatenate([A, B], axis=2))
+        A, B = both[:, :, :n], both[:, :, n:]
+    k, q = n if law.lag is None else n + m, C.shape[1]
+    into, out, through = (np.zeros((rows, *shape)) for shape in ((k, 2 * m), (q + m, k), (q + m, 2 * m)))
+    into[:, :n, m:], out[:, :q, :n], through[:, :q, m:] = B, C, D
     if law.lag is None:
-        into[:n, :m], through[:q, :m], through[q:, :m] = B, D, np.eye(m)
+        into[:, :n, :m], through[:, :q, :m], through[:, q:, :m] = B, D, np.eye(m)
     else:
-        whole = np.zeros((k, k))
-        whole[:n, :n], whole[:n, n:], whole[n:, n:] = A, B, -law.lag * np.eye(m)
-        into[n:, :m], out[:q, n:], out[q:, n:] = law.lag * np.eye(m), D, np.eye(m)
-        A = whole
+        A, into[:, :, :m] = add_lags(A, B, law.lag)
+        out[:, :q, n:], out[:, q:, n:] = D, np.eye(m)
     T = law.sample_time
     if T is None:
         return A, into, out, through
     if system.sample_time is not None:
-        return (A - np.eye(len(A))) / T, into / T, out, through
-    _, Phi = sample(A, np.eye(len(A)), T)  # (e^AT - 1) / T = A Phi / T
+        return (A - np.eye(A.shape[-1])) / T, into / T, out, through
+    _, Phi = sample(A, np.eye(A.shape[-1]), T)  # (e^AT - 1) / T = A Phi / T
     return A @ Phi / T, Phi @ into / T, out, through
 
 
@@ -77,7 +100,7 @@ def _law(law: Compensator, w: bytes) -> tuple[ComplexArray, ComplexArray, Comple
     if T is not None:
         turned, s = np.exp(-s * T * law.delay), np.expm1(s * T) / T
     F_A, F_B = difference_form(law)
-    F = law.C @ np.linalg.solve(s[:, None, None] * np.eye(len(F_A)) - F_A, F_B) + law.D
+    F = law.C @ _resolvent(s, F_A[None], F_B[None]) + law.D
     return s, turned, np.asarray(F, dtype=complex)
 
 

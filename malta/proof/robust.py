@@ -169,7 +169,7 @@ def margin_at(
     if wider is not None and wider.lower and wider.witness is not None:
         begun, reach = clock.monotonic(), wider.lower * (1 + (tolerance or TOLERANCE))
         witness = np.array([at.get(name, wider.witness[name]) for name in box.names])
-        t, frequency, p = loss_beside(problem, box, witness, min(reach, box.limit))
+        t, frequency, p = loss_beside(problem, box, witness, wider.lower, min(reach, box.limit))
         if p is not None and t >= wider.lower:
             named = dict(zip(box.names, p.tolist(), strict=True))
             moved = dict(zip(box.names, (p - box.nominal).tolist(), strict=True))

@@ -7,10 +7,10 @@ u = H F y                                 a control law F, and the lag, hold and
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -20,7 +20,8 @@ from malta.model.plant import Plant, symbolic
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
+    from malta.proof.groups import Group
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,13 +58,18 @@ class UncertainSystem:
 
         p : k x parameters, in the order of `names`
         """
-        rows = np.atleast_2d(p)
-        found = self.matrices.map(len(rows))(rows.T)
-        shapes = [self.matrices.size_out(i) for i in range(3)]
-        return tuple(  # type: ignore[return-value]
-            np.array(M).reshape(a, len(rows), b).swapaxes(0, 1)
-            for M, (a, b) in zip(found, shapes, strict=True)
-        )
+        A, B, C, *_ = self.every(p)
+        return A, B, C
+
+    def every(self, p: FloatArray) -> list[FloatArray]:
+        """All matrices at k rows of parameters: D and E too, where there are any."""
+        rows, made = np.atleast_2d(p), []
+        for i, found in enumerate(self.matrices.map(len(rows)).call([rows.T])):
+            pattern = self.matrices.sparsity_out(i)
+            matrix = np.zeros((len(rows), *pattern.shape))
+            matrix[:, *pattern.get_triplet()] = np.reshape(found.nonzeros(), (len(rows), pattern.nnz()))
+            made.append(matrix)
+        return made
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,49 +170,69 @@ def difference_form(c: Compensator) -> tuple[FloatArray, FloatArray]:
     return (c.A, c.B) if T is None else ((c.A - np.eye(len(c.A))) / T, c.B / T)
 
 
-class _Sides(NamedTuple):
-    """Both sides of a loop: x' = A x + B u, or (x+ - x) / T = A x + B u when sampled."""
-
-    A: FloatArray  # plant, lags, stored inputs
-    B: FloatArray
-    C: FloatArray
-    F_A: FloatArray  # compensator
-    F_B: FloatArray
-
-
-def _sides(c: Compensator, A: FloatArray, B: FloatArray, C: FloatArray) -> _Sides:
-    """Both sides in differences: slow poles lie close to 1, where the A of x+ = A x has lost their digits."""
-    if c.lag is not None:
-        A, B = add_lags(A, B, c.lag)
-    if c.sample_time is not None:
-        n, T = len(A), c.sample_time
-        _, Phi = sample(A, np.eye(n), T)  # (e^AT - 1) / T = A Phi / T
-        A, B = delay_inputs(A @ Phi / T, Phi @ B / T, c.delay)
-        stored = np.arange(n, len(A))  # delay_inputs gives the next values of these
-        A[n:], B[n:] = A[n:] / T, B[n:] / T
-        A[stored, stored] -= 1 / T
-    return _Sides(A, B, np.hstack([C, np.zeros((len(C), len(A) - C.shape[1]))]), *difference_form(c))
-
-
 def closed_loop(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:
     """State matrices of the closed loop at k rows of parameters; of sampled loops (A - 1) / T.
 
     The states are those of plant, lags, stored inputs and compensator.
     """
-    matrices = []
-    for plant in zip(*system.at(p), strict=True):
-        s = _sides(c, *plant)
-        n, whole = len(s.A), np.empty((len(s.A) + len(s.F_A),) * 2)
-        whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:] = (
-            s.A + s.B @ c.D @ s.C, s.B @ c.C, s.F_B @ s.C, s.F_A,
-        )  # fmt: skip
-        matrices.append(whole)
-    return np.array(matrices)
+    return _close(c, *system.at(p), *difference_form(c), c.C, c.D)
 
 
-def instability(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:
-    """The real part of the worst pole at k rows of parameters, 1/s; of sampled loops ln|lambda| / T."""
-    poles = np.linalg.eigvals(closed_loop(system, c, p))
+def _close(
+    c: Compensator, A: FloatArray, B: FloatArray, C: FloatArray,
+    F_A: FloatArray, F_B: FloatArray, F_C: FloatArray, F_D: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """State matrices of closed loops, of stacks of plants and of a law, with lag, hold and delay of the compensator.
+
+    The plant is in differences: slow poles lie close to 1, where the A of x+ = A x has lost their digits.
+    """
+    outputs = C.shape[-1]
+    if c.lag is not None:
+        A, B = add_lags(A, B, c.lag)
+    if c.sample_time is not None:
+        n, T = A.shape[-1], c.sample_time
+        _, Phi = sample(A, np.eye(n), T)  # (e^AT - 1) / T = A Phi / T
+        A, B = delay_inputs(A @ Phi / T, Phi @ B / T, c.delay)
+        stored = np.arange(n, A.shape[-1])  # delay_inputs gives the next values of these
+        if len(stored):
+            A[..., n:, :], B = A[..., n:, :] / T, B / T
+        A[..., stored, stored] -= 1 / T
+    n = A.shape[-1]
+    whole = np.zeros((len(A), n + len(F_A), n + len(F_A)))
+    whole[:, :n, :n], whole[:, :n, n:], whole[:, n:, n:] = A, B @ F_C, F_A
+    whole[:, :n, :outputs] += B @ F_D @ C
+    whole[:, n:, :outputs] = F_B @ C
+    return whole
+
+
+def _poles(system: UncertainSystem, c: Compensator, p: FloatArray, groups: Sequence[Group]) -> ComplexArray:
+    """The poles of the closed loop at k rows of parameters, group by group; of sampled loops (lambda - 1) / T."""
+    A, B, C = system.at(p)
+    F_A, F_B = difference_form(c)
+    found = []
+    for g in groups:
+        x, own = list(g.states), list(g.own)
+        law = F_A[np.ix_(own, own)], F_B[own]
+        if not x:
+            found.append(np.broadcast_to(np.linalg.eigvals(law[0]), (len(A), len(own))))
+            continue
+        into, through, out = B[:, x], c.D, c.C[:, own]
+        if g.inputs is not None:  # forces on these states in place of the inputs
+            rows = B[:, list(g.inputs)]
+            into, through, out = np.eye(len(x))[:, [x.index(i) for i in g.inputs]], rows @ through, rows @ out
+        closed = _close(c, A[:, x][:, :, x], into, C[:, :, x], *law, out, through)
+        found.append(np.linalg.eigvals(closed))
+    return np.concatenate(found, axis=1)
+
+
+def instability(
+    system: UncertainSystem, c: Compensator, p: FloatArray, groups: Sequence[Group] = ()
+) -> FloatArray:
+    """The real part of the worst pole at k rows of parameters, 1/s; of sampled loops ln|lambda| / T.
+
+    groups : states that close loops by themselves; none: the whole loop
+    """
+    poles = _poles(system, c, p, groups) if groups else np.linalg.eigvals(closed_loop(system, c, p))
     if c.sample_time is not None:
         T = c.sample_time
         grown = (2 * T * poles.real + T**2 * np.abs(poles) ** 2).max(axis=1)  # |lambda|^2 - 1

@@ -410,31 +410,32 @@ def eigenvalues(M: FloatArray) -> ComplexArray:
 
 
 def sample(A: FloatArray, B: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:
-    """Zero-order hold: Ad = e^(A Ts), Bd = integral of e^(A s) B over one sample."""
-    n, m = B.shape
-    held = np.zeros((n + m, n + m))
-    held[:n, :n], held[:n, n:] = A, B
+    """Zero-order hold: Ad = e^(A Ts), Bd = integral of e^(A s) B over one sample; of a stack of systems each."""
+    n, m = B.shape[-2:]
+    held = np.zeros((*A.shape[:-2], n + m, n + m))
+    held[..., :n, :n], held[..., :n, n:] = A, B
     E = _exponential(held * Ts)
-    return E[:n, :n], E[:n, n:]
+    return E[..., :n, :n], E[..., :n, n:]
 
 
 def delay_inputs(Ad: FloatArray, Bd: FloatArray, delay: int) -> tuple[FloatArray, FloatArray]:
     """The sampled system whose inputs act `delay` samples late; stored inputs follow x, the oldest first."""
-    n, m = Bd.shape
+    n, m = Bd.shape[-2:]
     if delay == 0:
         return Ad, Bd
     stored = m * delay
-    A = np.zeros((n + stored, n + stored))
-    A[:n, :n], A[:n, n : n + m] = Ad, Bd
-    A[n:, n:] = np.eye(stored, k=m)  # each stored input moves up one place
+    A = np.zeros((*Ad.shape[:-2], n + stored, n + stored))
+    A[..., :n, :n], A[..., :n, n : n + m] = Ad, Bd
+    A[..., n:, n:] = np.eye(stored, k=m)  # each stored input moves up one place
     return A, np.vstack([np.zeros((n + stored - m, m)), np.eye(m)])
 
 
 def add_lags(A: FloatArray, B: FloatArray, rate: float) -> tuple[FloatArray, FloatArray]:
     """The continuous system whose inputs follow as first-order lags, rate / (s + rate); they are states after x."""
-    m = B.shape[1]
-    lagged = np.block([[A, B], [np.zeros((m, len(A))), -rate * np.eye(m)]])
-    return lagged, np.vstack([np.zeros_like(B), rate * np.eye(m)])
+    n, m = B.shape[-2:]
+    lagged = np.zeros((*A.shape[:-2], n + m, n + m))
+    lagged[..., :n, :n], lagged[..., :n, n:], lagged[..., n:, n:] = A, B, -rate * np.eye(m)
+    return lagged, np.vstack([np.zeros((n, m)), rate * np.eye(m)])
 
 
 def add_integrals(Ad: FloatArray, Bd: FloatArray, Cd: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:
@@ -469,13 +470,22 @@ def sample_noise(A: FloatArray, W: FloatArray, Ts: float) -> FloatArray:
 
 
 def _exponential(M: FloatArray) -> FloatArray:
+    """e^M, of a stack of matrices each."""
     with np.errstate(all="ignore"):
         turn = np.ones(M.shape)
-        if not np.abs(M).max() < LARGEST and np.isfinite(M).all():  # large by the units of states, perhaps
+        if (
+            not np.abs(M).max(initial=0.0) < LARGEST and np.isfinite(M).all()
+        ):  # by the units of states, perhaps
+            if M.ndim > 2:
+                return np.array([_exponential(one) for one in M])
             _, (units, _) = linalg.matrix_balance(M, permute=False, separate=True)
             turn = units / units[:, None]
         # e^710 is past the largest float
-        E = linalg.expm(M * turn) / turn if np.abs(M * turn).max() < LARGEST else np.array([np.inf])
+        E = (
+            linalg.expm(M * turn) / turn
+            if np.abs(M * turn).max(initial=0.0) < LARGEST
+            else np.array([np.inf])
+        )
     if not np.isfinite(E).all():
         raise CheckError(
             "the sampled model's numbers overflow: no sample time of this length for so fast a machine"

@@ -36,7 +36,7 @@ from malta.proof.blocks.peaks import (
     patterns,
 )
 from malta.proof.blocks.polydisc import Size, is_zero_free
-from malta.proof.blocks.transfer import mu_bound, transfer
+from malta.proof.blocks.transfer import Signals, mu_bound, transfer
 from malta.proof.blocks.weight import Expanded, Weight, weight_of
 from malta.proof.box import Box, box_of
 from malta.proof.branches import within_branches
@@ -46,7 +46,7 @@ from malta.proof.loss import first_loss
 from malta.proof.margin import Margin
 from malta.proof.polynomial.enclosure import Unproven
 from malta.proof.problem import OfLoop
-from malta.proof.responses import Responses, responses
+from malta.proof.responses import responses
 from malta.proof.robust import deadline, law_of, problem_of
 from malta.proof.time_limit import TimeUp, time_limit
 from malta.proof.uncertain import Compensator, UncertainSystem
@@ -163,11 +163,14 @@ class Blocks:
         return bool((self.problem.instability(self.box.nominal_places()) >= 0).any())
 
     def transfer(self, p: FloatArray, w: FloatArray) -> ComplexArray:
-        """M at parameters p and frequencies w (rad/s), its rows times the blocks' weights: k x columns x rows."""
-        if len(w) > 1:
-            found = _responses_on_grid(self.system, self.law, p.tobytes(), w.tobytes())
+        """M at parameters p and frequencies w (rad/s), its rows times the blocks' weights: k x columns x rows.
+
+        p : one row, or a row for each frequency
+        """
+        if p.ndim == 1 and len(w) > 1:
+            found = _signals_on_grid(self.system, self.law, p.tobytes(), w.tobytes())
         else:
-            found = responses(self.system, self.law, p, w)
+            found = Signals(responses(self.system, self.law, p, w))
         M = transfer(found, self.blocks)
         scale = np.array([b.weight.at(w) for b in self.blocks for _ in b.columns])
         return np.asarray(M * scale.T[:, :, None])
@@ -205,8 +208,8 @@ class Blocks:
 
 
 @lru_cache(maxsize=64)  # searches of several gains begin at the same places; records compare by identity
-def _responses_on_grid(system: UncertainSystem, law: Compensator, p: bytes, w: bytes) -> Responses:
-    return responses(system, law, np.frombuffer(p), np.frombuffer(w))
+def _signals_on_grid(system: UncertainSystem, law: Compensator, p: bytes, w: bytes) -> Signals:
+    return Signals(responses(system, law, np.frombuffer(p), np.frombuffer(w)))
 
 
 @lru_cache(maxsize=8)  # gains of several channels need the same families; records compare by identity
@@ -224,7 +227,7 @@ def _scale_probe(
     """A block with its unit scaled by a power of two to about the loop's own gain."""
     if b.kind in ("multiplicative", "feedback"):
         return b
-    M = transfer(responses(system, law, nominal, frequencies(problem, nominal)), [b])
+    M = transfer(Signals(responses(system, law, nominal, frequencies(problem, nominal))), [b])
     size = float(np.abs(M[np.isfinite(M)]).max(initial=0.0))
     return replace(b, unit=2.0 ** -min(max(round(1 + math.log2(size)), -500), 500)) if size > 0 else b
 

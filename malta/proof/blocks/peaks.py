@@ -26,9 +26,11 @@ AROUND = np.array([0.5, 0.8, 0.9, 0.95, 0.98, 1.0, 1.02, 1.05, 1.1, 1.25, 2.0])
 ENDS = (0.01, 100.0)  # beyond the slowest and the fastest pole
 FAR_ENDS = (1e-5, 1e4)  # that stand for zero and for infinity
 GRID = 80
+STEP = 1e-8  # of relative places and log frequencies, for slopes
+AHEAD = 0.02 / 4.0 ** np.arange(7)  # log frequencies either way that an ascent looks at last
 REAL = 1e-3  # share of |s| below which an imaginary part shows no peak: of a real pole it is rounding
 
-Value = Callable[["FloatArray", "FloatArray"], "FloatArray"]  # of p and of rows of w
+Value = Callable[["FloatArray", "FloatArray"], "FloatArray"]  # of p, or rows of p, and of rows of w
 
 
 class Peak(NamedTuple):
@@ -104,31 +106,38 @@ def _uphill(value: Value, place: Peak, sides: FloatArray, top: float, until: flo
     low, width = sides[free, 0], sides[free, 1] - sides[free, 0]
     best = place
 
-    def at(z: FloatArray) -> tuple[FloatArray, float]:
-        p = place.p.copy()
-        p[free] = np.clip(low + width * np.clip(z[:-1], 0, 1), *sides[free].T)
-        return p, min(place.frequency * math.exp(float(z[-1])), top)
-
-    def loss(z: FloatArray) -> float:
+    def losses(z: FloatArray) -> FloatArray:
+        """The losses at rows of relative places and log frequencies."""
         nonlocal best
-        p, w = at(z)
-        found = float(value(p, np.array([w]))[0])
-        if found > best.value:
-            best = Peak(found, w, p)
-        return -math.log(max(found, 1e-300)) if math.isfinite(found) else -700.0
+        p = np.tile(place.p, (len(z), 1))
+        p[:, free] = np.clip(low + width * np.clip(z[:, :-1], 0, 1), *sides[free].T)
+        w = np.minimum(place.frequency * np.exp(z[:, -1]), top)
+        found = value(p, w)
+        k = int(np.where(np.isnan(found), -np.inf, found).argmax())
+        if found[k] > best.value:
+            best = Peak(float(found[k]), float(w[k]), p[k])
+        return np.where(np.isfinite(found), -np.log(np.maximum(found, 1e-300)), -700.0)
 
-    bounds = [(0.0, 1.0)] * len(free) + [(-3.0, 3.0)]
-    z = np.append(np.clip((place.p[free] - low) / width, 0, 1), 0.0)
+    bounds = np.array([(0.0, 1.0)] * len(free) + [(-3.0, 3.0)])
+
+    def slopes(z: FloatArray) -> tuple[float, FloatArray]:
+        h = np.where(z + STEP > bounds[:, 1], -STEP, STEP)
+        found = losses(np.vstack([z, z + np.diag(h)]))
+        return float(found[0]), (found[1:] - found[0]) / h
+
+    def coordinates(of: Peak) -> FloatArray:
+        x = np.clip((of.p[free] - low) / width, 0, 1)
+        return np.append(x, math.log(of.frequency / place.frequency))
 
     def stop(z: Any) -> None:
         del z
         if clock.monotonic() > until:
             raise StopIteration
 
-    optimize.minimize(loss, z, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60}, callback=stop)  # type: ignore[call-overload]
-    z = np.append(np.clip((best.p[free] - low) / width, 0, 1), math.log(best.frequency / place.frequency))
-    optimize.minimize_scalar(
-        lambda x: loss(np.append(z[:-1], x)), bounds=(z[-1] - 0.02, z[-1] + 0.02), method="bounded",
-        options={"xatol": 1e-10},
-    )  # fmt: skip
+    optimize.minimize(
+        slopes, coordinates(place), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60},
+        callback=stop,
+    )  # type: ignore[call-overload]  # fmt: skip
+    for half in AHEAD:
+        losses(coordinates(best) + np.linspace(-half, half, 9)[:, None] * np.eye(len(free) + 1)[-1])
     return best

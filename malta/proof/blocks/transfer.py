@@ -12,6 +12,8 @@ It is computed from frequency responses, a route of its own beside the polynomia
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -29,12 +31,33 @@ ROUNDS = 40
 ZOOMS = 7
 
 
-def transfer(r: Responses, blocks: Sequence[Block]) -> ComplexArray:
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """The signals of a loop from additions to sensors, to commands and from forces on the plant, side by side."""
+
+    of: Responses
+
+    @cached_property
+    def y(self) -> ComplexArray:
+        """The outputs: S (G_y F, G_y, G_d)."""
+        r = self.of
+        # solved for on either side: about integrators G and F are huge, and an inverse times them has lost all digits
+        loop = r.G_y @ r.F
+        return np.asarray(
+            np.linalg.solve(np.eye(loop.shape[-1]) - loop, np.concatenate([loop, r.G_y, r.G_d], axis=2))
+        )
+
+    @cached_property
+    def u(self) -> ComplexArray:
+        """The commands: (1 - F G)^-1 F (1, G_y, G_d)."""
+        r, (q, m) = self.of, self.of.G_y.shape[1:]
+        law_reads = np.concatenate([np.broadcast_to(np.eye(q), (len(r.F), q, q)), r.G_y, r.G_d], axis=2)
+        return np.asarray(np.linalg.solve(np.eye(m) - r.F @ r.G_y, r.F @ law_reads))
+
+
+def transfer(signals: Signals, blocks: Sequence[Block]) -> ComplexArray:
     """M from the outputs of the blocks, in their order, to their inputs: frequencies x columns x rows."""
-    q, m = r.G_y.shape[1:]
-    # solved for on either side: about integrators G and F are huge, and an inverse times them has lost all digits
-    y = np.linalg.solve(np.eye(q) - r.G_y @ r.F, np.concatenate([r.G_y @ r.F, r.G_y, r.G_d], axis=2))
-    u = _inputs(r) if any(_acts_at_inputs(b) for b in blocks) else y
+    q, m = signals.of.G_y.shape[1:]
     total = sum(len(b.rows) for b in blocks)
     into = np.zeros((q + 2 * m, total))
     passed = {0: np.zeros((q, total)), q: np.zeros((m, total))}  # additions to a signal by earlier blocks
@@ -46,9 +69,9 @@ def transfer(r: Responses, blocks: Sequence[Block]) -> ComplexArray:
         into[[first + i for i in rows], own] = np.eye(len(rows))
         if b.kind == "feedback":  # it reads its own addition
             passed[first][rows, own] += np.eye(len(rows))
-        signal = u if _acts_at_inputs(b) else y
+        signal = signals.u if _acts_at_inputs(b) else signals.y
         if b.kind == "additive":
-            signal = r.H @ signal
+            signal = signals.of.H @ signal
         beside = passed[first][columns].copy() if b.kind in _LOOPS else 0.0
         found.append((signal[:, columns], beside))
         if b.kind in ("multiplicative", "additive"):
@@ -64,13 +87,6 @@ def _acts_at_inputs(b: Block) -> bool:
     return b.kind in ("additive", "effort") or (b.kind in _LOOPS and b.at == "forces")
 
 
-def _inputs(r: Responses) -> ComplexArray:
-    """u from additions to y, to u and from the disturbances: (1 - F G)^-1 F (1, G_y, G_d)."""
-    q, m = r.G_y.shape[1:]
-    law_reads = np.concatenate([np.broadcast_to(np.eye(q), (len(r.F), q, q)), r.G_y, r.G_d], axis=2)
-    return np.asarray(np.linalg.solve(np.eye(m) - r.F @ r.G_y, r.F @ law_reads))
-
-
 def mu_bound(M: ComplexArray, blocks: Sequence[Block]) -> tuple[FloatArray, ComplexArray]:
     """A lower bound of mu, and Delta of size one that has it: det(1 - M Delta / mu) = 0.
 
@@ -80,6 +96,11 @@ def mu_bound(M: ComplexArray, blocks: Sequence[Block]) -> tuple[FloatArray, Comp
     """
     finite = np.asarray(np.isfinite(M).all(axis=(1, 2)))
     M = np.where(finite[:, None, None], M, 0)
+    if M.shape[1:] == (1, 1):
+        size = np.abs(M)
+        return np.where(finite, size[:, 0, 0], np.inf), np.where(
+            size > 0, M.conj() / np.maximum(size, 1e-300), 1
+        )
     if len(blocks) == 1:
         u, s, vh = np.linalg.svd(M, full_matrices=False)
         return np.where(finite, s[:, 0], np.inf), _adjoint(vh[:, :1]) @ _adjoint(u[:, :, :1])

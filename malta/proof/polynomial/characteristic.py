@@ -194,8 +194,7 @@ class Characteristic:
         program = self.loop.program.only(matrices)
         if not (self.exact or (self.loop.program.rational and self.loop.program.short)):
             return program.run([arb(x) for x in p], POINTS)
-        entries = program.run(p, EXACT)
-        return entries if self.exact else [[(i, j, arb(x)) for i, j, x in matrix] for matrix in entries]
+        return program.run(p, EXACT)
 
     def _map_to_v(self, a: list[Any]) -> list[Any]:
         return map_bilinear(a) if self.discrete else a
@@ -410,4 +409,10 @@ def map_bilinear(a: list[Any]) -> list[Any]:
     table = _bilinear(len(a) - 1)
     if isinstance(a[-1], fmpq) or isinstance(a[0], fmpq):
         return list((table * fmpq_mat(len(a), 1, a)).entries())
-    return list((arb_mat(table) * arb_mat(len(a), 1, a)).entries())
+    return list((_bilinear_balls(len(a) - 1, ctx.prec) * arb_mat(len(a), 1, a)).entries())
+
+
+@lru_cache(maxsize=64)
+def _bilinear_balls(n: int, bits: int) -> Any:
+    del bits  # of the current precision
+    return arb_mat(_bilinear(n))

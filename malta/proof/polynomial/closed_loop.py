@@ -133,14 +133,19 @@ def add_lag(matrix: Any, a: Any, b: Any, c: Any, d: Any, rate: Any) -> tuple[Any
 def hold(matrix: Any, a: Any, b: Any, T: Any) -> tuple[Any, Any]:
     """The system under a zero-order hold, exactly: e^(A T) - I and the integral of e^(A t) B."""
     n, m = a.nrows(), b.ncols()
-    held = matrix(n + m, n + m, join_columns(matrix, a, b).entries() + [0] * (m * (n + m)))
-    both = (held * T).exp().entries()
-    rows = [both[i * (n + m) : (i + 1) * (n + m)] for i in range(n)]
-    phi = matrix(n, n, [x for row in rows for x in row[:n]])
-    gamma = matrix(n, m, [x for row in rows for x in row[n:]])
+    own, into, held = a.entries(), b.entries(), list[Any]()
     for i in range(n):
-        phi[i, i] -= 1
-    if not all(x.is_finite() for x in phi.entries()):
+        held += own[i * n : (i + 1) * n] + into[i * m : (i + 1) * m]
+    both = (matrix(n + m, n + m, held + [0] * (m * (n + m))) * T).exp().entries()
+    own, into = [], []
+    for i in range(n):
+        row = both[i * (n + m) : (i + 1) * (n + m)]
+        own += row[:n]
+        into += row[n:]
+    for i in range(0, n * n, n + 1):
+        own[i] -= 1
+    phi, gamma = matrix(n, n, own), matrix(n, m, into)
+    if not all(x.is_finite() for x in own):
         raise NotAnalytic("numbers that overflow: a system too fast for its sample time")
     return phi, gamma
 

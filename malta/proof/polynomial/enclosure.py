@@ -33,7 +33,8 @@ TAILS = (1e-9, 1e-7, 3e-6)  # what interpolation may leave out, relative to each
 WORST = 1e-5  # beyond which the box is cut
 HIGHEST = 16  # degree of an interpolation along one parameter
 LEBESGUE = 4.0  # 1 + Lambda up to that degree: Lambda <= 1 + 2 / pi log(d + 1), below 2.81
-RADII = tuple(2.0**k for k in (0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20))
+RADII = tuple(2.0**k for k in (0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20, 25, 32, 40))
+MIDDLE = RADII.index(2.0**12)  # where the search of discs begins
 BITS = 128  # of ball arithmetic, in which numbers of up to 128 bits take the least time
 MOST_BITS = 640  # beyond which a coefficient is taken as the ball that it is
 HOPE = 0.4  # of what the first place took, at least, the others take
@@ -190,39 +191,58 @@ class Disc(NamedTuple):
 def discs_of(
     f: Polynomial, i: int, low: list[Any], high: list[Any], size: list[tuple[float, int]]
 ) -> list[Disc]:
-    """Bounds on discs along one parameter on which the matrices are analytic, the largest disc first.
+    """Bounds on discs along one parameter on which the matrices are analytic.
+
+    log2 of the bound is convex in that of the radius, so that the degree it asks for falls towards the best one and
+    rises beyond.
 
     Raises TooWide when they are not analytic a little beyond the side.
     """
     found: list[Disc] = []
     refused = NotAnalytic("no disc about its range")
-    for radius in reversed(RADII):  # the largest that there is leaves out the least, mostly
-        check_time()
-        balls = []
-        for k, (a, b) in enumerate(zip(low, high, strict=True)):
-            middle, half = arb((a + b) / 2), arb((b - a) / 2)
-            if k == i:
-                room = arb(0, float((half * radius).upper()) * (1 + 1e-12))
-                balls.append(acb(middle + room, room))
-            else:
-                balls.append(acb(middle + arb(0, float(half.upper()) * (1 + 1e-12))))
-        try:
-            most = f.majorant(balls)
-        except NotAnalytic as error:
-            refused = error
-            continue
-        share = max(_log2(m) - _log2(s) for m, s in zip(most, size, strict=True) if s[0] > 0)
-        found.append(Disc(radius, share, most))
-        if len(found) > 2 and _degree(found[-1], TAILS[0]) > _degree(found[-3], TAILS[0]):
-            break
+    for radii in (RADII[MIDDLE:], RADII[:MIDDLE][::-1]):
+        least = min((_wanted_degree(disc, TAILS[0]) for disc in found), default=math.inf)
+        if len(found) > 1 and least < _wanted_degree(found[0], TAILS[0]):
+            break  # larger discs are the better ones
+        for radius in radii:
+            check_time()
+            try:
+                disc = _disc(f, i, low, high, size, radius)
+            except NotAnalytic as error:
+                refused = error
+                if radius >= RADII[MIDDLE]:  # nor on larger discs
+                    break
+                continue
+            found.append(disc)
+            wanted = _wanted_degree(disc, TAILS[0])
+            if wanted > least:
+                break
+            least = wanted
     if not found:
         raise TooWide(i, f"{f.names[i]}: {refused}") from refused
     return found
 
 
-def _degree(disc: Disc, tail: float) -> int:
-    """The lowest degree with an error of at most `tail` by the bound of a disc."""
-    return math.ceil((disc.share + 3 - math.log2(disc.radius - 1) - math.log2(tail)) / math.log2(disc.radius))
+def _disc(
+    f: Polynomial, i: int, low: list[Any], high: list[Any], size: list[tuple[float, int]], radius: float
+) -> Disc:
+    """Bounds on the disc of a radius along one parameter. Raises NotAnalytic where the matrices are not analytic."""
+    balls = []
+    for k, (a, b) in enumerate(zip(low, high, strict=True)):
+        middle, half = arb((a + b) / 2), arb((b - a) / 2)
+        if k == i:
+            room = arb(0, float((half * radius).upper()) * (1 + 1e-12))
+            balls.append(acb(middle + room, room))
+        else:
+            balls.append(acb(middle + arb(0, float(half.upper()) * (1 + 1e-12))))
+    most = f.majorant(balls)
+    share = max(_log2(m) - _log2(s) for m, s in zip(most, size, strict=True) if s[0] > 0)
+    return Disc(radius, share, most)
+
+
+def _wanted_degree(disc: Disc, tail: float) -> float:
+    """The degree at which the bound of a disc leaves an error of `tail`."""
+    return (disc.share + 3 - math.log2(disc.radius - 1) - math.log2(tail)) / math.log2(disc.radius)
 
 
 def _interpolation_side(name: str, axis: int, discs: list[Disc], tail: float) -> Side:
@@ -231,7 +251,7 @@ def _interpolation_side(name: str, axis: int, discs: list[Disc], tail: float) ->
     for disc in discs:
         radius, share, most = disc
         rest = share + 3 - math.log2(radius - 1)
-        degree = max(1, min(_degree(disc, tail), HIGHEST))
+        degree = max(1, min(math.ceil(_wanted_degree(disc, tail)), HIGHEST))
         left = rest - degree * math.log2(radius)
         enough = left <= math.log2(tail)
         rank = (not enough, degree if enough else 0, left)

@@ -18,7 +18,7 @@ from malta.proof.expressions import NotAnalytic
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
-ROUNDS = 12
+ROUNDS = 20
 SAFE = 1 + 1e-9
 
 

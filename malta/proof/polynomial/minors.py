@@ -12,10 +12,10 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
-from flint import acb_mat, arb, arb_mat, arb_poly, fmpq_mat, fmpq_poly
+from flint import acb_mat, arb, arb_mat, arb_poly, ctx, fmpq_mat, fmpq_poly
 
 from malta.proof.expressions import NotAnalytic, Program, exact
 from malta.proof.groups import A, B, C, E, Group, UncertainLoop, rational, upper
@@ -34,6 +34,7 @@ from malta.proof.polynomial.mirrors import Image, Places, first_alike
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
+MOST_WEIGHTS = 16  # sets of factors that are remembered
 MOST = 24  # minors beyond which the closed loop's own matrix is cheaper
 
 Pair = tuple[tuple[int, ...], tuple[int, ...]]
@@ -112,7 +113,7 @@ class Minors:
     def resolvent(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> Resolvent:
         """That of the first group of which this one is an image, at given p."""
         a, law = self._square(entries[A], matrix, self.image.of.states), self.loop.law
-        b = dense(matrix, a.nrows(), len(self.rows), ((i, k, 1) for k, i in enumerate(self.rows)))
+        b = _unit_columns(matrix, a.nrows(), self.rows)
         factor: Any = 1
         if self.loop.descriptor:
             e = self._square(entries[E], matrix, self.image.of.states)
@@ -163,19 +164,35 @@ class Minors:
 
     def combine(self, pi: dict[Pair, Any], beta: dict[Pair, Any], matrix: Any) -> list[Any]:
         """The coefficients a_0 ... a_N from the minors."""
-        kappa = self.balls[0 if matrix is fmpq_mat else 1]
-        total = pi[(), ()] * kappa[(), ()]
-        for (S, R), p in pi.items():
-            if not R:
-                continue
-            part = None
-            for T in itertools.combinations(range(len(self.inputs)), len(R)):
-                if (R, T) in beta:
-                    term = kappa[T, S] * beta[R, T]
-                    part = term if part is None else part + term
-            if part is not None:
-                total = total + p * part
+        total: Any = 0
+        for pair, weight in self._weights(beta, matrix).items():
+            total = pi[pair] * weight + total
         return list(total.coeffs())
+
+    def _weights(self, beta: dict[Pair, Any], matrix: Any) -> dict[Pair, Any]:
+        """The factor of each pi_SR, remembered for these forces: many places have the same."""
+        key = id(beta), matrix, ctx.prec
+        if key not in self.weighted:
+            kappa = self.balls[0 if matrix is fmpq_mat else 1]
+            found: dict[Pair, Any] = {((), ()): kappa[(), ()]}
+            for S, R in itertools.product(
+                *([s for k in range(1, self.order + 1) for s in itertools.combinations(range(len(on)), k)]
+                  for on in (self.outputs, self.rows))
+            ):  # fmt: skip
+                own = [T for T in itertools.combinations(range(len(self.inputs)), len(R)) if (R, T) in beta]
+                if len(S) == len(R) and own:
+                    found[S, R] = sum(
+                        (kappa[T, S] * beta[R, T] for T in own[1:]), kappa[own[0], S] * beta[R, own[0]]
+                    )
+            if len(self.weighted) > MOST_WEIGHTS:
+                self.weighted.clear()
+            self.weighted[key] = beta, found  # which keeps the forces, and so their id
+        return self.weighted[key][1]
+
+    @cached_property
+    def weighted(self) -> dict[Any, tuple[dict[Pair, Any], dict[Pair, Any]]]:
+        """The factors of minors that are remembered."""
+        return {}
 
     @property
     def degree(self) -> int:
@@ -190,7 +207,10 @@ class Minors:
 
         Raises NotAnalytic when numbers overflow.
         """
-        a, b, c, diagonal = _sizes(self, entries)
+        a, b, c, diagonal = parts = _sizes(self, entries)
+        known, key = self.resolvents, tuple((part.shape, part.tobytes()) for part in parts)
+        if key in known:  # of an image
+            return cast("Sizes", known[key])
         a, into, c, _ = driven_bounds(self.loop, (a, np.eye(len(a))[:, list(self.rows)], c, None), diagonal)
         pi: dict[Pair, Any] = {((), ()): coefficient_bounds(a, np.ones(len(a)))}
         for k in range(1, self.order + 1):
@@ -208,7 +228,8 @@ class Minors:
         }
         if not all(math.isfinite(size) for size in beta.values()):
             raise NotAnalytic("numbers that overflow")
-        return Sizes(pi, beta)
+        known[key] = made = Sizes(pi, beta)
+        return made
 
     def majorant(self, sizes: Sizes) -> list[Any]:
         """Upper bounds of the coefficients of s or g."""
@@ -261,6 +282,11 @@ class Sizes(NamedTuple):
 
     pi: dict[Pair, Any]
     beta: dict[Pair, float]
+
+
+@lru_cache(maxsize=64)
+def _unit_columns(matrix: Any, n: int, rows: tuple[int, ...]) -> Any:
+    return dense(matrix, n, len(rows), ((i, k, 1) for k, i in enumerate(rows)))
 
 
 def minors(loop: UncertainLoop, g: Group) -> Minors | None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
@@ -44,6 +45,7 @@ class Lead(NamedTuple):
 
 
 Table = Mapping[tuple[int, int], Ranged]
+Balls = Mapping[tuple[int, int], list[tuple[Any, Monomial]]]  # of a Table: coefficients and monomials
 
 
 class Bounds(NamedTuple):
@@ -79,33 +81,40 @@ class HeldMachine:
     travel: tuple[float, float]
     models: tuple[Mapping[tuple[int, int], Laurent], ...]  # Z, E, shares, ratios and rest as functions of y
 
+    @cached_property
+    def _balls(self) -> tuple[Balls, ...]:
+        """Z, Z without the k_i, E and the others, with balls for coefficients."""
+        tables = self.Z, _without(self.Z, self.stiff), self.E, self.shares, self.ratios, self.rest
+        return tuple(
+            {at: [(arb(a).union(arb(b)), m) for m, a, b in entry.terms] for at, entry in table.items()}
+            for table in tables
+        )
+
     def bounds(self, p: Sequence[Any]) -> Bounds:
         """Entrywise bounds over real balls p.
 
         Raises NotAnalytic when a bound is infinite, or when the forces at rest leave their assumed range.
         """
-        n, powers = len(self.lead), dict[tuple[int, int], Any]()
+        n, known = len(self.lead), dict[Monomial, Any]()
 
         def monomial(m: Monomial) -> Any:
-            total = arb(1)
-            for i, e in enumerate(m):
-                if e:
-                    if (i, e) not in powers:
-                        powers[i, e] = p[i] ** e if e > 0 else 1 / p[i] ** -e
-                    total *= powers[i, e]
-            return total
+            if m not in known:
+                total = arb(1)
+                for x, e in zip(p, m, strict=True):
+                    if e:
+                        total *= x**e if e > 0 else 1 / x**-e
+                known[m] = total
+            return known[m]
 
-        def size(table: Table) -> FloatArray:
+        def size(table: Balls) -> FloatArray:
             found = np.zeros((n, n))
-            for at, entry in table.items():
-                total = sum((arb(a).union(arb(b)) * monomial(m) for m, a, b in entry.terms), arb(0))
+            for at, terms in table.items():
+                total = sum((c * monomial(m) for c, m in terms), arb(0))
                 found[at] = float(total.abs_upper()) * (1 + 1e-9)
             return found
 
         b = np.array([float((arb(c) * monomial(m)).abs_upper()) * (1 + 1e-9) for c, m in self.lead])
-        left = _without(self.Z, self.stiff)
-        tables = (self.Z, left, self.E, self.shares, self.ratios, self.rest)
-        Z, beside, E, shares, ratios, rest = (size(t) for t in tables)
+        Z, beside, E, shares, ratios, rest = (size(t) for t in self._balls)
         if not all(np.isfinite(M).all() for M in (Z, beside, E, shares, ratios, rest, b)):
             raise NotAnalytic("a parameter that divides reaches zero")
         if self.rest and not (dominating_solution(ratios, rest[:, :1]) <= 1).all():

@@ -272,12 +272,12 @@ class HeldLoop:
         The proof is valid for any positive weights; the choice decides how far it reaches.
         """
         low, high = 0.0, reach
-        best, rho = self._perron(box.sides(0.0))
+        best, rho = self._perron(box.sides(0.0), math.inf)
         if rho >= LIMIT:
             return best
         for _ in range(HALVINGS):
             t = (low + high) / 2 if high < reach or low else reach
-            found, rho = self._perron(box.sides(t))
+            found, rho = self._perron(box.sides(t), LIMIT)
             if rho < LIMIT:
                 low, best = t, found
                 if t == reach:
@@ -286,11 +286,15 @@ class HeldLoop:
                 high = t if t < reach else reach * (1 - 1e-9)
         return best
 
-    def _perron(self, sides: FloatArray) -> tuple[FloatArray, float]:
-        """Perron's vector and value of |M0^-1| |e| at corners, sampled frequencies; infinite where M0 is unstable."""
+    def _perron(self, sides: FloatArray, most: float) -> tuple[FloatArray, float]:
+        """Perron's vector and value of |M0^-1| |e| at corners, sampled frequencies; infinite where M0 is unstable.
+
+        The value only grows with each corner, so that none is looked at where it is beyond `most`.
+        """
         n = len(self.machine.lead)
         seen = np.zeros((3 * n + len(self.law.A),) * 2)
         known: dict[Any, tuple[FloatArray, FloatArray] | None] = {}
+        vector, rho = np.ones(len(seen)), math.inf
         for p in _corners(sides):
             try:
                 W, V, rest = self._bounds(np.stack([p, p], axis=1))
@@ -309,13 +313,10 @@ class HeldLoop:
                 one += (G @ rest[members]).max(axis=0) * LOOSE
                 one[3 * r :] *= LOOSE
                 seen[members] = np.maximum(seen[members], one)
-        balanced, (units, _) = linalg.matrix_balance(seen, permute=False, separate=True)
-        balanced = balanced + FLOOR * balanced.max()
-        d: FloatArray = np.ones(len(seen))
-        for _ in range(100):
-            d = balanced @ d
-            d = d / d.max()
-        return np.exp2(np.round(8 * np.log2(d * units)) / 8), float((balanced @ d / d).max())
+            vector, rho = _perron_of(seen)
+            if rho >= most:
+                break
+        return vector, rho
 
     def _responses(self, g: Axes, values: tuple[float, ...]) -> tuple[FloatArray, FloatArray] | None:
         """|M0^-1| of a group to its forces and moves and to all, at frequencies; None where M0 is unstable."""
@@ -329,6 +330,17 @@ class HeldLoop:
         z = np.exp(1j * np.concatenate([np.geomspace(1e-3, 1, SWEEP) * np.pi, angles]))
         G = np.linalg.inv(z[:, None, None] * np.eye(len(A)) - A)
         return np.abs(_response_to_moves(G, r, self.T, 2)), np.abs(G)
+
+
+def _perron_of(M: FloatArray) -> tuple[FloatArray, float]:
+    """Perron's vector and value of a matrix without negative entries."""
+    balanced, (units, _) = linalg.matrix_balance(M, permute=False, separate=True)
+    balanced = balanced + FLOOR * balanced.max()
+    d: FloatArray = np.ones(len(M))
+    for _ in range(100):
+        d = balanced @ d
+        d = d / d.max()
+    return np.exp2(np.round(8 * np.log2(d * units)) / 8), float((balanced @ d / d).max())
 
 
 def _corners(sides: FloatArray) -> FloatArray:
