@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from malta.errors import InputError
 
@@ -75,7 +75,8 @@ def _is_unit(text: str) -> bool:
 # root units of gram, meter, second, ampere and radian are a product, and by the powers of these.
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6, "G": 1e9}
 _ROOTS = ("gram", "meter", "second", "ampere", "radian")
-_KILO, _Symbol = ((1e3, 1),), tuple[tuple[tuple[float, int], ...], tuple[int, ...]]
+_KILO = ((1e3, 1),)
+_Symbol: TypeAlias = tuple[tuple[tuple[float, int], ...], tuple[int, ...]]
 _SYMBOLS: dict[str, _Symbol] = {
     "g": ((), (1,)),
     "m": ((), (0, 1)),
