@@ -101,8 +101,6 @@ _WHOLE: dict[str, _Symbol] = {  # names without a prefix
     "deg": (((0.017453292519943295, 1),), (0, 0, 0, 0, 1)),
     "rpm": (((6.283185307179586, 1), (60.0, -1)), (0, 0, -1, 0, 1)),
 }
-
-
 _TOKEN = r"[()/*]|[^\W\d_]+(?:\^-?\d)?|\S"
 
 
@@ -119,7 +117,7 @@ def _plain_root_units(unit: str) -> tuple[float, dict[str, int]] | None:
     """Factor and root units of a product of known symbols; None for other names, and for parentheses in parentheses."""
     exponents: dict[str, int] = {}
     sign, group = 1, 1  # of the next factor, and of the parentheses that it stands in
-    unit = re.sub(r"\(\s*([^\W\d_]+)\s*\)", r"\1", unit)  # a name in parentheses
+    unit = re.sub(r"\(\s*([^\W\d_]+)\s*\)", r" \1 ", unit)  # a name in parentheses
     for token in re.findall(_TOKEN, re.sub(r"\s*(?:\*\*|\^)\s*", "^", unit)):
         if token == "(":
             if group != 1:
