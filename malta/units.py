@@ -75,10 +75,8 @@ def _is_unit(text: str) -> bool:
 # root units of gram, meter, second, ampere and radian are a product, and by the powers of these.
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6, "G": 1e9}
 _ROOTS = ("gram", "meter", "second", "ampere", "radian")
-_Symbol: TypeAlias = tuple[
-    tuple[tuple[float, int], ...], tuple[int, ...]
-]  # scales with powers, powers of _ROOTS
 _KILO = ((1e3, 1),)
+_Symbol: TypeAlias = tuple[tuple[tuple[float, int], ...], tuple[int, ...]]
 _SYMBOLS: dict[str, _Symbol] = {
     "g": ((), (1,)),
     "m": ((), (0, 1)),
@@ -103,8 +101,6 @@ _WHOLE: dict[str, _Symbol] = {  # names without a prefix
     "deg": (((0.017453292519943295, 1),), (0, 0, 0, 0, 1)),
     "rpm": (((6.283185307179586, 1), (60.0, -1)), (0, 0, -1, 0, 1)),
 }
-
-
 _TOKEN = r"[()/*]|[^\W\d_]+(?:\^-?\d)?|\S"
 
 
@@ -121,7 +117,7 @@ def _plain_root_units(unit: str) -> tuple[float, dict[str, int]] | None:
     """Factor and root units of a product of known symbols; None for other names, and for parentheses in parentheses."""
     exponents: dict[str, int] = {}
     sign, group = 1, 1  # of the next factor, and of the parentheses that it stands in
-    unit = re.sub(r"\(\s*([^\W\d_]+)\s*\)", r"\1", unit)  # a name in parentheses
+    unit = re.sub(r"\(\s*([^\W\d_]+)\s*\)", r" \1 ", unit)  # a name in parentheses
     for token in re.findall(_TOKEN, re.sub(r"\s*(?:\*\*|\^)\s*", "^", unit)):
         if token == "(":
             if group != 1:

@@ -54,6 +54,37 @@ DESIGNS = ("table2", "calibrated")
 
 def pytest_configure(config: pytest.Config) -> None:
     hypothesis.settings.load_profile("fast" if config.option.markexpr == "not slow" else "untimed")
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False  # pytest-xdist keeps the order below
+
+
+# Modules whose tests take longest: parallel workers begin with them, so that none of them is left alone at the end.
+LONGEST = (
+    *(
+        "chain",
+        "certificate",
+        "compare",
+        "documents",
+        "pages",
+        "notebooks",
+        "report_page",
+        "tune",
+        "many_parameters",
+    ),
+    *(
+        "export_cli",
+        "firmware_trials",
+        "firmware_misra",
+        "cli",
+        "experiments",
+        "campaign",
+        "halbach_experiments",
+    ),
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONGEST)
 
 
 class Design(NamedTuple):

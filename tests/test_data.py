@@ -276,7 +276,7 @@ def test_units_are_products_with_powers(unit: str, factor: float) -> None:
 def test_known_symbols_are_the_units_of_pint() -> None:
     """Each with each prefix, bit by bit; in products, whose factors round by their order, nearly so."""
     single = [prefix + symbol for prefix in ("", *units._PREFIXES) for symbol in units._SYMBOLS]
-    tails = ("/s^2", "/(V)^2", " m / (rad/ms)", "/(kg m)", "^2/V", "*s**-1", " / m / rad")
+    tails = ("/s^2", "/(V)^2", " m / (rad/ms)", "/(kg m)", "^2/V", "*s**-1", " / m / rad", "(m)")
     for unit in [*single, *units._WHOLE, *(one + tail for one in single for tail in tails)]:
         found, (factor, root) = units._plain_root_units(unit), units._pint_root_units(unit)
         assert found is not None, unit

@@ -21,6 +21,7 @@ from malta.units import unit_factor
 pytestmark = pytest.mark.usefixtures("proven_once")
 
 TABLE2 = "design/gains/table2.json"
+FEW: dict[str, dict[str, Any]] = {"capture": {"points": 5}, "supervised-faults": {"only": "stuck"}}
 SI = re.compile(r"(_(1|s2?|m2?|A|rad|Hz|N|J|W|V|kg|share|per|samples))+$")
 
 
@@ -186,9 +187,7 @@ def test_every_scenario(run: Run, gains: str, monkeypatch: pytest.MonkeyPatch) -
     from malta.simulation import catalogue
 
     def quick(name: str, plant: Any, c: Any, **options: Any) -> Any:
-        short: dict[str, dict[str, Any]] = {"capture": {"points": 5}, "supervised-faults": {"only": "stuck"}}
-        few = short.get(name, {})
-        return experiment(name, plant, c, **(options | few))
+        return experiment(name, plant, c, **(options | FEW.get(name, {})))
 
     experiment = catalogue.experiment
     monkeypatch.setattr(catalogue, "experiment", quick)

@@ -138,7 +138,7 @@ def _independent_stroke(plant: Plant, design: Design, samples: int, delay: int) 
     return trace
 
 
-@pytest.mark.parametrize("delay", [0, 1])
+@pytest.mark.parametrize("delay", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_stroke_equals_an_independent_integration(designs: dict[str, Design], delay: int) -> None:
     design = designs["calibrated"]
     run = malta.simulate(design.plant, design.controller, replace(_stroke(10e-3), delay=delay))
