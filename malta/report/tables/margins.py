@@ -335,6 +335,7 @@ def tolerance_table(found: LoopReport) -> Table:
      ────────────────────────────────────────────────────────────────────
      m                          -78.1 %   +1663.9 %                 100 %
      mass margin, linear loop               1.66 kg
+     payload held at rest                   0.63 kg
     <BLANKLINE>
     """
     anywhere = ["anywhere in the travel"] if found.extent.stroke else []
