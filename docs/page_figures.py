@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -334,6 +335,33 @@ def frames() -> Figure:
     return figure
 
 
+def current_noise() -> Figure:
+    """Rest and commands of two designs under noise of the current sensors; bars are 95 % intervals over seeds."""
+    from malta.machines.tubular.evidence import rests_of_seeds
+
+    noise = np.array([0.0, 5.0, 10.0, 20.0, 50.0])  # mA
+    figure, (motion, force) = new_figure(2, height=3.0)
+    for name, style in zip(("calibrated", "robust"), STYLES, strict=False):
+        law = malta.gains.read(f"design/gains/{name}.json")
+        plant = malta.plant_of(law.parameters)
+        rests = [
+            rests_of_seeds(plant.variant(replace(plant.parameters, s_i=1e-3 * s_i)), law, range(16))
+            for s_i in noise.tolist()
+        ]
+        worst = [max(rest[f"true {p}, rms"] for p in ("x1", "y1", "x2", "y2")) for rest in rests]
+        commands = [rest["bearing force, rms about its mean"] for rest in rests]
+        for axes, found, scale in ((motion, worst, 1e6), (force, commands, 1.0)):
+            sizes = [[scale * one, scale * one.half] for one in found]
+            axes.errorbar(noise, *np.transpose(sizes), capsize=2, label=name, **style)
+    motion.set_ylim(0, None)
+    force.set(yscale="log", ylim=(2e-3, 5))
+    finish(
+        motion, "noise of a current sensor, rms [mA]", "worst radial motion at rest, rms [µm]", "the mover"
+    )
+    finish(force, "noise of a current sensor, rms [mA]", "commanded bearing force, rms [N]", "its price")
+    return figure
+
+
 def bode() -> Figure:
     """The Bode plot of the machine that the tutorial begins with."""
     from malta.files import shipped_path
@@ -352,6 +380,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "discs": discs,
     "stages": stages,
     "frames": frames,
+    "current_noise": current_noise,
     "bode": bode,
 }
 

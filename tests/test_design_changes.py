@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from conftest import Run, one_sentence
 
+import malta
 from malta.cli.inputs import _name_of, read_changed_design
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
 FILE = Path("design/calibrated.toml")
+PUSHED = "inertia_feedforward=1.8"
 
 
 def test_changes_reach_the_machine_and_the_design() -> None:
@@ -36,9 +39,27 @@ def test_changes_reach_the_machine_and_the_design() -> None:
     assert len(many.name) < 60
 
 
+def test_more_inertia_is_fed_forward() -> None:
+    """1.8 times: the same gains; the heaviest mover with a weak drive overshoots less, the nominal one errs more."""
+    plain, pushed = (read_changed_design(Path("design/robust.toml"), changes) for changes in (None, [PUSHED]))
+    assert (plain.inertia_feedforward, pushed.inertia_feedforward) == (1.0, 1.8)
+    assert plain.sha256 == malta.gains.read("design/gains/robust.json").spec_sha256 != pushed.sha256
+    model = malta.linearize(plain.plant, plain.plant.at())
+    first, second = (malta.synthesize(spec, model) for spec in (plain, pushed))
+    np.testing.assert_array_equal(first.K, second.K)
+    np.testing.assert_allclose(second.feedforward.inertia, 1.8 * first.feedforward.inertia, rtol=1e-12)
+    par: Any = plain.parameters
+    machines = {"m": par.m * np.array([1.0, 1.2]), "K_D": par.K_D * np.array([1.0, 0.85])}
+    found = [malta.simulate_many(plain.plant, c, malta.Scenario.stroke(), machines) for c in (first, second)]
+    assert 0.7 * found[0].overshoot[1] > found[1].overshoot[1]
+    assert found[0].overshoot[1] > 0.015 > found[1].overshoot[1]
+    assert found[0].deviation[0, 4] < 0.1e-3 < found[1].deviation[0, 4] < 0.3e-3
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
+        ("inertia_feedforward=-1", "design/calibrated.toml: inertia_feedforward: found -1"),
         ("l_B=3kg", "--set: l_B.unit: found 'kg', expected a unit of m"),
         ("m=-1", "--set: m: found -1.0 kg, expected a finite number above 0 in kg"),
         ("nix=3", "--set: nix: found an unknown parameter, expected one of m "),

@@ -148,6 +148,7 @@ def spec_of(
         current_loop_delay=content.current_loop_delay,
         current_lag=content.current_lag,
         position_feedforward=content.position_feedforward,
+        inertia_feedforward=content.inertia_feedforward,
         pause=_rates(content.pause, plant, path, "pause"),
         references=_references(content.references, plant, path),
         commutation=content.commutation,
@@ -166,6 +167,7 @@ LATER = (
     "current_lag",
     "coordinates",
     "position_feedforward",
+    "inertia_feedforward",
     "commutation",
     "references",
 )  # keys that change no design without them

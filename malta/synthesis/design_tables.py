@@ -127,6 +127,9 @@ class DesignFile(Record):
     position_feedforward: StrictBool = entry(
         "whether the forces that hold the machine at its reference are fed forward", default=False
     )
+    inertia_feedforward: Annotated[Finite, Field(ge=0, le=10)] = entry(
+        "multiple of the machine's inertia that is fed forward along the reference", "1", default=1.0
+    )
     pause: dict[StrictStr, Quantity] | None = entry(
         "by output: rate of the reference above which the sum of its errors waits", default=None
     )

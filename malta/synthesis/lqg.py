@@ -386,6 +386,10 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
         raise InputError(spec.path, f"{error.where}: {error.field}", error.found, error.expected) from error
     except (CheckError, np.linalg.LinAlgError) as error:
         raise CheckError(f"{spec.path}: {error}") from error
+    if spec.inertia_feedforward != 1:
+        old = controller.feedforward
+        scaled = replace(old, inertia=spec.inertia_feedforward * np.asarray(old.inertia))
+        controller = replace(controller, feedforward=scaled)
     if spec.commutation == "predicted":
         try:
             controller = commutate_ahead(controller, model)

@@ -219,6 +219,7 @@ class Spec:
     pause : p, m/s: of the reference, above which sums of errors wait; 0: never
     references : 3 x p, SI: limits of positions, speeds and accelerations; 0: those of the machine
     position_feedforward : whether the forces that hold the machine at its reference are fed forward
+    inertia_feedforward : multiple of the machine's inertia in the feedforward of p*''
     commutation : the place for which currents are commutated: "measured" or "predicted"
     loads : what a PID is judged by; None: nothing
     specification : SI, by requirement: "margin"; by requirement and signal: "noise_motion x"
@@ -251,6 +252,7 @@ class Spec:
     pause: tuple[float, ...] = ()
     references: tuple[tuple[float, ...], ...] = ()
     position_feedforward: bool = False
+    inertia_feedforward: float = 1.0
     commutation: Place = "measured"
     loads: Loads | None = None
     specification: Mapping[str, float] = dataclass_field(default_factory=dict)
