@@ -147,6 +147,7 @@ def spec_of(
         current_lag=content.current_lag,
         position_feedforward=content.position_feedforward,
         pause=_rates(content.pause, plant, path, "pause"),
+        braking=_rates(content.braking, plant, path, "braking", " / s^2"),
         references=_references(content.references, plant, path),
         commutation=content.commutation,
         law=_law(content, plant, path),
