@@ -361,7 +361,7 @@ def _ahead_rows() -> list[Row]:
 BRAKES = "its braking; the least for 10 mm is 28.3 ms, at ±1000 N all the way"
 SWINGS = "±1000 N are too little for gains this fast: a linear law brakes too late and swings about its end"
 SLOW = "y and z approach their ends at the fastest rate that brakes within ±1000 N, √(3 F / 2 m d)"
-SLOWEST = "of Kp = 1.2 N/µm: the gains, which the paper does not print, decide about its torques"
+SLOWEST = "Kp = 1.2 N/µm of the PID: gains, which the paper does not print, decide about its torques"
 
 
 def _jump_rows() -> list[Row]:
@@ -428,7 +428,8 @@ def _jump_rows() -> list[Row]:
             jump_ratio,
             "implied.phi_ratio",
             "at least",
-            "its conclusion: the table is better",
+            "its conclusion: the table is better; what it leaves is what "
+            "late currents do, as by the exact model",
         )
     )
     return found
