@@ -483,6 +483,13 @@ def test_every_printed_number_is_claimed(paper: dict[str, Any]) -> None:
     assert {key for key in printed(paper) if key} - keys == inputs
 
 
+def test_gain_files_keep_where_axes_brake(pid: Design, tmp_path: Path) -> None:
+    files = [tmp_path / f"kept{suffix}" for suffix in (".json", ".npz", ".mat")]
+    malta.gains.write(pid.controller, pid.margins, *files)
+    for file in files:
+        np.testing.assert_array_equal(malta.gains.read(file).braking, pid.controller.braking)
+
+
 def test_an_axis_that_cannot_brake_is_refused(lqg: Design) -> None:
     spec, model = lqg.spec, malta.linearize(lqg.plant, lqg.plant.at())
     with pytest.raises(malta.InputError, match=r"braking\.psi: found an axis without both"):

@@ -96,7 +96,7 @@ def controller_of(file: GainFile, path: str | Path) -> Controller:
     errors = _tracks_errors(file)
     if errors:
         _check_error_law(file, arrays, path)
-    return Controller(
+    fields: dict[str, Any] = dict(
         name=file.design.name,
         spec_sha256=file.design.spec_sha256,
         parameters=par,
@@ -119,6 +119,10 @@ def controller_of(file: GainFile, path: str | Path) -> Controller:
         if file.commutation is None
         else Commutation(file.commutation.lead, **arrays["commutation"]),
     )
+    try:
+        return Controller(**fields)
+    except InputError as error:  # the record does not know the file
+        raise InputError(path, f"law.{error.field}", error.found, error.expected) from error
 
 
 def _of_outputs(
