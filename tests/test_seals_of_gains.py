@@ -56,6 +56,10 @@ def _twice(document: dict[str, Any]) -> None:
     document["feedforward"]["z_grid"][1] = document["feedforward"]["z_grid"][0]
 
 
+def _brake(error: float, k: int, document: dict[str, Any]) -> None:
+    document |= {"version": 2, "law": {"tracks": "states", "braking": [error * (n == k) for n in range(5)]}}
+
+
 CHANGES: dict[str, tuple[Change, str]] = {
     "another schema": (lambda d: d.update(schema="other"), "schema"),
     "another version": (lambda d: d.update(version=3), "version"),
@@ -70,6 +74,8 @@ CHANGES: dict[str, tuple[Change, str]] = {
     "no sample time": (lambda d: d.update(sample_time=0.0), "sample_time"),
     "NaN": (partial(_put, "operating_point", "u", [float("nan")] * 5), "operating_point.u.0"),
     "infinity": (partial(_put, "limits", "voltage", [float("inf")] * 5), "limits.voltage.0"),
+    "braking below 0": (partial(_brake, -1e-3, 4), "law.braking"),
+    "braking of a sensor beside the centre": (partial(_brake, 1e-3, 0), "law.braking"),
     "an unknown key": (partial(_put, "design", "note", "mine"), "design.note"),
     "an unknown table": (lambda d: d.update(notes={}), "notes"),
 }

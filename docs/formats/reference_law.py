@@ -34,6 +34,7 @@ class Law:
         self.n0, (self.n, self.m) = len(file["model"]["A"]), self.Bd.shape
         self.f_max = np.array(file["limits"]["force"] or [np.inf] * self.m)
         self.pause = np.array(law.get("pause") or [0.0] * self.m)
+        self.braking = np.array(law.get("braking") or [0.0] * self.m)
         self.reach, self.stroke = np.array(REACH[self.machine]), STROKE[self.machine]
         later = [signal["name"] for signal in file["signals"]["states"]][self.n0 :: self.m]
         self.lagging = int(any(name.endswith("[i]") for name in later))
@@ -82,9 +83,14 @@ class Law:
         if "rate" in self.ff:
             xi_ref[self.n0 - len(self.ff["rate"]) : self.n0] += self.ff["rate"] @ dp
         waits = self.frozen | ((self.pause > 0) & (np.abs(dp) > self.pause))
+        waits |= (self.braking > 0) & (np.abs(p - y) > self.braking)
         self.e = self.e + np.where(waits, 0, self.Ts * (p - y))
         v0 = np.array([np.interp(y[self.stroke], self.ff["z_grid"], f) for f in self.ff["v0"].T])
-        wanted = self.K @ (xi_ref - xi_hat) + self.Ki @ self.e + v_ff + v0
+        off = xi_ref - xi_hat
+        for k in np.flatnonzero(self.braking):
+            b, size = self.braking[k], abs(off[k])
+            off[k] *= np.sqrt(b * (2 * size - b)) / size if size > b else 1
+        wanted = self.K @ off + self.Ki @ self.e + v_ff + v0
         v = np.clip(wanted, -self.f_max, self.f_max)
         self.frozen = v != wanted
         self.xi_pred = self.Ad @ xi_hat + self.Bd @ (v - v0)

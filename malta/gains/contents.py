@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 import numpy as np
 
@@ -96,7 +96,7 @@ def controller_of(file: GainFile, path: str | Path) -> Controller:
     errors = _tracks_errors(file)
     if errors:
         _check_error_law(file, arrays, path)
-    return Controller(
+    fields: dict[str, Any] = dict(
         name=file.design.name,
         spec_sha256=file.design.spec_sha256,
         parameters=par,
@@ -112,22 +112,30 @@ def controller_of(file: GainFile, path: str | Path) -> Controller:
         current_loop=None if file.current_loop is None else CurrentLoop(**file.current_loop.model_dump()),
         limits=Limits(**(unlimited | arrays["limits"])),
         tracks="errors" if errors else "states",
-        pause=_pause(file, layout.plant, path),
+        pause=_of_outputs(file, layout.plant, path, "pause"),
+        braking=_of_outputs(file, layout.plant, path, "braking"),
         references=_references(file, layout.plant, path),
         commutation=None
         if file.commutation is None
         else Commutation(file.commutation.lead, **arrays["commutation"]),
     )
+    try:
+        return Controller(**fields)
+    except InputError as error:  # the record does not know the file
+        raise InputError(path, f"law.{error.field}", error.found, error.expected) from error
 
 
-def _pause(file: GainFile, plant: Plant, path: str | Path) -> FloatArray:
-    """Rates of the references above which sums of errors wait; none where the file has none."""
-    given = None if file.law is None else file.law.pause
+def _of_outputs(
+    file: GainFile, plant: Plant, path: str | Path, name: Literal["pause", "braking"]
+) -> FloatArray:
+    """A number of at least 0 for each output, as the rates above which sums wait; none where the file has none."""
+    given = None if file.law is None else getattr(file.law, name)
     if given is None:
         return np.zeros(0)
-    found = _array(given, (len(plant.outputs),), path, "law.pause")
+    found = _array(given, (len(plant.outputs),), path, f"law.{name}")
     if (found < 0).any():
-        raise InputError(path, "law.pause", str(found.tolist()), "rates of at least 0")
+        expected = "rates of at least 0" if name == "pause" else "errors of at least 0"
+        raise InputError(path, f"law.{name}", str(found.tolist()), expected)
     return found
 
 

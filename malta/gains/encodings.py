@@ -38,6 +38,7 @@ MATRICES = (
 )
 VECTORS = (
     "law.pause",
+    "law.braking",
     "operating_point.",
     "feedforward.inertia",
     "feedforward.z_grid",

@@ -89,9 +89,11 @@ def document(controller: Controller, margins: LoopReport) -> dict[str, Any]:
     ahead = c.commutation is not None
     extended = linear or c.tracks == "errors" or not c.feedforward.rate.size or bool(c.lagging) or ahead
     extended = extended or in_positions or bool(c.feedforward.position.size) or bool(c.pause.size)
+    extended = extended or bool(c.braking.size)
     extended = extended or bool(c.references.size)
     law: dict[str, Any] = {"tracks": c.tracks} | ({"coordinates": "positions"} if in_positions else {})
     law |= {"pause": c.pause} if c.pause.size else {}
+    law |= {"braking": c.braking} if c.braking.size else {}
     law |= {"references": c.references} if c.references.size else {}
     tables: dict[str, Any] = {
         "schema": SCHEMA,

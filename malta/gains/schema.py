@@ -95,6 +95,12 @@ class Law(Record):
     pause: Vector | None = entry(
         "rates of the references above which sums of errors wait; 0: never", "m/s", shape="p", default=None
     )
+    braking: Vector | None = entry(
+        "errors of positions beyond which an axis brakes at a constant rate, and its sum of errors waits; 0: never",
+        "m, rad",
+        shape="p",
+        default=None,
+    )
     references: Matrix | None = entry(
         "limits of references: positions, speeds, accelerations; 0: those of the machine",
         "SI",

@@ -102,7 +102,8 @@ def _name_signals(schema: Schema, plant: Plant) -> None:
                 properties[key] = require_names(properties[key], allowed, all_of=key in complete)
     whole = schema["properties"]
     whole["operating_point"] = require_names(whole["operating_point"], states)
-    whole["pause"] = require_names(whole["pause"], outputs)
+    for key in ("pause", "braking"):
+        whole[key] = require_names(whole[key], outputs)
     limits = schema["$defs"]["ReferencesTable"]["properties"]
     for key in limits:
         limits[key] = require_names(limits[key], outputs)

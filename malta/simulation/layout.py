@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Names of numbers_of that all machines of a batch share: those of the controller and of its samples.
 SHARED = (
     *("Ad", "Bd", "Cd", "K", "Ki", "L", "force_limit", "control_time", "Kp", "Ki_current", "rate"),
-    *("pause", "lead", "ahead", "grid_ends", "substep"),
+    *("pause", "braking", "lead", "ahead", "grid_ends", "substep"),
 )
 
 Fidelity = Literal["force", "dq", "phase"]

@@ -8,12 +8,17 @@
 
 At every sample:
   1. y = measured outputs;                      e += Ts (p* - y), frozen on the axes that saturated last, and on
-                                                those whose reference moves faster than `pause`, where there is one
+                                                those whose reference moves faster than `pause`, where there is one,
+                                                and on those that are farther off than `braking`, where there is one
   2. xi_hat = xi_pred + L (y - Cd xi_pred)                                     (steady-state Kalman filter)
   3. v_fb = K (xi* - xi_hat) + Ki e             with xi* = (P(z*)^-1 p*, its derivative)
   4. v = saturate(v_fb + v_ff + v0(z)),         v_ff = inertia p*'' + speed p*' + position q*, z the measured stroke
   5. currents = those that make v where y says the machine is, held until the next sample
   6. xi_pred = Ad xi_hat + Bd (v - v0(z))
+Where an axis has a `braking`, b, an error xi* - xi_hat of its position that is larger counts in step 3 as
+sqrt(b (2 |error| - b)), with its sign: a far end is approached at the speed from which a constant deceleration stops,
+as limits of the force allow, and not in proportion to the distance. Within b the law is the linear one.
+
 The mechanical states stand first in xi. Where the design models the lag of the current loops, the forces that act at
 the sample follow: v - v0 behind first-order lags. Where it models a delay of d samples, forces of the last d samples
 follow, the oldest first: v - v0, and what currents commutated for an old reading make beside it. The reference of both
@@ -191,6 +196,8 @@ class Controller:
         past its end.
     references : 3 x p, SI: limits of positions, speeds and accelerations of references, which exported controllers
         obey; 0: those of the machine; none: all of them
+    braking : p, m or rad: errors of positions beyond which an axis brakes along the parabola of a constant deceleration
+        and its sum of errors waits, 0: never; none: no axis does. Only of outputs that are the state of their index.
     tracks : what the filter takes: "states" (y) or "errors" (y - p*)
     commutation : place for which currents are commutated; None: the reading y
 
@@ -226,6 +233,7 @@ class Controller:
     limits: Limits
     pause: FloatArray = field(default_factory=lambda: np.zeros(0), metadata={"later": True})
     references: FloatArray = field(default_factory=lambda: np.zeros((0, 0)), metadata={"later": True})
+    braking: FloatArray = field(default_factory=lambda: np.zeros(0), metadata={"later": True})
     tracks: Tracks = field(default="states", metadata={"later": True})
     commutation: Commutation | None = field(default=None, metadata={"later": True})
 
@@ -242,6 +250,12 @@ class Controller:
                 "as many of both: let `currents` share one force among coils that act alike, or measure less"
             )
             raise InputError("Controller", "forces", found, expected)
+        for k in np.flatnonzero(self.braking):
+            if self.tracks == "errors" or not _is_own_state(self.C[k], int(k)):
+                found = f"one of {self.measurements[k].name}"
+                raise InputError(
+                    self.name, "braking", found, "one of an output that is the state of its index"
+                )
 
     def __repr__(self) -> str:
         return (
@@ -296,6 +310,11 @@ class LinearLaw(NamedTuple):
     D_r: FloatArray
 
 
+def _is_own_state(row: FloatArray, k: int) -> bool:
+    """Whether an output, a row of C, is the state of its index k."""
+    return k < len(row) // 2 and bool(np.array_equal(row, np.eye(len(row))[k]))
+
+
 def stored_forces(inputs: tuple[Signal, ...], delay: int) -> tuple[Signal, ...]:
     """The states that hold the forces of the last `delay` samples, the oldest first."""
     return tuple(Signal(f"{s.name}[k-{age}]", s.unit) for age in range(delay, 0, -1) for s in inputs)
@@ -317,6 +336,8 @@ def gains_of(c: Controller) -> dict[str, ca.DM]:
     matrices |= {"force_limit": ca.DM(c.limits.force), "control_time": ca.DM(c.sample_time)}
     if c.pause.any():
         matrices["pause"] = ca.sparsify(ca.DM(c.pause))
+    if c.braking.any():
+        matrices["braking"] = ca.sparsify(ca.DM(c.braking))
     if c.commutation is None:
         return matrices
     lead = c.commutation.lead
@@ -330,7 +351,32 @@ def filtered(tracks: Tracks, y: Any, p_ref: Any) -> Any:
 
 def sum_errors(g: Mapping[str, Any], e: Any, frozen: Any, y: Any, p_ref: Any, add: Add = operator.add) -> Any:
     """Step 1: e, the sums of errors at this sample. add: how a sum takes what is added to it, see Add."""
+    if "braking" in g:
+        far = {k: ca.fabs(p_ref[k] - y[k]) > g["braking"][k] for k in _braking_axes(g)}
+        frozen = ca.vertcat(
+            *(ca.if_else(far[k], 1, frozen[k]) if k in far else frozen[k] for k in range(y.numel()))
+        )
     return add(e, g["control_time"] * (1 - frozen) * (p_ref - y))
+
+
+def _braking_axes(g: Mapping[str, Any]) -> list[int]:
+    """The axes that brake."""
+    return [k for k in range(g["braking"].numel()) if g["braking"].sparsity().has_nz(k, 0)]
+
+
+def _braked(g: Mapping[str, Any], off: Any) -> Any:
+    """What braking takes off the forces for errors xi* - xi_hat: exactly 0 within the errors from which axes brake."""
+    found: Any = 0
+    for k in _braking_axes(g):
+        b = g["braking"][k]
+        size = ca.fmax(ca.fabs(off[k]), b)
+        found = found + g["K"][:, k] * ((ca.sqrt(b * (2 * size - b)) / size - 1) * off[k])
+    note(
+        "brake",
+        "braked = K (sqrt(b (2 a - b)) / a - 1) (xi_ref - xi_hat), a = max(|xi_ref - xi_hat|, b)",
+        braked=found,
+    )
+    return found
 
 
 def estimated(g: Mapping[str, Any], xi_pred: Any, y: Any, C: Any = None, add: Add = operator.add) -> Any:
@@ -349,6 +395,8 @@ def commanded(
     """Steps 3, 4 and 6: (xi_pred, frozen, v) from the estimate and the sums of errors."""
     # The first sum is the same for all machines under one reference: engines compute it once a sample.
     wanted = (g["K"] @ xi_ref + v_ff) + (g["Ki"] @ e - g["K"] @ xi_hat) + v0
+    if "braking" in g:
+        wanted = wanted + _braked(g, xi_ref - xi_hat)
     note("law", "w = K (xi_ref - xi_hat) + Ki e + v_ff + v0", w=wanted)
     v = ca.fmax(ca.fmin(wanted, g["force_limit"]), -g["force_limit"])
     saturated = v != wanted

@@ -150,6 +150,7 @@ def spec_of(
         position_feedforward=content.position_feedforward,
         inertia_feedforward=content.inertia_feedforward,
         pause=_rates(content.pause, plant, path, "pause"),
+        braking=_rates(content.braking, plant, path, "braking", " / s^2"),
         references=_references(content.references, plant, path),
         commutation=content.commutation,
         law=_law(content, plant, path),

@@ -133,6 +133,10 @@ class DesignFile(Record):
     pause: dict[StrictStr, Quantity] | None = entry(
         "by output: rate of the reference above which the sum of its errors waits", default=None
     )
+    braking: dict[StrictStr, Quantity] | None = entry(
+        "by output: deceleration at which the law brakes from errors that are too large to brake in proportion",
+        default=None,
+    )
     references: ReferencesTable | None = entry(
         "limits of what may be asked of the machine, which exported controllers obey", default=None
     )

@@ -22,8 +22,10 @@ of disturbance on each input, which the regulator takes off again.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -400,7 +402,33 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
             spec.path, "pause", "a law without sums of errors", "one with integrals, or no pause"
         )
     references = np.array(spec.references) if spec.references else controller.references
-    return replace(controller, spec_sha256=spec.sha256, pause=np.array(spec.pause), references=references)
+    return replace(
+        controller,
+        spec_sha256=spec.sha256,
+        pause=np.array(spec.pause),
+        braking=braking_errors(controller, spec.braking, spec.path),
+        references=references,
+    )
+
+
+def braking_errors(c: Controller, decelerations: Sequence[float], path: str | Path) -> FloatArray:
+    """Errors from which axes brake at these decelerations, m/s^2: a / rate^2, with the rate of approach of each axis.
+
+    Within them speed follows the error, v = rate times error, where rate = K_position / K_rate; beyond them it is the
+    speed from which the deceleration a stops, v^2 = 2 a (error - a / rate^2 / 2). Both meet with one slope.
+
+    Raises InputError for an axis whose own force does not answer its position and its rate.
+    """
+    found, half = np.array(decelerations), len(c.A) // 2
+    for k in np.flatnonzero(found):
+        near, damped = c.K[k, k], c.K[k, half + k] if half + k < len(c.A) else 0.0
+        if not (near > 0 and damped > 0):
+            name = c.measurements[k].name
+            raise InputError(
+                path, f"braking.{name}", "an axis without both", "a feedback of position and of rate"
+            )
+        found[k] /= (near / damped) ** 2
+    return found
 
 
 def _backward_euler(

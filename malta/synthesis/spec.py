@@ -217,6 +217,7 @@ class Spec:
     uncertainty : relative, either way, by parameter
     current_lag : whether the lag of the current loops is in the design model
     pause : p, m/s: of the reference, above which sums of errors wait; 0: never
+    braking : p, m/s^2: deceleration at which the law brakes from far errors; 0: it does not
     references : 3 x p, SI: limits of positions, speeds and accelerations; 0: those of the machine
     position_feedforward : whether the forces that hold the machine at its reference are fed forward
     inertia_feedforward : multiple of the machine's inertia in the feedforward of p*''
@@ -250,6 +251,7 @@ class Spec:
     uncertainty: Mapping[str, float]
     current_lag: bool = False
     pause: tuple[float, ...] = ()
+    braking: tuple[float, ...] = ()
     references: tuple[tuple[float, ...], ...] = ()
     position_feedforward: bool = False
     inertia_feedforward: float = 1.0

@@ -77,30 +77,32 @@ def step_figure(e: Experiment, published: Published | None = None) -> Figure:
 
 
 def jump_figure(e: Experiment, published: Published | None = None) -> Figure:
-    """The same as jumps of the reference: motion and forces as designed and softened, torque and tilt by coil model."""
-    designed, soft = e.cases[0], [case for case in e.cases[1:] if case.label != "exact, soft"]
+    """The same as jumps of the reference: y and its force by law, torque and tilt by coil model with soft gains."""
+    laws = {case.label.split(", ", 1)[1]: case for case in e.cases if case.label.startswith("table")}
+    soft = [case for case in e.cases if case.label in ("table, soft", "analytical, soft")]
     figure = new_page(
         runs_of(e),
-        "jumps of the reference in z and y: gains as designed, and soft in y and z",
-        ", ".join(f"{c.label}: y off by {merit_phrase(c.merits[0])}" for c in (designed, *soft[:1])),
+        "jumps of the reference in z and y, by the law and by the coil model",
+        "y off after 0.1 s: "
+        + ", ".join(f"{t} {number(1e6 * c.merits[1].value)} µm" for t, c in laws.items()),
         wspace=0.3,
         left=0.075,
         hspace=0.2,
     )
     (motion, forces), (torque, tilt) = figure.subplots(2, 2, sharex=True)
-    for case, style in zip((designed, *soft[:1]), (STYLES[1], STYLES[0]), strict=False):
-        run, text = case.run, case.label.split(", ")[-1]
-        draw_line(motion, run.t * 1e3, (run.p[:, 1] - run.reference[0, 1]) * 1e3, label=f"y, {text}", **style)
+    for (text, case), style in zip(laws.items(), STYLES, strict=False):
+        run = case.run
+        draw_line(motion, run.t * 1e3, (run.p[:, 1] - run.reference[0, 1]) * 1e3, label=text, **style)
         mark_end(motion, run, run.t * 1e3, (run.p[:, 1] - run.reference[0, 1]) * 1e3)
-        draw_line(forces, run.t * 1e3, run.v[:, 1], label=f"F_y, {text}", **style)
+        draw_line(forces, run.t * 1e3, run.v[:, 1], label=text, **style)
     draw_published(forces, published, "steps.force_limit", "N", "published limit", both=True)
     for case, style in zip(soft, STYLES, strict=False):
         run = case.run
         draw_line(torque, run.t * 1e3, run.v[:, 3], label=case.label, **style)
         draw_line(tilt, run.t * 1e3, (run.p - run.reference)[:, 3] * 1e6, label=case.label, **style)
-    finish_axes(motion, "", "moved [mm]", legend=2)
-    finish_axes(forces, "", "commanded force [N]", legend=2)
-    finish_axes(torque, "time [ms]", "commanded T_x [N m]", legend=2)
+    finish_axes(motion, "", "y, moved [mm]", legend=3)
+    finish_axes(forces, "", "F_y, commanded [N]")
+    finish_axes(torque, "time [ms]", "T_x, commanded [N m]", legend=2)
     finish_axes(tilt, "time [ms]", "phi, off reference [µrad]")
     return figure
 

@@ -119,6 +119,9 @@ def _law(subject: Subject) -> Iterator[Entry]:
         if pause:
             name, unit = f"integral of {signal.name} waits above", f"{signal.unit}/s"
             yield Entry("law", name, float(pause), unit, signal.name)
+    for signal, error in zip(c.measurements, c.braking, strict=False):
+        if error:
+            yield Entry("law", f"{signal.name} brakes from", float(error), signal.unit, signal.name)
     for words, per, row in zip(
         ("reference", "speed", "acceleration"), ("", "/s", "/s^2"), c.references, strict=False
     ):

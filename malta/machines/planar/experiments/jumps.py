@@ -1,8 +1,8 @@
 """The published steps of the planar motor as the paper commands them: jumps of the reference.
 
 A jump saturates the forces in y and z. A linear law that is much faster than these limits allow then brakes too late
-and swings about its end, whatever its integrals do: sums of errors wait while their axis saturates, and the filter is
-told of the limited force. What settles is a law that approaches its end at a rate at which it can brake.
+and swings about its end, and the error of the first sample alone charges its sums. What settles is a law that
+approaches its end at a speed from which it can stop: by its `braking`, or, as a linear one, at a rate that is slow.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from malta.machines.planar.experiments.motions import (
     MODELS,
     MOVE_AT,
     PLACE,
+    arrival,
     parameters_of,
     with_coil_model,
 )
@@ -41,7 +42,7 @@ from malta.synthesis.lqg import lqg, weights_of
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
-DESIGNED, SOFT = "as designed", "soft"  # ends of the labels of cases
+DESIGNED, LINEAR, SOFT = "as designed", "without braking", "soft"  # ends of the labels of cases
 Y, Z = 1, 2  # the axes that jump
 SMALLEST = 1e-6  # m: a smaller jump asks for no softer gains
 
@@ -61,7 +62,8 @@ def jump(
 ) -> Experiment:
     """The published steps as jumps of the reference, Figs 9 to 12: up by `lift` (m), then `distance` (m) along y.
 
-    Once as designed, with the table of `cells`, then with y and z softened (`soften`) and each coil model.
+    Once as designed and once without the law's `braking`, with the table of `cells`; then, without it, with y and z
+    softened (`soften`) and each coil model.
 
     rate : of approach in y and z, 1/s; 0: the fastest one that brakes within the limits of the forces
 
@@ -74,7 +76,9 @@ def jump(
     scenario = scenario_of("jump", DURATION, reference, FORCES | options)
     rates = (rate, rate) if rate else braking_rates(plant, distance, lift)
     soft = soften(controller, plant, rates)
-    flights = [(plant, with_coil_model(controller, "table", cells), f"table, {DESIGNED}")]
+    by_table = with_coil_model(controller, "table", cells)
+    flights = [(plant, by_table, f"table, {DESIGNED}")]
+    flights += [(plant, replace(by_table, braking=np.zeros(0)), f"table, {LINEAR}")]
     flights += [(plant, with_coil_model(soft, model, cells), f"{model}, {SOFT}") for model in MODELS]
     cases, cut = fly_all(
         [(p, c, PlannedRun(label, scenario, jump_merits)) for p, c, label in flights], progress, options
@@ -106,7 +110,9 @@ def braking_rates(plant: Plant, distance: float, lift: float) -> tuple[float, fl
 
 
 def soften(controller: Controller, plant: Plant, rates: tuple[float, float]) -> Controller:
-    """The same controller with gains in y and z that approach a distant end at these rates, 1/s, or at its own.
+    """The same controller, without braking, with gains in y and z that approach a distant end at these rates, 1/s.
+
+    It is no faster than it was.
 
     A PID keeps its Kd and has Kp = rate Kd and no integral, which would sum the way up to the end. The regulator of an
     LQG has w_n = sqrt(2) rate, so that Kp = rate Kd too; its filter stays as it is.
@@ -121,7 +127,7 @@ def soften(controller: Controller, plant: Plant, rates: tuple[float, float]) -> 
         for k, rate in zip((Y, Z), rates, strict=True):
             K[k, k] = min(rate * K[k, half + k], K[k, k])
             Ki[k] = 0
-        return replace(controller, K=K, Ki=Ki)
+        return replace(controller, K=K, Ki=Ki, braking=np.zeros(0))
     own = weights_of(controller)
     q = own.q.copy()
     for k, rate in zip((Y, Z), rates, strict=True):
@@ -154,10 +160,13 @@ def jumps_reference(
 
 
 def jump_merits(run: Trajectory) -> tuple[Merit, ...]:
-    """What is left in y and z at the end, how far they went beyond, and how long the forces were at their limit."""
+    """When y arrives, what is left in y and z at the end and how far they went beyond; forces, and time at limits."""
     moved = run.p[:, [Y, Z]] - run.reference[-1, [Y, Z]]
     past = moved * np.sign(run.reference[-1, [Y, Z]] - run.reference[0, [Y, Z]])
     return (
+        Merit(
+            "y within 10 um after its step", arrival(run, float(run.reference[-1, Y])), "ms", key="y_settled"
+        ),
         *(Merit(f"{name}, left at the end", abs(float(moved[-1, k])), "um") for k, name in enumerate("yz")),
         *(
             Merit(f"{name}, overshoot", max(float(past[:, k].max()), 0.0), "um")

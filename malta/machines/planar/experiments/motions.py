@@ -177,7 +177,7 @@ def step_merits(run: Trajectory) -> tuple[Merit, ...]:
     late = run.t >= LIFT_AT + 0.02 - Ts / 2
     beyond = (run.p[:, 1] - target[1]) * np.sign(target[1] - run.reference[0, 1])
     return (
-        Merit("y within 10 um after its step", _arrival(run, target[1]), "ms", key="y_settled"),
+        Merit("y within 10 um after its step", arrival(run, target[1]), "ms", key="y_settled"),
         Merit("y, overshoot", max(float(beyond.max()), 0.0), "um"),
         Merit(
             "z, from 20 ms after its step", _largest(np.abs(run.p[late, 2] - target[2])), "um", key="z_late"
@@ -192,7 +192,7 @@ def step_merits(run: Trajectory) -> tuple[Merit, ...]:
     )
 
 
-def _arrival(run: Trajectory, target: float) -> float:
+def arrival(run: Trajectory, target: float) -> float:
     """Time from the step in y until y stays within WITHIN of the target, s; NaN if it does not."""
     off = np.flatnonzero(np.abs(run.p[:, 1] - target) > WITHIN)
     if not len(off) or off[-1] + 1 == len(run.t):
