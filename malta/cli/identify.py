@@ -25,8 +25,8 @@ def identify(
             "--parameter",
             "-p",
             metavar="NAME",
-            help="To identify: of the machine, or of its sensors' errors. Repeatable. "
-            "[those told to 20 %, but for masses and lengths]",
+            help="To identify: of the machine, or of its sensors' errors. Repeatable. [those told to 50 %, but for "
+            "masses and lengths]",
         ),
     ] = None,
     known: Annotated[

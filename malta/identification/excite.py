@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 BAND = (2.0, 400.0)  # Hz
 LINES = 12  # of each input
 PERIODS = 10
-SHARE = 0.2  # of its value: a parameter that is found worse is not asked for by itself
+SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
 QUIET = 1e-9  # m or rad: noise of a sensor that has none
 CURRENT = 0.1  # of the current limit: the amplitude where none is given
 
@@ -100,7 +100,7 @@ def excite(
     periods : that are logged
     band : Hz, lowest and highest line
     lines : of each input
-    parameters : whose accuracy is predicted; (): those that will be found to 20 %, but for masses and lengths
+    parameters : whose accuracy is predicted; (): those that will be found to 50 %, but for masses and lengths
     seed : of the phases
 
     Returns an ExcitationPlan.

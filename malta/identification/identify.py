@@ -39,7 +39,7 @@ WINDOW = 3  # lines to either side whose bins are taken together
 EXCITED = 1e-6  # of the largest line of an excitation: what is above is a line
 FEWEST = 3  # periods
 SIGMA = 1.959963984540054  # half of a 95 % interval
-SHARE = 0.2  # of its value: a parameter that is found worse is not asked for by itself
+SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
 LOST = 1.0  # of its value: a combination of parameters that is found worse is not found
 LIKELY = 1e-6  # probability below which chi2 refuses the model
 SLACK = 1.1  # factor of chi2: the noise's covariance is estimated too
@@ -157,7 +157,7 @@ def identify(
 
     controller : the gain file that flew; its machine's parameters are where the search starts
     log : with measured currents and an excitation of whole periods
-    parameters : names of the machine's record or of its sensors' errors; (): those that the log tells to 20 %, but for
+    parameters : names of the machine's record or of its sensors' errors; (): those that the log tells to 50 %, but for
         masses and lengths, which are held
     known : parameters with values that were weighed or measured otherwise, SI
     start : values from which the search starts, SI
@@ -387,7 +387,7 @@ def _information(model: ResponseModel, s: Spectrum) -> FloatArray:
 def _require_identifiable(model: ResponseModel, F: FloatArray, source: str) -> None:
     """Raise CheckError where parameters are not told, alone or together, and say which combination it is."""
     if not model.names:
-        raise CheckError(f"{source}: no parameter is told by this log to 20 %: name some, or excite more")
+        raise CheckError(f"{source}: no parameter is told by this log to 50 %: name some, or excite more")
     blind = [name for name, f in zip(model.names, np.diag(F), strict=True) if f <= 0]
     if blind:
         raise CheckError(f"{source}: {' '.join(blind)} do not act on the response at all")
@@ -431,9 +431,8 @@ def _estimate(model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str,
     white = _whitened(model, s, theta)
     dof = 2 * white.size - len(scale)
     chi2 = float(2 * (np.abs(white) ** 2).sum() / dof)
-    spread = max(1.0, chi2)
-    slopes_of_e = np.asarray(found.jac)
-    covariance = spread * np.linalg.pinv(slopes_of_e.T @ slopes_of_e) * np.outer(scale, scale)
+    covariance = _covariance(np.asarray(found.jac), np.asarray(found.fun), max(1.0, chi2))
+    covariance *= np.outer(scale, scale)
     outputs = (np.abs(white) ** 2).mean(axis=0).tolist()
     par, plant = model.plant.parameters, model.plant
     others = replace(model, names=tuple(n for n in acting(plant) if n not in model.names))
@@ -455,6 +454,18 @@ def _estimate(model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str,
         by_output=dict(zip([o.name for o in plant.outputs], outputs, strict=True)),
         dropped=dropped,
     )
+
+
+def _covariance(slopes: FloatArray, e: FloatArray, spread: float) -> FloatArray:
+    """The covariance of parameters from slopes of the residuals e in standard deviations.
+
+    chi2 times (J' J)^-1; and where the lines that tell a parameter have larger residuals than others, the larger
+    deviation of (J' J)^-1 J' diag(e^2) J (J' J)^-1, which takes each line's own (White, Econometrica 48(4), 1980).
+    """
+    inverse = np.linalg.pinv(slopes.T @ slopes)
+    own = inverse @ (slopes.T * e**2) @ slopes @ inverse * len(e) / (len(e) - len(inverse))
+    grown = np.sqrt(np.maximum(np.diag(own) / (spread * np.diag(inverse)), 1.0))
+    return np.asarray(spread * inverse * np.outer(grown, grown))
 
 
 def _whiteness(white: ComplexArray, s: Spectrum) -> float:
