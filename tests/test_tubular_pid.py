@@ -62,7 +62,9 @@ def design(spec: Spec) -> SynthesizedDesign:
 
 @pytest.fixture(scope="module")
 def found(spec: Spec, published: dict[str, Any]) -> Evidence:
-    return evidence_of(spec, published)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("malta.machines.tubular.evidence.MACHINES", 64)
+        return evidence_of(spec, published)
 
 
 def terms_of(spec: Spec) -> Pid:

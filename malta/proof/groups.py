@@ -137,6 +137,7 @@ def _symbolic(program: Program) -> Symbolic | None:
         return None
 
 
+@lru_cache(maxsize=32)  # records compare by identity
 def groups(loop: UncertainLoop) -> list[Group]:
     """The strongly connected parts of the closed loop: its characteristic polynomial is the product of theirs."""
     law, n = loop.law, loop.states

@@ -8,7 +8,6 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import optimize
 
 from malta.errors import CheckError
 from malta.proof.expressions import NotAnalytic
@@ -183,6 +182,8 @@ def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float, proven:
 
     if is_late():
         return high
+    from scipy import optimize  # which takes a while to read
+
     with suppress(ValueError):  # it is unstable at the lower end, too
         optimize.brentq(rate, low, high, xtol=width, maxiter=60, disp=False)
     return high

@@ -294,7 +294,8 @@ class HeldLoop:
         n = len(self.machine.lead)
         seen = np.zeros((3 * n + len(self.law.A),) * 2)
         known: dict[Any, tuple[FloatArray, FloatArray] | None] = {}
-        vector, rho = np.ones(len(seen)), math.inf
+        vector: FloatArray = np.ones(len(seen))
+        rho = math.inf
         for p in _corners(sides):
             try:
                 W, V, rest = self._bounds(np.stack([p, p], axis=1))
