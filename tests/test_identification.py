@@ -98,6 +98,7 @@ def test_parameters_are_within_their_intervals(log: malta.Log, plan: malta.Excit
 
 def test_without_names_those_are_found_that_the_log_tells(log: malta.Log) -> None:
     found = malta.identify(CONTROLLER, log)
+    assert not found.dropped.keys() & set(found.names)
     assert {"K_A", "K_B", "K_D", "I_xx"} <= set(found.names)
     assert found.held["l_B"] == 0.04456
     assert "R" not in found.held
@@ -216,6 +217,7 @@ def test_exported_laws_have_no_excitation(plan: malta.ExcitationPlan) -> None:
         malta.simulate(changed({}), CONTROLLER, malta.Scenario.excited(lambda t: np.zeros((len(t), 2)), 0.01))
 
 
+@pytest.mark.slow
 def test_commands_from_excitation_to_data_file(run: Run, tmp_path: Path) -> None:
     flown, data = tmp_path / "flown.npz", tmp_path / "found.toml"
     short = ("--period", "0.5", "--periods", "3", "--band", "4..400", "--motion", "40um")

@@ -97,6 +97,7 @@ def test_gaps_stuck_and_clipped_sensors_are_seen(log: malta.Log) -> None:
     assert (whole.gaps, whole.stuck, whole.clipped) == (0, {}, {})
 
 
+@pytest.mark.slow
 def test_commands_write_and_show_a_log(run: Run, tmp_path: Path) -> None:
     file, picture = tmp_path / "stroke.csv", tmp_path / "log.png"
     said = run("simulate", ROBUST, "--set", "K_D=4.68", "--noise", "1", "--log", file)

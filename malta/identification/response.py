@@ -1,7 +1,8 @@
 """The response of a machine from measured currents to measured outputs, in parameters by name.
 
-Between samples a current grows evenly from one measured value to the next (a first-order hold): voltages are held, and
-a sample is short against L / R. Then delay, current loops and law drop out, whatever they are, and what is left is
+Between samples a current goes exponentially from one measured value to the next: with the rate R / L of windings whose
+voltages are held; of a machine without a model of its windings with that of its current loops, or it is held. Then
+delay, current loops and law drop out, whatever they are, and what is left is the machine
 
     x' = f(x, forces(i), load(x)),   y = h(x)       linearized where the log was made, with the mean current there
 """
@@ -76,13 +77,24 @@ class ResponseModel:
         """
         A, B, C, late = (np.array(M) for M in self._matrices(theta))
         n, m, Ts = len(A), B.shape[1], self.sample_time
-        held = np.isinf(self.plant.actuator.crossover)
+        actuator = self.plant.actuator
+        driven = actuator.R / actuator.L if self.plant.windings is not None and actuator.L else 0.0
+        rate = actuator.crossover if self.plant.windings is None else driven
+        held = bool(np.isinf(rate))
+        rate = 0.0 if held else rate
         whole = np.zeros((n + 2 * m,) * 2)
-        whole[:n, :n], whole[:n, n : n + m], whole[n : n + m, n + m :] = A, B, np.eye(m) / Ts
+        whole[:n, :n], whole[:n, n : n + m] = A, B
+        whole[n : n + m, n : n + m], whole[n : n + m, n + m :] = (
+            -rate * np.eye(m),
+            (rate or 1 / Ts) * np.eye(m),
+        )
         E = expm(whole * Ts)
         at, growing = E[:n, n : n + m], E[:n, n + m :]
         z = np.exp(1j * np.asarray(w) * Ts)[:, None, None]
-        into = at + 0 * z if held else (at - growing) + z * growing
+        # What the current goes towards, from its values at both ends: its command behind a lag, else its growth.
+        left = np.exp(-rate * Ts)
+        part = growing / (1 - left) if rate else growing
+        into = at + 0 * z if held else (at - left * part) + z * part
         ends = z * np.eye(n)
         found = C @ np.linalg.solve(z * np.eye(n) - E[:n, :n], np.concatenate([into, ends], axis=2))
         found *= np.exp(-1j * np.asarray(w) * late.item())[:, None, None]
