@@ -72,7 +72,7 @@ COMMANDS: tuple[tuple[tuple[str, ...], str], ...] = (
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("wait", "arguments", "sentence"),
-    [(0.15, *COMMANDS[0]), *((wait, *command) for wait in (0.7, 4.0) for command in COMMANDS)],
+    [(0.3, *COMMANDS[0]), *((wait, *command) for wait in (0.7, 4.0) for command in COMMANDS)],
 )
 def test_ctrl_c_says_what_stands(
     wait: float, arguments: tuple[str, ...], sentence: str, tmp_path: Path
