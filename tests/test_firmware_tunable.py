@@ -28,6 +28,7 @@ from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
 from malta.firmware.folder import folder_files
 from malta.firmware.native import Native, compile_controller, view
+from malta.firmware.parts import decide
 from malta.firmware.signals import Target
 from malta.firmware.supervised import NUMBERS, compile_supervised
 from malta.firmware.vectors import record_vectors
@@ -77,6 +78,14 @@ def test_the_folder_compiles_without_a_warning_and_passes(
     assert "No margin is proven for other gains than the default ones (it was not asked for)" in report
     (more,) = re.findall(r"this computer \d+ in place of \d+ \(([+-][\d.]+) %\)", report)
     assert -10 < float(more) < 8
+
+
+@pytest.mark.slow
+def test_names_of_the_machine_s_own_equations_are_no_gains() -> None:
+    """K is a gain and, of the planar motor's coils, the matrix of their wrenches."""
+    names = [name for block in decide(tunable("planar_pid")).blocks for name in block.results]
+    assert "wrench_matrix_K" in names
+    assert "K" not in names
 
 
 @cache

@@ -195,6 +195,7 @@ def test_one_loop_answers_all_questions() -> None:
 def test_what_a_loop_leaves_out_is_said() -> None:
     assert "PI" in malta.loop(*shipped("robust"), current_loops="lag").left_out
     assert "electronics" in malta.loop(*shipped("halbach")).left_out
+    assert "`braking`" in malta.loop(*shipped("planar")).left_out
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ def excite(
     file does not know.
 
     \b
-    Example:  malta excite design/gains/robust.json --motion 20um --set K_A=9000 --log build/robust.npz
+    Example:  malta excite design/gains/robust.json --motion 20um --log log.npz
     """
     from malta.identification.excite import excite as plan_excitation
     from malta.loops.loop import loop

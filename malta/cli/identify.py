@@ -46,7 +46,7 @@ def identify(
     A log that the machine's model does not explain is refused with exit code 1, and no file is written.
 
     \b
-    Example:  malta identify design/gains/robust.json build/robust.npz -o build/robust-identified.toml
+    Example:  malta identify design/gains/robust.json log.npz -o found.toml
     """
     from malta.identification.data_file import write_data
     from malta.identification.identify import identify as identify_parameters

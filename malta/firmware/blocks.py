@@ -58,14 +58,16 @@ def staged_function(
 ) -> Staged:
     """A function with named, dense arguments and results, in the blocks that were noted.
 
-    A noted value that is a result, or the next value of an argument (`e`, of the result `e_next`), is that result; the
-    first note of a name counts. Raises KeyError for a result that no note names.
+    A noted value that is a result, or the next value of an argument (`e`, of the result `e_next`), is that result; one
+    that only bears an argument's name has its block's before it. The first note of a name counts. Raises KeyError for a
+    result that no note names.
     """
     blocks: list[Block] = []
     between: dict[str, Any] = {}
     known: set[str] = set()
     for block, text, values, times in equations:
         names = {(f"{key}_next" if f"{key}_next" in results else key): value for key, value in values.items()}
+        names = {(f"{block}_{key}" if key in arguments else key): value for key, value in names.items()}
         names = {key: value for key, value in names.items() if key not in known}
         known |= set(names)
         between |= {key: value for key, value in names.items() if key not in results}

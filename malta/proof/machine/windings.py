@@ -61,7 +61,9 @@ def chosen_loops(plant: Plant, controller: Controller, current_loops: CurrentLoo
         raise InputError("verify", "current_loops", repr(current_loops), "lag or pi")
     return (
         "pi"
-        if current_loops == "pi" and not left_out(plant, controller) and _driven(plant, controller)
+        if current_loops == "pi"
+        and not _missing_current_loops(plant, controller)
+        and _driven(plant, controller)
         else "lag"
     )
 
@@ -70,8 +72,20 @@ def _driven(plant: Plant, controller: Controller) -> bool:
     return plant.windings is not None and controller.current_loop is not None
 
 
+BRAKING = "the limited speed at which far errors are approached (`braking`)"
+
+
 def left_out(plant: Plant, controller: Controller, current_loops: CurrentLoops = "pi") -> str:
-    """What the machine's loop leaves out of the current loops; "": nothing that simulations fly by default."""
+    """What the machine's loop leaves out; "": nothing that simulations fly by default."""
+    found = (
+        _missing_current_loops(plant, controller, current_loops),
+        BRAKING if controller.braking.any() else "",
+    )
+    return ", and ".join(filter(None, found))
+
+
+def _missing_current_loops(plant: Plant, controller: Controller, current_loops: CurrentLoops = "pi") -> str:
+    """What it leaves out of the current loops."""
     if current_loops == "lag" and _driven(plant, controller):
         return "the PI current controllers, for which first-order lags at their crossover stand"
     if plant.electronics is not None and plant.windings is None:
