@@ -6,8 +6,6 @@ import os
 import sys
 from pathlib import Path
 
-import malta
-
 
 def python_module(module: str, *arguments: str) -> list[str]:
     """The command that runs a module; -P: a random.py or json.py in the current folder is not what malta imports."""
@@ -16,5 +14,5 @@ def python_module(module: str, *arguments: str) -> list[str]:
 
 def environment(**more: str) -> dict[str, str]:
     """The environment of such a process, with further variables: it finds this malta wherever it is started."""
-    places = [str(Path(malta.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+    places = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, places)), "PYTHONSAFEPATH": "1"} | more

@@ -17,7 +17,18 @@ from house import ORDER as PACKAGES
 import malta
 
 # Each may import those before it; machines stand where nobody generic imports them.
-GROUND = ("errors", "identifiers", "units", "interrupts", "files", "archives", "tables", "threads", "display")
+GROUND = (
+    "errors",
+    "identifiers",
+    "units",
+    "interrupts",
+    "files",
+    "archives",
+    "tables",
+    "threads",
+    "processes",
+    "display",
+)
 ORDER = (*GROUND, *PACKAGES[1:])
 MACHINES = {"tubular", "halbach", "planar"}
 SOURCES = sorted((ROOT / "malta").rglob("*.py"))

@@ -30,7 +30,7 @@ from malta.proof.polynomial.rational import (
     TooLarge,
     symbolic,
 )
-from malta.proof.uncertain import Compensator, UncertainSystem
+from malta.proof.uncertain import Compensator, Group, UncertainSystem
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -68,18 +68,6 @@ class UncertainLoop:
     def sampled(self) -> bool:
         """Whether a continuous system is held and sampled."""
         return self.law.sample_time is not None and self.system.sample_time is None
-
-
-@dataclass(frozen=True, eq=False)
-class Group:
-    """States of the system and of the compensator that close a loop by themselves.
-
-    inputs : the states on which inputs act, when these are fewer than the inputs; else None
-    """
-
-    states: tuple[int, ...]
-    own: tuple[int, ...]
-    inputs: tuple[int, ...] | None
 
 
 def loop_of(system: UncertainSystem, law: Compensator) -> UncertainLoop:

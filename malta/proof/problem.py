@@ -21,7 +21,7 @@ from malta.proof.expressions import (
     Program,
     exact,
 )
-from malta.proof.groups import Group, UncertainLoop, groups
+from malta.proof.groups import UncertainLoop, groups
 from malta.proof.polynomial import rounding
 from malta.proof.polynomial.characteristic import (
     Characteristic,
@@ -33,8 +33,8 @@ from malta.proof.polynomial.closed_loop import closed_loop, driven_group
 from malta.proof.polynomial.family import binary
 from malta.proof.polynomial.rational import Symbolic, TooLarge, symbolic
 from malta.proof.time_limit import TimeUp
+from malta.proof.uncertain import Group, critical_frequency, instability
 from malta.proof.uncertain import closed_loop as closed_matrices
-from malta.proof.uncertain import critical_frequency, instability
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

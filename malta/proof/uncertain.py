@@ -21,7 +21,18 @@ from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
-    from malta.proof.groups import Group
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """States of the system and of the compensator that close a loop by themselves.
+
+    inputs : the states on which inputs act, when these are fewer than the inputs; else None
+    """
+
+    states: tuple[int, ...]
+    own: tuple[int, ...]
+    inputs: tuple[int, ...] | None
 
 
 @dataclass(frozen=True, eq=False)

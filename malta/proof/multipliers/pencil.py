@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.proof.groups import C, Group, UncertainLoop
+from malta.proof.groups import C, UncertainLoop
 from malta.proof.multipliers.expansion import (
     EPS,
     Expansion,
@@ -27,6 +27,7 @@ from malta.proof.multipliers.expansion import (
 from malta.proof.multipliers.hold_series import LEVELS, hold_series, square_hold_series
 from malta.proof.polynomial.degrees import clear_denominators
 from malta.proof.polynomial.rational import TooLarge
+from malta.proof.uncertain import Group
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

@@ -27,7 +27,7 @@ from malta.proof.expressions import (
     Program,
     finite,
 )
-from malta.proof.groups import A, B, C, D, E, Group, UncertainLoop, divide_by_descriptor, rational
+from malta.proof.groups import A, B, C, D, E, UncertainLoop, divide_by_descriptor, rational
 from malta.proof.polynomial.closed_loop import closed_loop, coefficients, dense, driven_group, majorant_matrix
 from malta.proof.polynomial.degrees import (
     clear_denominators,
@@ -39,6 +39,7 @@ from malta.proof.polynomial.degrees import (
 from malta.proof.polynomial.majorant import coefficient_bounds
 from malta.proof.polynomial.minors import Minors, Resolvent, minors
 from malta.proof.polynomial.rational import Symbolic, value
+from malta.proof.uncertain import Group
 
 MOST = 20_000  # places that are remembered
 

@@ -9,7 +9,8 @@ import numpy as np
 from flint import acb_mat, arb
 
 from malta.proof.expressions import NotAnalytic, exact
-from malta.proof.groups import A, B, C, D, E, Group, UncertainLoop, hold_bounds, rational, upper
+from malta.proof.groups import A, B, C, D, E, UncertainLoop, hold_bounds, rational, upper
+from malta.proof.uncertain import Group
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

@@ -6,8 +6,9 @@ from typing import Any
 
 from flint import fmpq, fmpq_mat
 
-from malta.proof.groups import A, B, C, D, E, Group, UncertainLoop
+from malta.proof.groups import A, B, C, D, E, UncertainLoop
 from malta.proof.polynomial.rational import Ratio, Symbolic
+from malta.proof.uncertain import Group
 
 
 def degree(polynomial: Any, i: int) -> int:

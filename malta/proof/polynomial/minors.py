@@ -18,7 +18,7 @@ import numpy as np
 from flint import acb_mat, arb, arb_mat, arb_poly, ctx, fmpq_mat, fmpq_poly
 
 from malta.proof.expressions import NotAnalytic, Program, exact
-from malta.proof.groups import A, B, C, E, Group, UncertainLoop, rational, upper
+from malta.proof.groups import A, B, C, E, UncertainLoop, rational, upper
 from malta.proof.polynomial.closed_loop import (
     add_lag,
     dense,
@@ -30,6 +30,7 @@ from malta.proof.polynomial.closed_loop import (
 )
 from malta.proof.polynomial.majorant import all_bounds, coefficient_bounds
 from malta.proof.polynomial.mirrors import Image, Places, first_alike
+from malta.proof.uncertain import Group
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

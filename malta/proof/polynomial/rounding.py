@@ -23,7 +23,6 @@ from malta.proof.groups import (
     B,
     C,
     E,
-    Group,
     UncertainLoop,
     divide_by_descriptor,
     groups,
@@ -32,6 +31,7 @@ from malta.proof.groups import (
 )
 from malta.proof.polynomial.majorant import coefficient_bounds
 from malta.proof.polynomial.rational import Ratio, Symbolic, value
+from malta.proof.uncertain import Group
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
