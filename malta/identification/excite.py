@@ -45,6 +45,13 @@ class ExcitationPlan:
     current : by measured current: largest deviation from the current at rest, A
     command : by input: the largest command, with the one that holds the machine, as a share of its limit
     accuracy : by parameter: half of the 95 % interval that the log will give, as a share of its value
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/robust.json")
+    >>> loop = malta.loop(malta.plant_of(controller.parameters), controller)
+    >>> plan = malta.excite(loop, period=0.5, periods=4, band=(4, 400))
+    >>> plan.duration
+    2.5
     """
 
     signal: Multisine
@@ -110,9 +117,10 @@ def excite(
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
-    >>> plan = malta.excite(malta.loop(malta.plant_of(controller.parameters), controller), motion=10e-6)
-    >>> f"{1e6 * max(plan.motion.values()):.1f} um, K_A to {100 * plan.accuracy['K_A']:.2g} %"
-    '10.0 um, K_A to 0.36 %'
+    >>> loop = malta.loop(malta.plant_of(controller.parameters), controller)
+    >>> plan = malta.excite(loop, motion=10e-6)
+    >>> f"{1e6 * max(plan.motion.values()):.1f} um, K_A to {plan.accuracy['K_A']:.2%}"
+    '10.0 um, K_A to 0.13%'
     """
     _require(loop, force, current, motion, period, periods, band)
     plant, m = loop.plant, len(loop.plant.inputs)

@@ -69,6 +69,17 @@ class Identified:
     distortion : power at multiples of 1 / period that were not excited, over the noise; 1 of a linear machine
     by_output : chi2 of each output
     dropped : parameters that this log does not tell by themselves, with their standard deviation as a share
+
+    >>> import dataclasses, malta
+    >>> controller = malta.gains.read("design/gains/robust.json")
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> plan = malta.excite(malta.loop(plant, controller), period=0.5, periods=4, band=(4, 400))
+    >>> true = plant.variant(dataclasses.replace(plant.parameters, K_A=9000.0))
+    >>> excited = malta.Scenario.excited(plan.signal, plan.duration)
+    >>> run = malta.simulate(true, controller, excited)
+    >>> found = malta.identify(controller, malta.log_of(run), parameters=["K_A", "K_B"])
+    >>> found.names, len(found.intervals["K_A"])
+    (('K_A', 'K_B'), 2)
     """
 
     log: Log
@@ -167,12 +178,13 @@ def identify(
     Raises InputError for unknown parameters and another machine's signals; CheckError for a log that tells nothing:
     too short, without excitation, another sample time, a stuck or clipped sensor, parameters that only act together.
 
-    >>> import malta
+    >>> import dataclasses, malta
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> plan = malta.excite(malta.loop(plant, controller), period=0.5, periods=4, band=(4, 400))
-    >>> heavier = plant.variant(malta.read("data/tubular.toml").__class__(**{**vars(plant.parameters), "K_A": 9000.0}))
-    >>> run = malta.simulate(heavier, controller, malta.Scenario.excited(plan.signal, plan.duration))
+    >>> true = plant.variant(dataclasses.replace(plant.parameters, K_A=9000.0))
+    >>> excited = malta.Scenario.excited(plan.signal, plan.duration)
+    >>> run = malta.simulate(true, controller, excited)
     >>> found = malta.identify(controller, malta.log_of(run), parameters=["K_A", "K_B"])
     >>> found.refusal, bool(abs(found.values[0] - 9000) < 20)
     ('', True)

@@ -53,10 +53,12 @@ class Log:
     columns : by group: y (measured outputs), v (commanded forces), i (measured currents), u (commanded voltages),
         reference, excitation (forces beside the law's) and flags (1 while a limit is reached); k x signals each
     signals : by group: the names and units of its columns
+    sha256 : of the file; "" of a run
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
-    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(noise=1.0))
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
     >>> log = malta.log_of(run)
     >>> log.samples, log.names("y"), log.columns["i"].shape[1]
     (2000, ['x1', 'y1', 'x2', 'y2', 'z'], 12)
@@ -82,11 +84,18 @@ class Log:
         return len(self.t)
 
     def names(self, group: str) -> list[str]:
-        """The names of a group's signals; none of a group that the log has not."""
+        """The names of a group's signals; none of a group that the log has not.
+
+        group : as "y"
+        """
         return [signal.name for signal in self.signals.get(group, ())]
 
     def table(self, group: str, names: list[str]) -> FloatArray:
-        """The columns of a group by name, k x names. Raises InputError for a signal that the log lacks."""
+        """The columns of a group by name, k x names. Raises InputError for a signal that the log lacks.
+
+        group : as "y"
+        names : of its signals
+        """
         known = self.names(group)
         for name in names:
             if name not in known:
@@ -213,7 +222,8 @@ def log_of(run: Trajectory) -> Log:
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(noise=1.0))
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
     >>> malta.log_of(run).names("flags")[-1]
     'current_limit'
     """
@@ -290,7 +300,12 @@ def write_log(log: Log, path: str | Path) -> Path:
 
     Returns the path. Raises InputError for another suffix, and for a file that cannot be written.
 
-        malta.write_log(malta.log_of(run), "stand.npz")
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/robust.json")
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
+    >>> malta.write_log(malta.log_of(run), "build/stand.npz").name
+    'stand.npz'
     """
     path = Path(path)
     _require_suffix(path)
@@ -360,7 +375,13 @@ def read_log(path: str | Path) -> Log:
 
     Raises InputError: no such file, another suffix, damage, headings that are no "name [unit]", times that do not rise.
 
-        log = malta.read_log("stand.csv")
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/robust.json")
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
+    >>> file = malta.write_log(malta.log_of(run), "build/stand.csv")
+    >>> malta.read_log(file).samples
+    2000
     """
     path = Path(path)
     _require_suffix(path)

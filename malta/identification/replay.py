@@ -53,6 +53,14 @@ class LawReplay:
     expected : by output: noise and steps of the machine's sensors, SI
     whiteness : by output: the largest autocorrelation of the innovation over 20 samples, in standard deviations
     same : whether all commands are the logged ones, but for rounding
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/robust.json")
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
+    >>> found = malta.replay_law(controller, malta.log_of(run))
+    >>> found.v.shape, found.innovation.shape
+    ((2000, 5), (2000, 5))
     """
 
     v: FloatArray
@@ -89,7 +97,8 @@ def replay_law(controller: Controller, log: Log) -> LawReplay:
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
-    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(noise=1.0))
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
     >>> malta.replay_law(controller, malta.log_of(run)).same
     True
     """

@@ -73,7 +73,10 @@ class UncertainSystem:
         return A, B, C
 
     def every(self, p: FloatArray) -> list[FloatArray]:
-        """All matrices at k rows of parameters: D and E too, where there are any."""
+        """All matrices at k rows of parameters: D and E too, where there are any.
+
+        p : k x parameters, in the order of `names`
+        """
         rows, made = np.atleast_2d(p), []
         for i, found in enumerate(self.matrices.map(len(rows)).call([rows.T])):
             pattern = self.matrices.sparsity_out(i)

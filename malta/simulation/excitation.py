@@ -33,8 +33,9 @@ class Multisine:
 
     Raises InputError for lines that are not whole, positive, different and in order.
 
-    >>> import numpy as np
-    >>> one = Multisine(1.0, np.array([3, 7]), np.array([0, 1]), np.ones(2), np.zeros(2), 2)
+    >>> import malta, numpy as np
+    >>> lines, axis, size = np.array([3, 7]), np.array([0, 1]), np.ones(2)
+    >>> one = malta.Multisine(1.0, lines, axis, size, np.zeros(2), inputs=2)
     >>> one(np.array([0.0, 0.5])).round(9).tolist()
     [[1.0, 1.0], [-1.0, -1.0]]
     """

@@ -26,7 +26,7 @@ def run_groups(lib: Any, work: Work, workers: int, progress: Callable[[float], N
     lanes, shared, parts = work
     groups, done = len(lanes.states), list[int]()
     most = max(1, WORK // (len(shared.given) * shared.substeps))
-    if len(parts) == 1:
+    if len(parts) <= 2:  # a run, and perhaps the rest before it
         calls = _calls(groups, workers, 1, min(16, most))
     else:  # calls of short parts: the more groups in each, the less it counts
         step = min(64, -(-groups // workers), most)
