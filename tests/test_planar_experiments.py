@@ -425,7 +425,7 @@ def test_the_ledger(
 ) -> None:
     """Chosen numbers are by construction, bounds say how far, speed proves nothing, what is missed has a reason."""
     monkeypatch.setattr("malta.report.ledger.experiment", lambda name, *_, **__: flown[name])
-    monkeypatch.setattr("malta.report.ledger.verify", lambda *_: lqg.margins)
+    monkeypatch.setattr("malta.report.ledger.linear_report", lambda *_: lqg.margins)
     found = {claim.subject: claim for claim in ledger([lqg.spec], paper).claims}
     words = {
         "one coil at 3 A: F_x [N]": "by construction; B_r and the corner radius",

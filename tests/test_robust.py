@@ -509,7 +509,7 @@ def test_an_unstable_loop_has_no_margin() -> None:
         ({"m": math.inf}, None, "a share of 0 or more"),
         ({"m": (0.2, math.nan)}, None, "about the nominal 0.36"),
         ({"m": (0.4, 0.5)}, None, "about the nominal 0.36"),
-        ({"m": (0.36, 0.36)}, None, "about the nominal 0.36"),
+        ({"m": (0.36, 0.36)}, None, "at least one uncertain parameter"),
         ({"m": (0.5, 0.1)}, None, "about the nominal 0.36"),
         ({"m": 0.2}, {"m": (0.3, 0.4)}, "in one of them"),
     ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -318,7 +319,8 @@ def _variants(value: Any) -> Iterator[tuple[str, Any]]:
     if is_dataclass(value):
         for f in fields(value):
             for way, other in _variants(getattr(value, f.name)):
-                yield f".{f.name}{way}", replace(cast("Any", value), **{f.name: other})
+                with suppress(malta.InputError):  # no such record: braking of outputs that are no states
+                    yield f".{f.name}{way}", replace(cast("Any", value), **{f.name: other})
     elif isinstance(value, tuple):
         make = getattr(value, "_make", tuple)
         for k, entry in enumerate(value):
@@ -338,7 +340,7 @@ def _nudged(array: Any) -> Any:
     return other
 
 
-@pytest.mark.parametrize("name", ["calibrated", "tubular_pid"])
+@pytest.mark.parametrize("name", ["calibrated", "tubular_pid", "planar"])
 def test_every_entry_of_a_controller_is_in_its_fingerprint(name: str) -> None:
     """The operating point and the signals too: no two of the controllers that differ in one place share one."""
     controller = malta.gains.read(f"design/gains/{name}.json")

@@ -356,7 +356,7 @@ def test_bandwidth_and_margin_are_judge(motor: Spec, monkeypatch: pytest.MonkeyP
         bound: Any = SimpleNamespace(lower=1.25)
         return replace(malta.verify(model, controller), robust=bound)
 
-    monkeypatch.setattr(outcomes, "verify", proven)
+    monkeypatch.setattr(outcomes, "linear_report", proven)
     rows = {r.name: r for r in judge(spec)}
     assert rows["margin"].ratio == 0.8
     assert rows["bandwidth"].at_least

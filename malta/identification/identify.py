@@ -73,7 +73,8 @@ class Identified:
     >>> import dataclasses, malta
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
-    >>> plan = malta.excite(malta.loop(plant, controller), period=0.5, periods=4, band=(4, 400))
+    >>> loop = malta.loop(plant, controller)
+    >>> plan = malta.excite(loop, period=0.5, periods=4, band=(4, 400))
     >>> true = plant.variant(dataclasses.replace(plant.parameters, K_A=9000.0))
     >>> excited = malta.Scenario.excited(plan.signal, plan.duration)
     >>> run = malta.simulate(true, controller, excited)
@@ -181,7 +182,8 @@ def identify(
     >>> import dataclasses, malta
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
-    >>> plan = malta.excite(malta.loop(plant, controller), period=0.5, periods=4, band=(4, 400))
+    >>> loop = malta.loop(plant, controller)
+    >>> plan = malta.excite(loop, period=0.5, periods=4, band=(4, 400))
     >>> true = plant.variant(dataclasses.replace(plant.parameters, K_A=9000.0))
     >>> excited = malta.Scenario.excited(plan.signal, plan.duration)
     >>> run = malta.simulate(true, controller, excited)

@@ -109,7 +109,8 @@ def claims_table(ledger: Ledger, *, why: bool = False) -> ClaimLines:
 
     >>> import malta, rich
     >>> from malta.report.ledger import Claim, Ledger
-    >>> claim = Claim("pole of x [rad/s]", "±218.92", ("±218.92",), "by construction; K_A", "input")
+    >>> verdict = "by construction; K_A"
+    >>> claim = Claim("pole of x [rad/s]", "±218.92", ("±218.92",), verdict, "input")
     >>> ledger = Ledger("tubular", "the paper", ("table2",), (claim,))
     >>> rich.print(malta.report.claims_table(ledger, why=True))
     Published numbers and ours: tubular, the paper
