@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
-import sys
 from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -416,15 +416,15 @@ ANALYSES: list[Any] = []
 @pytest.fixture
 def analysed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands print one analysis of `calibrated`, whatever the form."""
-    module = sys.modules["malta.cli.verify"]
-    analyse = module._analyse
+    module = importlib.import_module("malta.tuning.verify")
+    verify = module.verify
 
     def once(*arguments: Any, **options: Any) -> Any:
         if not ANALYSES:
-            ANALYSES.append(analyse(*arguments, **options))
+            ANALYSES.append(verify(*arguments, **options))
         return ANALYSES[0]
 
-    monkeypatch.setattr(module, "_analyse", once)
+    monkeypatch.setattr(module, "verify", once)
 
 
 @pytest.mark.slow
