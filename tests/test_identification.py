@@ -152,6 +152,21 @@ def test_logs_that_tell_nothing_are_refused(log: malta.Log) -> None:
         malta.identify(CONTROLLER, log, parameters=["K_A", "R"])
 
 
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"lines": 0}, "lines: found 0, expected a number above 0"),
+        ({"period": 1e9}, "samples of all, expected at most 5e.07"),
+        ({"periods": 10**9}, "samples of all, expected at most 5e.07"),
+        ({"band": (400.0, 2.0)}, "band: found 400 to 2 Hz, expected rising"),
+        ({"motion": -1e-6}, "motion: found -1e-06, expected a number above 0"),
+    ],
+)
+def test_an_excitation_that_cannot_be_is_refused(plant: Plant, options: dict[str, Any], says: str) -> None:
+    with pytest.raises(malta.InputError, match=says):
+        malta.excite(malta.loop(plant, CONTROLLER), **options)
+
+
 def test_a_few_missing_samples_are_bridged(log: malta.Log) -> None:
     y = np.array(log.columns["y"])
     y[[1000, 5000, 5001]] = np.nan
@@ -175,6 +190,8 @@ def test_the_data_file_keeps_intervals(log: malta.Log, tmp_path: Path) -> None:
     assert list(data.shares) == ["I_xx", "K_A", "K_B", "K_D"]
     assert data.shares["K_A"] == pytest.approx(found.half_widths[0] / found.values[0], rel=1e-9)
     assert data.joint == pytest.approx(3.0802 / 1.95996, rel=1e-4)  # sqrt of chi2 of 4 at 95 %
+    with pytest.raises(malta.InputError, match=r"suffix '.json', expected .toml"):
+        write_data(found, tmp_path / "found.json", gains=ROBUST, known={})
     with pytest.raises(malta.InputError, match="parameters with an interval"):
         read_identified("data/tubular.toml")
 

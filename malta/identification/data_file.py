@@ -31,11 +31,13 @@ def write_data(found: Identified, path: str | Path, *, gains: str, known: Mappin
     gains : the gain file, for the sources
     known : parameters that the user knew, SI
 
-    Returns the path. Raises InputError for a file that cannot be written.
+    Returns the path. Raises InputError for another suffix, and a file that cannot be written.
 
         write_data(found, "robust-identified.toml", gains="design/gains/robust.json", known={})
     """
     path, par = Path(path), found.plant.parameters
+    if path.suffix != ".toml":
+        raise InputError(path, "", f"suffix {path.suffix!r}", ".toml, as data files have")
     units, values = units_of(par), values_of(par)
     module = file_of(found.plant.name)
     machine = found.plant.name if module is None else str(Path(module).resolve())

@@ -31,6 +31,7 @@ LINES = 12  # of each input
 PERIODS = 10
 SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
 QUIET = 1e-9  # m or rad: noise of a sensor that has none
+LONGEST = 5e7  # samples of a flight
 CURRENT = 0.1  # of the current limit: the amplitude where none is given
 
 
@@ -122,7 +123,8 @@ def excite(
     >>> f"{1e6 * max(plan.motion.values()):.1f} um, K_A to {plan.accuracy['K_A']:.2%}"
     '10.0 um, K_A to 0.13%'
     """
-    _require(loop, force, current, motion, period, periods, band)
+    sizes = {"force": force, "current": current, "motion": motion, "period": period}
+    _require(loop, sizes, {"periods": periods, "lines": lines}, band)
     plant, m = loop.plant, len(loop.plant.inputs)
     signal = interleaved_multisine(period, *band, inputs=m, lines=lines, seed=seed)
     limit = np.array(plant.actuator.force_limit)
@@ -233,19 +235,16 @@ def _plan(
 
 
 def _require(
-    loop: Loop,
-    force: float | None,
-    current: float | None,
-    motion: float | None,
-    period: float,
-    periods: int,
-    band: tuple[float, float],
+    loop: Loop, sizes: Mapping[str, float | None], counts: Mapping[str, int], band: tuple[float, float]
 ) -> None:
     """Raise InputError for what no excitation can be."""
-    sizes = {"force": force, "current": current, "motion": motion, "period": period, "periods": periods}
-    for name, value in sizes.items():
+    for name, value in {**sizes, **counts}.items():
         if value is not None and not (np.isfinite(value) and value > 0):
             raise InputError("excite", name, str(value), "a number above 0")
+    period = sizes["period"] or 0.0
+    samples = (counts["periods"] + 1) * period / loop.sample_time
+    if samples > LONGEST:
+        raise InputError("excite", "periods", f"{samples:.3g} samples of all", f"at most {LONGEST:g}")
     nyquist, whole = 0.5 / loop.sample_time, period / loop.sample_time
     if not 0 < band[0] < band[1] < nyquist:
         raise InputError("excite", "band", f"{band[0]:g} to {band[1]:g} Hz", f"rising, below {nyquist:g} Hz")

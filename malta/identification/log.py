@@ -368,7 +368,7 @@ def _to_mat(log: Log) -> bytes:
 def read_log(path: str | Path) -> Log:
     """Read a log: a .csv, .npz or .mat of malta, or a .csv of another program with headings "name [unit]".
 
-    path : the file. Units are converted to SI; a cell that is empty or no number is a missing reading.
+    path : the file. Units are converted to SI; a cell that is empty or nan is a missing reading.
 
     Returns a Log. Signals of headings without a prefix are found by their unit when the log is used: positions and
     angles are measured outputs, forces and torques commands, currents and voltages those of the axes.
