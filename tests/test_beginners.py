@@ -172,6 +172,20 @@ def test_a_design_without_specification_is_not_judged(ball: Any) -> None:
     )
 
 
+def test_a_pid_with_the_wrong_sign_is_told_so(tmp_path: Path) -> None:
+    for name in ("ball.py", "ball.toml", "design/ball_pid.toml"):
+        source = shipped_path("examples", "ball", *name.split("/"))
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        text = source.read_text(encoding="utf-8")
+        for gain in ("8, unit", "100, unit", "25, unit"):
+            text = text.replace(f"value = {gain}", f"value = -{gain}")
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    result = CliRunner().invoke(cli.app, ["design", str(tmp_path / "design" / "ball_pid.toml")])
+    assert result.exit_code == 1
+    assert "is unstable" in result.stderr
+    assert "with the other sign of Kp, Ki and Kd it is stable" in result.stderr
+
+
 def test_a_range_of_no_width_and_arguments_with_defaults_are_fine() -> None:
     """k held fast beside m, as without it; `extra` keeps its value."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from malta.margins.loop_report import LoopReport
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
-    from malta.synthesis.spec import Spec
+    from malta.synthesis.spec import Pid, Spec
 
 
 def design(
@@ -115,7 +116,12 @@ def _run_design(
     controller = synthesize(spec, model)
     note("margins")
     margins = linear_report(model, controller, spec.uncertainty)
-    require_stable(margins, str(file))
+    try:
+        require_stable(margins, str(file))
+    except CheckError as error:
+        if spec.pid and linear_report(model, synthesize(_reversed(spec, spec.pid), model)).stable:
+            raise CheckError(f"{error}; with the other sign of Kp, Ki and Kd it is stable") from error
+        raise
     note(job)
     result = _simulate_gain_file(file, spec, controller, margins, job)
     note("figure")
@@ -129,6 +135,11 @@ def _run_design(
         contents
     )  # last, and all at once: whatever fails leaves the old gain files and their figure
     return Made(spec.name, page, margins, result, paths, picture, unchanged)
+
+
+def _reversed(spec: Spec, pid: Pid) -> Spec:
+    """The design with the other sign of its PID gains."""
+    return replace(spec, law=replace(pid, Kp=-pid.Kp, Ki=-pid.Ki, Kd=-pid.Kd))
 
 
 def _document(made: Made, changes: Sequence[str]) -> DesignPart:
