@@ -8,6 +8,7 @@ from pathlib import Path
 from hypothesis import strategies as st
 
 from fuzz.oracle import Ended, line, observe
+from malta.cli.assignments import GENERAL
 
 GAINS = tuple(f"design/gains/{name}.json" for name in ("table2", "halbach", "tubular_pid"))
 PLACES = (
@@ -65,6 +66,7 @@ OWN = (
     "way",
     "x",
     "",
+    *GENERAL,
 )
 
 _numbers = st.sampled_from(NUMBERS) | st.floats().map(repr) | st.integers(-5, 500).map(str)
@@ -85,9 +87,7 @@ def _options(**given: st.SearchStrategy[str]) -> st.SearchStrategy[tuple[str, ..
 
 
 _of_runs = {
-    "scenario": _words, "set": _assignments, "distance": _numbers, "rise": _numbers, "profile": _words, "option": _own,
-    "fidelity": _words, "noise": _numbers, "sensor": _assignments, "feedforward": _words, "bearing_axes": _words,
-    "delay": _numbers, "seed": _numbers,
+    "scenario": _words, "set": _assignments, "option": _own, "sensor": _assignments, "seed": _numbers,
 }  # fmt: skip
 _gains = st.sampled_from(GAINS) | st.sampled_from(PLACES)
 _places = st.sampled_from(PLACES)
@@ -97,7 +97,7 @@ _usage = st.lists(
 
 LINES: st.SearchStrategy[tuple[str, ...]] = st.one_of(
     st.tuples(st.just("simulate"), _gains).flatmap(lambda head: _options(
-        **_of_runs, during=_words, estimator=_words, engine=_words, replay=_runs,
+        **_of_runs, engine=_words, replay=_runs,
     ).map(lambda rest: (*head, "--json", *rest))),
     st.tuples(st.just("campaign"), _gains).flatmap(lambda head: _options(
         **_of_runs, spread=_assignments, case=_words, sampler=_words, workers=_numbers, worst=_numbers, design=_places,
@@ -106,6 +106,8 @@ LINES: st.SearchStrategy[tuple[str, ...]] = st.one_of(
         set=_assignments, uncertain=_assignments, current_loops=_words, time=_numbers, certificate=_places,
     ).map(lambda rest: (*head, "--json", "--no-proof", *rest))),
     st.tuples(st.sampled_from(("check", "new")), st.sampled_from((*GAINS, *PLACES[4:], "--json", "--gains"))),
+    st.tuples(st.sampled_from(("identify", "learn", "replay")), _gains, _places),
+    st.tuples(st.just("log"), _places),
     st.tuples(st.just("claims"), st.sampled_from((*GAINS, *PLACES[4:]))),
     st.tuples(st.just("claims"), st.just("--update"), st.sampled_from((*GAINS, *PLACES[5:]))),
     st.tuples(st.just("tune"), st.sampled_from(PLACES), st.just("--check")).filter(lambda x: "table2.toml" not in x[1]),
