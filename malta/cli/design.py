@@ -119,7 +119,7 @@ def _run_design(
     try:
         require_stable(margins, str(file))
     except CheckError as error:
-        if spec.pid and linear_report(model, synthesize(_reversed(spec, spec.pid), model)).stable:
+        if spec.pid and linear_report(model, synthesize(_with_other_sign(spec, spec.pid), model)).stable:
             raise CheckError(f"{error}; with the other sign of Kp, Ki and Kd it is stable") from error
         raise
     note(job)
@@ -137,7 +137,7 @@ def _run_design(
     return Made(spec.name, page, margins, result, paths, picture, unchanged)
 
 
-def _reversed(spec: Spec, pid: Pid) -> Spec:
+def _with_other_sign(spec: Spec, pid: Pid) -> Spec:
     """The design with the other sign of its PID gains."""
     return replace(spec, law=replace(pid, Kp=-pid.Kp, Ki=-pid.Ki, Kd=-pid.Kd))
 

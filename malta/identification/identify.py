@@ -216,10 +216,10 @@ def _known_plant(plant: Plant, known: Mapping[str, float], start: Mapping[str, f
     require_parameters(plant, list(values))
     if not values:
         return plant
-    return _changed(plant, values)
+    return _plant_with(plant, values)
 
 
-def _changed(plant: Plant, values: Mapping[str, float]) -> Plant:
+def _plant_with(plant: Plant, values: Mapping[str, float]) -> Plant:
     """The machine with these parameters; those that are alike by declaration stay alike. Errors of sensors are none."""
     par: Any = plant.parameters
     own = {name: float(value) for name, value in values.items() if name in symbolic_names(par)}
@@ -372,7 +372,7 @@ def _covariances(between: ComplexArray) -> tuple[ComplexArray, FloatArray]:
     return (sums[last] - sums[first]) / counts[:, None, None], counts.astype(float)
 
 
-def _whitened(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexArray:
+def _white_residuals(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexArray:
     """Residuals at the lines in standard deviations, lines x p; squares sum up to chi2 with twice as many entries.
 
     The inverse of a covariance that is estimated from n bins is too large by n / (n - p).
@@ -435,14 +435,14 @@ def _estimate(model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str,
 
     def residuals(moved: FloatArray) -> FloatArray:
         try:
-            e = np.sqrt(2) * _whitened(model, s, start + scale * moved).ravel()
+            e = np.sqrt(2) * _white_residuals(model, s, start + scale * moved).ravel()
         except (np.linalg.LinAlgError, ValueError):
             return np.full(2 * s.lines.size * s.outputs.shape[1], 1e6)
         return np.concatenate([e.real, e.imag])
 
     found = least_squares(residuals, np.zeros(len(scale)), method="lm", x_scale="jac", xtol=1e-7)
     theta = start + scale * found.x
-    white = _whitened(model, s, theta)
+    white = _white_residuals(model, s, theta)
     dof = 2 * white.size - len(scale)
     chi2 = float(2 * (np.abs(white) ** 2).sum() / dof)
     covariance = _covariance(np.asarray(found.jac), np.asarray(found.fun), max(1.0, chi2))
@@ -454,7 +454,7 @@ def _estimate(model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str,
     held = {n: float(getattr(par, n)) for n, slope in zip(others.names, slopes, strict=True) if slope.any()}
     return Identified(
         log=log,
-        plant=_changed(plant, dict(zip(model.names, theta.tolist(), strict=True))),
+        plant=_plant_with(plant, dict(zip(model.names, theta.tolist(), strict=True))),
         names=model.names,
         values=theta,
         start=start,

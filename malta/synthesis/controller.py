@@ -364,7 +364,7 @@ def _braking_axes(g: Mapping[str, Any]) -> list[int]:
     return [k for k in range(g["braking"].numel()) if g["braking"].sparsity().has_nz(k, 0)]
 
 
-def _braked(g: Mapping[str, Any], off: Any) -> Any:
+def _braking_force(g: Mapping[str, Any], off: Any) -> Any:
     """What braking takes off the forces for errors xi* - xi_hat: exactly 0 within the errors from which axes brake."""
     found: Any = 0
     for k in _braking_axes(g):
@@ -396,7 +396,7 @@ def commanded(
     # The first sum is the same for all machines under one reference: engines compute it once a sample.
     wanted = (g["K"] @ xi_ref + v_ff) + (g["Ki"] @ e - g["K"] @ xi_hat) + v0
     if "braking" in g:
-        wanted = wanted + _braked(g, xi_ref - xi_hat)
+        wanted = wanted + _braking_force(g, xi_ref - xi_hat)
     note("law", "w = K (xi_ref - xi_hat) + Ki e + v_ff + v0", w=wanted)
     v = ca.fmax(ca.fmin(wanted, g["force_limit"]), -g["force_limit"])
     saturated = v != wanted

@@ -109,10 +109,10 @@ def verify(
     worst = worst_sensitivities(plant, controller, box, current_loops, time=time) if worst_case else {}
     reach((1 + MOST) / 2)
     carried = payload(plant, controller) if found.stable and proof else None
-    return judged(replace(found, worst=worst, payload=carried), spec, proof=proof, flights=flights)
+    return with_requirements(replace(found, worst=worst, payload=carried), spec, proof=proof, flights=flights)
 
 
-def judged(found: LoopReport, spec: Spec | None, *, proof: bool, flights: bool) -> LoopReport:
+def with_requirements(found: LoopReport, spec: Spec | None, *, proof: bool, flights: bool) -> LoopReport:
     """Add the requirements of a design file; a note says where they cannot be judged.
 
     proof : whether the margin is among them, where flights are not

@@ -17,7 +17,7 @@ from malta.margins.loop_report import in_groups
 from malta.model.data import plant_of
 from malta.simulation.catalogue import experiment, main_job
 from malta.simulation.experiments import progress_of_part
-from malta.tuning.verify import judged, verify
+from malta.tuning.verify import verify, with_requirements
 
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
@@ -111,7 +111,7 @@ def analyse(
     )  # fmt: skip
     notes: list[str] = []
     job = _main_job(subject, notes, progress_of_part(progress, 1, 2))
-    found = judged(found, subject.spec, proof=proof, flights=True)
+    found = with_requirements(found, subject.spec, proof=proof, flights=True)
     return Analysis(subject, found, job, tuple(campaigns), (*notes, *found.notes))
 
 

@@ -9,7 +9,7 @@ import warnings
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
-from malta.report.figures.parts import printable, show_plain_texts
+from malta.report.figures.parts import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -49,7 +49,6 @@ def inline_svg(figure: Figure, prefix: str, label: str, styles: dict[str, str]) 
 def _svg_bytes(figure: Figure) -> bytes:
     import matplotlib
 
-    show_plain_texts(figure)
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "malta", "svg.fonttype": "none"}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # the browser's fonts have it

@@ -37,10 +37,7 @@ def _add_page(document: PdfPages, figure: Figure, caption: str) -> None:
 
     from matplotlib.transforms import Bbox
 
-    from malta.report.figures.parts import show_plain_texts
-
     width, height = figure.get_size_inches()
     lines = "\n".join(textwrap.wrap(caption, round(LETTERS * width / 9.0)))
     figure.text(0.02, -0.12 / height, lines, fontsize=9, va="top", ha="left")
-    show_plain_texts(figure)
     document.savefig(figure, bbox_inches=Bbox([[0.0, -CAPTION], [width, height]]))  # type: ignore[no-untyped-call]

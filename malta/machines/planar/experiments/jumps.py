@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
-from malta.machines.planar import commutation
 from malta.machines.planar.experiments.motions import (
     CELLS,
     DISTANCE,
@@ -29,6 +28,7 @@ from malta.machines.planar.experiments.motions import (
     PLACE,
     arrival,
     parameters_of,
+    start_of_moves,
     with_coil_model,
 )
 from malta.model.linearize import linearize
@@ -144,16 +144,13 @@ def jumps_reference(
 
     Raises InputError for a position outside the travel.
     """
-    par = parameters_of(plant)
-    first = np.array([*place, gap])
-    for p in (first, first + np.array([0, distance, lift])):
-        commutation.check_position(par, p)
+    first, T_s = start_of_moves(plant, place, gap, lift, distance), parameters_of(plant).T_s
 
     def at(t: FloatArray) -> Motion:
         p = np.zeros((len(t), 6))
-        p[:, :3] = first - [0, 0, par.h]
+        p[:, :3] = first
         for axis, size, begin in ((Z, lift, LIFT_AT), (Y, distance, MOVE_AT)):
-            p[:, axis] += size * (np.asarray(t) > begin - par.T_s / 2)
+            p[:, axis] += size * (np.asarray(t) > begin - T_s / 2)
         return Motion(p, np.zeros_like(p), np.zeros_like(p))
 
     return at

@@ -142,6 +142,17 @@ def steps_ahead(plant: Plant, controller: Controller, **options: Any) -> Experim
 FORCES: dict[str, Any] = QUIET | {"fidelity": "force", "substeps": 1}  # the error of one substep is 1e-13 m
 
 
+def start_of_moves(
+    plant: Plant, place: tuple[float, float], gap: float, lift: float, distance: float
+) -> FloatArray:
+    """The position x, y, z, m, from which z rises and y moves. Raises InputError where either is outside the travel."""
+    par = parameters_of(plant)
+    first = np.array([*place, gap])
+    for p in (first, first + np.array([0, distance, lift])):
+        commutation.check_position(par, p)
+    return np.asarray(first - [0, 0, par.h])
+
+
 def steps_reference(
     plant: Plant, place: tuple[float, float], gap: float, lift: float, distance: float
 ) -> Reference:
@@ -149,16 +160,12 @@ def steps_reference(
 
     Raises InputError for a position outside the travel.
     """
-    par = parameters_of(plant)
-    first = np.array([*place, gap])
-    last = first + np.array([0, distance, lift])
-    for p in (first, last):
-        commutation.check_position(par, p)
+    first = start_of_moves(plant, place, gap, lift, distance)
     moves = ((2, lift, LIFT_AT, LIFTING), (1, distance, MOVE_AT, MOVING))
 
     def at(t: FloatArray) -> Motion:
         motion = [np.zeros((len(t), 6)) for _ in range(3)]
-        motion[0][:, :3] = first - [0, 0, par.h]
+        motion[0][:, :3] = first
         for axis, size, begin, duration in moves:
             rise = duration / references.QUINTIC_DURATION
             for column, s in zip(
