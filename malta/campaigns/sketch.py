@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from malta.model.plant import FloatArray
 
-    IntArray = NDArray[np.int64]
-
 EXACT = 100_000  # values that a sketch keeps as they are
 BITS = 13  # of the mantissa that name a bucket; a power of two of values takes 2**BITS counts, 64 KB
 ACCURACY = 2.0 ** -(BITS + 1)  # relative, of a quantile of counted values
@@ -40,7 +38,9 @@ class Sketch:
     smallest: float = math.inf
     largest: float = -math.inf
     values: tuple[FloatArray, ...] = ()  # all of them, in any order, while they are at most EXACT
-    counts: Mapping[int, IntArray] = field(default_factory=dict)  # sign and exponent -> count of each bucket
+    counts: Mapping[int, NDArray[np.int64]] = field(
+        default_factory=dict
+    )  # sign and exponent -> count of each bucket
 
     @property
     def exact(self) -> bool:
@@ -83,11 +83,13 @@ def _count_if_many(sketch: Sketch) -> Sketch:
     return Sketch(sketch.count, sketch.smallest, sketch.largest, (), counts)
 
 
-def _add_counts(one: Mapping[int, IntArray], other: Mapping[int, IntArray]) -> Mapping[int, IntArray]:
+def _add_counts(
+    one: Mapping[int, NDArray[np.int64]], other: Mapping[int, NDArray[np.int64]]
+) -> Mapping[int, NDArray[np.int64]]:
     return {**one, **{k: one[k] + new if k in one else new for k, new in other.items()}}
 
 
-def _count(parts: Iterable[FloatArray]) -> dict[int, IntArray]:
+def _count(parts: Iterable[FloatArray]) -> dict[int, NDArray[np.int64]]:
     """The counts of values: magnitudes by the bits of their numbers, those of negative numbers in reverse."""
     values = np.concatenate([*parts])
     magnitudes = (np.abs(values).view(np.int64)) >> (52 - BITS)
@@ -127,7 +129,7 @@ def histogram(sketch: Sketch, edges: FloatArray) -> FloatArray:
     return np.diff(np.interp(edges, at, np.stack([below[:-1], below[1:]], axis=1).ravel()))
 
 
-def _buckets(sketch: Sketch) -> tuple[FloatArray, FloatArray, IntArray]:
+def _buckets(sketch: Sketch) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     """Lower and upper end of each bucket that has values, within those of all values, and its count; ascending."""
     exponents = sorted(sketch.counts)
     counts = np.concatenate([sketch.counts[k] for k in exponents])

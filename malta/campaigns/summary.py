@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
     from malta.synthesis.spec import Spec
 
-    IntArray = NDArray[np.int64]
-
 KEPT = 1000  # of the worst runs, by each measure of badness
 WITHIN, LIMITED = "within the published bounds", "completed, commands limited"
 
@@ -52,7 +50,7 @@ UNBOUNDED = Bounds()
 class Runs:
     """Some runs of a campaign, a row for each."""
 
-    index: IntArray
+    index: NDArray[np.int64]
     values: FloatArray  # runs x names, SI
     batch: Batch
 
@@ -122,12 +120,12 @@ class Summary:
     plan: Plan
     bounds: Bounds
     runs: int
-    verdicts: IntArray
+    verdicts: NDArray[np.int64]
     within: int | None
     specified: int | None
     engines: tuple[str, ...]
     listed: tuple[Merit, ...]
-    bands: IntArray
+    bands: NDArray[np.int64]
     kept: Runs
     interrupted: bool = False
     damaged: tuple[Path, ...] = ()
@@ -266,7 +264,7 @@ def bin_edges(plan: Plan, name: str) -> FloatArray:
     return np.linspace(middle - half, middle + half, 11 if plan.samples >= 200 else 6)
 
 
-def _bands(found: Campaign, within: NDArray[np.bool_] | None) -> IntArray:
+def _bands(found: Campaign, within: NDArray[np.bool_] | None) -> NDArray[np.int64]:
     """Number of runs by varied value, way to end, and bin."""
     way = 2 + found.batch.verdict.astype(int)
     way[found.completed & (found.batch.saturated.max(axis=1, initial=0.0) > 0)] = 1

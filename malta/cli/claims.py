@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from malta.cli.completion import design_files as complete_designs
+from malta.cli.completion import complete_designs
 from malta.cli.inputs import design_files
 from malta.cli.options import AsJson
 from malta.cli.output import make_console, print_document, print_written, progress_bar

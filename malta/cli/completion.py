@@ -15,7 +15,7 @@ def gain_files(incomplete: str) -> list[str]:
     return _files(incomplete, Path("design", "gains"), GAINS)
 
 
-def design_files(incomplete: str) -> list[str]:
+def complete_designs(incomplete: str) -> list[str]:
     """Design files: those in design/ at first, later files and folders below what was typed."""
     return _files(incomplete, Path("design"), DESIGNS)
 

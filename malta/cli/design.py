@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from malta.cli.completion import design_files as complete_designs
+from malta.cli.completion import complete_designs
 from malta.cli.inputs import design_files, gains_folder, read_changed_design
 from malta.cli.options import AsJson, DesignChanges
 from malta.cli.output import make_console, print_document, print_error, print_written, working

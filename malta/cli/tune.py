@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from malta.cli.completion import design_files
+from malta.cli.completion import complete_designs
 from malta.cli.options import AsJson
 from malta.cli.output import interruption, make_console, print_document, print_written, progress_bar, working
 from malta.errors import CheckError, InputError
@@ -26,7 +26,7 @@ def tune(
         typer.Argument(
             metavar="SPEC",
             help="A design file with [specification] and [search].",
-            autocompletion=design_files,
+            autocompletion=complete_designs,
         ),
     ],
     out: Annotated[

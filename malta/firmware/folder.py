@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from malta.firmware.a2l import a2l_text
+from malta.firmware.calibration import FNV_FACTOR, FNV_START
 from malta.firmware.ctext import c_name, c_number
 from malta.firmware.elementary import Precision
 from malta.firmware.export import RISES, context_of, render, sources
@@ -26,7 +27,7 @@ from malta.firmware.stand_in import example_stroke, stand_in_context
 from malta.firmware.step import programs_of
 from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
 from malta.firmware.trials import trial_context
-from malta.firmware.vectors import FNV_FACTOR, FNV_START, SAMPLES, Vector, record_vectors
+from malta.firmware.vectors import SAMPLES, Vector, record_vectors
 
 EXAMPLE_SAMPLES = 10_000  # of the example's main program, beside its stroke
 

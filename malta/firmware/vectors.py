@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from malta.firmware.calibration import FNV_FACTOR, FNV_START
 from malta.firmware.program import TYPES
 from malta.firmware.signals import (
     Target,
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
 
 SAMPLES = 60  # of each vector
 STROKE = 0.02  # of the travel, at most
-FNV_START, FNV_FACTOR = 2166136261, 16777619  # of the checksum: FNV-1a of 32 bits, over words
 
 
 class Vector(NamedTuple):
