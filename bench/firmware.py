@@ -22,11 +22,9 @@ from timing import Result, medians
 import malta
 from malta.firmware.cost import CLOCK, FLAGS, PROCESSORS, Processor, cost_on
 from malta.firmware.ctext import c_name, c_number, function_text, signature
-from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
-from malta.firmware.lowering import lower
-from malta.firmware.parts import decide_function, named_function, sense_function
-from malta.firmware.program import evaluate, program_of
+from malta.firmware.period_functions import decide_function, named_function, sense_function
+from malta.firmware.program import Precision, evaluate, lower, program_of
 from malta.firmware.signals import Target, input_fields, reference_fields, state_fields
 from malta.firmware.step import look_up, programs_of, started_state, step_of
 from malta.firmware.vectors import record_vectors

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from peer_problem import MECHANICAL, NO_SPIN, Stated, Workload, packed, problem, stated
 
-from malta.simulation.noise import keys
+from malta.simulation.readings import keys
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

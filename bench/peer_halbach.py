@@ -13,7 +13,7 @@ from scipy.special import erf
 
 from malta.machines.halbach.electronics import MEAN_OF, current_loop
 from malta.machines.halbach.plant import Parameters
-from malta.simulation.noise import keys, normals
+from malta.simulation.readings import keys, normals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

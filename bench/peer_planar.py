@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from malta.machines.planar.coils import Table
+from malta.machines.planar.field import Table
 from malta.machines.planar.plant import Parameters
 
 if TYPE_CHECKING:

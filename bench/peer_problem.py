@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.machines.tubular.plant import Parameters, plant
-from malta.simulation.compiled import feedforward_table
+from malta.simulation.engine.compiled import feedforward_table
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:

@@ -38,13 +38,14 @@ from timing import Result, medians, optional
 
 import malta
 from malta.machines.halbach.experiments.motions import steps_reference
-from malta.machines.planar import coils, commutation
+from malta.machines.planar import commutation
+from malta.machines.planar import field as coils
 from malta.machines.planar import plant as planar
+from malta.machines.planar.experiments.models import compile_function
 from malta.machines.planar.experiments.motions import CELLS
-from malta.machines.planar.experiments.timings import compile_function
 from malta.machines.tubular import plant as tubular
-from malta.model.published import published_value
-from malta.simulation.engines import engine_of, library_of
+from malta.model.data import published_value
+from malta.simulation.engine.engines import engine_of, library_of
 from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
 

@@ -16,16 +16,16 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta import gains as gains
     from malta import report as report
     from malta import schemas as schemas
-    from malta.app.notebook import app_widget as app_widget
+    from malta.app.server import app_widget as app_widget
     from malta.campaigns.limits import limit_of as limit_of
     from malta.campaigns.plan import Plan as Plan
     from malta.campaigns.rare import rare_event as rare_event
     from malta.campaigns.result import Campaign as Campaign
     from malta.campaigns.run import campaign as campaign
-    from malta.campaigns.sensitivity import sensitivity as sensitivity
+    from malta.campaigns.studies import sensitivity as sensitivity
+    from malta.campaigns.studies import tolerances as tolerances
     from malta.campaigns.summary import Summary as Summary
     from malta.campaigns.survey import summarize as summarize
-    from malta.campaigns.tolerance import tolerances as tolerances
     from malta.errors import CheckError as CheckError
     from malta.errors import InputError as InputError
     from malta.firmware.exports import export_c as export_c
@@ -47,18 +47,19 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.identification.replay import replay_law as replay_law
     from malta.loops.curves import LoopCurves as LoopCurves
     from malta.loops.curves import loop_curves as loop_curves
+    from malta.loops.linear_loops import LoopSystems as LoopSystems
+    from malta.loops.linear_loops import loop_systems as loop_systems
     from malta.loops.loop import Loop as Loop
     from malta.loops.loop import loop as loop
-    from malta.loops.loop_systems import LoopSystems as LoopSystems
-    from malta.loops.loop_systems import loop_systems as loop_systems
-    from malta.loops.recovery import Recovery as Recovery
-    from malta.loops.recovery import recovery as recovery
+    from malta.loops.time_domain import Recovery as Recovery
+    from malta.loops.time_domain import recovery as recovery
     from malta.margins.loop_report import LoopReport as LoopReport
     from malta.model.data import plant_of as plant_of
+    from malta.model.data import published as published
     from malta.model.data import read as read
     from malta.model.equilibrium import trim as trim
-    from malta.model.inverse import InverseCheck as InverseCheck
     from malta.model.linear import linear_machine as linear_machine
+    from malta.model.linearize import InverseCheck as InverseCheck
     from malta.model.linearize import LinearModel as LinearModel
     from malta.model.linearize import linearize as linearize
     from malta.model.machines import machine as machine
@@ -68,10 +69,9 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.model.plant import OperatingPoint as OperatingPoint
     from malta.model.plant import Plant as Plant
     from malta.model.plant import Signal as Signal
-    from malta.model.published import published as published
     from malta.proof.blocks.blocks import Dynamic as Dynamic
-    from malta.proof.blocks.dynamic import dynamic_margin as dynamic_margin
     from malta.proof.blocks.gain import Gain as Gain
+    from malta.proof.blocks.gain import dynamic_margin as dynamic_margin
     from malta.proof.blocks.gain import worst_case_gain as worst_case_gain
     from malta.proof.margin import Margin as Margin
     from malta.proof.robust import margin_of_polynomial as margin_of_polynomial
@@ -81,16 +81,16 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.proof.uncertain import UncertainSystem as UncertainSystem
     from malta.report.ledger import ledger as ledger
     from malta.simulation import references as references
-    from malta.simulation.batch import replayed as replayed
-    from malta.simulation.batch import simulate_many as simulate_many
-    from malta.simulation.catalogue import experiment as experiment
-    from malta.simulation.digest import Batch as Batch
-    from malta.simulation.excitation import Multisine as Multisine
+    from malta.simulation.engine.batch import replayed as replayed
+    from malta.simulation.engine.batch import simulate_many as simulate_many
+    from malta.simulation.engine.digest import Batch as Batch
     from malta.simulation.experiments import Experiment as Experiment
+    from malta.simulation.experiments.catalogue import experiment as experiment
+    from malta.simulation.experiments.time_optimal import fastest_stroke as fastest_stroke
+    from malta.simulation.references import Multisine as Multisine
     from malta.simulation.scenario import Fault as Fault
     from malta.simulation.scenario import Scenario as Scenario
     from malta.simulation.simulate import simulate as simulate
-    from malta.simulation.time_optimal import fastest_stroke as fastest_stroke
     from malta.simulation.trajectory import Trajectory as Trajectory
     from malta.simulation.trajectory import stroke_figures as stroke_figures
     from malta.synthesis.calibrate import calibrate as calibrate

@@ -16,9 +16,10 @@ import numpy as np
 from IPython.display import display
 
 import malta
-from malta.machines.halbach import electronics, motor
+from malta.machines.halbach import electronics
+from malta.machines.halbach import electronics as motor
 from malta.machines.halbach import plant as halbach
-from malta.synthesis.sampled import sampled_model
+from malta.synthesis.kalman import sampled_model
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

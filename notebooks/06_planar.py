@@ -18,7 +18,8 @@ import numpy as np
 from IPython.display import display
 
 import malta
-from malta.machines.planar import coils, commutation
+from malta.machines.planar import commutation
+from malta.machines.planar import field as coils
 from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
 

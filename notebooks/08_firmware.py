@@ -18,11 +18,10 @@ import numpy as np
 from IPython.display import display
 
 import malta
-from malta.firmware.cost import CLOCK, costs, operations
+from malta.firmware.cost import CLOCK, costs, operations, rounded_margin, rounding_noise, smallest_error
 from malta.firmware.flight import differences
-from malta.firmware.rounding import rounded_margin, rounding_noise, smallest_error
 from malta.firmware.signals import Target
-from malta.simulation.compiled import compiler
+from malta.simulation.engine.compiled import compiler
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

@@ -26,7 +26,7 @@ from malta.cli import main as cli
 from malta.files import replace_files
 from malta.firmware import cost
 from malta.machines.tubular import plant as tubular
-from malta.model.published import published as read_published
+from malta.model.data import published as read_published
 from malta.proof import robust
 from malta.proof.blocks import gain
 from malta.proof.problem import OfLoop, OfSeveral, Problem

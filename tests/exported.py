@@ -13,9 +13,9 @@ from conftest import ROOT
 
 import malta
 from malta.firmware import report
-from malta.firmware.elementary import Precision
 from malta.firmware.export import render, root_context
-from malta.firmware.folder import folder_files
+from malta.firmware.exports import folder_files
+from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of
 from malta.synthesis.controller import Controller
 

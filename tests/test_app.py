@@ -19,10 +19,9 @@ import numpy as np
 import pytest
 
 import malta
-from malta.app import follow
-from malta.app.files import Edit, fingerprint, open_design
+from malta.app import session as follow
+from malta.app.files import Edit, TakenError, fingerprint, inside, open_design, save_design
 from malta.app.picture import View, picture, solve
-from malta.app.saving import TakenError, inside, save_design
 from malta.app.server import LARGEST, PAGES, Server
 from malta.app.session import Session
 from malta.app.worker import work
@@ -30,9 +29,9 @@ from malta.errors import InputError
 from malta.files import shipped_path
 from malta.margins.travel import travel_loops, travel_margin
 from malta.processes import environment, python_module
-from malta.proof.rays import ray_bound
-from malta.tuning.outcomes import judge
+from malta.proof.loss import ray_bound
 from malta.tuning.search import model_and_controller
+from malta.tuning.verify import judge
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -90,7 +89,7 @@ def test_picture_has_the_figures_of_verify_and_recovery(design: Path) -> None:
 
 
 def test_linear_run_is_what_the_simulation_does() -> None:
-    from malta.app.runs import planned_run
+    from malta.app.picture import planned_run
 
     problem = solve(open_design(ROTOR).apply(Edit()))
     name, planned = planned_run(problem.plant, problem.controller, "step s_Ax")

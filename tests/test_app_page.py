@@ -17,8 +17,7 @@ from browsing import browser as browser
 from test_app import copied
 
 import malta
-from malta.app.notebook import script
-from malta.app.server import Server
+from malta.app.server import Server, script
 from malta.app.session import Session
 
 pytestmark = pytest.mark.slow

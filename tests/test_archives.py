@@ -16,7 +16,7 @@ from conftest import ROOT, refusal
 import malta
 from malta import gains
 from malta.archives import read_npz
-from malta.simulation.force_log import read_log
+from malta.simulation.experiments.recording import read_log
 
 
 def npz(**arrays: Any) -> bytes:

@@ -11,10 +11,9 @@ import pytest
 from flint import arb, fmpq
 
 import malta
-from malta.proof.basis import in_plain_basis
 from malta.proof.expressions import EXACT
 from malta.proof.groups import loop_of
-from malta.proof.robust import law_of, problem_of
+from malta.proof.robust import in_plain_basis, law_of, problem_of
 
 L_A, L_B, I_T, I_P = 0.241, 0.139, 6e-2, 8e-4  # m, m, kg m^2, kg m^2
 BEARINGS = np.array([[1, 0, 0, L_A], [0, 1, -L_A, 0], [1, 0, 0, -L_B], [0, 1, L_B, 0]])

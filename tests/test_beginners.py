@@ -16,7 +16,7 @@ import malta
 from malta.cli import main as cli
 from malta.files import shipped_path
 from malta.model import machines
-from malta.synthesis.obstacles import lost_modes
+from malta.synthesis.lqg import lost_modes
 
 F = "f=lambda x, u, w: ca.vertcat(x[1], (u + w) / par.m)"
 FORCES = "        forces=lambda x, i: magnets(par, x[0], i),\n"

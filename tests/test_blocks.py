@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 import malta
 from malta import Dynamic
 from malta.errors import InputError
-from malta.proof.blocks.blocks import Block, probe
+from malta.proof.blocks.blocks import Block, probe, weight_of
 from malta.proof.blocks.transfer import Signals, mu_bound, performance, transfer
-from malta.proof.blocks.weight import weight_of
 from malta.proof.responses import responses
 
 ONE = weight_of(1.0, "")

@@ -20,13 +20,14 @@ from tampering import claiming
 
 import malta
 from malta.margins.loop_report import Stage
-from malta.margins.stages import _smallest
+from malta.margins.verify import _smallest
 from malta.proof.box import below
 from malta.proof.certificate import certificate, check, checked_file, checked_loop
 from malta.proof.exclusion import exclusion
 from malta.proof.groups import loop_of
 from malta.proof.margin import Margin
-from malta.proof.polynomial import degrees, enclosure
+from malta.proof.polynomial import characteristic as degrees
+from malta.proof.polynomial import enclosure
 from malta.proof.polynomial.family import nodes, restrict, restriction_rounding
 from malta.proof.polynomial.rounding import parts
 from malta.proof.problem import OfLoop

@@ -15,11 +15,12 @@ from flint import arb
 import malta
 from malta import Actuator, Plant, Signal, si
 from malta.errors import InputError
-from malta.proof.box import FAR, box_of
-from malta.proof.branches import (
+from malta.proof.box import (
     ENDS,
+    FAR,
     INTERVALS,
     Interval,
+    box_of,
     resolve_branches,
     within_branches,
     without_branches,

@@ -232,7 +232,7 @@ def test_a_reference_at_rest_is_answered_as_without_a_pause(flagship: Flagship) 
 
 
 def test_both_engines_wait_alike(flagship: Flagship, monkeypatch: pytest.MonkeyPatch) -> None:
-    from malta.simulation import compiled as compiling
+    from malta.simulation.engine import compiled as compiling
 
     spec, _, shipped = flagship
     scenario = replace(malta.Scenario.stroke(noise=0.0, quantize=False, fidelity="force"), duration=0.08)

@@ -32,18 +32,17 @@ from malta.campaigns.plan import (
     draw_machines,
     planned_run,
 )
-from malta.campaigns.result import Campaign, rate
+from malta.campaigns.result import Campaign, figures_of, rate, runs_within_bounds
 from malta.campaigns.run import SLOW_BLOCK, campaign, replay
-from malta.campaigns.statistics import figures_of, runs_within_bounds
 from malta.campaigns.store import MANIFEST, block_name, read_plan
 from malta.campaigns.summary import worst_of
 from malta.files import temporary_name
 from malta.machines.tubular.experiments import CASES, EXPERIMENTS
 from malta.report import figures
-from malta.simulation import compiled
-from malta.simulation.catalogue import cases_of
-from malta.simulation.digest import Batch, verdicts
-from malta.simulation.engines import engine_of, library_of
+from malta.simulation.engine import compiled
+from malta.simulation.engine.digest import Batch, verdicts
+from malta.simulation.engine.engines import engine_of, library_of
+from malta.simulation.experiments.catalogue import cases_of
 
 if TYPE_CHECKING:
     from conftest import Design

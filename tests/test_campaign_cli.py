@@ -16,7 +16,7 @@ from conftest import Run, without_progress
 from typer.testing import CliRunner
 
 from malta.cli import main as cli
-from malta.simulation import compiled
+from malta.simulation.engine import compiled
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -308,8 +308,8 @@ def test_ctrl_c_keeps_and_shows_what_is_done(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_without_a_compiler_it_says_so(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from malta.simulation import compiled
-    from malta.simulation.engines import engine_of, library_of
+    from malta.simulation.engine import compiled
+    from malta.simulation.engine.engines import engine_of, library_of
 
     monkeypatch.setattr(compiled, "compiler", lambda: None)
     for memory in (library_of, engine_of):

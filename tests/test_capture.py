@@ -10,9 +10,9 @@ import pytest
 
 import malta
 from malta import references
-from malta.machines.tubular.experiments.capture import PLANES, RAYS
+from malta.machines.tubular.experiments.lifting import PLANES, RAYS
 from malta.simulation.experiments import Experiment
-from malta.simulation.recoverable import reach, recoverable
+from malta.simulation.experiments.bounds import reach, recoverable
 from malta.simulation.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def test_maps_of_other_sizes_are_refused(plant: Plant, points: Any) -> None:
 def test_without_a_compiler_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     controller = malta.gains.read(ROBUST)
     plant: Plant = malta.plant_of(controller.parameters)
-    monkeypatch.setattr("malta.simulation.engines.library", lambda *_: None)
+    monkeypatch.setattr("malta.simulation.engine.engines.library", lambda *_: None)
     unseen: dict[str, Any] = {"fidelity": "dq", "delay": 3}  # a shape that no other test has compiled
     with pytest.raises(malta.InputError, match="found no C compiler"):
         malta.experiment("capture", plant, controller, **unseen)

@@ -24,7 +24,7 @@ from malta.margins.travel import travel_loops
 from malta.proof.certificate import certificate, checked_file
 from malta.proof.certificate.check import Verdict, check
 from malta.proof.machine.windings import CurrentLoops
-from malta.report.tables.certificate import claim_share
+from malta.report.tables.design import claim_share
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

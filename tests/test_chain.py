@@ -29,9 +29,8 @@ from malta.loops.classical import (
 )
 from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
 from malta.margins.loop_report import LoopReport
-from malta.margins.stages import MACHINE, SAMPLED, compensators, staged_report
 from malta.margins.travel import place_margin
-from malta.margins.verify import linear_report
+from malta.margins.verify import MACHINE, SAMPLED, compensators, linear_report, staged_report
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
 from malta.proof.blocks.gain import Gain

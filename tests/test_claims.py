@@ -28,14 +28,12 @@ from malta.machines.tubular.evidence import (
     is_solved_for_ratio,
     mean_of_seeds,
 )
-from malta.machines.tubular.experiments.rest import RESTING
-from malta.model.data import plant_of
-from malta.model.published import published_value
+from malta.machines.tubular.experiments.disturbances import RESTING
+from malta.model.data import plant_of, published_value
 from malta.report import ledger as claims
 from malta.report.ledger import Claim, Ledger, Row
-from malta.simulation.compiled import compiler
-from malta.simulation.experiments import REAL
-from malta.simulation.responses import step_wrench
+from malta.simulation.engine.compiled import compiler
+from malta.simulation.experiments import REAL, step_wrench
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.units import in_unit

@@ -22,9 +22,8 @@ from typer.testing import CliRunner
 import malta
 from malta import gains
 from malta.cli import main as cli
-from malta.cli.assignments import GENERAL, read_options
-from malta.cli.command import renew
-from malta.cli.inputs import design_files
+from malta.cli.main import renew
+from malta.cli.options import GENERAL, design_files, read_options
 from malta.errors import InputError
 from malta.model.plant import Plant
 from malta.report.ledger import Ledger
@@ -757,8 +756,8 @@ def test_the_number_of_substeps_comes_with_an_error(run: Run) -> None:
 
 
 def test_without_a_compiler_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    from malta.simulation import compiled
-    from malta.simulation.engines import engine_of, library_of
+    from malta.simulation.engine import compiled
+    from malta.simulation.engine.engines import engine_of, library_of
 
     monkeypatch.setattr(compiled, "compiler", lambda: None)
     for cached in (library_of, engine_of):

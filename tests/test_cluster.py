@@ -21,7 +21,6 @@ from conftest import one_sentence, without_progress
 
 import malta
 from malta.campaigns import dask as cluster
-from malta.campaigns.block import fly
 from malta.campaigns.dask import (
     _at_worker,
     _collect,
@@ -32,7 +31,8 @@ from malta.campaigns.dask import (
 )
 from malta.campaigns.plan import Plan
 from malta.campaigns.run import campaign
-from malta.simulation.digest import Batch
+from malta.campaigns.store import fly
+from malta.simulation.engine.digest import Batch
 
 if TYPE_CHECKING:
     from conftest import Design

@@ -10,9 +10,9 @@ import pytest
 from flint import fmpq
 
 import malta
-from malta.proof.companion import MOST, companion
 from malta.proof.groups import groups
 from malta.proof.multipliers.pencil import Rows
+from malta.proof.problem import MOST, companion
 
 NAMES = tuple(f"q{i}" for i in range(14))
 

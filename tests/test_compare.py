@@ -16,13 +16,12 @@ from page_checks import read_page
 from rich.console import Console
 from test_report_page import HOSTILE, STRANGE, cart_controller
 
-from malta.cli.documents.pages import compare_output
-from malta.margins.figures import MEANINGS, LoopFigure, best_of, four_digits
+from malta.cli.documents.loops import compare_output
+from malta.margins.loop_report import MEANINGS, LoopFigure, best_of, four_digits
 from malta.margins.verify import linear_report
 from malta.report.page.analysis import Subject
-from malta.report.page.compared import comparison_page
-from malta.report.page.comparison import Comparison, Row, compare, names_of
-from malta.report.tables.comparison import comparison_tables
+from malta.report.page.comparison import Comparison, Row, compare, comparison_tables, names_of
+from malta.report.page.report import comparison_page
 
 if TYPE_CHECKING:
     from malta.synthesis.controller import Controller

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from conftest import Run
 
-from malta.cli.completion import GAINS
+from malta.cli.options import GAINS
 
 ROBUST = ("robust", "robust_observer")
 

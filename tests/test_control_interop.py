@@ -20,12 +20,12 @@ import malta
 from malta.campaigns.plan import fingerprint
 from malta.gains import encodings
 from malta.loops.sampled_loops import machine_loop
-from malta.simulation.generic import jump
+from malta.simulation.experiments.catalogue import jump
 from malta.synthesis import kalman as kalman_filter
 from malta.synthesis import lqg, riccati
 
 if TYPE_CHECKING:
-    from malta.loops.loop_systems import LoopSystems
+    from malta.loops.linear_loops import LoopSystems
     from malta.model.linearize import LinearModel
     from malta.model.plant import FloatArray, Plant
     from malta.synthesis.controller import Controller

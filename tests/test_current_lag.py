@@ -19,9 +19,9 @@ from malta.loops.sampled_loops import machine_loop, sampled_loop
 from malta.margins.verify import controller_poles
 from malta.simulation.inputs import lagging_references
 from malta.synthesis.controller import Controller
+from malta.synthesis.kalman import with_lags
 from malta.synthesis.lqg import gains, integral_weight, lqg, weights
 from malta.synthesis.riccati import add_integrals, delay_inputs, eigenvalues, sample, sample_cost
-from malta.synthesis.sampled import with_lags
 from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:

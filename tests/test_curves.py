@@ -17,7 +17,7 @@ from malta.loops.classical import delay_margins
 from malta.loops.curves import LoopCurves, loop_curves, respond
 from malta.loops.linear_loops import linear_loop
 from malta.loops.locus import root_locus
-from malta.loops.steps import loop_steps, step_figures
+from malta.loops.time_domain import loop_steps, step_figures
 from malta.simulation.references import Motion
 
 if TYPE_CHECKING:

@@ -13,8 +13,7 @@ from flint import arb, fmpq
 
 import malta
 from malta.proof.box import box_of
-from malta.proof.exclusion.hurwitz import determinant
-from malta.proof.exclusion.signs import Signs, raise_bound, signs_over
+from malta.proof.exclusion.hurwitz import Signs, determinant, raise_bound, signs_over
 from malta.proof.robust import law_of, problem_of
 
 DAMPING = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)

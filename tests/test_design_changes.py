@@ -11,7 +11,7 @@ import pytest
 from conftest import Run, one_sentence
 
 import malta
-from malta.cli.inputs import _name_of, read_changed_design
+from malta.cli.options import _name_of, read_changed_design
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

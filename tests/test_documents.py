@@ -14,9 +14,8 @@ from jsonschema import Draft202012Validator
 import malta
 from malta.cli.documents.published import ALL_SCHEMAS, MODELS
 from malta.cli.documents.published import schema_of as schema
-from malta.identifiers import distinct, identifier, unit_suffix
 from malta.report.ledger import Claim, Ledger
-from malta.units import unit_factor
+from malta.units import distinct, identifier, unit_factor, unit_suffix
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -184,7 +183,7 @@ def test_the_others(run: Run, tmp_path: Path) -> None:
 def test_every_scenario(run: Run, gains: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from malta import gains as gain_files
     from malta.model.data import plant_of
-    from malta.simulation import catalogue
+    from malta.simulation.experiments import catalogue
 
     def quick(name: str, plant: Any, c: Any, **options: Any) -> Any:
         return experiment(name, plant, c, **(options | FEW.get(name, {})))

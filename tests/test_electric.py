@@ -16,8 +16,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import malta
-from malta.machines.tubular import windings
-from malta.machines.tubular.windings import (
+from malta.machines.tubular import drive as windings
+from malta.machines.tubular.drive import (
     AXES,
     K_L,
     K_R,
@@ -28,7 +28,7 @@ from malta.machines.tubular.windings import (
     to_axes,
     to_phases,
 )
-from malta.simulation import inverter
+from malta.simulation import current_control as inverter
 from malta.synthesis.feedforward import pi_current_loop
 
 if TYPE_CHECKING:

@@ -22,13 +22,13 @@ from hypothesis import strategies as st
 
 import malta
 from malta import references
-from malta.simulation import compiled, engines, translate
-from malta.simulation.compiled import LANES
-from malta.simulation.engines import engine_of, library_of, shape_of
+from malta.simulation.engine import compiled, engines
+from malta.simulation.engine import engines as translate
+from malta.simulation.engine.compiled import LANES, process_folder
+from malta.simulation.engine.engines import engine_of, library_of, shape_of
+from malta.simulation.engine.instructions import Counts
 from malta.simulation.layout import FIDELITIES, Fidelity
-from malta.simulation.once import Counts
 from malta.simulation.period import Period
-from malta.simulation.private_folders import process_folder
 from malta.simulation.scenario import Fault, Scenario, setup_of
 from malta.simulation.trajectory import SERIES
 
@@ -777,7 +777,7 @@ def test_a_library_that_was_cut_short_is_not_run(
     (folder / sound.name).write_bytes(whole[: int(share * len(whole))])
     (tmp_path / "text.c").write_text(text, encoding="utf-8")
     loading = (
-        "from pathlib import Path; from malta.simulation.compiled import library; import sys\n"
+        "from pathlib import Path; from malta.simulation.engine.compiled import library; import sys\n"
         "assert library(Path(sys.argv[1]).read_text(encoding='utf-8'), 1, Path(sys.argv[2])) is not None"
     )
     ended = subprocess.run(
@@ -913,7 +913,7 @@ def test_two_processes_may_compile_at_once(small: tuple[Period, str], fresh: Pat
     slow.chmod(0o755)
     (tmp_path / "text.c").write_text(small[1], encoding="utf-8")
     compiling = (
-        "from pathlib import Path; from malta.simulation.compiled import library; import sys\n"
+        "from pathlib import Path; from malta.simulation.engine.compiled import library; import sys\n"
         "assert library(Path(sys.argv[1]).read_text(encoding='utf-8'), 1) is not None"
     )
     environment = os.environ | {"CC": str(slow)}

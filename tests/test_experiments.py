@@ -19,16 +19,15 @@ from scipy.linalg import expm
 import malta
 from malta import references
 from malta.loops.sampled_loops import machine_loop, sampled_loop
-from malta.machines.tubular.experiments import EXPERIMENTS, forces, lifting, rest, strokes
-from malta.model.data import plant_of
-from malta.model.published import published_value
-from malta.simulation.catalogue import experiment
-from malta.simulation.experiments import Case, Experiment, Merit
-from malta.simulation.responses import compliance
+from malta.machines.tubular.experiments import EXPERIMENTS, lifting, strokes
+from malta.machines.tubular.experiments import disturbances as forces
+from malta.machines.tubular.experiments import disturbances as rest
+from malta.model.data import plant_of, published_value
+from malta.simulation.experiments import Case, Experiment, Merit, compliance
+from malta.simulation.experiments.catalogue import experiment
 from malta.simulation.scenario import ESTIMATORS, Fault, Scenario
 from malta.simulation.simulate import simulate
-from malta.simulation.trajectory import Trajectory
-from malta.simulation.verdict import Verdict
+from malta.simulation.trajectory import Trajectory, Verdict
 from malta.synthesis.lqg import lqr
 
 if TYPE_CHECKING:

@@ -19,15 +19,15 @@ from exported import of_each_kind
 import malta
 from malta.firmware.ctext import c_name
 from malta.firmware.export import comment, sources
+from malta.firmware.exports import folder_files
 from malta.firmware.flight import differences, engine_of_c
-from malta.firmware.folder import folder_files
 from malta.firmware.signals import Target
-from malta.simulation import compiled
+from malta.simulation.engine import compiled
 
 if TYPE_CHECKING:
     from conftest import Run
 
-    from malta.firmware.elementary import Precision
+    from malta.firmware.program import Precision
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -193,7 +193,7 @@ def test_without_a_compiler_the_c_does_not_fly(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(compiled, "compiler", lambda: None)
-    malta.firmware.native.compile_controller.cache_clear()
+    malta.firmware.flight.compile_controller.cache_clear()
     code, _, err = run("simulate", "design/gains/table2.json", "--controller", "c")
     assert code == 2
     assert "C compiler: found none that works" in one_sentence(err)

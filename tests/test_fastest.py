@@ -25,8 +25,8 @@ from scipy.optimize import fsolve
 import malta
 from malta.machines.tubular import plant as tubular
 from malta.model.equilibrium import load_balance
-from malta.simulation import time_optimal as fastest
-from malta.simulation.time_optimal import FastestStroke, fastest_stroke, sigmoid_at_peak_current
+from malta.simulation.experiments import time_optimal as fastest
+from malta.simulation.experiments.time_optimal import FastestStroke, fastest_stroke, sigmoid_at_peak_current
 from malta.synthesis.feedforward import static_feedforward
 
 if TYPE_CHECKING:

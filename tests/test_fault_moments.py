@@ -14,10 +14,9 @@ from figure_checks import defects, texts_of
 import malta
 from malta.errors import InputError
 from malta.firmware.supervisor import MONITORS
-from malta.machines.tubular.commissioning_figure import supervised_faults_figure
-from malta.machines.tubular.experiments.contact import SOFT
-from malta.machines.tubular.experiments.fault_moments import KINDS, PHASES, Outcome, draw_blows, totals_of
-from malta.simulation.compiled import compiler
+from malta.machines.tubular.experiment_figures import supervised_faults_figure
+from malta.machines.tubular.experiments.faults import KINDS, PHASES, SOFT, Outcome, draw_blows, totals_of
+from malta.simulation.engine.compiled import compiler
 from malta.simulation.experiments import Case, Experiment
 from malta.synthesis.controller import Controller
 

@@ -14,11 +14,11 @@ from figure_checks import defects, texts_of
 
 import malta
 from malta import report
-from malta.cli.assignments import read_shares
+from malta.cli.options import read_shares
 from malta.model.signals import outputs_of
 from malta.report import encode_figure, new_figure
-from malta.simulation.catalogue import experiments_of
 from malta.simulation.experiments import Case, Experiment
+from malta.simulation.experiments.catalogue import experiments_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -17,7 +17,7 @@ import malta
 from malta.campaigns.store import read_manifest
 from malta.files import read_file, replace_files, temporary_name, writer
 from malta.proof.certificate import checked_file
-from malta.simulation.force_log import read_log
+from malta.simulation.experiments.recording import read_log
 from malta.tables import load_toml
 
 

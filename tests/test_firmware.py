@@ -12,16 +12,23 @@ import pytest
 from exported import PRECISIONS, controller, of_each_kind, target
 
 import malta
-from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
-from malta.firmware.flight import differences, engine_of_c
+from malta.firmware.exports import folder_files
+from malta.firmware.flight import (
+    call,
+    call_piece,
+    compile_controller,
+    differences,
+    engine_of_c,
+    new_state,
+    view,
+    write,
+)
 from malta.firmware.fmu import build_fmu
-from malta.firmware.folder import folder_files
-from malta.firmware.native import call, call_piece, compile_controller, new_state, view, write
-from malta.firmware.program import evaluate
+from malta.firmware.program import Precision, evaluate
 from malta.firmware.signals import Target, reading_ranges, reference_fields, state_fields
 from malta.firmware.step import look_up, programs_of, started_state, step_of, zero_reference
-from malta.simulation.compiled import compiler
+from malta.simulation.engine.compiled import compiler
 
 WARNINGS = (
     *("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-Werror", "-Wall", "-Wextra", "-Wpedantic"),

@@ -13,9 +13,9 @@ from exported import PRECISIONS, require, run, target
 from firmware import A9, M4F, RUNNERS, agree, can_count, cases, instructions, whole_step
 
 from malta.firmware.cost import CLOCK
-from malta.firmware.elementary import Precision
-from malta.firmware.native import call, compile_controller, new_state, view, write
-from malta.firmware.parts import decide_function
+from malta.firmware.flight import call, compile_controller, new_state, view, write
+from malta.firmware.period_functions import decide_function
+from malta.firmware.program import Precision
 from malta.firmware.signals import input_fields, output_fields, reference_fields, state_fields
 from malta.firmware.step import look_up
 from malta.firmware.vectors import record_vectors

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from exported import HERE, PRECISIONS, build, run, run_test, write_folder
 
-from malta.firmware.elementary import Precision
+from malta.firmware.program import Precision
 
 STRICT = ("-O1", "-g", "-Wall", "-Wextra", "-Werror", "-Wconversion")
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from exported import PRECISIONS, require, root_text, run, texts, write_folder
 
-from malta.firmware.elementary import Precision
-from malta.firmware.misra import DEVIATIONS
+from malta.firmware.program import Precision
+from malta.firmware.report import DEVIATIONS
 
 CHECKS = ("--addon=misra", "--enable=warning,style,performance,portability", "--std=c99", "--quiet")
 SECONDS = 600.0  # for a file, on a computer with much else to do

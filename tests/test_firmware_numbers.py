@@ -14,14 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
-from malta.firmware.flight import engine_of_c
-from malta.firmware.native import Native, call, compile_controller, new_state, view, write
-from malta.firmware.program import TYPES
+from malta.firmware.flight import Native, call, compile_controller, engine_of_c, new_state, view, write
+from malta.firmware.program import TYPES, Precision
 from malta.firmware.signals import Target, input_fields, state_fields
 from malta.simulation import references
-from malta.simulation.compiled import compiler
+from malta.simulation.engine.compiled import compiler
 
 ERROR = 1e-8  # m, which does not move a float of 1e-4 in a sample of 50 us
 BAD = (math.nan, math.inf, -math.inf, 1e30, -1e30)

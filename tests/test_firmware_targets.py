@@ -22,7 +22,7 @@ from exported import (
 )
 
 from malta.firmware.cost import FLAGS
-from malta.firmware.elementary import Precision
+from malta.firmware.program import Precision
 
 SOME = ["float", *(pytest.param(p, marks=pytest.mark.slow) for p in PRECISIONS if p != "float")]
 NAMES = ["halbach", *(pytest.param(n, marks=pytest.mark.slow) for n in ("robust", "planar_pid"))]

@@ -15,7 +15,6 @@ import pytest
 from exported import EXACT, HERE, controller, require, run, run_test, target
 
 import malta
-from malta.firmware.a2l import a2l_text
 from malta.firmware.calibration import (
     checksum_of,
     counts_of,
@@ -24,16 +23,16 @@ from malta.firmware.calibration import (
     parameters_of,
     proven_share,
 )
-from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
-from malta.firmware.folder import folder_files
-from malta.firmware.native import Native, compile_controller, view
-from malta.firmware.parts import decide
+from malta.firmware.exports import a2l_text, folder_files
+from malta.firmware.flight import Native, compile_controller, view
+from malta.firmware.period_functions import decide
+from malta.firmware.program import Precision
 from malta.firmware.signals import Target
 from malta.firmware.supervised import NUMBERS, compile_supervised
 from malta.firmware.vectors import record_vectors
 from malta.margins.tuned_gains import GainBox
-from malta.simulation.compiled import compiler
+from malta.simulation.engine.compiled import compiler
 from malta.synthesis.controller import gains_of
 
 pytestmark = pytest.mark.usefixtures("proven_once")

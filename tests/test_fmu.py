@@ -20,17 +20,17 @@ from conftest import ROOT
 import malta
 from malta.errors import InputError
 from malta.firmware import fmu as module
-from malta.firmware.elementary import Precision
+from malta.firmware.flight import FLAGS
 from malta.firmware.fmu import build_fmu
 from malta.firmware.machine import Machine, command_field
-from malta.firmware.native import FLAGS
+from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.supervised import NUMBERS, Flown, Requests, supervised_engine
 from malta.firmware.supervisor import MONITORS, STATES
 from malta.firmware.unit import PARTS, Part, unit_of
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.simulation import references
-from malta.simulation.compiled import compiler
+from malta.simulation.engine.compiled import compiler
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

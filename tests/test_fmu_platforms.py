@@ -21,9 +21,8 @@ from test_fmu import SHA256, Unit, content, target
 
 import malta
 from malta.errors import InputError
-from malta.firmware import platforms
-from malta.firmware.fmu import build_fmu
-from malta.firmware.platforms import PLATFORMS, platforms_named
+from malta.firmware import fmu as platforms
+from malta.firmware.fmu import PLATFORMS, build_fmu, platforms_named
 
 fmpy: Any = pytest.importorskip("fmpy")
 with_zig = pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="ziglang not installed")

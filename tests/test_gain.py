@@ -17,11 +17,9 @@ from malta.errors import InputError
 from malta.margins.travel import travel_loops, worst_sensitivities
 from malta.model.data import plant_of
 from malta.proof.blocks import gain
-from malta.proof.blocks.blocks import Block
-from malta.proof.blocks.dynamic import Blocks
-from malta.proof.blocks.peaks import Peak, frequencies, patterns
-from malta.proof.blocks.transfer import Signals, transfer
-from malta.proof.blocks.weight import weight_of
+from malta.proof.blocks.blocks import Block, weight_of
+from malta.proof.blocks.gain import Blocks
+from malta.proof.blocks.transfer import Peak, Signals, frequencies, patterns, transfer
 from malta.proof.polynomial.family import align, combine, family
 from malta.proof.responses import responses
 from malta.proof.robust import problem_of

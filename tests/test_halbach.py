@@ -17,12 +17,13 @@ from scipy.integrate import solve_ivp
 
 import malta
 from malta.gains.encodings import content_sha256
-from malta.machines.halbach import electronics, motor
+from malta.machines.halbach import electronics
+from malta.machines.halbach import electronics as motor
 from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.plant import Parameters
+from malta.model.data import published_value
 from malta.model.parameters import values_of
-from malta.model.published import published_value
-from malta.synthesis.sampled import sampled_model
+from malta.synthesis.kalman import sampled_model
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

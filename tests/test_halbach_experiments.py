@@ -22,7 +22,8 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 
 import malta
 from malta.machines.halbach import claims as claims
-from malta.machines.halbach import electronics, motor
+from malta.machines.halbach import electronics
+from malta.machines.halbach import electronics as motor
 from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.electronics import IDEAL, Options
 from malta.machines.halbach.evidence import Evidence, open_loop_dip, rise_of_dip
@@ -30,16 +31,16 @@ from malta.machines.halbach.experiments.lift import FAULTS, LAWS, lift_force, mo
 from malta.machines.halbach.experiments.motions import steps_reference
 from malta.machines.halbach.experiments.open_loop import fit_servo, positions_at_rest, servo_step
 from malta.machines.halbach.plant import Parameters
+from malta.model.data import published_value
 from malta.model.plant import Plant
-from malta.model.published import published_value
 from malta.report.ledger import ledger
-from malta.simulation.catalogue import cases_of, experiment
-from malta.simulation.compiled import compiler
+from malta.simulation.engine.compiled import compiler
+from malta.simulation.experiments.catalogue import cases_of, experiment
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller, linear_law
+from malta.synthesis.kalman import sampled_model
 from malta.synthesis.riccati import sample_noise
-from malta.synthesis.sampled import sampled_model
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

@@ -13,13 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import malta
-from malta.machines.halbach import electronics, motor
+from malta.machines.halbach import electronics
+from malta.machines.halbach import electronics as motor
 from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.electronics import IDEAL, REAL, Options
 from malta.machines.halbach.plant import Parameters
-from malta.model.drive import Electronics
 from malta.model.parameters import shape_parameters
 from malta.model.plant import Plant, symbolic
+from malta.model.sensors import Electronics
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

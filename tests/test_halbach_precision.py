@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import malta
-from malta.machines.halbach import claims, electronics, evidence, motor
+from malta.machines.halbach import claims, electronics, evidence
+from malta.machines.halbach import electronics as motor
 from malta.machines.halbach.electronics import DEAD_ENDS, IDEAL, IQ_BITS, Options
 from malta.machines.halbach.plant import Parameters
-from malta.model.data import plant_of
-from malta.model.published import published_value
+from malta.model.data import plant_of, published_value
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory

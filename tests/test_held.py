@@ -14,8 +14,7 @@ from scipy import linalg
 
 import malta
 from malta import gains
-from malta.loops.machine_laws import sampled_law
-from malta.loops.sampled_loops import machine_loop, machine_system, sampled_loop
+from malta.loops.sampled_loops import machine_loop, machine_system, sampled_law, sampled_loop
 from malta.margins.travel import travel_margin
 from malta.margins.verify import controller_poles, linear_report, unstable_gain
 from malta.model.data import plant_of
@@ -29,10 +28,10 @@ from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller, linear_law
+from malta.synthesis.kalman import held, sampled_model
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
 from malta.synthesis.riccati import sample
-from malta.synthesis.sampled import held, sampled_model
 from malta.synthesis.spec import Pid, Weights
 
 ROOT = Path(__file__).parent.parent

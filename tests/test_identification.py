@@ -14,7 +14,7 @@ from conftest import Run
 import malta
 from malta.identification.data_file import read_identified, write_data
 from malta.identification.excite import model_at, predicted_spectra
-from malta.simulation.excitation import interleaved_multisine
+from malta.simulation.references import interleaved_multisine
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant

@@ -16,8 +16,8 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
 import malta
-from malta.loops.recovery import recovery
 from malta.loops.sampled_loops import machine_loop, machine_system
+from malta.loops.time_domain import recovery
 from malta.margins.travel import travel_margin
 from malta.model.data import plant_of
 from malta.model.linearize import linearize

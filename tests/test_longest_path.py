@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from exported import require, run, target, texts
 
-from malta.firmware.cost import PROCESSORS, cost_on
-from malta.firmware.folder import folder_files
-from malta.firmware.longest_path import FLAGS, LISTING, longest_path, passes_of
+from malta.firmware.cost import APART as FLAGS
+from malta.firmware.cost import LISTING, PROCESSORS, cost_on, longest_path, passes_of
+from malta.firmware.exports import folder_files
 
 C = """int f(int x) {
   int sum = 0;

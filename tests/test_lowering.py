@@ -11,9 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import malta
-from malta.firmware.elementary import Precision
-from malta.firmware.lowering import lower
-from malta.firmware.program import Program, evaluate, program_of
+from malta.firmware.program import Precision, Program, evaluate, lower, program_of
 
 X, Y = ca.SX.sym("x"), ca.SX.sym("y")
 ALL = ca.Function(

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 import malta
 from malta import references
+from malta.machines.tubular import drive as windings
 from malta.machines.tubular import plant as tubular
-from malta.machines.tubular import windings
-from malta.simulation.engines import engine_of
+from malta.simulation.engine.engines import engine_of
 from malta.simulation.inputs import initial_values, inputs_of
 from malta.simulation.layout import FIDELITIES, Fidelity, layout_of
 from malta.simulation.period import initial_state

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 
 import malta
 from malta import references
-from malta.simulation import compiled
-from malta.simulation.batch import record_run, replayed, simulate_many
-from malta.simulation.digest import Batch, verdicts
-from malta.simulation.engines import engine_of, library_of
+from malta.simulation.engine import compiled
+from malta.simulation.engine.batch import record_run, replayed, simulate_many
+from malta.simulation.engine.digest import Batch, verdicts
+from malta.simulation.engine.engines import engine_of, library_of
 from malta.simulation.layout import FIDELITIES, Fidelity
-from malta.simulation.noise import keys, normals, starts_of_parts
+from malta.simulation.readings import keys, normals, starts_of_parts
 from malta.simulation.scenario import Correction, Fault, Scenario
 from malta.simulation.trajectory import Trajectory, stroke_figures
 

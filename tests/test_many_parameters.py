@@ -15,8 +15,8 @@ from scipy import linalg
 
 import malta
 from malta.proof.box import Box, box_of
-from malta.proof.multipliers.hold_series import LEVELS, _gains
 from malta.proof.multipliers.multipliers import Blocks, Multiplier, multiplier
+from malta.proof.multipliers.pencil import LEVELS, _gains
 from malta.proof.multipliers.pencil_response import Branch, excludes_zero, response
 from malta.proof.multipliers.structured import Structured, rows_of
 from malta.proof.problem import OfLoop

@@ -8,8 +8,7 @@ import pytest
 from conftest import ROOT, Run
 
 from malta.errors import InputError
-from malta.report.ledger import Claim, Ledger
-from malta.report.markdown import find_tables, replace_tables
+from malta.report.ledger import Claim, Ledger, find_tables, replace_tables
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -23,8 +23,9 @@ from scipy.io import loadmat, savemat
 from scipy.sparse import csc_array
 
 from malta.errors import InputError
-from malta.gains import encodings, mat
-from malta.gains.mat import COMPRESSED, DEEPEST, LARGEST, MATRIX, read_mat
+from malta.gains import encodings
+from malta.gains import encodings as mat
+from malta.gains.encodings import COMPRESSED, DEEPEST, LARGEST, MATRIX, read_mat
 
 COMMITTED = sorted(Path("design/gains").glob("*.mat"))
 SMALL = Path("design/gains/halbach_pid.mat")

@@ -20,7 +20,7 @@ import malta
 from malta.gains import encodings
 from malta.loops.sampled_loops import machine_system
 from malta.model.plant import Plant, Signal
-from malta.simulation.generic import jump
+from malta.simulation.experiments.catalogue import jump
 
 if TYPE_CHECKING:
     from collections.abc import Callable

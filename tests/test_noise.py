@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from malta.simulation.noise import GAMMA, keys, normals
+from malta.simulation.readings import GAMMA, keys, normals
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

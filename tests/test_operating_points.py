@@ -12,12 +12,12 @@ import pytest
 from magnets import BENCH, MACHINES, bench, two_coils
 
 import malta
+from malta.app.picture import linear_run
 from malta.loops.sampled_loops import loaded_model, machine_loop, machine_system
 from malta.model.equilibrium import commanded
 from malta.model.plant import OperatingPoint
 from malta.proof.machine.parametric_plants import of_plant
-from malta.simulation.linear_run import linear_run
-from malta.simulation.payload import held_payload
+from malta.simulation.experiments.bounds import held_payload
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -14,8 +14,8 @@ from conftest import refusal
 
 import malta
 from malta import report
-from malta.campaigns.statistics import bounds_of
-from malta.margins.extent import NOWHERE
+from malta.campaigns.result import bounds_of
+from malta.margins.travel import NOWHERE
 from malta.model import machines
 from malta.model.machines import part_of, require_part
 from malta.model.plant import Signal
@@ -26,8 +26,8 @@ from malta.model.signals import (
     stroke_unit,
 )
 from malta.report import figures
-from malta.simulation.catalogue import cases_of, main_job, options_of
 from malta.simulation.experiments import Case, Experiment, Merit, PlannedRun, fly, scenario_of
+from malta.simulation.experiments.catalogue import cases_of, main_job, options_of
 from malta.simulation.references import hold
 
 if TYPE_CHECKING:

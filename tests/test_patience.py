@@ -9,8 +9,8 @@ import pytest
 from conftest import Run, one_sentence
 
 import malta
-from malta.cli import patience
-from malta.cli.patience import duration_text, limit_time
+from malta.cli import output as patience
+from malta.cli.output import duration_text, limit_time
 from malta.simulation.scenario import MOST_SUBSTEPS
 from malta.simulation.simulate import integration_error
 
@@ -81,7 +81,7 @@ def test_the_commands_refuse_and_obey(
 ) -> None:
     monkeypatch.setattr(patience, "ENOUGH", 0.0)
     monkeypatch.setattr(patience, "LONGEST", 1e-9)
-    monkeypatch.setattr("malta.simulation.workers.LOOK", 1e-3)
+    monkeypatch.setattr("malta.simulation.engine.batch.LOOK", 1e-3)
     own = {
         "simulate": ("--option", "substeps=500", "--option", "fidelity=force", "--out", tmp_path),
         "campaign": ("--samples", "1024", "--option", "fidelity=force", "--spread", "1%", "--out", tmp_path),

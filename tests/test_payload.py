@@ -13,7 +13,7 @@ from conftest import Run
 import malta
 from malta import gains
 from malta.model.data import plant_of
-from malta.simulation.payload import STEP, flown_payload, held_payload, payload
+from malta.simulation.experiments.bounds import STEP, flown_payload, held_payload, payload
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

@@ -24,9 +24,9 @@ from test_documents import document
 
 import malta
 from malta.errors import InputError
-from malta.firmware import serial_line
-from malta.firmware.elementary import Precision
-from malta.firmware.serial_line import START, Frame, frame_bytes
+from malta.firmware import pil as serial_line
+from malta.firmware.pil import START, Frame, frame_bytes
+from malta.firmware.program import Precision
 
 if TYPE_CHECKING:
     from conftest import Run

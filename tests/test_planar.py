@@ -20,16 +20,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta.machines.planar import coils, commutation
+from malta.machines.planar import commutation
+from malta.machines.planar import field as coils
 from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
 from malta.machines.planar.field import ODD_X, ODD_Y, Series
+from malta.model.data import published as read_published
+from malta.model.data import published_value
 from malta.model.plant import symbolic
-from malta.model.published import published as read_published
-from malta.model.published import published_value
 from malta.model.rigidbody import rotation
+from malta.simulation.engine.engines import translate
 from malta.simulation.references import QUINTIC_DURATION, quintic
-from malta.simulation.translate import translate
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

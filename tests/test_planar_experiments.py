@@ -16,17 +16,20 @@ from scipy.integrate import solve_ivp
 
 import malta
 from malta.machines.planar import claims as claims
-from malta.machines.planar import coils, commutation
+from malta.machines.planar import commutation
 from malta.machines.planar import experiments as experiments
+from malta.machines.planar import field as coils
 from malta.machines.planar import plant as planar
-from malta.machines.planar.experiments import jumps, models, motions, timings
+from malta.machines.planar.experiments import models, motions
+from malta.machines.planar.experiments import models as timings
+from malta.machines.planar.experiments import motions as jumps
 from malta.margins.loop_report import LoopReport
-from malta.model.published import published as read_published
-from malta.model.published import published_value
+from malta.model.data import published as read_published
+from malta.model.data import published_value
 from malta.report.figures import experiment_figure
 from malta.report.ledger import ledger
-from malta.simulation.catalogue import cases_of, experiments_of
 from malta.simulation.experiments import Experiment
+from malta.simulation.experiments.catalogue import cases_of, experiments_of
 from malta.synthesis.controller import law, linear_law
 from malta.synthesis.lqg import braking_errors
 
@@ -401,7 +404,7 @@ def test_times_are_those_of_the_numbers(lqg: Design, flown: dict[str, Experiment
 
 
 def test_without_a_compiler_there_is_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("malta.simulation.compiled.compiler", lambda: None)
+    monkeypatch.setattr("malta.simulation.engine.compiled.compiler", lambda: None)
     x = ca.SX.sym("x")
     assert np.isnan(timings.compiled_seconds(ca.Function("square", [x], [x * x]), np.ones(1)))
 

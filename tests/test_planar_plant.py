@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta.machines.planar import coils, commutation
+from malta.machines.planar import commutation
+from malta.machines.planar import field as coils
 from malta.machines.planar import plant as planar
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim

@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 
-from malta.simulation import compiled, private_folders
-from malta.simulation.private_folders import is_private, open_private, process_folder
+from malta.simulation.engine import compiled
+from malta.simulation.engine import compiled as private_folders
+from malta.simulation.engine.compiled import is_private, open_private, process_folder
 
 TEXT = "int answer(void) { return 42; }"
 PLANTED = "int answer(void) { return 13; }"

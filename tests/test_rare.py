@@ -17,12 +17,20 @@ import malta
 from malta import gains
 from malta.campaigns.limits import limit_of, merits_of, slug
 from malta.campaigns.plan import Plan
-from malta.campaigns.rare import rare_event, read_design_point, replay_design_point, write_event
-from malta.campaigns.run import campaign
-from malta.campaigns.statistics import runs_within_bounds
-from malta.campaigns.subset import LEVELS, Runs, Subset, _genealogical_cov, subset_simulation
-from malta.campaigns.yields import runs_within_specification
-from malta.simulation.noise import keys
+from malta.campaigns.rare import (
+    LEVELS,
+    Runs,
+    Subset,
+    _genealogical_cov,
+    rare_event,
+    read_design_point,
+    replay_design_point,
+    subset_simulation,
+    write_event,
+)
+from malta.campaigns.result import runs_within_bounds
+from malta.campaigns.run import campaign, runs_within_specification
+from malta.simulation.readings import keys
 
 if TYPE_CHECKING:
     from collections.abc import Callable

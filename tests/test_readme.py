@@ -10,10 +10,10 @@ from conftest import ROOT
 from scipy.stats import binomtest
 
 import malta
-from malta.campaigns.yields import main_yields
+from malta.campaigns.run import main_yields
 from malta.machines.tubular.claims import SOURCE
 from malta.machines.tubular.evidence import FEWER
-from malta.report.markdown import find_tables
+from malta.report.ledger import find_tables
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

@@ -13,10 +13,17 @@ import pytest
 from conftest import refusal
 
 import malta
-from malta.machines.tubular.experiments.recording import OWN, RECORDED, SLOW
+from malta.machines.tubular.experiments.strokes import OWN, RECORDED, SLOW
 from malta.simulation.experiments import Experiment
-from malta.simulation.force_log import ForceLog, columns_of_log, log_of, read_log
-from malta.simulation.recording import record, slow_stroke, with_recorded
+from malta.simulation.experiments.recording import (
+    ForceLog,
+    columns_of_log,
+    log_of,
+    read_log,
+    record,
+    slow_stroke,
+    with_recorded,
+)
 from malta.simulation.scenario import Scenario
 from malta.simulation.trajectory import save
 from malta.synthesis.feedforward import static_feedforward

@@ -13,13 +13,13 @@ from conftest import ROOT, assert_folds, printed
 
 import malta
 from malta.errors import CheckError, InputError
-from malta.loops.recovery import furthest, load_vector, recovery
 from malta.loops.sampled_loops import disturbance_map
+from malta.loops.time_domain import furthest, load_vector, recovery
 from malta.model.linearize import linearize
-from malta.report.figures.recovery import recovery_figure
-from malta.report.tables.recovery import recovery_table
-from malta.simulation import responses
-from malta.synthesis.step_response import step_response
+from malta.report.figures.margins import recovery_figure
+from malta.report.tables.design import recovery_table
+from malta.simulation import experiments as responses
+from malta.synthesis.recovery import step_response
 
 if TYPE_CHECKING:
     from conftest import Run

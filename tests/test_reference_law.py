@@ -13,10 +13,10 @@ from exported import controller, target
 from reference_law import REACH, Drive, Law
 
 import malta
-from malta.firmware.native import call, compile_controller, new_state, view, write
-from malta.firmware.parts import decide_function, sense_function
+from malta.firmware.flight import call, compile_controller, new_state, view, write
+from malta.firmware.period_functions import decide_function, sense_function
 from malta.firmware.signals import Target, reading_ranges, state_fields
-from malta.simulation.compiled import compiler
+from malta.simulation.engine.compiled import compiler
 from malta.simulation.references import Motion
 
 if TYPE_CHECKING:

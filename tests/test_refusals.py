@@ -14,7 +14,7 @@ import pytest
 from conftest import Run, one_sentence, refusal
 
 import malta
-from malta.campaigns import block
+from malta.campaigns import store as block
 from malta.campaigns.plan import Plan
 from malta.campaigns.run import campaign
 from malta.campaigns.store import block_name, seal
@@ -22,7 +22,7 @@ from malta.errors import LONGEST, InputError, shorten
 from malta.files import file_exists
 from malta.model.sensors import MOST_DELAY
 from malta.simulation.experiments import PlannedRun, fly_all
-from malta.simulation.force_log import columns_of_log, read_log
+from malta.simulation.experiments.recording import columns_of_log, read_log
 from malta.simulation.scenario import Scenario
 from malta.tuning.search import Journal
 from malta.units import to_si

@@ -23,7 +23,7 @@ from malta.report import figures
 from malta.report.ledger import Claim, Ledger
 from malta.simulation.experiments import Case, Experiment, Merit
 from malta.simulation.scenario import Scenario
-from malta.simulation.verdict import Verdict
+from malta.simulation.trajectory import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable

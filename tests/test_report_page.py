@@ -18,12 +18,9 @@ from page_checks import cells_of, read_page
 import malta
 from malta.cli.report import read_subject
 from malta.margins.verify import linear_report
-from malta.report.figures.parts import printable
-from malta.report.page.analysis import Subject, analyse
-from malta.report.page.document import Page
-from malta.report.page.headline import key_figures
-from malta.report.page.inline import dark_colour
-from malta.report.page.pdf import pdf_of
+from malta.report.figures.drawing import printable
+from malta.report.page.analysis import Subject, analyse, key_figures
+from malta.report.page.document import Page, dark_colour, pdf_of
 from malta.report.page.report import page_of
 
 if TYPE_CHECKING:

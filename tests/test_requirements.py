@@ -13,14 +13,14 @@ import pytest
 from conftest import ROOT, refusal
 
 import malta
-from malta.loops.noise import noise_of
 from malta.loops.sampled_loops import machine_loop
+from malta.loops.time_domain import noise_of
 from malta.machines.tubular.requirements import REQUIREMENTS
 from malta.synthesis.requirements import GENERIC, requirements_for
 from malta.synthesis.spec import Loads, Pid, Spec
 from malta.tuning.groups import figures_of, groups_of
-from malta.tuning.outcomes import judge
 from malta.tuning.search import Effort, at_least_of, merge, model_and_controller
+from malta.tuning.verify import judge
 
 
 def motor_file(folder: Path, *lines: str) -> Path:

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from malta import gains
 from malta.errors import InputError
 from malta.loops.sampled_loops import machine_law, machine_system
-from malta.margins.stages import compensators
 from malta.margins.travel import travel_margin
+from malta.margins.verify import compensators
 from malta.model.data import plant_of
 from malta.proof.responses import responses
 from malta.proof.robust import robust_margin

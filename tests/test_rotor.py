@@ -21,11 +21,9 @@ from matplotlib import pyplot
 
 import malta
 from malta import report
-from malta.campaigns.statistics import figures_of
-from malta.margins.extent import NOWHERE, Extent, extent_of, positions_of
-from malta.margins.figures import zone
-from malta.margins.loop_report import LoopReport
-from malta.margins.travel import travel_loops, travel_margin
+from malta.campaigns.result import figures_of
+from malta.margins.loop_report import LoopReport, zone
+from malta.margins.travel import NOWHERE, Extent, extent_of, positions_of, travel_loops, travel_margin
 from malta.model import machines
 from malta.model.checks import check_plant
 from malta.model.machines import machine
@@ -33,7 +31,7 @@ from malta.model.plant import Plant
 from malta.proof.blocks.gain import Gain
 from malta.proof.margin import Margin
 from malta.proof.uncertain import instability
-from malta.simulation.catalogue import cases_of
+from malta.simulation.experiments.catalogue import cases_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

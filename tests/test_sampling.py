@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2, qmc
 
-from malta.campaigns.plan import MOST
-from malta.campaigns.sampling import latin_hypercube, permute, sobol
-from malta.simulation.noise import keys
+from malta.campaigns.plan import MOST, latin_hypercube, permute, sobol
+from malta.simulation.readings import keys
 
 
 @settings(max_examples=60, deadline=None)

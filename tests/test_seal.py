@@ -16,14 +16,13 @@ import pytest
 from conftest import Run, refusal
 
 import malta
-from malta.campaigns import identity
+from malta.campaigns import plan as identity
 from malta.campaigns.dask import _at_worker, _task
-from malta.campaigns.identity import fingerprint, revision_of
-from malta.campaigns.plan import Plan, planned_run
+from malta.campaigns.plan import Plan, fingerprint, planned_run, revision_of
 from malta.campaigns.result import Campaign
 from malta.campaigns.run import campaign
 from malta.campaigns.store import MANIFEST, block_name, read_plan, seal
-from malta.simulation.digest import Batch
+from malta.simulation.engine.digest import Batch
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -224,7 +223,7 @@ def test_a_folder_of_another_engine_is_refused(
         revision_of.cache_clear()
 
 
-@pytest.mark.parametrize("edited", ["simulation/digest.py", "simulation/engine.c", "model/plant.py"])
+@pytest.mark.parametrize("edited", ["simulation/engine/digest.py", "simulation/engine.c", "model/plant.py"])
 def test_a_module_that_decides_runs_changes_the_revision(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edited: str
 ) -> None:

@@ -8,11 +8,13 @@ from pathlib import Path
 
 from malta import archives, files, tables, units
 from malta.campaigns import plan
-from malta.cli import patience
-from malta.gains import mat
+from malta.cli import output as patience
+from malta.gains import encodings as mat
 from malta.model import sensors
 from malta.proof.certificate import check, checked_file
-from malta.simulation import compiled, force_log, inputs, scenario
+from malta.simulation import inputs, scenario
+from malta.simulation.engine import compiled
+from malta.simulation.experiments import recording as force_log
 
 TEXT = (Path(__file__).parents[1] / "SECURITY.md").read_text(encoding="utf-8")
 LIMITS = {

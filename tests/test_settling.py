@@ -12,14 +12,14 @@ import pytest
 from conftest import Run
 
 import malta
-from malta.simulation.batch import record_run
-from malta.simulation.catalogue import settling
+from malta.simulation.engine.batch import record_run
+from malta.simulation.experiments.catalogue import settling
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from malta.model.plant import FloatArray, Plant
-    from malta.simulation.digest import Batch
+    from malta.simulation.engine.digest import Batch
     from malta.synthesis.controller import Controller
 
 REST, ROBUST, TABLE2 = 0.02, "design/gains/robust.json", "design/gains/table2.json"

@@ -19,8 +19,7 @@ from malta.loops.sampled_loops import sampled_loop
 from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
 from malta.simulation.scenario import Scenario
-from malta.simulation.trajectory import save, stroke_figures
-from malta.simulation.verdict import Verdict, bearing_verdict
+from malta.simulation.trajectory import Verdict, bearing_verdict, save, stroke_figures
 from malta.synthesis.controller import linear_law
 
 if TYPE_CHECKING:

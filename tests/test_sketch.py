@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from malta.campaigns import sketch as module
-from malta.campaigns.sketch import ACCURACY, EXACT, Sketch, histogram, merge, quantiles, sketch_of
+from malta.campaigns import summary as module
+from malta.campaigns.summary import ACCURACY, EXACT, Sketch, histogram, merge, quantiles, sketch_of
 
 SHARES = (0.0, 0.01, 0.05, 0.5, 0.95, 0.99, 0.999, 1.0)
 LIMIT = 50  # values that are kept in these tests

@@ -13,13 +13,22 @@ from conftest import Run
 
 import malta
 from malta import gains
-from malta.campaigns import tolerance
+from malta.campaigns import studies as tolerance
 from malta.campaigns.limits import limit_of
 from malta.campaigns.plan import Plan
 from malta.campaigns.result import Rate, rate
 from malta.campaigns.run import campaign
-from malta.campaigns.sensitivity import Index, Sensitivity, _indices, _points, sensitivity
-from malta.campaigns.tolerance import ALL, Tolerances, spread_of, tolerances
+from malta.campaigns.studies import (
+    ALL,
+    Index,
+    Sensitivity,
+    Tolerances,
+    _indices,
+    _points,
+    sensitivity,
+    spread_of,
+    tolerances,
+)
 
 BOX = ("m", "K_A", "K_B")
 SHAKY = "design/gains/table2.json"

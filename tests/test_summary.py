@@ -17,17 +17,15 @@ from rich.console import Console
 
 import malta
 from malta import report
-from malta.campaigns import sketch, summary
-from malta.campaigns.block import Block, fly
+from malta.campaigns import summary
+from malta.campaigns import summary as sketch
 from malta.campaigns.plan import SAMPLERS, Plan, draw_machines
-from malta.campaigns.result import Campaign, gather
-from malta.campaigns.run import BLOCK, FILES, LARGE_BLOCK, Session, block_size, campaign, replay
-from malta.campaigns.statistics import figures_of, runs_within_bounds
-from malta.campaigns.store import MANIFEST, block_name, figure_shapes
+from malta.campaigns.result import Campaign, figures_of, gather, runs_within_bounds
+from malta.campaigns.run import BLOCK, FILES, LARGE_BLOCK, Session, block_size, campaign, replay, yields_of
+from malta.campaigns.store import MANIFEST, Block, block_name, figure_shapes, fly
 from malta.campaigns.summary import Bounds, Summary, join, summary_of, worst_of, worst_runs
 from malta.campaigns.survey import Sum, summarize
-from malta.campaigns.yields import yields_of
-from malta.simulation.digest import Batch, verdicts
+from malta.simulation.engine.digest import Batch, verdicts
 
 if TYPE_CHECKING:
     from conftest import Design

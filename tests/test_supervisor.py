@@ -18,12 +18,12 @@ from test_firmware import WARNINGS
 import malta
 from malta.errors import InputError
 from malta.firmware import supervised
-from malta.firmware.elementary import Precision
-from malta.firmware.export import sources
-from malta.firmware.native import call, compile_controller, new_state, view
+from malta.firmware.export import phase_currents, sources
+from malta.firmware.flight import call, compile_controller, new_state, view
+from malta.firmware.program import Precision
+from malta.firmware.report import UNWATCHED, watch_lines, watch_table
 from malta.firmware.sensor_loss import expected_readings, gains_without, prediction_correction
 from malta.firmware.signals import Target, fidelity_of
-from malta.firmware.stand_in import phase_currents
 from malta.firmware.supervised import NUMBERS, compile_supervised
 from malta.firmware.supervisor import (
     FLYING,
@@ -38,9 +38,8 @@ from malta.firmware.supervisor import (
     reference_limits,
 )
 from malta.firmware.supervisor_text import monitor_lines, supervisor_members, supervisor_sources
-from malta.firmware.watch import UNWATCHED, watch_lines, watch_table
-from malta.machines.tubular.experiments.contact import SOFT
-from malta.simulation.compiled import compiler
+from malta.machines.tubular.experiments.faults import SOFT
+from malta.simulation.engine.compiled import compiler
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

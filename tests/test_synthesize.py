@@ -11,7 +11,7 @@ import pytest
 import malta
 from malta.margins.verify import controller_poles
 from malta.synthesis.feedforward import pi_current_loop, static_feedforward
-from malta.synthesis.sampled import sampled_model
+from malta.synthesis.kalman import sampled_model
 
 if TYPE_CHECKING:
     from conftest import Design

@@ -10,7 +10,7 @@ import pytest
 import threadpoolctl
 
 import malta
-from malta.threads import on_one_thread, one_blas_thread
+from malta.processes import on_one_thread, one_blas_thread
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -18,15 +18,24 @@ from malta.machines.tubular.evidence import evidence as evidence_of
 from malta.margins.loop_report import Outcome
 from malta.report import ledger as claims
 from malta.report.ledger import Row
-from malta.simulation.catalogue import experiment
+from malta.simulation.experiments.catalogue import experiment
 from malta.simulation.trajectory import stroke_figures
 from malta.synthesis.controller import law
 from malta.synthesis.pid import axes_of, pid
 from malta.synthesis.spec import Pid
-from malta.tuning.outcomes import SynthesizedDesign, judge
-from malta.tuning.pid import close_loop, loads_of, loop_figures, parts_of, whole_machine
-from malta.tuning.pid_estimates import BETWEEN, estimates_of, name_of, outputs_of
+from malta.tuning.pid import (
+    BETWEEN,
+    close_loop,
+    estimates_of,
+    loads_of,
+    loop_figures,
+    name_of,
+    outputs_of,
+    parts_of,
+    whole_machine,
+)
 from malta.tuning.search import model_and_controller
+from malta.tuning.verify import SynthesizedDesign, judge
 
 if TYPE_CHECKING:
     from pathlib import Path

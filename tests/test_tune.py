@@ -17,20 +17,17 @@ from conftest import ROOT, Run, refusal
 
 import malta
 from malta import gains, report
-from malta.loops.noise import noise_of, noise_variance
 from malta.loops.sampled_loops import machine_loop
+from malta.loops.time_domain import noise_of, noise_variance
 from malta.machines.tubular.requirements import DRIVE
-from malta.margins.figures import BANDWIDTHS
-from malta.margins.loop_report import Outcome
-from malta.simulation.catalogue import experiment
+from malta.margins.loop_report import BANDWIDTHS, Outcome
+from malta.simulation.experiments.catalogue import experiment
 from malta.synthesis.controller import linear_law, linear_law_of
 from malta.synthesis.requirements import requirements_for
 from malta.synthesis.riccati import eigenvalues
 from malta.tuning import lqg as tune_lqg
-from malta.tuning.design_text import design_text
 from malta.tuning.groups import figures_of
 from malta.tuning.lqg import _clusters, _search, _worst
-from malta.tuning.outcomes import judge
 from malta.tuning.search import (
     Effort,
     Journal,
@@ -39,8 +36,9 @@ from malta.tuning.search import (
     at_least_of,
     merge,
 )
-from malta.tuning.tune import Tuned, problem_sha256
+from malta.tuning.tune import Tuned, design_text, problem_sha256
 from malta.tuning.tune import tune as tuned
+from malta.tuning.verify import judge
 
 if TYPE_CHECKING:
     from malta.margins.loop_report import LoopReport

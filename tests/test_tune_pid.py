@@ -21,10 +21,8 @@ from malta.machines.halbach import electronics
 from malta.machines.halbach import plant as halbach
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Pid
-from malta.tuning import outcomes
 from malta.tuning import pid as tune_pid
-from malta.tuning.design_text import design_text
-from malta.tuning.outcomes import judge
+from malta.tuning import verify as outcomes
 from malta.tuning.pid import (
     _goal,
     close_loop,
@@ -40,8 +38,9 @@ from malta.tuning.search import (
     model_and_controller,
     separate,
 )
-from malta.tuning.tune import problem_sha256
+from malta.tuning.tune import design_text, problem_sha256
 from malta.tuning.tune import tune as tuned
+from malta.tuning.verify import judge
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -9,8 +9,8 @@ from conftest import ROOT
 from exported import EXACT, require, run
 
 import malta
-from malta.firmware.elementary import Precision
-from malta.firmware.folder import folder_files
+from malta.firmware.exports import folder_files
+from malta.firmware.program import Precision
 from malta.firmware.signals import Target
 from malta.simulation.layout import fidelities
 

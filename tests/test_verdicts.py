@@ -17,7 +17,7 @@ import malta
 from malta.app.worker import outcome_document
 from malta.gains.file import read
 from malta.margins.loop_report import Outcome
-from malta.report.page.headline import _requirements as headline
+from malta.report.page.analysis import _requirements as headline
 from malta.report.tables.tuning import found_text, requirements_table
 from malta.synthesis.requirements import (
     SEEDS,
@@ -27,8 +27,8 @@ from malta.synthesis.requirements import (
     mean_over_seeds,
     reached_with_every_seed,
 )
-from malta.tuning.outcomes import SynthesizedDesign, judge, outcomes_of, unflown
 from malta.tuning.search import model_and_controller
+from malta.tuning.verify import SynthesizedDesign, judge, outcomes_of, unflown
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -145,7 +145,7 @@ def test_undecided_ends_tune_with_exit_code_1(monkeypatch: pytest.MonkeyPatch) -
 
     from malta.cli.main import app
 
-    monkeypatch.setattr("malta.tuning.outcomes.judge", lambda *_: (OPEN,))
+    monkeypatch.setattr("malta.tuning.verify.judge", lambda *_: (OPEN,))
     ended = CliRunner().invoke(app, ["tune", "--check", str(ROOT / "design" / "halbach_pid.toml"), "--json"])
     (row,) = json.loads(ended.stdout)["requirements"]
     assert (row["holds"], row["verdict"], row["interval"]) == (False, "undecided", [0.95, 1.03])

@@ -11,8 +11,7 @@ import pytest
 
 import malta
 from malta.loops.sampled_loops import machine_loop, sampled_loop
-from malta.margins.figures import BANDWIDTHS, zone
-from malta.margins.loop_report import require_stable
+from malta.margins.loop_report import BANDWIDTHS, require_stable, zone
 from malta.synthesis.riccati import eigenvalues
 
 if TYPE_CHECKING:

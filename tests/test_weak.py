@@ -24,7 +24,7 @@ from malta.proof.uncertain import closed_loop, instability, model_of
 from malta.proof.weak_coupling import taylor
 from malta.proof.weak_coupling.axes import members_of, state_matrix
 from malta.proof.weak_coupling.held_currents import HeldMachine, dominating_solution, held_machine
-from malta.proof.weak_coupling.laurent import Evaluation, Laurent
+from malta.proof.weak_coupling.taylor import Evaluation, Laurent
 from malta.proof.weak_coupling.weak_coupling import HeldLoop, coupling_bounds
 
 NAMES = ("m", "I_x", "I_z", "B_r", "r_z")

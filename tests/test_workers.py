@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from malta.simulation import workers
-from malta.simulation.compiled import LANES, Lanes, Part, Shared, numbers_in_lanes, repeat_in_lanes
+from malta.simulation.engine import batch as workers
+from malta.simulation.engine.compiled import LANES, Lanes, Part, Shared, numbers_in_lanes, repeat_in_lanes
 
 SAMPLES, SUBSTEPS = 100, 4
 

@@ -13,16 +13,23 @@ import pytest
 import malta
 from malta import references
 from malta.machines.tubular import plant as tubular
-from malta.simulation import compiled, prepared
-from malta.simulation.batch import simulate_many
-from malta.simulation.digest import cruise_functions, digest_function
-from malta.simulation.engines import EngineChoice, compiled_period, engine_of, shape_of
-from malta.simulation.expressions import Identities, conserved, linear_parts
+from malta.simulation import simulate as prepared
+from malta.simulation.engine import compiled
+from malta.simulation.engine.batch import simulate_many
+from malta.simulation.engine.digest import cruise_functions, digest_function
+from malta.simulation.engine.engines import (
+    EngineChoice,
+    compiled_period,
+    engine_of,
+    shape_of,
+    source,
+    translate,
+)
+from malta.simulation.engine.instructions import Counts
+from malta.simulation.engine.integration_state import Identities, conserved, linear_parts
 from malta.simulation.layout import ending_columns, numbers_of, with_symbols
-from malta.simulation.once import Counts
 from malta.simulation.period import Period, columns_of
 from malta.simulation.scenario import Scenario, setup_of
-from malta.simulation.translate import source, translate
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -269,7 +276,7 @@ def test_a_quiet_sample_updates_a_digest_as_any_other(designs: dict[str, Design]
 
 
 def _names(shape: Any) -> list[str]:
-    from malta.simulation.digest import digest_sizes
+    from malta.simulation.engine.digest import digest_sizes
 
     return [name for name, size in digest_sizes(shape.plant).items() for _ in range(size)]
 

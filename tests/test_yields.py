@@ -12,8 +12,7 @@ from conftest import Run
 import malta
 from malta import gains
 from malta.campaigns.plan import Plan
-from malta.campaigns.run import campaign
-from malta.campaigns.yields import main_yields, runs_within_specification, specified_bounds, yields_of
+from malta.campaigns.run import campaign, main_yields, runs_within_specification, specified_bounds, yields_of
 from malta.machines.tubular.experiments.strokes import SETTLE
 
 if TYPE_CHECKING:

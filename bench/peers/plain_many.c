@@ -65,7 +65,7 @@ static inline real wave_sine(real x)
 #endif
 #include "plain.h"
 
-/* Two normals by Box and Muller from SplitMix64 of a key and a counter, in single precision: malta/simulation/noise.py.
+/* Two normals by Box and Muller from SplitMix64 of a key and a counter, in single precision: malta/simulation/readings.py.
  * To the bit, so nothing is contracted. */
 typedef uint32_t halves __attribute__((vector_size(4 * W)));
 typedef int32_t indices __attribute__((vector_size(4 * W)));

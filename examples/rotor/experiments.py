@@ -21,18 +21,19 @@ from malta.loops.loop import loop
 from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
 from malta.model.plant import Plant
-from malta.simulation import generic, references
+from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,
     Experiment,
     Merit,
     PlannedRun,
     Progress,
+    amplitude,
     fly,
     fly_all,
     scenario_of,
 )
-from malta.simulation.responses import amplitude
+from malta.simulation.experiments import catalogue as generic
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 

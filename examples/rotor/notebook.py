@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import malta
-from malta.margins.figures import ZONES
+from malta.margins.loop_report import ZONES
 from malta.model.machines import attribute_of, machine
 
 # The folder of the machine, wherever Jupyter was started.

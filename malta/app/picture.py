@@ -12,30 +12,150 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 
 from malta.app.files import Edited
-from malta.app.runs import planned_run
 from malta.errors import CheckError, InputError
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.loop import Loop, loop_of_model
-from malta.loops.noise import noise_of
 from malta.loops.sampled_loops import continuous_poles
-from malta.margins.figures import BANDWIDTHS, MEANINGS, zone
-from malta.margins.loop_report import Stage
+from malta.loops.time_domain import noise_of
+from malta.margins.loop_report import BANDWIDTHS, MEANINGS, Stage, zone
 from malta.margins.travel import travel_loops
 from malta.margins.verify import bandwidths_of, controller_poles, stage_of
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.proof.rays import RayBound, ray_bound
-from malta.simulation.linear_run import linear_run
+from malta.proof.loss import RayBound, ray_bound
+from malta.simulation.engine.engines import evaluate
+from malta.simulation.experiments.catalogue import cases_of, main_job, series_of, step_cases
+from malta.simulation.inputs import feedforward, motion_of, past_forces
+from malta.simulation.period import state_reference
 from malta.synthesis.lqg import synthesize
 from malta.synthesis.riccati import eigenvalues
 
 if TYPE_CHECKING:
+    from malta.loops.sampled_loops import SampledLoop
     from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.simulation.experiments import PlannedRun
+    from malta.simulation.references import Motion
+    from malta.simulation.scenario import Scenario
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
+
+
+# The runs that the page can show: the machine's main job, and a step of each output.
+
+
+STEP = "step "
+
+
+def run_names(plant: Plant, controller: Controller) -> list[str]:
+    """The runs by name, the one that the page begins with first: the main job, unless nothing moves in it."""
+    job, steps = main_job(plant), [STEP + s.name for s in plant.outputs]
+    if job not in series_of(plant):
+        return steps
+    scenario = cases_of(job, plant, controller)[0].scenario
+    moves = scenario.reference(plant)(np.linspace(0.0, scenario.duration, 50)).p
+    return [job, *steps] if np.ptp(moves, axis=0).any() else [*steps, job]
+
+
+def planned_run(plant: Plant, controller: Controller, name: str) -> tuple[str, PlannedRun]:
+    """A run by its name, and the name; "": the first. Raises InputError for an unknown one."""
+    known = run_names(plant, controller)
+    name = name or known[0]
+    if name not in known:
+        raise InputError("run", "name", repr(name), "one of " + ", ".join(known))
+    if name.startswith(STEP):
+        return name, step_cases(plant, controller, output=name.removeprefix(STEP), size=0.0, time=0.0)[0]
+    return name, cases_of(name, plant, controller)[0]
+
+
+# What goes wrong behind the page, in one sentence: a page has no place for a traceback.
+
+
+def describe_error(error: Exception) -> str:
+    """The sentence of an error; of one that malta does not raise on purpose, its kind and text as well."""
+    if isinstance(error, InputError | CheckError):
+        return str(error)
+    if isinstance(error, ArithmeticError):
+        return f"numbers beyond what can be computed ({error})"
+    if isinstance(error, MemoryError):
+        return "more was asked for than this computer has memory for"
+    return f"a defect of malta or of the machine's module: {type(error).__name__} ({error})"
+
+
+# A reference followed by the linear loop of a machine: what a simulation shows, in milliseconds and without limits.
+#
+#     X+ = M X + G r,   p = C X,   v = K X + D r        X = (machine, law), r = (p*, xi*, v_ff, v0)
+#
+# The loop is `malta.loop`: hold, delay, current loops, late sensors, loads against v0(z) at the
+# trim. Forces that saturate, sums of errors that wait, and what changes along the way are left to `simulate`.
+
+
+LONGEST = 20_000  # samples
+
+
+class LinearRun(NamedTuple):
+    """A reference and its answer, one row a sample, SI."""
+
+    t: FloatArray  # s, k
+    reference: FloatArray  # k x p
+    p: FloatArray  # k x p, true outputs
+    v: FloatArray  # k x m, commanded forces beside those that hold the machine at its operating point
+
+
+def linear_run(loop: SampledLoop, controller: Controller, scenario: Scenario) -> LinearRun:
+    """Follow the reference of a scenario with the linear loop, which starts at rest on the reference.
+
+    loop : `malta.loop(machine, controller).sampled`
+
+    Raises InputError for more than LONGEST samples.
+    """
+    c, law, plant = controller, loop.control, plant_of(controller.parameters)
+    samples = max(1, round(scenario.duration / c.sample_time))
+    if samples > LONGEST:
+        raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
+    t = np.arange(samples) * c.sample_time
+    motion = motion_of(scenario, plant, c, t)
+    here = np.array(ca.DM(plant.h(ca.DM(plant.point(c.operating_point[0]).x), 0))).ravel()
+    r = _references(c, motion, here)
+    closed, driven = loop.closed, r @ np.vstack([loop.Bd @ law.D_r, law.B_r]).T
+    n, m = len(loop.Ad), len(c.forces)
+    X = np.empty((samples, len(closed)))
+    with np.errstate(all="ignore"):  # an unstable loop runs away
+        state = _at_rest(closed, driven[0])
+        for k in range(samples):
+            X[k] = state
+            state = closed @ state + driven[k]
+        p = here + X[:, :n] @ loop.outputs.T
+        v = X @ np.hstack([law.D_y @ loop.Cd, law.C])[:m].T + r @ law.D_r[:m].T
+    return LinearRun(t, motion.p, p, v)
+
+
+def _at_rest(closed: FloatArray, driven: FloatArray) -> FloatArray:
+    """The states of which X = M X + G r, for a reference that stands still."""
+    left = np.eye(len(closed)) - closed
+    try:
+        return np.linalg.solve(left, driven)
+    except np.linalg.LinAlgError:  # an integral that nothing reads
+        return np.asarray(np.linalg.lstsq(left, driven, rcond=None)[0])
+
+
+def _references(c: Controller, motion: Motion, here: FloatArray) -> FloatArray:
+    """r = (p*, xi*, v_ff, v0) at every sample, as deviations from the operating point; v0 follows the readings."""
+    v_ff, hold = feedforward(c, motion), c.feedforward.position
+    if hold.size:  # at the operating point it is no deviation
+        v_ff = v_ff - c.operating_point[0][: hold.shape[1]] @ hold.T
+    zeros, p = np.zeros_like(v_ff), motion.p - here
+    if c.tracks == "errors":
+        return np.hstack([p, np.zeros((len(p), len(c.states))), v_ff, zeros])
+    rest, rates = state_reference(plant_of(c.parameters)), len(c.feedforward.rate)
+    states = evaluate(rest.map(len(p)), motion.p, motion.dp)[0] - np.array(rest(here, 0)).ravel()
+    if rates:
+        states[:, len(c.A) - rates :] += motion.dp @ c.feedforward.rate.T
+    return np.hstack([p, states, past_forces(c, motion, v_ff), v_ff, zeros])
+
 
 POINTS = 400  # of a curve over time, at most
 LOAD_POINTS = 240
@@ -44,7 +164,7 @@ DIGITS = 6  # of what is drawn
 
 @dataclass(frozen=True)
 class View:
-    """What the page looks at: a run of runs.py, and a disturbance of the machine; "": the first of each."""
+    """What the page looks at: a run of picture.py, and a disturbance of the machine; "": the first of each."""
 
     run: str = ""
     load: str = ""

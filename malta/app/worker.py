@@ -17,17 +17,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
-from malta.app.faults import describe_error
 from malta.app.files import DesignFiles, Edited, fingerprint, open_design
-from malta.app.picture import Problem, View, curves, margin_document, solve
-from malta.app.runs import planned_run
+from malta.app.picture import Problem, View, curves, describe_error, margin_document, planned_run, solve
 from malta.errors import CheckError, InputError, shorten
 from malta.margins.loop_report import Outcome
 from malta.margins.travel import travel_loops, travel_margin
-from malta.proof.rays import ray_bound
+from malta.proof.loss import ray_bound
 from malta.simulation.simulate import simulate
 from malta.synthesis.requirements import judge_figure, proven_margin
-from malta.tuning.outcomes import SynthesizedDesign, outcomes_of
+from malta.tuning.verify import SynthesizedDesign, outcomes_of
 
 LONGEST = 120.0  # s, of a proof
 

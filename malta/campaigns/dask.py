@@ -14,7 +14,7 @@ from pkgutil import resolve_name
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
-from malta.campaigns.block import Block, fly
+from malta.campaigns.store import Block, fly
 from malta.errors import InputError
 from malta.model.machines import load_sources, sources_of
 

@@ -18,19 +18,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from malta.campaigns.block import simulate_machines
 from malta.campaigns.plan import Plan, machines_at, planned_run, varied_names
-from malta.campaigns.result import Campaign
-from malta.campaigns.statistics import Finding, figures_of
+from malta.campaigns.result import Campaign, Finding, figures_of
+from malta.campaigns.run import specified_bounds
+from malta.campaigns.store import simulate_machines
 from malta.campaigns.summary import UNBOUNDED, Bounds
-from malta.campaigns.yields import specified_bounds
 from malta.errors import InputError
 from malta.model.signals import outputs_of
 from malta.units import in_unit
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
-    from malta.simulation.digest import Batch
+    from malta.simulation.engine.digest import Batch
 
 EVENTS = ("touchdown", "published", "specification")  # limits without a bound of the user's own
 BELOW = float(np.nextafter(1, 0))  # the largest severity of a run within its limit

@@ -9,40 +9,263 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
+from functools import cache, lru_cache
 from importlib.metadata import version
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from malta.campaigns.identity import fingerprint as fingerprint
-from malta.campaigns.identity import firmware_sha256, revision_of
-from malta.campaigns.sampling import latin_hypercube, sobol
 from malta.errors import InputError
-from malta.firmware.elementary import Precision
+from malta.files import read_file
+from malta.firmware.program import Precision
 from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import decode
 from malta.model.data import plant_of
+from malta.model.machines import part_of
 from malta.model.parameters import differences, shape_parameters, twins_of, units_of, values_of
 from malta.model.plant import Plant, readonly
-from malta.simulation.catalogue import cases_of
+from malta.simulation.engine.batch import functions_text
 from malta.simulation.experiments import PlannedRun
+from malta.simulation.experiments.catalogue import cases_of
+from malta.simulation.readings import GAMMA, keys, mix
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from malta.model.plant import FloatArray
+    from malta.simulation.scenario import Scenario
+
+
+# Points of a design in the unit box, any consecutive ones of them without the others.
+#
+# A campaign of a hundred million runs draws its machines block by block, on several computers: no point may need a
+# table of all. A Latin hypercube needs, for each dimension, a random permutation of its samples. Here that
+# permutation is a Feistel network on the pairs (l, r) of the numbers l + a r, 0 <= l < a, 0 <= r < b, with a b >= n,
+# whose rounds
+#
+#     l <- (l + F(r)) mod a    and    r <- (r + F(l)) mod b
+#
+# can each be undone, so that the network permutes the numbers below a b. A number that comes out as n or more goes
+# through it again, until it is below n: what is left permutes the numbers below n. F is SplitMix64 of a key.
+#
+# Sources: M. D. McKay, R. J. Beckman, W. J. Conover, Technometrics 21(2), 1979 (Latin hypercubes); J. Black, P.
+# Rogaway, Ciphers with arbitrary finite domains, CT-RSA 2002 (networks on a b >= n, and the way back below n); I. M.
+# Sobol, 1967, and S. Joe, F. Y. Kuo, SIAM J. Sci. Comput. 30, 2008 (direction numbers, those of
+# scipy.stats.qmc.Sobol).
+
+
+ROUNDS = 24  # so many that all 5040 permutations of 7 numbers come equally often; pairs are mixed after a few
+JITTER = 22  # bits of a place in its stratum: 30 bits of strata, these and the half fill the 53 of a number
+DIGITS = 30  # bits of a coordinate of a Sobol point
+
+
+def latin_hypercube(seed: int, samples: int, dimensions: int, first: int, count: int) -> FloatArray:
+    """Points first ... first + count - 1 of a Latin hypercube of `samples` points, count x dimensions.
+
+    In each dimension every stratum [k/n, (k+1)/n) has one of the n = `samples` points, at a random place in it.
+
+    >>> sorted((latin_hypercube(0, 4, 1, 0, 4)[:, 0] * 4).astype(int).tolist())
+    [0, 1, 2, 3]
+    """
+    runs = np.arange(first, first + count, dtype=np.uint64)
+    # Indices below 0: runs have the others, for their noise.
+    streams = keys(seed, -1 - np.arange(2 * dimensions)).reshape(dimensions, 2)
+    columns = []
+    for permuting, placing in streams:
+        stratum = permute(runs, samples, permuting).astype(float)
+        place = mix(placing + runs * np.uint64(GAMMA)) >> np.uint64(64 - JITTER)
+        columns.append((stratum + (place.astype(float) + 0.5) / 2**JITTER) / samples)
+    return np.stack(columns, axis=1)
+
+
+def permute(numbers: NDArray[np.uint64], size: int, key: np.uint64) -> NDArray[np.uint64]:
+    """Where a permutation of 0 ... size - 1 takes some of these numbers. The key chooses the permutation."""
+    a = math.isqrt(size - 1) + 1
+    a += a % 2  # rounds of an odd a and an odd b would be even permutations, and make no others
+    b = -(-size // a)
+    found = _through_network(numbers, np.uint64(a), np.uint64(b), key)
+    while (outside := found >= size).any():
+        found[outside] = _through_network(found[outside], np.uint64(a), np.uint64(b), key)
+    return found
+
+
+def _through_network(
+    numbers: NDArray[np.uint64], a: np.uint64, b: np.uint64, key: np.uint64
+) -> NDArray[np.uint64]:
+    right, left = np.divmod(numbers, a)
+    for own in mix(key + np.arange(1, ROUNDS + 1, dtype=np.uint64) * np.uint64(GAMMA)).reshape(-1, 2):
+        left = (left + mix(own[0] + right * np.uint64(GAMMA)) % a) % a
+        right = (right + mix(own[1] + left * np.uint64(GAMMA)) % b) % b
+    return np.asarray(left + a * right)
+
+
+def sobol(seed: int, samples: int, dimensions: int, first: int, count: int) -> FloatArray:
+    """Points first ... first + count - 1 of scipy's scrambled Sobol sequence, count x dimensions; to the bit.
+
+    Point n is that of 0, xor the direction numbers of the ones in n xor n // 2, the Gray code of n.
+    """
+    start, directions = _directions(seed, max(samples - 1, 1).bit_length(), dimensions)
+    runs = np.arange(first, first + count, dtype=np.uint64)
+    gray = runs ^ (runs >> np.uint64(1))
+    points = np.tile(start, (count, 1))
+    for bit, direction in enumerate(directions):
+        points ^= (
+            np.where((gray >> np.uint64(bit)) & np.uint64(1), np.uint64(1), np.uint64(0))[:, None] * direction
+        )
+    return np.asarray(points / 2.0**DIGITS)
+
+
+@lru_cache(maxsize=8)
+def _directions(seed: int, bits: int, dimensions: int) -> tuple[NDArray[np.uint64], list[NDArray[np.uint64]]]:
+    """Point 0 and the direction numbers of the first 2**bits points, as whole numbers below 2**DIGITS.
+
+    The Gray code of 2**(k + 1) - 1 is 2**k: that point differs from point 0 by direction k alone.
+    """
+    from scipy.stats import qmc  # half a second to import
+
+    sequence = qmc.Sobol(dimensions, rng=seed, bits=DIGITS)
+    start, at, directions = _whole(sequence.random(1)), 1, []
+    for bit in range(bits):
+        sequence.fast_forward(2 ** (bit + 1) - 1 - at)
+        at = 2 ** (bit + 1)
+        directions.append(_whole(sequence.random(1)) ^ start)
+    return start, directions
+
+
+def _whole(points: FloatArray) -> NDArray[np.uint64]:
+    return np.asarray(points[0] * 2.0**DIGITS).astype(np.uint64)
+
+
+# Hashes by which a campaign recognizes its own runs: of a record's content, and of the revision of engine and law.
+#
+# Runs of two revisions differ, so a folder keeps the runs of one revision only.
+
+
+PACKAGES = ("model", "synthesis", "simulation")  # whose modules decide a run
+
+
+def fingerprint(record: Any) -> str:
+    """sha256 of every number, name and tuple in a record: equal for a gain file's .json, .npz and .mat.
+
+    Each part is hashed with its kind and its size, so that two records of different structure never give the same
+    bytes: ((1, 2), (3,)) and ((1,), (2, 3)) differ.
+    """
+    marks = hashlib.sha256()
+    for part in _parts(record):
+        marks.update(part)
+    return marks.hexdigest()
+
+
+def _parts(value: Any) -> Iterator[bytes]:
+    """The bytes of a value: its kind, its size, then its content."""
+    if isinstance(value, np.ndarray | np.generic | float | int):
+        yield f"number {np.shape(value)}:".encode()
+        # Files do not store the sign of a zero: + 0.0 drops it.
+        yield (np.asarray(value, dtype="<f8") + 0.0).tobytes()
+    elif is_dataclass(value):
+        # A field that came later is left out at its default: older gain files do not mention it.
+        kept = [
+            f.name
+            for f in fields(value)
+            if not (f.metadata.get("later") and _is_usual(f, getattr(value, f.name)))
+        ]
+        yield f"record {len(kept)}:".encode()
+        for name in kept:
+            yield from _parts(name)
+            yield from _parts(getattr(value, name))
+    elif isinstance(value, Mapping):
+        yield f"table {len(value)}:".encode()
+        for name in sorted(value):
+            yield from _parts(name)
+            yield from _parts(value[name])
+    elif isinstance(value, tuple | list):
+        yield f"list {len(value)}:".encode()
+        for entry in value:
+            yield from _parts(entry)
+    else:
+        text = repr(value).encode()
+        yield f"text {len(text)}:".encode() + text
+
+
+def _is_usual(f: Field[Any], value: Any) -> bool:
+    """Whether a field has its default."""
+    usual: Any = f.default if f.default_factory is MISSING else f.default_factory()
+    return np.array_equal(value, usual) if isinstance(value, np.ndarray) else bool(value == usual)
+
+
+@lru_cache(maxsize=8)
+def revision_of(plant: Plant, controller: Controller, scenario: Scenario) -> dict[str, str]:
+    """The revision of engine and law that decides the runs of a scenario: three hashes, each sha256.
+
+    engine : of the modules of malta that simulate a run, with the C text of the engine
+    machine : of the modules of the machine's model and of its experiments
+    law : of the functions of a control period as the engine compiles them: machine, controller and digest
+    """
+    model = type(plant.parameters).__module__
+    part = part_of("experiments", plant.name)
+    modules = dict.fromkeys([model] if part is None else [model, part.__name__])
+    return {
+        "engine": _engine_sha256(),
+        "machine": _sha256(part for name in modules for part in _module_parts(name)),
+        "law": _sha256([functions_text(plant, controller, scenario).encode()]),
+    }
+
+
+@cache
+def _engine_sha256() -> str:
+    """sha256 of the names and texts of the modules of PACKAGES, and of the engine's C text."""
+    return _sha256(_package_parts(PACKAGES))
+
+
+@cache
+def firmware_sha256() -> str:
+    """The same of the modules that write the exported C, and of its templates."""
+    return _sha256(_package_parts(("firmware", "firmware/templates")))
+
+
+def _package_parts(packages: tuple[str, ...]) -> list[bytes]:
+    """The names and texts of the modules and C files of packages."""
+    parts: list[bytes] = []
+    for package in packages:
+        for file in sorted(files("malta").joinpath(package).iterdir(), key=lambda file: file.name):
+            if file.name.endswith((".py", ".c", ".h")):
+                parts += [f"{package}/{file.name}".encode(), file.read_bytes()]
+    return parts
+
+
+def _module_parts(name: str) -> list[bytes]:
+    """The name of a module and the texts of its files, those of its whole folder for a package.
+
+    The name alone where a module has no file, as in a notebook, and for a script: `law` covers their models.
+    """
+    found = getattr(sys.modules.get(name), "__file__", None)
+    if name == "__main__" or found is None:
+        return [name.encode()]
+    path = Path(found)
+    paths = sorted(path.parent.glob("*.py")) if path.name == "__init__.py" else [path]
+    return [name.encode(), *(read_file(p, "module of a machine", Path.read_bytes) for p in paths)]
+
+
+def _sha256(parts: Iterable[bytes]) -> str:
+    """sha256 of parts, each with its length."""
+    marks = hashlib.sha256()
+    for part in parts:
+        marks.update(f"{len(part)}:".encode() + part)
+    return marks.hexdigest()
+
 
 SCHEMA, VERSION = "malta-campaign", 1
 Sampler = Literal["latin-hypercube", "sobol"]
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 Law = Literal["own", "c", "c-float"]
 PRECISIONS: dict[Law, Precision] = {"c": "double", "c-float": "float"}
-DRAWING = (
-    2  # how samplers make points of a seed, see sampling.py; a folder of another version has other machines
-)
+DRAWING = 2  # how samplers make points of a seed, see plan.py; a folder of another version has other machines
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,22 +6,27 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.stats import binomtest
 
-from malta.campaigns.block import Block
-from malta.campaigns.plan import Plan, varied_names
-from malta.campaigns.store import figure_shapes
+from malta.campaigns.plan import Plan, half_width, varied_names
+from malta.campaigns.store import Block, figure_shapes
 from malta.display import Description, display
+from malta.model.data import published_value
+from malta.model.parameters import differences, units_of
 from malta.model.plant import readonly
-from malta.simulation.digest import Batch, verdicts
+from malta.model.signals import inputs_of, outputs_of, stroke_unit
+from malta.simulation.engine.digest import Batch, verdicts
+from malta.simulation.experiments import setting
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from malta.model.plant import FloatArray
+
 
 CONFIDENCE = 0.95  # of the interval about a share
 
@@ -145,3 +150,110 @@ def rate(count: int, runs: int) -> Rate:
         return Rate(0, 0, math.nan, 0.0, 1.0)
     low, high = binomtest(count, runs).proportion_ci(CONFIDENCE, method="exact")
     return Rate(count, runs, count / runs, float(low), float(high))
+
+
+# Statistics of a campaign: figures of merit beside the paper's, runs within its bounds, the worst runs.
+
+
+class Finding(NamedTuple):
+    """A figure of merit over all completed runs, SI."""
+
+    label: str
+    kind: str  # figures of one kind share a diagram
+    unit: str  # for display
+    values: FloatArray  # a row for each run of the campaign; NaN where it has none
+    published: float = math.nan  # SI; NaN where the paper has none
+    relation: str = "at most"  # of ours to the published: "about" or "at most"
+
+    @property
+    def within(self) -> NDArray[np.bool_]:
+        """True for runs that were completed within the published bound."""
+        return np.asarray(self.values <= self.published)
+
+
+CLEARANCE = "clearance:"  # kind of the figures that tell how close a run came to each contact
+RISE = ("rise, 10-90 %", "overshoot")  # of a stroke: a scenario without one has them at no run
+
+
+def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> list[Finding]:
+    """The figures of merit of a campaign, with the bounds that the paper prints for this scenario."""
+    rose = np.isfinite(found.batch.rise).any()
+    return [f for f in every_figure(found, published) if rose or f.kind not in RISE]
+
+
+def every_figure(found: Campaign, published: Mapping[str, Any] | None = None) -> list[Finding]:
+    """The same for every block of a campaign: also the figures of a stroke where no run has made one."""
+    plan, batch = found.plan, found.batch
+    plant, done = plan.plant, found.completed
+    names = [signal.name for signal in plant.outputs]
+    keys = {} if published is None else bounds_of(plan)
+
+    def finding(
+        name: str, kind: str, unit: str, values: FloatArray, key: str = "", relation: str = "at most"
+    ) -> Finding:
+        bound = published_value(published or {}, keys[key]) if key in keys else math.nan
+        label = f"{kind} {name}" if name else kind
+        return Finding(label, kind, unit, readonly(np.where(done, values, np.nan)), bound, relation)
+
+    first = 1 if plant.has_stroke else 0  # of the groups: the stroke and the thrust
+    strokes, others = outputs_of(plant)[:first], outputs_of(plant)[first:]
+    thrusts, efforts = inputs_of(plant)[:first], inputs_of(plant)[first:]
+    lengthwise = [(k, group) for group in strokes for k in group.columns]
+    sides = [(k, group) for group in others for k in group.columns]
+    listed = [
+        finding("", RISE[0], "ms", batch.rise, "rise", "about"),
+        finding("", RISE[1], "percent", batch.overshoot, "overshoot"),
+    ]
+    listed += [
+        finding("", f"deviation of {names[k]}", stroke_unit(plant), batch.deviation[:, k], "stroke")
+        for k, _ in lengthwise
+    ]
+    listed += [finding(names[k], "deviation", g.fine, batch.deviation[:, k], g.unit) for k, g in sides]
+    if plan.scenario == "hold":
+        listed += [finding("", f"rms of {names[k]}", g.fine, batch.rms[:, k]) for k, g in lengthwise]
+        listed += [finding(names[k], "rms", g.fine, batch.rms[:, k]) for k, g in sides]
+    listed += [
+        finding("", f"largest {g.name}", g.unit, batch.force[:, g.columns].max(axis=1, initial=0.0))
+        for g in (*efforts, *thrusts)
+    ]
+    listed += [
+        finding(name.removeprefix("touchdown at "), CLEARANCE, "percent", batch.contact[:, k])
+        for k, name in enumerate(plant.contacts)
+    ]
+    return [
+        *listed,
+        finding("", "limited commands", "percent", batch.saturated.max(axis=1, initial=0.0)),
+    ]
+
+
+def bounds_of(plan: Plan) -> Mapping[str, str]:
+    """The bounds that the machine's paper prints for the scenario of a plan, as keys of data/published/."""
+    bounds = setting(plan.plant, "bounds", None)
+    found: Mapping[str, str] = {} if bounds is None else bounds(plan.scenario, plan.options)
+    return found
+
+
+def runs_within_bounds(
+    found: Campaign, published: Mapping[str, Any] | None = None
+) -> NDArray[np.bool_] | None:
+    """True for runs that were completed within every published bound; None where the paper has no bounds."""
+    bounds = [
+        f for f in every_figure(found, published) if f.relation == "at most" and math.isfinite(f.published)
+    ]
+    return np.all([f.within for f in bounds], axis=0) if bounds else None
+
+
+def unit_of(plan: Plan, name: str) -> str:
+    """The unit in which a varied value is displayed."""
+    errors = {signal.name: signal.unit for signal in plan.plant.sensor_errors} | differences(plan.parameters)
+    shown = {"1": "percent", "m": "um", "rad": "deg"}
+    return shown.get(errors[name], errors[name]) if name in errors else units_of(plan.parameters)[name]
+
+
+def spread_text(plan: Plan, name: str) -> str:
+    """The spread of a value to either side as text, as "±10 %"."""
+    if name in plan.spread and name not in differences(plan.parameters):
+        return f"±{100 * plan.spread[name]:.4g} %"
+    unit = unit_of(plan, name)
+    size = f"±{in_unit(half_width(plan, name), unit):.4g}"
+    return f"{size} %" if unit == "percent" else f"{size} {unit.replace('um', 'µm')}"

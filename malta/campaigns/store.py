@@ -19,15 +19,16 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from malta.archives import read_npz
-from malta.campaigns.block import Block
 from malta.campaigns.plan import (
+    PRECISIONS,
     SCHEMA,
     VERSION,
+    Machines,
     Plan,
     draw_machines,
     fingerprint,
@@ -36,9 +37,76 @@ from malta.campaigns.plan import (
 )
 from malta.errors import InputError
 from malta.files import file_exists, read_file, remove_leftovers, replace_files, writer
-from malta.simulation.compiled import LANES
-from malta.simulation.digest import LARGEST_FIGURE, Batch, verdicts
+from malta.firmware.flight import engine_of_c
+from malta.simulation.engine.batch import is_compiled, simulate_many
+from malta.simulation.engine.compiled import LANES
+from malta.simulation.engine.digest import LARGEST_FIGURE, Batch, verdicts
+from malta.simulation.experiments import Progress
+from malta.simulation.scenario import Scenario
 from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from malta.model.plant import FloatArray
+
+
+# A block: some consecutive runs of a plan, simulated together.
+
+
+class Block(NamedTuple):
+    """The runs of a block, a row for each."""
+
+    values: FloatArray  # runs x names, SI: drawn parameters and errors of the sensors
+    batch: Batch
+    engine: str  # that simulated them, see store.ENGINES
+
+
+def simulate_machines(
+    plan: Plan,
+    machines: Machines,
+    scenario: Scenario | None = None,
+    *,
+    first: int = 0,
+    noise: NDArray[np.int64] | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Batch:
+    """Simulate a plan's scenario, or another one, on machines; first, noise, workers as in `simulate_many`."""
+    return simulate_many(
+        plan.plant,
+        plan.controller,
+        planned_run(plan).scenario if scenario is None else scenario,
+        machines.changes,
+        sensor_errors=machines.sensor_errors,
+        first=first,
+        noise=noise,
+        workers=workers,
+        engine=None if plan.law == "own" else engine_of_c(PRECISIONS[plan.law]),
+        progress=progress,
+    )
+
+
+def fly(
+    plan: Plan, first: int, count: int, workers: int | None = None, progress: Progress | None = None
+) -> Block:
+    """Simulate the `count` runs of a plan from run `first` on.
+
+    first : a multiple of LANES, so that a run has the same place in its group of machines in every block
+    workers : threads; None: one for each core
+    """
+    machines = draw_machines(plan, first, count)
+    batch = simulate_machines(plan, machines, first=first, workers=workers, progress=progress)
+    return Block(machines.values, batch, _engine_name(plan))
+
+
+def _engine_name(plan: Plan) -> str:
+    """What simulates a plan's runs."""
+    if plan.law != "own":
+        return f"exported C, {PRECISIONS[plan.law]}"
+    compiled = is_compiled(plan.plant, plan.controller, planned_run(plan).scenario)
+    return "compiled" if compiled else "virtual machine"
+
 
 MANIFEST, GAINS = "campaign.json", "gains_file"
 HEADERS = 1_000_000  # bytes of a block beside its numbers, at most

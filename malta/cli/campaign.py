@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 
 import typer
 
-from malta.cli.assignments import read_options, read_sensor_errors, read_shares
-from malta.cli.completion import scenarios
-from malta.cli.inputs import change_machine, design_of, print_scenarios, read_controller
 from malta.cli.options import (
     MACHINE,
+    NUMBER,
     RUN,
     SCENARIOS,
     AsJson,
@@ -20,23 +19,319 @@ from malta.cli.options import (
     MachineFile,
     OwnOptions,
     Yes,
+    change_machine,
+    design_of,
+    print_scenarios,
+    read_assignments,
+    read_controller,
+    read_options,
+    read_sensor_errors,
+    read_shares,
+    scenarios,
 )
 from malta.cli.output import (
     NO_COMPILER,
+    duration_text,
+    interruption,
+    limit_time,
     make_console,
     print_document,
+    print_line,
     print_note,
+    print_text,
     print_written,
     progress_bar,
 )
-from malta.cli.patience import limit_time
-from malta.cli.status import StatusOptions, print_tables, show_status
-from malta.cli.studies import Setting, run_study, study_of
 from malta.errors import InputError
+from malta.files import json_text, replace_files
 
 if TYPE_CHECKING:
-    from malta.campaigns.plan import Law, Sampler
-    from malta.campaigns.summary import Summary
+    from malta.campaigns.limits import Limit
+    from malta.campaigns.plan import Law, Plan, Sampler
+    from malta.campaigns.summary import Bounds, Summary
+    from malta.campaigns.survey import Status
+    from malta.cli.documents.loops import Part
+    from malta.simulation.experiments import Progress
+
+
+# The status of a campaign's folder, and what `malta campaign` prints of it.
+
+
+def print_tables(gains: Path, found: Summary, worst: int) -> None:
+    """Print what was flown, the yield, the distributions and the worst runs; only the first without runs."""
+    from malta import report
+
+    plan, console = found.plan, make_console()
+    print_text(console, f"{gains}: {report.run_text(plan)}, {found.runs} of {plan.samples} machines")
+    print_text(console, f"{report.box_text(plan)}; {plan.sampler}, seed {plan.seed}")
+    if not found.runs:
+        return
+    console.print(report.campaign_tables(found, worst=worst))
+    if worst:
+        console.print(
+            f"one of them again: malta simulate {gains} --replay {found.folder}:RUN", soft_wrap=True
+        )
+
+
+class StatusOptions(NamedTuple):
+    """Options of a campaign that say how its status is looked at."""
+
+    design: Path | None
+    machine: Path | None
+    worst: int
+    as_json: bool
+
+
+def show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: StatusOptions) -> None:
+    """Print the status of the campaign in a folder. Raises InputError for options that the campaign decides."""
+    from malta.campaigns.store import noted_gains
+    from malta.campaigns.summary import Bounds
+    from malta.campaigns.survey import status as status_of
+    from malta.model.data import plant_of, published_figures
+
+    sources = {param: ctx.get_parameter_source(str(param.name)) for param in ctx.command.params}
+    given = [param for param, source in sources.items() if source and source.name == "COMMANDLINE"]
+    others = [
+        param.opts[0] for param in given if param.name not in ("status", "gains", *StatusOptions._fields)
+    ]
+    if others:
+        raise InputError(
+            "--status", "", f"{', '.join(others)} too", "none of them: the folder has its campaign"
+        )
+    gains = noted_gains(folder) if gains is None else gains
+    controller = read_controller(gains, options.machine)
+    published = published_figures(plant_of(controller.parameters).name)
+    bounds = Bounds(published, design_of(gains, controller, options.design))
+    with progress_bar("status") as progress:
+        found = status_of(folder, controller, bounds, progress)
+    if options.as_json:
+        from malta.cli.documents.campaigns import StatusOutput, runs_fields, status_fields
+
+        fields = runs_fields(found.summary, options.worst) | status_fields(found)
+        print_document(StatusOutput(gains=str(gains), folder=str(folder), **fields))
+        return
+    for file in found.summary.damaged:
+        print_note(f"{file}: a damaged block, which the campaign will fly again")
+    console = make_console()
+    for line in _status_lines(found):
+        print_line(console, line)
+    print_tables(gains, found.summary, options.worst)
+
+
+def _status_lines(found: Status) -> list[str]:
+    """Blocks in the folder, and whether others seem to come."""
+    summary = found.summary
+    lines = [
+        f"{summary.folder}: {found.blocks} of {found.of} blocks of {found.size} runs, "
+        f"{found.stored / 1e6:.1f} MB, {len(summary.damaged)} damaged"
+    ]
+    last = "" if found.age is None else f": the last block came {duration_text(found.age)} ago"
+    if found.running:
+        left = "" if found.left is None else f", about {duration_text(found.left)} left"
+        lines.append(f"running{last}{left}")
+    elif found.blocks < found.of:
+        lines.append(f"not running{last}; the same command goes on")
+    return lines
+
+
+# Studies of `malta campaign` on its box, in place of plain runs: rare events, sensitivity and tolerances.
+
+
+class Study(NamedTuple):
+    """A study of STUDIES."""
+
+    name: str
+    limit: str  # "touchdown", "deviation-y1=20um", "help"
+    wanted: float = 1.0  # yield to keep
+
+
+class Setting(NamedTuple):
+    """What the studies have in common."""
+
+    gains: Path
+    plan: Plan
+    bounds: Bounds
+    folder: Path
+    workers: int | None
+    as_json: bool
+    yes: bool  # to work of any length
+
+
+def study_of(name: str | None, limit: str | None, keep: str | None, cluster: str | None) -> Study | None:
+    """The study that the options ask for; None for a plain campaign.
+
+    Raises InputError for an unknown study, for a cluster, and for a limit or a yield that is none or has no study.
+    """
+    if name is None:
+        for option, given in (("--limit", limit), ("--keep", keep)):
+            if given is not None:
+                raise InputError(option, "", repr(given), "it with --study")
+        return None
+    if name not in STUDIES:
+        raise InputError("--study", "", repr(name), "one of " + ", ".join(STUDIES))
+    if cluster is not None:
+        raise InputError("--study", name, "--cluster too", "it without: it runs on this machine")
+    if (keep is None) == (name == "tolerances"):
+        raise InputError(
+            "--study", name, f"{'no ' if keep is None else ''}--keep", "it with tolerances alone, as 99%"
+        )
+    wanted = 1.0 if keep is None else read_assignments("--keep", [f"yield={keep}"], {"yield": "1"})["yield"]
+    if not 0 < wanted <= 1:
+        raise InputError("--keep", "", repr(keep), "a yield above 0 % and up to 100 %, as 99%")
+    return Study(name, limit or "touchdown", wanted)
+
+
+class Outcome(NamedTuple):
+    """What a study leaves behind."""
+
+    document: Part
+    files: list[Path]
+    parts: list[Any]  # tables and lines for the console
+    notes: list[str]
+    interrupted: bool = False
+
+
+def run_study(study: Study, setting: Setting) -> None:
+    """Run a study, write it into the campaign's folder and print it; exit with code 130 after Ctrl-C."""
+    from malta import report
+    from malta.campaigns.plan import planned_run
+    from malta.campaigns.run import Session, campaign_folder
+    from malta.simulation.engine.batch import is_compiled
+
+    if study.limit == "help":
+        _print_limits(setting.plan)
+        raise typer.Exit
+    limit = read_limit(study.limit, setting.plan, setting.bounds)
+    what, session = f"{setting.plan.scenario}, {study.name}", Session(setting.workers)
+    folder = campaign_folder(setting.plan, setting.folder, session, setting.gains)
+    with folder, progress_bar(what, insists=False) as bar:
+        progress = limit_time(bar, what, agreed=setting.yes)
+        try:
+            outcome = STUDIES[study.name](limit, study.wanted, setting, progress)
+        except KeyboardInterrupt:
+            raise interruption(f"nothing is known of {what}; {setting.folder} stands as it was") from None
+    if setting.as_json:
+        print_document(outcome.document)
+    else:
+        console = make_console()
+        print_text(console, f"{setting.gains}: {report.run_text(setting.plan)}")
+        print_text(console, f"{report.box_text(setting.plan)}; seed {setting.plan.seed}")
+        for part in outcome.parts:
+            console.print(part, soft_wrap=isinstance(part, str))
+        print_written(console, outcome.files)
+    for note in outcome.notes:
+        print_note(note)
+    plan = setting.plan
+    if not (plan.plant.tabulated or is_compiled(plan.plant, plan.controller, planned_run(plan).scenario)):
+        print_note(NO_COMPILER)
+    if outcome.interrupted:
+        raise typer.Exit(130)
+
+
+def _rare(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> Outcome:
+    """The probability of exceeding a limit."""
+    from malta import report
+    from malta.campaigns.rare import event_name, rare_event, write_event
+    from malta.cli.documents.campaigns import RareOutput, rare_fields
+
+    event = rare_event(setting.plan, limit, workers=setting.workers, progress=progress)
+    files = [write_event(event, setting.folder)]
+    parts: list[Any] = [report.rare_event_tables(event)]
+    if event.design_point is not None:
+        place = f"{setting.folder}:{event_name(limit)}"
+        parts.append(f"the design point again: malta simulate {setting.gains} --replay {place}")
+    notes = [text for text in (report.rare_event_sentence(event),) if text]
+    if event.uncertain:
+        notes.append(
+            f"the failures descend from {event.found.ancestors} of the first runs: the coefficient of variation is "
+            "itself uncertain, more --samples make it certain"
+        )
+    document = RareOutput(**_head(setting, files), **rare_fields(event))
+    return Outcome(document, files, parts, notes, event.found.interrupted)
+
+
+def _sobol(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> Outcome:
+    """Which parameter costs yield."""
+    from malta import report
+    from malta.campaigns.studies import sensitivity, sensitivity_document
+    from malta.cli.documents.campaigns import SobolOutput, sobol_fields
+
+    found = sensitivity(setting.plan, limit, workers=setting.workers, progress=progress)
+    files = [_write(setting, f"sobol_{limit.slug}.json", sensitivity_document(found))]
+    if found.of_yield or any(found.of_merits.values()):
+        files.append(setting.folder / f"sobol_{limit.slug}.png")
+        report.sensitivity(found, files[-1])
+    notes = [text for text in (report.sensitivity_sentence(found),) if text]
+    output = SobolOutput(**_head(setting, files), **sobol_fields(found))
+    return Outcome(output, files, [report.sensitivity_tables(found)], notes)
+
+
+def _tolerance(limit: Limit, wanted: float, setting: Setting, progress: Progress | None) -> Outcome:
+    """The largest spreads that keep a yield."""
+    from malta import report
+    from malta.campaigns.studies import tolerance_document, tolerances
+    from malta.cli.documents.campaigns import ToleranceOutput, tolerance_fields
+
+    found = tolerances(setting.plan, limit, wanted, workers=setting.workers, progress=progress)
+    files = [_write(setting, f"tolerance_{limit.slug}.json", tolerance_document(found))]
+    notes = [text for text in (report.tolerance_sentence(found),) if text]
+    output = ToleranceOutput(**_head(setting, files), **tolerance_fields(found))
+    return Outcome(output, files, [report.spreads_table(found)], notes)
+
+
+def _head(setting: Setting, files: list[Path]) -> dict[str, Any]:
+    """What the documents of all studies begin with."""
+    names = [str(file) for file in files]
+    gains, folder = str(setting.gains), str(setting.folder)
+    return {"gains": gains, "folder": folder, "files": names, "manifest": setting.plan.manifest}
+
+
+STUDIES = {"rare": _rare, "sensitivity": _sobol, "tolerances": _tolerance}
+
+
+def _write(setting: Setting, name: str, document: dict[str, Any]) -> Path:
+    path = setting.folder / name
+    replace_files({path: (json_text(document) + "\n").encode()})
+    return path
+
+
+def read_limit(text: str, plan: Plan, bounds: Bounds) -> Limit:
+    """Read a limit: "touchdown", "published", "specification", or a merit with its bound, as "deviation-y1=20um".
+
+    A bound without a unit is in SI. Raises InputError for any other text.
+    """
+    from malta.campaigns.limits import limit_of, merits_of, slug
+    from malta.units import to_si, unit_factor
+
+    name, sign, value = (part.strip() for part in text.partition("="))
+    bound = None
+    try:
+        if sign:
+            number = re.fullmatch(NUMBER, value)
+            if number is None:
+                raise InputError("--limit", name, repr(value), "a number with its unit, as 20um")
+            _, shown = merits_of(plan).get(slug(name), ("", "percent"))
+            bound = float(number[1])
+            if number[2]:
+                unit = number[2].replace("%", "percent")
+                bound = to_si(bound, unit, shown, "--limit", name) * unit_factor(shown, name)
+        return limit_of(plan, name, bound, bounds)
+    except InputError as error:
+        raise InputError(
+            "--limit", error.field.removeprefix("limit").strip(), error.found, error.expected
+        ) from None
+
+
+def _print_limits(plan: Plan) -> None:
+    """Print the names of the limits, with the units of those that take a bound."""
+    from malta.campaigns.limits import EVENTS, merits_of
+
+    console = make_console()
+    for name in EVENTS:
+        console.print(name)
+    for name, (label, unit) in merits_of(plan).items():
+        console.print(f"{name}=VALUE  {label} [{'%' if unit == 'percent' else unit}]")
+
 
 STUDY = "A study in place of plain runs"  # a panel of the help
 
@@ -148,9 +443,8 @@ def campaign(
     from malta.campaigns.run import Session, campaign_folder
     from malta.campaigns.summary import Bounds
     from malta.campaigns.survey import summarize
-    from malta.model.data import plant_of
-    from malta.model.published import published_figures
-    from malta.simulation.catalogue import main_job, settling
+    from malta.model.data import plant_of, published_figures
+    from malta.simulation.experiments.catalogue import main_job, settling
 
     controller = read_controller(gains, machine)
     parameters = change_machine(controller.parameters, change)

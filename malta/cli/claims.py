@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from malta.cli.completion import complete_designs
-from malta.cli.inputs import design_files
-from malta.cli.options import AsJson
+from malta.cli.options import AsJson, complete_designs, design_files
 from malta.cli.output import make_console, print_document, print_written, progress_bar
 from malta.errors import InputError
 
@@ -91,7 +89,7 @@ def _compute_ledgers(specs: Sequence[Spec], progress: Callable[[float], None] | 
 
 def _compute_each(groups: Sequence[Sequence[Spec]], progress: Callable[[float], None] | None) -> list[Ledger]:
     """Compute the ledger of each group of designs of one machine."""
-    from malta.model.published import published
+    from malta.model.data import published
     from malta.report.ledger import ledger
     from malta.simulation.experiments import progress_of_part
 
@@ -107,7 +105,7 @@ def _update(file: Path, designs: Sequence[Path]) -> None:
     Raises InputError for designs beside the file, a table of a design that is not there, and a file without tables.
     """
     from malta.files import read_file, replace_files
-    from malta.report.markdown import find_tables, replace_tables
+    from malta.report.ledger import find_tables, replace_tables
     from malta.synthesis.design_file import read_design
 
     if designs:
@@ -124,3 +122,37 @@ def _update(file: Path, designs: Sequence[Path]) -> None:
         ledgers = _compute_each(specs, progress)
     replace_files({file: replace_tables(text, ledgers, str(file)).encode()})
     print_written(make_console(), [file])
+
+
+# `malta schema`: the JSON schemas of files, and of what commands print with --json.
+
+
+def schema(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Which one; all names if none is given.")
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[DATA]", help="Data file of a machine: a schema with the names of its signals."
+        ),
+    ] = None,
+) -> None:
+    """Print the JSON schema of a file, or of what a command prints with --json.
+
+    \b
+    Example:  malta schema verify-output
+              malta schema design > design.schema.json
+              malta schema design data/tubular.toml > tubular.schema.json
+    """
+    from malta import schemas
+    from malta.cli.documents.published import ALL_SCHEMAS, schema_of
+    from malta.files import json_text
+    from malta.model.data import plant_of, read
+
+    if name is None:
+        print("\n".join(ALL_SCHEMAS))
+    elif data is None:
+        print(json_text(schema_of(name)))
+    else:
+        print(json_text(schemas.schema(name, plant_of(read(data)))))

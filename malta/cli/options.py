@@ -2,13 +2,284 @@
 
 from __future__ import annotations
 
+import hashlib
+import math
+import re
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from malta.cli.completion import gain_files, parameters
-from malta.files import locate
+from malta.cli.output import make_console, print_note
+from malta.errors import CheckError, InputError
+from malta.files import locate, shipped_path
+from malta.tables import load_toml
+
+if TYPE_CHECKING:
+    from malta.model.plant import Parameters, Plant
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
+
+
+# Options of the form NAME=VALUE, read as numbers in SI.
+
+
+class GeneralOption(NamedTuple):
+    """An option that every scenario takes."""
+
+    default: Any  # of the type that is read
+    meaning: str
+
+
+# Fields of Scenario; each may be given as `--option NAME=VALUE`.
+GENERAL: Mapping[str, GeneralOption] = {
+    "fidelity": GeneralOption(
+        "", "force, dq (PI loops on the windings) or phase; the scenario's own without it"
+    ),
+    "noise": GeneralOption(0.0, "of the sensors, in multiples"),
+    "settle": GeneralOption(
+        0.0, "rest before the reference, of which no figure tells; yields of strokes have one"
+    ),
+    "estimator": GeneralOption("steady-state", "steady-state, kalman (time-varying) or extended"),
+    "quantize": GeneralOption(False, "sensors with the machine's resolution"),
+    "bearing": GeneralOption(False, "touchdown bearings push back, or a touchdown ends the run"),
+    "scheduled": GeneralOption(False, "C(z) of the measured z in the filter"),
+    "feedforward": GeneralOption("own", "axial, as printed, or attraction: also what holds it off centre"),
+    "bearing_axes": GeneralOption(
+        "fixed", "current controllers fixed, or turning with the force, as printed"
+    ),
+    "real_pwm": GeneralOption(False, "in phase: duty cycles in steps, dead time of the half-bridges"),
+    "delay": GeneralOption(0, "samples between measurement and command"),
+    "substeps": GeneralOption(0, "Runge-Kutta steps a sample; the error is estimated"),
+}
+LENGTHS = {"distance": "m", "rise": "s", "settle": "s"}  # units of options that many machines have
+NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)"  # a number, and the unit that may follow it
+EXAMPLES = {"--set": "m=0.56 or l_B=45mm", "--spread": "20% or m=10%"}  # in the errors of these options
+EXAMPLE = "gain_x1=0.02 or offset_y2=5um"  # of the others
+
+
+def read_assignments(option: str, texts: list[str] | None, units: Mapping[str, str]) -> dict[str, float]:
+    """Read `NAME=VALUE`, each value with the unit that may follow it, as numbers in SI.
+
+    units : SI unit of each name that may be assigned; "1" for a number without unit, or in %
+
+    Raises InputError for another form, an unknown name, a name given twice or a unit that does not fit.
+
+    >>> read_assignments("--set", ["l_B=45mm"], {"l_B": "m"})
+    {'l_B': 0.045}
+    """
+    values: dict[str, float] = {}
+    for text in texts or ():
+        name, value = _split(text)
+        number = re.fullmatch(NUMBER, value)
+        if number is None or not name.isidentifier():
+            raise InputError(option, "", repr(text), f"NAME=VALUE, as {EXAMPLES.get(option, EXAMPLE)}")
+        if name not in units:
+            kind = "sensor error" if option == "--sensor" else "parameter"
+            raise InputError(option, name, f"an unknown {kind}", "one of " + " ".join(units))
+        _require_once(option, name, value, values)
+        values[name] = _in_si(number, units[name], option, name)
+    return values
+
+
+def read_entries(option: str, texts: list[str]) -> dict[str, Any]:
+    """Read `NAME=VALUE` as entries of a design file: a number, one with its unit, true or false, or a word.
+
+    Raises InputError for another form, and for a name given twice.
+
+    >>> read_entries("--set", ["bases.state.x=50um", "delay=1", "uncertainty.m=30%"])
+    {'bases.state.x': {'value': 50.0, 'unit': 'um'}, 'delay': 1, 'uncertainty.m': 0.3}
+    """
+    entries: dict[str, Any] = {}
+    for text in texts:
+        name, value = _split(text)
+        if not all(part.isidentifier() for part in name.split(".")) or not value:
+            raise InputError(option, "", repr(text), f"NAME=VALUE, as {EXAMPLES[option]}")
+        _require_once(option, name, value, entries)
+        number = re.fullmatch(NUMBER, value)
+        if number is None:
+            entries[name] = {"true": True, "false": False}.get(value, value)
+        elif number[2] in ("%", "percent"):
+            entries[name] = float(number[1]) / 100
+        elif number[2]:
+            entries[name] = {"value": float(number[1]), "unit": number[2]}
+        else:
+            entries[name] = int(number[1]) if re.fullmatch(r"[-+]?\d+", number[1]) else float(number[1])
+    return entries
+
+
+def read_sensor_errors(texts: list[str] | None, plant: Plant) -> dict[str, float]:
+    """Read `--sensor NAME=VALUE`, errors of a machine's sensors, in SI; raises as `read_assignments` does."""
+    return read_assignments("--sensor", texts, {error.name: error.unit for error in plant.sensor_errors})
+
+
+def read_shares(
+    gains: Path,
+    texts: list[str] | None,
+    parameters: Parameters,
+    published: Mapping[str, Any] | None,
+    option: str = "--spread",
+) -> dict[str, float]:
+    """Read how far parameters vary: `SHARE` for all that are uncertain, `NAME=SHARE` for one.
+
+    Without a text these are the shares in the gain file. The spread of a difference or an offset is in its own unit.
+
+    Raises InputError for two shares for all, and as `read_assignments` does.
+    """
+    from malta.campaigns.plan import box_of
+    from malta.model.parameters import differences, units_of
+
+    named = [text for text in texts or () if "=" in text]
+    general = [text for text in texts or () if "=" not in text]
+    if len(general) > 1:
+        raise InputError(option, "", " and ".join(general), "one share for all, others as NAME=SHARE")
+    shares: dict[str, float] = {}
+    if general or not named:
+        shares = box_of(gains, published, option)
+    if general:
+        share = read_assignments(option, [f"all={general[0]}"], {"all": "1"})["all"]
+        shares = dict.fromkeys(shares, share)
+    own = differences(parameters) if option == "--spread" else {}
+    units = dict.fromkeys(units_of(parameters), "1") | own
+    return shares | read_assignments(option, named, units)
+
+
+def read_uncertainty(
+    gains: Path, texts: list[str] | None, parameters: Parameters, published: Mapping[str, Any] | None
+) -> dict[str, float]:
+    """Read `--uncertain`, the box of a margin: shares above 0. Raises InputError as `read_shares`."""
+    box = read_shares(gains, texts, parameters, published, option="--uncertain")
+    for name, share in box.items():
+        if not 0 < share < math.inf:
+            raise InputError("--uncertain", name, f"{100 * share:g} %", "a share above 0 %")
+    return box
+
+
+def read_options(texts: list[str] | None, scenario: str, plant: Plant) -> dict[str, Any]:
+    """Read the scenario's own options and general ones, `--option NAME=VALUE`, in SI and of the type of their defaults.
+
+    Raises InputError for an unknown option, one that is given twice, or a value of another type.
+    """
+    from malta.simulation.experiments import setting
+    from malta.simulation.experiments.catalogue import option_of
+
+    units = LENGTHS | setting(plant, "OPTION_UNITS", {})
+    merged: dict[str, Any] = {}
+    for text in texts or ():
+        name, value = _split(text)
+        if not (name and value):
+            raise InputError("--option", "", repr(text), "NAME=VALUE")
+        default = GENERAL[name].default if name in GENERAL else option_of(scenario, plant, name)
+        _require_once("--option", name, value, merged)
+        merged[name] = _read_like(default, value, units.get(name, "1"), name)
+    return merged
+
+
+def _read_like(default: Any, text: str, si_unit: str, name: str) -> Any:
+    """Read the value of a scenario's option with the type of its default."""
+    if isinstance(default, str) or default is None:
+        return text
+    if isinstance(default, bool):
+        if text not in ("true", "false"):
+            raise InputError("--option", name, repr(text), "true or false")
+        return text == "true"
+    several = isinstance(default, tuple)
+    numbers = [re.fullmatch(NUMBER, part.strip()) for part in (text.split(",") if several else [text])]
+    values = [_in_si(number, si_unit, "--option", name) for number in numbers if number is not None]
+    if len(values) < len(numbers):
+        raise InputError("--option", name, repr(text), "numbers" if several else "a number")
+    if several:
+        return tuple(values)
+    return int(values[0]) if isinstance(default, int) and values[0].is_integer() else values[0]
+
+
+def _require_once(option: str, name: str, value: str, known: Mapping[str, Any]) -> None:
+    """Raise InputError for a name that has a value already."""
+    if name in known:
+        raise InputError(option, name, f"{value!r} for the second time", "it once")
+
+
+def _split(text: str) -> tuple[str, str]:
+    """The name and the value of `NAME=VALUE`; the value is empty where there is none."""
+    name, _, value = (part.strip() for part in text.partition("="))
+    return name, value
+
+
+def _in_si(number: re.Match[str], si_unit: str, option: str, name: str) -> float:
+    """The value in SI of a match of NUMBER."""
+    from malta.units import to_si
+
+    value, unit = float(number[1]), number[2]
+    if si_unit != "1":
+        return to_si(value, unit or si_unit, si_unit, option, name)
+    if unit not in ("", "%", "percent"):
+        raise InputError(option, f"{name}.unit", repr(unit), "no unit, or %")
+    return value * (0.01 if unit else 1.0)
+
+
+# What a shell offers at the Tab key: gain files, designs, scenarios, parameters. Whatever fails offers nothing.
+
+
+GAINS = (".json", ".npz", ".mat")
+DESIGNS = (".toml",)
+
+
+def gain_files(incomplete: str) -> list[str]:
+    """Gain files: those in design/gains at first, later files and folders below what was typed."""
+    return _files(incomplete, Path("design", "gains"), GAINS)
+
+
+def complete_designs(incomplete: str) -> list[str]:
+    """Design files: those in design/ at first, later files and folders below what was typed."""
+    return _files(incomplete, Path("design"), DESIGNS)
+
+
+def scenarios(ctx: Any, incomplete: str) -> list[str]:
+    """The scenarios of the machine of the gain file that was typed."""
+    found: list[str] = []
+    with suppress(Exception):
+        from malta import gains
+        from malta.model.data import plant_of
+        from malta.simulation.experiments.catalogue import experiments_of
+
+        plant = plant_of(gains.read(_typed_gains(ctx)).parameters)
+        found = [name for name in experiments_of(plant) if name.startswith(incomplete)]
+    return found
+
+
+def parameters(ctx: Any, incomplete: str) -> list[str]:
+    """The parameters in the gain file that was typed, as `m=`."""
+    found: list[str] = []
+    with suppress(Exception):
+        from malta.gains.encodings import decode
+
+        names = decode(_typed_gains(ctx))["plant"]["parameters"]
+        found = [f"{name}=" for name in names if name.startswith(incomplete)]
+    return found
+
+
+def _typed_gains(ctx: Any) -> Path:
+    """The gain file that was typed; behind an option without its value it is still among the bare arguments."""
+    from malta.files import locate
+
+    words = [ctx.params.get("gains"), *ctx.args]
+    return locate(next(word for word in words if word and Path(word).suffix in GAINS))
+
+
+def _files(incomplete: str, usual: Path, suffixes: tuple[str, ...]) -> list[str]:
+    """Files with one of the suffixes and folders that begin with what was typed; in the usual folder without it."""
+    with suppress(OSError):
+        if not incomplete and usual.is_dir():
+            return sorted(f"{path}" for path in usual.iterdir() if path.suffix in suffixes)
+        typed = Path(incomplete)
+        folder, start = (typed, "") if incomplete.endswith("/") else (typed.parent, typed.name)
+        entries = [path for path in folder.iterdir() if path.name.startswith(start)]
+        found = [f"{path}/" for path in entries if path.is_dir()]
+        return sorted(found + [f"{path}" for path in entries if path.suffix in suffixes])
+    return []
+
 
 MACHINE = "Machine"  # a panel of a help
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")]
@@ -88,3 +359,172 @@ MachineFile = Annotated[
         show_envvar=True,
     ),
 ]
+
+
+# What commands read before they begin: design files, the changed machine, published figures, scenarios.
+
+
+LONGEST_NAME = 48  # letters of the changes in the name of a design; more are shortened to a number
+
+
+def design_files(
+    command: str, named: list[Path] | None, *, reverse: bool = False, or_shipped: bool = False
+) -> list[Path]:
+    """The design files that were named, or all of design/ in alphabetical or reverse order.
+
+    or_shipped : where there is no folder design/ here, those that come with malta
+
+    Data of machines among them are named on the standard error and left out, unless they were named as designs.
+    Raises InputError, naming the command, where design/ has none.
+    """
+    if named:
+        return named
+    folder = Path("design")
+    if or_shipped and not folder.is_dir():
+        folder = shipped_path("design")
+    files = []
+    for file in sorted(folder.glob("*.toml"), reverse=reverse):
+        if _is_machine_data(file):
+            print_note(f"{file}: data of a machine, no design: left out")
+        else:
+            files.append(file)
+    if not files:
+        raise InputError(
+            command, "", "no design files (*.toml) here", "a folder design/ with some, or their names"
+        )
+    return files
+
+
+def _is_machine_data(file: Path) -> bool:
+    """Whether a file has what data of machines have and designs have not; a file that cannot be read is no data."""
+    try:
+        content = load_toml(file)
+    except InputError:
+        return False
+    return "parameters" in content and not {"weights", "pid", "sample_time"} & set(content)
+
+
+def gains_folder(design_file: Path) -> Path:
+    """Where the gain files of a design go: gains/ beside it; design/gains/ here, where it comes with malta."""
+    return design_file.parent / "gains" if locate(design_file) == design_file else Path("design", "gains")
+
+
+def read_controller(gains: Path, machine_file: Path | None) -> Controller:
+    """Read a gain file. `machine_file` models the machine that it names, where that is the user's own.
+
+    Raises InputError as `malta.machine` and `gains.read`; an unknown machine is named with the option that tells it.
+    """
+    from malta import gains as gain_files
+    from malta.model.machines import machine
+
+    if machine_file is not None:
+        machine(machine_file)
+    return gain_files.read(gains)
+
+
+def verify_and_write(controller: Controller, gains: Path, folder: Path) -> list[Path]:
+    """Verify a controller over the uncertainty of the gain file that it comes from, and write it in all encodings."""
+    from malta import gains as gain_files
+    from malta.gains.file import content_of
+    from malta.tuning.verify import verify
+
+    margins = verify(controller, uncertainty=content_of(gains)[0].uncertainty)
+    paths = [folder / f"{controller.name}{suffix}" for suffix in gain_files.SUFFIXES]
+    gain_files.write(controller, margins, *paths)
+    return paths
+
+
+def design_of(gains: Path, controller: Controller, named: Path | None) -> Spec | None:
+    """The design of a gain file: the file that was named, else NAME.toml beside its folder; None where there is none.
+
+    Raises InputError for a named file that is no design of the machine.
+    """
+    from malta.synthesis.design_file import read_design
+
+    try:
+        spec = read_design(named or gains.parent.parent / f"{controller.name}.toml")
+    except InputError:
+        if named is None:
+            return None
+        raise
+    own, other = controller.parameters, spec.parameters
+    if type(own) is type(other):
+        return spec
+    if named is None:
+        return None
+    raise InputError(named, "machine", spec.plant.name, "that of the gain file")
+
+
+def read_changed_design(file: Path, changes: list[str] | None) -> Spec:
+    """Read a design file with `--set NAME=VALUE`: parameters of the machine, and entries of the file.
+
+    The design has a name of its own then, with its changes: `calibrated_m_0_56`.
+
+    Raises InputError for a change of the design's name or machine, and as `read_design` does.
+    """
+    from dataclasses import replace
+
+    from malta.model.parameters import units_of
+    from malta.synthesis.design_file import read_design
+    from malta.synthesis.design_tables import DesignFile
+
+    spec = read_design(file)
+    if not changes:
+        return spec
+    units = units_of(spec.parameters)
+    of_machine = [text for text in changes if text.partition("=")[0].strip() in units]
+    others = read_entries("--set", [text for text in changes if text not in of_machine])
+    for name in others:
+        if name in ("name", "machine"):
+            raise InputError("--set", name, "a change of it", "another design file")
+        if name.partition(".")[0] not in DesignFile.model_fields:
+            expected = f"one of {' '.join(units)}, or an entry of the design file"
+            raise InputError("--set", name, "an unknown parameter", expected)
+    values = read_assignments("--set", of_machine, units)
+    change_machine(spec.parameters, of_machine)  # which says what is wrong with a value
+    changed = read_design(file, values, others)
+    return replace(
+        changed, name=f"{spec.name}_{_name_of(changes)}", summary=f"{spec.summary}; with {', '.join(changes)}"
+    )
+
+
+def _name_of(changes: list[str]) -> str:
+    """The changes as a part of a file's name: `m=.4` is m_0_4, `m=4` is m_4 and `m=4%` m_4percent."""
+    words = re.sub(r"(?<!\d)\.(?=\d)", "0.", " ".join(changes)).replace("%", "percent")
+    words = re.sub(r"[\u00b5\u03bc]", "u", words)  # micro
+    words = re.sub(r"[^A-Za-z0-9-]+", "_", words).strip("_")
+    return words if len(words) <= LONGEST_NAME else hashlib.sha256(words.encode()).hexdigest()[:8]
+
+
+def change_machine(parameters: Parameters, changes: list[str] | None) -> Parameters:
+    """Apply `--set NAME=VALUE` to a machine's parameters and name the preset accordingly.
+
+    Raises InputError for an unknown parameter, a value it cannot have, or a machine that cannot be controlled.
+    """
+    from dataclasses import replace
+
+    from malta.model.data import plant_of
+    from malta.model.parameters import units_of
+
+    values = read_assignments("--set", changes, units_of(parameters))
+    try:
+        preset = f"{parameters.preset}, changed" if values else parameters.preset
+        machine = replace(parameters, **values, preset=preset)
+        plant_of(machine)
+    except InputError as error:
+        raise InputError("--set", error.field, error.found, error.expected) from error
+    except CheckError as error:
+        raise InputError("--set", "", str(error), "a machine that can be controlled") from error
+    return machine
+
+
+def print_scenarios(plant: Plant, *, campaigns: bool = False) -> None:
+    """Print the scenarios of a machine: all of them, or those that campaigns can run."""
+    from malta import report
+    from malta.simulation.experiments.catalogue import series_of
+
+    console = make_console()
+    console.print(report.scenarios_table(plant, series_of(plant) if campaigns else None))
+    console.print("Every scenario takes, as --option NAME=VALUE:")
+    for name, option in GENERAL.items():
+        console.print(f"  {name:12}  {option.meaning}", highlight=False)

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 
 import typer
 
-from malta.cli.assignments import read_uncertainty
-from malta.cli.inputs import change_machine, design_of, read_controller
-from malta.cli.options import AsJson, Changes, DesignFile, GainFile, MachineFile, Uncertain
+from malta.cli.options import (
+    NUMBER,
+    AsJson,
+    Changes,
+    DesignFile,
+    GainFile,
+    MachineFile,
+    Uncertain,
+    change_machine,
+    design_of,
+    read_assignments,
+    read_controller,
+    read_uncertainty,
+)
 from malta.cli.output import (
     interruption,
     make_console,
@@ -21,13 +34,20 @@ from malta.cli.output import (
     progress_bar,
 )
 from malta.errors import InputError
-from malta.files import replace_files
+from malta.files import locate, replace_files
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from malta.campaigns.summary import Summary
+    from malta.loops.curves import LoopCurves
+    from malta.loops.linear_loops import Place
+    from malta.loops.locus import RootLocus
+    from malta.model.plant import Plant
     from malta.report.page.analysis import Subject
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
+
 
 CAMPAIGNS = Path("build", "campaigns")  # where `malta campaign` keeps its folders
 
@@ -64,8 +84,7 @@ def report(
     Example:  malta report design/gains/robust.json --out build/robust.html --pdf
     """
     from malta.margins.loop_report import require_stable
-    from malta.report.page.document import SUFFIXES, require_suffix
-    from malta.report.page.pdf import pdf_of
+    from malta.report.page.document import SUFFIXES, pdf_of, require_suffix
     from malta.report.page.report import report_work
 
     controller = read_controller(gains, machine)
@@ -79,7 +98,7 @@ def report(
             contents[page_file.with_suffix(".pdf")] = pdf_of(page)
     replace_files(contents)
     if as_json:
-        from malta.cli.documents.pages import report_output
+        from malta.cli.documents.loops import report_output
 
         print_document(report_output(gains, analysis, contents))
     else:
@@ -110,7 +129,7 @@ def read_subject(
 
     Raises InputError for a change, a share or a design file that does not fit.
     """
-    from malta.model.published import published_figures
+    from malta.model.data import published_figures
     from malta.report.page.report import subject_of
 
     parameters = change_machine(controller.parameters, change)
@@ -127,10 +146,9 @@ def _campaigns_of(folders: Sequence[Path] | None, controller: Controller, spec: 
 
     Raises InputError for a named folder without a campaign, or with one of another controller.
     """
-    from malta.campaigns.status import status
     from malta.campaigns.summary import Bounds
-    from malta.model.data import plant_of
-    from malta.model.published import published_figures
+    from malta.campaigns.survey import status
+    from malta.model.data import plant_of, published_figures
 
     bounds = Bounds(published_figures(plant_of(controller.parameters).name), spec)
     found = []
@@ -141,3 +159,311 @@ def _campaigns_of(folders: Sequence[Path] | None, controller: Controller, spec: 
             if folders:
                 raise
     return [summary for summary in found if summary.runs or folders]
+
+
+# `malta plot`: the plots of a control engineer of one or several gain files.
+
+
+KINDS = ("bode", "nyquist", "nichols", "pzmap", "sigma", "sensitivity", "gang", "step", "load", "rootlocus")
+LOCUS = "rootlocus"
+GAIN = "gain"
+SUFFIXES = (".png", ".svg", ".pdf")
+Machines = Mapping[str, tuple["Plant", "Controller"]]  # by the names of their loops
+
+
+class Picture(NamedTuple):
+    """A figure with the name that its file gets: NAME_KIND."""
+
+    name: str
+    figure: Figure
+
+
+def plot(
+    gains: GainFile,
+    kinds: Annotated[
+        list[str], typer.Argument(metavar="KIND...", help=f"One or more of: {', '.join(KINDS)}.")
+    ],
+    others: Annotated[
+        list[Path] | None,
+        typer.Option("--with", metavar="GAINS", help="Another gain file, laid over the first. Repeatable."),
+    ] = None,
+    channel: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="A channel to draw. Repeatable. [all]")
+    ] = None,
+    at: Annotated[str, typer.Option(help="Where the loop is cut: sensors or forces.")] = "sensors",
+    parameter: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Root locus: a parameter of the machine, or gain. [gain]"),
+    ] = None,
+    span: Annotated[
+        str | None,
+        typer.Option(
+            "--range",
+            metavar="LOW..HIGH",
+            help="Root locus: multiples of the nominal value, or values with units. [0.5..1.5, gain 0.1..10]",
+        ),
+    ] = None,
+    change: Changes = None,
+    machine: MachineFile = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE|FOLDER", help="A .png, .svg or .pdf file, or a folder. [build/NAME_KIND.png]"
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Draw the loop of a gain file: one channel at a time with the others closed, margins where they are read.
+
+    bode, nyquist, nichols: loop gain with margins. sigma: singular values of L, S, T. sensitivity: |S|, |T| with the
+    zones of ISO 14839-3. gang: gang of four. pzmap: poles and zeros. step: references. load: 1 N or 1 N m from
+    outside, and compliance. rootlocus: poles over the loop gain or a parameter.
+
+    The loop is the machine's: sampled, with hold, delay and current loops. The machine is the one in the file, with
+    the changes given by --set.
+
+    \b
+    Examples:  malta plot design/gains/robust.json bode nyquist
+               malta plot design/gains/robust.json rootlocus --parameter m
+    """
+    _require_kinds(kinds, at, out, parameter, span)
+    machines = _read_machines([gains, *(locate(path) for path in others or ())], machine, change)
+    from malta.loops.curves import loop_curves
+
+    place = cast("Place", at)
+    loops = {name: loop_curves(*pair, name=name) for name, pair in machines.items()}
+    channels = _channels(loops, kinds, channel, place)
+    loci = _loci(machines, parameter or GAIN, span, channels, place) if LOCUS in kinds else ()
+    names = [*dict.fromkeys(kinds)]
+    pictures = _draw(loops, names, channels, place, loci)
+    files = _save(pictures, out)
+    if as_json:
+        from malta.cli.documents.plots import plot_output
+
+        print_document(plot_output(loops.values(), names, channels, place, loci, files))
+    else:
+        print_written(make_console(), files)
+    for name, curves in loops.items():
+        if not curves.stable:
+            print_note(f"{name}: the loop is unstable")
+
+
+def _require_kinds(
+    kinds: Sequence[str], at: str, out: Path | None, parameter: str | None, span: str | None
+) -> None:
+    """Raise InputError for an unknown kind or place, options without a root locus, and a file for several pictures."""
+    for kind in kinds:
+        if kind not in KINDS:
+            raise InputError("plot", "KIND", repr(kind), "one of " + " ".join(KINDS))
+    if at not in ("sensors", "forces"):
+        raise InputError("--at", "", repr(at), "sensors or forces")
+    for option, given in (("--parameter", parameter), ("--range", span)):
+        if given is not None and LOCUS not in kinds:
+            raise InputError(option, "", f"no {LOCUS} among the kinds", f"{LOCUS}, which it is for")
+    if out is not None and out.suffix and out.suffix not in SUFFIXES and not out.is_dir():
+        raise InputError("--out", "", str(out), "a folder, or a file " + ", ".join(SUFFIXES))
+    if out is not None and out.suffix in SUFFIXES and len({*kinds}) > 1:
+        raise InputError("--out", "", f"one file for {len({*kinds})} pictures", "a folder")
+
+
+def _read_machines(files: Sequence[Path], machine: Path | None, change: list[str] | None) -> Machines:
+    """Machines and controllers by the names of the designs; designs of one name get those of their files."""
+    from malta.model.data import plant_of
+
+    controllers = [read_controller(file, machine) for file in files]
+    names = [c.name for c in controllers]
+    if len({*names}) < len(names):
+        names = [str(file) for file in files]
+    if len({*names}) < len(names):
+        raise InputError("--with", "", "the same gain file twice", "other gain files")
+    plants = [plant_of(change_machine(c.parameters, change)) for c in controllers]
+    return dict(zip(names, zip(plants, controllers, strict=True), strict=True))
+
+
+def _channels(
+    loops: Mapping[str, LoopCurves], kinds: Sequence[str], named: list[str] | None, at: Place
+) -> list[str] | None:
+    """The channels that were named; None: all. Raises InputError for a name that no plot of these kinds has."""
+    if not named:
+        return None
+    signals = {
+        s.name
+        for curves in loops.values()
+        for s in (*curves.channels(at), *(curves.loop.outputs if {"gang", "step", "load"} & {*kinds} else ()))
+    }
+    for name in named:
+        if name not in signals:
+            known = dict.fromkeys(s.name for curves in loops.values() for s in curves.channels(at))
+            raise InputError("--channel", "", repr(name), "one of " + " ".join(known))
+    return named
+
+
+def _loci(
+    machines: Machines,
+    parameter: str,
+    span: str | None,
+    channels: list[str] | None,
+    at: Place,
+) -> Sequence[RootLocus]:
+    """The root locus of each loop, behind a progress bar."""
+    from malta.loops.locus import root_locus
+
+    if channels is not None and len(channels) > 1 and parameter == GAIN:
+        raise InputError(
+            "--channel", "", f"{len(channels)} channels", f"one for a {LOCUS} over the gain, or none"
+        )
+    only = channels[0] if channels and parameter == GAIN else None
+    found = []
+    for name, (plant, controller) in machines.items():
+        ends = _read_span(plant, parameter, span)
+        with progress_bar(f"root locus of {name}") as progress:
+            one = root_locus(
+                plant, controller, parameter=parameter, span=ends, channel=only, at=at, progress=progress
+            )
+        found.append(replace(one, name=name))
+    return found
+
+
+def _read_span(plant: Plant, parameter: str, span: str | None) -> tuple[float, float] | None:
+    """Both ends of a range in SI: multiples of the nominal value where neither has a unit. Raises InputError."""
+    from malta.model.parameters import units_of
+
+    units = units_of(plant.parameters) | {GAIN: "1"}
+    if parameter not in units:
+        raise InputError(
+            "--parameter", "", repr(parameter), "one of " + " ".join([GAIN, *units_of(plant.parameters)])
+        )
+    if span is None:
+        return None
+    ends = span.split("..")
+    numbers = [re.fullmatch(NUMBER, end.strip()) for end in ends]
+    if len(ends) != 2 or None in numbers:
+        raise InputError("--range", "", repr(span), "LOW..HIGH, as 0.5..1.5 or 0.2kg..0.5kg")
+    plain = all(number is not None and not number[2] for number in numbers)
+    nominal = 1.0 if parameter == GAIN else float(getattr(plant.parameters, parameter))
+    if plain and nominal == 0:
+        unit = units[parameter]
+        raise InputError(
+            "--range", "", f"multiples of {parameter}, which is 0", f"values with a unit, as 1{unit}"
+        )
+    if plain:
+        low, high = sorted(float(cast("re.Match[str]", number)[1]) * nominal for number in numbers)
+    else:
+        low, high = (
+            read_assignments("--range", [f"{parameter}={end.strip()}"], units)[parameter] for end in ends
+        )
+    if not low < high:
+        raise InputError("--range", "", repr(span), "a lower value, then a higher one")
+    return low, high
+
+
+def _draw(
+    loops: Mapping[str, LoopCurves],
+    kinds: Sequence[str],
+    channels: list[str] | None,
+    at: Place,
+    loci: Sequence[RootLocus],
+) -> list[Picture]:
+    """The pictures of all kinds; a root locus is drawn of each loop."""
+    from malta.report import plots
+
+    outputs = None
+    if channels is not None:
+        known = {s.name for curves in loops.values() for s in curves.loop.outputs}
+        outputs = [name for name in channels if name in known] or None
+    draw: Mapping[str, Callable[[], Any]] = {
+        "bode": lambda: plots.bode(loops, channel=channels, at=at),
+        "nyquist": lambda: plots.nyquist(loops, channel=channels, at=at),
+        "nichols": lambda: plots.nichols(loops, channel=channels, at=at),
+        "pzmap": lambda: plots.pzmap(loops),
+        "sigma": lambda: plots.sigma(loops, at=at),
+        "sensitivity": lambda: plots.sensitivity_curves(loops, channel=channels, at=at),
+        "gang": lambda: plots.gang_of_four(loops, channel=outputs),
+        "step": lambda: plots.step(loops, channel=outputs),
+        "load": lambda: plots.load_response(loops, channel=outputs),
+    }
+    first = next(iter(loops))
+    pictures = []
+    for kind in kinds:
+        if kind == LOCUS:
+            pictures += [
+                Picture(f"{found.name}_{LOCUS}", plots.root_locus(found, loops[found.name])) for found in loci
+            ]
+        else:
+            pictures.append(Picture(f"{first}_{kind}", draw[kind]()))
+    return pictures
+
+
+def _save(pictures: Sequence[Picture], out: Path | None) -> list[Path]:
+    """Write the pictures to the file that was named, or to a folder as NAME_KIND.png, all or none."""
+    from malta.files import replace_files
+    from malta.report import encode_figure
+
+    one = out is not None and out.suffix in SUFFIXES and not out.is_dir()
+    if one and len(pictures) > 1:
+        raise InputError("--out", "", f"one file for {len(pictures)} pictures", "a folder")
+    folder = Path("build") if out is None else out
+    paths = [cast("Path", out)] if one else [folder / f"{_file_name(p.name)}.png" for p in pictures]
+    contents = {path: encode_figure(p.figure, path) for path, p in zip(paths, pictures, strict=True)}
+    replace_files(contents)
+    return list(contents)
+
+
+def _file_name(name: str) -> str:
+    """The name of a loop as that of a file: a path of a gain file becomes one word."""
+    return re.sub(r"[^\w .,()\[\]$+-]", "_", name)[:120]
+
+
+# `malta compare`: several gain files beside each other.
+
+
+def compare(
+    gains: Annotated[
+        list[Path], typer.Argument(metavar="GAINS...", help="2 to 8 gain files: .json, .npz or .mat.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a page (.html) with the curves over each other."),
+    ] = None,
+    uncertain: Uncertain = None,
+    change: Changes = None,
+    no_proof: Annotated[
+        bool, typer.Option("--no-proof", help="Leave out the margins of the parameters, which take longest.")
+    ] = False,
+    machine: MachineFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare gain files: what differs in the designs, and every figure of merit with the better one marked.
+
+    Machines that differ are compared in what their loops have in common. An unstable loop gives exit code 1.
+
+    \b
+    Example:  malta compare design/gains/table2.json design/gains/robust.json
+    """
+    from malta.margins.loop_report import require_stable
+    from malta.report.page.comparison import compare as compare_subjects
+    from malta.report.page.comparison import comparison_tables, require_count
+    from malta.report.page.document import SUFFIXES, require_suffix
+
+    require_count(len(gains))
+    page_file = None if out is None else require_suffix(out, *SUFFIXES)
+    files = [locate(file) for file in gains]
+    subjects = [read_subject(file, read_controller(file, machine), change, uncertain, None) for file in files]
+    with unwritten_progress("compare") as progress:
+        found = compare_subjects(subjects, proof=not no_proof, progress=progress)
+        written = []
+        if page_file is not None:
+            from malta.report.page.report import comparison_page
+
+            replace_files({page_file: comparison_page(found).content})
+            written.append(page_file)
+    if as_json:
+        from malta.cli.documents.loops import compare_output
+
+        print_document(compare_output(found, written))
+    else:
+        console = make_console()
+        console.print(comparison_tables(found, console.width))
+        print_written(console, written)
+    for file, design in zip(files, found.designs, strict=True):
+        require_stable(design.report, str(file))

@@ -8,15 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from malta.cli.assignments import read_options, read_sensor_errors
-from malta.cli.completion import scenarios
-from malta.cli.exported import (
-    compare_flights,
-    comparison_table,
-    require_controller,
-    titles,
-)
-from malta.cli.inputs import change_machine, print_scenarios, read_controller, verify_and_write
 from malta.cli.options import (
     MACHINE,
     RUN,
@@ -28,14 +19,76 @@ from malta.cli.options import (
     OwnOptions,
     Seed,
     Yes,
+    change_machine,
+    print_scenarios,
+    read_controller,
+    read_options,
+    read_sensor_errors,
+    scenarios,
+    verify_and_write,
 )
-from malta.cli.output import make_console, print_document, print_note, print_text, print_written, progress_bar
-from malta.cli.patience import limit_time
+from malta.cli.output import (
+    limit_time,
+    make_console,
+    print_document,
+    print_note,
+    print_text,
+    print_written,
+    progress_bar,
+)
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
+    from malta.firmware.flight import Difference
+    from malta.firmware.program import Precision
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
+
+
+# What `--controller c` adds to `malta simulate`: the exported C flies, beside the simulation's law and in float.
+
+
+CONTROLLERS = ("own", "c")
+
+
+def require_controller(name: str, engine: str) -> None:
+    """InputError for an unknown controller, and for an engine beside the C, which has its own."""
+    if name not in CONTROLLERS:
+        raise InputError("--controller", "", repr(name), "own, or c")
+    if name == "c" and engine != "auto":
+        raise InputError("--engine", "", f"{engine} beside --controller c", "one of the two")
+
+
+def compare_flights(
+    fly: Callable[[Any], Experiment], flown: Experiment
+) -> dict[str, dict[Precision, list[Difference]]]:
+    """The differences of the C's flights to those of the simulation's law, by case and precision.
+
+    fly : makes the experiment with an engine; flown : that of the C in double precision
+    """
+    from malta.firmware.flight import differences, engine_of_c
+
+    own, single = fly("auto"), fly(engine_of_c("float"))
+    found: dict[str, dict[Precision, list[Difference]]] = {}
+    for case, c, f in zip(own.cases, flown.cases, single.cases, strict=True):
+        found[case.label] = {"double": differences(case.run, c.run), "float": differences(case.run, f.run)}
+    return found
+
+
+def comparison_table(title: str, found: dict[Precision, list[Difference]]) -> Any:
+    """A table of the largest difference of each signal, as a share of its range."""
+    from malta.report.tables.layout import add_row, new_table
+
+    table = new_table(title, "signal", "largest", "C, double", "C, float")
+    for double, single in zip(found["double"], found["float"], strict=True):
+        add_row(table, double.name, f"{double.range:.3g}", f"{double.share:.1e}", f"{single.share:.1e}")
+    return table
+
+
+def titles(labels: Sequence[str]) -> list[str]:
+    """A title for the table of each case."""
+    text = "The exported C against the simulation's law: largest difference / range"
+    return [text if len(labels) == 1 else f"{text}: {label}" for label in labels]
 
 
 LONGEST_NUMBER = 20  # digits of a run; Python refuses thousands of them
@@ -109,9 +162,8 @@ def simulate(
     \b
     Example:  malta simulate design/gains/calibrated.json --set m=0.56 --out build
     """
-    from malta.model.data import plant_of
-    from malta.model.published import published_figures
-    from malta.simulation.catalogue import experiment, main_job
+    from malta.model.data import plant_of, published_figures
+    from malta.simulation.experiments.catalogue import experiment, main_job
 
     controller = read_controller(gains, machine)
     plant = plant_of(change_machine(controller.parameters, change))
@@ -127,7 +179,7 @@ def simulate(
     substeps = options.get("substeps")
     times = (3.0 if substeps else 1.0) * (
         10.0 if law == "c" else 1.0
-    )  # own law, double and float: see exported.py
+    )  # own law, double and float: see simulate.py
     with progress_bar(chosen, insists=False) as bar:
         # With substeps a second run, with twice as many, follows for the estimate of the error.
         progress = limit_time(bar, chosen, agreed=yes, times=times)
@@ -150,7 +202,7 @@ def simulate(
 
         files.append(write_log(log_of(simulation.experiment.run), log))
     if as_json:
-        from malta.cli.documents.simulations import SimulateOutput, experiment_fields, flights
+        from malta.cli.documents.campaigns import SimulateOutput, experiment_fields, flights
 
         names, fields = [str(file) for file in files], experiment_fields(simulation.experiment)
         print_document(

@@ -13,9 +13,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
-from malta.firmware.elementary import Precision
-from malta.firmware.lowering import lower
-from malta.firmware.program import Block, Program, program_of, reached, without_unused
+from malta.firmware.program import Block, Precision, Program, lower, program_of, reached, without_unused
 from malta.model.equations import Equation
 
 LONGEST = 140  # operations of a function, with results that it only copies

@@ -2,24 +2,285 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
 
 from malta.errors import InputError
 from malta.files import file_exists, locate, replace_files
-from malta.firmware.elementary import Precision
+from malta.firmware.calibration import FNV_FACTOR, FNV_START, counts_of, monitor_titles, parameters_of
+from malta.firmware.cost import rounded
+from malta.firmware.ctext import c_name, c_number
+from malta.firmware.export import (
+    RISES,
+    comment,
+    context_of,
+    example_stroke,
+    render,
+    sources,
+    stand_in_context,
+)
 from malta.firmware.fmu import build_fmu
-from malta.firmware.folder import folder_files
-from malta.firmware.rounding import rounded
-from malta.firmware.signals import Target, fidelity_of
+from malta.firmware.program import Precision
+from malta.firmware.report import report_text
+from malta.firmware.signals import (
+    Field,
+    Target,
+    current_readings,
+    fidelity_of,
+    input_fields,
+    output_fields,
+    reading_ranges,
+    reference_fields,
+    state_fields,
+)
+from malta.firmware.step import programs_of
+from malta.firmware.supervisor import MONITORS, STATES, TIMES, monitors_of
+from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
 from malta.firmware.unit import Part
+from malta.firmware.vectors import SAMPLES, Vector, record_vectors, trial_context
 from malta.gains.file import content_of, read
 from malta.model.data import plant_of
-from malta.proof.arguments import positive
+from malta.proof.uncertain import positive
 from malta.simulation.layout import Fidelity
 from malta.synthesis.controller import Controller
+
+# ASAP2 description (1.7) of a tunable controller: its parameters as CHARACTERISTIC, what it commands as MEASUREMENT.
+#
+# Addresses are symbol links with offsets: the parameters are those of <name>_default_parameters, the measurements
+# those of the variables `out` and `supervisor` of the program, as in <name>_example.c. A linker's map makes them
+# numbers.
+
+
+WIDE = 1e12  # of a measurement without a limit
+WHOLE = 4  # bytes of an int32_t
+
+
+class Entry(NamedTuple):
+    """A number in the target's memory."""
+
+    name: str
+    meaning: str
+    unit: str
+    factor: float  # the number times this is in the unit
+    low: float  # in the unit
+    high: float
+    symbol: str
+    offset: int  # bytes
+    kind: str = "REAL"  # or LONG, ULONG
+    table: str = ""  # words for its values
+
+
+def a2l_text(t: Target, name: str) -> str:
+    """The text of <name>.a2l. name : the controller's, as a C identifier"""
+    entries = list(_parameters(t, name))
+    measured = [*_outputs(t), *_supervision()]
+    known = dict.fromkeys((e.unit, e.factor) for e in (*entries, *measured) if not e.table)
+    methods = {key: f"conversion_{k}" for k, key in enumerate(known, 1)}
+    return render(
+        "parameters.a2l",
+        {
+            "name": name,
+            "title": comment(t.controller.name).replace('"', "'"),
+            "real": "FLOAT64_IEEE" if t.precision == "double" else "FLOAT32_IEEE",
+            "methods": [
+                {"name": title, "unit": unit, "factor": repr(factor)}
+                for (unit, factor), title in methods.items()
+            ],
+            "characteristics": [_shown(e, methods) for e in entries],
+            "measurements": [_shown(e, methods) for e in measured],
+            "states": list(enumerate(STATES)),
+            "monitors": [(-1, "NONE"), *enumerate(MONITORS)],
+        },
+    )
+
+
+def _shown(e: Entry, methods: dict[tuple[str, float], str]) -> dict[str, Any]:
+    return e._asdict() | {
+        "meaning": comment(e.meaning).replace('"', "'"),
+        "method": e.table or methods[e.unit, e.factor],
+        "low": repr(float(e.low)),
+        "high": repr(float(e.high)),
+    }
+
+
+def _bytes(t: Target) -> int:
+    return 8 if t.precision == "double" else 4
+
+
+def _labels(field: Field) -> list[str]:
+    """A name for each number of a field, which is a C identifier."""
+    if field.size == 1 and not field.signals[0].name:
+        return [field.name]
+    labels = [f"{field.name}.{c_name(s.name.replace('*', ''))}" for s in field.signals]
+    if len(set(labels)) < len(labels):
+        return [f"{field.name}.entry_{k}" for k in range(field.size)]
+    return labels
+
+
+def _parameters(t: Target, name: str) -> Iterator[Entry]:
+    """The record of parameters, in its order."""
+    symbol, at = f"{name}_default_parameters", 0
+    for p in parameters_of(t):
+        factor, own = p.shown or (1.0, "")
+        ranges = np.stack([p.least, p.most]) * factor
+        for label, signal, low, high in zip(_labels(p.field), p.field.signals, *ranges, strict=True):
+            unit = own or ("" if signal.unit in ("SI", "1") else signal.unit)
+            yield Entry(label, p.field.meaning, unit, factor, low, high, symbol, at)
+            at += _bytes(t)
+    for title, most in zip(monitor_titles(monitors_of(t)), counts_of(t), strict=True):
+        words = "samples in a row until a monitor acts"
+        yield Entry(f"samples.{c_name(title)}", words, "", 1.0, 1, most, symbol, at, "LONG")
+        at += WHOLE
+    words = f"FNV-1a, from 0x{FNV_START:08x}, over the bytes of the record before it"
+    yield Entry("checksum", words, "", 1.0, 0, 2**32 - 1, symbol, at, "ULONG")
+
+
+def _outputs(t: Target) -> Iterator[Entry]:
+    """What a step commands and estimates."""
+    c, at = t.controller, 0
+    most = {
+        "y_used": reading_ranges(t.believed),
+        "v": np.asarray(c.limits.force, dtype=float),
+        "current": np.broadcast_to(c.limits.current, len(t.believed.actuator.coils)),
+    }
+    for field in output_fields(t):
+        limits = np.minimum(most.get(field.name, np.full(field.size, WIDE)), WIDE)
+        for label, signal, limit in zip(_labels(field), field.signals, limits, strict=True):
+            unit = "" if signal.unit in ("SI", "1") else signal.unit
+            is_share = field.name in ("refused", "saturated", "met")
+            low, high = (0.0, 1.0) if is_share else (-limit, limit)
+            yield Entry(label, field.meaning, unit, 1.0, low, high, "out", at)
+            at += _bytes(t)
+
+
+def _supervision() -> Iterator[Entry]:
+    """What a supervisor says; its record begins with its times."""
+    at = WHOLE * len(TIMES)
+    tables = {"state": "state_names", "enable": "", "monitor": "monitor_names", "reaction": ""}
+    for k, (key, table) in enumerate(tables.items()):
+        low, high = (-1, len(MONITORS)) if key == "monitor" else (0, len(STATES))
+        words = "of the supervisor"
+        yield Entry(
+            f"supervisor.{key}", words, "", 1.0, low, high, "supervisor", at + WHOLE * k, "LONG", table
+        )
+
+
+# The exported folder: the controller's C, its test with recorded vectors, build files, an example and a report.
+
+
+EXAMPLE_SAMPLES = 10_000  # of the example's main program, beside its stroke
+
+
+def folder_files(
+    t: Target,
+    sha256: str,
+    uncertainty: Mapping[str, float] | None = None,
+    *,
+    proof: bool = True,
+    clock: float | None = None,
+) -> dict[str, str]:
+    """Every file of an export by its name.
+
+    sha256 : of the gain file
+    uncertainty : of the gain file's margin; proof : whether the report proves it again with rounded coefficients
+    clock : Hz, of the processor that the report thinks of; None: that of the paper
+
+        files = folder_files(Target(controller, "float"), sha256)
+    """
+    name = c_name(t.controller.name)
+    files = sources(t, sha256, name) | supervisor_sources(t, name)
+    c_files = [file for file in files if file.endswith(".c")]
+    context = context_of(t, programs_of(t), name, sha256) | {
+        "objects": " ".join(file.removesuffix(".c") + ".o" for file in c_files),
+        "c_files": " ".join(c_files),
+        "driven": t.driven,
+        "currents": len(current_readings(t)) if t.driven else 0,
+        **stand_in_context(t, name),
+        **_example_context(t),
+    }
+    tested = context | _test_context(t)
+    files |= {
+        f"{name}_test.c": render("test.c", tested | trial_context(t, name)),
+        f"{name}_pil.c": render("pil.c", tested),
+        f"{name}_example.c": render("example.c", context),
+        "Makefile": render("Makefile", context),
+        "CMakeLists.txt": render("CMakeLists.txt", context),
+    }
+    context["monitors"] = monitor_lines(t)
+    if t.tunable:
+        files[f"{name}.a2l"] = a2l_text(t, name)
+    report = report_text(t, context, list(files), dict(uncertainty or {}), proof=proof, clock=clock)
+    return files | {"REPORT.md": report}
+
+
+def _example_context(t: Target) -> dict[str, Any]:
+    """How long the example runs, and its stroke."""
+    if not (t.believed.has_stroke and t.believed.travel > 0):
+        return {"example_samples": EXAMPLE_SAMPLES}
+    end, rise = example_stroke(t)
+    return {
+        "example_samples": EXAMPLE_SAMPLES + math.ceil(RISES * rise / t.controller.sample_time),
+        "example_end": c_number(end, t.precision),
+        "example_rise": c_number(rise, t.precision),
+    }
+
+
+def _test_context(t: Target) -> dict[str, Any]:
+    """What the template of the test is filled with."""
+    vectors = record_vectors(t)
+    return {
+        "samples": SAMPLES,
+        "real_bytes": 8 if t.precision == "double" else 4,
+        "word": "uint64_t" if t.precision == "double" else "uint32_t",
+        "readings": vectors[0].readings.shape[1],
+        "answers": vectors[0].expected.shape[1],
+        "last": "commands" if t.driven or t.has_set_points else "currents",
+        "last_field": "command" if t.driven or t.has_set_points else "current",
+        "fnv_start": FNV_START,
+        "fnv_factor": FNV_FACTOR,
+        "reference_all": reference_fields(t),
+        "input_all": input_fields(t),
+        "output_all": _filled(output_fields(t)),
+        "state_all": _filled(state_fields(t)),
+        "vectors": [_vector_text(v, t.precision) for v in vectors],
+    }
+
+
+def _filled(fields: list[Field]) -> list[Field]:
+    return [field for field in fields if field.size]
+
+
+def _vector_text(v: Vector, precision: Precision) -> dict[str, Any]:
+    """A vector's numbers as C."""
+
+    def rows(values: Any) -> str:
+        lines = ["{" + ", ".join(_number(x, precision) for x in row) + "}" for row in values]
+        return ",\n".join(lines)
+
+    sums = [f"0x{x:08x}u" for x in v.checksums]
+    return {
+        "name": v.name,
+        "warm": int(v.warm),
+        "readings": rows(v.readings),
+        "answers": rows(v.expected),
+        "checksums": ",\n".join(", ".join(sums[k : k + 10]) for k in range(0, len(sums), 10)),
+    }
+
+
+def _number(value: Any, precision: Precision) -> str:
+    """A number as C, also one that is not finite."""
+    kind = "double" if precision == "double" else "float"
+    if math.isnan(value):
+        return f"({kind})NAN"
+    if math.isinf(value):
+        return f"({kind})INFINITY" if value > 0 else f"-({kind})INFINITY"
+    return c_number(float(np.float32(value)) if precision == "float" else float(value), precision)
+
 
 FASTEST = 1e12  # Hz, of a clock
 Until = Literal["currents", "duty-cycles"]

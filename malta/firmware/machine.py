@@ -24,9 +24,8 @@ import numpy as np
 
 from malta.firmware.ctext import c_number, function_text, signature
 from malta.firmware.export import call_text, comment, number_rows, render, root_context
-from malta.firmware.lowering import lower
-from malta.firmware.parts import named_function, symbols
-from malta.firmware.program import Program, program_of
+from malta.firmware.period_functions import named_function, symbols
+from malta.firmware.program import Program, lower, program_of
 from malta.firmware.signals import Field, Target, current_readings, output_fields
 from malta.model.parameters import acting_names, twins_of, units_of
 from malta.model.plant import Plant, Signal, symbolic
@@ -40,8 +39,8 @@ from malta.simulation.layout import (
     places_of,
     read_currents,
 )
-from malta.simulation.noise import COSINE, LOGARITHM, SINE
 from malta.simulation.period import Period, initial_state, period_of, state_reference
+from malta.simulation.readings import COSINE, LOGARITHM, SINE
 from malta.simulation.scenario import Scenario, setup_of, substeps_of
 
 TINY = 1e-6  # share of a substep that rounding may add, see engines.substeps_until

@@ -12,9 +12,9 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.firmware.elementary import Precision
+from malta.firmware.program import Precision
 from malta.model.data import plant_of
-from malta.model.lookup import LookUp, recorded_look_ups
+from malta.model.equations import LookUp, recorded_look_ups
 from malta.model.plant import Plant, Signal, readonly
 from malta.simulation.layout import Fidelity, Setup, electronics_of, fidelities
 from malta.synthesis.controller import Controller

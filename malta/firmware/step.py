@@ -2,18 +2,225 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
-from malta.firmware.blocks import staged_program
-from malta.firmware.calibration import law_values
-from malta.firmware.pieces import parts_of
+from malta.firmware.blocks import Staged, staged_function, staged_program
+from malta.firmware.calibration import law_arguments, law_values
+from malta.firmware.period_functions import (
+    Sums,
+    currents,
+    decide,
+    drive_currents,
+    feedforward,
+    numbers,
+    places_in_table,
+    sense,
+    set_points,
+    state_at,
+    symbols,
+    table_size,
+)
 from malta.firmware.program import TYPES, Program, evaluate
-from malta.firmware.signals import Target, reference_fields, state_fields
-from malta.model.lookup import interpolate
+from malta.firmware.signals import Field, Target, input_fields, reference_fields, state_fields
+from malta.model.equations import interpolate, note, recorded_equations
+from malta.model.plant import Plant
+from malta.simulation import references
+from malta.simulation.period import state_reference
+from malta.synthesis.controller import commanded, estimated, filtered, freeze_moving, sum_errors
+
+# The pieces of a control period that are usable alone, and all functions of an export together.
+#
+# calibrate          y = gain raw + offset
+# hall_position      z of the sine and the cosine of two Hall sensors half a pole apart
+# positions          y -> q
+# filter, law        xi_hat from a reading; forces within their limits, and what the filter expects next
+# sum_errors         e += Ts (p* - y), where no axis waits
+# feedforward        forces of a reference;  reference_states: what the states are on it
+# currents           forces -> coil currents where the machine is;  set_points: those of a machine's own electronics
+# current_control    PI current loops: currents, readings and link voltage -> voltages of axes or duty cycles
+# to_axes, to_phases, induced_voltage    dq transformations and the voltages that motion induces
+# logistic, quintic  shares of a stroke with their rates
+
+
+def parts_of(t: Target) -> dict[str, Staged]:
+    """All functions of an export by name: `sense` and `decide`, then the pieces that are usable alone."""
+    return {s.plain.name(): s for s in (sense(t), decide(t), state_at(t), *pieces(t))}
+
+
+def pieces(t: Target) -> list[Staged]:
+    """The pieces of a control period that are usable alone."""
+    return [*_law_pieces(t), *_current_pieces(t), *strokes(), *_transformations(t.believed)]
+
+
+def _piece(
+    name: str, arguments: dict[str, Any], compute: Callable[..., dict[str, Any]], equation: str = ""
+) -> Staged:
+    """A piece that computes its results from its arguments; `equation` gives those that no note names."""
+    with recorded_equations() as equations:
+        results = compute(**arguments)
+        note("result", equation, **results)
+    return staged_function(name, arguments, results, equations)
+
+
+def _law_pieces(t: Target) -> list[Staged]:
+    """From readings to forces."""
+    c, plant, g = t.controller, t.believed, numbers(t)
+    n, m, outputs = len(c.states), len(c.forces), len(c.measurements)
+    sizes = dict.fromkeys(("raw", "gain", "offset", "y", "e", "frozen"), outputs)
+    sizes |= {"xi_pred": n, "xi_hat": n, "xi_ref": n, "v_ff": m, "v0": m}
+    reference = symbols(reference_fields(t))
+
+    def some(*names: str) -> dict[str, Any]:
+        return {
+            name: reference[name] if name in reference else ca.SX.sym(name, sizes[name]) for name in names
+        }
+
+    def law(xi_hat: Any, e: Any, xi_ref: Any, v_ff: Any, v0: Any, **_: Any) -> dict[str, Any]:
+        following, saturated, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
+        return {"v": v, "saturated": saturated, "xi_pred_next": following}
+
+    return [
+        _piece("calibrate", some("raw", "gain", "offset"), _calibrated, "y = gain raw + offset"),
+        _piece(
+            "positions", some("y"), lambda y: {"q": plant.position_of(y)}, "q: the place at which y is read"
+        ),
+        _piece("feedforward", reference, lambda p, dp, ddp: {"v_ff": feedforward(t, p, dp, ddp)}),
+        _piece(
+            "reference_states",
+            some("p", "dp"),
+            lambda p, dp: {"states": state_reference(plant)(p, dp)},
+            "states = (q*, dq*), which is at rest at p",
+        ),
+        _piece(
+            "filter",
+            some("xi_pred", "y", "p") | law_arguments(t, "L"),
+            lambda xi_pred, y, p, **_: {"xi_hat": estimated(g, xi_pred, filtered(c.tracks, y, p))},
+            f"xi_hat = xi_pred + L ({'y - p' if c.tracks == 'errors' else 'y'} - Cd xi_pred)",
+        ),
+        _piece(
+            "sum_errors",
+            some("e", "frozen", "y", "p", "dp"),
+            lambda e, frozen, y, p, dp: {"e_next": sum_errors(g, e, freeze_moving(g, frozen, dp), y, p)},
+            "e_next = e + Ts (p - y), where no axis waits",
+        ),
+        _piece(
+            "law",
+            some("xi_hat", "e", "xi_ref", "v_ff", "v0") | law_arguments(t, "K", "Ki", "force_limit"),
+            law,
+            "xi_pred_next = Ad xi_hat + Bd (v - v0)",
+        ),
+    ]
+
+
+def _calibrated(raw: Any, gain: Any, offset: Any) -> dict[str, Any]:
+    return {"y": gain * raw + offset}
+
+
+def _current_pieces(t: Target) -> list[Staged]:
+    """From forces to currents, and from currents to what is commanded."""
+    c, plant = t.controller, t.believed
+    y, v = ca.SX.sym("y", len(c.measurements)), ca.SX.sym("v", len(c.forces))
+    table, current = ca.SX.sym("table", table_size(t)), ca.SX.sym("current", len(plant.actuator.coils))
+    given = {"y": y, "v": v, **({"table": table} if t.look_ups else {})} | law_arguments(t, "current_limit")
+    found = [
+        _piece("currents", given, lambda y, v, table=table, **_: {"current": currents(t, y, v, table)[1]})
+    ]
+    if t.look_ups:
+        meaning = "table_at: where the currents at y read their table"
+        found.append(_piece("places", {"y": y}, lambda y: {"table_at": places_in_table(t, y)}, meaning))
+    if t.has_set_points:
+        given = {"current": current, "y": y}
+        found.append(_piece("set_points", given, lambda current, y: {"command": set_points(t, current, y)}))
+    elif t.driven:
+        found.append(_current_control(t, current))
+    return found
+
+
+def _current_control(t: Target, current: Any) -> Staged:
+    """The PI current loops alone; `states` are those of the machine's design model, estimated or of the readings."""
+    names = ("u_integral", "u_limited", "i_last", "link_last", "u_rest")
+    state = symbols(_chosen(state_fields(t), names))
+    read = symbols(_chosen(input_fields(t), ("i", "i_valid", "link")))
+    known = ca.SX.sym("states", len(t.controller.A))
+
+    def control(**_: Any) -> dict[str, Any]:
+        sums = Sums(t, state)
+        command, after = drive_currents(t, numbers(t), state, read, current, known, sums)
+        return {"command": command} | {f"{name}_next": value for name, value in (after | sums.rests).items()}
+
+    own = law_arguments(t, "Kp", "Ki_current")
+    return _piece("current_control", {"current": current, "states": known, **state, **read, **own}, control)
+
+
+def _chosen(fields: Sequence[Field], names: Sequence[str]) -> list[Field]:
+    """The fields of these names."""
+    return [field for field in fields if field.name in names]
+
+
+def _transformations(plant: Plant) -> list[Staged]:
+    """Axes from phases and back, of a machine with windings, and the position of two Hall sensors half a pole apart."""
+    if plant.windings is None:
+        return []
+    drive, x = plant.windings, ca.SX.sym("x", len(plant.states))
+    i_phase, u = ca.SX.sym("i_phase", len(drive.phases)), ca.SX.sym("u", len(drive.axes))
+    hall = {name: ca.SX.sym(name) for name in ("sine", "cosine", "z_last", "pole")}
+    return [
+        _piece(
+            "to_axes",
+            {"x": x, "i_phase": i_phase},
+            lambda x, i_phase: {"i": drive.to_axes(x) @ i_phase},
+            "i = T_axes i_phase",
+        ),
+        _piece(
+            "to_phases",
+            {"x": x, "u": u},
+            lambda x, u: {"u_phase": drive.to_phases(x) @ u},
+            "u_phase = T_phases u",
+        ),
+        _piece(
+            "induced_voltage", {"x": x}, lambda x: {"e": drive.emf(x)}, "e: the voltages that motion induces"
+        ),
+        _piece("hall_position", hall, _hall_position, "z = pole / pi (angle of (cosine, sine) + 2 pi turns)"),
+    ]
+
+
+def _hall_position(sine: Any, cosine: Any, z_last: Any, pole: Any) -> dict[str, Any]:
+    """The position that is nearest to the last one, of two Hall sensors half a pole apart."""
+    angle = ca.atan2(sine, cosine)
+    turns = (z_last * math.pi / pole - angle) / (2 * math.pi)
+    return {"z": (angle + 2 * math.pi * ca.floor(turns + 0.5)) * pole / math.pi}
+
+
+def strokes() -> list[Staged]:
+    """Shares of a stroke, with rate and acceleration, from the time since its middle: see simulation/references.py."""
+    arguments = {"t": ca.SX.sym("t"), "rise": ca.SX.sym("rise")}
+
+    def logistic(t: Any, rise: Any) -> dict[str, Any]:
+        return dict(zip(_SHARE, references.logistic(t, rise, ca.tanh), strict=True))
+
+    def quintic(t: Any, rise: Any) -> dict[str, Any]:
+        found = references.quintic(t, rise, lambda u, low, high: ca.fmin(ca.fmax(u, low), high))
+        return dict(zip(_SHARE, found, strict=True))
+
+    return [
+        _piece(
+            "logistic",
+            arguments,
+            logistic,
+            "share = (1 + tanh(2 ln(3) t / rise)) / 2, with rate and acceleration",
+        ),
+        _piece("quintic", arguments, quintic, "share = s^3 (10 - 15 s + 6 s^2), with rate and acceleration"),
+    ]
+
+
+_SHARE = ("share", "rate", "acceleration")
+
 
 Vectors = dict[str, Any]
 Step = Callable[[Vectors, Mapping[str, Any], Mapping[str, Any]], tuple[Vectors, Vectors]]

@@ -11,10 +11,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
-from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
-from malta.firmware.flight import Step, engine_of_c
-from malta.firmware.native import EXTRA, REALS, Native, compile_controller, compile_files, record_type, view
+from malta.firmware.flight import (
+    EXTRA,
+    REALS,
+    Native,
+    Step,
+    compile_controller,
+    compile_files,
+    engine_of_c,
+    record_type,
+    view,
+)
+from malta.firmware.program import Precision
 from malta.firmware.signals import Target
 from malta.firmware.supervisor import FLYING, STATES, State
 from malta.firmware.supervisor_text import (
@@ -24,12 +33,12 @@ from malta.firmware.supervisor_text import (
     supervisor_sources,
     time_members,
 )
-from malta.simulation.compiled import compiler
+from malta.simulation.engine.compiled import compiler
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant
-    from malta.simulation.engines import Engine
-    from malta.simulation.prepared import Prepared
+    from malta.simulation.engine.engines import Engine
+    from malta.simulation.simulate import Prepared
 
 OFF_COMMAND = 0.5  # duty cycles of half-bridges that make no voltage
 NUMBERS: dict[State, int] = {state: k for k, state in enumerate(STATES)}

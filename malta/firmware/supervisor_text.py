@@ -13,8 +13,7 @@ import numpy as np
 
 from malta.firmware.ctext import c_number, function_text
 from malta.firmware.export import arithmetic_context, comment, render
-from malta.firmware.lowering import lower
-from malta.firmware.program import Program, program_of
+from malta.firmware.program import Program, lower, program_of
 from malta.firmware.sensor_loss import expected_readings, gains_without, prediction_correction
 from malta.firmware.signals import Target, current_readings, input_fields, output_fields
 from malta.firmware.supervisor import (

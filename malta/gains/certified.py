@@ -16,16 +16,13 @@ import numpy as np
 
 from malta.errors import CheckError, InputError, shorten
 from malta.files import locate
-from malta.gains.agreement import APART
 from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import content_sha256
-from malta.gains.file import content_of, read
+from malta.gains.file import APART, content_of, read
 from malta.loops.sampled_loops import LAST
-from malta.margins.extent import extent_of
-from malta.margins.travel import ENDS, travel_loops
-from malta.model.data import plant_of
+from malta.margins.travel import ENDS, extent_of, travel_loops
+from malta.model.data import plant_of, published_figures
 from malta.model.parameters import units_of
-from malta.model.published import published_figures
 from malta.proof.box import box_of, sides_of
 from malta.proof.certificate.certificate import Origin, loops_of
 from malta.proof.certificate.checked_file import LONG, Claim, Document, Loop, Parameter, Places, double

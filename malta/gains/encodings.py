@@ -9,8 +9,10 @@ import hashlib
 import io
 import json
 import re
+import struct
 import zipfile
-from collections.abc import Callable, Mapping
+import zlib
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +21,208 @@ import numpy as np
 from malta.archives import read_npz
 from malta.errors import InputError
 from malta.files import read_file
-from malta.gains.mat import read_mat
 from malta.tables import require_shallow
+
+# A strict reader of MAT-files, level 5: the elements that gain files are made of, and no others.
+#
+#     file      128 bytes of header, then elements: matrices, plain or compressed (zlib)
+#     element   type and size, 4 bytes each, or both in 4 bytes where the content fits into 4; content, padded to 8 bytes
+#     matrix    flags and class, dimensions, name; then the content of its class:
+#               struct   length of a name, names, a matrix for each;  cell   a matrix for each entry
+#               char     one element of text;                         number one element of integers or floats
+#
+# Every size is compared with the bytes that are left before anything is read, so no file makes this reader crash, run
+# on, or take more memory than a small multiple of the file, or of LARGEST where it is compressed. Source: MathWorks,
+# MAT-File Format (R2019b), chapter 1.
+
+
+HEADER = 128  # bytes
+LITTLE_ENDIAN = b"\x00\x01IM"  # version 1.0 and the mark of the byte order, at the end of the header
+LARGEST = 16_000_000  # bytes of all compressed elements after decompression
+DEEPEST = 16  # structs in structs
+
+INT8, INT32, UINT32, MATRIX, COMPRESSED = 1, 5, 6, 14, 15
+NUMBERS = {
+    1: "<i1",
+    2: "<u1",
+    3: "<i2",
+    4: "<u2",
+    5: "<i4",
+    6: "<u4",
+    7: "<f4",
+    9: "<f8",
+    12: "<i8",
+    13: "<u8",
+}
+TEXTS = {2: "ascii", 4: "utf-16-le", 16: "utf-8", 17: "utf-16-le"}  # text as bytes or as MATLAB stores it
+CELL, STRUCT, CHAR = 1, 2, 4
+CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+
+
+def read_mat(data: bytes) -> dict[str, Any]:
+    """The variables of a MAT-file by name: structs as tables, cells as lists, text, and arrays of two dimensions.
+
+    Raises ValueError for damage and for anything that gain files do not have: big-endian files, other classes, arrays
+    that are complex, logical or of more than two dimensions, several structs in one array.
+    """
+    if data[HEADER - len(LITTLE_ENDIAN) : HEADER] != LITTLE_ENDIAN:
+        raise ValueError("its header is none of a little-endian MAT-file of level 5")
+    found: dict[str, Any] = {}
+    room = LARGEST
+    for kind, content in _elements(memoryview(data)[HEADER:]):
+        if kind == COMPRESSED:
+            kind, content = _decompress(content, room)
+            room -= len(content)  # never 0, which zlib takes for no limit: the tag is not counted
+        if kind != MATRIX:
+            raise ValueError(f"an element of type {kind} in place of a matrix")
+        name, value = _matrix(content, 0)
+        if not name or name in found:
+            raise ValueError(f"{name} stands twice" if name else "a matrix without a name")
+        found[name] = value
+    return found
+
+
+def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """(type, content) of each element of some bytes, which end with the last one and its padding."""
+    at = 0
+    while at < len(data):
+        if len(data) - at < 8:
+            raise ValueError(f"{len(data) - at} bytes in place of an element")
+        kind, size = struct.unpack_from("<II", data, at)
+        begin, padded = at + 8, size + -size % 8
+        if kind >> 16:  # type, size and content in 8 bytes
+            kind, size = kind & 0xFFFF, kind >> 16
+            begin, padded = at + 4, 4
+        elif kind == COMPRESSED:  # without padding
+            padded = size
+        if size > padded or padded > len(data) - begin:
+            raise ValueError(f"an element of {size} bytes where {len(data) - begin} are left")
+        yield kind, data[begin : begin + size]
+        at = begin + padded
+
+
+def _decompress(content: memoryview, room: int) -> tuple[int, memoryview]:
+    """The one element that a compressed element consists of; at most `room` bytes."""
+    unpacker = zlib.decompressobj()
+    try:
+        plain = unpacker.decompress(content, room)
+    except zlib.error as error:
+        raise ValueError(f"a compressed element that is damaged: {error}") from error
+    if not unpacker.eof or unpacker.unused_data:
+        raise ValueError(f"a compressed element that is damaged, or of more than {LARGEST} bytes")
+    parts = _elements(memoryview(plain))
+    found = next(parts, None)
+    if found is None or next(parts, None) is not None:
+        raise ValueError("a compressed element that is not one matrix")
+    return found
+
+
+def _matrix(content: memoryview, depth: int) -> tuple[str, Any]:
+    """Name and value of a matrix; no bytes at all are an empty one."""
+    if not content:
+        return "", np.zeros((0, 0))
+    if depth > DEEPEST:
+        raise ValueError(f"more than {DEEPEST} structs in structs")
+    parts = _elements(content)
+    flags = np.frombuffer(_content(parts, UINT32, "flags", 8), "<u4")
+    kind = int(flags[0]) & 0xFF
+    if int(flags[0]) & 0xFF00:
+        raise ValueError("an array that is complex, logical or global")
+    rows, columns = map(int, np.frombuffer(_content(parts, INT32, "dimensions", 8), "<i4"))
+    if rows < 0 or columns < 0:
+        raise ValueError(f"{rows} x {columns} entries")
+    name = _name(_content(parts, INT8, "name"))
+    value: Any
+    if kind == STRUCT:
+        value = _struct(parts, rows * columns, depth)
+    elif kind == CELL:
+        value = _texts(parts, rows * columns, depth)
+    elif kind == CHAR:
+        value = _text(parts, rows, columns)
+    elif kind in CLASSES:
+        value = _numbers(parts, rows, columns, np.dtype(CLASSES[kind]))
+    else:
+        raise ValueError(f"an array of class {kind}")
+    if next(parts, None) is not None:
+        raise ValueError(f"more than one array in the matrix {name!r}")
+    return name, value
+
+
+def _content(
+    parts: Iterator[tuple[int, memoryview]], kind: int, what: str, size: int | None = None
+) -> memoryview:
+    """The content of the next element, which has to be of a type, and of a size where one is given."""
+    found, content = next(parts, (0, memoryview(b"")))
+    if found != kind or (size is not None and len(content) != size):
+        raise ValueError(f"{len(content)} bytes of type {found} in place of {what}")
+    return content
+
+
+def _name(content: memoryview) -> str:
+    """A name, which may be empty; signals of a machine from plain matrices may have names with spaces."""
+    name = bytes(content).decode("ascii")
+    if not name.isprintable():
+        raise ValueError(f"the name {name[:40]!r}")
+    return name
+
+
+def _struct(parts: Iterator[tuple[int, memoryview]], count: int, depth: int) -> dict[str, Any]:
+    if count != 1:
+        raise ValueError(f"{count} structs in one array")
+    length = int(np.frombuffer(_content(parts, INT32, "the length of a name", 4), "<i4")[0])
+    names = bytes(_content(parts, INT8, "the names of a struct"))
+    if length < 1 or len(names) % length:
+        raise ValueError(f"{len(names)} bytes of names of {length} bytes each")
+    table: dict[str, Any] = {}
+    for at in range(0, len(names), length):
+        text, end, _ = names[at : at + length].partition(b"\0")
+        name = _name(memoryview(text))
+        if not name or not end or name in table:
+            raise ValueError(
+                f"{name} stands twice" if name in table else "a name without letters or without end"
+            )
+        table[name] = _matrix(_content(parts, MATRIX, name), depth + 1)[1]
+    return table
+
+
+def _texts(parts: Iterator[tuple[int, memoryview]], count: int, depth: int) -> list[str]:
+    """The texts of a cell array; more entries than bytes end with an error at the last byte."""
+    texts = []
+    for _ in range(count):
+        value = _matrix(_content(parts, MATRIX, "an entry of a cell array"), depth + 1)[1]
+        if not isinstance(value, str):
+            raise ValueError("a cell array with entries other than text")
+        texts.append(value)
+    return texts
+
+
+def _text(parts: Iterator[tuple[int, memoryview]], rows: int, columns: int) -> str:
+    """Text in one row. Characters beyond 16 bits count twice where they are stored as two."""
+    kind, content = next(parts, (0, memoryview(b"")))
+    if kind not in TEXTS or (rows * columns and rows != 1):
+        raise ValueError(f"text of {rows} rows in an element of type {kind}")
+    text = bytes(content).decode(TEXTS[kind])
+    stored = len(content) // 2 if TEXTS[kind] == "utf-16-le" else len(text)
+    if stored != rows * columns:
+        raise ValueError(f"{stored} characters in place of {rows * columns}")
+    if "\0" in text:
+        raise ValueError("text with a null character")
+    return text
+
+
+def _numbers(parts: Iterator[tuple[int, memoryview]], rows: int, columns: int, wanted: np.dtype[Any]) -> Any:
+    """An array, rows x columns; numbers may be stored in a type that is smaller than the array's class."""
+    kind, content = next(parts, (0, memoryview(b"")))
+    if kind not in NUMBERS or not np.can_cast(NUMBERS[kind], wanted):
+        raise ValueError(f"numbers of type {kind} in an array of {wanted}")
+    stored = np.dtype(NUMBERS[kind])
+    if len(content) != rows * columns * stored.itemsize:
+        raise ValueError(
+            f"{len(content)} bytes of numbers in place of {rows} x {columns} of {stored.itemsize} each"
+        )
+    array = np.frombuffer(content, stored).astype(wanted)
+    return array.reshape((rows, columns), order="F") if array.size else np.zeros((0, 0))
+
 
 MAT_HEADER = 116  # bytes of descriptive text that open a MAT-file
 MATRICES = (

@@ -14,7 +14,7 @@ from malta.errors import CheckError, InputError
 from malta.identification.log import Log
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names
-from malta.simulation.engines import evaluate
+from malta.simulation.engine.engines import evaluate
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant

@@ -19,12 +19,12 @@ from malta.archives import read_npz
 from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.files import read_file, replace_files
-from malta.gains.mat import read_mat
+from malta.gains.encodings import read_mat
 from malta.model.plant import Signal, readonly
 from malta.simulation.current_control import reading_errors
-from malta.simulation.excitation import Multisine
 from malta.simulation.layout import Loop
-from malta.simulation.prepared import prepare
+from malta.simulation.references import Multisine
+from malta.simulation.simulate import prepare
 from malta.units import to_si
 
 if TYPE_CHECKING:

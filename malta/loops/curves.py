@@ -21,7 +21,7 @@ from scipy import linalg
 
 from malta.display import Curves, Description, display
 from malta.errors import CheckError, InputError
-from malta.loops.channels import (
+from malta.loops.classical import (
     ChannelMargins,
     Crossing,
     Seen,
@@ -30,8 +30,8 @@ from malta.loops.channels import (
     margins_of_channel,
 )
 from malta.loops.linear_loops import LinearLoop, Place, System, linear_loop
+from malta.processes import on_one_thread
 from malta.synthesis.state_space import balanced_units
-from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Signal

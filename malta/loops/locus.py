@@ -21,8 +21,8 @@ from malta.loops.linear_loops import LinearLoop, Place, linear_loop
 from malta.model.data import plant_of
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
+from malta.processes import on_one_thread
 from malta.synthesis.riccati import eigenvalues
-from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray

@@ -25,11 +25,11 @@ from malta.loops.sampled_loops import (
 )
 from malta.model.parameters import units_of
 from malta.model.plant import position_at
+from malta.processes import on_one_thread
 from malta.proof.machine.windings import CurrentLoops, chosen_loops, left_out
 from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.robust import robust_margin
 from malta.synthesis.riccati import eigenvalues
-from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.model.linearize import LinearModel

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import math
 import time as clock
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from malta.loops.classical import Nominal
 from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
-from malta.margins.extent import extent_of, machine_at, positions_of
 from malta.model.data import plant_of
+from malta.model.parameters import units_of
 from malta.model.plant import off_stroke
+from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of
 from malta.proof.expressions import NotAnalytic
 from malta.proof.machine.parametric_plants import LONGEST
@@ -38,7 +40,6 @@ from malta.proof.time_limit import TimeUp, time_limit
 from malta.proof.uncertain import Compensator, UncertainSystem, is_commutated, model_of
 from malta.proof.weak_coupling.held_currents import held_machine
 from malta.proof.weak_coupling.weak_coupling import HeldLoop
-from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,6 +47,92 @@ if TYPE_CHECKING:
     from malta.model.plant import Plant
     from malta.proof.blocks.gain import Gain
     from malta.synthesis.controller import Controller
+
+
+# The intervals that one proof covers beside the uncertainty: the travel of the machine, and some parameters.
+
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Extent:
+    """The intervals that every proof covers (SI), and the course, along which the places of the machine lie.
+
+    Example: `str(extent_of(rotor))` is "for all Omega in 0 .. 2094 rad/s" where `rotor.over` is {"Omega": (0, 2094)}.
+    """
+
+    stroke: str = ""  # a state; "": the machine has no travel
+    travel: float = 0.0  # of the stroke, either way, m
+    over: Mapping[str, Interval] = field(default_factory=dict)  # intervals of parameters, SI
+    units: Mapping[str, str] = field(default_factory=dict)  # SI units of these parameters
+
+    @property
+    def intervals(self) -> dict[str, Interval]:
+        """All intervals by name."""
+        along = {self.stroke: (-self.travel, self.travel)} if self.stroke else {}
+        return along | dict(self.over)
+
+    @property
+    def course(self) -> str:
+        """The name of the course: the stroke, else the first of the parameters; "" without either."""
+        return self.stroke or next(iter(self.over), "")
+
+    @property
+    def unit(self) -> str:
+        """The SI unit of the course."""
+        return "m" if self.stroke else self.units.get(self.course, "1")
+
+    @property
+    def values(self) -> str:
+        """The intervals of parameters in words: "all Omega in 0 .. 2094 rad/s"; "" without any."""
+        parts = (
+            f"{name} in {low:.4g} .. {high:.4g} {self.units.get(name, '1')}".removesuffix(" 1")
+            for name, (low, high) in self.over.items()
+        )
+        return "all " + ", ".join(parts) if self.over else ""
+
+    def __str__(self) -> str:
+        everywhere = ["over the travel"] if self.stroke else []
+        return " and ".join([*everywhere, *([f"for {self.values}"] if self.over else [])])
+
+
+NOWHERE = Extent()  # a machine without a travel and without intervals of parameters
+
+
+def extent_of(plant: Plant, names: Iterable[str] = ()) -> Extent:
+    """The extent of a plant's proofs, without the uncertain parameters `names`, whose ranges grow with the margin."""
+    uncertain = set(names)
+    over = {name: interval for name, interval in plant.over.items() if name not in uncertain}
+    units = units_of(plant.parameters)
+    stroke = plant.stroke if plant.has_stroke else ""
+    return Extent(stroke, plant.travel, over, {name: units[name] for name in over})
+
+
+def machine_at(plant: Plant, course: str, position: float) -> tuple[Plant, dict[str, float]]:
+    """The plant at a position of its course (SI), and the states that are not zero there."""
+    if plant.has_stroke:
+        return plant, {plant.stroke: position}
+    if not course:
+        return plant, {}
+    par: Any = plant.parameters
+    return plant.variant(replace(par, **{course: position})), {}
+
+
+def positions_of(plant: Plant, extent: Extent, shares: Iterable[float]) -> tuple[tuple[float, ...], ...]:
+    """The places of a machine (SI): +- each share of its travel; else the ends and the own value of a parameter."""
+    if extent.stroke:
+        return tuple(tuple(dict.fromkeys((share * plant.travel, -share * plant.travel))) for share in shares)
+    own = own_position(plant, extent, {})
+    return tuple((value,) for value in sorted({own, *extent.over.get(extent.course, ())}))
+
+
+def own_position(plant: Plant, extent: Extent, states: Mapping[str, float]) -> float:
+    """The position of the machine along its course (SI): the stroke in `states`, else the value of the parameter."""
+    if extent.stroke or not extent.course:
+        return states.get(extent.stroke, 0.0)
+    return float(getattr(plant.parameters, extent.course))
+
 
 NOT_BETWEEN = "not between them"  # what a margin of several places says
 LONG = 5000  # operations of matrices that are not enclosed over an interval of positions

@@ -21,13 +21,13 @@ import numpy as np
 from malta.loops.sampled_loops import LAST
 from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
+from malta.processes import on_one_thread
 from malta.proof.box import box_of
 from malta.proof.groups import groups, loop_of
 from malta.proof.machine.windings import chosen_loops, current_control, force_modes, windings_of
 from malta.proof.margin import Ranges
 from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator, UncertainSystem, is_commutated
-from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant

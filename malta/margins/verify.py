@@ -5,38 +5,65 @@ The loops and their signals are those of loops.py; at the sensors S = (I - P F)^
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from malta.errors import CheckError
+from malta.errors import CheckError, InputError
+from malta.loops.classical import (
+    Classical,
+    Nominal,
+    classical_margins,
+    nominal_loop,
+    peak_sensitivity,
+    worst_of,
+)
 from malta.loops.loop import loop_of_model
 from malta.loops.sampled_loops import (
     LAST,
     SampledLoop,
     commanded_model,
     continuous_poles,
+    machine_law,
     sampled_loop,
     sorted_poles,
 )
-from malta.margins.extent import extent_of
-from malta.margins.figures import BANDWIDTHS
-from malta.margins.loop_report import LoopReport, Poles, Stage
-from malta.margins.travel import travel_margin
+from malta.margins.loop_report import BANDWIDTHS, Link, LoopReport, Place, Poles, Stage
+from malta.margins.travel import (
+    EACH,
+    PLACES,
+    Extent,
+    covers_travel,
+    depends_on_course,
+    extent_of,
+    loaded_loop_at,
+    own_position,
+    place_margin,
+    places_along,
+    travel_margin,
+)
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
+from malta.model.parameters import units_of
+from malta.model.plant import Plant, position_at
+from malta.processes import on_one_thread
+from malta.proof.machine.parametric_plants import of_plant
+from malta.proof.machine.windings import CurrentLoops, chosen_loops
+from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.responses import crossing, find_peaks
+from malta.proof.robust import robust_margin
+from malta.proof.uncertain import Compensator
 from malta.synthesis.controller import Controller
+from malta.synthesis.kalman import gain_at_rest
+from malta.synthesis.lqg import kalman, lqi, lqr, weights_of
 from malta.synthesis.riccati import add_integrals, eigenvalues
-from malta.synthesis.sampled import gain_at_rest
-from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from malta.model.plant import ComplexArray, FloatArray
-    from malta.proof.machine.windings import CurrentLoops
 
 
 def controller_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
@@ -178,3 +205,256 @@ def _natural_frequencies(model: LinearModel, controller: Controller) -> dict[str
 
 def _singular_values(G: ComplexArray) -> FloatArray:
     return np.asarray(np.linalg.svd(G, compute_uv=False))
+
+
+# The margin at each stage of a design, from full state feedback to the machine's own loop.
+#
+#     LQR -> LQI -> LQG -> LQGI -> with current loops -> sampled -> machine
+#
+# From `sampled` on the gains are the gain file's own, with hold and delay. Current loops are first-order lags, as
+# papers have them, up to `sampled`. The machine has the PI controllers of the gain file on its windings
+# (windings.py), as simulations fly it by default; a machine without windings ends at `sampled`. A PID has the stages
+# from `sampled` on. A design without weights on integrals has no LQI and no LQGI.
+#
+# The first five stages are continuous; they are synthesized from the cost and the noise in the gain file. Each stage
+# has its parametric margin (robust.py) and its peak sensitivity: at the forces for state feedback, where an LQR
+# guarantees at most 1, at the sensors for output feedback, as ISO 14839-3 measures it. The parametric margins of all
+# stages are of the design model at a position, without the loads, which v0(z) cancels. The peak sensitivity of the
+# last stage, and the disk margins, delay margins and the gang of four, are of the machine's loop under its loads
+# against v0(z), as in verify.py: a cogging that is stiffer than the axial loop shows there.
+
+
+SAMPLED = "sampled"  # with first-order lags
+MACHINE = "machine"  # with PI controllers on the windings: the last stage of a machine that has some
+
+
+def compensators(
+    plant: Plant, controller: Controller, current_loops: CurrentLoops = LAST
+) -> dict[str, tuple[Compensator, bool]]:
+    """The control laws of the stages by name, each with whether it feeds back the states.
+
+    plant : the machine, whose delay and current loops the last stages have
+
+    State feedback reads [y, x]; the other laws read y.
+    """
+    own = {SAMPLED: (machine_law(plant, controller, "lag"), False)}
+    if chosen_loops(plant, controller, current_loops) == "pi":
+        own[MACHINE] = machine_law(plant, controller), False
+    if controller.cost is None:
+        return own
+    believed, weights = plant_of(controller.parameters), weights_of(controller)
+    model = linearize(believed, believed.point(controller.operating_point[0]))
+    A, B, C, K, L = model.A, model.B, model.C, lqr(model, weights), kalman(model, weights)
+    n, p, m = len(A), len(C), B.shape[1]
+    half = believed.coordinates
+    to_modes = np.linalg.inv(C[:, :half]) if p == half else np.eye(p)
+    back = np.linalg.inv(to_modes)
+    stages: dict[str, tuple[Compensator, bool]] = {
+        "LQR": (
+            Compensator(
+                np.zeros((0, 0)), np.zeros((0, p + n)), np.zeros((m, 0)), np.hstack([np.zeros((m, p)), -K])
+            ),
+            True,
+        )
+    }
+    integral = bool(weights.q_i.any())
+    K_i, Ki = lqi(model, weights) if integral else (K, np.zeros((m, p)))
+    if integral:  # e' = -y, in the coordinates of the modes
+        e = np.hstack([-to_modes, np.zeros((p, n))])
+        D = np.hstack([np.zeros((m, p)), -K_i])
+        stages["LQI"] = Compensator(np.zeros((p, p)), e, Ki @ back, D, integrals=p), True
+    stages["LQG"] = Compensator(A - B @ K - L @ C, L, -K, np.zeros((m, p))), False
+    last = stages["LQG"][0]
+    if integral:
+        observer = np.block([[A - B @ K_i - L @ C, B @ Ki @ back], [np.zeros((p, n + p))]])
+        last = Compensator(
+            observer, np.vstack([L, -to_modes]), np.hstack([-K_i, Ki @ back]), np.zeros((m, p)), integrals=p
+        )
+        stages["LQGI"] = last, False
+    if np.isfinite(plant.actuator.crossover):
+        stages["+ current loops"] = replace(last, lag=plant.actuator.crossover), False
+    return stages | own
+
+
+@dataclass(frozen=True, eq=False)
+class _Question:
+    """The arguments of `staged_report`, and results that its parts share."""
+
+    plant: Plant
+    controller: Controller
+    uncertainty: Mapping[str, float]
+    current_loops: CurrentLoops
+    time: float | None
+    proof: bool
+    report: Callable[[], None]  # called after each part
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The uncertain parameters, and the mass for its margin: one model answers all questions."""
+        own = tuple(self.uncertainty)
+        return (*own, *({"m"} & set(units_of(self.plant.parameters)) - set(own)))
+
+    @cached_property
+    def extent(self) -> Extent:
+        return extent_of(self.plant, self.names)
+
+    @cached_property
+    def whole(self) -> bool:
+        """Whether one proof covers the travel."""
+        return covers_travel(self.plant, self.controller, self.names, self.current_loops)
+
+    @cached_property
+    def _place_margins(self) -> dict[float, Margin]:
+        return {}
+
+    @cached_property
+    def _travel_margins(self) -> dict[tuple[object, float | None], Margin]:
+        return {}
+
+    @cached_property
+    def _moves(self) -> bool:
+        return depends_on_course(self.plant, self.controller, self.names, self.current_loops)
+
+    def loaded_loop_at(self, position: float) -> Nominal:
+        return loaded_loop_at(self.plant, self.controller, self.names, position, self.current_loops)
+
+    def margin_at(self, position: float) -> Margin:
+        """The margin at a position along the course; computed once if the loop does not depend on the position."""
+        z, known = position if self._moves else 0.0, self._place_margins
+        if z not in known:
+            travel = self._travel_margins.get(self._key(self.uncertainty, self.time))
+            known[z] = place_margin(
+                self.plant, self.controller, self.uncertainty, z, self.current_loops, self.names, travel
+            )
+        return known[z]
+
+    def _key(self, ranges: Ranges, time: float | None) -> tuple[object, float | None]:
+        return tuple(ranges.items()), time
+
+    def margin_over(self, ranges: Ranges, time: float | None, progress: Progress | None = None) -> Margin:
+        """The margin anywhere in the extent; computed once for equal ranges: +1 kg may be the range of the mass."""
+        known, key = self._travel_margins, self._key(ranges, time)
+        if key not in known:
+            known[key] = travel_margin(
+                self.plant, self.controller, ranges, self.current_loops, self.names,
+                time=time, progress=progress,
+            )  # fmt: skip
+        self.report()
+        return known[key]
+
+
+@on_one_thread
+def staged_report(
+    found: LoopReport,
+    uncertainty: Mapping[str, float],
+    *,
+    progress: Callable[[float], None] | None = None,
+    bounds: Progress | None = None,
+    time: float | None = None,
+    proof: bool = True,
+) -> LoopReport:
+    """Add what `malta verify` shows beside the linear figures: parametric margins with proof, and the classical ones.
+
+    The margin over the travel is the largest t for which all parameters may deviate by t times their range at once.
+
+    found : the linear figures, whose `current_loops` is that of the last stage
+    uncertainty : relative half range of each parameter, as {"m": 0.2} for +-20 %; margins are multiples of it
+    progress : called with the share of the work that is done, 0 to 1
+    bounds : called with the lower and upper bound of the margin over the travel so far
+    time : s, longest search of the margin over the travel; None: 120
+    proof : False: without parametric margins, in a fraction of the time
+
+    Raises InputError for unknown parameters or none.
+    """
+    if not uncertainty:
+        raise InputError("verify", "uncertainty", "no parameters", 'some, as {"m": 0.2}')
+    steps, total = itertools.count(1), 9 + 2 * len(uncertainty) + len(PLACES)
+
+    def report() -> None:
+        if progress is not None:
+            progress(min(1.0, next(steps) / total))
+
+    plant, controller, current_loops = found.plant, found.controller, found.current_loops
+    question = _Question(plant, controller, uncertainty, current_loops, time, proof, report)
+    travel = question.margin_over(uncertainty, time, bounds) if proof else None
+    links = _links(question)
+    tolerance, mass = _tolerances(question) if proof else ({}, None)
+    places, worst = _places(question)
+    sensors = [s.name for s in plant.outputs]
+    return replace(
+        found,
+        uncertainty=dict(uncertainty),
+        robust=travel,
+        extent=question.extent,
+        chain=links,
+        disks=worst.disks if worst else (),
+        delay=worst.delay if worst else dict.fromkeys(sensors, float("nan")),
+        gang=worst.gang if worst else {},
+        tolerance=tolerance,
+        mass=mass,
+        places=places,
+    )
+
+
+def _links(q: _Question) -> tuple[Link, ...]:
+    """The stages of the chain, each with its margin and its peak sensitivity."""
+    at = position_at(q.plant, q.plant.point(q.controller.operating_point[0]).x)
+    believed = plant_of(q.controller.parameters)
+    links = []
+    stages = compensators(q.plant, q.controller, q.current_loops)
+    last = [*stages][-1]
+    for name, (law, states) in stages.items():
+        own = name in (SAMPLED, MACHINE)
+        if own:
+            stage = q if name == last else replace(q, current_loops="lag")
+            position = own_position(q.plant, q.extent, at)
+            loop = stage.loaded_loop_at(position)
+            margin = stage.margin_at(position) if q.proof else NOT_PROVEN
+        else:
+            system = of_plant(q.plant, list(q.uncertainty), states=states, at=at, believed=believed)
+            margin = robust_margin(system, law, q.uncertainty, time=q.time) if q.proof else NOT_PROVEN
+            loop = nominal_loop(system, law)
+        where: Literal["forces", "sensors"] = "forces" if states else "sensors"
+        links.append(Link(name, margin, peak_sensitivity(loop, where), where, loaded=own))
+        q.report()
+    return tuple(links)
+
+
+def _tolerances(q: _Question) -> tuple[dict[str, tuple[Margin, Margin]], Margin | None]:
+    """How far each parameter alone may go, down and up; and the mass margin of a machine with a mass m, kg."""
+    time = q.time if q.whole else min(q.time or EACH, EACH)
+    tolerance = {}
+    for name, share in q.uncertainty.items():
+        nominal = getattr(q.plant.parameters, name)
+        down = q.margin_over({name: (nominal * (1 - share), nominal)}, time)
+        tolerance[name] = down, q.margin_over({name: (nominal, nominal * (1 + share))}, time)
+    if "m" not in units_of(q.plant.parameters):
+        return tolerance, None
+    m: float = getattr(q.plant.parameters, "m")  # noqa: B009  a machine's own field
+    return tolerance, q.margin_over({"m": (m, m + 1.0)}, time)
+
+
+def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:
+    """The places along the course, and the worst of their classical margins; None where one of them is unstable."""
+    sensors = [s.name for s in q.plant.outputs]
+    places: list[Place] = []
+    classical: list[Classical | None] = []
+    for positions in places_along(q.plant, q.controller, q.names, q.current_loops):
+        proven_at = positions if q.whole else positions[:1]  # else a place takes as long as the whole travel
+        margin = _smallest([q.margin_at(z) for z in proven_at]) if q.proof else NOT_PROVEN
+        loops = [q.loaded_loop_at(z) for z in positions]
+        peak = float(np.max([peak_sensitivity(loop, "sensors") for loop in loops]))
+        sides = [classical_margins(loop, sensors) if loop.stable else None for loop in loops]
+        classical += sides
+        worst = worst_of(sides)
+        disk, delay = (worst.disks[2].size, min(worst.delay.values())) if worst else (np.nan, np.nan)
+        places.append(Place(positions[0], margin, peak, disk, delay))
+        q.report()
+    return tuple(places), worst_of(classical)
+
+
+def _smallest(margins: Sequence[Margin]) -> Margin:
+    """One margin that holds at several places: the smallest lower and the smallest upper bound."""
+    lower = None if any(m.lower is None for m in margins) else min(m.lower or 0.0 for m in margins)
+    reason = "; ".join(dict.fromkeys(m.reason for m in margins if m.reason))
+    return replace(min(margins, key=lambda m: m.upper), lower=lower, reason=reason)

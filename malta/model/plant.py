@@ -19,13 +19,12 @@ import numpy as np
 from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.model.checks import DEFAULT, defaults
-from malta.model.drive import CasadiFn, Drive, Electronics
-from malta.model.sensors import LateSensors, require_short
+from malta.model.sensors import CasadiFn, Drive, Electronics, LateSensors, require_short
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from malta.model.inverse import InverseCheck
+    from malta.model.linearize import InverseCheck
 
     FloatArray = NDArray[np.floating[Any]]
     ComplexArray = NDArray[np.complexfloating[Any, Any]]
@@ -360,7 +359,7 @@ class Plant:
         ball: `currents` is not the inverse of `forces` along q
           q in -0.002 .. 0.002 m: at -0.002 the currents of f = -3.6 N make -11.02 N, 103 % of its limit apart
         """
-        from malta.model.inverse import check_inverse  # which imports this module
+        from malta.model.linearize import check_inverse  # which imports this module
 
         return check_inverse(self)
 

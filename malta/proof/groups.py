@@ -17,7 +17,6 @@ from flint import arb, arb_mat
 from scipy import linalg, sparse
 
 from malta.errors import InputError
-from malta.proof.arguments import plural
 from malta.proof.expressions import (
     NotAnalytic,
     Program,
@@ -30,7 +29,7 @@ from malta.proof.polynomial.rational import (
     TooLarge,
     symbolic,
 )
-from malta.proof.uncertain import Compensator, Group, UncertainSystem
+from malta.proof.uncertain import Compensator, Group, UncertainSystem, plural
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

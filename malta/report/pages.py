@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rich.console import Group
 
-from malta.loops.recovery import recovery
+from malta.loops.time_domain import recovery
 from malta.margins.loop_report import LoopReport
 from malta.model.linearize import LinearModel
 from malta.report.figures import (
@@ -20,10 +20,9 @@ from malta.report.figures import (
     worst_figure,
     yield_figure,
 )
-from malta.report.figures.margins import chain_figure
-from malta.report.figures.parts import Published
-from malta.report.figures.recovery import recovery_figure
-from malta.report.figures.sensitivity import sensitivity_figure
+from malta.report.figures.campaign import sensitivity_figure
+from malta.report.figures.drawing import Published
+from malta.report.figures.margins import chain_figure, recovery_figure
 from malta.report.tables.design import bandwidth_table, loop_poles_table, poles_table, sensitivity_table
 from malta.report.tables.experiments import experiment_table
 from malta.report.tables.layout import Paragraph
@@ -35,9 +34,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from malta.campaigns.result import Campaign
-    from malta.campaigns.sensitivity import Sensitivity
+    from malta.campaigns.studies import Sensitivity
     from malta.campaigns.summary import Summary
-    from malta.loops.recovery import Recovery
+    from malta.loops.time_domain import Recovery
     from malta.model.plant import Plant
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller

@@ -10,5 +10,5 @@ file: what depends on other files or on arithmetic (dimensions of units, shapes 
 checks alone.
 """
 
-from malta.schemas.registry import SCHEMAS as SCHEMAS
-from malta.schemas.registry import schema as schema
+from malta.schemas.files import SCHEMAS as SCHEMAS
+from malta.schemas.files import schema as schema

@@ -2,20 +2,81 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from pydantic import StrictStr, create_model
+from pydantic import BaseModel, StrictStr, create_model
 
+from malta.errors import InputError
 from malta.gains.schema import GainFile
 from malta.model.data import MachineFile
 from malta.model.parameters import units_of
-from malta.schemas.parts import Schema, change_nodes, require_names, schema_of, without_null
 from malta.synthesis.design_file import LQG, ONLY_LQG
 from malta.synthesis.design_tables import AnyBound, DesignFile, specification_record
 from malta.synthesis.requirements import requirements_for
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant
+
+
+# JSON schemas as nested tables, and what is changed in those that pydantic makes.
+
+
+DRAFT = "https://json-schema.org/draft/2020-12/schema"
+Schema = dict[str, Any]
+
+
+def schema_of(model: type[BaseModel], title: str) -> Schema:
+    """Make the schema of a table; its title replaces those that pydantic derives from names of Python."""
+    return {"$schema": DRAFT, "title": title} | change_nodes(
+        model.model_json_schema(by_alias=True), _drop_title
+    )
+
+
+def change_nodes(node: Schema, change: Callable[[Schema], Schema]) -> Schema:
+    """Apply a change to a schema and all schemas in it, the innermost first."""
+    node = dict(node)
+    for key in ("$defs", "properties"):
+        if key in node:
+            node[key] = {name: change_nodes(inner, change) for name, inner in node[key].items()}
+    for key in ("additionalProperties", "items"):
+        if isinstance(node.get(key), dict):
+            node[key] = change_nodes(node[key], change)
+    if "anyOf" in node:
+        node["anyOf"] = [change_nodes(inner, change) for inner in node["anyOf"]]
+    return change(node)
+
+
+def without_null(node: Schema) -> Schema:
+    """Remove null from the alternatives, as TOML has none: an entry is left out."""
+    if "anyOf" not in node:
+        return node
+    rest: list[Schema] = [inner for inner in node["anyOf"] if inner != {"type": "null"}]
+    node = {key: value for key, value in node.items() if (key, value) != ("default", None)}
+    if len(rest) > 1:
+        return node | {"anyOf": rest}
+    del node["anyOf"]
+    return rest[0] | node
+
+
+def require_names(node: Schema, names: Iterable[str], *, all_of: bool = False) -> Schema:
+    """Restrict the keys of a table with free keys to some names.
+
+    all_of : each of the names has to stand in the table
+    """
+    if "anyOf" in node:
+        return node | {"anyOf": [require_names(inner, names, all_of=all_of) for inner in node["anyOf"]]}
+    if not isinstance(node.get("additionalProperties"), dict):
+        return node
+    properties = dict.fromkeys(names, node["additionalProperties"])
+    needed = {"required": list(properties)} if all_of else {}
+    return node | {"properties": properties, "additionalProperties": False} | needed
+
+
+def _drop_title(node: Schema) -> Schema:
+    """A schema without the title that repeats its name."""
+    return {key: value for key, value in node.items() if key != "title"}
+
 
 PUBLISHED: Schema = {
     "type": "object",
@@ -149,3 +210,39 @@ def _alternative(node: Schema) -> Schema:
     bare = {key: value for key, value in node.items() if key not in said}
     kinds = bare["anyOf"] if list(bare) == ["anyOf"] else [bare]
     return said | {"anyOf": [*kinds, {"$ref": "#/$defs/Published"}]}
+
+
+# Schemas by the names of what they describe.
+
+
+SCHEMAS: dict[str, Callable[[], Schema]] = {"gain": gain_schema, "design": design_schema, "data": data_schema}
+"""Functions that make the schemas of files, by the names that `malta.schemas.schema` takes.
+
+>>> import malta
+>>> sorted(malta.schemas.SCHEMAS)
+['data', 'design', 'gain']
+"""
+
+OF_MACHINES: dict[str, Callable[[Plant], Schema]] = {"design": design_schema, "data": data_schema}
+
+
+def schema(name: str, plant: Plant | None = None) -> Schema:
+    """Return the JSON schema (draft 2020-12) of a kind of file.
+
+    name : "gain", "design" or "data"
+    plant : the machine whose names a design file or a data file may have; None: any names
+
+    Raises InputError for an unknown name, and for a machine where the schema is the same for all machines.
+
+    >>> import malta
+    >>> malta.schemas.schema("data")["required"]
+    ['machine', 'parameters']
+    >>> plant = malta.plant_of(malta.read("data/halbach.toml"))
+    >>> parameters = malta.schemas.schema("data", plant)["properties"]["parameters"]
+    >>> parameters["properties"]["m"]["unit"]
+    'kg'
+    """
+    known = SCHEMAS if plant is None else OF_MACHINES
+    if name not in known:
+        raise InputError("schema", "name", repr(name), "one of " + ", ".join(known))
+    return SCHEMAS[name]() if plant is None else OF_MACHINES[name](plant)

@@ -1,8 +1,8 @@
 /* The loop around one control period of machine and controller: the frame of every compiled engine.
 
    Before it stand the sizes as #defines, numbers.c, the functions `prepare`, `foresee`, `sense`, `decide`, `substep` and
-   those of the digest, which translate.py generates from CasADi expressions, and noise.c. c, d and g are those of
-   once.py. LANES machines run side by side, one in each lane of a SIMD register; with LANES 1 a `real` is a double and
+   those of the digest, which engines.py generates from CasADi expressions, and noise.c. c, d and g are those of
+   instructions.py. LANES machines run side by side, one in each lane of a SIMD register; with LANES 1 a `real` is a double and
    the rows of every sample are kept.                                                                                */
 
 /* v0(z), linear between the points of the grid: rows of the table are z, v0 and dv0/dz. Only columns that are not zero

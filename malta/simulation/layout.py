@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import casadi as ca
 import numpy as np
 
-from malta.model.drive import Electronics
 from malta.model.parameters import acting_names, twins_of
 from malta.model.plant import Plant, symbolic
+from malta.model.sensors import Electronics
 from malta.synthesis.controller import Controller, CurrentLoop, gains_of
 
 if TYPE_CHECKING:

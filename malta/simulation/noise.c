@@ -1,5 +1,5 @@
 /* Noise: SplitMix64 of a lane's key and a counter, 32 bits for the radius and 32 for the angle of Box-Muller, in single
-   precision. Every operation rounds as those of noise.py do, so none may be contracted: the same numbers to the bit.  */
+   precision. Every operation rounds as those of readings.py do, so none may be contracted: the same numbers to the bit.  */
 typedef uint64_t bits64 __attribute__((vector_size(8 * LANES)));
 typedef uint32_t bits32 __attribute__((vector_size(8 * LANES))); /* twice as many */
 typedef int32_t whole32 __attribute__((vector_size(8 * LANES)));

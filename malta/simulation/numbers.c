@@ -1,4 +1,4 @@
-/* Numbers of compiled engines: one in a double, or LANES of them in a SIMD register, and the operations of translate.py
+/* Numbers of compiled engines: one in a double, or LANES of them in a SIMD register, and the operations of engines.py
    on either. A whole is a mask: -1 where something is true, and 0 elsewhere.                                       */
 
 #include <math.h>

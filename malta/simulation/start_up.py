@@ -23,11 +23,10 @@ from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.plant import Plant
 from malta.proof.uncertain import is_commutated
-from malta.simulation.engines import Engine
+from malta.simulation.engine.engines import Engine
 from malta.simulation.layout import layout_of, numbers_of
-from malta.simulation.period import period_of
+from malta.simulation.period import period_of, runge_kutta
 from malta.simulation.scenario import Simulation
-from malta.simulation.substep import runge_kutta
 from malta.synthesis.controller import Controller, Noise
 from malta.synthesis.kalman import noise_input
 from malta.synthesis.riccati import sample

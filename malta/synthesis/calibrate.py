@@ -8,8 +8,8 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.model.linearize import LinearModel
+from malta.processes import on_one_thread
 from malta.synthesis.spec import Weights
-from malta.threads import on_one_thread
 
 
 @on_one_thread

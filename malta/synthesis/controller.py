@@ -54,7 +54,7 @@ from malta.model.plant import Parameters, Signal, readonly
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
-    from malta.synthesis.sampled import Gains
+    from malta.synthesis.kalman import Gains
     from malta.synthesis.spec import Coordinates
 
 

@@ -22,20 +22,26 @@ import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.files import locate
-from malta.model.data import plant_of, read
+from malta.model.data import plant_of, published, read
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
-from malta.model.published import published
 from malta.synthesis.design_tables import (
     DesignFile,
     PidTable,
     ReferencesTable,
     SearchTable,
     specification_table,
+    with_published,
 )
-from malta.synthesis.published_entries import with_published
-from malta.synthesis.quantities import bases, numbers, ordered, positive, variances
-from malta.synthesis.recovery import RecoveryBound, recovery_bounds
+from malta.synthesis.recovery import (
+    RecoveryBound,
+    bases,
+    numbers,
+    ordered,
+    positive,
+    recovery_bounds,
+    variances,
+)
 from malta.synthesis.requirements import Requirement, requirements_for
 from malta.synthesis.spec import (
     Loads,

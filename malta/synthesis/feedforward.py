@@ -20,8 +20,8 @@ from malta.synthesis.controller import (
     Feedforward,
     Limits,
 )
+from malta.synthesis.kalman import held
 from malta.synthesis.riccati import sample
-from malta.synthesis.sampled import held
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

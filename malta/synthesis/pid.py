@@ -18,11 +18,11 @@ from scipy import linalg
 
 from malta.errors import CheckError, InputError
 from malta.model.linearize import LinearModel
+from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import machine_part
-from malta.synthesis.sampled import Gains
+from malta.synthesis.kalman import Gains
 from malta.synthesis.spec import Pid
-from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

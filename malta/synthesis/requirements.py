@@ -27,10 +27,9 @@ from malta.model.plant import Plant, Signal
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Parameters
     from malta.synthesis.controller import Controller
-    from malta.synthesis.recovery import RecoveryBound
-    from malta.synthesis.sampled import Gains, Linear
+    from malta.synthesis.kalman import Gains, Linear
+    from malta.synthesis.recovery import RecoveryBound, StepResponse
     from malta.synthesis.spec import Spec
-    from malta.synthesis.step_response import StepResponse
 
 Law = Literal["LQG", "PID"]
 Trade = Literal["force", "motion"]

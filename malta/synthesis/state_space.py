@@ -19,9 +19,9 @@ from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
 from malta.model.plant import OperatingPoint, Plant, Signal
+from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, linear_law
 from malta.synthesis.feedforward import machine_part
-from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

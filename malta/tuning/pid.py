@@ -10,7 +10,7 @@ On the machine's own sampled loop (hold, held currents, delay, current loops), w
 The root of the sum of J_i^2 is minimized, in SI units, so that the forces weigh the axes; [specification] bounds the
 rest. Integral gains become as large as that allows. Parts of the machine that nothing joins are searched by themselves.
 Differential evolution finds the region, COBYQA (Ragonneau and Zhang) the place on the bounds. What else is asked for
-is estimated in each trial (pid_estimates.py) where forces do not depend on where the machine is; elsewhere a margin
+is estimated in each trial (pid.py) where forces do not depend on where the machine is; elsewhere a margin
 over the travel is only judged, as the regulator's natural frequencies are everywhere.
 """
 
@@ -20,15 +20,15 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy import optimize, sparse
 
 from malta.errors import InputError
 from malta.loops.loop import loop_of_model
-from malta.loops.noise import covariance
 from malta.loops.sampled_loops import SampledLoop
+from malta.loops.time_domain import covariance
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
@@ -40,7 +40,7 @@ from malta.synthesis.pid import Axes, axes_of, law_of_outputs, pid_gains
 from malta.synthesis.requirements import ratio_of
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Loads, Pid, Spec, pid_signals
-from malta.tuning.pid_estimates import estimates_of, name_of, outputs_of
+from malta.tuning.groups import figures_of_gains, groups_of
 from malta.tuning.search import (
     UNSTABLE,
     Effort,
@@ -59,9 +59,85 @@ from malta.tuning.search import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from malta.model.linearize import LinearModel
     from malta.model.plant import FloatArray
     from malta.synthesis.controller import Controller
+    from malta.tuning.groups import Group
+
+
+# What requirements estimate of a trial of PID gains: noise of forces, answers to loads, margin at corners of the box.
+#
+# The loops are those of tuning.groups, closed with a PID, so a machine whose currents are held between samples has
+# none.
+
+
+EXACT = {"load_error", "noise_motion", "peak_sensitivity", "bandwidth"}  # tuning.pid computes these
+BETWEEN = 1e-3  # of a margin: the corners of the box are interpolated between samples of the machine
+OF = " of "  # between the name of an estimate and the outputs that it is of
+
+
+class Estimates(NamedTuple):
+    """The groups of a machine whose figures [specification] bounds; of mirror images one."""
+
+    spec: Spec
+    axes: Axes
+    groups: tuple[Group, ...]
+
+    def figures(self, terms: Pid, outputs: Sequence[int]) -> list[dict[str, float]]:
+        """Compute the figures of the groups among some outputs, named as "force_noise of x1 x2"."""
+        found = []
+        for group in self.groups:
+            if set(group.outputs) <= set(outputs):
+                own = " ".join(self.spec.plant.outputs[k].name for k in group.outputs)
+                figures = _figures(self.spec, group, terms, self.axes)
+                found.append({f"{name}{OF}{own}": value for name, value in figures.items()})
+        return found
+
+
+def estimates_of(spec: Spec, touched: Sequence[set[int]]) -> Estimates:
+    """Find what of [specification] needs estimates.
+
+    touched : the outputs that each variable of the search touches; mirror images have the same variables
+    """
+    model = linearize(spec.plant, spec.plant.at(**spec.operating_point))
+    terms, axes = spec.pid, axes_of(model, spec.axes)
+    asked = {base_of(name) for name in spec.specification} - EXACT
+    if terms is None or not asked or model.E.any():
+        return Estimates(spec, axes, ())
+    distinct: dict[tuple[object, ...], Group] = {}
+    for group in groups_of(spec):
+        few, _ = law_of_outputs(terms, axes, group.outputs)
+        numbers = tuple(tuple(v.tolist()) for v in (few.Kp, few.Ki, few.Kd, few.filters))
+        variables = tuple(k for k, own in enumerate(touched) if own & set(group.outputs))
+        distinct.setdefault((group.picture, numbers, variables), group)
+    return Estimates(spec, axes, tuple(distinct.values()))
+
+
+def outputs_of(figure: str) -> list[str]:
+    """Name the outputs that a figure is of: of "noise_motion x" and of estimates; none of one of the whole machine."""
+    _, of, own = figure.rpartition(OF)
+    return own.split() if of else own.split()[1:]
+
+
+def name_of(figure: str) -> str:
+    """Return a figure's name in [specification]: "force_noise" of "force_noise of x1 x2"."""
+    name, of, own = figure.rpartition(OF)
+    return name if of else own
+
+
+def _figures(spec: Spec, group: Group, terms: Pid, axes: Axes) -> dict[str, float]:
+    """The estimates of one group; none where its loop is unstable."""
+    P = group.model.C[:, : len(group.states) // 2]
+    few, own = law_of_outputs(terms, axes, group.outputs)
+    gains = pid_gains(P, few, spec.sample_time, own._replace(of_positions=own.of_outputs @ P))
+    figures = {}
+    for name, value in figures_of_gains(spec, group, gains).items():
+        if base_of(name) not in EXACT:
+            figures[name] = (1 - BETWEEN if base_of(name) == "margin" else 1.0) * value
+    return figures
+
 
 JOINS = 1e-9  # of the largest entries of its row and column: smaller ones are rounding
 STEEP = 30.0  # cost of a bound's logarithm in that of the load error: far beyond what any bound is worth

@@ -8,7 +8,7 @@ from pathlib import Path
 from hypothesis import strategies as st
 
 from fuzz.oracle import Ended, line, observe
-from malta.cli.assignments import GENERAL
+from malta.cli.options import GENERAL
 
 GAINS = tuple(f"design/gains/{name}.json" for name in ("table2", "halbach", "tubular_pid"))
 PLACES = (

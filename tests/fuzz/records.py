@@ -22,8 +22,7 @@ from malta.proof.certificate import certificate, checked_file
 from malta.proof.certificate.check import check
 from malta.proof.uncertain import Compensator
 from malta.report import campaign_tables
-from malta.simulation.force_log import columns_of_log, read_log
-from malta.simulation.recording import record
+from malta.simulation.experiments.recording import columns_of_log, read_log, record
 from malta.tuning.search import Journal
 
 PATIENCE = 3.0  # s for the check of a certificate

@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 import malta
 from malta.gains.encodings import content_sha256
 from malta.machines.tubular import plant as tubular
+from malta.machines.tubular.drive import SIDES, attraction, potential
 from malta.machines.tubular.experiments.strokes import delayed_stroke
-from malta.machines.tubular.figure_13 import WAIT, Figure13, carried_weight, figure_13, radial_deviation
-from malta.machines.tubular.modules import SIDES, attraction, potential
-from malta.machines.tubular.unbalance import centre_of_gravity
+from malta.machines.tubular.further_claims import WAIT, Figure13, carried_weight, figure_13, radial_deviation
+from malta.machines.tubular.plant import centre_of_gravity
 from malta.model.data import plant_of
 from malta.model.parameters import acting_names, differences, values_of
 from malta.model.rigidbody import rotation

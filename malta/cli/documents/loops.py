@@ -2,18 +2,116 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+import re
+from collections.abc import Iterable, Mapping
+from operator import attrgetter
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, Self
 
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from malta.cli.documents.parts import UNIT, Files, Number, Part, Shares, with_keys
+from malta.units import distinct
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from malta.loops.recovery import Deviation, Recovery
+    from malta.loops.time_domain import Deviation, Recovery
     from malta.margins.loop_report import LoopReport
+    from malta.report.page.analysis import Analysis
+    from malta.report.page.comparison import Comparison
+
+
+# Parts that several documents share: ends of runs, shares of runs, files.
+
+
+Number = Annotated[float | None, Field(description="null where it is not finite, or where there is none")]
+Files = Annotated[list[str], Field(description="files that the command wrote")]
+Shares = Annotated[
+    dict[str, float],
+    Field(
+        description="half range of each parameter, as a share of it, or in SI for a difference or an offset"
+    ),
+]
+
+
+UNIT = re.compile(r"_(?:rad_per_s|rad|share|kg|s|N|A)$")  # at the end of a key
+
+
+class Part(BaseModel):
+    """A table of a document, which renders a record: a key has the record's field of its name, without its unit."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, populate_by_name=True, json_schema_serialization_defaults_required=True
+    )
+    READS: ClassVar[Mapping[str, str]] = {}  # keys of other names -> the field, as "run.verdict"
+
+    @classmethod
+    def fields_of(cls, record: Any) -> dict[str, Any]:
+        """What a record has of the keys."""
+        found = {}
+        for key in cls.model_fields:
+            path = cls.READS.get(key) or (key if hasattr(record, key) else UNIT.sub("", key))
+            if key in cls.READS or hasattr(record, path):
+                value = attrgetter(path)(record)
+                found[key] = value.tolist() if hasattr(value, "tolist") else value  # an array
+        return found
+
+    @classmethod
+    def of(cls, record: Any, **given: Any) -> Self:
+        """The table of a record; `given` are keys that it does not have, or has in another form."""
+        return cls.model_validate(cls.fields_of(record) | given)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, record: Any) -> Any:
+        return record if isinstance(record, Mapping | Part) else cls.fields_of(record)
+
+
+class End(Part):
+    """How a run ended, and when."""
+
+    name: str = Field(description='"completed", "diverged", "interrupted" or the contact that was touched')
+    time_s: Number
+
+
+class ShareOfRuns(Part):
+    """A share of runs with its 95 % interval (Clopper-Pearson)."""
+
+    passed: int
+    runs: int
+    share: Number
+    low: Number
+    high: Number
+
+
+class Labelled(Protocol):
+    """A figure of merit."""
+
+    @property
+    def identifier(self) -> str:
+        """Its key."""
+
+    @property
+    def value(self) -> float:
+        """SI."""
+
+
+def merits_of(merits: Iterable[Labelled]) -> dict[str, Number]:
+    """Figures of merit by their identifiers."""
+    listed = list(merits)
+    names = distinct(merit.identifier for merit in listed)
+    return {name: merit.value for name, merit in zip(names, listed, strict=True)}
+
+
+def words_of(label: str) -> str:
+    """A label as a key: `+ current loops` is current_loops."""
+    return "_".join(re.findall(r"\w+", label))
+
+
+def with_keys(table: Mapping[str, Any]) -> dict[str, Any]:
+    """A table whose keys are labels, with keys that are identifiers."""
+    return dict(zip(distinct(map(words_of, table)), table.values(), strict=True))
+
 
 Poles = list[tuple[float, float]]
 
@@ -244,3 +342,84 @@ def _recovery(found: Recovery) -> RecoveryPart:
         )
 
     return RecoveryPart.of(found, outputs={d.output: deviation(d) for d in found.outputs})
+
+
+# The documents of `malta report` and `malta compare`.
+
+
+class ReportOutput(Part):
+    """What `malta report --json` prints."""
+
+    kind: Literal["malta-report-output"] = Field(default="malta-report-output", alias="schema")
+    version: Literal[1] = 1
+    gains: str
+    design: str
+    figures: dict[str, Number] = Field(description="the figures of merit of the page, SI")
+    files: Files
+
+
+class ComparedDesign(Part):
+    """A design of a comparison."""
+
+    name: str = Field(description="the design's, or with a number where two have one name")
+    gains: str
+    machine: str
+    stable: bool
+
+
+class ComparedFigure(Part):
+    """A figure of merit of all designs."""
+
+    key: str
+    group: str
+    better: str | None = Field(description='"high" or "low"; null where neither is better')
+    values: list[Number] = Field(description="of each design, SI")
+    best: list[str] = Field(description="designs whose value is the better one; none of a tie")
+
+
+class CompareOutput(Part):
+    """What `malta compare --json` prints."""
+
+    kind: Literal["malta-compare-output"] = Field(default="malta-compare-output", alias="schema")
+    version: Literal[1] = 1
+    designs: list[ComparedDesign]
+    differences: dict[str, list[Any]] = Field(description="what the designs do not share, one entry a design")
+    figures: list[ComparedFigure]
+    remarks: list[str] = Field(description="what could not be compared, and why")
+    files: Files
+
+
+def report_output(gains: Path, analysis: Analysis, files: Iterable[Path]) -> ReportOutput:
+    """The document of a report."""
+    figures: dict[str, float | None] = {score.key: score.value for score in analysis.figures}
+    name = analysis.subject.controller.name
+    return ReportOutput(gains=str(gains), design=name, figures=figures, files=list(map(str, files)))
+
+
+def compare_output(found: Comparison, files: Iterable[Path]) -> CompareOutput:
+    """The document of a comparison."""
+    designs = [
+        ComparedDesign(name=name, gains=a.subject.source, machine=a.plant.name, stable=a.report.stable)
+        for name, a in zip(found.names, found.designs, strict=True)
+    ]
+    figures = [
+        ComparedFigure(
+            key=row.key,
+            group=row.group,
+            better=next(s for s in row.scores if s is not None).meaning.better or None,
+            values=[None if score is None else score.value for score in row.scores],
+            best=[name for name, best in zip(found.names, row.best, strict=True) if best],
+        )
+        for row in found.rows
+    ]
+    differences = {
+        row.key: [None if entry is None else entry.value for entry in row.entries]
+        for row in found.differences
+    }
+    return CompareOutput(
+        designs=designs,
+        differences=differences,
+        figures=figures,
+        remarks=list(found.remarks),
+        files=list(map(str, files)),
+    )

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from malta.cli.documents.parts import Files, Number, Part
+from malta.cli.documents.loops import Files, Number, Part
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from malta.loops.channels import ChannelMargins
+    from malta.loops.classical import ChannelMargins
     from malta.loops.curves import LoopCurves
     from malta.loops.linear_loops import Place
     from malta.loops.locus import RootLocus
-    from malta.synthesis.step_response import StepResponse
+    from malta.synthesis.recovery import StepResponse
 
 Line = Annotated[list[Number], Field(description="one number for each frequency, time or value")]
 Poles = Annotated[list[list[float]], Field(description="rows of real and imaginary part")]
@@ -265,7 +265,7 @@ def _poles_part(curves: LoopCurves) -> PolesPart:
 
 def _answers(curves: LoopCurves, kinds: Sequence[str], outputs: dict[str, int]) -> dict[str, Any]:
     """The answers to steps and loads."""
-    from malta.loops.steps import loop_steps
+    from malta.loops.time_domain import loop_steps
 
     found = loop_steps(curves.loop)
     made: dict[str, Any] = {}
@@ -289,7 +289,7 @@ def _answers(curves: LoopCurves, kinds: Sequence[str], outputs: dict[str, int]) 
 
 def _line(answer: StepResponse, output: int, column: int) -> dict[str, Any]:
     """A step response at POINTS times at most until it has settled, and the figures that are read off."""
-    from malta.loops.steps import step_figures
+    from malta.loops.time_domain import step_figures
 
     found = step_figures(answer, output, column)
     end = 1.6 * found.settling if 0 < found.settling < math.inf else float(answer.t[-1])

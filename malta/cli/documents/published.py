@@ -8,27 +8,30 @@ from typing import Any
 
 from malta.cli.documents.campaigns import (
     CampaignOutput,
+    DesignOutput,
     RareOutput,
+    SimulateOutput,
     SobolOutput,
     StatusOutput,
     ToleranceOutput,
 )
-from malta.cli.documents.identification import (
+from malta.cli.documents.loops import CompareOutput, Part, ReportOutput, VerifyOutput
+from malta.cli.documents.others import (
+    CheckOutput,
+    ClaimsOutput,
     ExciteOutput,
+    ExportOutput,
     IdentifyOutput,
     LearnOutput,
     LogOutput,
+    PilOutput,
     ReplayOutput,
+    TuneOutput,
 )
-from malta.cli.documents.loops import VerifyOutput
-from malta.cli.documents.others import CheckOutput, ClaimsOutput, ExportOutput, PilOutput, TuneOutput
-from malta.cli.documents.pages import CompareOutput, ReportOutput
-from malta.cli.documents.parts import Part
 from malta.cli.documents.plots import PlotOutput
-from malta.cli.documents.simulations import DesignOutput, SimulateOutput
 from malta.errors import InputError
 from malta.schemas import SCHEMAS
-from malta.schemas.parts import DRAFT
+from malta.schemas.files import DRAFT
 
 MODELS: dict[str, type[Part]] = {
     "design-output": DesignOutput,

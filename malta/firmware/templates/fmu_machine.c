@@ -84,7 +84,7 @@ static float polynomial(float x, const float *coefficients, int32_t degree) {
   return value;
 }
 
-/* A normal number of a stream, of which each counter gives two: see malta/simulation/noise.py, whose bits these are. */
+/* A normal number of a stream, of which each counter gives two: see malta/simulation/readings.py, whose bits these are. */
 static {{ name }}_real normal_number(uint64_t key, uint64_t number) {
   static const float logarithm[8] = { {{ logarithm }} };
   static const float cosine[5] = { {{ cosine }} };

@@ -9,18 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.machines.halbach import electronics, motor
+from malta.machines.halbach import electronics
+from malta.machines.halbach import electronics as motor
 from malta.machines.halbach.experiments.lift import LAWS, MOVE, move_reference, sound_moves
 from malta.machines.halbach.experiments.motions import COUNT, PAUSE, STEP, responses
 from malta.machines.halbach.experiments.open_loop import positions_at_rest
 from malta.machines.halbach.plant import Parameters
 from malta.margins.loop_report import LoopReport
+from malta.model.data import published_value
 from malta.model.linearize import LinearModel
-from malta.model.published import published_value
 from malta.report.ledger import case_merit, run_design
 from malta.simulation.experiments import Experiment, Progress
 from malta.synthesis.controller import Controller
-from malta.synthesis.sampled import sampled_model
+from malta.synthesis.kalman import sampled_model
 from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:

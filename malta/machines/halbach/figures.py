@@ -18,14 +18,15 @@ from malta.machines.halbach.experiments.lift import (
     lift_force,
 )
 from malta.machines.halbach.experiments.motions import BEFORE, PAUSE, responses
-from malta.report.figures.marks import draw_dots, draw_noisy
-from malta.report.figures.parts import (
+from malta.report.figures.drawing import (
     MORE,
     STYLES,
     Published,
     add_shared_legend,
     draw_bound,
+    draw_dots,
     draw_line,
+    draw_noisy,
     ending_text,
     finish_axes,
     merit_phrase,

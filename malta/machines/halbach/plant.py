@@ -26,8 +26,17 @@ from functools import partial
 import casadi as ca
 
 from malta.errors import InputError
-from malta.machines.halbach.electronics import MEAN_OF, current_delay, current_loop, electronics
-from malta.machines.halbach.motor import GAP, forces, motion, motor_constant, phase_currents
+from malta.machines.halbach.electronics import (
+    GAP,
+    MEAN_OF,
+    current_delay,
+    current_loop,
+    electronics,
+    forces,
+    motion,
+    motor_constant,
+    phase_currents,
+)
 from malta.model.parameters import check_parameters, si
 from malta.model.plant import (
     Actuator,

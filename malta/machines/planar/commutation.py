@@ -17,17 +17,15 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.machines.planar.coils import (
+from malta.machines.planar.field import (
     CoilModel,
+    Series,
+    Shape,
     Table,
     controller_model,
     model_of_order,
     shape_of,
     simulation_model,
-)
-from malta.machines.planar.field import (
-    Series,
-    Shape,
 )
 from malta.model.equations import Equation, note, recorded_equations, recording
 from malta.model.plant import (

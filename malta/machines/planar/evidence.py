@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.machines.planar import coils, commutation
+from malta.machines.planar import commutation
+from malta.machines.planar import field as coils
 from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
-from malta.machines.planar.experiments.jumps import SOFT, jump
 from malta.machines.planar.experiments.models import CURRENT, coil_wrench
-from malta.machines.planar.experiments.motions import steps_ahead
+from malta.machines.planar.experiments.motions import SOFT, jump, steps_ahead
 from malta.margins.loop_report import LoopReport
-from malta.model.published import published_value
+from malta.model.data import published_value
 from malta.report.ledger import (
     case_merit,
     merit,

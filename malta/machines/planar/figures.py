@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.report.figures.marks import draw_dots, draw_group
-from malta.report.figures.parts import (
+from malta.report.figures.drawing import (
     BOUND,
     STYLES,
     Published,
     add_shared_legend,
     draw_bound,
+    draw_dots,
+    draw_group,
     draw_line,
     draw_published,
     finish_axes,

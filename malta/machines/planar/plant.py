@@ -3,7 +3,7 @@
 Source: F. Xing, B. Kou, L. Zhang, X. Yin, Y. Zhou, "Design of a Control System for a Maglev Planar Motor Based on
 Two-Dimension Linear Interpolation", 2017; equation and table numbers are its own.
 State: x y z, the angles phi theta psi of eq. (7), and their rates. x, y lie in the plane of the magnets, gravity is
-along -z. The inputs are a wrench, from which commutation.py finds sixteen coil currents by a model of coils.py.
+along -z. The inputs are a wrench, from which commutation.py finds sixteen coil currents by a model of field.py.
 
 Heights: the plant's state z counts from the working height par.h, so that z = 0 is the air gap of Table 1. Coil models
 and the functions of a position p take the height of the coils' lower faces above the magnets, of a level mover.
@@ -19,7 +19,6 @@ from typing import Any
 import casadi as ca
 
 from malta.errors import InputError
-from malta.machines.planar.coils import CoilModel, shape_of, simulation_model
 from malta.machines.planar.commutation import (
     check_pitch,
     current_law,
@@ -30,7 +29,10 @@ from malta.machines.planar.commutation import (
 )
 from malta.machines.planar.field import (
     COIL_ORDER,
+    CoilModel,
     centre_of_force,
+    shape_of,
+    simulation_model,
 )
 from malta.model.parameters import check_parameters, si
 from malta.model.plant import (

@@ -33,8 +33,8 @@ from malta.machines.tubular.evidence import (
 )
 from malta.machines.tubular.evidence import evidence as evidence
 from malta.machines.tubular.experiments.strokes import SETTLE
-from malta.machines.tubular.figure_13 import ROWS as FIGURE_13
 from malta.machines.tubular.further_claims import BRAKE, CAPTURE, MEANS, RULE_OF_THUMB
+from malta.machines.tubular.further_claims import ROWS as FIGURE_13
 from malta.report.ledger import (
     ZONE_NOTE,
     Row,

@@ -12,16 +12,15 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import stdtrit
 
-from malta.campaigns.yields import Yields, main_campaign, yields_of
+from malta.campaigns.run import Yields, main_campaign, yields_of
 from malta.loops.loop import loop_of_model
-from malta.loops.noise import noise_of
-from malta.loops.recovery import PLACES, Deviation, recovery
-from malta.machines.tubular.experiments.rest import hold
+from malta.loops.time_domain import PLACES, Deviation, noise_of, recovery
+from malta.machines.tubular.experiments.disturbances import hold
 from malta.machines.tubular.experiments.strokes import delayed_stroke
 from malta.margins.loop_report import LoopReport
-from malta.margins.stages import compensators
+from malta.margins.verify import compensators
+from malta.model.data import published_value
 from malta.model.linearize import LinearModel, linearize
-from malta.model.published import published_value
 from malta.proof.machine.parametric_plants import of_plant
 from malta.proof.robust import robust_margin
 from malta.report.ledger import (
@@ -29,11 +28,11 @@ from malta.report.ledger import (
     proven_share,
     run_design,
 )
-from malta.simulation.catalogue import experiment
-from malta.simulation.compiled import compiler
+from malta.simulation.current_control import link_voltage, open_loop_gain
+from malta.simulation.engine.compiled import compiler
 from malta.simulation.experiments import Experiment, Progress
-from malta.simulation.inverter import link_voltage, open_loop_gain
-from malta.simulation.payload import flown_payload, held_payload, largest_mass
+from malta.simulation.experiments.bounds import flown_payload, held_payload, largest_mass
+from malta.simulation.experiments.catalogue import experiment
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import StrokeFigures, stroke_figures

@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from malta.machines.tubular.capture_figure import capture_figure
-from malta.machines.tubular.carrier_figure import carrier_figure
-from malta.machines.tubular.commissioning_figure import commissioning_figure, supervised_faults_figure
-from malta.machines.tubular.experiments.rest import RESTING
-from malta.machines.tubular.recording_figure import recording_figure
+from malta.machines.tubular.experiment_figures import (
+    capture_figure,
+    carrier_figure,
+    commissioning_figure,
+    recording_figure,
+    supervised_faults_figure,
+)
+from malta.machines.tubular.experiments.disturbances import RESTING
 from malta.model.data import plant_of
-from malta.report.figures.marks import draw_dots, draw_group, draw_histograms, draw_largest, draw_spreads
-from malta.report.figures.parts import (
+from malta.report.figures.drawing import (
     BOUND,
     CROSS,
     DOT,
@@ -29,8 +31,13 @@ from malta.report.figures.parts import (
     add_shared_legend,
     clearance,
     draw_bound,
+    draw_dots,
+    draw_group,
+    draw_histograms,
+    draw_largest,
     draw_line,
     draw_published,
+    draw_spreads,
     end_of,
     ended_early,
     ending_text,

@@ -3,7 +3,7 @@
 Source: S. Miric et al., IEEE Trans. Ind. Electron. 68(1), 2021; equation and table numbers are its own.
 State: x y z, the Cardan angles alpha beta gamma, and their rates. The mover's axis is z, gravity is along -y.
 Two modules act at z = -l_B and z = +l_B, two radial sensor planes sit at z = -l_S and z = +l_S. Modules that differ and
-a mover out of balance are those of modules.py and unbalance.py.
+a mover out of balance are those of drive.py and plant.py.
 """
 
 from __future__ import annotations
@@ -15,17 +15,16 @@ from typing import Any
 
 import casadi as ca
 
-from malta.machines.tubular.drive import drive
-from malta.machines.tubular.modules import (
+from malta.machines.tubular.drive import (
     SIDES,
     attraction,
     bearing_constants,
     difference_of_attraction,
+    drive,
+    hall_position,
     levers,
     potential,
 )
-from malta.machines.tubular.unbalance import centre_of_gravity, second_derivative
-from malta.machines.tubular.windings import hall_position
 from malta.model.parameters import check_parameters, si
 from malta.model.plant import (
     Actuator,
@@ -44,6 +43,28 @@ from malta.model.rigidbody import (
     rotation,
 )
 from malta.model.sensors import late_sensors
+
+# The mover's centre of gravity off its axis, by c = (c_x, c_y, 0) in frame R.
+#
+# The position x y z is that of the point A of the mover's axis, the axis of its magnets and the one that the sensors
+# see. The centre of gravity O is off it by r = R_IR c, so with F at the axis, moments T_A about A, and w at O
+#
+#     m (A'' + r'') = F + w,     I omega' + omega x I omega = T_A - r x F + w_T.
+#
+# Two effects remain of an unbalance on a mover that is not driven round: thrust along the axis tilts the mover by
+# the torque c x f_D, and the weight hangs below the axis: the mover rolls as a pendulum of the frequency
+# sqrt(m g |c| / I_zz). A principal axis that is tilted against the axis of the magnets acts only through products of
+# angular rates, so it is left out.
+
+
+def centre_of_gravity(par: Parameters, q_r: Any, trig: Trig = EXACT) -> Any:
+    """r = R_IR c: from the mover's axis to its centre of gravity, in frame I, m."""
+    return rotation(q_r, trig).T @ ca.vertcat(par.c_x, par.c_y, 0)
+
+
+def second_derivative(r: Any, q: Any, dq: Any, ddq: Any) -> Any:
+    """r'' of an expression r of q; q and dq are CasADi SX symbols."""
+    return ca.jtimes(ca.jtimes(r, q, dq), q, dq) + ca.jtimes(r, q, ddq)
 
 
 @dataclass(frozen=True)

@@ -8,42 +8,368 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from malta.display import Description, display, quantity
 from malta.errors import InputError
+from malta.processes import on_one_thread
 from malta.proof.blocks.blocks import (
     At,
     Block,
     Channels,
     Dynamic,
+    Expanded,
+    Weight,
     blocks_of,
     channels_of,
+    check_blocks,
+    probe,
     shape_of,
+    weight_of,
 )
-from malta.proof.blocks.dynamic import (
-    SEARCH,
-    Blocks,
-    check_effort,
-    question_of,
+from malta.proof.blocks.polydisc import Part, Size, is_zero_free, parts_of
+from malta.proof.blocks.transfer import (
+    Peak,
+    Signals,
+    climb,
+    frequencies,
+    mu_bound,
+    patterns,
+    performance,
+    transfer,
 )
-from malta.proof.blocks.peaks import Peak, climb, patterns
-from malta.proof.blocks.polydisc import is_zero_free
-from malta.proof.blocks.transfer import performance
-from malta.proof.blocks.weight import weight_of
-from malta.proof.margin import unproven
+from malta.proof.box import Box, box_of, within_branches
+from malta.proof.families import is_nominal_stable
+from malta.proof.groups import loop_of
+from malta.proof.loss import first_loss
+from malta.proof.margin import Margin, unproven
 from malta.proof.polynomial.enclosure import Unproven
-from malta.proof.robust import deadline
-from malta.proof.uncertain import Compensator, UncertainSystem
-from malta.threads import on_one_thread
+from malta.proof.problem import OfLoop
+from malta.proof.responses import responses
+from malta.proof.robust import deadline, law_of, problem_of
+from malta.proof.time_limit import TimeUp, time_limit
+from malta.proof.uncertain import Compensator, UncertainSystem, positive
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
     from malta.proof.margin import Ranges
+
+
+# Unmodelled dynamics beside real parameters: stable blocks Delta_k with |Delta_k(jw)| <= t |W_k(jw)|.
+#
+# The loop loses stability at the smallest t with det(1 - M(jw; p) Delta) = 0 for some p of box(t), some Delta of that
+# size and some frequency; for one block alone that is |W M| = 1 / t. polydisc.py proves the determinant free of zeros
+# for smaller t.
+
+
+DYNAMIC_TOLERANCE = 1e-3
+DYNAMIC_STEPS = (
+    1,
+    3,
+    10,
+    30,
+    100,
+    300,
+    1000,
+    3000,
+    10_000,
+)  # bounds that are tried, in multiples of the tolerance
+ROUNDS = 3
+ROUNDS_OF_SECANT = 40
+SEARCH = 0.4  # share of the time for the search of a loss; the rest is for the proof
+
+
+@on_one_thread
+def dynamic_margin(
+    system: UncertainSystem,
+    compensator: Compensator | Any,
+    ranges: Ranges,
+    dynamic: Dynamic | Sequence[Dynamic],
+    over: Mapping[str, tuple[float, float]] | None = None,
+    *,
+    tolerance: float = DYNAMIC_TOLERANCE,
+    time: float | None = None,
+) -> Margin:
+    """Prove how far real parameters and blocks of unmodelled dynamics may deviate together before the loop is unstable.
+
+    The weights of the blocks grow with t as the ranges of the parameters do. This is robstab with ureal and ultidyn.
+
+    system : the uncertain system, from `malta.uncertain`
+    compensator : u = F y (positive feedback): a Compensator, a control.StateSpace, or a gain matrix
+    ranges : of the parameters, as in `malta.robust_margin`; may be empty
+    dynamic : a block, or up to four that act in this order, at most one of them full
+    over : intervals that do not grow with t, in SI
+    tolerance : relative distance between the proven bound and the loss that was found
+    time : s, longest search, which then returns the bounds found so far; None: 120
+
+    Returns a Margin. `witness` holds the parameters; the blocks' sizes there are `t |W|` at `frequency`.
+
+    Raises InputError as `malta.robust_margin` does, for channels that the loop does not have and for invalid weights.
+
+    >>> import malta
+    >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
+    >>> found = malta.dynamic_margin(motor, [[-2.0]], {}, malta.Dynamic(0.5))
+    >>> round(found.upper, 3)  # |T| = 2 / 3 at w = 0
+    3.0
+    """
+    begun = clock.monotonic()
+    law, box = question_of("dynamic_margin", system, compensator, ranges, over)
+    check_effort("dynamic_margin", tolerance, time)
+    blocks = blocks_of(system, dynamic, "dynamic_margin")
+    if not blocks:
+        raise InputError("dynamic_margin", "dynamic", "no block", "at least one malta.Dynamic")
+    asked = Blocks.of(system, law, box, blocks, "dynamic_margin")
+    if asked.unstable():
+        reason = "the nominal loop is unstable"
+        return Margin(0.0, 0.0, None, None, {}, {}, (), clock.monotonic() - begun, reason)
+    until = deadline(begun, time)
+    with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
+        lost = _loss(asked, begun + SEARCH * (until - begun))
+        t = math.inf if lost is None else _size(asked, lost)
+        lower, reason = _prove_dynamic(asked, min(t, asked.box.limit), tolerance, until)
+    spent, names = clock.monotonic() - begun, box.names
+    if lost is None:
+        return Margin(lower, math.inf, None, None, {}, {}, (), spent, reason, box.searched)
+    witness = dict(zip(names, lost.p.tolist(), strict=True))
+    moved = dict(zip(names, (lost.p - box.nominal).tolist(), strict=True))
+    return Margin(lower, t, lost.frequency, witness, moved, {}, (), spent, reason)
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """A loop with complex blocks, over a box of parameters."""
+
+    system: UncertainSystem
+    law: Compensator
+    box: Box
+    blocks: tuple[Block, ...]
+    problem: OfLoop  # without the blocks
+    with_blocks: OfLoop  # whose last parameters are entries of these blocks, perhaps among those of others
+    entries: tuple[list[int], ...]  # of each block: their numbers
+
+    @classmethod
+    def of(
+        cls, system: UncertainSystem, law: Compensator, box: Box, blocks: Sequence[Block], where: str
+    ) -> Blocks:
+        """The loop of a system and a compensator with blocks.
+
+        Raises InputError for blocks that cannot be combined.
+        """
+        check_blocks(blocks, where)
+        problem = problem_of(system, law)
+        scaled = tuple(_scale_probe(system, law, box.nominal, b, problem) for b in blocks)
+        first, one = len(system.names), scaled[0]
+        if len(scaled) == 1 and one.kind in ("multiplicative", "feedback") and not one.full:
+            return cls(
+                system,
+                law,
+                box,
+                scaled,
+                problem,
+                _in_each_channel(system, law, one.at),
+                ([first + one.rows[0]],),
+            )
+        ends = np.cumsum([first, *(len(b.entries) for b in scaled)]).tolist()
+        entries = tuple(list(range(*pair)) for pair in pairwise(ends))
+        more, wider = probe(system, law, scaled)
+        return cls(system, law, box, scaled, problem, OfLoop(loop_of(more, wider), more.names), entries)
+
+    def unstable(self) -> bool:
+        """Whether the nominal loop is unstable anywhere in the intervals that do not grow."""
+        return bool((self.problem.instability(self.box.nominal_places()) >= 0).any())
+
+    def transfer(self, p: FloatArray, w: FloatArray) -> ComplexArray:
+        """M at parameters p and frequencies w (rad/s), its rows times the blocks' weights: k x columns x rows.
+
+        p : one row, or a row for each frequency
+        """
+        if p.ndim == 1 and len(w) > 1:
+            found = _signals_on_grid(self.system, self.law, p.tobytes(), w.tobytes())
+        else:
+            found = Signals(responses(self.system, self.law, p, w))
+        M = transfer(found, self.blocks)
+        scale = np.array([b.weight.at(w) for b in self.blocks for _ in b.columns])
+        return np.asarray(M * scale.T[:, :, None])
+
+    def stable(self) -> bool:
+        """Whether the nominal loop is proven stable."""
+        return is_nominal_stable(self.problem, self.box)
+
+    def sizes(self, share: float) -> list[Size]:
+        """The size of each block on cells, as a function: share times its weight."""
+        T = self.law.sample_time
+
+        def on(weight: Weight, cells: FloatArray, scale: int) -> Expanded:
+            return weight.on(cells, scale, T).times(share)
+
+        return [partial(on, b.weight) for b in self.blocks]
+
+    def parts(self, reach: float, shares: Sequence[float], until: float) -> list[Part]:
+        """The groups' polynomials over box(reach), for blocks of these shares of their weights.
+
+        Raises Unproven when they cannot be enclosed.
+        """
+        most = [share * b.weight.most for share, b in zip(shares, self.blocks, strict=True)]
+        try:
+            with time_limit(until):
+                blocks = list(zip(self.blocks, self.entries, strict=True))
+                return parts_of(self.with_blocks, blocks, self.box, reach, most, until)
+        except TimeUp as error:
+            raise Unproven("time was up before the coefficients were found") from error
+
+    def starts(self, t: float, chosen: FloatArray) -> list[FloatArray]:
+        """The parameters in box(t) at relative places `chosen` (rows, -1 to 1)."""
+        sides = self.box.near_sides(t)
+        return [sides.mean(axis=1) + x * (sides[:, 1] - sides[:, 0]) / 2 for x in chosen]
+
+
+@lru_cache(maxsize=64)  # searches of several gains begin at the same places; records compare by identity
+def _signals_on_grid(system: UncertainSystem, law: Compensator, p: bytes, w: bytes) -> Signals:
+    return Signals(responses(system, law, np.frombuffer(p), np.frombuffer(w)))
+
+
+@lru_cache(maxsize=8)  # gains of several channels need the same families; records compare by identity
+def _in_each_channel(system: UncertainSystem, law: Compensator, at: At) -> OfLoop:
+    """The loop with a block 1 + Delta in each channel at the sensors or at the forces."""
+    count = dict(zip(("sensors", "forces"), shape_of(system), strict=True))[at]
+    one = weight_of(1.0, "probe")
+    more, wider = probe(system, law, [Block("feedback", at, (i,), (i,), one) for i in range(count)])
+    return OfLoop(loop_of(more, wider), more.names)
+
+
+def _scale_probe(
+    system: UncertainSystem, law: Compensator, nominal: FloatArray, b: Block, problem: OfLoop
+) -> Block:
+    """A block with its unit scaled by a power of two to about the loop's own gain."""
+    if b.kind in ("multiplicative", "feedback"):
+        return b
+    M = transfer(Signals(responses(system, law, nominal, frequencies(problem, nominal))), [b])
+    size = float(np.abs(M[np.isfinite(M)]).max(initial=0.0))
+    return replace(b, unit=2.0 ** -min(max(round(1 + math.log2(size)), -500), 500)) if size > 0 else b
+
+
+def question_of(
+    caller: str, system: Any, compensator: Any, ranges: Any, over: Any
+) -> tuple[Compensator, Box]:
+    """The compensator as a record, and the box. Raises InputError as robust_margin does."""
+    law = law_of(system, compensator, caller)
+    none = {} if over is None else over
+    box = box_of(system.names, system.nominal, system.limits, ranges, none, empty=True, caller=caller)
+    box = within_branches(box, system.positive)
+    if not box.most > 0:
+        raise InputError(caller, "over", f"intervals within which {box.ends}", "narrower ones")
+    return law, box
+
+
+def check_effort(caller: str, tolerance: Any, time: Any) -> None:
+    """Raise InputError unless the tolerance lies between 0 and 1 and the time is positive or None."""
+    positive(caller, "tolerance", tolerance, below=1.0)
+    if time is not None:
+        positive(caller, "time", time, endless=True)
+
+
+def _size(asked: Blocks, place: Peak) -> float:
+    """The smallest t whose box and blocks contain the parameters and blocks of a peak."""
+    return max(float(asked.box.margin(place.p)), 1 / place.value if place.value > 0 else math.inf)
+
+
+def _loss(asked: Blocks, until: float) -> Peak | None:
+    """The peak at the smallest t for which a loss of stability was found; None within the limits of the parameters."""
+    box, every = asked.box, patterns(len(asked.box.names))
+    seen: list[Peak] = []
+
+    def value(p: FloatArray, w: FloatArray) -> FloatArray:
+        return mu_bound(asked.transfer(p, w), asked.blocks)[0]
+
+    def peak(t: float, chosen: FloatArray) -> Peak:
+        starts = [box.nominal, *asked.starts(t, chosen)]
+        found = climb(value, asked.problem, box.near_sides(t), starts, until)
+        seen.append(found)
+        return found
+
+    def nearest() -> Peak:
+        return min(seen, key=lambda place: _size(asked, place))
+
+    peak(0.0, every)
+    if (box.down + box.up).any():
+        high = min(_size(asked, nearest()), asked.box.limit)
+        if (asked.problem.instability(np.array(asked.starts(high, every))) >= 0).any():
+            with time_limit(until):
+                t, w, p = first_loss(asked.problem, box, high)  # by the parameters alone
+            if p is not None and w is not None:
+                seen.append(Peak(1 / t, w, p))
+                high = t
+        top = peak(high, every)
+        for _ in range(ROUNDS):
+            if top.value * high < 1 or clock.monotonic() > until:
+                break
+            _narrow(peak, high, _pattern(box, high, top.p), until)
+            high = _size(asked, nearest())
+            top = peak(high, every)
+            if top.value * high < 1 + 1e-9:
+                break
+    best = nearest()
+    return best if math.isfinite(_size(asked, best)) else None
+
+
+def _narrow(peak: Callable[[float, FloatArray], Peak], high: float, chosen: FloatArray, until: float) -> None:
+    """Search the t with t |M| = 1 below `high`, where t |M| > 1, by secants in log t."""
+
+    def excess(x: float) -> float:
+        return math.log(max(peak(math.exp(x), chosen).value, 1e-300)) + x
+
+    above = math.log(high)
+    below = above - math.log(2)
+    at_above, at_below = excess(above), excess(below)
+    while at_below >= 0 and clock.monotonic() < until:
+        above, at_above = below, at_below
+        below -= math.log(2)
+        at_below = excess(below)
+    for _ in range(ROUNDS_OF_SECANT):
+        if not at_below < 0 <= at_above or above - below < 1e-11 or clock.monotonic() > until:
+            return
+        share = min(max(at_above / (at_above - at_below), 0.02), 0.98)
+        x = above - share * (above - below)
+        here = excess(x)
+        if here < 0:
+            below, at_below, at_above = x, here, at_above / 2
+        else:
+            above, at_above, at_below = x, here, at_below / 2
+        if abs(here) < 1e-10:
+            return
+
+
+def _pattern(box: Box, t: float, p: FloatArray) -> FloatArray:
+    """The relative place of p in box(t), -1 to 1, and the middle: two rows."""
+    sides = box.near_sides(t)
+    half = (sides[:, 1] - sides[:, 0]) / 2
+    x = np.where(half > 0, (p - sides.mean(axis=1)) / np.where(half > 0, half, 1), 0)
+    return np.array([np.clip(x, -1, 1), 0 * x])
+
+
+def _prove_dynamic(asked: Blocks, upper: float, tolerance: float, until: float) -> tuple[float | None, str]:
+    """The largest t for which stability is proven, and the reason when there is none."""
+    parts: list[Part] = []
+    reason = ""
+    for step in DYNAMIC_STEPS:
+        if clock.monotonic() > until:
+            break
+        t = upper / (1 + step * tolerance)
+        try:
+            parts = parts or asked.parts(t, [t] * len(asked.blocks), until)
+        except Unproven as error:
+            reason = str(error)
+            continue
+        if is_zero_free(parts, t, asked.sizes(t), until)[0]:
+            return (t, "") if asked.stable() else (None, "the nominal loop is not proven stable")
+    return None, reason or "not settled"
+
 
 Of = Literal["sensitivity", "complementary", "compliance", "effort"]
 

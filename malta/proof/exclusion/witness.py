@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from malta.proof.exclusion.exclusion import Growth
-from malta.proof.exclusion.frequency import cover
+from malta.proof.exclusion.exclusion import Cell, Growth, cover
 from malta.proof.polynomial.family import Family, basis
 from malta.proof.time_limit import is_late
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
+
 
 STEPS = 8  # of the frequency grid in an octave
 SPACING = 0.6 / STEPS  # half a step and more, in ln w
@@ -179,3 +180,247 @@ def gradients(f: Family, zero: Zero) -> tuple[ComplexArray, complex]:
     rows, along = rows_and_slopes(f, zero.branch, np.array([zero.x]))
     by_x = complex((along @ a)[0]) * (-1 if zero.branch else 1)
     return np.asarray((rows @ slopes.T)[0]), by_x
+
+
+# The descent to the nearest loss of stability: the smallest t with a(jw; p) = 0 for some w and some p in box(t).
+#
+# A root x of a(jx; p) is followed as p moves. Its angle Im ln x is zero on the boundary of stability and a smooth
+# function of p: one real equation. Each step linearizes this equation and finds in closed form the smallest t that
+# solves it within a trust region: Newton's method, which uses its free directions to reduce t. At w = 0 and at
+# infinity (the Nyquist frequency) the equation is that of one real coefficient.
+
+
+MOST = 60  # steps of a descent
+BEYOND = 1.2  # a descent ends beyond this multiple of the smallest t known
+CLOSE = 1e-9  # relative gain of a step below which a descent ends
+FAR = 1.5  # |change of ln x| beyond which a root counts as another one
+NEAR = 0.3  # |change of ln x| within which a root belongs to its start
+
+
+class _Place(NamedTuple):
+    """A root at u, or an end of the frequencies: value + moved du = 0 is the linearized equation."""
+
+    x: complex
+    u: FloatArray
+    t: float
+    value: float
+    moved: FloatArray
+
+
+def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: float) -> Zero | None:
+    """Descend from a start to a zero of f of smallest t; None when none with t below `below` is found."""
+    here = _find_root(f, g, branch, x, u, below)
+    trust, widest, best = 0.5, 1.0, None
+    for k in range(MOST if here is not None else 0):
+        assert here is not None
+        if is_late():
+            break
+        found = _smallest_step(f, g, here, trust)
+        if found is None:  # nothing within the trust region solves the equation
+            if trust >= widest:
+                break
+            trust = min(2 * trust, widest)
+            continue
+        t, cost, du = found
+        left = here.t + cost * abs(here.value) - t
+        if (k > 2 and t > BEYOND * below) or t - 3 * left > below:
+            break
+        there = _follow_root(f, g, branch, here.x, np.clip(here.u + du, 0, 1))
+        gain = -np.inf if there is None else left - (there.t + cost * abs(there.value) - t)
+        if abs(here.value) < 1e-9:
+            zero = _as_zero(f, branch, here)
+            best = zero if zero is not None and (best is None or zero.t < best.t) else best
+            if zero is not None and left <= CLOSE * here.t:
+                break
+        if there is None or gain < 0.1 * left:
+            trust = widest = min(trust, float(np.abs(du).max(initial=0.0))) / 3
+            if trust < 1e-8:
+                break
+            continue
+        here, widest = there, 1.0
+        if gain > 0.6 * left:
+            trust = min(2 * trust, 1.0)
+    return best if best is None or best.t < below else None
+
+
+def _as_zero(f: Family, branch: int, here: _Place) -> Zero | None:
+    """The place as a zero if f vanishes there to rounding, else None."""
+    x = abs(here.x)
+    a, _ = coefficients_at(f, here.u)
+    rows, _ = rows_and_slopes(f, branch, x)
+    small = _modulus(complex((rows @ a)[0])) <= 1e-11 * float((np.abs(rows) @ f.size())[0])
+    return Zero(here.t, branch, x, here.u) if small else None
+
+
+def _find_root(f: Family, g: Growth, branch: int, x: complex, u: FloatArray, below: float) -> _Place | None:
+    """The root next to x if it is near the boundary, else one near a place that the linearized equation leads to."""
+    if x == 0:
+        return _follow_root(f, g, branch, 0.0, u)
+    for _ in range(12):
+        here = _follow_root(f, g, branch, x, u, NEAR)
+        if here is not None:
+            return here
+        a, slopes = coefficients_at(f, u)
+        rows, along = rows_and_slopes(f, branch, x)
+        value, turned, moved = complex((rows @ a)[0]), complex((along @ a)[0]), (rows @ slopes.T)[0]
+        turn = np.conj(1j * turned)
+        t = float(g.margin(g.parameters(u)))
+        place = _Place(x, u, t, float((turn * value).real), (turn * moved).real)
+        found = _smallest_step(f, g, place, 0.5)
+        if found is None or found[0] > below:
+            return None
+        u = np.clip(u + found[2], 0, 1)
+        x *= float(np.exp(np.clip(-((value + moved @ found[2]) / turned).real, -0.5, 0.5)))
+    return None
+
+
+def _follow_root(
+    f: Family, g: Growth, branch: int, x: complex, u: FloatArray, far: float = FAR
+) -> _Place | None:
+    """The root next to x at u, by Newton's method in ln x; None when ln x changes by more than `far`."""
+    a, slopes = coefficients_at(f, u)
+    t = float(g.margin(g.parameters(u)))
+    if x == 0:
+        rows, _ = rows_and_slopes(f, branch, 0.0)
+        value, moved = float((rows @ a).real[0]), (rows @ slopes.T).real[0]
+        scale = max(float(np.abs(moved).max(initial=0.0)), 1e-300)
+        return _Place(0.0, u, t, value / scale, moved / scale)
+    first = x
+    for _ in range(15):
+        rows, along = rows_and_slopes(f, branch, complex(x))
+        turned = complex((along @ a)[0])
+        step = complex((rows @ a)[0]) / turned if turned else np.inf
+        if not np.isfinite(step) or abs(np.log(x / first)) > far:
+            return None
+        x = x * np.exp(-step if abs(step) < 0.5 else -0.5 * step / abs(step))
+        if abs(step) < 1e-9:  # the next step would be below rounding
+            moved = -(rows @ slopes.T)[0] / turned
+            return _Place(complex(x), u, t, float(np.angle(x)), moved.imag)
+    return None
+
+
+class _Sides(NamedTuple):
+    """The sides of box(t) seen from u: middle - t below <= du <= middle + t above on the axes that grow."""
+
+    grows: Any
+    middle: FloatArray
+    below: FloatArray
+    above: FloatArray
+
+
+def _sides(g: Growth, u: FloatArray, free: Any) -> _Sides:
+    slope, grows = g.slopes(u), g.grows & free
+    unit = np.where(slope == 0, 1, slope)
+    below, above = np.where(unit > 0, g.down, g.up), np.where(unit > 0, g.up, g.down)
+    return _Sides(grows, (g.nominal - g.parameters(u)) / unit, below / np.abs(unit), above / np.abs(unit))
+
+
+def _smallest_step(
+    f: Family, g: Growth, here: _Place, trust: float
+) -> tuple[float, float, FloatArray] | None:
+    """The smallest t whose box contains a solution du of the linearized equation, t per unit of the value, and du.
+
+    The equation is s du = h, and the largest s du in box(t) is piecewise linear in t. None: no t solves it.
+    """
+    free = np.array([n > 1 for n in f.shape], dtype=bool)
+    u, sides = here.u, _sides(g, here.u, free)
+    low, high = np.where(free, np.maximum(-trust, -u), 0), np.where(free, np.minimum(trust, 1 - u), 0)
+    h, s = -here.value, np.where(free, here.moved, 0)
+    s = np.where(np.abs(s) > 1e-12 * np.abs(s).max(initial=0.0), s, 0)
+    grows, middle, below, above = sides
+    with np.errstate(all="ignore"):
+        outside = np.where(
+            middle > high, (middle - high) / below, np.where(middle < low, (low - middle) / above, 0)
+        )
+    t = float(np.where(grows, outside, 0).max(initial=0.0))
+    if not t < np.inf:
+        return None
+
+    def end(t: float, s: FloatArray) -> FloatArray:
+        """du of the largest s du in box(t)."""
+        top = np.where(grows, np.minimum(high, middle + t * above), high)
+        bottom = np.where(grows, np.maximum(low, middle - t * below), low)
+        rest = np.clip(np.where(grows, middle, 0), bottom, top)  # axes without effect stay nominal, or at u
+        return np.asarray(np.where(s > 0, top, np.where(s < 0, bottom, rest)))
+
+    most, least = end(t, s), end(t, -s)
+    if s @ most < h:
+        t, du = _grow_box(t, s, h, end, sides, (low, high))
+    elif s @ least > h:
+        t, du = _grow_box(t, -s, -h, end, sides, (low, high))
+    else:
+        span = float(s @ (most - least))
+        du = least + (most - least) * ((h - s @ least) / span if span > 0 else 0.5)
+    if not t < np.inf:
+        return None
+    pull = float(np.where(grows, np.abs(s) * np.minimum(below, above), 0).sum())
+    return t, 2 / max(pull, 1e-9), du
+
+
+def _grow_box(
+    t: float, s: FloatArray, h: float, end: Any, sides: _Sides, room: tuple[FloatArray, FloatArray]
+) -> tuple[float, FloatArray]:
+    """The smallest t whose box contains a du with s du = h; infinite when the trust region ends before."""
+    (low, high), (grows, middle, below, above) = room, sides
+    with np.errstate(all="ignore"):
+        full = np.where(
+            s > 0, (high - middle) / above, (middle - low) / below
+        )  # t at which an axis reaches the trust region
+        rate = np.where(grows & (s != 0), np.abs(s) * np.where(s > 0, above, below), 0)
+    for stop in [*np.sort(full[(rate > 0) & (full > t)]).tolist(), np.inf]:
+        pull = float(rate[full > t].sum())
+        missing = h - float(s @ end(t, s))
+        if pull > 0 and t + missing / pull <= stop:
+            t += missing / pull
+            return t, end(t, s)
+        t = stop
+        if not np.isfinite(t):
+            break
+    return np.inf, np.zeros(len(s))
+
+
+def from_cell(f: Family, g: Growth, cell: Cell, below: float) -> Zero | None:
+    """A zero with t below `below` in a cell that resists: the zero next to its middle, and the descent from there."""
+    low, high = cell.interval
+    u, best = cell.box.mean(axis=1), None
+    for x in ((low + high) / 2, *([0.0] if low == 0 else [])):
+        near = project(f, g, cell.branch, x, u)
+        if near is not None and near.t < (best.t if best is not None else below):
+            best = near
+    if best is None:
+        return None
+    if best.t <= 1.01 * cell.smallest:
+        return best
+    further = nearest(f, g, best.branch, best.x, best.u, best.t)
+    return further if further is not None and further.t < best.t else best
+
+
+def project(f: Family, g: Growth, branch: int, x: float, u: FloatArray) -> Zero | None:
+    """The zero next to a place, by Newton's method with steps of least norm; None when it leaves the box."""
+    free = np.array([n > 1 for n in f.shape])
+    for _ in range(30):
+        a, slopes = coefficients_at(f, u)
+        rows, along = rows_and_slopes(f, branch, x)
+        value, size = complex((rows @ a)[0]), float((np.abs(rows) @ f.size())[0])
+        if _modulus(value) <= 1e-12 * size:
+            return Zero(float(g.margin(g.parameters(u))), branch, x, u)
+        moved, turned = (rows @ slopes.T)[0] * free, complex((along @ a)[0])
+        columns = moved if x == 0 else np.append(moved, turned)
+        J = columns.real[None] if x == 0 else np.array([columns.real, columns.imag])
+        right = np.array([value.real]) if x == 0 else np.array([value.real, value.imag])
+        if not (np.isfinite(J).all() and np.isfinite(right).all()):
+            return None
+        step = -np.linalg.lstsq(J / size, right / size, rcond=1e-12)[0]
+        if np.abs(step).max() > 0.5:
+            return None
+        u = u + step[: len(u)]
+        if (u < -1e-9).any() or (u > 1 + 1e-9).any():
+            return None
+        u = np.clip(u, 0, 1)
+        x = x if x == 0 else x * float(np.exp(step[-1]))
+    return None
+
+
+def _modulus(z: complex) -> float:
+    """|z|; infinite on overflow, for which abs() raises an error."""
+    return math.hypot(z.real, z.imag)

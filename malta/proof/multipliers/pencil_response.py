@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from malta.proof.multipliers.expansion import EPS, Expansion
 from malta.proof.multipliers.multipliers import Blocks, Multiplier
+from malta.proof.multipliers.pencil import EPS, Expansion
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray

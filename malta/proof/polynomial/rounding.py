@@ -2,7 +2,7 @@
 
 On the boundary of stability the loop is M = diag(M_k) + e with small e. det M is not zero where the row sums of
 |diag(M_k)^-1 e| are below one: where |det M_k| > sum_i |cofactor_ij| e_i for every k and column j, e_i row sums of e.
-The sum is the determinant of M_k with e in column j. It is bounded like coefficients (majorant.py) and becomes part of
+The sum is the determinant of M_k with e in column j. It is bounded like coefficients (closed_loop.py) and becomes part of
 the radius of det M_k. Lag, hold and delay have |h| <= 1 there and are left out of M.
 """
 
@@ -29,7 +29,7 @@ from malta.proof.groups import (
     hold_bounds,
     upper,
 )
-from malta.proof.polynomial.majorant import coefficient_bounds
+from malta.proof.polynomial.closed_loop import coefficient_bounds
 from malta.proof.polynomial.rational import Ratio, Symbolic, value
 from malta.proof.uncertain import Group
 

@@ -4,7 +4,7 @@
 
 B is close to a diagonal of monomials b_i(p). Z and E are the stiffness of currents at another place than that of their
 commutation; Z is the lower left block of A = [[0, 1], [Z, 0]] in `jacobians`. The matrices are enclosed for every y of
-the travel at once (laurent.py), as sums of monomials of p with coefficients in intervals.
+the travel at once (taylor.py), as sums of monomials of p with coefficients in intervals.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from flint import arb
 from malta.proof.expressions import NotAnalytic, program
 from malta.proof.uncertain import model_of
 from malta.proof.weak_coupling import taylor
-from malta.proof.weak_coupling.laurent import Evaluation, Laurent, Monomial, Value
+from malta.proof.weak_coupling.taylor import Evaluation, Laurent, Monomial, Value
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant

@@ -30,24 +30,24 @@ from malta.model.signals import (
 )
 from malta.report.figures.campaign import distributions_figure as distributions_figure
 from malta.report.figures.campaign import yield_figure as yield_figure
-from malta.report.figures.front import front_figure as front_figure
-from malta.report.figures.marks import draw_group
-from malta.report.figures.parts import MORE as MORE
-from malta.report.figures.parts import POINTS as POINTS
-from malta.report.figures.parts import STYLES as STYLES
-from malta.report.figures.parts import (
+from malta.report.figures.drawing import MORE as MORE
+from malta.report.figures.drawing import POINTS as POINTS
+from malta.report.figures.drawing import STYLES as STYLES
+from malta.report.figures.drawing import (
     Published,
     draw_bound,
+    draw_group,
     draw_line,
     ending_text,
     finish_axes,
     micro,
     new_page,
 )
-from malta.report.figures.parts import number as number
+from malta.report.figures.drawing import number as number
+from malta.report.figures.margins import front_figure as front_figure
 from malta.report.figures.runs import worst_figure as worst_figure
-from malta.simulation.catalogue import experiments_of
 from malta.simulation.experiments import Case, Experiment
+from malta.simulation.experiments.catalogue import experiments_of
 from malta.simulation.trajectory import Trajectory
 from malta.units import in_unit
 
@@ -146,7 +146,7 @@ def encode_figure(figure: Figure, path: Path) -> bytes:
     """
     import matplotlib
 
-    from malta.report.figures.inline import png_of
+    from malta.report.figures.drawing import png_of
 
     if path.suffix not in (".png", ".svg", ".pdf"):
         raise InputError(path, "", f"suffix {path.suffix!r}", "one of .png, .svg, .pdf")

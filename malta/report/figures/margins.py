@@ -4,32 +4,47 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from itertools import cycle, pairwise
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.figures import ZONES
-from malta.report.figures.parts import (
+from malta.loops.loop import loop_along
+from malta.loops.sampled_loops import SampledLoop
+from malta.loops.time_domain import furthest, load_vector
+from malta.margins.loop_report import ZONES
+from malta.report.figures.drawing import (
     BOUND,
     DOT,
     LEGEND,
+    MORE,
     NOTE,
     PAPER,
     STYLES,
     draw_grid,
+    draw_group,
+    finish_axes,
+    front_lines,
+    micro,
     new_figure,
 )
+from malta.synthesis.requirements import Trade
+from malta.units import unit_factor
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from malta.loops.time_domain import Deviation, Recovery
     from malta.margins.loop_report import LoopReport
+    from malta.model.plant import FloatArray, Plant
     from malta.proof.blocks.gain import Gain
     from malta.proof.margin import Margin
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.recovery import StepResponse
+    from malta.tuning.tune import Tuned
 
 
 LOOKS: tuple[dict[str, Any], dict[str, Any]] = ({"color": "#c9c9c9"}, {"color": "#5a5a5a"})  # stages, machine
@@ -205,3 +220,175 @@ def _legend(axes: Axes, bottom: float = 1.0, handles: Sequence[Artist] | None = 
     """A legend of two columns above the axes, of what is drawn or of these handles."""
     where: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, bottom), "borderaxespad": 0.2}
     axes.legend(handles=handles, ncols=2, **where, **LEGEND)
+
+
+# The figure of how a machine takes loads from outside: deviation over time, and compliance over frequency.
+
+
+FINE = {"m": "um", "rad": "urad"}  # units that outputs are drawn in
+SHOWN = 1.5  # times the longest time to 1 %
+POINTS = 400  # of frequency
+RECOVERY_LOOKS = (
+    STYLES[0],
+    MORE[1],
+    STYLES[2],
+    MORE[0],
+    *STYLES[1::2],
+    *MORE[2:],
+)  # a line that covers another has gaps
+
+
+def recovery_figure(plant: Plant, controller: Controller, found: Sequence[Recovery]) -> Figure:
+    """Deviation after a unit step of every disturbance, and compliance over frequency, of the output furthest off.
+
+    found : the answers of this machine to its disturbances, as malta.recovery(plant, controller) gives them
+
+    A row for each pair of units, as um under N. Raises CheckError for an unstable loop.
+    """
+    picked = furthest(found)
+    units = {s.name: s.unit for s in plant.disturbances}
+    rows: dict[tuple[str, str], list[tuple[Recovery, Deviation]]] = {}
+    for load, output in picked:
+        rows.setdefault((output.unit, units[load.name]), []).append((load, output))
+    height = 0.9 + 2.4 * len(rows)
+    figure = new_figure(
+        f"{controller.name}: how a load from outside is carried",
+        size=(9.0, height),
+        left=0.1,
+        bottom=0.6 / height,
+        top=0.97 - 0.62 / height,
+        hspace=0.5,
+    )
+    panels = figure.subplots(len(rows), 2, squeeze=False)
+    loop = loop_along(plant, controller).sampled
+    answer = loop.answer()
+    for (left, right), ((unit, of), lines) in zip(panels, rows.items(), strict=True):
+        _draw_steps(left, plant, answer, lines, FINE.get(unit, unit), of)
+        _draw_compliance(right, plant, loop, lines, FINE.get(unit, unit), of)
+    return figure
+
+
+def _draw_steps(
+    axes: Axes,
+    plant: Plant,
+    answer: StepResponse,
+    lines: Sequence[tuple[Recovery, Deviation]],
+    unit: str,
+    of: str,
+) -> None:
+    """Deviation over time of the output furthest off, after 1 N or 1 N m at t = 0."""
+    names = [s.name for s in plant.outputs]
+    settled = max(output.settled for _, output in lines)
+    end = min(SHOWN * settled, float(answer.t[-1])) if np.isfinite(settled) else float(answer.t[-1])
+    shown = answer.t <= end
+    series = {}
+    for load, output in lines:
+        y = answer.of(load_vector(plant, load.name, load.load)).y[shown, names.index(output.output), 0]
+        series[f"{load.name}: {output.output}"] = y * np.sign(y[np.abs(y).argmax()]) / unit_factor(unit, unit)
+    columns = draw_group(axes, 1e3 * answer.t[shown], series, RECOVERY_LOOKS)
+    finish_axes(axes, "time [ms]", f"deviation under 1 {of} [{micro(unit)}]", legend=columns)
+
+
+def _draw_compliance(
+    axes: Axes,
+    plant: Plant,
+    loop: SampledLoop,
+    lines: Sequence[tuple[Recovery, Deviation]],
+    unit: str,
+    of: str,
+) -> None:
+    """Amplitude of the same outputs over frequency, under a load of amplitude 1 N or 1 N m."""
+    names = [s.name for s in plant.outputs]
+    w: FloatArray = np.geomspace(1.0, 0.3 * np.pi / loop.sample_time, POINTS)
+    series = {}
+    for load, output in lines:
+        amplitude = np.abs(loop.compliance(w, load_vector(plant, load.name, load.load)))
+        series[f"{load.name}: {output.output}"] = amplitude[:, names.index(output.output)] / unit_factor(
+            unit, unit
+        )
+    axes.set(xscale="log", yscale="log")
+    draw_group(axes, w / (2 * np.pi), series, RECOVERY_LOOKS)
+    finish_axes(
+        axes,
+        "frequency [Hz]",
+        f"compliance [{micro(unit)}/({of})]" if " " in of else f"compliance [{micro(unit)}/{of}]",
+    )
+
+
+# The figure of a search: the Pareto front of noise and motion against the proven margin.
+
+
+LABELS = ("noise of the force [N rms]", "true motion [µm rms]")  # by trade
+MARKS = ((0, "o"), (2, "s"), (1, "D"))  # style of a line and marker
+
+
+def front_figure(tuned: Tuned) -> Figure:
+    """Draw the Pareto front of a search: force noise and motion over the proven margin, the chosen trial ringed.
+
+    A dot has the least force noise, or the least motion, that goes with its margin. The chosen trial has to keep the
+    bounds of both and of the experiments at once, so it may lie off either front.
+
+    tuned : from `malta.tune`
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    >>> import malta
+    >>> from malta.tuning.search import Trial
+    >>> from malta.tuning.tune import Tuned
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
+    >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
+    >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
+    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
+    >>> figure = malta.report.front_figure(tuned)
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['noise of the force [N rms]', 'true motion [µm rms]']
+    """
+    asked, chosen, front = tuned.spec.specification, tuned.trial, tuned.front
+    taken = next((one for one in front if one.values == chosen.values), chosen)
+    others = [one for one in front if one is not taken] or [taken]
+    kept = (
+        "keeps all that is asked for" if tuned.reached else f"misses {tuned.binding.name.replace('_', ' ')}"
+    )
+    share = f"{100 * taken.figures['margin']:.0f} %"
+    found = f"{tuned.trials} trials; open marks: taken, margin {share}, which {kept}; "
+    found += "filled: least force noise, or least motion, at a margin"
+    figure = new_figure(f"{tuned.spec.name}: margin against noise", found, size=(9.0, 4.6), left=0.1)
+    panels: Any = figure.subplots(1, 2)
+    for axes, trade, y in zip(panels, get_args(Trade), LABELS, strict=True):
+        lines = front_lines(tuned.spec.plant, taken.figures, trade)
+        axes.set_yscale("log")
+        for (name, label, scale, _), (style, marker) in zip(lines, cycle(MARKS), strict=False):
+            if all(name in one.figures for one in front):
+                points = [(100 * one.figures["margin"], scale * one.figures[name]) for one in others]
+                where = 100 * taken.figures["margin"], scale * taken.figures[name]
+                _draw_points(axes, points, where, STYLES[style] | {"marker": marker, "label": label})
+        if "margin" in asked:
+            axes.axvline(100 * asked["margin"], **BOUND)
+            above: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
+            axes.annotate("asked for", (100 * asked["margin"], 1.01), **above, **NOTE)
+        axes.margins(x=0.04)
+        finish_axes(axes, "proven margin [% of the box]", y, legend=2)
+        axes.margins(x=0.04)
+    return figure
+
+
+def _draw_points(
+    axes: Axes, points: Sequence[tuple[float, float]], taken: tuple[float, float], style: dict[str, Any]
+) -> None:
+    """Draw trials, those that none beats as a line where they are more than two, and a ring at the one taken."""
+    best = _pareto_front(points)
+    if len(best) <= 2:
+        best, style = sorted(points), style | {"linestyle": "none"}
+    axes.plot(*np.array(best).T, markersize=4, **style)
+    ring = {"markersize": 10, "markerfacecolor": "none", "markeredgecolor": style["color"]}
+    axes.plot(*taken, **DOT | ring | {"marker": style["marker"]})
+
+
+def _pareto_front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The points (margin, size) that no other beats in both, by margin."""
+    found: list[tuple[float, float]] = []
+    for margin, size in sorted(points, key=lambda point: (-point[0], point[1])):
+        if not found or size < found[-1][1]:
+            found.append((margin, size))
+    return found[::-1]

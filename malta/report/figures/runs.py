@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.model.signals import lateral_outputs
-from malta.report.figures.parts import (
+from malta.report.figures.drawing import (
     BOUND,
     CROSS,
     DOT,
@@ -27,7 +27,7 @@ from malta.report.figures.parts import (
     published_in_unit,
     rows_and_columns,
 )
-from malta.simulation.digest import LARGEST_FIGURE
+from malta.simulation.engine.digest import LARGEST_FIGURE
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -39,7 +39,9 @@ if TYPE_CHECKING:
     from malta.campaigns.plan import Plan
     from malta.campaigns.result import Campaign
     from malta.campaigns.summary import Runs, Summary
+    from malta.identification.log import Log
     from malta.model.plant import FloatArray
+
 
 SHOWN = 9  # parameters with a panel each, at most
 LEAST = 1e-3  # of a deviation on a logarithmic axis, in its fine unit
@@ -91,7 +93,7 @@ def nearest_figure(summary: Summary) -> Figure:
     in its place. Of more runs than a summary keeps, these are the nearest.
     """
     from malta.campaigns.plan import varied_names
-    from malta.campaigns.statistics import unit_of
+    from malta.campaigns.result import unit_of
     from malta.campaigns.summary import bin_edges
 
     runs = summary.kept
@@ -168,7 +170,7 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
     2
     """
     from malta.campaigns.plan import half_width, middle_of, varied_names
-    from malta.campaigns.statistics import spread_text
+    from malta.campaigns.result import spread_text
     from malta.campaigns.summary import Bounds, as_summary, worst_runs
 
     summary = as_summary(found, Bounds(published))
@@ -200,7 +202,7 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
 
 def _draw_errors(axes: Axes, summary: Summary, runs: Runs) -> None:
     """The largest deviation of each run with its value, beside its bounds; where the reference jumps, its nearness."""
-    from malta.campaigns.statistics import bounds_of
+    from malta.campaigns.result import bounds_of
 
     plan, plant, published = summary.plan, summary.plan.plant, summary.bounds.published
     across, completed = lateral_outputs(plant)[0], runs.batch.completed == 1
@@ -254,8 +256,49 @@ def _set_reach(axes: Axes, values: FloatArray, bounds: Sequence[float]) -> None:
 
 def _run_label(plan: Plan, index: int, verdict: float) -> str:
     """The number of a run, and how it ended."""
-    from malta.simulation.digest import verdicts
+    from malta.simulation.engine.digest import verdicts
 
     name = verdicts(plan.plant)[int(verdict)]
     text = f"run {index}"
     return text if name == "completed" else f"{text}\n{name.replace(' at ', chr(10) + 'at ')}"
+
+
+# The figure of a log: a panel for each group of columns.
+
+
+PANELS = {
+    "y": "measured",
+    "reference": "reference",
+    "v": "command",
+    "excitation": "excitation",
+    "i": "current",
+}
+POINTS = 2000  # of a line: intervals, each drawn from its least to its largest value
+
+
+def log_figure(log: Log) -> Figure:
+    """Draw a log: measured outputs, reference, commands, excitation and currents over time."""
+    groups = [group for group in PANELS if log.names(group) and np.nan_to_num(log.columns[group]).any()]
+    figure = new_figure(log.source, "; ".join(log.survey.findings), size=(9.0, 1.2 + 1.9 * len(groups)))
+    for axes, group in zip(
+        figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0], groups, strict=True
+    ):
+        micro = {"m": 1e6, "rad": 1e6}.get(log.signals[group][0].unit, 1.0)
+        for signal, values in zip(log.signals[group], log.columns[group].T, strict=True):
+            axes.plot(*_thinned(log.t, micro * values), lw=0.8, label=signal.name)
+        unit = log.signals[group][0].unit
+        finish_axes(
+            axes, "time [s]", f"{PANELS[group]} [{'u' if micro != 1 else ''}{unit}]", legend=len(axes.lines)
+        )
+    return figure
+
+
+def _thinned(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The least and the largest value of each of POINTS intervals."""
+    each = len(t) // POINTS
+    if each < 4:
+        return t, values
+    whole = POINTS * each
+    parts = values[:whole].reshape(POINTS, each)
+    ends = np.stack([parts.min(axis=1), parts.max(axis=1)], axis=1).ravel()
+    return np.repeat(t[:whole:each], 2), ends

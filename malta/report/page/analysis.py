@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,23 +14,29 @@ import numpy as np
 from malta.errors import CheckError, InputError
 from malta.loops.curves import loop_curves
 from malta.loops.sampled_loops import LAST
-from malta.margins.figures import figure
-from malta.margins.loop_report import in_groups
+from malta.margins.loop_report import BANDWIDTHS, figure, in_groups, zone
 from malta.model.data import plant_of
-from malta.simulation.catalogue import experiment, main_job
+from malta.model.linear import is_linear
+from malta.model.parameters import units_of
+from malta.model.plant import Signal
+from malta.model.signals import FINE
+from malta.report.figures.drawing import merit_phrase, micro, number
 from malta.simulation.experiments import progress_of_part
+from malta.simulation.experiments.catalogue import experiment, main_job
+from malta.synthesis.spec import Pid, Weights, integral_signals, pid_signals, process_signals
 from malta.tuning.verify import verify, with_requirements
+from malta.units import identifier, in_unit
 
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
     from malta.loops.curves import LoopCurves
-    from malta.margins.figures import LoopFigure
-    from malta.margins.loop_report import LoopReport
-    from malta.model.plant import Parameters, Plant
+    from malta.margins.loop_report import LoopFigure, LoopReport
+    from malta.model.plant import FloatArray, Parameters, Plant
     from malta.proof.machine.windings import CurrentLoops
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
+
 
 Share = Callable[[float], None]  # takes the share of the work that is done, 0 to 1
 JOBS = {"low": "job_lower", "high": "job_higher", "": "job"}  # kinds of figures by which way is better
@@ -142,3 +150,346 @@ def _job_figures(job: Experiment | None) -> Iterator[LoopFigure]:
         label = f"{case}: {merit.label}" if case else merit.label
         name = f"{job.name} {case} {merit.key or merit.label}"
         yield figure(JOBS[merit.better], name, label, merit.value, merit.unit)
+
+
+# What a design is, entry by entry: machine, law, weights, noise, gains. Reports list it, comparisons seek changes.
+
+
+# Units for values below a size, SI, the smallest first.
+FINER: dict[str, tuple[tuple[str, float], ...]] = {
+    "s": (("us", 1e-3), ("ms", 1.0)),
+    "m": (("um", 1e-4), ("mm", 1.0)),
+    "rad": (("urad", 1e-4), ("mrad", 0.1)),
+}
+
+
+GROUPS = (
+    *(
+        "machine",
+        "parameters",
+        "uncertainty",
+        "law",
+        "PID gains",
+        "weights",
+        "bases",
+        "cost",
+        "noise",
+        "gains",
+    ),
+    "limits",
+)
+
+
+class Entry(NamedTuple):
+    """A number or a word of a design, as it stands in its files."""
+
+    group: str  # of GROUPS
+    name: str
+    value: float | str  # SI
+    unit: str = ""
+    signal: str = ""  # in the name, of an entry that each signal has
+
+    @property
+    def key(self) -> str:
+        """The entry as an identifier with its unit."""
+        return identifier(f"{self.group} {self.name}", self.unit)
+
+    def text(self, unit: str) -> str:
+        """The value in a unit of display, with six digits."""
+        if isinstance(self.value, str):
+            return self.value
+        return f"{in_unit(self.value, unit) if unit else self.value:.6g}"
+
+    def equals(self, other: Entry | None) -> bool:
+        """Whether another design has the same value, but for rounding."""
+        if other is None or isinstance(self.value, str) or isinstance(other.value, str):
+            return other is not None and self.value == other.value
+        return bool(np.isclose(self.value, other.value, rtol=1e-9, atol=0.0))
+
+
+def display_unit(unit: str, values: Iterable[float | str]) -> str:
+    """The unit in which some values of an SI unit have few digits: "us" of 5e-5 s."""
+    sizes = [abs(value) for value in values if not isinstance(value, str) and value]
+    small = (fine for fine, size in FINER.get(unit, ()) if sizes and max(sizes) < size)
+    return next(small, unit)
+
+
+def kind_of(controller: Controller) -> str:
+    """The kind of a control law in a word."""
+    if controller.cost is not None:
+        return "LQG"
+    return "linear law of the errors" if controller.tracks == "errors" else "PID"
+
+
+def design_entries(subject: Subject) -> list[Entry]:
+    """List what a design is: the machine, the law, its weights and its noise, the size of its gains."""
+    parts = (_machine, _law, _weights, _noise_entries, _gains, _limits)
+    return sorted((entry for part in parts for entry in part(subject)), key=lambda e: GROUPS.index(e.group))
+
+
+def _machine(subject: Subject) -> Iterator[Entry]:
+    parameters = subject.parameters
+    yield Entry("machine", "name", "linear" if is_linear(parameters) else subject.plant.name)
+    yield Entry("machine", "preset", parameters.preset)
+    for name, unit in units_of(parameters).items():
+        yield Entry("parameters", name, float(getattr(parameters, name)), unit)
+    for name, share in subject.box.items():
+        yield Entry("uncertainty", name, share, "1")
+
+
+def _law(subject: Subject) -> Iterator[Entry]:
+    c = subject.controller
+    yield Entry("law", "kind", kind_of(c))
+    yield Entry("law", "sample time", c.sample_time, "s")
+    yield Entry("law", "delay in the design model", float(c.delay), "1")
+    yield Entry("law", "lag of the current loops in the design model", "yes" if c.lagging else "no")
+    yield Entry("law", "integrals of errors", "yes" if c.integrating else "no")
+    yield Entry("law", "observed forces of disturbance", "yes" if c.observed else "no")
+    yield Entry("law", "commutation", "measured place" if c.commutation is None else "predicted place")
+    spec = subject.written_from
+    if spec is not None and spec.pid is None:
+        yield Entry("law", "discretization", spec.discretization)
+    for signal, pause in zip(c.measurements, c.pause, strict=False):
+        if pause:
+            name, unit = f"integral of {signal.name} waits above", f"{signal.unit}/s"
+            yield Entry("law", name, float(pause), unit, signal.name)
+    for signal, error in zip(c.measurements, c.braking, strict=False):
+        if error:
+            yield Entry("law", f"{signal.name} brakes from", float(error), signal.unit, signal.name)
+    for words, per, row in zip(
+        ("reference", "speed", "acceleration"), ("", "/s", "/s^2"), c.references, strict=False
+    ):
+        for signal, limit in zip(c.measurements, row, strict=True):
+            if limit:
+                yield Entry(
+                    "law",
+                    f"largest {words} of {signal.name}",
+                    float(limit),
+                    f"{signal.unit}{per}",
+                    signal.name,
+                )
+    if c.current_loop is not None:
+        yield Entry("law", "current loop Kp", c.current_loop.Kp, "V/A")
+        yield Entry("law", "current loop Ki", c.current_loop.Ki, "V / (A s)")
+
+
+def _weights(subject: Subject) -> Iterator[Entry]:
+    c, plant = subject.controller, subject.plant
+    law = None if subject.written_from is None else subject.written_from.law
+    if isinstance(law, Pid):
+        for table, signals in pid_signals(plant, law.axes).items():
+            plain = [Signal(s.name, re.sub(r"\((\w+)\)", r"\1", s.unit).replace(" / ", "/")) for s in signals]
+            yield from _row("PID gains", f"{table} ", plain, getattr(law, table))
+    elif isinstance(law, Weights):
+        integrals = integral_signals(plant, law.coordinates)
+        for table, states, weight, base in (
+            ("state", plant.design_states, law.q, law.q_base),
+            ("input", plant.inputs, law.r, law.r_base),
+            ("integral", integrals, law.q_i, law.q_i_base),
+        ):
+            plain = [Signal(s.name, "1") for s in states]
+            yield from _row("weights", f"{table} ", plain, weight)
+            yield from _row("bases", f"{table} ", states, base)
+    elif c.cost is not None:
+        integrals = integral_signals(plant, c.cost.coordinates)
+        for table, states, cost in (
+            ("state", plant.design_states, c.cost.state),
+            ("input", plant.inputs, c.cost.input),
+            ("integral", integrals, c.cost.integral),
+        ):
+            squares = [Signal(s.name, _over_square(s.unit)) for s in states]
+            yield from _row("cost", f"{table} ", squares, cost)
+
+
+def _over_square(unit: str) -> str:
+    """The unit of a weight on a square: "1/m^2" of m, "1/(m/s)^2" of m/s."""
+    if unit == "1":
+        return unit
+    return f"1/{unit}^2" if unit.isalpha() else f"1/({unit})^2"
+
+
+def _noise_entries(subject: Subject) -> Iterator[Entry]:
+    noise, cost, plant = subject.controller.noise, subject.controller.cost, subject.plant
+    if noise is None or cost is None:
+        return
+    sources = process_signals(plant, cost.coordinates)
+    yield from _row("noise", "process ", sources, np.sqrt(noise.process))
+    yield from _row("noise", "sensor ", plant.outputs, np.sqrt(noise.sensor))
+    yield from _row("noise", "drift ", sources, np.sqrt(noise.drift))
+    plain = [Signal(s.name, "1") for s in sources]
+    yield from _row("noise", "correlation ", plain, noise.correlation)
+
+
+def _gains(subject: Subject) -> Iterator[Entry]:
+    for name in ("K", "Ki", "L"):
+        yield Entry("gains", f"norm of {name}", float(np.linalg.norm(getattr(subject.controller, name))), "1")
+    yield Entry("gains", "states of the law", float(len(subject.controller.states)), "1")
+
+
+def _limits(subject: Subject) -> Iterator[Entry]:
+    c = subject.controller
+    for signal, limit in zip(c.forces, c.limits.force, strict=True):
+        if np.isfinite(limit):
+            yield Entry("limits", signal.name, float(limit), signal.unit, signal.name)
+
+
+def _row(group: str, prefix: str, signals: Sequence[Signal], values: FloatArray) -> Iterator[Entry]:
+    """An entry for each signal that has a value; none of an empty vector."""
+    for signal, value in zip(signals, values, strict=False):
+        yield Entry(group, f"{prefix}{signal.name}", float(value), signal.unit, signal.name)
+
+
+# The top of a report: its key figures, and what the design is in words.
+
+
+MERITS = 3  # of the main job, on the first screen
+
+
+class KeyFigure(NamedTuple):
+    """A figure that a reader looks for first."""
+
+    label: str
+    value: str
+    note: str = ""
+    state: str = ""  # "good", "near", "bad" or ""
+
+
+def key_figures(a: Analysis) -> list[KeyFigure]:
+    """List the figures that a reader looks for first: stability, margin, peak |S|, bandwidth, noise, main job."""
+    parts = (_stability, _margin, _peak, _bandwidth, _noise, _job, _requirements)
+    return [figure for part in parts for figure in part(a)]
+
+
+def _stability(a: Analysis) -> Iterator[KeyFigure]:
+    stable = a.report.stable
+    largest = a.report.stages[-1].spectral_radius
+    note = "with hold, delay and current loops" if stable else f"a pole at |λ| = {largest:.6f}"
+    yield KeyFigure("Loop", "stable" if stable else "UNSTABLE", note, "good" if stable else "bad")
+
+
+def _margin(a: Analysis) -> Iterator[KeyFigure]:
+    label, margin = "Margin of the parameters", a.report.robust
+    if not a.subject.box:
+        yield KeyFigure(label, "not asked", "the gain file names no uncertain parameters")
+    elif not a.report.stable:
+        yield KeyFigure(label, "none", "the loop is unstable already", "bad")
+    elif margin is None:
+        yield KeyFigure(label, "not proven", "left out by --no-proof")
+    elif margin.lower is None:
+        yield KeyFigure(label, "nothing proven", margin.reason, "bad")
+    else:
+        box = ", ".join(f"{name} ±{100 * share:g} %" for name, share in a.subject.box.items())
+        state = "good" if margin.lower >= 1 else "bad"
+        where = f" {a.report.extent}" if str(a.report.extent) else ""
+        more = "at least " if margin.exhausted else ""
+        yield KeyFigure("Proven margin", f"{more}{100 * margin.lower:.1f} %", f"of {box}{where}", state)
+
+
+def _peak(a: Analysis) -> Iterator[KeyFigure]:
+    if not a.report.stable:
+        return
+    peaks = {name: peak for name, peak in a.report.peak_sensitivity.items() if name != "sigma_max"}
+    name = max(peaks, key=lambda sensor: peaks[sensor])
+    found = zone(peaks[name])
+    state = {"A": "good", "B": "near"}.get(found, "bad")
+    note = f"zone {found} of ISO 14839-3, worst at {name}"
+    yield KeyFigure("Peak |S|", f"{peaks[name]:.2f}", note, state)
+
+
+def _bandwidth(a: Analysis) -> Iterator[KeyFigure]:
+    key = "sigma_max_T"
+    value = a.report.bandwidth.get(key, math.nan)
+    if math.isfinite(value):
+        note = f"{number(value)} rad/s, {BANDWIDTHS[key]}"
+        yield KeyFigure("Bandwidth", f"{number(value / (2 * math.pi), 3)} Hz", note)
+
+
+def _noise(a: Analysis) -> Iterator[KeyFigure]:
+    noise = a.report.noise
+    if noise is None or not (np.any(noise.motion) or np.any(noise.force)):
+        return
+    for values, signals, label in (
+        (noise.motion, a.plant.outputs, "Motion at rest"),
+        (noise.force, a.plant.inputs, "Commands at rest"),
+    ):
+        largest: dict[str, tuple[float, str]] = {}  # by unit
+        for signal, value in zip(signals, values.tolist(), strict=True):
+            largest[signal.unit] = max(largest.get(signal.unit, (0.0, "")), (value, signal.name))
+        texts = []
+        for unit, (value, _) in largest.items():
+            fine = FINE.get(unit, unit)
+            shown = "" if fine == "1" else f" {micro(fine)}"
+            texts.append(f"{number(in_unit(value, fine), 3)}{shown}")
+        names = ", ".join(name for _, name in largest.values())
+        yield KeyFigure(label, " · ".join(texts), f"rms of the worst: {names}")
+
+
+def _job(a: Analysis) -> Iterator[KeyFigure]:
+    if a.job is None:
+        return
+    outcome, label = a.job.outcome, a.job.name.replace("-", " ").replace("_", " ").capitalize()
+    state = "bad" if a.job.failed else "good"
+    short = "completed" if not a.job.failed else outcome
+    fidelity = f"simulated, fidelity {a.job.run.scenario.fidelity}"
+    yield KeyFigure(label, short, outcome if short != outcome and a.job.failed else fidelity, state)
+    for merit in a.job.merits[:MERITS]:
+        if math.isfinite(merit.value) and not a.job.failed:
+            yield KeyFigure(merit.label.capitalize(), merit_phrase(merit), label.lower())
+
+
+def _requirements(a: Analysis) -> Iterator[KeyFigure]:
+    asked = [one for one in a.report.requirements if one.asked is not None]
+    if asked:
+        held = sum(one.holds for one in asked)
+        open_ = sum(one.verdict == "undecided" for one in asked)
+        state = "good" if held == len(asked) else "bad"
+        words = f"{held} of {len(asked)} hold" + (f", {open_} undecided" if open_ else "")
+        yield KeyFigure("Requirements", words, "[specification] of the design file", state)
+
+
+def summary_sentences(a: Analysis) -> list[str]:
+    """Say in words what the design is."""
+    c, plant = a.subject.controller, a.plant
+    rate = (
+        f"at {1e-3 / c.sample_time:g} kHz" if c.sample_time <= 1e-3 else f"every {c.sample_time * 1e3:g} ms"
+    )
+    law = kind_of(c)
+    article = "An" if law == "LQG" else "A"
+    what = f"{law} controller" if law.isupper() else law
+    text = f"{article} {what} of the machine {plant.name}, preset {a.subject.parameters.preset}: "
+    text += f"{_count(len(c.measurements), 'measurement')} and {_count(len(c.forces), 'command')} {rate}, "
+    text += f"{_count(len(c.states), 'state')}."
+    sentences = [text]
+    parts = []
+    if c.integrating:
+        parts.append("sums the errors")
+    if c.observed:
+        parts.append("observes constant forces of disturbance")
+    if c.lagging:
+        parts.append("has the lag of the current loops in its model")
+    if c.delay:
+        parts.append(f"has a delay of {_count(c.delay, 'sample')} in its model")
+    if c.commutation is not None:
+        parts.append("commutates for the predicted place")
+    if parts:
+        sentences.append(f"It {_list_in_words(parts)}.")
+    if plant.has_stroke:
+        sentences.append(f"The stroke moves {plant.stroke} by ±{in_unit(plant.travel, 'mm'):g} mm.")
+    spec = a.subject.written_from
+    if spec is not None and spec.summary:
+        sentences.insert(0, f"{spec.summary.rstrip('.')}.")
+    if a.subject.changes:
+        sentences.append(
+            f"The machine is changed: {', '.join(a.subject.changes)}; the controller is not told."
+        )
+    if not a.report.stable:
+        sentences.append("The loop is UNSTABLE on this machine: it has no sensitivities, margins or noise.")
+    return sentences
+
+
+def _count(number_of: int, what: str) -> str:
+    return f"{number_of} {what}{'' if number_of == 1 else 's'}"
+
+
+def _list_in_words(parts: Sequence[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

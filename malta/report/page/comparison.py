@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from rich.console import Group
+from rich.text import Text
+
 from malta.errors import InputError
-from malta.margins.figures import LoopFigure, best_of
-from malta.report.page.design import GROUPS, Entry, design_entries, display_unit
+from malta.margins.loop_report import LoopFigure, best_of
+from malta.report.figures.drawing import micro
+from malta.report.page.analysis import GROUPS, Entry, design_entries, display_unit
+from malta.report.tables.layout import new_table
 from malta.simulation.experiments import progress_of_part
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from malta.report.page.analysis import Analysis, Subject
+
 
 LEAST, MOST = 2, 8  # designs
 NOTHING = "-"  # the text of a design that has no such entry or figure
@@ -253,3 +261,70 @@ def _deeper(subject: Subject, depth: int) -> str:
     """The last parts of the name of a subject's file; the design's name without a file."""
     parts = PurePath(subject.source).parts
     return "/".join(parts[-depth:]) if parts else subject.controller.name
+
+
+# The tables of a comparison for a terminal: what differs, and figures of merit with the better one marked.
+
+
+JOINT = "\N{NO-BREAK SPACE}"
+BEST = "*"  # behind the better value, beside bold letters
+LABELS = 34  # letters of the first column; longer labels are broken into lines
+NAME = 18  # letters of a design's name in a heading; longer names are broken
+EDGE = 2  # letters at both ends of a line
+
+
+def comparison_tables(found: Comparison, width: int = 80) -> Group:
+    """What differs in the designs, and their figures of merit, in blocks of designs that fit in `width` columns."""
+    parts: list[Any] = []
+    for title, lines in (
+        ("What differs in the designs", found.difference_lines),
+        (f"Figures of merit ({BEST} and bold: better)", found.figure_lines),
+    ):
+        for columns in _blocks(found.names, lines, width):
+            parts.append(_table(title, found.names, lines, columns))
+    if not found.differences:
+        parts.insert(0, Text("The designs do not differ.\n"))
+    parts += [Text(remark) for remark in found.remarks]
+    return Group(*parts)
+
+
+def _blocks(names: Sequence[str], lines: Sequence[Line], width: int) -> Iterator[list[int]]:
+    """Columns of designs that fit beside each other; none without lines."""
+    block: list[int] = []
+    room, sign = width - LABELS - EDGE, _sign_width(lines)
+    for k, name in enumerate(names if lines else ()):
+        needed = max(min(len(name), NAME), *(len(line.texts[k]) + sign for line in lines)) + EDGE
+        if block and needed > room:
+            yield block
+            block, room = [], width - LABELS - EDGE
+        block.append(k)
+        room -= needed
+    if block:
+        yield block
+
+
+def _sign_width(lines: Sequence[Line]) -> int:
+    """The letters behind a value that mark it as better."""
+    return len(BEST) + 1 if any(any(line.best) for line in lines) else 0
+
+
+def _table(title: str, names: Sequence[str], lines: Sequence[Line], columns: Sequence[int]) -> Table:
+    """A table of some of the designs, with a line for each group, of the lines that one of them has a value in."""
+    table = new_table(title, "", *(names[k] for k in columns))
+    group, blank = "", JOINT * _sign_width(lines)
+    for line in lines:
+        if all(line.texts[k] == NOTHING for k in columns):
+            continue
+        if line.group != group:
+            if group:
+                table.add_section()
+            group = line.group
+            table.add_row(Text(group, style="italic"))
+        cells = [
+            Text(f"{line.texts[k]}{JOINT}{BEST}", style="bold")
+            if line.best[k]
+            else Text(line.texts[k] + blank)
+            for k in columns
+        ]
+        table.add_row(Text(micro(line.heading)), *cells)
+    return table

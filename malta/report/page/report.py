@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from malta.model.signals import FINE
+from malta.report import plots
+from malta.report.figures.drawing import MORE, STYLES, draw_line, finish_axes, micro, new_figure
+from malta.report.page.analysis import KeyFigure
+from malta.report.page.document import Front, Page, render
+from malta.report.page.sections import Item, Picture, Section, Sheet, distinct_channels, polish
+from malta.units import in_unit
+
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from malta.campaigns.summary import Summary
     from malta.gains.schema import GainFile
     from malta.model.plant import Parameters
     from malta.report.page.analysis import Analysis, Subject
-    from malta.report.page.comparison import Comparison
-    from malta.report.page.document import Page
+    from malta.report.page.comparison import Comparison, Line
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
+
 
 WORK = 0.75  # share of the work that is done when all is computed; the rest is drawing
 
@@ -99,7 +112,7 @@ def comparison_page(found: Comparison) -> Page:
     >>> b"What differs in the designs" in malta.report.comparison_page(found).content
     True
     """
-    from malta.report.page.compared import comparison_page as write
+    write = comparison_page
 
     return write(found)
 
@@ -138,8 +151,8 @@ def provenance_of(file: GainFile) -> tuple[tuple[str, str], ...]:
 
 def page_of(found: Analysis, progress: Callable[[float], None] | None = None) -> Page:
     """Write an analysis as a page."""
+    from malta.report.page.analysis import key_figures
     from malta.report.page.document import Front, render
-    from malta.report.page.headline import key_figures
     from malta.report.page.sections import report_sections
 
     c = found.subject.controller
@@ -174,3 +187,151 @@ def report_work(
     return found, page_of(
         found, None if progress is None else lambda share: progress(WORK + (1 - WORK) * share)
     )
+
+
+# Curves of several designs over each other, for the page of a comparison.
+
+
+def overlaid(found: Comparison) -> Iterator[Item]:
+    """The figures of a comparison: sensitivities, Nyquist plots, singular values, loads, the main job."""
+    named = dict(zip(found.names, found.designs, strict=True))
+    loops = {name: a.curves for name, a in named.items()}
+    stable = {name: loops[name] for name, a in named.items() if a.report.stable}
+    panels = distinct_channels(loops)
+    if stable and found.one_machine:
+        shown = distinct_channels(stable)
+        yield Picture(
+            partial(plots.sensitivity_curves, stable, channel=shown.channels),
+            f"Sensitivity S and complementary sensitivity T, with the zones of ISO 14839-3.{shown.note}",
+        )
+    if found.one_machine:
+        yield Picture(
+            partial(plots.nyquist, loops, channel=panels.channels),
+            f"Nyquist plots of the loop at each sensor, the others closed.{panels.note}",
+        )
+    if stable:
+        yield Picture(partial(plots.sigma, stable), "Singular values of L, S and T with all sensors at once.")
+    if stable and found.one_machine and found.designs[0].plant.disturbances:
+        yield Picture(
+            partial(plots.load_response, stable),
+            "Deviation after a unit step of each load from outside, and compliance over frequency.",
+        )
+    flown = [(name, a) for name, a in named.items() if a.job is not None]
+    if found.one_machine and len(flown) > 1:
+        yield Picture(
+            lambda: _job_figure(flown),
+            "The main job on the nonlinear machine: the leading output, its distance from the reference, and the "
+            "leading command.",
+        )
+
+
+def _job_figure(designs: Sequence[tuple[str, Analysis]]) -> Figure:
+    """The leading output of the main job, its error, and the leading command, of the first run of each design."""
+    figure = new_figure("", size=(9.0, 6.4))
+    figure.subplots_adjust(left=0.095, right=0.985, bottom=0.085, top=0.9, hspace=0.28)
+    panels = figure.subplots(3, 1, sharex=True)
+    plant = designs[0][1].plant
+    k, m = plant.leading_output, plant.leading_input
+    signal, force = plant.outputs[k], plant.inputs[m]
+    shown = {"m": "mm", "rad": "mrad"}.get(signal.unit, signal.unit)
+    fine = FINE.get(signal.unit, signal.unit)
+    for (name, a), style in zip(designs, cycle((*STYLES, *MORE)), strict=False):
+        assert a.job is not None
+        run = a.job.run
+        t = 1e3 * run.t
+        draw_line(panels[0], t, in_unit(1.0, shown) * run.p[:, k], label=name, **style)
+        draw_line(panels[1], t, in_unit(1.0, fine) * (run.p - run.reference)[:, k], **style)
+        draw_line(panels[2], t, run.v[:, m], **style)
+    labels = (
+        f"{signal.name}{_in_brackets(shown)}",
+        f"{signal.name}, off reference{_in_brackets(fine)}",
+        f"command {force.name}{_in_brackets(force.unit)}",
+    )
+    for axes, label in zip(panels, labels, strict=True):
+        finish_axes(axes, "time [ms]" if axes is panels[-1] else "", label)
+    _add_legend(figure, panels[0])
+    return figure
+
+
+def _in_brackets(unit: str) -> str:
+    return "" if unit == "1" else f" [{micro(unit)}]"
+
+
+def _add_legend(figure: Figure, axes: Axes) -> None:
+    """One legend above all panels, in rows of four."""
+    handles, labels = axes.get_legend_handles_labels()
+    shown = [label if len(label) <= 40 else f"{label[:37]}..." for label in labels]
+    figure.legend(
+        handles, shown, ncols=4, loc="upper center", bbox_to_anchor=(0.5, 0.995), frameon=False, fontsize=9
+    )
+
+
+# The page of a comparison: the same tables as in a terminal, and the curves of all designs over each other.
+
+
+SIGN = "★"  # before the better value, beside bold letters
+
+
+def comparison_page(found: Comparison, progress: Callable[[float], None] | None = None) -> Page:
+    """Write a comparison as one page in HTML that needs no network and no other file.
+
+    progress : takes the share of the figures that are drawn
+    """
+    machines = ", ".join(dict.fromkeys(a.plant.name for a in found.designs))
+    front = Front(
+        "Comparison of designs",
+        " · ".join(found.names),
+        f"Machine {machines}",
+        _heads(found),
+        "malta compare",
+    )
+    sections = (
+        Section("differences", "What differs in the designs", tuple(_differences(found))),
+        Section("figures", "Figures of merit", tuple(_figures(found))),
+        Section("curves", "Curves", tuple(overlaid(found))),
+    )
+    return render(front, [section for section in sections if section.items], progress)
+
+
+def _heads(found: Comparison) -> list[KeyFigure]:
+    """One figure for each design: whether it is stable, its margin, and in how many rows it is better."""
+    heads = []
+    for k, (name, a) in enumerate(zip(found.names, found.designs, strict=True)):
+        better = sum(row.best[k] for row in found.rows)
+        margin = a.report.robust
+        proven = (
+            f"margin {100 * margin.lower:.1f} %, " if margin is not None and margin.lower is not None else ""
+        )
+        stable = "stable" if a.report.stable else "UNSTABLE"
+        note = f"{proven}better in {better} of {len(found.rows)} figures"
+        heads.append(KeyFigure(name, stable, note, "good" if a.report.stable else "bad"))
+    return heads
+
+
+def _differences(found: Comparison) -> Iterator[Item]:
+    if not found.differences:
+        yield "The designs do not differ."
+        return
+    yield _sheet(found.names, found.difference_lines)
+
+
+def _figures(found: Comparison) -> Iterator[Item]:
+    yield f"{SIGN} and bold: better than another design, in digits that are shown. Ties are not marked."
+    yield _sheet(found.names, found.figure_lines)
+    yield from found.remarks
+
+
+def _sheet(names: Sequence[str], lines: Sequence[Line]) -> Sheet:
+    """A table with a heading line for each group."""
+    rows: list[tuple[str, ...]] = []
+    marks: list[tuple[str, ...]] = []
+    group = ""
+    for own, heading, texts, best in lines:
+        if own != group:
+            group = own
+            rows.append((own.capitalize(),))
+            marks.append(("",))
+        cells = (f"{SIGN} {text}" if star else text for text, star in zip(texts, best, strict=True))
+        rows.append((polish(heading), *map(polish, cells)))
+        marks.append(("", *("best" if star else "" for star in best)))
+    return Sheet("", ("", *names), tuple(rows), (False, *(True for _ in names)), tuple(marks))

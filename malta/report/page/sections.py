@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
 
-from malta.loops.noise import budget_of
-from malta.margins.figures import four_digits
+from malta.loops.time_domain import budget_of
+from malta.margins.loop_report import four_digits
+from malta.model.data import published_figures
 from malta.model.plant import Signal
-from malta.model.published import published_figures
 from malta.model.signals import FINE
-from malta.report.figures.parts import UNITS
-from malta.report.page.channels import distinct_channels
-from malta.report.page.design import design_entries, display_unit
-from malta.report.page.headline import summary_sentences
-from malta.report.page.sheets import Sheet, matrix_sheets, plain_sheet, sheets_of
+from malta.report.figures.drawing import UNITS, micro
+from malta.report.page.analysis import design_entries, display_unit, summary_sentences
 from malta.report.tables.campaign import box_text, campaign_tables, run_text
-from malta.report.tables.design import bandwidth_table, loop_poles_table, poles_table, sensitivity_table
+from malta.report.tables.design import (
+    bandwidth_table,
+    loop_poles_table,
+    poles_table,
+    recovery_table,
+    sensitivity_table,
+)
 from malta.report.tables.experiments import experiment_table, limits_text
 from malta.report.tables.margins import (
     chain_table,
@@ -33,7 +40,6 @@ from malta.report.tables.margins import (
     tolerance_table,
     worst_case_table,
 )
-from malta.report.tables.recovery import recovery_table
 from malta.report.tables.tuning import found_text
 from malta.units import in_unit
 
@@ -41,8 +47,140 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from malta.loops.classical import Classical
+    from malta.loops.curves import LoopCurves
     from malta.margins.loop_report import LoopReport, Outcome
+    from malta.model.plant import FloatArray
     from malta.report.page.analysis import Analysis
+
+
+# Which channels of a loop need a panel of their own: mirror images have the same curves.
+
+
+ALIKE = 1e-3  # relative difference of curves that a plot does not show
+
+
+class Panels(NamedTuple):
+    """The channels to draw, and a sentence on those that have the curves of others; it begins with a space."""
+
+    channels: tuple[str, ...]
+    note: str
+
+
+def distinct_channels(loops: Mapping[str, LoopCurves]) -> Panels:
+    """Choose the channels at the sensors whose curves differ in some loop from those of the channels before them."""
+    names = dict.fromkeys(s.name for curves in loops.values() for s in curves.channels())
+    like: dict[str, list[str]] = {}
+    for name in names:
+        twin = next((other for other in like if _are_alike(loops, name, other)), None)
+        like.setdefault(name if twin is None else twin, []).append(name)
+    notes = []
+    for name, (_, *others) in like.items():
+        if others:
+            listed = others[0] if len(others) == 1 else f"{', '.join(others[:-1])} and {others[-1]}"
+            notes.append(f"{listed} {'has' if len(others) == 1 else 'have'} the curves of {name}")
+    return Panels(tuple(like), f" {'; '.join(notes)}." if notes else "")
+
+
+def _are_alike(loops: Mapping[str, LoopCurves], one: str, other: str) -> bool:
+    """Whether two channels have the same curves in every loop."""
+    for curves in loops.values():
+        known = [s.name for s in curves.channels()]
+        if one not in known or other not in known:
+            return False
+        alone = curves.responses.alone("sensors")
+        a, b = alone[:, known.index(one)], alone[:, known.index(other)]
+        if not np.allclose(a, b, rtol=ALIKE, atol=0.0, equal_nan=True):
+            return False
+    return True
+
+
+# Tables of a page, from the same tables that the terminal shows.
+
+
+WIDE = 8  # columns of a matrix beside each other
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table of a page: cells as text, and for each column whether it is aligned to the right."""
+
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    right: tuple[bool, ...]
+    # by row and column, of a cell that stands out: "good", "near", "bad" or "best"
+    marks: tuple[tuple[str, ...], ...] = ()
+
+    def mark(self, row: int, column: int) -> str:
+        """The mark of a cell; "" for none."""
+        return self.marks[row][column] if self.marks else ""
+
+
+def sheets_of(parts: Any) -> list[Sheet]:
+    """The tables in what a terminal would print, in its order; texts between them become tables without rows."""
+    if isinstance(parts, Table):
+        return [_sheet(parts)]
+    if isinstance(parts, Group):
+        return [sheet for part in parts.renderables for sheet in sheets_of(part)]
+    if isinstance(parts, str | Text):
+        return [Sheet(polish(str(parts)), (), (), ())] if str(parts).strip() else []
+    return [sheet for part in parts for sheet in sheets_of(part)] if isinstance(parts, Iterable) else []
+
+
+def _sheet(table: Table) -> Sheet:
+    columns = [[polish(_text(cell)) for cell in column.cells] for column in table.columns]
+    return Sheet(
+        polish(_text(table.title or "")),
+        tuple(polish(_text(column.header)) for column in table.columns),
+        tuple(zip(*columns, strict=True)),
+        tuple(column.justify == "right" for column in table.columns),
+    )
+
+
+def _text(cell: Any) -> str:
+    return cell.plain if isinstance(cell, Text) else str(cell)
+
+
+def polish(text: str) -> str:
+    """A text of a terminal with the signs that a page has: ±, ≤, µm, minus.
+
+    >>> polish("-3745+-3096j <= 1 um")
+    '−3745±3096j ≤ 1 µm'
+    """
+    text = text.replace("+-", "±").replace("<=", "≤").replace(">=", "≥")
+    return micro(re.sub(r"(?<![\w.])-(?=\d)", "−", text))
+
+
+def plain_sheet(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Sheet:
+    """A table whose first column is of words, the others of numbers."""
+    return Sheet(
+        polish(title),
+        tuple(map(polish, heads)),
+        tuple(tuple(map(polish, row)) for row in rows),
+        (False, *(True for _ in heads[1:])),
+    )
+
+
+def matrix_sheets(
+    title: str, M: FloatArray, rows: Sequence[Signal], columns: Sequence[Signal]
+) -> Iterator[Sheet]:
+    """A matrix with the names and units of its rows and columns, in parts that a sheet of paper has room for."""
+    for first in range(0, len(columns), WIDE):
+        part = columns[first : first + WIDE]
+        heads = ["", *(_name(s) for s in part)]
+        values = M[:, first : first + WIDE].tolist()
+        cells = ([_name(s), *(_entry(value) for value in row)] for s, row in zip(rows, values, strict=True))
+        more = "" if len(part) == len(columns) else f", columns {first + 1} to {first + len(part)}"
+        yield plain_sheet(f"{title}{more}", heads, cells)
+
+
+def _name(signal: Signal) -> str:
+    return signal.name if signal.unit == "1" else f"{signal.name} [{signal.unit}]"
+
+
+def _entry(value: float) -> str:
+    return f"{value:.6g}" if value else "0"
+
 
 NARROW = 3  # columns of a table
 NEAR = 0.95  # of a bound: a requirement holds, but hardly
@@ -243,7 +381,7 @@ def _loop(a: Analysis) -> Iterator[Item]:
 def _loads(a: Analysis) -> Iterator[Item]:
     if not a.report.recovery:
         return
-    from malta.report.figures.recovery import recovery_figure
+    from malta.report.figures.margins import recovery_figure
 
     c = a.subject.controller
     yield Picture(

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.loops.curves import LoopCurves
-from malta.margins.figures import ZONES, zone
-from malta.report.figures.parts import new_figure
-from malta.report.plots.parts import (
+from malta.margins.loop_report import ZONES, zone
+from malta.report.figures.drawing import new_figure
+from malta.report.plots.panels import (
     PLACES,
     Sheet,
     add_legend,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.loops.channels import ChannelMargins
+    from malta.loops.classical import ChannelMargins
     from malta.loops.linear_loops import Place
     from malta.model.plant import FloatArray
 

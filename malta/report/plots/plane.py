@@ -12,9 +12,9 @@ from malta.errors import InputError
 from malta.loops.curves import loop_curves
 from malta.loops.locus import GAIN, RootLocus
 from malta.loops.locus import root_locus as locus_of
-from malta.report.figures.parts import new_figure, number
+from malta.report.figures.drawing import new_figure, number
 from malta.report.plots.frequency import title_of
-from malta.report.plots.parts import Sheet, add_legend, head_of, loops_of, plain, styles_of
+from malta.report.plots.panels import Sheet, add_legend, head_of, loops_of, plain, styles_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.report.figures.parts import BOUND, draw_grid
+from malta.report.figures.drawing import BOUND, draw_grid
 from malta.report.plots.frequency import ALONE, Channel, phase_of, title_of
-from malta.report.plots.parts import (
+from malta.report.plots.panels import (
     CLEAR,
     PLACES,
     chosen_channels,
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.loops.channels import ChannelMargins
+    from malta.loops.classical import ChannelMargins
     from malta.loops.linear_loops import Place
     from malta.model.plant import ComplexArray, FloatArray
 

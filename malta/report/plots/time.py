@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
-from malta.loops.steps import StepFigures, loop_steps, step_figures
+from malta.loops.time_domain import StepFigures, loop_steps, step_figures
 from malta.model.signals import FINE
-from malta.report.figures.parts import draw_grid, micro, number
+from malta.report.figures.drawing import draw_grid, micro, number
 from malta.report.plots.frequency import Channel, title_of
-from malta.report.plots.parts import (
+from malta.report.plots.panels import (
     chosen_channels,
     draw_level,
     finish_frequency,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from malta.loops.curves import LoopCurves
-    from malta.synthesis.step_response import StepResponse
+    from malta.synthesis.recovery import StepResponse
 
 SHOWN = 1.6  # times the longest settling time
 LONGEST = 60.0  # times the shortest rise or time to the peak

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from rich.console import Group
@@ -12,14 +13,15 @@ from malta.model.parameters import differences
 from malta.model.signals import (
     lateral_outputs,
 )
-from malta.report.figures.parts import Published, number
-from malta.report.tables.layout import Paragraph
-from malta.report.tables.parts import add_row, new_table
+from malta.report.figures.drawing import Published, number
+from malta.report.tables.layout import Paragraph, add_row, new_table
 from malta.units import in_unit
 
 if TYPE_CHECKING:
     from malta.campaigns.plan import Plan
-    from malta.campaigns.result import Campaign
+    from malta.campaigns.rare import RareEvent
+    from malta.campaigns.result import Campaign, Rate
+    from malta.campaigns.studies import Index, Sensitivity, Spread, Tolerances
     from malta.campaigns.summary import Summary
     from malta.synthesis.spec import Spec
 
@@ -55,7 +57,7 @@ def box_text(plan: Plan) -> str:
     >>> malta.report.box_text(malta.Plan(controller, spread={"m": 0.1, "K_A": 0.05}))
     'm ±10 %, K_A ±5 %'
     """
-    from malta.campaigns.statistics import spread_text
+    from malta.campaigns.result import spread_text
 
     spreads: dict[str, list[str]] = {}
     for name in (*plan.spread, *plan.sensor_spread):
@@ -131,7 +133,7 @@ def _ends_table(found: Summary) -> Table:
 
 
 def _findings_table(found: Summary) -> Table:
-    from malta.campaigns.sketch import ACCURACY
+    from malta.campaigns.summary import ACCURACY
 
     bounds = any(math.isfinite(m.published) for m in found.merits)
     heads = [*(f"{p} %" for p in PERCENTILES), "largest", *(["published", "kept [%]"] if bounds else [])]
@@ -165,7 +167,7 @@ def _worst_table(found: Summary, count: int) -> Table:
     """The worst runs, each with its parameters relative to the middle of the box and its sensor errors."""
     from malta.campaigns.plan import varied_names
     from malta.campaigns.summary import worst_runs
-    from malta.simulation.digest import verdicts
+    from malta.simulation.engine.digest import verdicts
 
     plan, runs = found.plan, worst_runs(found, count)
     ends, groups = verdicts(plan.plant), lateral_outputs(plan.plant)
@@ -188,10 +190,260 @@ def _worst_table(found: Summary, count: int) -> Table:
 
 def _deviation_text(plan: Plan, name: str, value: float) -> str:
     """A varied quantity of a run: a parameter in percent of its middle, a sensor error in its unit."""
-    from malta.campaigns.statistics import unit_of
+    from malta.campaigns.result import unit_of
 
     if name in plan.spread and name not in differences(plan.parameters):
         middle = getattr(plan.parameters, name)
         return f"{name}={100 * (value / middle - 1):+.1f}%" if middle else f"{name}={value:+.3g}"
     unit = unit_of(plan, name)
     return f"{name}={in_unit(value, unit):+.2f}{'%' if unit == 'percent' else unit}"
+
+
+# Tables of the studies on a campaign's box: rare events, sensitivities, tolerances.
+
+
+def rare_event_tables(event: RareEvent) -> Group:
+    """Tabulate the probability of a rare event with its interval, the levels on the way to it, and its design point.
+
+    event : from `malta.rare_event`
+
+    Returns a rich Group of tables, which `rich.print` prints.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> short = {"duration": 0.02}  # s
+    >>> box = {"m": 0.2}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=100, options=short)
+    >>> limit = malta.limit_of(plan, "deviation-y", 40e-6)
+    >>> event = malta.rare_event(plan, limit, workers=1)
+    >>> tables = malta.report.rare_event_tables(event).renderables
+    >>> [str(table.title) for table in tables][:2]
+    ['Rare event: deviation y above 40 um or an earlier end', 'Levels: 1 is the limit']
+    """
+    parts: list[Table | str] = [_probability_table(event), _levels_table(event)]
+    if event.design_point is not None:
+        parts.append(_design_point_table(event))
+    return Group(*parts)
+
+
+def rare_event_sentence(event: RareEvent) -> str:
+    """Say what is known of a rare event where no run failed.
+
+    event : from `malta.rare_event`
+
+    Returns a sentence; "" where runs failed.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> short = {"duration": 0.02}  # s
+    >>> box = {"m": 0.1}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=100, options=short)
+    >>> limit = malta.limit_of(plan, "deviation-y", 40e-6)
+    >>> event = malta.rare_event(plan, limit, workers=1)
+    >>> malta.report.rare_event_sentence(event).partition(", as")[0]
+    'no run failed: deviation y above 40 um or an earlier end has a probability below 2.4e-08'
+    """
+    found = event.found
+    if found.reached:
+        return ""
+    _, high = found.interval()
+    ending = "interrupted" if found.interrupted else "no run failed"
+    return (
+        f"{ending}: {event.limit.text} has a probability below {high:.2g}, as a severity of "
+        f"{found.levels[-1].threshold:.3g} has; the most severe of {found.simulated} runs reached {found.worst:.3g}"
+    )
+
+
+def _probability_table(event: RareEvent) -> Table:
+    found = event.found
+    table = new_table(f"Rare event: {event.limit.text}", "", "")
+    table.show_header = False
+    if not found.reached:
+        add_row(table, "probability", f"below {found.interval()[1]:.2g}")
+        add_row(table, "simulated runs", f"{found.simulated}")
+        return table
+    low, high = found.interval()
+    add_row(table, "probability", f"{found.probability:.3g}")
+    add_row(table, "coefficient of variation [%]", f"{100 * found.cov:.3g}")
+    add_row(table, "95 % interval", f"{low:.3g} to {high:.3g}")
+    add_row(table, "simulated runs", f"{found.simulated}")
+    add_row(table, "plain sampling needs, for the same coefficient", f"{found.plain:.2g}")
+    return table
+
+
+def _levels_table(event: RareEvent) -> Table:
+    """One row for each level; a severity of 1 is the limit."""
+    heads = ("level", "severity", "passed [%]", "c.o.v. [%]", "accepted [%]", "probability")
+    table = new_table("Levels: 1 is the limit", *heads)
+    table.columns[0].justify = "right"
+    probability = 1.0
+    for k, level in enumerate(event.found.levels):
+        probability *= level.share
+        accepted = "" if math.isnan(level.acceptance) else f"{100 * level.acceptance:.0f}"
+        cells = [f"{k + 1}", f"{level.threshold:.4g}", f"{100 * level.share:.3g}", f"{100 * level.cov:.3g}"]
+        add_row(table, *cells, accepted, f"{probability:.3g}")
+    return table
+
+
+def _design_point_table(event: RareEvent) -> Table:
+    """The machine of the design point: each value, and how far it is off the middle."""
+    from malta.campaigns.plan import half_width
+
+    plan, point = event.plan, event.design_point
+    assert point is not None
+    title = f"Design point: {point.end} at {point.time * 1e3:.1f} ms, {point.distance:.3g} standard deviations off"
+    table = new_table(title, "parameter", "value", "off the middle [% of the spread]")
+    for name, value in point.values.items():
+        half = half_width(plan, name)
+        middle = getattr(plan.parameters, name) if name in plan.spread else 0.0
+        off = f"{100 * (value - middle) / half:+.1f}" if half else "0"
+        add_row(table, name, value_text(plan, name, value), off)
+    return table
+
+
+def sensitivity_tables(found: Sensitivity) -> Group:
+    """Tabulate total and first-order Sobol indices of the yield and of each figure of merit, by what varies.
+
+    found : from `malta.sensitivity`
+
+    Returns a rich Group of tables, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> options = {"duration": 0.02, "noise": 0.0}
+    >>> box = {"m": 0.2, "C": 0.2}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=64, options=options)
+    >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
+    >>> rich.print(malta.report.sensitivity_tables(found).renderables[0])
+    yield: 100 % (89.11 to 100 %) of the machines without touchdown; 64 runs
+    """
+    said = f"yield: {share_text(found.within)} of the machines {found.limit.kept}; {found.runs} runs"
+    parts: list[Table | Paragraph] = [Paragraph(said)]
+    if not (found.of_yield or any(found.of_merits.values())):
+        return Group(*parts)
+    parts.append(_index_table("Total indices: a parameter, alone and with others", found, total=True))
+    parts.append(_index_table("First-order indices: a parameter alone", found, total=False))
+    return Group(*parts)
+
+
+def sensitivity_sentence(found: Sensitivity) -> str:
+    """Say why figures have no indices.
+
+    found : from `malta.sensitivity`
+
+    Returns a sentence; "" where all figures have indices.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> options = {"duration": 0.02, "noise": 0.0}
+    >>> box = {"m": 0.2, "C": 0.2}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=64, options=options)
+    >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
+    >>> malta.report.sensitivity_sentence(found)
+    'every run is without touchdown: the yield has no indices'
+    """
+    if not found.of_yield:
+        every = "every" if found.within.share == 1 else "no"
+        return f"{every} run is {found.limit.kept}: the yield has no indices"
+    if not all(found.of_merits.values()):
+        return "figures that some runs have no value of, as they were not completed, have no indices"
+    return ""
+
+
+def _index_table(title: str, found: Sensitivity, *, total: bool) -> Table:
+    table = new_table(f"{title}, with 95 % intervals", "figure", *found.factors)
+
+    def cell(index: Index) -> str:
+        value, half = (index.total, index.total_half) if total else (index.first, index.first_half)
+        return f"{max(value, 0.0):.2f} ±{half:.2f}" if abs(value) < 0.005 else f"{value:.2f} ±{half:.2f}"
+
+    for label, indices in {"yield": found.of_yield, **found.of_merits}.items():
+        if indices:
+            add_row(table, label, *map(cell, indices))
+    return table
+
+
+def spreads_table(found: Tolerances) -> Table:
+    """Tabulate the largest spread of each parameter that keeps the wanted yield, beside today's.
+
+    found : from `malta.tolerances`
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> short = {"duration": 0.02}  # s
+    >>> box = {"m": 0.1}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=20, options=short)
+    >>> limit = malta.limit_of(plan, "deviation-y", 50e-6)
+    >>> found = malta.tolerances(plan, limit, 0.95, workers=1)
+    >>> table = malta.report.spreads_table(found)
+    >>> [str(column.header) for column in table.columns][:4], table.row_count
+    (['parameter', 'today', 'largest', 'times'], 1)
+    """
+    from malta.campaigns.result import spread_text
+
+    wanted = f"{100 * found.wanted:.6g} %"
+    title = f"Largest spreads that keep {wanted} {found.limit.kept}; today {share_text(found.today)}"
+    table = new_table(title, "parameter", "today", "largest", "times", "yield [%]", "95 % interval [%]")
+    for spread in found.spreads:
+        alone = spread.name in found.plan.spread or spread.name in found.plan.sensor_spread
+        today = spread_text(found.plan, spread.name) if alone else ""
+        if spread.within is None:
+            add_row(table, spread.name, today, "none", "0", "", "")
+            continue
+        more = ">= " if spread.factor == spread.widest else ""
+        times = f"{more}{spread.factor:.3g}"
+        largest = more + spread_text(_with_spread(found, spread), spread.name) if alone else ""
+        interval = f"{100 * spread.within.low:.4g} to {100 * spread.within.high:.4g}"
+        add_row(table, spread.name, today, largest, times, f"{100 * spread.within.share:.4g}", interval)
+    return table
+
+
+def tolerance_sentence(found: Tolerances) -> str:
+    """Name the parameters that keep the yield again with a wider spread.
+
+    found : from `malta.tolerances`
+
+    Returns a sentence; "" where none does.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> short = {"duration": 0.02}  # s
+    >>> box = {"m": 0.1}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=20, options=short)
+    >>> limit = malta.limit_of(plan, "deviation-y", 50e-6)
+    >>> found = malta.tolerances(plan, limit, 0.95, workers=1)
+    >>> malta.report.tolerance_sentence(found)
+    ''
+    """
+    names = " ".join(spread.name for spread in found.spreads if not spread.monotone)
+    return f"a wider spread keeps the yield again: {names}" if names else ""
+
+
+def _with_spread(found: Tolerances, spread: Spread) -> Plan:
+    """The plan with the largest spread of one parameter."""
+    plan = found.plan
+    own = {name: width * (spread.factor if name == spread.name else 1) for name, width in plan.spread.items()}
+    errors = plan.sensor_spread
+    wider = {name: width * (spread.factor if name == spread.name else 1) for name, width in errors.items()}
+    return replace(plan, spread=own, sensor_spread=wider)
+
+
+def share_text(share: Rate) -> str:
+    """A rate in percent with its interval."""
+    return f"{100 * share.share:.4g} % ({100 * share.low:.4g} to {100 * share.high:.4g} %)"
+
+
+def value_text(plan: Plan, name: str, value: float) -> str:
+    """A varied value with its unit."""
+    from malta.campaigns.result import unit_of
+
+    unit = unit_of(plan, name)
+    return f"{in_unit(value, unit):.6g} {'%' if unit == 'percent' else unit}"

@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, TypeGuard
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 from rich.table import Table
 from scipy import sparse
 
-from malta.margins.figures import BANDWIDTHS, ZONES, zone
-from malta.margins.loop_report import LoopReport
+from malta.loops.time_domain import SHARE, furthest
+from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, zone
+from malta.model.data import published_value
 from malta.model.linearize import LinearModel
-from malta.model.published import published_value
-from malta.report.figures.parts import Published, published_in_unit
-from malta.report.tables.parts import add_row, new_table
+from malta.model.signals import FINE
+from malta.proof.certificate.checked_file import double
+from malta.report.figures.drawing import Published, number, published_in_unit
+from malta.report.tables.layout import add_row, new_table
+from malta.units import in_unit
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
+    from collections.abc import Sequence
+
+    from malta.loops.time_domain import Recovery
+    from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.proof.certificate.checked_file import Claim
 
 
 def poles_table(model: LinearModel, published: Published | None) -> Table:
@@ -198,3 +206,95 @@ def _pole_text(poles: ComplexArray) -> str:
         text = f"{real}+-{pole.imag:.4g}j" if pole.imag > 1e-6 * abs(pole) else real
         counted[text] = counted.get(text, 0) + 1
     return "  ".join(text if count == 1 else f"{text} (x{count})" for text, count in counted.items())
+
+
+# What a certificate claims, for a terminal: of which loop, and in which box. Digits are cut towards less.
+
+
+DIGITS = 7  # of the ends of an interval
+LOOPS = {"lag": "current loops, if any, as first-order lags", "pi": "the PI current loops of the gain file"}
+
+
+def claim_text(claim: Claim) -> str:
+    """The loop that a certificate names: machine, law, stage and sample time."""
+    T = "continuous" if claim.sample_time is None else f"sampled every {double(claim.sample_time):g} s"
+    if claim.origin is None:
+        return f"Claim: of matrices alone, {T}"
+    o = claim.origin
+    text = f"Claim: {o.machine}, preset {o.preset}; law {o.law}, sha256 {o.sha256[:12]}..., {T}"
+    text += f"; with {LOOPS[o.current_loops]}"
+    if claim.places is not None:
+        at = ", ".join(f"{double(x):g}" for x in claim.places.at)
+        text += f"; at {claim.places.name} = {at} {claim.places.unit}, not between them"
+    return text
+
+
+def claim_share(claim: Claim) -> str:
+    """The multiple of the uncertainty that is claimed, in percent, cut."""
+    lower = double(claim.lower)
+    near = round(100_000 * lower)
+    return f"{(near if near / 100_000 <= lower else near - 1) / 1000:.3f} %"
+
+
+def claim_table(claim: Claim) -> Table:
+    """The box of a certificate: each parameter with its nominal value and its interval at the claim, cut inwards."""
+    table = new_table(f"The box at {claim_share(claim)}", "parameter", "nominal", "from", "to", "unit")
+    for p in claim.parameters:
+        low, high = _cut(p.interval[0], ROUND_CEILING), _cut(p.interval[1], ROUND_FLOOR)
+        ends = [f"{x:.{DIGITS}g}" for x in (low, high)]
+        if not low <= double(p.nominal) <= high:  # narrower than the digits
+            ends = [repr(double(x)) for x in p.interval]
+        add_row(table, p.name, f"{double(p.nominal):.{DIGITS}g}", *ends, p.unit or "")
+    return table
+
+
+def _cut(x: Any, towards: str) -> float:
+    """An end with some digits: the nearest number, unless that is beyond the end."""
+    end = double(x)
+    near = float(f"{end:.{DIGITS}g}")
+    within = near >= end if towards == ROUND_CEILING else near <= end
+    return near if within else float(Context(prec=DIGITS, rounding=towards).create_decimal(end))
+
+
+# The table of constant loads from outside: how far they move a machine, and how fast it comes back.
+
+
+def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
+    """Tabulate the output that each load moves furthest: largest deviation, what is left, settling, compliance.
+
+    The peak over frequency is the amplitude of the output under a load of this amplitude.
+
+    found : from `malta.recovery`
+    plant : the machine
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> found = malta.recovery(spec.plant, controller)
+    >>> rich.print(malta.report.recovery_table(found, spec.plant))
+    A constant load from outside, and the output that it moves furthest
+    <BLANKLINE>
+                               left    left     1 %
+                      moves   after   after   after     peak
+     load    output      by   0.1 s   0.3 s     [s]   over w   at rad/s
+     ──────────────────────────────────────────────────────────────────
+     1 N w   y [um]   343.4   94.98   1.722   0.266    430.5       42.8
+    <BLANKLINE>
+    """
+    units = {s.name: s.unit for s in plant.disturbances}
+    after = [f"left after {t:g} s" for t in (found[0].after if found else ())]
+    heads = ("load", "output", "moves by", *after, f"{100 * SHARE:g} % after [s]", "peak over w", "at rad/s")
+    table = new_table("A constant load from outside, and the output that it moves furthest", *heads)
+    table.columns[1].justify = "left"
+    for recovered, d in furthest(found):
+        load = ", ".join(f"{size:g} {units[name]} {name}" for name, size in recovered.load.items())
+        fine = FINE.get(d.unit, d.unit)
+        # Below a millionth of the largest nothing is left.
+        left = (value if value > 1e-6 * d.largest else 0.0 for value in d.left)
+        lengths = [number(in_unit(value, fine)) for value in (d.largest, *left)]
+        settled = "never" if math.isinf(d.settled) else f"{d.settled:.3g}"
+        peak = number(in_unit(d.compliance, fine))
+        add_row(table, load, f"{d.output} [{fine}]", *lengths, settled, peak, f"{d.frequency:.3g}")
+    return table

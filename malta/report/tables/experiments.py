@@ -3,20 +3,38 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 
-from malta.report.figures.parts import Published
-from malta.report.tables.layout import Paragraph
-from malta.report.tables.parts import add_row, merit_heading, merit_text, new_table, published_text
-from malta.simulation.catalogue import experiments_of, options_of
+from malta.identification.response import units_of_model
+from malta.report.figures.drawing import Published
+from malta.report.tables.layout import (
+    INDENT,
+    Paragraph,
+    add_row,
+    fold,
+    merit_heading,
+    merit_text,
+    new_table,
+    published_text,
+)
 from malta.simulation.experiments import setting
+from malta.simulation.experiments.catalogue import experiments_of, options_of
 
 if TYPE_CHECKING:
+    from rich.console import Console, ConsoleOptions, RenderResult
+
+    from malta.identification.excite import ExcitationPlan
+    from malta.identification.identify import Identified
+    from malta.identification.log import Log
+    from malta.identification.replay import LawReplay
     from malta.model.plant import Plant
+    from malta.report.ledger import Claim, Ledger
     from malta.simulation.experiments import Experiment, Merit
 
 
@@ -185,3 +203,184 @@ def _options(name: str, plant: Plant) -> list[str]:
         text = ",".join(str(v).lower() if isinstance(v, bool) else f"{v}" for v in values)
         shown.append(f"{option}={text} {units.get(option, '')}".rstrip())
     return shown
+
+
+# Tables of logs, excitations, identified parameters and replays.
+
+
+def log_table(log: Log) -> Table:
+    """Statistics of the columns of a log; a column that never changes has one number."""
+    table = new_table("Signals", "signal", "least", "mean", "largest", "deviation")
+    for heading, (least, mean, largest, deviation) in log.survey.statistics.items():
+        if not heading.startswith("flag."):
+            add_row(table, heading, *(f"{value:.4g}" for value in (least, mean, largest, deviation)))
+    return table
+
+
+def excitation_tables(plan: ExcitationPlan, plant: Plant) -> list[Table]:
+    """What moves how far, what current flows, and what will be found how well."""
+    moved = new_table("What it does, by the linear loop", "signal", "largest", "of its limit")
+    for signal in plant.outputs:
+        scale, unit = (1e6, f"u{signal.unit}") if signal.unit in ("m", "rad") else (1.0, signal.unit)
+        add_row(moved, f"{signal.name} [{unit}]", f"{scale * plan.motion[signal.name]:.4g}", "")
+    for signal, limit in zip(plant.inputs, plant.actuator.force_limit, strict=True):
+        share = plan.command[signal.name]
+        add_row(moved, f"{signal.name} [{signal.unit}]", f"{share * limit:.4g}", f"{100 * share:.3g} %")
+    most = max(plan.current.values())
+    for name, value in plan.current.items():
+        if value > 1e-6 * most:
+            share = value / plant.actuator.current_limit
+            add_row(moved, f"{name} beside that at rest [A]", f"{value:.4g}", f"{100 * share:.3g} %")
+    told = new_table("What its log will tell", "parameter", "half of the 95 % interval [%]")
+    for name, share in plan.accuracy.items():
+        add_row(told, name, f"{100 * share:.2g}")
+    return [moved, told]
+
+
+def identified_table(found: Identified) -> Table:
+    """The identified parameters with their 95 % intervals."""
+    table = new_table("Identified", "parameter", "value", "95 % interval", "half [%]", "gain file")
+    units = units_of_model(found.plant)
+    for name, value, half, start in zip(
+        found.names, found.values.tolist(), found.half_widths.tolist(), found.start.tolist(), strict=True
+    ):
+        unit = "" if units[name] == "1" else f" [{units[name]}]"
+        share = f"{100 * half / abs(value):.2g}" if value else "-"
+        ends = f"{value - half:.6g} .. {value + half:.6g}"
+        add_row(table, f"{name}{unit}", f"{value:.5g}", ends, share, f"{start:.5g}")
+    return table
+
+
+def quality_table(found: Identified) -> Table:
+    """How well the model explains the log."""
+    table = new_table("How well the model explains the log", "figure", "found", "if it is right")
+    add_row(table, f"chi2 / dof, {found.dof} degrees", f"{found.chi2:.3g}", f"1, at most {found.limit:.3g}")
+    for name, value in found.by_output.items():
+        add_row(table, f"of {name}", f"{value:.3g}", "1")
+    add_row(table, "correlation of neighbouring lines [sigma]", f"{found.whiteness:.2g}", "-2 .. 2")
+    add_row(table, "power where nothing was excited", f"{found.distortion:.3g}", "1")
+    return table
+
+
+def replay_table(found: LawReplay, plant: Plant) -> Table:
+    """Commands and innovations of a law on a log."""
+    table = new_table("The law on the log", "signal", "from the start", "second half", "sensor", "whiteness")
+    for signal in plant.inputs:
+        off = f"{found.at_once[signal.name]:.2g}", f"{found.difference[signal.name]:.2g}"
+        add_row(table, f"{signal.name} differs by [{signal.unit}]", *off, "", "")
+    for signal in plant.outputs:
+        name = signal.name
+        cells = f"{found.rms[name]:.3g}", f"{found.expected[name]:.3g}", f"{found.whiteness[name]:.2g}"
+        add_row(table, f"innovation of {name}, rms [{signal.unit}]", "", *cells)
+    return table
+
+
+# The ledger of published numbers, a line a claim.
+
+
+GAP = 2  # columns of a terminal between those of a line
+LEAST = 30  # letters of a claim that a line shows at least: a terminal with room for fewer has fewer designs a line
+ELLIPSIS = "…"
+
+
+@dataclass(frozen=True)
+class ClaimLines:
+    """A line for each claim: claim, published figure, that of each design, and the verdict in one word.
+
+    Claims that are too long for their line are cut in the middle. Where not all designs fit beside each other, the
+    lines are printed once for as many designs as fit, and then for the others.
+
+    ledger : from `malta.ledger`
+    why : below each line the whole claim, where it was cut, and the whole verdict with its reason
+    """
+
+    ledger: Ledger
+    why: bool = False
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Draw the lines in the width that is given."""
+        width = options.max_width
+        yield Text("\n".join(fold(f"Published numbers and ours: {self.ledger.title}", width)))
+        for designs in self._blocks(width):
+            yield Text("\n".join(["", *self._lines(designs, width)]))
+
+    def _columns(self, designs: Sequence[int]) -> list[list[str]]:
+        """The texts of all columns but the claim's, each with its heading."""
+        ledger = self.ledger
+        ours = [[ledger.designs[k], *(claim.ours[k] for claim in ledger.claims)] for k in designs]
+        published = ["published", *(claim.published for claim in ledger.claims)]
+        return [published, *ours, ["verdict", *(claim.word for claim in ledger.claims)]]
+
+    def _room(self, designs: Sequence[int], width: int) -> int:
+        """The letters that are left for the claim."""
+        return width - sum(max(map(len, column)) + GAP for column in self._columns(designs))
+
+    def _blocks(self, width: int) -> list[list[int]]:
+        """The designs that stand beside each other."""
+        blocks: list[list[int]] = [[]]
+        for k in range(len(self.ledger.designs)):
+            if blocks[-1] and self._room([*blocks[-1], k], width) < LEAST:
+                blocks.append([])
+            blocks[-1].append(k)
+        return blocks
+
+    def _lines(self, designs: Sequence[int], width: int) -> Iterator[str]:
+        """Heading, rule and claims for some of the designs."""
+        columns = self._columns(designs)
+        longest = max(len("claim"), *(len(claim.subject) for claim in self.ledger.claims))
+        room = max(min(self._room(designs, width), longest), 2 * len(ELLIPSIS) + 1)
+        widths = [max(map(len, column)) for column in columns]
+        for row, claim in enumerate((None, *self.ledger.claims)):
+            numbers = (
+                " " * GAP + column[row].rjust(n) for column, n in zip(columns[:-1], widths, strict=False)
+            )
+            subject = "claim" if claim is None else claim.subject
+            line = _cut(subject, room).ljust(room) + "".join(numbers) + " " * GAP + columns[-1][row]
+            yield line
+            if claim is None:
+                yield "─" * (room + sum(n + GAP for n in widths))
+            elif self.why:
+                yield from _reasons(claim, room, width)
+
+
+def _reasons(claim: Claim, room: int, width: int) -> Iterator[str]:
+    """The whole claim, where its line has it cut, and the whole verdict, as lines that are indented."""
+    whole = f"{claim.subject}: " if len(claim.subject) > room else ""
+    if whole or claim.verdict != claim.word:
+        yield from (INDENT + line for line in fold(whole + claim.verdict, width - len(INDENT)))
+
+
+def _cut(text: str, room: int) -> str:
+    """A text in `room` letters, without its middle where it is longer: the end tells rows and units apart.
+
+    >>> _cut("K(p) and pseudo-inverse, table [us]", 24)
+    'K(p) and pse…table [us]'
+    """
+    if len(text) <= room:
+        return text
+    end = (room - len(ELLIPSIS)) // 2
+    return text[: room - len(ELLIPSIS) - end].rstrip() + ELLIPSIS + text[len(text) - end :].lstrip()
+
+
+def claims_table(ledger: Ledger, *, why: bool = False) -> ClaimLines:
+    """Tabulate published numbers, a line each: the paper's value, that of each design, and the verdict in one word.
+
+    ledger : from `malta.ledger`
+    why : below each line the whole verdict, with its reason
+
+    Returns what `rich.print` prints: a line for each claim, in the width of the terminal.
+
+    >>> import malta, rich
+    >>> from malta.report.ledger import Claim, Ledger
+    >>> verdict = "by construction; K_A"
+    >>> claim = Claim("pole of x [rad/s]", "±218.92", ("±218.92",), verdict, "input")
+    >>> ledger = Ledger("tubular", "the paper", ("table2",), (claim,))
+    >>> rich.print(malta.report.claims_table(ledger, why=True))
+    Published numbers and ours: tubular, the paper
+    <BLANKLINE>
+    claim              published   table2  verdict
+    ──────────────────────────────────────────────
+    pole of x [rad/s]    ±218.92  ±218.92  input
+      by construction; K_A
+    """
+    return ClaimLines(ledger, why)

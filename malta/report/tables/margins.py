@@ -8,21 +8,19 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from malta.margins.figures import zone
+from malta.margins.loop_report import zone
 from malta.model.signals import axis_units
 from malta.proof.margin import NOT_PROVEN, unproven
-from malta.report.tables.design import bandwidth_table, loop_poles_table, sensitivity_table
-from malta.report.tables.layout import Paragraph
-from malta.report.tables.parts import add_row, new_table
-from malta.report.tables.recovery import recovery_table
+from malta.report.tables.design import bandwidth_table, loop_poles_table, recovery_table, sensitivity_table
+from malta.report.tables.layout import Paragraph, add_row, new_table
 from malta.report.tables.tuning import requirements_table
 
 if TYPE_CHECKING:
-    from malta.margins.extent import Extent
     from malta.margins.loop_report import LoopReport
+    from malta.margins.travel import Extent
     from malta.proof.blocks.gain import Gain
     from malta.proof.margin import Margin
-    from malta.report.figures.parts import Published
+    from malta.report.figures.drawing import Published
     from malta.synthesis.spec import Spec
 
 WAYS = ("down", "up")

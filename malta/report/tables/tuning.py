@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from malta.report.figures.parts import UNITS, front_lines
-from malta.report.tables.parts import add_row, new_table
+from malta.report.figures.drawing import UNITS, front_lines
+from malta.report.tables.layout import add_row, new_table
 from malta.synthesis.requirements import Trade, requirements_for
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
     Returns a rich Table, which `rich.print` prints.
 
     >>> import malta, rich
-    >>> from malta.tuning.outcomes import Outcome
+    >>> from malta.tuning.verify import Outcome
     >>> margin = Outcome("margin", 3.0, 3.6, "1", "proven over the travel", at_least=True)
     >>> rich.print(malta.report.requirements_table([margin]))
     Requirements

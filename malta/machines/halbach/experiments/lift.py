@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.machines.halbach import electronics, motor
+from malta.machines.halbach import electronics
+from malta.machines.halbach import electronics as motor
 from malta.machines.halbach.electronics import Options, Pwm
 from malta.model.plant import Plant
 from malta.simulation import references

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.machines.halbach import electronics, motor
+from malta.machines.halbach import electronics
+from malta.machines.halbach import electronics as motor
 from malta.machines.halbach.electronics import IDEAL, Pwm
 from malta.machines.halbach.experiments.lift import FASTER, move_reference
 from malta.model.plant import Plant

@@ -16,10 +16,8 @@ from collections.abc import Callable
 from typing import Any
 
 from malta.errors import InputError
-from malta.machines.planar.experiments.jumps import jump
-from malta.machines.planar.experiments.models import errors
-from malta.machines.planar.experiments.motions import delay, step, step_cases
-from malta.machines.planar.experiments.timings import timing
+from malta.machines.planar.experiments.models import errors, timing
+from malta.machines.planar.experiments.motions import delay, jump, step, step_cases
 from malta.simulation.experiments import (
     Experiment,
     PlannedRun,

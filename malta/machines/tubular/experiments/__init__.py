@@ -23,19 +23,26 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from malta.errors import InputError
-from malta.machines.tubular.experiments.capture import capture
-from malta.machines.tubular.experiments.carrier import carrier, carrier_cases
 from malta.machines.tubular.experiments.commissioning import commissioning, supervised_faults
-from malta.machines.tubular.experiments.failures import faults
-from malta.machines.tubular.experiments.forces import disturbance, disturbance_cases
-from malta.machines.tubular.experiments.lifting import lift_cases, lift_off, payload
-from malta.machines.tubular.experiments.recording import record_v0
-from malta.machines.tubular.experiments.rest import hold, hold_cases, thermal, tilt, tilt_cases
+from malta.machines.tubular.experiments.disturbances import (
+    carrier,
+    carrier_cases,
+    disturbance,
+    disturbance_cases,
+    hold,
+    hold_cases,
+    thermal,
+    tilt,
+    tilt_cases,
+)
+from malta.machines.tubular.experiments.faults import faults
+from malta.machines.tubular.experiments.lifting import capture, lift_cases, lift_off, payload
 from malta.machines.tubular.experiments.strokes import (
     DISTANCE,
     RISE,
     drive_limit_cases,
     drive_limits,
+    record_v0,
     stroke,
     stroke_cases,
 )

@@ -14,9 +14,14 @@ import numpy as np
 from malta.errors import InputError
 from malta.firmware.supervised import NUMBERS, Flown, Requests, require_compiler, supervised_engine
 from malta.firmware.supervisor import FLYING, State
-from malta.machines.tubular.experiments.contact import SOFT, contact_of, contacts_of
-from malta.machines.tubular.experiments.failures import AT, planned_faults
-from malta.machines.tubular.experiments.fault_moments import fly_moments
+from malta.machines.tubular.experiments.faults import (
+    AT,
+    SOFT,
+    contact_of,
+    contacts_of,
+    fly_moments,
+    planned_faults,
+)
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE
 from malta.model.plant import Plant
@@ -31,8 +36,7 @@ from malta.simulation.experiments import (
     progress_of_part,
     scenario_of,
 )
-from malta.simulation.trajectory import Trajectory
-from malta.simulation.verdict import Verdict
+from malta.simulation.trajectory import Trajectory, Verdict
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -86,7 +90,7 @@ def supervised_faults(
 
     A supervised run has no touchdown where it stays off its bearings, or meets them at the end of a landing, slowly.
 
-    moments : in place of those faults, all classes of fault_moments.py, each at so many random moments of lift,
+    moments : in place of those faults, all classes of faults.py, each at so many random moments of lift,
         operation, stroke and landing
     """
     _require_own_engine("supervised-faults", options)

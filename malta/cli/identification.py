@@ -1,0 +1,337 @@
+"""`malta identify`: parameters of a machine from a log, with intervals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from malta.cli.options import (
+    AsJson,
+    Changes,
+    GainFile,
+    MachineFile,
+    Seed,
+    change_machine,
+    read_assignments,
+    read_controller,
+    verify_and_write,
+)
+from malta.cli.output import make_console, print_document, print_text, print_written, progress_bar, working
+from malta.errors import CheckError, InputError
+
+if TYPE_CHECKING:
+    from malta.identification.excite import ExcitationPlan
+    from malta.model.plant import Plant
+    from malta.synthesis.controller import Controller
+
+
+LogFile = Annotated[Path, typer.Argument(metavar="LOG", help="A log: .csv, .npz or .mat.")]
+
+
+def identify(
+    gains: GainFile,
+    log: LogFile,
+    parameters: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--parameter",
+            "-p",
+            metavar="NAME",
+            help="To identify: of the machine, or of its sensors' errors. Repeatable. [those told to 50 %, but for "
+            "masses and lengths]",
+        ),
+    ] = None,
+    known: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="Weighed or measured otherwise, as m=0.36kg. Repeatable."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="Write a data file, as robust-identified.toml."),
+    ] = None,
+    machine: MachineFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Identify parameters of the machine from a log under excitation, each with its 95 % interval.
+
+    Maximum likelihood at the excited lines, from measured currents to measured outputs; feedback does not bias it.
+    A log that the machine's model does not explain is refused with exit code 1, and no file is written.
+
+    \b
+    Example:  malta identify design/gains/robust.json log.npz -o found.toml
+    """
+    from malta.identification.data_file import write_data
+    from malta.identification.identify import identify as identify_parameters
+    from malta.identification.log import read_log
+    from malta.identification.response import units_of_model
+    from malta.model.data import plant_of
+    from malta.report.tables.experiments import identified_table, quality_table
+
+    controller = read_controller(gains, machine)
+    values = read_assignments("--known", known, units_of_model(plant_of(controller.parameters)))
+    with working(f"identifying from {log}"):
+        found = identify_parameters(controller, read_log(log), parameters=parameters or (), known=values)
+    files = []
+    if out is not None and not found.refusal:
+        files.append(write_data(found, out, gains=str(gains), known=values))
+    if as_json:
+        from malta.cli.documents.others import identify_output
+
+        print_document(identify_output(gains, found, files))
+    else:
+        console = make_console()
+        console.print(identified_table(found))
+        console.print(quality_table(found))
+        held = ", ".join(f"{name} = {value:.5g}" for name, value in found.held.items())
+        print_text(console, f"taken as known, SI: {held or 'nothing'}")
+        if found.dropped:
+            print_text(console, f"act, but are not told by themselves: {' '.join(found.dropped)}")
+        print_written(console, files)
+    if found.refusal:
+        raise CheckError(f"{log}: {found.refusal}")
+
+
+# `malta excite`: an excitation of all axes, what it will do and find, and the log of its flight.
+
+
+def excite(
+    gains: GainFile,
+    force: Annotated[str | None, typer.Option(help="Largest force of each input, as 2N.")] = None,
+    current: Annotated[
+        str | None, typer.Option(help="Largest current beside that at rest, as 200mA. [10 % of its limit]")
+    ] = None,
+    motion: Annotated[str | None, typer.Option(help="Largest motion of any output, as 20um.")] = None,
+    period: Annotated[float, typer.Option(help="Of the multisine [s].")] = 1.0,
+    periods: Annotated[int, typer.Option(help="That are logged, after one in which the loop settles.")] = 10,
+    band: Annotated[str, typer.Option(metavar="LOW..HIGH", help="Lowest and highest line [Hz].")] = "2..400",
+    lines: Annotated[int, typer.Option(help="Of each input.")] = 12,
+    parameters: Annotated[
+        list[str] | None,
+        typer.Option("--parameter", "-p", metavar="NAME", help="Whose accuracy is predicted. Repeatable."),
+    ] = None,
+    change: Changes = None,
+    seed: Seed = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write one period of the forces at the law's samples (.csv)."),
+    ] = None,
+    log: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Fly it on the simulated machine: its log, .csv, .npz or .mat."),
+    ] = None,
+    machine: MachineFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Excite all axes at once, and say first what moves how far, what flows and what the log will tell.
+
+    Each input has lines of its own (interleaved multisines of a low crest factor). The forces are added to the law's,
+    whose filter knows them as sent. With --log they fly on the simulated machine, with --set as a machine that the gain
+    file does not know.
+
+    \b
+    Example:  malta excite design/gains/robust.json --motion 20um --log log.npz
+    """
+    from malta.identification.excite import excite as plan_excitation
+    from malta.loops.loop import loop
+    from malta.model.data import plant_of
+    from malta.report.tables.experiments import excitation_tables
+
+    controller = read_controller(gains, machine)
+    plant = plant_of(controller.parameters)
+    units = {"force": "N", "current": "A", "motion": "m"}
+    given = {"force": force, "current": current, "motion": motion}
+    sizes = {
+        name: read_assignments(f"--{name}", [f"{name}={text}"], units)[name]
+        for name, text in given.items()
+        if text is not None
+    }
+    low, high = _band(band)
+    plan = plan_excitation(
+        loop(plant, controller), **sizes,
+        period=period, periods=periods, band=(low, high), lines=lines, parameters=parameters or (),
+        seed=seed or 0,
+    )  # fmt: skip
+    console, files = make_console(), []
+    if out is not None:
+        files.append(_write_period(out, plan, plant, controller.sample_time))
+    if not as_json:
+        f, crest = plan.signal.frequencies, plan.signal.crest_factor
+        print_text(
+            console,
+            f"{gains}: {len(f)} lines from {f[0]:g} to {f[-1]:g} Hz, crest factors {min(crest):.2f} to "
+            f"{max(crest):.2f}, {plan.duration:g} s",
+        )
+        for table in excitation_tables(plan, plant):
+            console.print(table)
+    if log is not None:
+        files.append(
+            _fly(plan, plant_of(change_machine(controller.parameters, change)), controller, log, seed)
+        )
+    if as_json:
+        from malta.cli.documents.others import excite_output
+
+        print_document(excite_output(gains, plan, files))
+    else:
+        print_written(console, files)
+
+
+def _band(text: str) -> tuple[float, float]:
+    """The ends of a band, Hz."""
+    low, dots, high = text.partition("..")
+    try:
+        return float(low), float(high)
+    except ValueError:
+        raise InputError("--band", "", repr(text if dots else low), "LOW..HIGH in Hz, as 2..400") from None
+
+
+def _write_period(path: Path, plan: ExcitationPlan, plant: Plant, Ts: float) -> Path:
+    """Write one period of the excitation at the samples of the law."""
+    import numpy as np
+
+    from malta.files import replace_files
+
+    if path.suffix != ".csv":
+        raise InputError(path, "", f"suffix {path.suffix!r}", ".csv")
+    t = Ts * np.arange(round(plan.signal.period / Ts))
+    heading = ",".join(["t [s]", *(f"exc.{s.name} [{s.unit}]" for s in plant.inputs)])
+    rows = "\n".join(
+        ",".join(f"{x:.9g}" for x in row) for row in np.column_stack([t, plan.signal(t)]).tolist()
+    )
+    replace_files({path: f"{heading}\n{rows}\n".encode()})
+    return path
+
+
+def _fly(plan: ExcitationPlan, plant: Plant, controller: Controller, path: Path, seed: int | None) -> Path:
+    """Fly an excitation and write its log. Raises CheckError when the flight ends early."""
+    from malta.identification.log import log_of, write_log
+    from malta.simulation.scenario import Scenario
+    from malta.simulation.simulate import simulate
+
+    scenario = Scenario.excited(plan.signal, plan.duration, seed=seed or 0)
+    if plant.windings is None:
+        scenario = scenario.replace(fidelity="force")
+    with progress_bar("excited", insists=False) as progress:
+        run = simulate(plant, controller, scenario, progress=progress)
+    if not run.verdict.completed:
+        raise CheckError(f"the excited machine: {run.verdict.name} at {run.verdict.time:.4g} s")
+    return write_log(log_of(run), path)
+
+
+# `malta log`: what a log of a bench holds, and what is wrong with it.
+
+
+def log(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A log: .csv, .npz or .mat.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw it: a .png, .svg or .pdf file.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show a log: statistics of its signals, gaps, jitter, missing readings, stuck and clipped sensors, limits.
+
+    \b
+    Example:  malta log build/robust.npz --out build/log.png
+    """
+    from malta.identification.log import read_log
+    from malta.report.tables.experiments import log_table
+
+    found = read_log(file)
+    files = []
+    if out is not None:
+        from malta.report.figures import save
+        from malta.report.figures.runs import log_figure
+
+        files.append(save(log_figure(found), out))
+    if as_json:
+        from malta.cli.documents.others import log_output
+
+        print_document(log_output(found, files))
+        return
+    console, survey = make_console(), found.survey
+    of = f"{found.machine or 'an unnamed machine'} under {found.controller or 'an unnamed law'}"
+    length = (
+        f"{found.samples} samples of {1e6 * found.sample_time:g} us, {found.samples * found.sample_time:g} s"
+    )
+    print_text(console, f"{file}: {of}, {length}")
+    excited = (
+        f"an excitation with a period of {found.period:g} s" if found.period else "no periodic excitation"
+    )
+    print_text(console, f"{excited}, jitter {1e6 * survey.jitter:.3g} us, {survey.gaps} gaps")
+    console.print(log_table(found))
+    for finding in survey.findings or ("nothing is missing, stuck, clipped or at a limit",):
+        print_text(console, finding)
+    print_written(console, files)
+
+
+# `malta learn`: what the log of a stroke teaches about the next one.
+
+
+def learn(
+    gains: GainFile,
+    log: LogFile,
+    parameter: Annotated[
+        str, typer.Option(metavar="NAME", help="The force constant of the thrust. [found by its effect]")
+    ] = "",
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Write NAME_learned as .json, .npz and .mat.")
+    ] = None,
+    machine: MachineFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Learn the thrust of the drive from the log of one stroke, and write it into what the law believes.
+
+    The new gain file commutates with the learned force constant, and its filter predicts with it: the next stroke needs
+    no feedback to correct the thrust.
+
+    \b
+    Example:  malta learn design/gains/robust.json build/stroke.npz --out build
+    """
+    from malta.identification.learn import learn as learn_thrust
+    from malta.identification.log import read_log
+
+    found = learn_thrust(read_controller(gains, machine), read_log(log), parameter=parameter)
+    files = [] if out is None else verify_and_write(found.controller, gains, out)
+    if as_json:
+        from malta.cli.documents.others import learn_output
+
+        print_document(learn_output(gains, log, found, files))
+        return
+    console = make_console()
+    half = 1.96 * found.deviation
+    print_text(console, f"{log}: the stroke took {found.factor:.4f} +- {half:.4f} times the thrust expected")
+    print_text(console, f"{found.parameter}: {found.before:.5g} -> {found.after:.5g}, as the law believes it")
+    print_written(console, files)
+
+
+# `malta replay`: the law of a gain file on the readings of a log.
+
+
+def replay(gains: GainFile, log: LogFile, machine: MachineFile = None, as_json: AsJson = False) -> None:
+    """Run a law on logged readings: does it command what was logged, and how large are its innovations?
+
+    Commands that differ give exit code 1: another gain file flew, or another law. Innovations larger than the sensors'
+    noise, or far from white, say that the machine is not the one that the filter believes in.
+
+    \b
+    Example:  malta replay design/gains/robust.json build/stroke.npz
+    """
+    from malta.identification.log import read_log
+    from malta.identification.replay import replay_law
+    from malta.model.data import plant_of
+    from malta.report.tables.experiments import replay_table
+
+    controller = read_controller(gains, machine)
+    with working(f"replaying {log}"):
+        found = replay_law(controller, read_log(log))
+    if as_json:
+        from malta.cli.documents.others import replay_output
+
+        print_document(replay_output(gains, log, found))
+    else:
+        console = make_console()
+        console.print(replay_table(found, plant_of(controller.parameters)))
+        same = "as logged, but for rounding" if found.same else "not those of the log"
+        print_text(console, f"{log}: the commands of {controller.name} are {same}")
+    raise typer.Exit(0 if found.same else 1)

@@ -1,0 +1,388 @@
+"""How a machine takes a load: its answer to a constant force or torque from outside, and its compliance.
+
+         w (constant, from t = 0)
+         |
+         v         y
+    [ machine ] ------> [ law ] --+        the loop of loop.py: hold, delay, current loops, loads
+         ^                        |        against v0(z) at the trim
+         +------------------------+
+
+The load acts between samples, as a constant of the continuous machine: x' = A x + B v + B_w w, sampled exactly. Outputs
+are the true ones at the samples, also where sensors read them late.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from malta.display import Description, display, quantity
+from malta.errors import CheckError, InputError
+from malta.loops.linear_loops import LinearLoop, System
+from malta.loops.loop import Loop, loop_along, loop_from
+from malta.loops.sampled_loops import SampledLoop
+from malta.model.plant import position_in
+from malta.processes import on_one_thread
+from malta.proof.responses import find_peaks
+from malta.synthesis.recovery import StepResponse, step_response
+from malta.synthesis.requirements import Noise
+from malta.synthesis.riccati import sample
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray, Plant
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.recovery import RecoveryBound
+
+
+AFTER = (0.1, 0.3)  # s
+SHARE = 0.01  # of the largest deviation
+PLACES = 9  # of the travel, its ends among them
+
+
+@dataclass(frozen=True, eq=False)
+class Deviation:
+    """What a constant load does to one output. SI."""
+
+    output: str
+    unit: str
+    largest: float
+    left: tuple[float, ...]  # the largest from each time of Recovery.after on
+    settled: float  # s, from which it stays within SHARE of the largest; inf: never
+    final: float  # what stays
+    compliance: float  # the largest amplitude over frequency that a load of this amplitude makes
+    frequency: float  # rad/s, of it
+
+
+@display
+@dataclass(frozen=True, eq=False)
+class Recovery:
+    """The answer of a machine's loop to a constant load from outside.
+
+    name : of the load
+    load : N or N m, by disturbance
+    after : s, times after which what is left is looked at
+    outputs : of each output, in SI: `largest` deviation, what is `left` after these times, the time after which it is
+        `settled` (s), the `final` value, and the largest `compliance` over frequency with its `frequency` (rad/s)
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> found = malta.recovery(plant, controller, {"payload": {"F_z": -2.0}})
+    >>> z = found[0].outputs[-1]
+    >>> f"{found[0].name} moves {z.output} by {z.largest * 1e6:.0f} um"
+    'payload moves z by 699 um'
+    """
+
+    name: str
+    load: Mapping[str, float]
+    after: tuple[float, ...]
+    outputs: tuple[Deviation, ...]
+
+    @property
+    def description(self) -> Description:
+        """What the load does to each output."""
+        rows = tuple(
+            (
+                o.output,
+                f"moves {quantity(o.largest, o.unit)}, {quantity(o.final, o.unit)} stay, "
+                f"settled after {quantity(o.settled, 's')}",
+            )
+            for o in self.outputs
+        )
+        load = ", ".join(f"{name} {value:g}" for name, value in self.load.items())
+        return Description(f"Recovery from {self.name}: {load}", rows)
+
+
+@on_one_thread
+def recovery(
+    plant: Plant | Loop,
+    controller: Controller | None = None,
+    loads: Mapping[str, Mapping[str, float]] | None = None,
+    *,
+    position: float | None = None,
+    after: tuple[float, ...] = AFTER,
+) -> tuple[Recovery, ...]:
+    """Answer constant loads from outside with the machine's linear loop.
+
+    plant : the machine, or its Loop
+    controller : of the plant; None: the Loop has it
+    loads : sizes in N or N m by disturbance, for each name; None: 1 N or 1 N m of each of the plant's disturbances
+    position : of the stroke, m, of a plant; None: the controller's operating point
+    after : s, times after which what is left is looked at
+
+    Returns a Recovery for each load.
+
+    Raises InputError for a machine without disturbances or a load of an unknown one, and CheckError for an unstable
+    loop.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> found = malta.recovery(malta.plant_of(controller.parameters), controller)
+    >>> x1 = found[0].outputs[0]
+    >>> f"1 N of {found[0].name} moves {x1.output} by {x1.largest * 1e6:.1f} um"
+    '1 N of F_x moves x1 by 48.2 um'
+    """
+    whole = loop_from(plant, controller, position)
+    plant = whole.plant
+    known = [s.name for s in plant.disturbances]
+    if not known:
+        raise InputError(plant.name, "disturbances", "none", "a machine on which forces act from outside")
+    loads = {name: {name: 1.0} for name in known} if loads is None else loads
+    sizes = [load_vector(plant, name, load) for name, load in loads.items()]
+    loop = whole.sampled
+    unit_loads = loop.answer()
+    return tuple(
+        Recovery(name, dict(load), after, _deviations(plant, loop, unit_loads, size, after))
+        for (name, load), size in zip(loads.items(), sizes, strict=True)
+    )
+
+
+def furthest(found: Sequence[Recovery]) -> tuple[tuple[Recovery, Deviation], ...]:
+    """Pick the output that each load moves furthest; a load that moves none is left out.
+
+    Outputs of different units are compared by their share of what any of the loads does to their unit.
+    """
+    units: dict[str, float] = {}
+    for d in (d for r in found for d in r.outputs):
+        units[d.unit] = max(units.get(d.unit, 0.0), d.largest)
+    picked = []
+    for r in found:
+        moved = [d for d in r.outputs if d.largest > 0]
+        if moved:
+            picked.append((r, max(moved, key=lambda d: d.largest / units[d.unit])))
+    return tuple(picked)
+
+
+def load_vector(plant: Plant, name: str, load: Mapping[str, float]) -> FloatArray:
+    """Return a load as a number for each of a plant's disturbances. Raises InputError for an unknown disturbance."""
+    known = [s.name for s in plant.disturbances]
+    for disturbance in load:
+        if disturbance not in known:
+            raise InputError("recovery", name, disturbance, "one of " + (" ".join(known) or "none"))
+    return np.array([load.get(disturbance, 0.0) for disturbance in known])
+
+
+@on_one_thread
+def bounded_deviation(
+    plant: Plant, controller: Controller, bound: RecoveryBound, position: float | None = None
+) -> float:
+    """Compute what a bound is of at a position of the stroke; an unstable loop deviates without limit."""
+    chosen = [k for k, s in enumerate(plant.outputs) if s.name in bound.outputs]
+    at = position_in(plant, plant.point(controller.operating_point[0]).x) if position is None else position
+    try:
+        answer = _answer_along(plant, controller, position).of(bound.load_at(at))
+    except CheckError:
+        return math.inf
+    reached = answer.largest if bound.after is None else answer.left(bound.after)
+    return float(reached[chosen].max())
+
+
+@lru_cache(maxsize=16)  # several bounds are of the same positions; records compare by identity
+def _answer_along(plant: Plant, controller: Controller, position: float | None) -> StepResponse:
+    """The answer to unit loads at a position of the stroke. Raises CheckError for an unstable loop."""
+    return loop_along(plant, controller, position).sampled.answer()
+
+
+def worst_along(plant: Plant, controller: Controller, bound: RecoveryBound) -> tuple[float, float]:
+    """The same at the worst of PLACES positions of the travel, and that position, m."""
+    positions = np.linspace(-plant.travel, plant.travel, PLACES).tolist()
+    return max((bounded_deviation(plant, controller, bound, z), z) for z in positions)
+
+
+def _deviations(
+    plant: Plant, loop: SampledLoop, unit_loads: StepResponse, load: FloatArray, after: tuple[float, ...]
+) -> tuple[Deviation, ...]:
+    """What a load does to each output."""
+    answer, Ts = unit_loads.of(load), loop.sample_time
+    w = np.geomspace(1e-2, np.pi / Ts, 240)
+    peaks, at = find_peaks(lambda some: np.abs(loop.compliance(some, load)), w)
+    reached, settled, left = answer.largest, answer.within(SHARE), [answer.left(t) for t in after]
+    moves = reached[:, 0] > 1e-12 * float(reached.max())  # what rounding moves stands still
+    return tuple(
+        Deviation(
+            output=s.name,
+            unit=s.unit,
+            largest=float(reached[k, 0]) if moves[k] else 0.0,
+            left=tuple(float(rest[k, 0]) if moves[k] else 0.0 for rest in left),
+            settled=float(settled[k, 0]) if moves[k] else 0.0,
+            final=float(answer.final[k, 0]),
+            compliance=float(peaks[k]),
+            frequency=float(at[k]),
+        )
+        for k, s in enumerate(plant.outputs)
+    )
+
+
+# Answers of any linear loop to steps of its references and of the loads on it, and the figures that are read off.
+
+
+SETTLED = 0.02  # of the final value, or of the largest one where the answer returns to zero
+FAST = 0.05  # of the fastest time constant: a sample of a continuous loop
+GROWN = 1e3  # how far the answer of an unstable loop grows
+SAMPLES = 2000  # of the answer of an unstable loop
+
+
+class StepFigures(NamedTuple):
+    """What is read off a step response. NaN where the loop is unstable or the answer returns to zero."""
+
+    rise: float  # s, 10 to 90 % of the final value
+    overshoot: float  # share of the final value
+    settling: float  # s, from which it stays within 2 %; inf: never
+    peak: float  # the value furthest from zero, with its sign
+    peak_time: float  # s
+    final: float
+
+
+class LoopSteps(NamedTuple):
+    """Answers of the true outputs: p outputs x p references, p outputs x d loads."""
+
+    references: StepResponse
+    loads: StepResponse
+
+
+@on_one_thread
+def loop_steps(loop: LinearLoop) -> LoopSteps:
+    """The answers of a loop to a unit step of each reference, and of each load.
+
+    An unstable loop is followed until its fastest growing mode has grown a thousandfold; its final values are NaN.
+
+    >>> import control
+    >>> answer = loop_steps(linear_loop(control.tf([4], [1, 1, 0]))).references
+    >>> round(step_figures(answer, 0, 0).overshoot, 3)
+    0.444
+    """
+    system, T = loop.closed_loop(), loop.sample_time
+    M, g, dt = _sample_system(loop, system, T)
+    if loop.stable:
+        found = step_response(M, g, system.C, dt)
+        found = StepResponse(found.t, found.y + system.D, found.final + system.D)
+    else:
+        found = _respond_for_a_while(loop, M, g, system, dt)
+    p = len(loop.outputs)
+    return LoopSteps(
+        StepResponse(found.t, found.y[..., :p], found.final[:, :p]),
+        StepResponse(found.t, found.y[..., p:], found.final[:, p:]),
+    )
+
+
+def _sample_system(loop: LinearLoop, system: System, T: float | None) -> tuple[FloatArray, FloatArray, float]:
+    """The closed loop from sample to sample: M, g and the time between samples."""
+    if T is not None:
+        return np.eye(len(system.A)) + T * system.A, T * system.B, T
+    fastest = float(np.abs(loop.closed_poles).max(initial=0.0)) or 1.0
+    return *sample(system.A, system.B, FAST / fastest), FAST / fastest
+
+
+def _respond_for_a_while(
+    loop: LinearLoop, M: FloatArray, g: FloatArray, system: System, dt: float
+) -> StepResponse:
+    """The answer of an unstable loop over a finite time."""
+    growth = max(float(loop.closed_poles.real.max()), 1e-3 * float(np.abs(loop.closed_poles).max()))
+    stride = max(1, round(math.log(GROWN) / growth / dt / SAMPLES))
+    n, w = g.shape
+    one = np.block([[M, g], [np.zeros((w, n)), np.eye(w)]])
+    step, out = np.linalg.matrix_power(one, stride), np.hstack([system.C, system.D])
+    count = max(2, min(SAMPLES, math.ceil(math.log(GROWN) / growth / dt / stride)))
+    state, found = np.vstack([np.zeros((n, w)), np.eye(w)]), []
+    for _ in range(count):
+        found.append(out @ state)
+        state = step @ state
+    t = stride * dt * np.arange(count)
+    return StepResponse(t, np.array(found), np.full((len(system.C), w), np.nan))
+
+
+def step_figures(answer: StepResponse, output: int, column: int) -> StepFigures:
+    """Rise, overshoot, settling and peak of one output after one step."""
+    t, y, final = answer.t, answer.y[:, output, column], float(answer.final[output, column])
+    k = int(np.abs(y).argmax())
+    peak, largest = float(y[k]), float(np.abs(y[k]))
+    nan = math.nan
+    if math.isnan(final):
+        return StepFigures(nan, nan, nan, peak, float(t[k]), nan)
+    returns = abs(final) < 1e-6 * max(largest, 1e-300)
+    band = SETTLED * (largest if returns else abs(final))
+    outside = np.flatnonzero(np.abs(y - final) > band)
+    settling = 0.0 if not len(outside) else _settling_time(t, np.abs(y - final), band, int(outside[-1]))
+    if returns:
+        return StepFigures(nan, nan, settling, peak, float(t[k]), final)
+    share = y / final
+    rise = _first(t, share, 0.9) - _first(t, share, 0.1)
+    return StepFigures(rise, max(0.0, float(share.max()) - 1), settling, peak, float(t[k]), final)
+
+
+def _first(t: FloatArray, share: FloatArray, level: float) -> float:
+    """When a line first reaches a level, between samples; NaN where it never does."""
+    above = np.flatnonzero(share >= level)
+    if not len(above):
+        return math.nan
+    k = int(above[0])
+    if k == 0:
+        return float(t[0])
+    return float(t[k - 1] + (t[k] - t[k - 1]) * (level - share[k - 1]) / (share[k] - share[k - 1]))
+
+
+def _settling_time(t: FloatArray, away: FloatArray, band: float, last: int) -> float:
+    """When a deviation enters its band for good, between samples; infinite where it ends outside."""
+    if last + 1 >= len(t):
+        return math.inf
+    high, low = float(away[last]), float(away[last + 1])
+    return float(t[last] + (t[last + 1] - t[last]) * (high - band) / (high - low))
+
+
+# What the sensors' noise and steps leave at rest: covariances of linear loops.
+
+
+def covariance(A: FloatArray, W: FloatArray) -> FloatArray:
+    """Solve X = A X A' + W by doubling, for a stable A (n x n); slow poles next to 1 take some thirty steps."""
+    X, A = W, A.copy()
+    for _ in range(60):
+        more = A @ X @ A.T
+        X, A = X + more, A @ A
+        if np.abs(np.diag(more)).max() <= 1e-12 * np.abs(np.diag(X)).max():
+            break
+    return X
+
+
+def noise_variance(plant: Plant) -> FloatArray:
+    """Return the variance of one measurement of each output: the sensors' noise, and q^2 / 12 of their steps."""
+    variance: FloatArray = np.array(plant.noise) ** 2 + np.array(plant.resolution) ** 2 / 12
+    return variance
+
+
+def noise_of(loop: SampledLoop, plant: Plant) -> Noise:
+    """Compute the rms of the true outputs and of the commanded forces from the sensors' noise and steps."""
+    return _noise_from(loop, noise_variance(plant), len(plant.inputs))
+
+
+def budget_of(loop: SampledLoop, plant: Plant) -> Noise:
+    """Compute which sensors the noise at rest comes from: shares of each variance, p x p of motion, m x p of force.
+
+    A row without noise is zero.
+    """
+    V = noise_variance(plant)
+    parts = [_noise_from(loop, V * alone, len(plant.inputs)) for alone in np.eye(len(V))]
+    return Noise(_shares([part.motion for part in parts]), _shares([part.force for part in parts]))
+
+
+def _shares(sizes: list[FloatArray]) -> FloatArray:
+    """The share of each part in the sum of squares, a column for each part."""
+    squares = np.array(sizes).T ** 2
+    whole = squares.sum(axis=1, keepdims=True)
+    found: FloatArray = np.divide(squares, whole, out=np.zeros_like(squares), where=whole > 0)
+    return found
+
+
+def _noise_from(loop: SampledLoop, V: FloatArray, m: int) -> Noise:
+    """The noise at rest from sensors of these variances; of m forces, behind which a loop may hand on readings."""
+    c = loop.control
+    noise = np.vstack([loop.Bd @ c.D_y, c.B_y])
+    X, n = covariance(loop.closed, noise * V @ noise.T), len(loop.Ad)
+    command = np.hstack([c.D_y @ loop.Cd, c.C])
+    out = np.diag(loop.outputs @ X[:n, :n] @ loop.outputs.T)
+    force = np.diag(command @ X @ command.T + c.D_y * V @ c.D_y.T)[:m]
+    return Noise(np.sqrt(out), np.sqrt(force))

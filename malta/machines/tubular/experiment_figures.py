@@ -1,0 +1,377 @@
+"""Figures of commissioning by the supervisor, and of faults with and without it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.firmware.supervisor import MONITORS, STATES
+from malta.machines.tubular.experiments.commissioning import WITH
+from malta.machines.tubular.experiments.disturbances import KNOWN
+from malta.machines.tubular.experiments.faults import Outcome
+from malta.machines.tubular.experiments.lifting import PLANES
+from malta.machines.tubular.experiments.strokes import OWN, RECORDED
+from malta.report.figures.drawing import (
+    CROSS,
+    MORE,
+    NOTE,
+    STYLES,
+    Published,
+    add_shared_legend,
+    clearance,
+    draw_bound,
+    draw_group,
+    draw_largest,
+    draw_line,
+    ended_early,
+    finish_axes,
+    mark_end,
+    merit_phrase,
+    micro,
+    new_page,
+    number,
+    runs_of,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from malta.model.plant import FloatArray
+    from malta.simulation.experiments import Experiment
+
+
+def commissioning_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """Heights, stroke, deviation from the reference and forces, with the states of the supervisor."""
+    run, ms = e.run, e.run.t * 1e3
+    plant, state = run.plant, e.curves["state"]
+    flying = (state >= list(STATES).index("LIFT")) & (state <= list(STATES).index("LANDING"))
+    followed = np.where(flying[:, None], e.curves["followed"], np.nan)
+    shown = (e.merits[1], e.merits[3], e.merits[5])
+    found = ", ".join(f"{merit.label} {merit_phrase(merit)}" for merit in shown)
+    figure = new_page([run], "commissioning by the supervisor", found, hspace=0.3, top=0.83)
+    (height, error), (stroke, force) = figure.subplots(2, 2, sharex=True)
+    axis = plant.stroke_output
+    for k, style in zip((1, 3), STYLES, strict=False):
+        draw_line(height, ms, run.p[:, k] * 1e6, label=plant.outputs[k].name, **style)
+    draw_line(height, ms, followed[:, 1] * 1e6, label="reference that is followed", **STYLES[3])
+    draw_line(stroke, ms, run.p[:, axis] * 1e3, **STYLES[0])
+    draw_line(stroke, ms, followed[:, axis] * 1e3, **STYLES[3])
+    off = np.abs(run.p - followed)[:, [k for k in range(followed.shape[1]) if k != axis]].max(axis=1)
+    draw_line(error, ms, np.maximum(off * 1e6, 1e-2), **STYLES[0])
+    error.set_yscale("log")
+    first = sorted(range(len(plant.inputs)), key=lambda k: k != plant.thrust_input)
+    draw_group(force, ms, {plant.inputs[k].name: run.v[:, k] for k in first})
+    draw_bound(height, -clearance(plant) * 1e6, "touchdown bearing", where="below left")
+    finish_axes(height, "", "height [µm]")
+    finish_axes(error, "", "off its reference, radially [µm]")
+    finish_axes(stroke, "time [ms]", f"{plant.stroke} [mm]")
+    finish_axes(force, "time [ms]", "commanded forces [N]", legend=len(first))
+    for axes in (height, error, stroke, force):
+        _mark_states(axes, ms, state, named=axes is height)
+    add_shared_legend(figure)
+    return figure
+
+
+def _mark_states(axes: Axes, ms: FloatArray, state: FloatArray, *, named: bool) -> None:
+    """Shade every other state, and write the names above the axes, upright where they are short."""
+    edges = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state)]
+    apart, free = 0.033 * ms[-1], -np.inf  # of upright names
+    for n, (begin, end) in enumerate(pairwise(edges)):
+        left, right = ms[begin], ms[end - 1]
+        if n % 2:
+            axes.axvspan(left, right, color="#e6e6e6", zorder=0)
+        if named:
+            upright = right - left < 0.13 * ms[-1]
+            place = max((left + right) / 2, free)
+            free = place + apart if upright else free
+            where: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
+            name = list(STATES)[int(state[begin])].lower()
+            axes.annotate(name, (place, 1.01), rotation=90 * upright, **where, **NOTE | {"fontsize": 7})
+
+
+def supervised_faults_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """The speed at which a bearing is met after each fault, with and without the supervisor; deviations over time."""
+    if any(merit.label == "moments" for merit in e.merits):
+        return _moments_figure(e)
+    found = "; ".join(f"{merit.label}: {merit.value:.0f}" for merit in e.merits)
+    places = {"left": 0.245, "wspace": 0.24, "top": 0.75}
+    figure = new_page(runs_of(e), "faults with and without the supervisor", found, **places)
+    bars, deviations = figure.subplots(1, 2, width_ratios=(1, 1.25))
+    _draw_speeds(bars, e)
+    _draw_deviations(deviations, e)
+    finish_axes(bars, "speed at the first contact [mm/s]", "", legend=2)
+    finish_axes(
+        deviations, "time after the fault [ms]", "largest radial deviation [µm]", legend=1, side="right"
+    )
+    return figure
+
+
+def _draw_speeds(axes: Axes, e: Experiment) -> None:
+    """Two bars for each fault: alone, and with the supervisor."""
+    labels = list(dict.fromkeys(case.label.removesuffix(WITH) for case in e.cases))
+    speeds = [case.merits[2].value * 1e3 for case in e.cases]
+    for case, speed in zip(e.cases, speeds, strict=True):
+        supervised = case.label.endswith(WITH)
+        place = labels.index(case.label.removesuffix(WITH)) + (0.2 if supervised else -0.2)
+        text = "no contact"
+        if speed >= 0:
+            axes.barh(place, speed, height=0.36, **LOOKS[supervised])
+            text = f"{number(speed, 2)} mm/s, " + ("touchdown" if ended_early(case.run) else "landed")
+        where: dict[str, Any] = {"xytext": (3, 0), "textcoords": "offset points", "va": "center"}
+        axes.annotate(
+            text, (max(speed, 0.0) if speed >= 0 else 0.0, place), **where, **NOTE | {"fontsize": 7}
+        )
+    for supervised, look in LOOKS.items():
+        axes.barh(0, 0, label="with supervisor" if supervised else "alone", **look)
+    axes.set_yticks(range(len(labels)), [micro(label) for label in labels], fontsize=9)
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+    axes.set_xlim(0, 1.9 * max([speed for speed in speeds if speed >= 0], default=1.0))
+
+
+def _moments_figure(e: Experiment) -> Figure:
+    """Contact speeds, currents and times until it is off of each class of faults, a mark for each moment."""
+    merits = {merit.label: merit for merit in e.merits}
+    alone, supervised = (
+        merit_phrase(merits[f"fastest contact {who}"]) for who in ("alone", "with supervisor")
+    )
+    found = (
+        f"{merits['moments'].value:.0f} moments; fastest contact alone {alone}, with supervisor {supervised}"
+    )
+    places = {"left": 0.24, "right": 0.98, "wspace": 0.12, "top": 0.87}
+    title = "faults at random moments of lift, operation, stroke and landing"
+    figure = new_page(runs_of(e), title, found, **places)
+    panels = figure.subplots(1, 3, sharey=True)
+    classes = {label: [Outcome(*row) for row in rows] for label, rows in e.curves.items()}
+    for n, rows in enumerate(classes.values()):
+        shown: tuple[tuple[list[float], list[float]], ...] = (
+            ([row.speed_alone * 1e3 for row in rows], [row.speed * 1e3 for row in rows]),
+            ([row.current_alone for row in rows], [row.current for row in rows]),
+            ([], [max(row.safe * 1e3, SOONEST) for row in rows]),
+        )
+        for axes, values in zip(panels, shown, strict=True):
+            for supervised_run, marks in zip((False, True), values, strict=True):
+                place = n + (0.18 if supervised_run else -0.18)
+                label = ("with supervisor" if supervised_run else "alone") if n == 0 else None
+                axes.plot(marks, [place] * len(marks), label=label, **MARKS[supervised_run])
+    limit = e.run.plant.actuator.current_limit
+    dashes: dict[str, Any] = {"color": "#2b2b2b", "linewidth": 0.8, "linestyle": "--"}
+    panels[1].axvline(limit, label=f"limit of an axis, {limit:g} A", **dashes)
+    panels[2].set_xscale("log")
+    panels[0].set_yticks(range(len(classes)), [_named(*one) for one in classes.items()], fontsize=7)
+    panels[0].set_ylim(len(classes) - 0.4, -0.6)
+    for axes, label in zip(panels, ("fastest contact [mm/s]", "current of an axis [A]"), strict=False):
+        finish_axes(axes, label, "")
+        axes.set_xlim(-0.03 * axes.get_xlim()[1], 1.05 * axes.get_xlim()[1])
+    panels[2].set_xlim(SOONEST / 1.5, LATEST)
+    finish_axes(panels[2], "off or landed after [ms]", "")
+    panels[2].set_xlim(SOONEST / 1.5, LATEST)
+    add_shared_legend(figure)
+    return figure
+
+
+def _named(label: str, rows: Sequence[Outcome]) -> str:
+    """A class of faults, and below it the monitors that acted last, the most frequent first."""
+    acted = [MONITORS[int(row.monitor)].lower().replace("_", " ") for row in rows if row.monitor >= 0]
+    names = sorted(set(acted), key=lambda name: (-acted.count(name), name))
+    return f"{micro(label)}\n({', '.join(names[:3]) or 'no monitor'})"
+
+
+SOONEST, LATEST = 1e-2, 1e3  # ms, of the axis of times
+MARKS: dict[bool, dict[str, Any]] = {
+    False: {"color": "#2b2b2b", "marker": "x", "markersize": 4, "linestyle": "none"},
+    True: {
+        "color": "#2b2b2b",
+        "marker": "o",
+        "markersize": 4,
+        "linestyle": "none",
+        "markerfacecolor": "#ffffff",
+    },
+}
+LOOKS: dict[bool, dict[str, Any]] = {
+    False: {"color": "#2b2b2b"},
+    True: {"color": "#ffffff", "edgecolor": "#2b2b2b", "hatch": "////"},
+}
+
+
+def _draw_deviations(axes: Axes, e: Experiment) -> None:
+    """The largest radial deviation over time of two faults that end in a touchdown without the supervisor."""
+    struck = e.run.scenario.faults[0].at
+    alone = [case for case in e.cases if not case.label.endswith(WITH)]
+    down = [case.label for case in alone if ended_early(case.run)][:2]
+    styles = iter(STYLES)
+    for case in (case for case in e.cases if case.label.removesuffix(WITH) in down):
+        run = case.run
+        radial = [k for k in range(run.p.shape[1]) if k != run.plant.stroke_output]
+        ms, off = (run.t - struck) * 1e3, np.abs(run.p[:, radial]).max(axis=1) * 1e6
+        label = micro(case.label.removesuffix(WITH)) + (", supervised" if case.label.endswith(WITH) else "")
+        draw_largest(axes, ms, np.maximum(off, 0.1), label=label, **next(styles))
+        if case.merits[1].value >= 0:
+            k = min(int(np.searchsorted(ms, case.merits[1].value * 1e3)), len(ms) - 1)
+            down_there = {"label": "touchdown"} if ended_early(run) else {"marker": "v", "label": "landed"}
+            axes.plot(ms[k], off[k], **CROSS | down_there)
+    if not down:
+        axes.annotate("no touchdown", (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=0.1)
+    draw_bound(axes, clearance(e.run.plant) * 1e6, "touchdown bearing")
+
+
+# The figure of the experiment record-v0: recorded beside computed v0(z), and the strokes with both.
+
+
+def recording_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """v0(z) of the thrust and the differences of all forces; axial errors of strokes with own and recorded v0."""
+    found = "no v0 recorded"
+    if e.merits:
+        thrust = next(merit for merit in e.merits if merit.label.endswith(e.run.plant.thrust))
+        found = f"{thrust.label}: {merit_phrase(thrust)}; {e.merits[-1].label}: {merit_phrase(e.merits[-1])}"
+    figure = new_page(runs_of(e), "v0(z) recorded by a slow stroke", found, hspace=0.34, top=0.83, left=0.1)
+    (table, difference), (own, recorded) = figure.subplots(2, 2)
+    _draw_tables(table, difference, e)
+    top = 0.0
+    for axes, what in ((own, OWN), (recorded, RECORDED)):
+        drawn = [case for case in e.cases if case.label.endswith(what)]
+        for case in drawn:
+            run, ms = case.run, case.run.t * 1e3
+            error = (run.reference - run.p)[:, run.plant.stroke_output] * 1e3
+            draw_line(axes, ms, error, label=_machine(case.label), **_style(case.label, e))
+            mark_end(axes, run, ms, error)
+            top = max(top, float(np.abs(error).max()))
+        if not drawn:
+            axes.annotate("no such stroke", (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
+        finish_axes(axes, "time [ms]", f"axial error, {what} [mm]")
+    for axes in (own, recorded):
+        axes.set_ylim(-1.05 * top or None, 1.05 * top or None)
+    add_shared_legend(figure)
+    return figure
+
+
+def _draw_tables(table: Axes, difference: Axes, e: Experiment) -> None:
+    """v0 of the thrust on each machine beside the gain file's own; recorded less own v0, of bearings the extremes."""
+    plant, c = e.run.plant, e.run.controller
+    ff, axis = c.feedforward, plant.thrust_input
+    draw_line(table, ff.z_grid * 1e3, ff.v0[:, axis], label="own v0", **STYLES[3])
+    z = e.curves.get("z", np.zeros(0))
+    for name in (name for name in e.curves if name.startswith("v0 ")):
+        label = name.removeprefix("v0 ")
+        draw_line(table, z * 1e3, e.curves[name][:, axis], label=_machine(label), **_style(label, e))
+    if "v0 " in e.curves:
+        off = (e.curves["v0 "] - np.array([ff.at(float(at)) for at in z])) * 1e3
+        bearings = np.delete(off, axis, axis=1)
+        draw_line(difference, z * 1e3, off[:, axis], label=plant.thrust, **STYLES[0] | {"linewidth": 0.9})
+        count = f"{bearings.shape[1]} bearing forces, least to largest"
+        difference.fill_between(z * 1e3, *_extremes(bearings), color="#e0a08c", linewidth=0, label=count)
+    finish_axes(table, f"{plant.stroke} [mm]", f"v0 of {plant.thrust} [N]")
+    finish_axes(difference, f"{plant.stroke} [mm]", "recorded less own v0 [mN]", legend=2)
+
+
+def _extremes(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The least and the largest of each row."""
+    return values.min(axis=1), values.max(axis=1)
+
+
+def _machine(label: str) -> str:
+    """The machine of a case: its displaced cogging, or as it is."""
+    return label.rpartition(": ")[0] or "as it is"
+
+
+def _style(label: str, e: Experiment) -> dict[str, Any]:
+    """The line of a machine, the same in all panels."""
+    machines = list(dict.fromkeys(_machine(case.label) for case in e.cases))
+    return dict(STYLES[machines.index(_machine(label))]) if _machine(label) in machines else dict(MORE[0])
+
+
+# The figure of the experiment capture: maps of starts that return, and releases from just inside and beyond.
+
+
+SCALES = {"x": "mm", "y": "mm", "z": "mm", "alpha": "mrad", "beta": "mrad"}  # 1e3 of each SI value
+RETURNS = "#cfcfcf"
+SHOWN = 60.0  # ms, of the releases
+BESIDE: dict[str, Any] = {"color": "#000000", "linestyle": (0, (5, 2)), "linewidth": 1.3}
+INSIDE: dict[str, Any] = {"color": "#1f77b4", "linestyle": "-", "linewidth": 1.3}
+
+
+def capture_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """Maps of the starts at rest from which the mover returns, with what the force limit allows at best and the
+    clearance as built; the largest displacement over time of some releases."""
+    ratio = next(merit for merit in e.merits if merit.label == "x: their ratio")
+    inside = e.merits[-1]
+    found = f"along x it returns from {merit_phrase(ratio)} of what the force limit allows; "
+    found += f"{inside.label}: {merit_phrase(inside)}"
+    figure = new_page(runs_of(e), "released at rest, without touchdown bearings", found, hspace=0.42)
+    *maps, traces = figure.subplots(2, 2).ravel()
+    for axes, plane in zip(maps, PLANES, strict=True):
+        _draw_map(axes, e, plane)
+    highest = float(np.abs(e.curves["clearance x beta"][:, 0]).max()) * 1e3
+    for case, style in zip(e.cases, (*STYLES, *MORE), strict=False):
+        run, ms = case.run, case.run.t * 1e3
+        off = np.abs(run.p[:, :4]).max(axis=1) * 1e3
+        draw_line(traces, ms, off, label=case.label.removesuffix(", inside"), **style)
+        if run.verdict.completed:
+            highest = max(highest, float(off.max()))
+    finish_axes(traces, "time [ms]", "off centre, largest [mm]", legend=4)
+    traces.set_xlim(0, SHOWN)
+    traces.set_ylim(0, 1.3 * highest)
+    return figure
+
+
+def _draw_map(axes: Axes, e: Experiment, plane: tuple[str, str]) -> None:
+    """The starts of one plane that return, the bound of the force limit, and the clearance as built."""
+    from matplotlib.colors import ListedColormap
+
+    name = " ".join(plane)
+    across, up = (e.curves[f"axis {name} {state}"] * 1e3 for state in plane)
+    returns = e.curves[f"map {name}"]
+    axes.pcolormesh(across, up, returns, cmap=ListedColormap(["#ffffff", RETURNS]), vmin=0, vmax=1)
+    axes.plot([], [], label="returns", marker="s", markersize=8, linestyle="none", color=RETURNS)
+    if f"bound {name}" in e.curves:
+        bound = e.curves[f"bound {name}"] * 1e3
+        axes.plot(*np.vstack([bound, bound[:1]]).T, label="force limit, at best", **BESIDE)
+    else:  # the travel along, and across what is allowed at the centre
+        reach = float(np.abs(e.curves[f"bound {' '.join(PLANES[0])}"][:, 0]).max()) * 1e3
+        for side in (-reach, reach):
+            axes.axhline(side, label="force limit, at best", **BESIDE)
+    edge = e.curves[f"clearance {name}"] * 1e3
+    axes.plot(*np.vstack([edge, edge[:1]]).T, label="clearance", **INSIDE)
+    finish_axes(axes, f"{plane[0]} [{SCALES[plane[0]]}]", f"{plane[1]} [{SCALES[plane[1]]}]", legend=3)
+
+
+# The figure of the experiment carrier: the carrier's move, radial deviations and bearing forces.
+
+
+SMOOTHED = 50  # samples of a mean of the noisy force
+
+
+def carrier_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """The carrier's acceleration, the force of a bearing, and the radial deviation at rest and during a stroke."""
+    rest = [case for case in e.cases if case.label.startswith("rest")]
+    told = ", ".join(f"{case.label.partition(', ')[2]} {merit_phrase(case.merits[0])}" for case in rest)
+    figure = new_page(runs_of(e), "the carrier accelerates sideways", f"radial deviation at rest: {told}")
+    (moved, force), (still, stroke) = figure.subplots(2, 2, sharex=True)
+    moved.plot(e.curves["t"] * 1e3, e.curves["acceleration"], color="#000000", linewidth=1.4)
+    for case in e.cases:
+        run, ms = case.run, case.run.t * 1e3
+        place, __, label = case.label.partition(", ")
+        style = STYLES[list(KNOWN).index(label)]
+        radial = [k for k in range(run.p.shape[1]) if k != run.plant.stroke_output]
+        off = np.maximum(np.abs((run.p - run.reference)[:, radial]).max(axis=1) * 1e6, 0.1)
+        axes = still if place == "rest" else stroke
+        draw_largest(axes, ms, off, label=label, **style)
+        mark_end(axes, run, ms, off)
+        if place == "rest":
+            count = len(ms) // SMOOTHED * SMOOTHED
+            means = (s[:count].reshape(-1, SMOOTHED).mean(axis=1) for s in (ms, run.v[:, 0]))
+            force.plot(*means, **style)
+    for axes in (still, stroke):
+        axes.set_yscale("log")
+        axes.set_ylim(0.1, 2e3)
+    finish_axes(moved, "", "acceleration [m/s²]")
+    finish_axes(force, "", f"{e.run.plant.inputs[0].name}, at rest, smoothed [N]")
+    finish_axes(still, "time [ms]", "radial deviation, at rest [µm]")
+    finish_axes(stroke, "time [ms]", "radial deviation, stroke [µm]")
+    add_shared_legend(figure)
+    return figure

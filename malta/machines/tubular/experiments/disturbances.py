@@ -1,0 +1,340 @@
+"""Outer forces on MALTA: steps, vibration of the housing, and compliance over frequency."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.machines.tubular.experiments.strokes import delayed_stroke
+from malta.model.plant import Plant
+from malta.simulation import references
+from malta.simulation.experiments import (
+    QUIET,
+    Experiment,
+    Merit,
+    PlannedRun,
+    Progress,
+    amplitude,
+    compliance,
+    fly,
+    rms,
+    scenario_of,
+    sine_wrench,
+    step_wrench,
+)
+from malta.simulation.readings import keys, normals
+from malta.simulation.scenario import Correction
+from malta.simulation.trajectory import Trajectory
+from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+def disturbance(
+    plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
+) -> Experiment:
+    """Steps of force and torque, vibration of the housing, sines of force; the linear loop's compliance beside them."""
+    wanted = disturbance_cases(plant, controller, **options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
+    steps, sines = cases[:4], cases[4:]
+    w = np.geomspace(0.01, 2000, 600) * 2 * math.pi
+    curve = compliance(plant, controller, w)
+    worst = int(curve.argmax())
+    found = (
+        Merit("largest compliance, x1 to F_x", float(curve[worst]), "um/N", key="largest_compliance"),
+        Merit("at", float(w[worst] / (2 * math.pi)), "Hz", key="compliance_frequency"),
+        Merit("smallest dynamic stiffness", float(1 / curve[worst]), "N/um", better="high"),
+    )
+    curves = {
+        "frequency": w / (2 * math.pi),
+        "compliance": curve,
+        "tones": np.array(TONES[: len(sines)]),
+        "simulated": np.array(
+            [case.merits[0].value / TONE_FORCE if case.run.verdict.completed else np.nan for case in sines]
+        ),
+    }
+    return Experiment("disturbance", "How stiff is it?", steps, found, curves, interrupted=cut)
+
+
+def disturbance_cases(plant: Plant, _: Controller, **options: Any) -> list[PlannedRun]:
+    """The runs of `disturbance`: steps, vibration, and sines of TONES."""
+    names = [s.name for s in plant.disturbances]
+    outputs = [s.name for s in plant.outputs]
+    wanted: list[PlannedRun] = []
+    for name, size, seen in (("F_x", 1.0, "x1"), ("F_z", 1.0, plant.stroke), ("T_y", 0.05, "x1")):
+        push = partial(step_wrench, column=names.index(name), size=size, at=0.02, width=len(names))
+        scenario = scenario_of("disturbance", 0.4, references.hold, QUIET | {"disturbance": push} | options)
+        unit = plant.disturbances[names.index(name)].unit
+        merits = partial(_step_merits, output=outputs.index(seen))
+        wanted.append(PlannedRun(f"step of {size:g} {unit} {name}", scenario, merits))
+    shake = partial(sine_wrench, column=names.index("F_y"), size=plant.mass, frequency=50.0, width=len(names))
+    vibration = scenario_of("vibration", 0.3, references.hold, QUIET | {"disturbance": shake} | options)
+    shaken = partial(_sine_merits, output=outputs.index("y1"), frequency=50.0)
+    wanted.append(PlannedRun("housing shaken by 1 m/s2 at 50 Hz along y", vibration, shaken))
+    for f in TONES:
+        push = partial(sine_wrench, column=names.index("F_x"), size=TONE_FORCE, frequency=f, width=len(names))
+        scenario = scenario_of(
+            "sine", 2 * max(0.1, 4 / f), references.hold, QUIET | {"disturbance": push} | options
+        )
+        found = partial(_sine_merits, output=outputs.index("x1"), frequency=f)
+        wanted.append(PlannedRun(f"{f:g} Hz", scenario, found))
+    return wanted
+
+
+TONES, TONE_FORCE = (5.0, 20.0, 60.0, 150.0, 400.0), 0.5  # Hz, N: the sines of force
+
+
+def _step_merits(run: Trajectory, output: int) -> tuple[Merit, ...]:
+    """Largest and last deflection of an output."""
+    error = np.abs(run.p[:, output])
+    return (
+        Merit(f"largest deflection of {run.plant.outputs[output].name}", float(error.max()), "um"),
+        Merit("left at the end", float(error[-1]), "um"),
+    )
+
+
+def _sine_merits(run: Trajectory, output: int, frequency: float) -> tuple[Merit, ...]:
+    """Amplitude of an output at a frequency (Hz)."""
+    return (Merit(f"amplitude of {run.plant.outputs[output].name}", amplitude(run, output, frequency), "um"),)
+
+
+# MALTA on a carrier that accelerates sideways, with and without radial feedforward of the known acceleration.
+#
+# Sec. IV-A: the first four components of v_FF can counter "any known radial disturbances, e.g. when the MALTA is
+# moved with parallel kinematics in pick-and-place robots". Reading: the stator moves along x by a known quintic, from
+# rest to rest; seen from the stator, the inertial force -m a acts at the mover's centre of gravity. The acceleration
+# is known at the sample at which it acts, not before.
+
+
+BEGIN, AFTER = 0.02, 0.08  # s, before and after the carrier's move
+KNOWN = {"not fed forward": 0.0, "fed forward": 1.0, "90 % fed forward": 0.9}  # share of the acceleration
+
+
+def carrier(
+    plant: Plant,
+    controller: Controller,
+    *,
+    carried: float = 0.1,
+    within: float = 0.2,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Experiment:
+    """The carrier moves sideways by `carried` (m) in `within` (s): at rest and during the published stroke, with the
+    inertial force fed forward and without."""
+    wanted = carrier_cases(plant, controller, carried=carried, within=within, **options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
+    t = np.arange(0, wanted[0].scenario.duration, controller.sample_time)
+    acceleration = carrier_acceleration(t, carried, within)
+    found = (
+        Merit("largest acceleration of the carrier", float(np.abs(acceleration).max()), "m/s^2"),
+        Merit("largest inertial force", float(plant.mass * np.abs(acceleration).max()), "N"),
+    )
+    curves = {"t": t, "acceleration": acceleration}
+    return Experiment("carrier", "Does it ride along?", cases, found, curves, interrupted=cut)
+
+
+def carrier_cases(
+    plant: Plant, _: Controller, *, carried: float, within: float, **options: Any
+) -> list[PlannedRun]:
+    """The runs of `carrier`: at rest, and during the published stroke."""
+    duration = BEGIN + within + AFTER
+    wanted = []
+    for place, reference in (("rest", references.hold), ("stroke", partial(delayed_stroke, wait=BEGIN))):
+        for label, share in KNOWN.items():
+            acts = partial(inertial_wrench, plant=plant, carried=carried, within=within)
+            own: dict[str, Any] = {"disturbance": acts}
+            own |= {"anticipated": partial(acts, share=share)} if share else {}
+            scenario = scenario_of("carrier", duration, reference, own | options)
+            wanted.append(PlannedRun(f"{place}, {label}", scenario, _merits))
+    return wanted
+
+
+def carrier_acceleration(t: FloatArray, carried: float, within: float) -> FloatArray:
+    """Acceleration of the carrier at the times t, m/s^2: a quintic from rest to rest that begins at BEGIN."""
+    _, __, shape = references.quintic(
+        np.asarray(t) - BEGIN - within / 2, within / references.QUINTIC_DURATION
+    )
+    return carried * shape
+
+
+def inertial_wrench(
+    t: FloatArray, plant: Plant, carried: float, within: float, share: float = 1.0
+) -> FloatArray:
+    """The wrench on the mover as seen from the carrier, or a share of it, at the times t."""
+    wrench = np.zeros((len(t), len(plant.disturbances)))
+    column = [s.name for s in plant.disturbances].index("F_x")
+    wrench[:, column] = -share * plant.mass * carrier_acceleration(t, carried, within)
+    return wrench
+
+
+def _merits(run: Trajectory) -> tuple[Merit, ...]:
+    """Radial deviation and the bearing currents."""
+    error, axis = run.p - run.reference, run.plant.stroke_output
+    radial = error[:, [k for k in range(error.shape[1]) if k != axis]]
+    bearings = [k for k in range(len(run.plant.inputs)) if k != run.plant.thrust_input]
+    constant = np.array(run.plant.actuator.force_constant)[bearings]
+    return (
+        Merit("radial deviation", float(np.abs(radial).max()), "um"),
+        Merit("rms of x1", rms(error[:, 0]), "um"),
+        Merit("largest bearing current", float(np.abs(run.v[:, bearings] / constant).max()), "A"),
+    )
+
+
+# MALTA at rest: sensor noise, a tilt about one sensor plane, and a support that drifts.
+
+
+def hold(
+    plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
+) -> Experiment:
+    """Rest at the middle with sensor noise: statistics of the last 2000 measured samples, and the true motion."""
+    cases, cut = fly(plant, controller, hold_cases(plant, controller, **options), progress, options)
+    return Experiment("hold", "How still does it stand?", cases, cases[0].merits, interrupted=cut)
+
+
+def hold_cases(_: Plant, controller: Controller, **options: Any) -> list[PlannedRun]:
+    """The run of `hold`."""
+    scenario = scenario_of("hold", (RESTING + 6000) * controller.sample_time, references.hold, options)
+    return [PlannedRun("hold", scenario, _rest_merits)]
+
+
+RESTING = 2000  # samples of the statistics, Table III
+
+
+def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
+    """Statistics of the last RESTING samples: measured, true, and of the bearing forces."""
+    plant, y, p, v = run.plant, run.y[-RESTING:], run.p[-RESTING:], run.v[-RESTING:]
+    names = [signal.name for signal in plant.outputs]
+    bearings = [k for k in range(len(plant.inputs)) if k != plant.thrust_input]
+    return (
+        *(
+            Merit(f"measured {n}, std", float(y[:, k].std()), "um", f"table_III.std.{n}")
+            for k, n in enumerate(names)
+        ),
+        *(
+            Merit(f"measured {n}, mean", float(y[:, k].mean()), "um", f"table_III.mean.{n}")
+            for k, n in enumerate(names)
+        ),
+        *(Merit(f"true {n}, rms", rms(p[:, k]), "um") for k, n in enumerate(names)),
+        Merit("bearing force, rms about its mean", rms((v - v.mean(axis=0))[:, bearings]), "N"),
+    )
+
+
+def tilt(
+    plant: Plant,
+    controller: Controller,
+    *,
+    radius: float = 200e-6,
+    frequency: float = 2.0,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Experiment:
+    """Eq. (21): a circle of `radius` (m) at `frequency` (Hz) in sensor plane 1, the other plane held at its centre.
+
+    As the paper, and with the attraction at the reference fed forward.
+    """
+    wanted = tilt_cases(plant, controller, radius=radius, frequency=frequency, **options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
+    return Experiment("tilt", "Does it tilt about sensor plane 2?", cases, (), interrupted=cut)
+
+
+def tilt_cases(
+    _: Plant, __: Controller, *, radius: float, frequency: float, **options: Any
+) -> list[PlannedRun]:
+    """The runs of `tilt`: one for each feedforward."""
+    kinds = [options["feedforward"]] if "feedforward" in options else ["axial", "attraction"]
+    reference = partial(references.circle, radius=radius, frequency=frequency)
+    merits = partial(_tilt_merits, settled=1 / frequency)
+    return [
+        PlannedRun(
+            f"feedforward {kind}",
+            scenario_of(
+                "tilt", 2 / frequency, reference, {"start": AT_REST} | options | {"feedforward": kind}
+            ),
+            merits,
+        )
+        for kind in kinds
+    ]
+
+
+AT_REST = dict.fromkeys(("x", "y", "alpha", "beta", "x_dot", "y_dot", "alpha_dot", "beta_dot"), 0.0)
+
+
+def _tilt_merits(run: Trajectory, settled: float) -> tuple[Merit, ...]:
+    """Deviation of plane 2 and error of plane 1 from `settled` (s) on, and the largest bearing force."""
+    late = run.t >= min(settled, run.t[-1])
+    error, bound = (run.p - run.reference)[late], ("um", "figure_16.deviation", "at most")
+    return (
+        Merit("SP2: largest deviation, true", float(np.hypot(error[:, 2], error[:, 3]).max()), *bound),
+        Merit("SP2: largest deviation, measured", float(np.abs(run.y[late][:, 2:4]).max()), *bound),
+        Merit("SP1: largest tracking error, true", float(np.hypot(error[:, 0], error[:, 1]).max()), "um"),
+        Merit("largest bearing force", float(np.abs(run.v[:, :4]).max()), "N"),
+    )
+
+
+def thermal(
+    plant: Plant,
+    controller: Controller,
+    *,
+    drift: float = 65e-6,
+    minute: float = 60.0,
+    faster: float = 30.0,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Experiment:
+    """The support drifts sideways by `drift` (m) over `minute` (s), run `faster` times as fast.
+
+    A laser on a fixed support reads the mover's position in sensor plane 2 every 10 ms with 0.1 um of noise; half of
+    each reading is subtracted from the reference of both planes.
+    """
+    duration, every, gain = minute / faster, 10e-3, 0.5
+    moved = partial(_drift, drift=drift, duration=duration)
+    merits = partial(_thermal_merits, moved=moved, late=duration / 10)
+    wanted = []
+    for label, share in (("compensated", gain), ("not compensated", 0.0)):
+        laser = _Laser(moved, share, [0, 2], len(plant.outputs))
+        scenario = scenario_of(
+            "thermal", duration, references.hold, {"correction": Correction(every, laser)} | options
+        )
+        wanted.append(PlannedRun(label, scenario, merits))
+    cases, cut = fly(plant, controller, wanted, progress, options)
+    lag = drift / duration * every / gain
+    found = (
+        Merit("drift of the support", drift, "um", "thermal.drift"),
+        Merit("lag if the mover goes where it is sent", lag, "um"),
+        Merit("the same at the true speed", lag / faster, "um", key="lag_at_true_speed"),
+    )
+    curves = {"drift": moved(cases[0].run.t)}
+    return Experiment("thermal", "Does it hold its place in space?", cases, found, curves, interrupted=cut)
+
+
+def _thermal_merits(run: Trajectory, moved: Callable[[Any], Any], late: float) -> tuple[Merit, ...]:
+    """Deviation in space from `late` (s) on."""
+    outside = (run.p[:, 2] + moved(run.t))[run.t >= min(late, run.t[-1])]
+    return (
+        Merit("largest deviation in space", float(np.abs(outside).max()), "um"),
+        Merit("rms deviation in space", rms(outside), "um"),
+    )
+
+
+def _drift(t: Any, drift: float, duration: float) -> Any:
+    """Displacement of the support, m, at the times t."""
+    return drift * np.asarray(t) / duration
+
+
+class _Laser:
+    """The outer loop of `thermal`: it integrates the laser's readings into an offset of the reference."""
+
+    def __init__(self, moved: Callable[[Any], Any], gain: float, columns: list[int], size: int) -> None:
+        self.moved, self.gain, self.columns = moved, gain, columns
+        self.offset, self.readings = np.zeros(size), 0
+
+    def __call__(self, t: float, p: FloatArray) -> FloatArray:
+        noise = 0.1e-6 * float(normals(keys(0, np.array([self.readings]))[0], 1, 1)[0, 0])
+        self.readings += 1
+        self.offset[self.columns] -= self.gain * (p[2] + float(self.moved(t)) + noise)
+        return self.offset.copy()

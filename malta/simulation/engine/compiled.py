@@ -1,0 +1,409 @@
+"""Shared libraries of control periods: the system's C compiler, the cache of its results, and calls into them.
+
+The user's cache folder keeps a library under the SHA-256 of its text, the compiler, the options and the processor. If
+others can write to that folder, one in the temporary folder serves, or else one of this process alone. Two processes
+that compile the same text at once write to different names first, and the last rename wins.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import hashlib
+import logging
+import os
+import platform
+import shlex
+import shutil
+import signal
+import stat
+import subprocess
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import platformdirs
+
+from malta.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from malta.model.plant import FloatArray
+
+
+# Folders that nobody else can write to: whoever writes a library's file decides what this process runs.
+#
+# A folder serves where it is the user's own and no symbolic link, and where only the user and the system can write to
+# it or replace a folder on the way to it. A refusal is one sentence, printed once, and another folder serves instead.
+
+
+OTHERS = stat.S_IWGRP | stat.S_IWOTH
+
+
+def open_private(folder: Path) -> Path | None:
+    """The real path of a folder, made with mode 0700 where it is missing; None for a folder that is not private.
+
+    Raises OSError where the folder cannot be made.
+    """
+    _make(folder)
+    own = folder.parent.resolve(strict=True) / folder.name
+    for way in _on_the_way(own):
+        fault = _fault(way.lstat(), (0, os.getuid()), sticky=True)
+        if fault:
+            _note(
+                f"malta: {folder}: found {fault} ({way}), expected a private folder: engines are not kept in it"
+            )
+            return None
+    status = own.lstat()
+    fault = "a symbolic link" if stat.S_ISLNK(status.st_mode) else _fault(status, (os.getuid(),))
+    if fault:
+        _note(f"malta: {folder}: found {fault}, expected a private folder: engines are not loaded from it")
+        return None
+    return own
+
+
+def is_private(file: Path) -> bool:
+    """Whether a file in a private folder is there, is a plain file of the user's own, and only he can write to it."""
+    try:
+        status = file.lstat()
+    except FileNotFoundError:
+        return False
+    plain = stat.S_ISREG(status.st_mode)
+    fault = _fault(status, (os.getuid(),)) if plain else "no plain file"
+    if fault:
+        _note(f"malta: {file}: found {fault}, expected a file that only you can write: it is made anew")
+    return not fault
+
+
+@cache
+def process_folder() -> Path:
+    """A new folder that is deleted when the process ends. Raises OSError without any temporary folder."""
+    folder = Path(tempfile.mkdtemp(prefix="malta-engines-"))  # of mode 0700
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def _on_the_way(folder: Path) -> Sequence[Path]:
+    """The folders around a folder: whoever can write to one of them can replace what is in it."""
+    return folder.parents
+
+
+def _make(folder: Path) -> None:
+    """Make a folder and those on the way to it that are missing, all with mode 0700."""
+    if not folder.parent.exists():
+        _make(folder.parent)
+    folder.mkdir(mode=0o700, exist_ok=True)
+
+
+def _fault(status: os.stat_result, owners: tuple[int, ...], *, sticky: bool = False) -> str:
+    """What lets others write: an owner that is none of `owners`, or the mode; "" for neither.
+
+    sticky : in folders of that mode, as /tmp, others cannot replace what is not theirs
+    """
+    if status.st_uid not in owners:
+        return f"one of user {status.st_uid}"
+    if status.st_mode & OTHERS and not (sticky and status.st_mode & stat.S_ISVTX):
+        return f"mode {stat.S_IMODE(status.st_mode):04o}"
+    return ""
+
+
+@cache
+def _note(sentence: str) -> None:
+    logging.getLogger("malta").warning(sentence)
+
+
+LANES = 8
+PATIENCE = 300.0  # s for a compilation, which takes some seconds
+FLAGS = (
+    *("-std=gnu11", "-O2", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
+    *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),
+)
+NATIVE = ("-march=native", "-mtune=generic")  # tuned for a compiler's guess of a processor, text is slower
+
+
+@cache
+def compiler() -> tuple[str, ...] | None:
+    """The system's C compiler, as a command: $CC (which may have options), or the first of cc, gcc and clang.
+
+    Raises InputError for a $CC with a quotation mark that is not closed.
+    """
+    given = os.environ.get("CC", "")
+    try:
+        chosen = shlex.split(given)
+    except ValueError as error:
+        raise InputError("$CC", "", repr(given[:60]), "a command, as a shell takes it") from error
+    for name, *options in [chosen] if chosen else [["cc"], ["gcc"], ["clang"]]:
+        path = shutil.which(name)
+        if path:
+            return path, *options
+    return None
+
+
+@cache
+def _processor() -> str:
+    """Model and features of the processor, on which `-march=native` depends."""
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return "".join(sorted({x for x in lines if x.startswith(("flags", "model name", "Features"))}))
+    return platform.processor() + platform.machine()
+
+
+@cache
+def _version(cc: tuple[str, ...]) -> str | None:
+    """What a compiler says of itself; None for one that does not answer."""
+    found = _answer([*cc, "--version"])
+    return None if found is None else found[1]
+
+
+def _answer(command: list[str], seconds: float | None = None) -> tuple[int, str] | None:
+    """A compiler's exit code and what it prints; None where it cannot be started, or is stopped after so long.
+
+    seconds : None: PATIENCE
+    """
+    seconds = PATIENCE if seconds is None else seconds
+    try:
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            errors="replace",
+            start_new_session=True,
+        )
+    except OSError:
+        return None
+    with process:
+        try:
+            printed, _ = process.communicate(timeout=seconds)
+        except BaseException as error:  # also Ctrl-C, which does not reach a session of its own
+            with suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL)  # with the programs that it started
+            if not isinstance(error, subprocess.TimeoutExpired):
+                raise
+            found = f"{command[0]} without an answer for {seconds:g} s"
+            logging.getLogger("malta").warning(f"malta: found {found}, expected a C compiler")
+            return None
+    return process.returncode, str(printed)
+
+
+def library(
+    text: str, lanes: int, folder: Path | None = None, flags: tuple[str, ...] | None = None
+) -> ctypes.CDLL | None:
+    """The library of a C text, from the cache folder or compiled now; None where no compiler can make it."""
+    cc = compiler()
+    version = None if cc is None else _version(cc)
+    if cc is None or version is None:
+        return None
+    flags = FLAGS if flags is None else flags
+    key = "\n".join([text, str(lanes), *flags, *NATIVE, *cc, version, _processor(), platform.platform()])
+    name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
+    for wanted in (folder or cache_folder(), _temporary_folder(), None):
+        try:
+            place = process_folder() if wanted is None else open_private(wanted)
+            if place is None:
+                continue
+            path = place / name
+            sound = is_private(path) and _is_intact(path)
+            if not sound and not _compile(cc, text, lanes, path, flags):
+                return None
+            return ctypes.CDLL(str(path))
+        except OSError:
+            continue
+    return None
+
+
+def _is_intact(path: Path) -> bool:
+    """Whether a library ends with the hash of its content. Loading half of a file would end the process."""
+    content = path.read_bytes()
+    return len(content) > 32 and hashlib.sha256(content[:-32]).digest() == content[-32:]
+
+
+def cache_folder() -> Path:
+    """The folder of compiled engines. Deleting it costs seconds of compilation. A user without a home has another."""
+    try:
+        return platformdirs.user_cache_path("malta")
+    except RuntimeError:  # neither $HOME nor an entry of the user in the system
+        return _temporary_folder()
+
+
+def _temporary_folder() -> Path:
+    return Path(tempfile.gettempdir()) / f"malta-{os.getuid()}"
+
+
+def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path, flags: tuple[str, ...]) -> bool:
+    """Compile a text to `path`, whole or not at all; False where the compiler fails."""
+    with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+        c, so = Path(scratch) / "engine.c", Path(scratch) / "engine.so"
+        c.write_text(text, encoding="utf-8")
+        for native in (NATIVE, ()):
+            command = [*cc, *flags, *native, f"-DLANES={lanes}"]
+            found = _answer([*command, str(c), "-o", str(so), "-lm"])
+            if found is None:
+                return False
+            if found[0] == 0:
+                content = so.read_bytes()
+                so.write_bytes(content + hashlib.sha256(content).digest())  # see _is_intact
+                so.chmod(0o600)  # whatever the umask: see is_private
+                so.replace(path)
+                return True
+    return False
+
+
+def shared_library(
+    files: Mapping[str, bytes],
+    flags: tuple[str, ...],
+    cc: tuple[str, ...] | None = None,
+    seconds: float | None = None,
+) -> bytes | None:
+    """The shared library of C files by name, for all processors of a kind; None where no compiler can make it.
+
+    cc : the compiler as a command; None: this system's, for its own kind
+    seconds : that it may take; None: PATIENCE
+    """
+    cc = cc or compiler()
+    if cc is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        for name, content in files.items():
+            (Path(folder) / name).write_bytes(content)
+        texts = [str(Path(folder) / name) for name in sorted(files) if name.endswith(".c")]
+        made = Path(folder) / "library"
+        found = _answer([*cc, *flags, *texts, "-o", str(made), "-lm"], seconds)
+        return made.read_bytes() if found is not None and found[0] == 0 else None
+
+
+def address_of(array: Any) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def feedforward_table(z_grid: FloatArray, v0: FloatArray) -> FloatArray:
+    """Rows of z, v0(z) and the slope of v0 up to the next row: the table that the engine interpolates."""
+    slope = np.diff(v0, axis=0) / np.diff(z_grid)[:, None]
+    return np.ascontiguousarray(np.hstack([z_grid[:, None], v0, np.vstack([slope, slope[-1:]])]))
+
+
+class Numbers(NamedTuple):
+    """Numbers of machines and controller: the same for all machines, but for some that are each machine's own."""
+
+    same: FloatArray
+    places: NDArray[np.int_]  # of those that are each machine's own
+    own: FloatArray  # groups x numbers x LANES
+
+
+class Lanes(NamedTuple):
+    """Machines of a batch in groups of LANES: every array is groups x numbers x LANES, keys are groups x LANES.
+
+    A run changes `states` and `digests` in place.
+    """
+
+    theta: FloatArray | Numbers  # numbers of machine and controller; an array: all are each machine's own
+    states: FloatArray
+    sigma: FloatArray  # standard deviations of the sensors' noise
+    keys: NDArray[np.uint64]  # of the noise
+    digests: FloatArray
+
+
+class Shared(NamedTuple):
+    """Inputs that all machines of a batch share."""
+
+    given: FloatArray  # samples x inputs of a sample
+    table: FloatArray  # of v0(z), see feedforward_table
+    substeps: int  # Runge–Kutta steps in a sample
+    uniform: bool  # noise of the sensors is uniform, not normal
+    foreseen: FloatArray | None = None  # what `foreseen` computes of them; None: every call does
+
+
+def arrange_in_lanes(rows: FloatArray, groups: int) -> FloatArray:
+    """Rows of machines, or one row of all, as groups x numbers x LANES; copies of the last fill the last group."""
+    if len(rows) == 1:
+        return repeat_in_lanes(rows[0], {}, groups)
+    lanes, whole = np.empty((groups, rows.shape[1], LANES)), len(rows) // LANES
+    lanes[:whole] = rows[: whole * LANES].reshape(whole, LANES, rows.shape[1]).swapaxes(1, 2)
+    if whole < groups:
+        rest = rows[whole * LANES :]
+        lanes[whole] = np.concatenate([rest, np.repeat(rows[-1:], LANES - len(rest), axis=0)]).T
+    return lanes
+
+
+def repeat_in_lanes(same: FloatArray, own: Mapping[int, FloatArray], groups: int) -> FloatArray:
+    """Numbers of machines as groups x numbers x LANES: the same for all but for those that are each machine's own.
+
+    own : a number for each machine, by index
+    """
+    lanes = np.broadcast_to(same[:, None], (groups, len(same), LANES)).copy()
+    lanes[:, list(own)] = numbers_in_lanes(same, own, groups).own
+    return lanes
+
+
+def numbers_in_lanes(same: FloatArray, own: Mapping[int, FloatArray], groups: int) -> Numbers:
+    """The numbers of `repeat_in_lanes`; only those that are each machine's own take memory for every machine."""
+    lanes = np.empty((groups, len(own), LANES))
+    for k, column in enumerate(own.values()):
+        lanes[:, k] = np.pad(column, (0, groups * LANES - len(column)), mode="edge").reshape(groups, LANES)
+    return Numbers(same, np.array(list(own), dtype=np.int_), lanes)
+
+
+def _numbers_of(theta: FloatArray | Numbers, chosen: slice) -> tuple[Any, ...]:
+    """The numbers of some groups as the engine takes them; the addresses keep their arrays alive."""
+    if not isinstance(theta, Numbers):
+        theta = Numbers(np.zeros(theta.shape[1]), np.arange(theta.shape[1]), theta)
+    same, places, own = (
+        array.ctypes.data_as(ctypes.c_void_p) for array in (theta.same, theta.places, theta.own[chosen])
+    )
+    return same, ctypes.c_long(len(theta.places)), places, own
+
+
+def foresee_samples(lib: ctypes.CDLL, lanes: Lanes, shared: Shared) -> FloatArray:
+    """What all machines of a batch share at every sample, samples x numbers: see instructions.py."""
+    call = partial(lib.foresee_all, ctypes.c_long(len(shared.given)), *_numbers_of(lanes.theta, slice(0, 1)))
+    numbers = np.empty((len(shared.given), call(address_of(shared.given), None)))
+    call(address_of(shared.given), address_of(numbers))
+    return numbers
+
+
+class Part(NamedTuple):
+    """A part of the time of all runs, which has noise of its own."""
+
+    samples: slice
+    keys: NDArray[np.uint64]  # groups x LANES
+    then: Callable[[FloatArray], None] | None = None  # what is done with the digests after it, in place
+
+
+def run_many(
+    lib: ctypes.CDLL, chosen: slice, lanes: Lanes, shared: Shared, parts: Sequence[Part] | None = None
+) -> None:
+    """Simulate the `chosen` groups of machines; their states and digests change in place.
+
+    parts : of the time, one after the other; None: all samples with the keys of the lanes
+    """
+    numbers = _numbers_of(lanes.theta, chosen)
+    states, sigma, digests = (
+        address_of(array[chosen]) for array in (lanes.states, lanes.sigma, lanes.digests)
+    )
+    groups, rows = ctypes.c_long(len(lanes.states[chosen])), ctypes.c_long(len(shared.table))
+    substeps, uniform = ctypes.c_long(shared.substeps), ctypes.c_long(shared.uniform)
+    table = address_of(shared.table)
+    ahead = foresee_samples(lib, lanes, shared) if shared.foreseen is None else shared.foreseen
+    for samples, keys, then in parts or [Part(slice(None), lanes.keys)]:
+        given = shared.given[samples]
+        lib.run_many(
+            groups,
+            ctypes.c_long(len(given)),
+            substeps,
+            *numbers,
+            rows,
+            table,
+            states,
+            address_of(given),
+            address_of(ahead[samples]),
+            uniform,
+            sigma,
+            address_of(keys[chosen]),
+            digests,
+        )
+        if then is not None:
+            then(lanes.digests[chosen])

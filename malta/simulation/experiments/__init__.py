@@ -1,0 +1,274 @@
+"""Experiments: simulated runs of a machine, and their figures of merit.
+
+An experiment is a function (plant, controller, *, progress=None, **options) -> Experiment, made of the records and
+functions of this file. Its options are fields of Scenario that replace the experiment's own (fidelity, noise, seed,
+estimator, ...), and the keywords of its signature: numbers in SI, words, true or false, or tuples of numbers, as their
+defaults are. catalogue.py finds a machine's experiments by name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from malta.display import Description, display
+from malta.errors import InputError
+from malta.loops.loop import loop_along
+from malta.margins.loop_report import Better
+from malta.model.linearize import linearize
+from malta.model.machines import attribute_of
+from malta.model.plant import Plant
+from malta.simulation.inputs import LONGEST
+from malta.simulation.references import Reference
+from malta.simulation.scenario import Scenario
+from malta.simulation.simulate import simulate
+from malta.simulation.trajectory import Trajectory
+from malta.synthesis.controller import Controller
+from malta.units import identifier, in_unit
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+Progress = Callable[[float], None]
+
+# Sensors as built, without systematic errors; and exact sensors.
+REAL: dict[str, Any] = {"noise": 1.0, "quantize": True, "sensor_errors": {}}
+QUIET: dict[str, Any] = {"noise": 0.0, "quantize": False, "sensor_errors": None}
+
+
+class Merit(NamedTuple):
+    """A figure of merit: value in SI, unit for display, the key of the paper's value, and which way is better."""
+
+    label: str
+    value: float
+    unit: str
+    published: str = ""  # key of data/published/
+    relation: str = "about"  # of ours to the published: "about" or "at most"
+    key: str = ""  # its name in documents, without a unit; "": the words of the label
+    better: Better = "low"  # "high", or "" where neither is
+
+    @property
+    def identifier(self) -> str:
+        """The key of the figure in JSON documents, with its SI unit: `rise_s`."""
+        return identifier(self.key or self.label, self.unit)
+
+    def __str__(self) -> str:
+        unit = "%" if self.unit == "percent" else self.unit
+        return f"{self.label} {in_unit(self.value, self.unit):.3g} {unit}"
+
+
+class Case(NamedTuple):
+    """A run of an experiment with its figures of merit."""
+
+    label: str
+    run: Trajectory
+    merits: tuple[Merit, ...]
+
+
+class PlannedRun(NamedTuple):
+    """A run that an experiment is going to simulate, and the function that evaluates its trajectory."""
+
+    label: str
+    scenario: Scenario
+    merits: Callable[[Trajectory], tuple[Merit, ...]]
+
+
+@display
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """The result of an experiment.
+
+    name : of the experiment
+    question : which it answers
+    cases : runs, each with its label, its Trajectory and its figures of merit
+    merits : figures of merit of the experiment as a whole, in SI, with a unit for display
+    curves : arrays that are drawn beside the runs
+    interrupted : whether Ctrl-C ended the experiment; it has the cases up to then
+    controller : a controller that the experiment has found, for a gain file; None: none
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> exact = {"noise": 0.0, "quantize": False}  # sensors
+    >>> found = malta.experiment("disturbance", spec.plant, controller, size=0.1, **exact)
+    >>> found.failed, found.cases[0].label, found.run.p.shape
+    (False, 'w', (2000, 1))
+    >>> str(found.cases[0].merits[0])
+    'y moves by 34.3 um'
+    """
+
+    name: str
+    question: str
+    cases: tuple[Case, ...]
+    merits: tuple[Merit, ...]
+    curves: Mapping[str, FloatArray] = field(default_factory=dict)
+    interrupted: bool = False
+    controller: Controller | None = None
+
+    def __str__(self) -> str:
+        cases = ("; ".join([case.label, *map(str, case.merits)]) for case in self.cases)
+        return "\n  ".join([f"{self.name}: {self.outcome}", *cases])
+
+    @property
+    def run(self) -> Trajectory:
+        """The first run."""
+        return self.cases[0].run
+
+    @property
+    def failed(self) -> bool:
+        """Whether a run ended early, except in experiments in which a touchdown is an expected result."""
+        ends = {case.run.verdict.name for case in self.cases}
+        findings = setting(self.run.plant, "FINDINGS", ())
+        return self.name not in findings and not ends <= {"completed", "interrupted"}
+
+    @property
+    def cut(self) -> bool:
+        """Whether Ctrl-C ended the experiment or its last run: no figure is final."""
+        return self.interrupted or any(case.run.verdict.name == "interrupted" for case in self.cases)
+
+    @property
+    def outcome(self) -> str:
+        """How the runs ended, in words."""
+        ends = [case for case in self.cases if not case.run.verdict.completed]
+        if not ends and self.interrupted:
+            return f"interrupted after {len(self.cases)} runs"
+        if not ends:
+            return f"completed at {self.run.verdict.time:.4g} s"
+        verdicts = [f"{case.run.verdict.name} at {case.run.verdict.time:.4g} s" for case in ends]
+        if len(self.cases) == 1:
+            return verdicts[0]
+        return f"{len(ends)} of {len(self.cases)} runs not completed ({ends[0].label}: {verdicts[0]})"
+
+    @property
+    def description(self) -> Description:
+        """How it ended, and the figures of merit of the whole and of each run."""
+        own = self.merits if len(self.cases) > 1 else ()
+        rows = [("in all", "; ".join(map(str, own)))] if own else []
+        rows += [(case.label, "; ".join(map(str, case.merits))) for case in self.cases]
+        return Description(f"Experiment {self.name!r}: {self.outcome}", tuple(rows))
+
+
+def scenario_of(
+    name: str, duration: float, reference: Callable[[Plant], Reference], options: Mapping[str, Any]
+) -> Scenario:
+    """The scenario of an experiment, with sensors as built unless the options differ."""
+    fields = REAL | {key: value for key, value in options.items() if key != "engine"}
+    return replace(Scenario(name, duration, reference), **fields)
+
+
+def fly(
+    plant: Plant,
+    controller: Controller,
+    planned: Sequence[PlannedRun],
+    progress: Progress | None,
+    options: Mapping[str, Any],
+) -> tuple[tuple[Case, ...], bool]:
+    """Simulate runs one after the other: the cases, and whether Ctrl-C ended the series before its last run."""
+    return fly_all([(plant, controller, one) for one in planned], progress, options)
+
+
+def fly_all(
+    flights: Sequence[tuple[Plant, Controller, PlannedRun]],
+    progress: Progress | None,
+    options: Mapping[str, Any],
+) -> tuple[tuple[Case, ...], bool]:
+    """`fly` for runs with different machines and controllers. Raises InputError for more than LONGEST samples."""
+    cases: list[Case] = []
+    samples = sum(one.scenario.samples(controller.sample_time) for _, controller, one in flights)
+    if samples > LONGEST:
+        where, found = (
+            f"scenario {flights[0][2].scenario.name}",
+            f"{len(flights)} of {samples:.4g} samples in all",
+        )
+        raise InputError(where, "runs", found, f"at most {LONGEST} samples")
+    for n, (plant, controller, (label, scenario, merits)) in enumerate(flights):
+        share = progress_of_part(progress, n, len(flights))
+        try:
+            run = simulate(plant, controller, scenario, engine=options.get("engine", "auto"), progress=share)
+        except KeyboardInterrupt:
+            if not cases:
+                raise
+            return tuple(cases), True
+        cases.append(Case(label, run, merits(run)))
+        if run.verdict.name == "interrupted":
+            return tuple(cases), True
+    return tuple(cases), False
+
+
+def progress_of_part(progress: Progress | None, n: int, total: int) -> Progress | None:
+    """The progress function of part n of `total` equal parts."""
+    return None if progress is None else lambda share: progress((n + share) / total)
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def setting(plant: Plant, name: str, default: Any) -> Any:
+    """The value of a name that the machine's module may define, see the list in catalogue.py."""
+    return attribute_of(plant, "experiments", name, default)
+
+
+# Forces and readings that experiments of several machines use: steps and sines, amplitudes, compliance.
+
+
+def compliance(
+    plant: Plant, controller: Controller, w: FloatArray, output: int = 0, wrench: str = "F_x"
+) -> FloatArray:
+    """|S(j w) G_w(j w)|, m/N: from a force on the centre of gravity to an output, on the linear loop of the machine.
+
+    S is the sampled loop's sensitivity at the sensors, G_w the open machine's response to the force between samples.
+    """
+    point = plant.point(controller.operating_point[0])
+    model = linearize(plant, point)
+    loop = loop_along(plant, controller)
+    x, w_ext = ca.SX.sym("x", len(plant.states)), ca.SX.sym("w", len(plant.disturbances))
+    rate = plant.f(x, ca.SX(point.u), w_ext)
+    column = [s.name for s in plant.disturbances].index(wrench)
+    B = np.array(ca.Function("B", [x, w_ext], [ca.jacobian(rate, w_ext)])(point.x, 0))[
+        list(plant.controlled), column
+    ]
+    S = loop.sensitivity(w)
+    eye = np.eye(len(model.A))
+    G = np.array([model.C @ np.linalg.solve(1j * wk * eye - model.A, B) for wk in w])
+    return np.asarray(np.abs(np.einsum("kij,kj->ki", S, G)[:, output]))
+
+
+def step_wrench(t: FloatArray, column: int, size: float, at: float, width: int) -> FloatArray:
+    """A wrench, k x width, whose entry `column` steps to `size` (N or N m) at `at` (s)."""
+    wrench = np.zeros((len(t), width))
+    wrench[t >= at, column] = size
+    return wrench
+
+
+def sine_wrench(t: FloatArray, column: int, size: float, frequency: float, width: int) -> FloatArray:
+    """A wrench, k x width, whose entry `column` is a sine of amplitude `size` (N or N m) at `frequency` (Hz)."""
+    wrench = np.zeros((len(t), width))
+    wrench[:, column] = size * np.sin(2 * math.pi * frequency * t)
+    return wrench
+
+
+def amplitude(run: Trajectory, output: int, frequency: float) -> float:
+    """Amplitude of an output at a frequency (Hz): a fit to the last whole periods in the second half of a run."""
+    Ts = run.controller.sample_time
+    period = 1 / frequency
+    periods = max(1, int(len(run.t) / 2 * Ts / period))
+    last = round(periods * period / Ts)
+    t, p = run.t[-last:], run.p[-last:, output]
+    basis = np.column_stack(
+        [
+            np.sin(2 * math.pi * frequency * t),
+            np.cos(2 * math.pi * frequency * t),
+            np.ones(len(t)),
+            t - t.mean(),
+        ]
+    )
+    fit = np.linalg.lstsq(basis, p, rcond=None)[0]
+    return float(math.hypot(fit[0], fit[1]))
