@@ -223,7 +223,9 @@ def test_a_folder_of_another_engine_is_refused(
         revision_of.cache_clear()
 
 
-@pytest.mark.parametrize("edited", ["simulation/engine/digest.py", "simulation/engine.c", "model/plant.py"])
+@pytest.mark.parametrize(
+    "edited", ["simulation/engine/digest.py", "simulation/engine/engine.c", "model/plant.py"]
+)
 def test_a_module_that_decides_runs_changes_the_revision(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edited: str
 ) -> None:

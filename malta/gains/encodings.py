@@ -26,7 +26,7 @@ from malta.tables import require_shallow
 # A strict reader of MAT-files, level 5: the elements that gain files are made of, and no others.
 #
 #     file      128 bytes of header, then elements: matrices, plain or compressed (zlib)
-#     element   type and size, 4 bytes each, or both in 4 bytes where the content fits into 4; content, padded to 8 bytes
+#     element   type and size, 4 bytes each, or both in 4 bytes if the content fits into 4; content, padded to 8 bytes
 #     matrix    flags and class, dimensions, name; then the content of its class:
 #               struct   length of a name, names, a matrix for each;  cell   a matrix for each entry
 #               char     one element of text;                         number one element of integers or floats

@@ -42,7 +42,8 @@ if TYPE_CHECKING:
 #
 #   * where a command of the preload, or of zero, makes the preload, as in most machines,
 #   * where the forces are affine in v, as those of a commutation with other parameters,
-#   * where, with squares of roots resolved, each is a polynomial of degree 2 in a command of its own, or all are affine.
+#   * where, with squares of roots resolved, each is a polynomial of degree 2 in a command of its own, or all are
+#     affine.
 #
 # Elsewhere v comes from a fixed number of Newton steps, which is good enough to search for unstable machines and not
 # for a proof: an operation that no enclosure knows keeps every proof away from such a model.
@@ -225,7 +226,7 @@ def of_plant(
     windings : these are states, too: inputs are their voltages, and their currents are further outputs (windings.py)
 
     The inputs are commanded forces: the controller commutates with its own parameters, and the currents produce forces
-    with the plant's parameters. The command at which the preload acts is a function of the parameters (parametric_plants.py);
+    with the plant's parameters. The command at which the preload acts is a function of the parameters (see below);
     where it is none that a proof could use, the system says so (`approximate`).
 
     Raises InputError for unknown names and for parameters that set the size of the model.

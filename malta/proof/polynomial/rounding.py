@@ -2,8 +2,8 @@
 
 On the boundary of stability the loop is M = diag(M_k) + e with small e. det M is not zero where the row sums of
 |diag(M_k)^-1 e| are below one: where |det M_k| > sum_i |cofactor_ij| e_i for every k and column j, e_i row sums of e.
-The sum is the determinant of M_k with e in column j. It is bounded like coefficients (closed_loop.py) and becomes part of
-the radius of det M_k. Lag, hold and delay have |h| <= 1 there and are left out of M.
+The sum is the determinant of M_k with e in column j. It is bounded like coefficients (closed_loop.py) and becomes
+part of the radius of det M_k. Lag, hold and delay have |h| <= 1 there and are left out of M.
 """
 
 from __future__ import annotations

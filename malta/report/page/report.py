@@ -95,28 +95,6 @@ def compare_gains(
     return compare([subject_of(one, uncertainty=uncertainty) for one in gains], proof=proof)
 
 
-def comparison_page(found: Comparison) -> Page:
-    """Write a comparison as one page in HTML that needs no network and no other file.
-
-    found : from `malta.report.compare_gains`
-
-    Returns a Page: a notebook shows it, and its `save` writes it to a file.
-
-    >>> import malta
-    >>> A, B, C = [[0, 1], [100, 0]], [[0], [1]], [[1, 0]]
-    >>> plant = malta.linear_machine(A, B, C, name="compared")
-    >>> model = malta.linearize(plant, plant.at())
-    >>> chosen = [malta.weights(q=[q, 1], r=[1], w=[1], v=[1e-8]) for q in (1e2, 1e4)]
-    >>> designs = [malta.lqg(model, one, Ts=1e-3) for one in chosen]
-    >>> found = malta.report.compare_gains(*designs, proof=False)
-    >>> b"What differs in the designs" in malta.report.comparison_page(found).content
-    True
-    """
-    write = comparison_page
-
-    return write(found)
-
-
 def subject_of(
     gains: str | Path | Controller,
     *,
@@ -275,7 +253,19 @@ SIGN = "★"  # before the better value, beside bold letters
 def comparison_page(found: Comparison, progress: Callable[[float], None] | None = None) -> Page:
     """Write a comparison as one page in HTML that needs no network and no other file.
 
-    progress : takes the share of the figures that are drawn
+    found : from `malta.report.compare_gains`; progress : takes the share of the figures that are drawn
+
+    Returns a Page: a notebook shows it, and its `save` writes it to a file.
+
+    >>> import malta
+    >>> A, B, C = [[0, 1], [100, 0]], [[0], [1]], [[1, 0]]
+    >>> plant = malta.linear_machine(A, B, C, name="compared")
+    >>> model = malta.linearize(plant, plant.at())
+    >>> chosen = [malta.weights(q=[q, 1], r=[1], w=[1], v=[1e-8]) for q in (1e2, 1e4)]
+    >>> designs = [malta.lqg(model, one, Ts=1e-3) for one in chosen]
+    >>> found = malta.report.compare_gains(*designs, proof=False)
+    >>> b"What differs in the designs" in malta.report.comparison_page(found).content
+    True
     """
     machines = ", ".join(dict.fromkeys(a.plant.name for a in found.designs))
     front = Front(

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 # C text of CasADi functions: the control period inside the loop of engine.c, on the numbers of numbers.c.
 #
 # Every number of machine and controller is an entry of theta, so that one compilation serves all machines and gain
-# files of a shape. What is the same for a run or for all lanes is computed once, see instructions.py. A long function is cut
-# into parts that hand numbers over in an array: compilers need far more than twice the time for twice the text in one
+# files of a shape. What is the same for a run or for all lanes is computed once, see instructions.py. A long function
+# is cut into parts that hand numbers over in an array: compilers need far more than twice the time for twice the text in one
 # piece. Each function has a second version for small tilts, which has no branches.
 
 
@@ -106,7 +106,7 @@ def source(p: Period, digest: ca.Function | None, cruise: Sequence[ca.Function] 
     prepare = _once("prepare(const real *theta, real *c, double *d)", [text.prepare for text in texts])
     ahead = _once("foresee(const double *d, const double *given, double *g)", [x.foresee for x in texts])
     numbers, noise, loop = (
-        files("malta.simulation").joinpath(f"{name}.c").read_text(encoding="utf-8")
+        files("malta.simulation.engine").joinpath(f"{name}.c").read_text(encoding="utf-8")
         for name in ("numbers", "noise", "engine")
     )
     noise = f"#if LANES > 1\n{noise}#endif\n"

@@ -1,6 +1,6 @@
 """The experiments of a machine by name, with their options.
 
-A machine without experiments of its own has those of simulation/experiments/catalogue.py. Other machines define, in the module of the
+A machine without experiments of its own has those at the end of this file. Other machines define, in the module of the
 plant or in a module `experiments` beside it,
 
     EXPERIMENTS   name -> experiment; the first is the machine's main job, which every design has to complete
