@@ -1,7 +1,7 @@
 """Robustness problems whose margins are published: what the tests assert and the benchmark times, each written once.
 
-Margins are in multiples of the box; where a source errs, tests/test_robust_published.py says why. Written in plain
-Python and numpy, as a user has them.
+Margins are in multiples of the box; where a source errs, tests/proof/test_robust_published.py says why. Written in
+plain Python and numpy, as a user has them.
 """
 
 from __future__ import annotations

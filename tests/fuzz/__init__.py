@@ -7,5 +7,5 @@
     lines    command lines
     oracle   what reading may do: exit codes, one sentence, no warning, bounded time and memory, nothing left behind
 
-`tests/test_fuzz.py` runs 2000 cases with a fixed seed; `make fuzz` goes on for as long as it is allowed to.
+`tests/project/test_fuzz.py` runs 2000 cases with a fixed seed; `make fuzz` goes on for as long as it is allowed to.
 """

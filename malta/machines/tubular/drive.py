@@ -141,9 +141,8 @@ def hall_position(z: Any, x: Any, y: Any, pole: Any, errors: Any) -> Any:
 #     rho = P - e,     F = K_A,i (1 + kappa |rho|^2 / r_max^2) rho,
 #
 # with the potential -K_A,i (|rho|^2 / 2 + kappa |rho|^4 / (4 r_max^2)). A pole pulls as 1 / gap^2, so two opposite
-# ones pull as 1 / (g - r)^2 - 1 / (g + r)^2 = (4 r / g^3) (1 + 2 r^2 / g^2 + ...): a magnetic gap g asks for
-#
-#     kappa = 2 (r_max / g)^2.
+# ones pull as 1 / (g - r)^2 - 1 / (g + r)^2 = (4 r / g^3) (1 + 2 r^2 / g^2 + ...): with a magnetic
+# gap g, kappa is 2 (r_max / g)^2.
 #
 # The pull at the sensors' centre, F at P = 0, is a load, as the weight is: v0(z) cancels it where a controller knows
 # of it. The rest grows from zero with P and belongs to the machine that a controller is designed for.

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 #
 # Every number of machine and controller is an entry of theta, so that one compilation serves all machines and gain
 # files of a shape. What is the same for a run or for all lanes is computed once, see instructions.py. A long function
-# is cut into parts that hand numbers over in an array: compilers need far more than twice the time for twice the text in one
-# piece. Each function has a second version for small tilts, which has no branches.
+# is cut into parts that hand numbers over in an array: compilers need far more than twice the time for twice the text
+# in one piece. Each function has a second version for small tilts, which has no branches.
 
 
 WHOLE = 4000  # statements: a longer function is cut into parts

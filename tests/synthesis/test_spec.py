@@ -16,7 +16,7 @@ import malta
 if TYPE_CHECKING:
     from conftest import Design
 
-DATA = Path(__file__).parents[1] / "data" / "tubular.toml"
+DATA = Path(__file__).parents[2] / "data" / "tubular.toml"
 
 TS = "sample_time = { value = 50,"
 TS_UNIT = 'sample_time = { value = 50, unit = "us" }'

@@ -428,6 +428,6 @@ for path in sorted(Path(sys.argv[1]).glob("*.mat")):
         text=True,
         timeout=120,
         check=False,
-        cwd=Path(__file__).parent,
+        cwd=Path(__file__).parent,  # whose module the program imports
     )
     assert (done.returncode, done.stderr) == (0, "")

@@ -31,7 +31,7 @@ from malta.synthesis.spec import Spec
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 TABLE2, CALIBRATED = "design/gains/table2.json", "design/gains/calibrated.json"
 WIDTH = 100
 HEAVY = ("casadi", "control", "matplotlib", "numpy", "pint", "scipy")

@@ -16,7 +16,7 @@ from malta.simulation import inputs, scenario
 from malta.simulation.engine import compiled
 from malta.simulation.experiments import recording as force_log
 
-TEXT = (Path(__file__).parents[1] / "SECURITY.md").read_text(encoding="utf-8")
+TEXT = (Path(__file__).parents[2] / "SECURITY.md").read_text(encoding="utf-8")
 LIMITS = {
     "a file": files.LARGEST,
     "a log": force_log.LARGEST,

@@ -34,7 +34,7 @@ from malta.synthesis.pid import pid
 from malta.synthesis.riccati import sample
 from malta.synthesis.spec import Pid, Weights
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @cache

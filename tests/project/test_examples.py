@@ -24,7 +24,7 @@ from malta.model import machines
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 FOLDERS = ("data", "design", "examples")  # that examples read
 # The examples that take longest, compilers included; the others together take some two seconds of processor time.
 SLOW = {

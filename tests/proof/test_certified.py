@@ -28,7 +28,7 @@ from malta.report.tables.design import claim_share
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 HALBACH = ROOT / "design" / "gains" / "halbach.json"
 BOX = {"m": 0.1, "A": 0.1, "b": 0.2, "R": 0.2}  # of its gain file
 LOST = 4.29  # a loop of the Halbach stage is unstable there

@@ -32,7 +32,7 @@ from malta.proof.uncertain import Compensator
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 HALBACH = ROOT / "design" / "gains" / "halbach.json"
 Change = Callable[[dict[str, Any]], None]
 
