@@ -1,8 +1,8 @@
 """Own mutants: faults put into the code that refuses, proves, seals and limits, one at a time; tests have to notice.
 
 Each `*.toml` lists mutants: file, the text it has, the text in its place, the tests that have to fail, and, where no
-test can notice, why: `equivalent`. `make mutants` runs them; `tests/project/test_mutants.py` checks that the texts still
-apply.
+test can notice, why: `equivalent`. `make mutants` runs them; `tests/project/test_mutants.py` checks that the texts
+still apply.
 """
 
 from __future__ import annotations
