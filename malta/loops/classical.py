@@ -168,17 +168,18 @@ def _disk_matrix(Q: ComplexArray) -> ComplexArray:
 def _balanced_norm(M: ComplexArray) -> FloatArray:
     """sigma_max of D M D^-1, D diagonal so that norms of rows and columns agree (Osborne): an upper bound of mu."""
     size = np.abs(M)
-    d = np.ones(size.shape[:2])
-    off = size * (1 - np.eye(size.shape[-1]))
+    d = np.ones((*size.shape[:2], 1))
+    off = (size * (1 - np.eye(size.shape[-1]))) ** 2
+    turned = np.ascontiguousarray(off.swapaxes(1, 2))
     for _ in range(ROUNDS):
-        scaled = off * d[:, :, None] / d[:, None, :]
-        rows, columns = np.sqrt((scaled**2).sum(2)), np.sqrt((scaled**2).sum(1))
+        squares = d**2
+        rows, columns = np.sqrt(squares * (off @ (1 / squares))), np.sqrt(turned @ squares / squares)
         both = (rows > 0) & (columns > 0)
         ratio = np.where(both, columns / np.where(both, rows, 1), 1)
         d = d * ratio**0.25
         if np.abs(ratio - 1).max(initial=0.0) < BALANCED:
             break
-    return np.asarray(np.linalg.svd(M * d[:, :, None] / d[:, None, :], compute_uv=False)[:, 0])
+    return np.asarray(np.linalg.svd(M * d / d.swapaxes(1, 2), compute_uv=False)[:, 0])
 
 
 def delay_margins(L: ComplexArray, w: FloatArray) -> FloatArray:

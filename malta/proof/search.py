@@ -98,7 +98,8 @@ DEAR = 3.0  # s that families take beyond which their boxes grow in small steps
 BRIEF, SMALL = 0.5, 0.015  # s, and share of the time, that a wider box may take at least
 PATIENCE = 20_000  # cells without progress after which the proof is given up
 HARD = 4000  # cells after which smaller boxes are proven first
-FEW = 100  # cells of many parameters, of which each is dear, before multipliers take their turn
+FEW = 100  # cells of many parameters, of which each may be dear, before multipliers take their turn
+CHEAP_NODES = 128_000  # coefficients of polynomials on these cells, where each has few
 NEAR = 1.005  # box of couplings, in multiples of where axes by themselves are lost
 LEVELS = 5  # of these boxes, each half of the next
 SMALLER = 4  # boxes, each half of the last one, that Hurwitz's determinant is tried on
@@ -247,9 +248,9 @@ class Job:
         Where the whole box takes long, smaller ones are proven first: each is a bound that stands.
         """
         searches = self._start(parts, self.target(reach), min(reach, self.upper))
-        final = self._advance(searches, reach, min(self.most_cells, FEW if self._is_many else HARD))
+        final = self._advance(searches, reach, min(self.most_cells, self._first_cells(parts)))
         best, kept = 0.0, searches
-        if self._is_open(searches):
+        if self._is_open(searches) and not self._is_near(final):
             if self._is_many:
                 self._multiply(self.target(reach), TURN, TURN_AFTER * (clock.monotonic() - self.begun))
             if not self._is_covered(reach):
@@ -260,7 +261,7 @@ class Job:
                 return final, searches
         if self._is_open(searches) and not self.late() and not _is_blocked(searches):
             top = self.target(reach)
-            for level in range(LEVELS, 0, -1):
+            for level in range(0 if self._is_near(final) else LEVELS, 0, -1):
                 small = self._start(parts, top * 0.5**level, top * 0.5**level)
                 found = self._advance(small, top * 0.5**level, HARD, rest=0.3)
                 if found > best:
@@ -271,6 +272,17 @@ class Job:
         if self._is_open(searches):
             self._explain_rest(searches)
         return (final, searches) if final >= best else (best, kept)
+
+    def _first_cells(self, parts: list[Part]) -> int:
+        """The number of cells after which other proofs take their turn."""
+        if not self._is_many:
+            return HARD
+        nodes = max((part.family.values.shape[1] for part in parts), default=1)
+        return min(HARD, max(FEW, CHEAP_NODES // nodes))
+
+    def _is_near(self, lower: float) -> bool:
+        """Whether a bound is as close to the witness as was asked for."""
+        return lower >= self.upper * (1 - self.asked)
 
     @cached_property
     def structured(self) -> Structured | None:

@@ -79,9 +79,14 @@ def rows_and_slopes(f: Family, branch: int, x: Any) -> tuple[ComplexArray, Compl
     return weights, weights * power
 
 
-def linear_distance(f: Family, g: Growth, u: FloatArray, branch: int, x: FloatArray) -> FloatArray:
-    """The smallest t at which the linearization about u vanishes, at each of the frequencies x."""
-    a, slopes = coefficients_at(f, u)
+def linear_distance(
+    f: Family, g: Growth, u: FloatArray, branch: int, x: FloatArray, at: tuple[FloatArray, FloatArray]
+) -> FloatArray:
+    """The smallest t at which the linearization about u vanishes, at each of the frequencies x.
+
+    at : `coefficients_at` u
+    """
+    a, slopes = at
     rows, by_x = rows_and_slopes(f, branch, x)
     value, moved = rows @ a, rows @ slopes.T
     grows: Any = g.grows
@@ -110,20 +115,21 @@ def starts(f: Family, g: Growth, most: int = 6) -> list[tuple[float, int, float,
     found: list[tuple[float, int, float, FloatArray]] = []
     centre = g.shares(g.nominal)
     fixed = [
-        np.array([c]) if grows or n == 1 else np.array([0.5, 0.0, 1.0])
-        for c, grows, n in zip(centre, g.grows, f.shape, strict=True)
+        np.array([c]) if grows or not width or n == 1 else np.array([0.5, 0.0, 1.0])
+        for c, grows, width, n in zip(centre, g.grows, g.high - g.low, f.shape, strict=True)
     ]
     places = [np.array(place) for place in itertools.islice(itertools.product(*fixed), 27)]
     x = np.geomspace(inner[0, 1], inner[-1, 2], STEPS * len(inner)) if len(inner) else np.ones(1)
     for u in places:
         if is_late():
             break
-        t = linear_distance(f, g, u, 0, x)
+        at = coefficients_at(f, u)
+        t = linear_distance(f, g, u, 0, x, at)
         low = np.flatnonzero((t <= np.r_[np.inf, t[:-1]]) & (t <= np.r_[t[1:], np.inf]) & np.isfinite(t))
         for k in low[np.argsort(t[low])][:most]:
             found.append((float(t[k]), 0, float(x[k]), u))
         for branch, end in ENDS:
-            found.append((float(linear_distance(f, g, u, branch, np.array([end]))[0]), branch, end, u))
+            found.append((float(linear_distance(f, g, u, branch, np.array([end]), at)[0]), branch, end, u))
     found.sort(key=lambda s: s[0])
     crossings = _corners(f, g, most)  # first: these do cross, where a small linear distance may lead nowhere
     return [*crossings, *(start for start in found[: 2 * most] if np.isfinite(start[0]))]
@@ -131,7 +137,7 @@ def starts(f: Family, g: Growth, most: int = 6) -> list[tuple[float, int, float,
 
 def _corners(f: Family, g: Growth, most: int) -> list[tuple[float, int, float, FloatArray]]:
     """The first loss of stability, by the roots, on the ways from the nominal values to corners of the box."""
-    free = [i for i, n in enumerate(f.shape) if n > 1]
+    free = [i for i, n in enumerate(f.shape) if n > 1 and g.high[i] > g.low[i]]
     if not free:
         return []
     rng = np.random.default_rng(0)

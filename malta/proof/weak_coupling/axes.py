@@ -70,6 +70,10 @@ class Axes:
     def degrees(self) -> tuple[int, ...]:
         return tuple(max(row[k] for row in self.powers) for k in range(len(self.names)))
 
+    def degrees_over(self, sides: FloatArray) -> tuple[int, ...]:
+        """The degrees over a box: zero along a side without width."""
+        return tuple(d if low < high else 0 for d, (low, high) in zip(self.degrees, sides, strict=True))
+
     def values_at(self, p: FloatArray) -> tuple[float, ...]:
         """The values of the factors at p, rounded."""
         return tuple(float(x.coefficient * np.prod(p ** np.array(x.monomial))) for x in self.factors)
@@ -89,8 +93,9 @@ class Axes:
 
         K x nodes and K; K x states x states x nodes and K x states x states, over 2^heights.
         """
-        weights = _bernstein(self.powers, self.degrees, sides)  # subsets x nodes
-        sizes = _bernstein(self.powers, self.degrees, np.abs(sides))
+        degrees = self.degrees_over(sides)
+        weights = _bernstein(self.powers, degrees, sides)  # subsets x nodes
+        sizes = _bernstein(self.powers, degrees, np.abs(sides))
         determinant, slack = _doubles(self.determinants, self.heights)
         values = determinant.T @ weights
         radius = (slack.T @ sizes + 64 * EPS * (np.abs(determinant).T @ sizes)).max(axis=1)
@@ -222,12 +227,12 @@ def _doubles(a: Sequence[list[Any]], heights: Sequence[int]) -> tuple[FloatArray
 
 
 def _bernstein(powers: Sequence[Sequence[int]], degrees: Sequence[int], sides: FloatArray) -> FloatArray:
-    """Bernstein coefficients of monomials over a box: monomials x nodes."""
+    """Bernstein coefficients of monomials over a box: monomials x nodes. A side of degree 0 has no width."""
     rows = []
     for power in powers:
         row = np.ones(1)
         for r, d, (low, high) in zip(power, degrees, sides.tolist(), strict=True):
-            own = [
+            own = [low**r] if not d else [
                 sum(
                     math.comb(i, s) * math.comb(d - i, r - s) * high**s * low ** (r - s)
                     for s in range(max(0, r - d + i), min(i, r) + 1)

@@ -114,12 +114,52 @@ class HeldMachine:
             return found
 
         b = np.array([float((arb(c) * monomial(m)).abs_upper()) * (1 + 1e-9) for c, m in self.lead])
-        Z, beside, E, shares, ratios, rest = (size(t) for t in self._balls)
+        return self._checked(b, [size(t) for t in self._balls])
+
+    def _checked(self, b: FloatArray, sizes: Sequence[FloatArray]) -> Bounds:
+        """The bounds of these sizes. Raises NotAnalytic as `bounds` does."""
+        Z, beside, E, shares, ratios, rest = sizes
         if not all(np.isfinite(M).all() for M in (Z, beside, E, shares, ratios, rest, b)):
             raise NotAnalytic("a parameter that divides reaches zero")
         if self.rest and not (dominating_solution(ratios, rest[:, :1]) <= 1).all():
             raise NotAnalytic("forces at rest that are not what they were taken for")
         return Bounds(Z, beside, E, shares, b)
+
+    @cached_property
+    def _sums(self) -> tuple[FloatArray, FloatArray, tuple[tuple[list[Any], FloatArray, FloatArray], ...]]:
+        """Of b the coefficients, exponents of all monomials, those of b first, and of each table of `_balls` the
+        places, the middles of coefficients and their half widths: places x monomials."""
+        tables = self.Z, _without(self.Z, self.stiff), self.E, self.shares, self.ratios, self.rest
+        known = {
+            m: k for k, m in enumerate(m for t in tables for entry in t.values() for m, _, _ in entry.terms)
+        }
+        column = {m: len(self.lead) + k for k, m in enumerate(known)}
+        found = []
+        for table in tables:
+            ends = np.zeros((2, len(table), len(self.lead) + len(column)))
+            for row, entry in enumerate(table.values()):
+                for m, a, b in entry.terms:
+                    ends[:, row, column[m]] += a, b
+            found.append((list(table), ends.sum(axis=0) / 2, np.abs(ends[1] - ends[0]) / 2))
+        exponents = np.array([*(m for _, m in self.lead), *column], dtype=float)
+        return np.array([c for c, _ in self.lead]), exponents.reshape(-1, len(self.names)), tuple(found)
+
+    def bounds_near(self, p: FloatArray) -> Bounds:
+        """The bounds at one p in doubles, to rounding: to choose by, not to prove with.
+
+        Raises NotAnalytic as `bounds` does.
+        """
+        leads, exponents, tables = self._sums
+        n, sizes = len(self.lead), []
+        with np.errstate(all="ignore"):
+            values = np.prod(p**exponents, axis=1)
+            for places, middle, half in tables:
+                found = np.zeros((n, n))
+                if places:
+                    i, j = np.array(places).T
+                    found[i, j] = np.abs(middle @ values) + half @ np.abs(values)
+                sizes.append(found)
+            return self._checked(np.abs(leads * values[:n]), sizes)
 
     def at(self, y: float) -> HeldMachine:
         """The machine at one position of the interval, enclosed as on the piece that holds it."""

@@ -159,7 +159,8 @@ def _part(g: Axes, coupling: Callable[[FloatArray], Coupling], sides: FloatArray
     with np.errstate(divide="ignore"):
         scale = scale_of(np.log2(np.abs(values).max(axis=1)) + np.array(g.heights))
     exponents = tuple(h + scale * k for k, h in enumerate(g.heights))
-    family = Family(tuple(d + 1 for d in g.degrees), values, radius, exponents, scale)
+    shape = tuple(d + 1 for d in g.degrees_over(sides))
+    family = Family(shape, values, radius, exponents, scale)
     group: Any = g  # a part uses `inverted` alone
     around = _CoupledGroup(g, sides, family, coupling).on
     return Part(group, sides, family, growth_over(sides, g.inverted, box), around)
@@ -238,7 +239,12 @@ class HeldLoop:
 
     def _bounds(self, sides: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """W, V and the dropped gains over a box. Raises NotAnalytic."""
-        bounds = self.machine.bounds([arb(low).union(arb(high)) for low, high in sides.tolist()])
+        return self._coupling_within(
+            self.machine.bounds([arb(low).union(arb(high)) for low, high in sides.tolist()])
+        )
+
+    def _coupling_within(self, bounds: Bounds) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """W, V and the dropped gains within bounds of the machine. Raises NotAnalytic."""
         loose = [i for i in range(len(bounds.Z)) if i not in self._stiff]
         bounds.beside[loose, loose] = bounds.Z[loose, loose]
         with np.errstate(over="ignore", invalid="ignore"):  # bounds that overflow are refused
@@ -296,9 +302,10 @@ class HeldLoop:
         known: dict[Any, tuple[FloatArray, FloatArray] | None] = {}
         vector: FloatArray = np.ones(len(seen))
         rho = math.inf
-        for p in _corners(sides):
+        corners = _corners(sides)
+        for count, p in enumerate(corners, 1):
             try:
-                W, V, rest = self._bounds(np.stack([p, p], axis=1))
+                W, V, rest = self._coupling_within(self.machine.bounds_near(p))
             except NotAnalytic:
                 return np.ones(len(seen)), math.inf
             forces = np.vstack([W, V])
@@ -314,9 +321,10 @@ class HeldLoop:
                 one += (G @ rest[members]).max(axis=0) * LOOSE
                 one[3 * r :] *= LOOSE
                 seen[members] = np.maximum(seen[members], one)
-            vector, rho = _perron_of(seen)
-            if rho >= most:
-                break
+            if count == len(corners) or (math.isfinite(most) and not count & (count - 1)):
+                vector, rho = _perron_of(seen)
+                if rho >= most:
+                    break
         return vector, rho
 
     def _responses(self, g: Axes, values: tuple[float, ...]) -> tuple[FloatArray, FloatArray] | None:
