@@ -2,12 +2,17 @@
 
 plan, limit -> rare_event -> RareEvent -> write_event -> read_design_point -> replay_design_point
 
+    rare_touchdown.json      the probability, its repetitions and the design point
+    rare_touchdown_0.npz     the first repetition of the subset simulation, with all its failures, under a seal
+    rare_touchdown_1.npz     ...
+
 The machines are uniform in the plan's box, as in a campaign, and every run has noise of its own, which changes part by
 part where a chain takes a step: see rare.py.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -18,7 +23,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
+from scipy.stats import t as student
 
+from malta.archives import read_npz
 from malta.campaigns.limits import Limit
 from malta.campaigns.plan import (
     Plan,
@@ -28,11 +35,12 @@ from malta.campaigns.plan import (
     varied_names,
     varying_columns,
 )
+from malta.campaigns.result import CONFIDENCE, Rate, rate
 from malta.campaigns.run import replay_machine
-from malta.campaigns.store import simulate_machines
+from malta.campaigns.store import seal, simulate_machines
 from malta.display import Description, display
 from malta.errors import InputError
-from malta.files import json_text, read_file, replace_files
+from malta.files import file_exists, json_text, read_file, replace_files
 from malta.simulation.engine.digest import verdicts
 
 if TYPE_CHECKING:
@@ -58,13 +66,25 @@ if TYPE_CHECKING:
 # noise) as it is, so that a step which is refused whenever it leaves the level leaves the distribution within the
 # level as it is. The size s is adapted to an acceptance of 44 %, by all chains together.
 #
+# Runs of one simulation are related, over the levels too, and intervals from their correlation are too short. How
+# exact the probability is, independent repetitions say: as the product of many shares, P is lognormal over R of them.
+# With mean m and standard deviation s of log P, the logarithm of its mean is m + s^2 / 2, with the standard error e
+# of
+#
+#     e^2 = s^2 / R + s^4 / (2 (R - 1))
+#
+# and the interval is m + s^2 / 2 -+ t e with t from Student's distribution of R - 1 degrees of freedom (Cox's method:
+# Zhou & Gao 1997, Olsson 2005).
+#
 # The levels follow the most severe runs. Failures of another kind, to which the severity of the first levels does not
-# lead, are missed, and no coefficient of variation tells of them.
+# lead, are missed by every repetition, and no interval tells of them.
 
 
 SHARE = 10  # one run in SHARE passes a level
 LEVELS = 10  # at most: probabilities down to 1e-10
-FEWEST = 100  # runs in a level
+REPETITIONS = 4
+FEWEST = 500  # runs in a level of a repetition: with 100, probabilities of 1e-5 were too large by a half
+APART = 2**40  # indices of noise from one repetition to the next
 ACCEPTANCE = 0.44  # of the steps, Papaioannou et al. 2015
 FIRST_STEP = 0.6  # size of the first step, in standard deviations
 
@@ -75,11 +95,10 @@ class Runs(NamedTuple):
     u: FloatArray  # runs x dimensions, standard normal
     noise: NDArray[np.int64]  # runs x parts, index of the run whose noise the part has
     severity: FloatArray  # 1 or more: failed
-    ancestor: NDArray[np.int64]  # of the runs of the first level, from which this one's chain descends
 
     def chosen(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Runs:
         """Some of the runs."""
-        return Runs(self.u[rows], self.noise[rows], self.severity[rows], self.ancestor[rows])
+        return Runs(self.u[rows], self.noise[rows], self.severity[rows])
 
 
 class Level(NamedTuple):
@@ -87,41 +106,76 @@ class Level(NamedTuple):
 
     threshold: float  # of the severity
     share: float  # of the runs that passed: the conditional probability
-    cov: float  # coefficient of variation of the share, with the correlation in the chains
     acceptance: float  # of the steps that led to the runs; NaN for the first level, which has none
 
 
 @dataclass(frozen=True, eq=False)
 class Subset:
-    """The result of a subset simulation."""
+    """The result of one subset simulation."""
 
     levels: tuple[Level, ...]
     simulated: int  # runs
-    cov: float  # coefficient of variation of the probability
     failures: Runs  # that the last level has; empty where no run failed
     worst: float  # largest severity below failure; NaN where every run failed
     samples: int  # runs in a level
-    interrupted: bool = False
 
     @property
     def reached(self) -> bool:
         """Whether runs failed, so that `probability` is that of the failure and not a bound above it."""
-        return bool(len(self.failures.severity)) and not self.interrupted
+        return bool(len(self.failures.severity))
 
     @property
     def probability(self) -> float:
         """Of the failure; of passing the last level where no run failed, which is more probable than a failure."""
         return math.prod(level.share for level in self.levels)
 
-    @property
-    def ancestors(self) -> int:
-        """Number of runs of the first level from which the failures descend."""
-        return len(np.unique(self.failures.ancestor))
 
-    def interval(self, z: float = 1.96) -> tuple[float, float]:
-        """The interval of a lognormal probability with this coefficient of variation: 95 % for z = 1.96."""
-        width = math.exp(z * math.sqrt(math.log1p(self.cov**2)))
-        return self.probability / width, min(1.0, self.probability * width)
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The probability that independent repetitions of a subset simulation agree on."""
+
+    repetitions: tuple[Subset, ...]
+
+    @property
+    def reached(self) -> bool:
+        """Whether runs failed in every repetition: `probability` is that of the failure and not a bound above it."""
+        return all(one.reached for one in self.repetitions)
+
+    @property
+    def probability(self) -> float:
+        """Of the failure; of passing the last levels where a repetition has no failure."""
+        return math.exp(self._normal[0]) if self._pooled is None else self._pooled.share
+
+    @property
+    def cov(self) -> float:
+        """Coefficient of variation of the probability."""
+        if self._pooled is None:
+            return math.sqrt(math.expm1(min(self._normal[1] ** 2, 700.0)))
+        return math.sqrt((1 - self._pooled.share) / (self._pooled.share * self._pooled.runs))
+
+    def interval(self) -> tuple[float, float]:
+        """The interval of the probability at CONFIDENCE: see above; Clopper-Pearson's where one level is enough."""
+        if self._pooled is not None:
+            return self._pooled.low, self._pooled.high
+        centre, error = self._normal
+        half = error * float(student.ppf((1 + CONFIDENCE) / 2, len(self.repetitions) - 1))
+        return math.exp(centre - half), math.exp(min(0.0, centre + half))
+
+    @property
+    def simulated(self) -> int:
+        """Number of runs of all repetitions."""
+        return sum(one.simulated for one in self.repetitions)
+
+    @property
+    def failures(self) -> Runs:
+        """The failures of all repetitions."""
+        found = [one.failures for one in self.repetitions]
+        return Runs(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+
+    @property
+    def worst(self) -> float:
+        """Largest severity below failure; NaN where every run failed."""
+        return max((one.worst for one in self.repetitions if not math.isnan(one.worst)), default=math.nan)
 
     @property
     def plain(self) -> float:
@@ -130,8 +184,68 @@ class Subset:
             return math.inf
         return (1 - self.probability) / (self.probability * self.cov**2)
 
+    @property
+    def _pooled(self) -> Rate | None:
+        """Share of the runs that failed, where every repetition has one level: they are independent then."""
+        if not self.reached or any(len(one.levels) > 1 for one in self.repetitions):
+            return None
+        return rate(len(self.failures.severity), sum(one.samples for one in self.repetitions))
+
+    @property
+    def _normal(self) -> tuple[float, float]:
+        """log of the probability, and its standard error."""
+        logs = np.log([one.probability for one in self.repetitions])
+        s2, R = float(logs.var(ddof=1)), len(logs)
+        return min(0.0, float(logs.mean()) + s2 / 2), math.sqrt(s2 / R + s2**2 / (2 * (R - 1)))
+
 
 Severity = Callable[["FloatArray", "NDArray[np.int64]"], "FloatArray"]
+
+
+def repeated_subset_simulation(
+    severity: Severity,
+    dimensions: int,
+    parts: int = 1,
+    *,
+    samples: int,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+    keep: Callable[[int, Callable[[], Subset]], Subset] | None = None,
+) -> Estimate:
+    """The probability that a severity is 1 or more, by REPETITIONS of `subset_simulation`.
+
+    samples : runs in a level of all repetitions together, in multiples of SHARE * REPETITIONS
+    keep : (repetition, function that simulates it) -> repetition; for who has some already
+
+    Raises InputError for fewer than FEWEST runs in a level of a repetition, and as `subset_simulation` does.
+
+        found = repeated_subset_simulation(lambda u, noise: u[:, 0] / 5.2, 1, samples=8000)
+        print(found.probability, found.interval())  # 1e-7
+    """
+    each = samples // REPETITIONS
+    if each < FEWEST:
+        expected = f"at least {REPETITIONS * FEWEST}: {REPETITIONS} repetitions of {FEWEST} in each level"
+        raise InputError("rare event", "samples", str(samples), expected)
+    found: list[Subset] = []
+
+    def report(share: float) -> None:
+        if progress is not None:
+            progress((len(found) + share) / REPETITIONS)
+
+    for k in range(REPETITIONS):
+        simulate = partial(
+            subset_simulation,
+            severity,
+            dimensions,
+            parts,
+            samples=each,
+            seed=(seed, k),
+            first=k * APART,
+            progress=report,
+        )
+        found.append(simulate() if keep is None else keep(k, simulate))
+        report(0.0)
+    return Estimate(tuple(found))
 
 
 def subset_simulation(
@@ -139,60 +253,44 @@ def subset_simulation(
     dimensions: int,
     parts: int = 1,
     *,
-    samples: int = 1000,
-    seed: int = 0,
+    samples: int,
+    seed: int | tuple[int, ...] = 0,
+    first: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> Subset:
-    """The probability that a severity is 1 or more.
+    """One subset simulation of the probability that a severity is 1 or more.
 
     severity : (u, noise) -> severity of each run: u is runs x dimensions, standard normal; noise is runs x parts,
         indices of runs whose noise is independent. Larger before it reaches 1 for runs that are nearer to failing.
     samples : runs in each level, in tens
+    first : index of the first run's noise
     progress : called now and then with an estimate of the share that is done
 
-    After Ctrl-C the result has the levels that are done, and says `interrupted`; before the first level is done the
-    KeyboardInterrupt is raised.
-
-    Raises InputError for fewer than FEWEST samples, and for a severity by which runs cannot be told apart.
-
-        found = subset_simulation(lambda u, noise: u[:, 0] / 5.2, 1)
-        print(found.probability, found.cov)  # 1e-7
+    Raises InputError for a severity by which runs cannot be told apart.
     """
-    if samples < FEWEST:
-        raise InputError("rare event", "samples", str(samples), f"at least {FEWEST} in each level")
     chains = samples // SHARE
     rng, size = np.random.default_rng(seed), chains * SHARE
-    u, noise = rng.standard_normal((size, dimensions)), np.repeat(np.arange(size)[:, None], parts, axis=1)
-    runs = Runs(u, noise, severity(u, noise), np.arange(size))
-    stride, levels, interrupted = _Stride(FIRST_STEP, math.nan, size), list[Level](), False
+    u, noise = (
+        rng.standard_normal((size, dimensions)),
+        np.repeat(first + np.arange(size)[:, None], parts, axis=1),
+    )
+    runs = Runs(u, noise, severity(u, noise))
+    stride, levels = _Stride(FIRST_STEP, math.nan, size), list[Level]()
     start = float(np.median(runs.severity))
     while True:
         threshold = _threshold(runs, chains, last=len(levels) == LEVELS - 1)
         passed = runs.severity >= threshold
         if not passed.any():
             break
-        cov = _cov(passed, chains, correlated=bool(levels))
-        levels.append(Level(threshold, float(passed.mean()), cov, stride.acceptance))
-        seeds = runs.chosen(passed)
+        levels.append(Level(threshold, float(passed.mean()), stride.acceptance))
         if progress is not None:
             progress(min(1.0, max(0.0, (threshold - start) / (1 - start))) if start < 1 else 1.0)
         if threshold >= 1:
             break
-        try:
-            runs, stride = _climb(severity, seeds, threshold, stride, rng, chains)
-        except KeyboardInterrupt:
-            interrupted = True
-            break
+        runs, stride = _climb(severity, runs.chosen(passed), threshold, stride, rng, chains, first)
     below = runs.severity[runs.severity < 1]
-    return Subset(
-        tuple(levels),
-        stride.drawn,
-        max(_genealogical_cov(seeds, size), math.sqrt(sum(level.cov**2 for level in levels))),
-        runs.chosen(runs.severity >= 1),
-        float(below.max()) if below.size else math.nan,
-        size,
-        interrupted,
-    )
+    failures = runs.chosen(runs.severity >= 1)
+    return Subset(tuple(levels), stride.drawn, failures, float(below.max()) if below.size else math.nan, size)
 
 
 class _Stride(NamedTuple):
@@ -200,7 +298,7 @@ class _Stride(NamedTuple):
 
     size: float  # in multiples of the standard deviation of the runs that passed
     acceptance: float  # in the last level
-    drawn: int  # runs simulated so far: index of the next noise
+    drawn: int  # runs simulated so far
 
 
 def _threshold(runs: Runs, chains: int, *, last: bool) -> float:
@@ -223,7 +321,13 @@ def _threshold(runs: Runs, chains: int, *, last: bool) -> float:
 
 
 def _climb(
-    severity: Severity, seeds: Runs, threshold: float, stride: _Stride, rng: np.random.Generator, chains: int
+    severity: Severity,
+    seeds: Runs,
+    threshold: float,
+    stride: _Stride,
+    rng: np.random.Generator,
+    chains: int,
+    first: int,
 ) -> tuple[Runs, _Stride]:
     """As many runs as before from the next level, by chains that begin with runs which passed it, and the next stride.
 
@@ -236,7 +340,7 @@ def _climb(
         size = np.minimum(1.0, length * spread)
         u = np.sqrt(1 - size**2) * state.u + size * rng.standard_normal(state.u.shape)
         fresh = rng.random(state.noise.shape) < min(1.0, length) ** 2
-        noise = np.where(fresh, drawn + np.arange(chains)[:, None], state.noise)
+        noise = np.where(fresh, first + drawn + np.arange(chains)[:, None], state.noise)
         proposed = severity(u, noise)
         drawn += chains
         kept = proposed >= threshold
@@ -244,44 +348,17 @@ def _climb(
             np.where(kept[:, None], u, state.u),
             np.where(kept[:, None], noise, state.noise),
             np.where(kept, proposed, state.severity),
-            state.ancestor,
         )
         states.append(state)
         rates.append(float(kept.mean()))
         length *= math.exp((rates[-1] - ACCEPTANCE) / math.sqrt(step))
-    u, noise, severities, ancestor = (np.concatenate(column) for column in zip(*states, strict=True))
-    return Runs(u, noise, severities, ancestor), _Stride(length, float(np.mean(rates)), drawn)
-
-
-def _cov(passed: NDArray[np.bool_], chains: int, *, correlated: bool) -> float:
-    """Coefficient of variation of a level's share (Au & Beck 2001, eqs. 28 and 29).
-
-    passed : of each run, in order of the steps, in each step in order of the chains
-    correlated : the runs are those of chains, and not independent
-    """
-    share = float(passed.mean())
-    correlation = 0.0
-    if correlated and share < 1:
-        table = passed.reshape(SHARE, chains).astype(float)
-        for k in range(1, SHARE):
-            covariance = float((table[:-k] * table[k:]).mean()) - share**2
-            correlation += 2 * (1 - k / SHARE) * covariance / (share * (1 - share))
-    return math.sqrt(max(0.0, (1 - share) / (share * len(passed)) * (1 + correlation)))
-
-
-def _genealogical_cov(survivors: Runs, size: int) -> float:
-    """Coefficient of variation of the product of all shares, from how unequally the first runs have descendants.
-
-    cov^2 = sum over the first level's runs of (share of the survivors that descend from it - 1 / size)^2
-    after Lee & Whiteley (2018). Chains that begin with related runs are correlated: Au & Beck's sum leaves that out.
-    """
-    descendants = np.bincount(survivors.ancestor, minlength=size) / len(survivors.severity)
-    return math.sqrt(float(((descendants - 1 / size) ** 2).sum()))
+    u, noise, severities = (np.concatenate(column) for column in zip(*states, strict=True))
+    return Runs(u, noise, severities), _Stride(length, float(np.mean(rates)), drawn)
 
 
 PARTS = 100  # of a run, whose noise changes independently
-SCHEMA, VERSION = "malta-rare-event", 1
-FEW = 10  # ancestors of the failures: with fewer, the coefficient of variation is itself uncertain
+SCHEMA, VERSION = "malta-rare-event", 2
+HEADERS = 100_000  # bytes of a repetition's file beside its failures, at most
 
 
 class DesignPoint(NamedTuple):
@@ -301,21 +378,18 @@ class RareEvent:
 
     plan: Plan
     limit: Limit
-    found: Subset
+    found: Estimate
     design_point: DesignPoint | None  # None where no run failed
-
-    @property
-    def uncertain(self) -> bool:
-        """Whether the failures descend from so few first runs that their coefficient of variation is a guess."""
-        return self.found.reached and len(self.found.levels) > 1 and self.found.ancestors < FEW
 
     @property
     def description(self) -> Description:
         """The probability with its interval, and the machine that fails most easily."""
         low, high = self.found.interval()
         known = f"{self.found.probability:.3g}, 95 % interval {low:.2g} .. {high:.2g}"
-        rows = [("probability", known if self.found.reached else f"below {high:.2g}, no run failed")]
-        rows.append(("simulated", f"{self.found.simulated} runs, {len(self.found.levels)} levels"))
+        rows = [("probability", known if self.found.reached else f"below {high:.2g}")]
+        levels = max(len(one.levels) for one in self.found.repetitions)
+        repetitions = f"{len(self.found.repetitions)} repetitions of up to {levels} level(s)"
+        rows.append(("simulated", f"{self.found.simulated} runs, {repetitions}"))
         if self.design_point is not None:
             values = ", ".join(f"{name} = {value:.4g}" for name, value in self.design_point.values.items())
             rows.append(("fails first", f"{values}: {self.design_point.end}"))
@@ -323,16 +397,23 @@ class RareEvent:
 
 
 def rare_event(
-    plan: Plan, limit: Limit, *, workers: int | None = None, progress: Progress | None = None
+    plan: Plan,
+    limit: Limit,
+    folder: str | Path | None = None,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
 ) -> RareEvent:
-    """Estimate the probability that a run of a plan exceeds a limit, by subset simulation.
+    """Estimate the probability that a run of a plan exceeds a limit, by four repetitions of a subset simulation.
 
-    Each level runs plan.samples machines, of which those beyond the level's threshold begin the chains of the next.
+    Each level of a repetition runs plan.samples / 4 machines, of which those beyond the level's threshold begin the
+    chains of the next. The interval is that of the repetitions, which have no run in common: see `docs/howto/rare.md`.
     plan.seed decides machines and noise; plan.sampler does not count. Source: S. K. Au and J. L. Beck, Probabilistic
     Engineering Mechanics 16 (2001) 263-277.
 
-    plan : the plan of the runs
+    plan : the plan of the runs, at least 2000
     limit : from `malta.limit_of`
+    folder : that of the plan's campaign, which keeps every repetition as soon as it is done; None: nothing is written
     workers : threads; None: one for each core
     progress : called with the share of the work that is done, 0 to 1
 
@@ -345,13 +426,14 @@ def rare_event(
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.2}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=100, options=short)
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=2000, options=short)
     >>> limit = malta.limit_of(plan, "deviation-y", 40e-6)
     >>> event = malta.rare_event(plan, limit, workers=1)
-    >>> 1e-4 < event.found.probability < 1
+    >>> low, high = event.found.interval()
+    >>> 0.1 < low < event.found.probability < high < 1
     True
-    >>> f"{len(event.found.levels)} level(s), {event.found.simulated} runs"
-    '1 level(s), 100 runs'
+    >>> f"{len(event.found.repetitions)} repetitions, {event.found.simulated} runs"
+    '4 repetitions, 2000 runs'
     """
     noisy = planned_run(plan).scenario.noise > 0
     dimensions = len(varying_columns(plan))
@@ -361,15 +443,60 @@ def rare_event(
     def severity(u: FloatArray, noise: NDArray[np.int64]) -> FloatArray:
         return limit.severity(_simulate(plan, u, noise, workers))
 
-    found = subset_simulation(
+    def keep(repetition: int, simulate: Callable[[], Subset]) -> Subset:
+        if folder is None:
+            return simulate()
+        path = Path(folder) / f"{event_name(limit)}_{repetition}.npz"
+        known = _read_repetition(path, plan, limit, repetition) if file_exists(path) else None
+        if known is not None:
+            return known
+        found = simulate()
+        replace_files({path: _encode_repetition(found, plan, limit, repetition)})
+        return found
+
+    found = repeated_subset_simulation(
         severity,
         dimensions,
         PARTS if noisy else 1,
         samples=plan.samples,
         seed=plan.seed,
         progress=progress,
+        keep=keep,
     )
     return RareEvent(plan, limit, found, _design_point(plan, found.failures))
+
+
+def _encode_repetition(found: Subset, plan: Plan, limit: Limit, repetition: int) -> bytes:
+    """A repetition as an .npz archive, with the identity of its plan, its limit and its seal."""
+    buffer = io.BytesIO()
+    arrays = {
+        "campaign": np.array(plan.identity),
+        "limit": np.array(limit.name),
+        "levels": np.array(found.levels),
+        "counts": np.array([found.simulated, found.samples]),
+        "worst": np.array(found.worst),
+        **found.failures._asdict(),
+    }
+    np.savez(buffer, **arrays, seal=np.array(seal(arrays, repetition)))
+    return buffer.getvalue()
+
+
+def _read_repetition(path: Path, plan: Plan, limit: Limit, repetition: int) -> Subset | None:
+    """The repetition that a file has; None for a damaged one, and for one of another plan or limit."""
+    largest = 16 * plan.samples * (PARTS + len(varied_names(plan)) + 1) + HEADERS  # twice what it takes
+    data = read_file(path, "repetition of a rare event", Path.read_bytes, largest)
+    try:
+        arrays = read_npz(data)
+        sealed = str(arrays.pop("seal"))
+        own = (str(arrays["campaign"]), str(arrays["limit"])) == (plan.identity, limit.name)
+        if not own or sealed != seal(arrays, repetition):
+            return None
+        levels = tuple(Level(*map(float, row)) for row in arrays["levels"])
+        simulated, samples = map(int, arrays["counts"])
+        failures = Runs(*(arrays[name] for name in Runs._fields))
+    except (ValueError, KeyError, TypeError):
+        return None
+    return Subset(levels, simulated, failures, float(arrays["worst"]), samples)
 
 
 def _simulate(plan: Plan, u: FloatArray, noise: NDArray[np.int64], workers: int | None = None) -> Batch:
@@ -410,11 +537,19 @@ def event_document(event: RareEvent) -> dict[str, Any]:
         "high": high,
         "simulated": found.simulated,
         "plain_sampling": found.plain if found.reached else None,
-        "ancestors": found.ancestors,
         "worst_severity": found.worst,
-        "interrupted": found.interrupted,
-        "levels": [level._asdict() for level in found.levels],
+        "repetitions": [_repetition_table(one) for one in found.repetitions],
         "design_point": None if point is None else point._asdict(),
+    }
+
+
+def _repetition_table(found: Subset) -> dict[str, Any]:
+    """One repetition; its probability is null where no run failed."""
+    return {
+        "probability": found.probability if found.reached else None,
+        "simulated": found.simulated,
+        "worst_severity": found.worst,
+        "levels": [level._asdict() for level in found.levels],
     }
 
 

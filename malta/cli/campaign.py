@@ -188,7 +188,6 @@ class Outcome(NamedTuple):
     files: list[Path]
     parts: list[Any]  # tables and lines for the console
     notes: list[str]
-    interrupted: bool = False
 
 
 def run_study(study: Study, setting: Setting) -> None:
@@ -224,8 +223,6 @@ def run_study(study: Study, setting: Setting) -> None:
     plan = setting.plan
     if not (plan.plant.tabulated or is_compiled(plan.plant, plan.controller, planned_run(plan).scenario)):
         print_note(NO_COMPILER)
-    if outcome.interrupted:
-        raise typer.Exit(130)
 
 
 def _rare(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> Outcome:
@@ -234,20 +231,18 @@ def _rare(limit: Limit, _: float, setting: Setting, progress: Progress | None) -
     from malta.campaigns.rare import event_name, rare_event, write_event
     from malta.cli.documents.campaigns import RareOutput, rare_fields
 
-    event = rare_event(setting.plan, limit, workers=setting.workers, progress=progress)
+    try:
+        event = rare_event(setting.plan, limit, setting.folder, workers=setting.workers, progress=progress)
+    except KeyboardInterrupt:
+        raise interruption(f"the same command goes on with the repetitions in {setting.folder}") from None
     files = [write_event(event, setting.folder)]
     parts: list[Any] = [report.rare_event_tables(event)]
     if event.design_point is not None:
         place = f"{setting.folder}:{event_name(limit)}"
         parts.append(f"the design point again: malta simulate {setting.gains} --replay {place}")
     notes = [text for text in (report.rare_event_sentence(event),) if text]
-    if event.uncertain:
-        notes.append(
-            f"the failures descend from {event.found.ancestors} of the first runs: the coefficient of variation is "
-            "itself uncertain, more --samples make it certain"
-        )
     document = RareOutput(**_head(setting, files), **rare_fields(event))
-    return Outcome(document, files, parts, notes, event.found.interrupted)
+    return Outcome(document, files, parts, notes)
 
 
 def _sobol(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> Outcome:

@@ -125,6 +125,24 @@ def test_indices_of_the_ishigami_function() -> None:
     assert _indices(np.ones_like(values), 2**13, 1) == ()
 
 
+def test_indices_of_the_g_function() -> None:
+    """Sobol's product of |4 x - 2| and factors: all orders interact; nine of ten intervals of 95 % contain theirs."""
+    weight = np.array([0.0, 1.0, 4.5, 9.0])
+    share = 1 / (3 * (1 + weight) ** 2)
+    variance = np.prod(1 + share) - 1
+    total = np.array([share[k] * np.prod(1 + np.delete(share, k)) for k in range(4)]) / variance
+    inside = []
+    for seed in range(10):
+        x = _points(4, 2**10, seed)
+        values = np.prod((np.abs(4 * x - 2) + weight) / (1 + weight), axis=1)
+        for k, index in enumerate(_indices(values, 2**10, seed)):
+            inside.append(abs(index.first - share[k] / variance) < index.first_half)
+            inside.append(abs(index.total - total[k]) < index.total_half)
+            assert index.first == pytest.approx(share[k] / variance, abs=0.06)
+            assert index.total == pytest.approx(total[k], abs=0.06)
+    assert np.mean(inside) >= 0.9
+
+
 def test_noise_is_a_factor() -> None:
     """Held still, where the machine barely matters, the noise of a run decides its largest deviation."""
     options = {"fidelity": "force", "duration": 0.02}

@@ -146,12 +146,15 @@ def test_claims(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["ledgers"][0]["claims"][0] == claim._asdict() | {"ours": ["2"]}
 
 
+SHORT = ("--option", "duration=5ms", "--option", "fidelity=force")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        ("rare-output", ["--study", "rare", "--limit", "touchdown", "--spread", "60%", "--samples", "100"]),
-        ("rare-output", ["--study", "rare", "--limit", "touchdown", "--spread", "1%", "--samples", "100"]),
+        ("rare-output", ["--study", "rare", "--spread", "60%", "--samples", "2000", *SHORT]),
+        ("rare-output", ["--study", "rare", "--spread", "1%", "--samples", "2000", *SHORT]),
         ("sobol-output", ["--study", "sensitivity", "--spread", "60%", "--samples", "128"]),
         (
             "tolerance-output",

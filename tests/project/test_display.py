@@ -53,7 +53,7 @@ RESULTS: dict[str, tuple[Callable[[malta.Spec, malta.Controller], Any], str]] = 
     "summary": (lambda _, c: malta.summarize(_plan(c), workers=1), "8 of 8: 100 %"),
     "batch": (lambda _, c: malta.campaign(_plan(c), workers=1).batch, "8 of 8 runs"),
     "rare": (
-        lambda _, c: malta.rare_event(_plan(c, 100), malta.limit_of(_plan(c), "deviation-y", 1e-9), workers=1),
+        lambda _, c: malta.rare_event(_plan(c, 2000), malta.limit_of(_plan(c), "deviation-y", 1e-9), workers=1),
         "probability  1, ",
     ),
     "tolerances": (

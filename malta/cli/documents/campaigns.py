@@ -135,8 +135,16 @@ class LevelPart(Part):
 
     threshold: Number = Field(description="severity; 1 is the limit")
     share: Number
-    cov: Number
     acceptance: Number
+
+
+class RepetitionPart(Part):
+    """One of the repetitions of a subset simulation, which have no run in common."""
+
+    probability: Number = Field(description="null where no run failed")
+    simulated: int
+    worst_severity: Number
+    levels: list[LevelPart]
 
 
 class DesignPointPart(Part):
@@ -153,21 +161,21 @@ class RareOutput(HeadPart):
     """What `malta campaign --study rare --json` prints."""
 
     kind: Literal["malta-rare-output"] = Field(default="malta-rare-output", alias="schema")
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     files: Files
     limit: str
     text: str
-    probability: Number = Field(description="null where no run failed: then it is below `bound`")
+    probability: Number = Field(
+        description="null where no run failed in some repetition: then it is below `bound`"
+    )
     bound: Number
     cov: Number = Field(description="coefficient of variation of the probability")
     low: Number
     high: Number
     simulated: int
     plain_sampling: Number = Field(description="runs that plain sampling needs for the same coefficient")
-    ancestors: int
     worst_severity: Number
-    interrupted: bool
-    levels: list[LevelPart]
+    repetitions: list[RepetitionPart]
     design_point: DesignPointPart | None
 
 

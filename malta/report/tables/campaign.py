@@ -203,7 +203,7 @@ def _deviation_text(plan: Plan, name: str, value: float) -> str:
 
 
 def rare_event_tables(event: RareEvent) -> Group:
-    """Tabulate the probability of a rare event with its interval, the levels on the way to it, and its design point.
+    """Tabulate the probability of a rare event with its interval, the repetitions behind it, and its design point.
 
     event : from `malta.rare_event`
 
@@ -214,14 +214,14 @@ def rare_event_tables(event: RareEvent) -> Group:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.2}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=100, options=short)
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=2000, options=short)
     >>> limit = malta.limit_of(plan, "deviation-y", 40e-6)
     >>> event = malta.rare_event(plan, limit, workers=1)
     >>> tables = malta.report.rare_event_tables(event).renderables
     >>> [str(table.title) for table in tables][:2]
-    ['Rare event: deviation y above 40 um or an earlier end', 'Levels: 1 is the limit']
+    ['Rare event: deviation y above 40 um or an earlier end', 'Repetitions: 1 is the limit']
     """
-    parts: list[Table | str] = [_probability_table(event), _levels_table(event)]
+    parts: list[Table | str] = [_probability_table(event), _repetitions_table(event)]
     if event.design_point is not None:
         parts.append(_design_point_table(event))
     return Group(*parts)
@@ -239,7 +239,7 @@ def rare_event_sentence(event: RareEvent) -> str:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.1}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=100, options=short)
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=2000, options=short)
     >>> limit = malta.limit_of(plan, "deviation-y", 40e-6)
     >>> event = malta.rare_event(plan, limit, workers=1)
     >>> malta.report.rare_event_sentence(event).partition(", as")[0]
@@ -249,11 +249,10 @@ def rare_event_sentence(event: RareEvent) -> str:
     if found.reached:
         return ""
     _, high = found.interval()
-    ending = "interrupted" if found.interrupted else "no run failed"
-    return (
-        f"{ending}: {event.limit.text} has a probability below {high:.2g}, as a severity of "
-        f"{found.levels[-1].threshold:.3g} has; the most severe of {found.simulated} runs reached {found.worst:.3g}"
-    )
+    failed, count = sum(one.reached for one in found.repetitions), len(found.repetitions)
+    runs = f"runs failed in {failed} of {count} repetitions alone" if failed else "no run failed"
+    below = "" if failed else f"; the most severe of {found.simulated} runs reached {found.worst:.3g}"
+    return f"{runs}: {event.limit.text} has a probability below {high:.2g}{below}"
 
 
 def _probability_table(event: RareEvent) -> Table:
@@ -273,17 +272,18 @@ def _probability_table(event: RareEvent) -> Table:
     return table
 
 
-def _levels_table(event: RareEvent) -> Table:
-    """One row for each level; a severity of 1 is the limit."""
-    heads = ("level", "severity", "passed [%]", "c.o.v. [%]", "accepted [%]", "probability")
-    table = new_table("Levels: 1 is the limit", *heads)
+def _repetitions_table(event: RareEvent) -> Table:
+    """One row for each repetition; a severity of 1 is the limit."""
+    heads = ("repetition", "levels", "runs", "accepted [%]", "last severity", "passed [%]", "probability")
+    table = new_table("Repetitions: 1 is the limit", *heads)
     table.columns[0].justify = "right"
-    probability = 1.0
-    for k, level in enumerate(event.found.levels):
-        probability *= level.share
-        accepted = "" if math.isnan(level.acceptance) else f"{100 * level.acceptance:.0f}"
-        cells = [f"{k + 1}", f"{level.threshold:.4g}", f"{100 * level.share:.3g}", f"{100 * level.cov:.3g}"]
-        add_row(table, *cells, accepted, f"{probability:.3g}")
+    for k, one in enumerate(event.found.repetitions):
+        last, rates = one.levels[-1], [level.acceptance for level in one.levels[1:]]
+        accepted = f"{100 * sum(rates) / len(rates):.0f}" if rates else ""
+        counts = f"{k + 1}", f"{len(one.levels)}", f"{one.simulated}"
+        below = "" if one.reached else "below "
+        shares = f"{last.threshold:.4g}", f"{100 * last.share:.3g}", f"{below}{one.probability:.3g}"
+        add_row(table, *counts, accepted, *shares)
     return table
 
 
