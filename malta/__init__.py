@@ -43,6 +43,10 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.identification.log import log_of as log_of
     from malta.identification.log import read_log as read_log
     from malta.identification.log import write_log as write_log
+    from malta.identification.measure import Measurement as Measurement
+    from malta.identification.measure import MeasurementPlan as MeasurementPlan
+    from malta.identification.measure import measure as measure
+    from malta.identification.measure import plan_measurement as plan_measurement
     from malta.identification.replay import LawReplay as LawReplay
     from malta.identification.replay import replay_law as replay_law
     from malta.loops.curves import LoopCurves as LoopCurves

@@ -113,6 +113,9 @@ def excite(
     ] = None,
     change: Changes = None,
     seed: Seed = None,
+    shift: Annotated[
+        int, typer.Option(help="Inputs by which lines are dealt later; 0, 1, ... excite each line in each.")
+    ] = 0,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write one period of the forces at the law's samples (.csv)."),
@@ -147,11 +150,11 @@ def excite(
         for name, text in given.items()
         if text is not None
     }
-    low, high = _band(band)
+    low, high = read_band(band)
     plan = plan_excitation(
         loop(plant, controller), **sizes,
         period=period, periods=periods, band=(low, high), lines=lines, parameters=parameters or (),
-        seed=seed or 0,
+        seed=seed or 0, shift=shift,
     )  # fmt: skip
     console, files = make_console(), []
     if out is not None:
@@ -177,8 +180,8 @@ def excite(
         print_written(console, files)
 
 
-def _band(text: str) -> tuple[float, float]:
-    """The ends of a band, Hz."""
+def read_band(text: str) -> tuple[float, float]:
+    """The ends of a band, Hz. Raises InputError for another form than LOW..HIGH."""
     low, dots, high = text.partition("..")
     try:
         return float(low), float(high)

@@ -23,6 +23,7 @@ from malta.cli.claims import claims, schema
 from malta.cli.design import design, new, tune
 from malta.cli.export import export, pil
 from malta.cli.identification import excite, identify, learn, log, replay
+from malta.cli.measure import measure
 from malta.cli.output import interruption, print_error, print_note, silence
 from malta.cli.report import compare, plot, report
 from malta.cli.simulate import simulate
@@ -147,7 +148,7 @@ def _first_line(command: Callable[..., None]) -> str:
 
 GROUPS: dict[str, tuple[Callable[..., None], ...]] = {  # the order of the help
     "Commands": (design, verify, check, simulate, campaign, tune),
-    "From the bench": (excite, log, identify, learn, replay),
+    "From the bench": (excite, log, identify, learn, replay, measure),
     "Pages and pictures": (plot, report, compare, live_page, claims),
     "For other programs": (export, pil, schema),
     "A machine of your own": (new,),

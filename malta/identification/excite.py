@@ -94,6 +94,7 @@ def excite(
     lines: int = LINES,
     parameters: Sequence[str] = (),
     seed: int = 0,
+    shift: int = 0,
 ) -> ExcitationPlan:
     """Design an excitation of all axes at once, and predict from the linear loop what it does and what it will find.
 
@@ -110,6 +111,7 @@ def excite(
     lines : of each input
     parameters : whose accuracy is predicted; (): those that will be found to 50 %, but for masses and lengths
     seed : of the phases
+    shift : by how many inputs the lines are dealt later; as many plans as inputs excite each line in each of them
 
     Returns an ExcitationPlan.
 
@@ -126,7 +128,7 @@ def excite(
     sizes = {"force": force, "current": current, "motion": motion, "period": period}
     _require(loop, sizes, {"periods": periods, "lines": lines}, band)
     plant, m = loop.plant, len(loop.plant.inputs)
-    signal = interleaved_multisine(period, *band, inputs=m, lines=lines, seed=seed)
+    signal = interleaved_multisine(period, *band, inputs=m, lines=lines, seed=seed, shift=shift)
     limit = np.array(plant.actuator.force_limit)
     wanted = np.full(m, np.inf if force is None else force)
     if force is None and current is None and motion is None:

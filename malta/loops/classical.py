@@ -160,6 +160,11 @@ def disk_margins_alone(loop: Nominal, sensors: Sequence[str]) -> list[Disk]:
     ]
 
 
+def disk_sizes(S: ComplexArray) -> FloatArray:
+    """The disk margin of all channels at once at each frequency, from sensitivities S, k x p x p: a lower bound."""
+    return np.asarray(1 / _balanced_norm(S - np.eye(S.shape[-1]) / 2))
+
+
 def _disk_matrix(Q: ComplexArray) -> ComplexArray:
     eye = np.eye(Q.shape[-1])
     return np.asarray(np.linalg.inv(eye - Q) - eye / 2)

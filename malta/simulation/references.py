@@ -342,7 +342,7 @@ class Multisine:
 
 
 def interleaved_multisine(
-    period: float, low: float, high: float, *, inputs: int, lines: int, seed: int = 0
+    period: float, low: float, high: float, *, inputs: int, lines: int, seed: int = 0, shift: int = 0
 ) -> Multisine:
     """A multisine of amplitude 1: lines evenly spaced in log f, dealt to the inputs in turn, phases of a low crest.
 
@@ -351,6 +351,7 @@ def interleaved_multisine(
     inputs : number of inputs
     lines : of each input
     seed : of the random phases
+    shift : by how many inputs the deal begins later; signals of shifts 0, 1, ... excite each line in each input
 
     Each input has its lines spread over the whole band. From random phases on, ever higher norms of the signal are
     minimized (Guillaume, Schoukens, Pintelon and Kollar, IEEE Trans. Instrum. Meas. 40(6), 1991).
@@ -369,7 +370,7 @@ def interleaved_multisine(
             "excitation", "lines", found, f"at least {wanted}, {lines} of each of {inputs} inputs"
         )
     chosen = _spread_lines(first, last, wanted)
-    axis = np.arange(wanted, dtype=float) % inputs
+    axis = (np.arange(wanted, dtype=float) + shift) % inputs
     phase = np.zeros(wanted)
     random = np.random.default_rng(seed)
     for j in range(inputs):

@@ -106,7 +106,7 @@ LINES: st.SearchStrategy[tuple[str, ...]] = st.one_of(
         set=_assignments, uncertain=_assignments, current_loops=_words, time=_numbers, certificate=_places,
     ).map(lambda rest: (*head, "--json", "--no-proof", *rest))),
     st.tuples(st.sampled_from(("check", "new")), st.sampled_from((*GAINS, *PLACES[4:], "--json", "--gains"))),
-    st.tuples(st.sampled_from(("identify", "learn", "replay")), _gains, _places),
+    st.tuples(st.sampled_from(("identify", "learn", "replay", "measure")), _gains, _places),
     st.tuples(st.just("log"), _places),
     st.tuples(st.just("claims"), st.sampled_from((*GAINS, *PLACES[4:]))),
     st.tuples(st.just("claims"), st.just("--update"), st.sampled_from((*GAINS, *PLACES[5:]))),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from malta.identification.identify import Identified
     from malta.identification.learn import Learned
     from malta.identification.log import Log
+    from malta.identification.measure import Curve, Measurement, MeasurementPlan
     from malta.identification.replay import LawReplay
     from malta.proof.certificate.checked_file import Claim
     from malta.report.ledger import Ledger
@@ -226,7 +228,7 @@ def claims_output(ledgers: Sequence[Ledger]) -> ClaimsOutput:
     )
 
 
-# The documents of `malta excite`, `log`, `identify`, `learn` and `replay`.
+# The documents of `malta excite`, `log`, `identify`, `learn`, `replay` and `measure`.
 
 
 class ExciteOutput(Part):
@@ -332,6 +334,68 @@ class ReplayOutput(Part):
     whiteness: dict[str, float] = Field(description="largest autocorrelation, in standard deviations")
 
 
+class MeasuredCurve(Part):
+    """A magnitude over the lines, as measured and as predicted; NaN becomes null."""
+
+    measured: list[Number]
+    deviation: list[Number] = Field(description="standard deviation of the measured magnitude")
+    predicted: list[Number]
+    low: list[Number] = Field(description="least magnitude over the uncertainty, sampled")
+    high: list[Number]
+
+
+class MeasuredSensor(Part):
+    """The loop at a sensor, the others closed."""
+
+    peak: float = Field(description="largest measured |S|")
+    peak_at_Hz: float
+    peak_below: float = Field(description="upper end of its 95 % band")
+    zone: Literal["A", "B", "C", "D"] = Field(description="of ISO 14839-3, by peak_below")
+    disk: float = Field(description="size of the disk margin of this sensor alone")
+    disk_above: float = Field(description="lower end of its 95 % band")
+    S: MeasuredCurve
+    T: MeasuredCurve
+    L: MeasuredCurve
+    compliance: dict[str, MeasuredCurve] = Field(description="|S P| by force, SI")
+
+
+class MeasureOutput(Part):
+    """What `malta measure GAINS LOG --json` prints."""
+
+    kind: Literal["malta-measure-output"] = Field(default="malta-measure-output", alias="schema")
+    version: Literal[1] = 1
+    gains: str
+    logs: str
+    frequency_Hz: list[float]
+    sensors: dict[str, MeasuredSensor]
+    largest: MeasuredCurve = Field(description="largest singular value of S")
+    disk: float = Field(description="size of the disk margin of all sensors at once, a lower bound")
+    disk_above: float
+    machines: int = Field(description="of the box, that were sampled for low and high")
+    box_share: dict[str, float]
+    law_missed_share: Number = Field(description="rms of commands at the lines beside those of the gain file")
+    refusal: str = Field(description='why the machine is not as predicted; "": it is')
+    files: Files
+
+
+class MeasurePlanOutput(Part):
+    """What `malta measure GAINS --plan --json` prints."""
+
+    kind: Literal["malta-measure-plan-output"] = Field(default="malta-measure-plan-output", alias="schema")
+    version: Literal[1] = 1
+    gains: str
+    flights: int
+    duration_s: float = Field(description="of all flights")
+    periods: int
+    frequency_Hz: list[float]
+    half_width: dict[str, list[float]] = Field(description="of the 95 % band of |S|, by sensor")
+    coherence: dict[str, list[float]] = Field(
+        description="within a period, the least of the flights, by sensor"
+    )
+    motion: dict[str, float] = Field(description="largest deviation of each output, SI")
+    current_A: dict[str, float] = Field(description="largest deviation of each current from that at rest")
+
+
 def excite_output(gains: Path, plan: ExcitationPlan, files: Iterable[Path]) -> ExciteOutput:
     """The document of an excitation."""
     return ExciteOutput(
@@ -419,4 +483,62 @@ def replay_output(gains: Path, log: Path, found: LawReplay) -> ReplayOutput:
         innovation_rms=dict(found.rms),
         sensor_noise=dict(found.expected),
         whiteness=dict(found.whiteness),
+    )
+
+
+def measure_output(gains: Path, found: Measurement, files: Iterable[Path]) -> MeasureOutput:
+    """The document of a loop that was measured."""
+    sensors = {}
+    for i, name in enumerate(found.sensors):
+        (peak, high, w), (disk, low) = found.peaks[name], found.disks[i]
+        sensors[name] = MeasuredSensor(
+            peak=peak,
+            peak_at_Hz=w / (2 * math.pi),
+            peak_below=high,
+            zone=found.zones[name],  # type: ignore[arg-type]
+            disk=disk.size,
+            disk_above=low,
+            S=_curve(found.S, i),
+            T=_curve(found.T, i),
+            L=_curve(found.L, i),
+            compliance={force: _curve(found.compliance, i, j) for j, force in enumerate(found.forces)},
+        )
+    disk, low = found.disks[-1]
+    return MeasureOutput(
+        gains=str(gains),
+        logs=found.source,
+        frequency_Hz=(found.w / (2 * math.pi)).tolist(),
+        sensors=sensors,
+        largest=_curve(found.largest, 0),
+        disk=disk.size,
+        disk_above=low,
+        machines=found.machines,
+        box_share=dict(found.box),
+        law_missed_share=found.law,
+        refusal=found.refusal,
+        files=list(map(str, files)),
+    )
+
+
+def _curve(curve: Curve, *at: int) -> MeasuredCurve:
+    """The magnitudes of a channel."""
+    one = curve.at(*at)
+    tables = {"measured": one.size, "deviation": one.deviation, "predicted": abs(one.predicted)}
+    tables |= {"low": one.low, "high": one.high}
+    return MeasuredCurve(**{name: table.tolist() for name, table in tables.items()})
+
+
+def measure_plan_output(gains: Path, plan: MeasurementPlan) -> MeasurePlanOutput:
+    """The document of a measurement that is planned."""
+    first = plan.excitations[0]
+    return MeasurePlanOutput(
+        gains=str(gains),
+        flights=len(plan.excitations),
+        duration_s=plan.duration,
+        periods=first.periods,
+        frequency_Hz=first.signal.frequencies.tolist(),
+        half_width=dict(zip(plan.sensors, plan.half_width.T.tolist(), strict=True)),
+        coherence={name: values.tolist() for name, values in plan.coherence.items()},
+        motion={name: max(one.motion[name] for one in plan.excitations) for name in first.motion},
+        current_A={name: max(one.current[name] for one in plan.excitations) for name in first.current},
     )

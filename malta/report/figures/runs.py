@@ -19,6 +19,7 @@ from malta.report.figures.drawing import (
     STYLES,
     Published,
     clearance,
+    draw_grid,
     finish_axes,
     legend_entries,
     micro,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from malta.campaigns.result import Campaign
     from malta.campaigns.summary import Runs, Summary
     from malta.identification.log import Log
+    from malta.identification.measure import Curve, Measurement
     from malta.model.plant import FloatArray
 
 
@@ -263,7 +265,7 @@ def _run_label(plan: Plan, index: int, verdict: float) -> str:
     return text if name == "completed" else f"{text}\n{name.replace(' at ', chr(10) + 'at ')}"
 
 
-# The figure of a log: a panel for each group of columns.
+# Figures of a log, and of a loop that was measured.
 
 
 PANELS = {
@@ -302,3 +304,40 @@ def _thinned(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]
     parts = values[:whole].reshape(POINTS, each)
     ends = np.stack([parts.min(axis=1), parts.max(axis=1)], axis=1).ravel()
     return np.repeat(t[:whole:each], 2), ends
+
+
+def measured_figure(found: Measurement) -> Figure:
+    """Draw a loop that was measured: S, T, open loop and compliance of each sensor with bands over the tube."""
+    p = len(found.sensors)
+    verdict = found.refusal or f"as predicted by {found.machines} machines of the box"
+    figure = new_figure(
+        f"{found.source}: the loop as measured", verdict, size=(11.0, 1.4 + 1.75 * p), wspace=0.42, left=0.07
+    )
+    curves = {"|S| [1]": found.S, "|T| [1]": found.T, "|L| [1]": found.L, "|S P| [m/N]": found.compliance}
+    panels = figure.subplots(p, 4, sharex=True, squeeze=False)
+    for i, (name, row) in enumerate(zip(found.sensors, panels, strict=True)):
+        for axes, (label, curve) in zip(row, curves.items(), strict=True):
+            at: tuple[int, ...] = (i,)
+            if curve is found.compliance:
+                j = int(curve.size[:, i].max(axis=0).argmax())
+                at, label = (i, j), f"{name} by {found.forces[j]} [SI]"
+            _draw_curve(axes, found.w / (2 * np.pi), curve.at(*at))
+            axes.set_ylabel(label if len(at) > 1 else f"{name}: {label}", fontsize=8)
+            axes.tick_params(which="both", labelsize=7)
+    for axes in panels[-1]:
+        axes.set_xlabel("frequency [Hz]", fontsize=8)
+    panels[0, 0].legend(fontsize=7, frameon=False)
+    return figure
+
+
+def _draw_curve(axes: Axes, f: FloatArray, curve: Curve) -> None:
+    """A response with its 95 % band as bars, the prediction as a line and its tube as an area."""
+    size, half = curve.size, 1.96 * curve.deviation
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.fill_between(f, curve.low, curve.high, color="#d9d9d9", linewidth=0, label="tube")
+    axes.plot(f, np.abs(curve.predicted), color="#4a4a4a", linewidth=0.9, label="predicted")
+    bars = np.array([np.minimum(half, 0.999 * size), half])
+    axes.errorbar(f, size, bars, fmt=".", color="#c1440e", markersize=3, elinewidth=0.8, label="measured")
+    axes.set_ylim(bottom=0.5 * min(float(size.min()), float(curve.low.min())))
+    draw_grid(axes)

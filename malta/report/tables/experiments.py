@@ -7,11 +7,13 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
 from malta.identification.response import units_of_model
+from malta.margins.loop_report import zone
 from malta.report.figures.drawing import Published
 from malta.report.tables.layout import (
     INDENT,
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
     from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
     from malta.identification.log import Log
+    from malta.identification.measure import Measurement, MeasurementPlan
     from malta.identification.replay import LawReplay
     from malta.model.plant import Plant
     from malta.report.ledger import Claim, Ledger
@@ -272,6 +275,39 @@ def replay_table(found: LawReplay, plant: Plant) -> Table:
         name = signal.name
         cells = f"{found.rms[name]:.3g}", f"{found.expected[name]:.3g}", f"{found.whiteness[name]:.2g}"
         add_row(table, f"innovation of {name}, rms [{signal.unit}]", "", *cells)
+    return table
+
+
+def measured_tables(found: Measurement) -> list[Table]:
+    """The largest |S| and |T| of each sensor as measured, with bands, and disk margins, beside what is predicted."""
+    table = new_table(
+        "The loop as measured, at the lines",
+        "sensor", "largest |S|", "at [Hz]", "95 % below", "zone", "predicted", "largest |T|", "predicted",
+    )  # fmt: skip
+    for i, name in enumerate(found.sensors):
+        peak, high, w = found.peaks[name]
+        tube = [f"{c.low[:, i].max():.3g} .. {c.high[:, i].max():.3g}" for c in (found.S, found.T)]
+        at = f"{w / (2 * np.pi):.4g}"
+        top = f"{found.T.size[:, i].max():.3g}"
+        add_row(table, name, f"{peak:.3g}", at, f"{high:.3g}", zone(high), tube[0], top, tube[1])
+    margins = new_table("Disk margins as measured, at the lines", "channels", "size", "95 % above", "at [Hz]")
+    for disk, low in found.disks:
+        cells = (f"{disk.size:.3g}", f"{low:.3g}", f"{disk.frequency / (2 * np.pi):.4g}")
+        add_row(margins, disk.channels, *cells)
+    return [table, margins]
+
+
+def measurement_plan_table(plan: MeasurementPlan) -> Table:
+    """What a measurement will tell of each sensor."""
+    table = new_table(
+        "What it will tell", "sensor", "coherence, least", "median", "half of a band of |S| [%]", "at [Hz]"
+    )
+    share = plan.half_width / np.maximum(np.abs(plan.S), 1.0)
+    for i, name in enumerate(plan.sensors):
+        k = int(share[:, i].argmax())
+        gamma = plan.coherence[name]
+        cells = (f"{gamma.min():.4f}", f"{np.median(gamma):.4f}", f"{100 * share[k, i]:.2g}")
+        add_row(table, name, *cells, f"{plan.w[k] / (2 * np.pi):.4g}")
     return table
 
 

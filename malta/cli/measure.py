@@ -1,0 +1,191 @@
+"""`malta measure`: the loop as it is measured, with bands, beside what is predicted; or the plan to measure it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from malta.cli.identification import read_band
+from malta.cli.options import (
+    AsJson,
+    GainFile,
+    MachineFile,
+    Uncertain,
+    read_assignments,
+    read_controller,
+    read_uncertainty,
+)
+from malta.cli.output import make_console, print_document, print_text, print_written, working
+from malta.errors import CheckError, InputError
+
+if TYPE_CHECKING:
+    from malta.identification.measure import Measurement
+    from malta.synthesis.controller import Controller
+
+PLAN = "Plan"  # a panel of the help
+
+
+def measure(
+    gains: GainFile,
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[LOG]...", help="Logs under excitation: one, or one for each input.", show_default=False
+        ),
+    ] = None,
+    uncertain: Uncertain = None,
+    identified: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A data file of malta identify: its machine and intervals."),
+    ] = None,
+    plan: Annotated[
+        bool, typer.Option("--plan", help="What to fly, and what it will tell.", rich_help_panel=PLAN)
+    ] = False,
+    width: Annotated[
+        str | None,
+        typer.Option(help="Half of the widest 95 % band of |S|, as 2%.", rich_help_panel=PLAN),
+    ] = None,
+    separate: Annotated[
+        bool,
+        typer.Option(
+            "--separate", help="A flight for each input: nothing is interpolated.", rich_help_panel=PLAN
+        ),
+    ] = False,
+    motion: Annotated[str | None, typer.Option(help="Largest motion, as 20um.", rich_help_panel=PLAN)] = None,
+    band: Annotated[
+        str, typer.Option(metavar="LOW..HIGH", help="Of the lines [Hz].", rich_help_panel=PLAN)
+    ] = "2..400",
+    lines: Annotated[int, typer.Option(help="Of each input.", rich_help_panel=PLAN)] = 12,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw it: a .png, .svg or .pdf file.")
+    ] = None,
+    machine: MachineFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure S, T, compliance and open loop at every sensor from logs, with 95 % bands, over what is predicted.
+
+    The tube of the prediction is of machines of the uncertainty: corners and others at random, sampled, not proven.
+    Exit code 0: within; 1: outside, another law, or a log that tells nothing.
+
+    \b
+    Example:  malta measure design/gains/robust.json --plan --width 2%
+              malta measure design/gains/robust.json log.npz --out measured.png
+    """
+    controller = read_controller(gains, machine)
+    if plan:
+        _require_no(logs, "a log beside --plan")
+        sizes = {} if motion is None else read_assignments("--motion", [f"motion={motion}"], {"motion": "m"})
+        wide = None if width is None else read_assignments("--width", [f"width={width}"], {"width": "1"})
+        _plan(
+            gains, controller, sizes | {"band": read_band(band), "lines": lines},
+            None if wide is None else wide["width"], separate=separate, as_json=as_json,
+        )  # fmt: skip
+        return
+    if not logs:
+        raise InputError("malta measure", "LOG", "none", "a log, or --plan")
+    with working(f"measuring from {', '.join(map(str, logs))}"):
+        found = _measured(gains, controller, logs, uncertain, identified)
+    files = []
+    if out is not None:
+        from malta.report.figures import save
+        from malta.report.figures.runs import measured_figure
+
+        files.append(save(measured_figure(found), out))
+    if as_json:
+        from malta.cli.documents.others import measure_output
+
+        print_document(measure_output(gains, found, files))
+    else:
+        _print(found, files)
+    if found.refusal:
+        raise CheckError(f"{found.source}: {found.refusal}")
+
+
+def _require_no(given: Any, what: str) -> None:
+    """Raise InputError where something was given that does not go together."""
+    if given:
+        raise InputError("malta measure", "", what, "one of them")
+
+
+def _measured(
+    gains: Path,
+    controller: Controller,
+    logs: list[Path],
+    uncertain: list[str] | None,
+    identified: Path | None,
+) -> Measurement:
+    """The measurement over the gain file's box, or over the intervals of an identified machine."""
+    from malta.identification.data_file import read_identified
+    from malta.identification.log import read_log
+    from malta.identification.measure import measure as measure_loop
+    from malta.model.data import published_figures
+
+    read = [read_log(log) for log in logs]
+    if identified is None:
+        par = controller.parameters
+        published = published_figures(read[0].machine) if read[0].machine else None
+        box = read_uncertainty(gains, uncertain, par, published)
+        return measure_loop(controller, *read, uncertainty=box)
+    _require_no(uncertain, "--uncertain beside --identified")
+    data = read_identified(identified)
+    if type(data.parameters) is not type(controller.parameters):
+        raise InputError(identified, "machine", "another machine", "that of the gain file")
+    box = {name: data.joint * share for name, share in data.shares.items()}
+    return measure_loop(controller, *read, parameters=data.parameters, uncertainty=box)
+
+
+def _print(found: Measurement, files: list[Path]) -> None:
+    """The tables, and in words what was compared with what."""
+    from malta.report.tables.experiments import measured_tables
+
+    console = make_console()
+    for table in measured_tables(found):
+        console.print(table)
+    how = "each line in each input" if found.experiments > 1 else "columns interpolated between their lines"
+    box = ", ".join(f"{name} +-{100 * share:.3g} %" for name, share in found.box.items()) or "no uncertainty"
+    print_text(
+        console, f"{len(found.w)} lines, {how}; predicted: {found.machines} machines, sampled, of {box}"
+    )
+    if not found.refusal:
+        print_text(console, "as predicted: |S| and |T| are within the tube at all lines")
+    print_written(console, files)
+
+
+def _plan(
+    gains: Path,
+    controller: Controller,
+    options: dict[str, Any],
+    width: float | None,
+    *,
+    separate: bool,
+    as_json: bool,
+) -> None:
+    """Print what will be flown, how, and what it will tell."""
+    from malta.identification.measure import plan_measurement
+    from malta.loops.loop import loop
+    from malta.model.data import plant_of
+    from malta.report.tables.experiments import excitation_tables, measurement_plan_table
+
+    plant = plant_of(controller.parameters)
+    found = plan_measurement(loop(plant, controller), width=width, separate=separate, **options)
+    if as_json:
+        from malta.cli.documents.others import measure_plan_output
+
+        print_document(measure_plan_output(gains, found))
+        return
+    first, console = found.excitations[0], make_console()
+    flights = f"{len(found.excitations)} flights" if separate else "one flight"
+    print_text(
+        console,
+        f"{gains}: {flights}, {first.periods} periods of {first.signal.period:g} s each and one to settle",
+    )
+    console.print(excitation_tables(first, plant)[0])
+    console.print(measurement_plan_table(found))
+    size = f" --motion {1e6 * options['motion']:g}um" if "motion" in options else ""
+    low, high = options["band"]
+    for k in range(len(found.excitations)):
+        shift = f" --shift {k}" if separate else ""
+        rest = f"--periods {first.periods} --band {low:g}..{high:g} --lines {options['lines']}{size}{shift}"
+        console.print(f"malta excite {gains} {rest} --log flown{k or ''}.npz", soft_wrap=True)
