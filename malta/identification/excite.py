@@ -13,6 +13,7 @@ from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.identification.response import (
     ResponseModel,
+    axes_of,
     candidates,
     deviations,
     information,
@@ -151,13 +152,12 @@ def model_at(loop: Loop, names: Sequence[str]) -> ResponseModel:
     plant = loop.plant
     at = {name: value for name, value in loop.at.items() if value}
     point = trim(plant, **at)
-    axes = plant.actuator.coils if plant.windings is None else plant.drive.axes
     y = np.array(ca.DM(plant.h(ca.DM(point.x), 0))).ravel()
     coils = ca.DM(plant.currents(ca.DM(y), ca.DM(point.v)))
     i = np.array(
         coils if plant.windings is None else ca.evalf(ca.densify(plant.drive.command(coils)))
     ).ravel()
-    currents = tuple(s.name for s in axes)
+    currents = tuple(s.name for s in axes_of(plant))
     return ResponseModel(plant, require_parameters(plant, names), currents, y, i, loop.sample_time)
 
 

@@ -38,6 +38,7 @@ NEIGHBOURS = 16  # bins between lines, nearest to a line, that tell the noise th
 WINDOW = 3  # lines to either side whose bins are taken together
 EXCITED = 1e-6  # of the largest line of an excitation: what is above is a line
 FEWEST = 3  # periods
+WIDER = 2  # times the highest line: up to there motion counts that curvature multiplies
 SIGMA = 1.959963984540054  # half of a 95 % interval
 SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
 LOST = 1.0  # of its value: a combination of parameters that is found worse is not found
@@ -198,6 +199,7 @@ def identify(
     names = tuple(name for name in names if name not in (known or {}))
     i, y = spectrum.currents[0].real, spectrum.outputs[0].real
     model = ResponseModel(plant, names, tuple(log.names("i")), y, i, log.sample_time)
+    measured, spectrum = spectrum, _straightened(model, spectrum, model.start)
     dropped: dict[str, float] = {}
     F = _information(model, spectrum)
     if not parameters:
@@ -207,7 +209,8 @@ def identify(
         model = replace(model, names=tuple(names[k] for k in left))
         F = F[np.ix_(left, left)]
     _require_identifiable(model, F, log.source)
-    return _estimate(model, spectrum, log, dropped)
+    first = _estimate(model, spectrum, log, dropped)
+    return _estimate(model, _straightened(model, measured, first.values), log, dropped)
 
 
 def _known_plant(plant: Plant, known: Mapping[str, float], start: Mapping[str, float]) -> Plant:
@@ -261,6 +264,7 @@ class Spectrum(NamedTuple):
     between: IntArray  # lines x NEIGHBOURS: the nearest bins with noise alone
     harmonics: IntArray  # multiples of 1 / period that were not excited, in the band of the lines
     rate: float  # rad/s of a bin
+    periods: int  # of the excitation in the record: every so many bins is a harmonic
     source: str  # the log's
     weight: (
         FloatArray  # of each output: 1 over the size of its coefficients above the lines, where nothing moves
@@ -311,9 +315,22 @@ def _spectrum(log: Log) -> Spectrum:
         free[nearest],
         harmonics,
         rate,
+        periods,
         log.source,
         weight,
     )
+
+
+def _straightened(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Spectrum:
+    """The spectrum without what the machine's curvature adds at harmonics; see `ResponseModel.beyond_linear`.
+
+    Products of two lines fall on other lines. Without this they were taken for the machine's linear response.
+    """
+    last = min(WIDER * int(s.lines[-1]) // s.periods, (len(s.outputs) - 1) // s.periods)
+    places = s.periods * np.arange(last + 1)
+    outputs = np.array(s.outputs)
+    outputs[places] -= model.beyond_linear(theta, s.outputs[places], s.currents[places], s.rate * s.periods)
+    return s._replace(outputs=outputs)
 
 
 def _whole(log: Log, group: str) -> FloatArray:

@@ -22,6 +22,7 @@ from malta.errors import InputError
 from malta.model.parameters import symbolic_names, twins_of
 from malta.model.plant import Plant, symbolic
 from malta.model.sensors import with_lags
+from malta.simulation.engine.engines import evaluate
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -108,8 +109,8 @@ class ResponseModel:
         )
 
     @cached_property
-    def _matrices(self) -> ca.Function:
-        """Parameters -> A, B, C of the states of the design model and of lagging readings, and the dead time, s."""
+    def _equations(self) -> tuple[Any, Any, Any, Any, Any, Any]:
+        """Symbols of parameters, all states and all currents; x', the readings, and the dead time of these, s."""
         plant, par = self.plant, self.plant.parameters
         theta = ca.SX.sym("theta", len(self.names))
         symbols = {name: theta[k] for k, name in enumerate(self.names)}
@@ -119,23 +120,85 @@ class ResponseModel:
         }
         machine = plant.variant(symbolic(par, of_machine | twins))
         errors = ca.vertcat(*(symbols.get(s.name, 0) for s in plant.sensor_errors))
-        x = ca.SX.sym("x", len(plant.states))
-        axes = plant.actuator.coils if plant.windings is None else plant.drive.axes
-        i = ca.SX.sym("i", len(axes))
+        x, i = ca.SX.sym("x", len(plant.states)), ca.SX.sym("i", len(axes_of(plant)))
         forces = machine.forces(x, i) if plant.windings is None else machine.drive.force(i)
         rate, read = machine.f(x, forces, machine.load(x)), machine.sense(x, errors)
-        keep, used = list(plant.controlled), self._places([s.name for s in axes])
+        return theta, x, i, rate, read, machine.sensors
+
+    @cached_property
+    def _matrices(self) -> ca.Function:
+        """Parameters -> A, B, C of the states of the design model and of lagging readings, and the dead time, s."""
+        theta, x, i, rate, read, sensors = self._equations
+        keep, used = list(self.plant.controlled), self._places
         blocks = (
             ca.jacobian(rate, x)[keep, keep],
             ca.jacobian(rate, i)[keep, used],
             ca.jacobian(read, x)[:, keep],
         )
-        late = 0 if machine.sensors is None else machine.sensors.dead_time
-        linear = [*with_lags(machine.sensors, *blocks), ca.SX(late)]
-        at = np.zeros(len(axes))
+        late = 0 if sensors is None else sensors.dead_time
+        linear = [*with_lags(sensors, *blocks), ca.SX(late)]
+        at = np.zeros(i.numel())
         at[used] = self.i
         here = ca.substitute(linear, [x, i], [ca.DM(self.place), ca.DM(at)])
         return ca.Function("matrices", [theta], [ca.densify(M) for M in here])
+
+    def beyond_linear(
+        self, theta: FloatArray, outputs: ComplexArray, currents: ComplexArray, rate: float
+    ) -> ComplexArray:
+        """What the machine's curvature adds to its outputs, harmonics x p: lever arms that move with the stroke, bent
+        loads, forces that change with the place.
+
+        The remainder r = f(x, i) - f(x_0, i_0) - A (x - x_0) - B (i - i_0) is a known input, as it is small and the
+        motion is measured: its response is that of the linear machine, C (s - A)^-1 r, beside the remainder of h. Zero
+        for a machine whose states are not (q, q').
+
+        theta : parameters, SI
+        outputs : harmonics x p, Fourier coefficients of the outputs over a period, from 0 on
+        currents : the same of the measured currents
+        rate : rad/s of the first harmonic
+        """
+        if not self.plant.second_order:
+            return np.zeros_like(outputs)
+        A, B, C, late = (np.array(M) for M in self._matrices(theta))
+        count, n = len(outputs), len(self.plant.controlled)
+        samples = 4 * count
+
+        def signal(coefficients: ComplexArray) -> FloatArray:
+            whole = np.zeros((samples // 2 + 1, coefficients.shape[1]), dtype=complex)
+            whole[:count] = coefficients
+            return np.asarray(np.fft.irfft(whole, samples, axis=0)) * samples
+
+        y, i, w = signal(outputs), signal(currents), rate * np.arange(count)
+        q = evaluate(self._positions.map(samples), y)[0]
+        moving = np.fft.rfft(q, axis=0)[:count] / samples * (1j * w)[:, None]
+        x = np.hstack([q, signal(moving)])
+        f, h = evaluate(self._values.map(samples), np.tile(theta, (samples, 1)), x, i)
+        off_x, off_i = x - self.place[list(self.plant.controlled)], i - self.i
+        r = f - off_x @ A[:n, :n].T - off_i @ B[:n].T
+        bent = h - off_x @ C[:, :n].T if C.shape[1] == n else np.zeros_like(h)
+        R, H = (np.fft.rfft(part, axis=0)[:count] / samples for part in (r, bent))
+        s, wide = 1j * w[1:, None, None], np.zeros((count - 1, len(A), 1), dtype=complex)
+        wide[:, :n, 0] = R[1:]
+        H[1:] += (C @ np.linalg.solve(s * np.eye(len(A)) - A, wide))[..., 0]
+        H[0] = 0
+        return np.asarray(H * np.exp(-1j * w * late.item())[:, None])
+
+    @cached_property
+    def _positions(self) -> ca.Function:
+        """y -> positions of the design model."""
+        y = ca.SX.sym("y", len(self.plant.outputs))
+        return ca.Function("positions", [y], [ca.densify(self.plant.position_of(y))])
+
+    @cached_property
+    def _values(self) -> ca.Function:
+        """Parameters, states of the design model and measured currents -> x' and readings."""
+        theta, x, i, rate, read, _ = self._equations
+        keep, used = list(self.plant.controlled), self._places
+        own, measured = ca.SX.sym("x", len(keep)), ca.SX.sym("i", len(used))
+        whole, flowing = ca.SX.zeros(x.numel()), ca.SX.zeros(i.numel())
+        whole[keep], flowing[used] = own, measured
+        found = ca.substitute([rate[keep], read], [x, i], [whole, flowing])
+        return ca.Function("values", [theta, own, measured], [ca.densify(part) for part in found])
 
     @cached_property
     def place(self) -> FloatArray:
@@ -145,13 +208,21 @@ class ResponseModel:
         x[list(self.plant.controlled)[: len(positions)]] = positions
         return x
 
-    def _places(self, known: list[str]) -> list[int]:
+    @cached_property
+    def _places(self) -> list[int]:
+        """Places of the measured currents among all."""
+        known = [s.name for s in axes_of(self.plant)]
         for name in self.currents:
             if name not in known:
                 raise InputError(
                     "log", name, "a current that the machine has not", "one of " + " ".join(known)
                 )
         return [known.index(name) for name in self.currents]
+
+
+def axes_of(plant: Plant) -> tuple[Any, ...]:
+    """The signals of the currents that a log may have: axes of the drive, or coils of a machine without windings."""
+    return plant.actuator.coils if plant.windings is None else plant.drive.axes
 
 
 def units_of_model(plant: Plant) -> dict[str, str]:
