@@ -200,10 +200,14 @@ def _print_tables(
 
     controller, console = found.controller, make_console()
     preset = f"{controller.parameters.preset} {' '.join(changes)}".rstrip()
+    verdict = report.verdict_text(found)
     print_text(console, f"{gains}: {controller.name}, {found.plant.name}, preset {preset}")
+    console.print(verdict)
+    console.print()
     console.print(report.poles_table(found.model, None if changes else published))
     for table in report.loop_tables(found, published, spec):
         console.print(table)
+    console.print(verdict)
 
 
 # `malta check`: the proof in a certificate, checked without the code that found it.

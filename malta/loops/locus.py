@@ -1,8 +1,9 @@
 """Root locus of any loop: the closed-loop poles over a parameter of the machine, or over a factor of the loop gain.
 
 Every sample is a set of eigenvalues. From sample to sample each pole goes to the one that the motion so far leads to,
-with the least sum of distances (assignment), and an interval in which a pole moves far is halved. The values at which
-the loop becomes stable or unstable are found by bisection.
+with the least sum of distances (assignment): conjugates stay conjugate, and pairs meet and part on the real axis. An
+interval in which a pole moves far is halved. The values at which the loop becomes stable or unstable are found by
+bisection.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from malta.synthesis.riccati import eigenvalues
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
+
+    Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
     from malta.synthesis.controller import Controller
 
 GAIN = "gain"  # the name of the factor of the loop gain
@@ -37,6 +40,7 @@ SLOW = 1e-4  # of the fastest rate: poles that may move as far as one of this ra
 DELAY = 0.02  # |z| of poles that count as pure delay
 NEAR = 1e-4  # of the range: intervals that are not halved
 ROUNDING = 1e-13  # of the fastest rate: growth that counts as none
+SAME = 1e-7  # of the fastest rate: imaginary parts below are rounding, as of a real pole that is there twice
 EXACT = 1e-8  # of the range: the accuracy of the values at which stability changes
 
 
@@ -211,9 +215,46 @@ def _in_order(sets: list[ComplexArray]) -> ComplexArray:
     rows = [sets[0]]
     for found in sets[1:]:
         ahead = rows[-1] if len(rows) < 2 else 2 * rows[-1] - rows[-2]
-        cost = np.abs(ahead[:, None] - found) + np.abs(rows[-1][:, None] - found)
-        rows.append(found[optimize.linear_sum_assignment(cost)[1]])
+        rows.append(_continue_branches(rows[-1], ahead, found))
     return np.array(rows)
+
+
+def _continue_branches(last: ComplexArray, ahead: ComplexArray, found: ComplexArray) -> ComplexArray:
+    """Eigenvalues in the order of the branches: conjugates stay conjugate, and pairs meet and part on the real axis.
+
+    Upper poles go to upper ones, real ones to real ones, lower ones where the conjugates of their partners go. What one
+    row has more of pairs than the other, the nearest two real poles of the other take or give.
+    """
+    cost = np.abs(ahead[:, None] - found) + np.abs(last[:, None] - found)
+    (upper, lower, real), (up, low, flat) = _split_pairs(last), _split_pairs(found)
+    target = np.empty(len(last), dtype=int)
+    while len(upper) > len(up):  # a pair meets
+        i, r = _nearest_two(cost[np.ix_(upper, flat)])
+        target[[upper[i], lower[i]]] = flat[list(r)]
+        upper, lower, flat = np.delete(upper, i), np.delete(lower, i), np.delete(flat, r)
+    while len(up) > len(upper):  # two real poles part
+        i, r = _nearest_two(cost[np.ix_(real, up)].T)
+        target[real[list(r)]] = up[i], low[i]
+        up, low, real = np.delete(up, i), np.delete(low, i), np.delete(real, r)
+    chosen = optimize.linear_sum_assignment(cost[np.ix_(upper, up)])[1]
+    target[upper], target[lower] = up[chosen], low[chosen]
+    target[real] = flat[optimize.linear_sum_assignment(cost[np.ix_(real, flat)])[1]]
+    return np.asarray(found[target])
+
+
+def _split_pairs(poles: ComplexArray) -> tuple[Indices, Indices, Indices]:
+    """Indices of the upper poles, of their conjugates in the same order, and of the real ones, by rounding."""
+    level = SAME * float(np.abs(poles).max(initial=0.0))
+    upper, lower = np.flatnonzero(poles.imag > level), np.flatnonzero(poles.imag < -level)
+    apart = np.abs(poles[upper].conj()[:, None] - poles[lower])
+    return upper, lower[optimize.linear_sum_assignment(apart)[1]], np.flatnonzero(np.abs(poles.imag) <= level)
+
+
+def _nearest_two(cost: FloatArray) -> tuple[int, tuple[int, int]]:
+    """The pair (a row), and the two real poles (columns) that it becomes at the least cost."""
+    two = np.argsort(cost, axis=1)[:, :2]
+    best = int(np.argmin(np.take_along_axis(cost, two, axis=1).sum(axis=1)))
+    return best, (int(two[best, 0]), int(two[best, 1]))
 
 
 def _in_rates(found: ComplexArray, T: float | None) -> ComplexArray:

@@ -283,16 +283,48 @@ class Outcome(NamedTuple):
         base, space, rest = self.name.partition(" ")
         return base.replace("_", " ") + space + rest
 
-    def __str__(self) -> str:
-        unit = "" if self.unit == "1" else f" {self.unit}"
+    @property
+    def _scale(self) -> tuple[float, str]:
+        """Factor from SI and unit that readers see: margins in percent, bandwidths in Hz, deviations in um."""
+        if self.name == "margin":
+            return 100.0, "%"
+        if self.unit == "rad/s":
+            return 1 / (2 * math.pi), "Hz"
+        fine = FINE.get(self.unit)
+        return (1e6, fine) if fine else ROOTS.get(self.unit, (1.0, self.unit))
+
+    def text(self, value: float) -> str:
+        """A value of it in the unit that readers see; a bandwidth has rad/s beside Hz."""
+        factor, unit = self._scale
+        more = f" ({value:.4g} rad/s)" if unit == "Hz" else ""
+        return f"{value * factor:.4g} {unit}".removesuffix(" 1") + more
+
+    @property
+    def asked_text(self) -> str:
+        """Its bound; "as little as possible" without one."""
         if self.asked is None:
-            return f"{self.name} is {self.found:.4g}{unit}, asked for little"
+            return "as little as possible"
+        return f"{'>=' if self.at_least else '<='} {self.text(self.asked)}"
+
+    @property
+    def found_text(self) -> str:
+        """What was found; of a mean over seeds with half the width of its interval."""
+        if self.interval is None:
+            return self.text(self.found)
+        low, high = self.interval
+        number, space, unit = self.text(self.found).partition(" ")
+        return f"{number} ± {(high - low) / 2 * self._scale[0]:.2g}{space}{unit}"
+
+    def __str__(self) -> str:
+        found = f"{self.name} is {self.text(self.found)}"
+        if self.asked is None:
+            return f"{found}, asked for little"
         bound = "at least" if self.at_least else "at most"
-        text = f"{self.name} is {self.found:.4g}{unit}, asked for {bound} {self.asked:.4g}{unit}"
+        text = f"{found}, asked for {bound} {self.text(self.asked)}"
         if self.verdict != "undecided" or self.interval is None:
             return text
-        low, high = self.interval
-        return f"{text}, undecided between {low:.4g} and {high:.4g}{unit}"
+        low, high = map(self.text, self.interval)
+        return f"{text}, undecided between {low} and {high}"
 
 
 @display
@@ -419,14 +451,14 @@ class LoopReport:
         lines = [f"{'stable' if self.stable else 'UNSTABLE'} with hold, delay and current loops"]
         for stage in self.stages:
             peaks = "  ".join(
-                f"{k} {v:.2f} {zone(v)}" for k, v in stage.peak_sensitivity.items() if k != "sigma_max"
+                f"{k} {v:.2f}, zone {zone(v)}" for k, v in stage.peak_sensitivity.items() if k != "sigma_max"
             )
             largest = stage.peak_sensitivity["sigma_max"]
             lines.append(
                 f"peak |S|, {stage.name}: {peaks}  all {largest:.2f} ({20 * np.log10(largest):.1f} dB)"
             )
         for key, value in self.bandwidth.items():
-            lines.append(f"bandwidth, {BANDWIDTHS[key]}: {value:.1f} rad/s ({value / (2 * np.pi):.2f} Hz)")
+            lines.append(f"bandwidth, {BANDWIDTHS[key]}: {value / (2 * np.pi):.2f} Hz ({value:.1f} rad/s)")
         if self.uncertainty:
             box = "  ".join(f"{name} +-{share * 100:g} %" for name, share in self.uncertainty.items())
             where = str(self.extent) if self.covers_travel else "in the middle and at the end of the travel"

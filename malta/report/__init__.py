@@ -60,6 +60,9 @@ from malta.report.tables.tuning import front_markdown as front_markdown
 from malta.report.tables.tuning import front_rows as front_rows
 from malta.report.tables.tuning import front_table as front_table
 from malta.report.tables.tuning import requirements_table as requirements_table
+from malta.report.verdict import verdict_html as verdict_html
+from malta.report.verdict import verdict_lines as verdict_lines
+from malta.report.verdict import verdict_text as verdict_text
 
 if TYPE_CHECKING:  # loaded when the first one is drawn: commands that draw none start sooner
     from malta.report.plots import bode as bode

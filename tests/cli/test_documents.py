@@ -99,7 +99,7 @@ def test_verify_as_json_and_as_tables_has_the_figures_of_the_record(run: Run) ->
     assert (moved["settled_s"], moved["largest"]) == pytest.approx((0.825, 1.44345e-3), rel=1e-4)
     assert moved["left"][1] == {"after_s": 0.3, "value": pytest.approx(9.5567e-4, rel=1e-4)}
     tables = run("verify", gains, "--no-proof").out
-    for text in ("21.5", "1.28 A", "0.265", "73158 us", "0.825"):
+    for text in ("21.5", "1.28", "0.265", "73158 µs", "0.825"):
         assert text in tables
 
 

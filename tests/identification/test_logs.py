@@ -104,7 +104,7 @@ def test_commands_write_and_show_a_log(run: Run, tmp_path: Path) -> None:
     assert f"wrote {file}" in said.out
     shown = run("log", file, "--out", picture)
     assert shown.code == 0
-    assert "2000 samples of 50 us" in shown.out
+    assert "2000 samples of 50 µs" in shown.out
     assert picture.stat().st_size > 10_000
     found = json.loads(run("log", file, "--json").out)
     assert found["signals"]["z"]["unit"] == "m"

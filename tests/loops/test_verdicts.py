@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import html
+import io
 import json
 import math
 import re
+from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from conftest import ROOT
+from rich.console import Console
 
 import malta
 from malta.app.worker import outcome_document
 from malta.gains.file import read
 from malta.margins.loop_report import Outcome
-from malta.report.page.analysis import _requirements as headline
-from malta.report.tables.tuning import found_text, requirements_table
+from malta.model.data import plant_of
+from malta.proof.margin import NOT_PROVEN
+from malta.report.tables.tuning import requirements_table
+from malta.report.verdict import verdict_html, verdict_lines, verdict_text
 from malta.synthesis.requirements import (
     SEEDS,
     Figure,
@@ -122,7 +127,7 @@ def test_a_named_design_of_another_machine_is_refused(run: Run) -> None:
 def test_undecided_is_no_pass_anywhere() -> None:
     assert (OPEN.verdict, OPEN.holds) == ("undecided", False)
     assert "undecided between 0.95 and 1.03" in str(OPEN)
-    assert found_text(OPEN) == "0.99 ± 0.04"
+    assert OPEN.found_text == "0.99 ± 0.04"
     assert "undecided" in str(list(requirements_table([OPEN]).columns[4].cells))
     assert outcome_document([OPEN])["holds"] is None
     held = Outcome("error", 1.0, 0.5, "1", "flights")
@@ -132,12 +137,36 @@ def test_undecided_is_no_pass_anywhere() -> None:
     assert judge_figure(Figure(math.nan, "nothing"), 1.0, at_least=False) == "fails"
 
 
-def test_the_headline_of_a_report_counts_undecided_requirements() -> None:
-    outcomes = (OPEN, Outcome("margin", 3.0, 3.5, "1", "proof", at_least=True))
-    page: Any = SimpleNamespace(report=SimpleNamespace(requirements=outcomes))
-    (key,) = headline(page)
-    assert "1 of 2 hold, 1 undecided" in str(key)
-    assert "good" not in str(key)
+def test_the_verdict_names_failures_first_and_says_the_same_everywhere() -> None:
+    """One record makes the lines of terminal and pages; a proven margin is never rounded up to what is not proven."""
+    controller = malta.gains.read(ROOT / ROBUST)
+    model = malta.linearize(plant_of(controller.parameters), plant_of(controller.parameters).at())
+    spoiled = replace(controller, K=0.0 * controller.K)
+    margin = Outcome("margin", 3.0, 2.0, "1", "proof", at_least=True)
+    held = Outcome("bandwidth", 100.0, 401.7, "rad/s", "loop", at_least=True)
+    proven = replace(NOT_PROVEN, lower=0.99996, upper=1.00004, reason="")
+    found = replace(
+        malta.verify(model, controller),
+        requirements=(held, OPEN, margin),
+        robust=proven,
+        uncertainty={"m": 0.2},
+    )
+    lines = verdict_lines(found)
+    assert [line.label for line in lines] == ["loop", "margin", "peak |S|", "requirements", "yield"]
+    assert (lines[1].value, lines[1].state) == ("99.9 % proven", "bad")
+    assert "lost at 100.1 %" in lines[1].note
+    assert lines[3].value == "1 of 3 FAILS, 1 undecided"
+    assert lines[3].note.startswith("margin 200 %, asked >= 300 %; error")
+    assert held.found_text == "63.93 Hz (401.7 rad/s)"
+    console = Console(width=200, file=io.StringIO(), color_system=None)
+    console.print(verdict_text(found))
+    terminal, page = console.file.getvalue(), html.unescape(verdict_html(lines))  # type: ignore[attr-defined]
+    for line in lines:
+        assert f"{line.value}, {line.note}" in terminal
+        assert line.value in page
+        assert line.note in page
+    unstable = verdict_lines(malta.verify(model, spoiled))
+    assert [line.state for line in unstable[:3]] == ["bad", "", "bad"]
 
 
 def test_undecided_ends_tune_with_exit_code_1(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,10 +20,10 @@ def _table() -> object:
 
 
 def test_texts_fold_at_spaces_and_keep_units_with_their_numbers() -> None:
-    assert fold("moves by 353.3 um in all", 12) == ["moves by", "353.3 um in", "all"]
+    assert fold("moves by 353.3 um in all", 12) == ["moves by", "353.3 µm in", "all"]
     assert fold("1 N m T_x", 5) == ["1 N m", "T_x"]
     assert fold("0.73 kg, not 0.75", 8) == ["0.73 kg,", "not 0.75"]
-    assert fold("largest compliance [um / N]", 12) == ["largest", "compliance", "[um / N]"]
+    assert fold("largest compliance [um / N]", 12) == ["largest", "compliance", "[µm / N]"]
     assert fold("held >= 20 % of it", 9) == ["held", ">= 20 %", "of it"]
     assert fold("-665.1 (x2)  -10  -328.3+-189.6j", 16) == ["-665.1 (x2)  -10", "-328.3+-189.6j"]
     assert fold("a\nb c", 80) == ["a", "b c"]

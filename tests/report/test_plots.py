@@ -22,7 +22,7 @@ from malta.cli.documents.published import output_schema
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.locus import root_locus
 from malta.model.signals import axis_units
-from malta.report.plots.plane import Window
+from malta.report.plots.plane import Window, branch_paths
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -153,6 +153,33 @@ def test_a_channel_and_axes_may_be_chosen(robust: LoopCurves) -> None:
         report.bode({})
     with pytest.raises(malta.InputError, match="no loads from outside"):
         report.load_response(control.tf([1], [1, 1]))
+
+
+@pytest.mark.parametrize("name", ["halbach_pid", pytest.param("planar", marks=pytest.mark.slow)])
+def test_a_root_locus_mirrors_and_its_branches_have_no_gaps(name: str) -> None:
+    """Sampled loops: each branch has a mirror image among the branches, and no step in it is longer than a tenth."""
+    controller = malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
+    found = root_locus(malta.plant_of(controller.parameters), controller)
+    strip = np.pi / found.sample_time
+    for row in found.poles:
+        known = row[np.isfinite(row) & (row.real > -1.2 * strip)]
+        mirrored = known.conj() + np.where(np.abs(known.imag) > 0.999 * strip, 2j * known.imag, 0)
+        assert np.abs(known[:, None] - mirrored).min(axis=0).max(initial=0.0) < 1e-6 * strip
+    for path in branch_paths(found):
+        step = np.abs(np.diff(path))
+        size = np.maximum(np.abs(path[1:]), 0.02 * strip)
+        assert np.nanmax(step / size, initial=0.0) < 0.2
+
+
+def test_a_root_locus_leaves_the_axis_at_a_right_angle_and_ends_at_zeros() -> None:
+    """(s + 3) / (s (s + 1)): a circle about the zero, of radius sqrt 6; one pole ends at -3, the other at infinity."""
+    found = root_locus((s + 3) / (s * (s + 1)), span=(1e-3, 1e4))
+    points = np.concatenate(branch_paths(found))
+    circle = points[np.abs(points.imag) > 1e-9]
+    assert np.abs(np.abs(circle + 3) - np.sqrt(6)).max() < 0.02
+    assert np.abs(circle.imag).min() < 0.05
+    assert np.abs(found.poles[-1] + 3).min() < 1e-3
+    assert found.poles[-1].real.min() < -9e3
 
 
 def test_a_root_locus_shows_its_ends_and_the_boundary() -> None:

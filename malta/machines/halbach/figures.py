@@ -20,6 +20,7 @@ from malta.machines.halbach.experiments.lift import (
 from malta.machines.halbach.experiments.motions import BEFORE, PAUSE, responses
 from malta.report.figures.drawing import (
     MORE,
+    REFERENCE,
     STYLES,
     Published,
     add_shared_legend,
@@ -47,8 +48,8 @@ if TYPE_CHECKING:
     from malta.simulation.experiments import Case, Experiment
     from malta.simulation.trajectory import Trajectory
 
-EACH: dict[str, Any] = {"color": "#b5b5b5", "linewidth": 0.7}
 ASKED: dict[str, Any] = {"color": "#c1440e", "linestyle": (0, (5, 2)), "linewidth": 1.2}
+EACH: dict[str, Any] = {"color": "#b5b5b5", "linewidth": 0.7}
 
 
 def step_figure(e: Experiment, _: Published | None = None) -> Figure:
@@ -94,7 +95,7 @@ def _draw_steps(axes: Axes, case: Case) -> None:
         axes.plot(ms[shown], 1e6 * distance * share[shown], **EACH | named)
     axes.plot(ms[shown], 1e6 * distance * shares.mean(axis=0)[shown], label="mean", **STYLES[0])
     asked = run.reference[BEFORE : BEFORE + PAUSE, 0]
-    axes.plot(ms[shown][: len(asked)], 1e6 * asked[shown[: len(asked)]], label="reference", **ASKED)
+    axes.plot(ms[shown][: len(asked)], 1e6 * asked[shown[: len(asked)]], label="reference", **REFERENCE)
     finish_axes(axes, "time after the step begins [ms]", f"position, {case.label} [µm]")
 
 
@@ -108,7 +109,7 @@ def stairs_figure(e: Experiment, published: Published | None = None) -> Figure:
     panels = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
     for k, (axes, case) in enumerate(zip(panels, e.cases, strict=False)):
         run = case.run
-        axes.plot(run.t, 1e6 * run.reference[:, 0], label="reference", drawstyle="steps-post", **ASKED)
+        axes.plot(run.t, 1e6 * run.reference[:, 0], label="reference", drawstyle="steps-post", **REFERENCE)
         draw_line(axes, run.t, 1e6 * run.p[:, 0], label="position", **STYLES[0])
         axes.set_title(case.label, fontsize=9, loc="left")
         finish_axes(axes, "time [s]" if k > 1 else "", "position [µm]")

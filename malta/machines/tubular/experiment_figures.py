@@ -18,12 +18,12 @@ from malta.report.figures.drawing import (
     CROSS,
     MORE,
     NOTE,
+    REFERENCE,
     STYLES,
     Published,
     add_shared_legend,
     clearance,
     draw_bound,
-    draw_group,
     draw_largest,
     draw_line,
     ended_early,
@@ -52,25 +52,33 @@ def commissioning_figure(e: Experiment, _: Published | None = None) -> Figure:
     followed = np.where(flying[:, None], e.curves["followed"], np.nan)
     shown = (e.merits[1], e.merits[3], e.merits[5])
     found = ", ".join(f"{merit.label} {merit_phrase(merit)}" for merit in shown)
-    figure = new_page([run], "commissioning by the supervisor", found, hspace=0.3, top=0.83)
-    (height, error), (stroke, force) = figure.subplots(2, 2, sharex=True)
+    places = {"size": (9.0, 9.6), "hspace": 0.28, "top": 0.885}
+    figure = new_page([run], "commissioning by the supervisor", found, **places)
+    (height, error), (stroke, thrust), *others = figure.subplots(4, 2, sharex=True)
     axis = plant.stroke_output
+    draw_line(height, ms, followed[:, 1] * 1e6, label="reference that is followed", **REFERENCE)
     for k, style in zip((1, 3), STYLES, strict=False):
         draw_line(height, ms, run.p[:, k] * 1e6, label=plant.outputs[k].name, **style)
-    draw_line(height, ms, followed[:, 1] * 1e6, label="reference that is followed", **STYLES[3])
+    draw_line(stroke, ms, followed[:, axis] * 1e3, **REFERENCE)
     draw_line(stroke, ms, run.p[:, axis] * 1e3, **STYLES[0])
-    draw_line(stroke, ms, followed[:, axis] * 1e3, **STYLES[3])
     off = np.abs(run.p - followed)[:, [k for k in range(followed.shape[1]) if k != axis]].max(axis=1)
-    draw_line(error, ms, np.maximum(off * 1e6, 1e-2), **STYLES[0])
+    draw_line(error, ms, np.maximum(off * 1e6, 1e-2), **STYLES[0] | {"linewidth": 0.8})
     error.set_yscale("log")
-    first = sorted(range(len(plant.inputs)), key=lambda k: k != plant.thrust_input)
-    draw_group(force, ms, {plant.inputs[k].name: run.v[:, k] for k in first})
     draw_bound(height, -clearance(plant) * 1e6, "touchdown bearing", where="below left")
     finish_axes(height, "", "height [µm]")
     finish_axes(error, "", "off its reference, radially [µm]")
-    finish_axes(stroke, "time [ms]", f"{plant.stroke} [mm]")
-    finish_axes(force, "time [ms]", "commanded forces [N]", legend=len(first))
-    for axes in (height, error, stroke, force):
+    finish_axes(stroke, "", f"{plant.stroke} [mm]")
+    radial = [k for k in range(len(plant.inputs)) if k != plant.thrust_input]
+    forces = dict(zip((plant.thrust_input, *radial), (thrust, *np.ravel(others)), strict=True))
+    for k, axes in forces.items():  # each in a panel of its own: noise hides the others
+        draw_line(axes, ms, run.v[:, k], **STYLES[0] | {"linewidth": 0.8})
+        bottom = axes in others[-1]
+        finish_axes(axes, "time [ms]" if bottom else "", f"{plant.inputs[k].name} [{plant.inputs[k].unit}]")
+    span = [run.v[:, radial].min(), run.v[:, radial].max()]
+    room = 0.08 * (span[1] - span[0])
+    for k in radial:
+        forces[k].set_ylim(span[0] - room, span[1] + room)
+    for axes in figure.axes:
         _mark_states(axes, ms, state, named=axes is height)
     add_shared_legend(figure)
     return figure

@@ -26,6 +26,7 @@ from malta.report.figures.drawing import (
     MORE,
     NOTE,
     PAPER,
+    REFERENCE,
     STYLES,
     Published,
     add_shared_legend,
@@ -81,7 +82,7 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     )
     (position, radial), (error, current) = figure.subplots(2, 2, sharex=True)
     names = [s.name for s in plant.outputs]
-    draw_line(position, ms, run.reference[:, axis] * 1e3, label="reference z*", **STYLES[2])
+    draw_line(position, ms, run.reference[:, axis] * 1e3, label="reference z*", **REFERENCE)
     draw_line(position, ms, run.p[:, axis] * 1e3, label="position z", **STYLES[0])
     draw_line(error, ms, (run.reference[:, axis] - run.p[:, axis]) * 1e3, **STYLES[0])
     off = (run.p - run.reference) * 1e6

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -112,6 +113,8 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
 def save(figure: Figure, path: str | Path) -> Path:
     """Write a figure as .png, .svg or .pdf, whole or not at all; the same figure gives the same bytes.
 
+    A .svg file is light on screens that prefer light pages, and dark on those that prefer dark ones.
+
     figure : a matplotlib Figure
     path : of the file; its suffix gives the form
 
@@ -130,6 +133,8 @@ def save(figure: Figure, path: str | Path) -> Path:
 
 def encode_figure(figure: Figure, path: Path) -> bytes:
     r"""Make the content of a .png, .svg or .pdf file of a figure; the same figure gives the same bytes.
+
+    A .svg file is light on screens that prefer light pages, and dark on those that prefer dark ones.
 
     figure : a matplotlib Figure
     path : of the file; its suffix gives the form
@@ -156,7 +161,19 @@ def encode_figure(figure: Figure, path: Path) -> bytes:
     date = {"Date": None} if path.suffix == ".svg" else {"CreationDate": None}
     with matplotlib.rc_context({"svg.hashsalt": "malta", "svg.fonttype": "none", "pdf.fonttype": 42}):
         figure.savefig(buffer, format=path.suffix[1:], metadata=date)
-    return buffer.getvalue()
+    return with_dark_mode(buffer.getvalue()) if path.suffix == ".svg" else buffer.getvalue()
+
+
+def with_dark_mode(svg: bytes) -> bytes:
+    """An SVG file that has light lines on a dark page, where the reader's screen prefers dark."""
+    from malta.report.page.document import dark_colour
+
+    text = svg.decode()
+    rules = ["svg{fill:#ededed}"]  # of texts, which have no colour of their own
+    for side, name in sorted(set(re.findall(r"(fill|stroke): #([0-9a-f]{6})", text))):
+        rules.append(f'[style*="{side}: #{name}"]{{{side}:{dark_colour(name)} !important}}')
+    style = f"<style>@media (prefers-color-scheme: dark){{{''.join(rules)}}}</style>"
+    return re.sub(r"(<svg\b[^>]*>)", lambda found: found[0] + style, text, count=1).encode()
 
 
 def run_figure(e: Experiment, _: Published | None = None) -> Figure:

@@ -25,6 +25,7 @@ from malta.units import in_unit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
+    from matplotlib.lines import Line2D
 
     from malta.model.plant import FloatArray
     from malta.simulation.experiments import Case, Experiment, Merit
@@ -51,6 +52,14 @@ MORE: Sequence[dict[str, Any]] = (  # used after STYLES
     {"color": "#8a8a8a", "linestyle": "-", "linewidth": 1.2},
 )
 BOUND: dict[str, Any] = {"color": "#9a9a9a", "linestyle": (0, (8, 3)), "linewidth": 0.9}
+BOUND_LINE = "bound"  # marks what is no data
+BEYOND = 2.5  # times the data: bounds further away are arrows
+REFERENCE: dict[str, Any] = {
+    "color": "#a9c6e0",
+    "linestyle": "-",
+    "linewidth": 5.0,
+    "zorder": 1.5,
+}  # under a curve
 NOTE: dict[str, Any] = {"fontsize": 8, "color": "#5a5a5a"}
 PAPER: dict[str, Any] = {
     "bbox": {"facecolor": "#ffffff", "edgecolor": "none", "alpha": 0.75, "pad": 0.4}
@@ -181,15 +190,20 @@ def draw_published(
 def draw_bound(
     axes: Axes, value: float, text: str, *, both: bool = False, where: str = "above right"
 ) -> None:
-    """Draw a line at a value, or at both signs of it, and extend the axes beyond it.
+    """Draw a line at a value, or at both signs of it, and extend the axes to it; the data decide what they show.
+
+    A bound beyond BEYOND times the data would flatten them: it is an arrow with its number at the edge instead.
 
     where : place of its text: above, below, or under the lower line of both; left or right
     """
-    lines = [np.asarray(line.get_ydata(), dtype=float) for line in axes.lines]
-    reach = max((float(np.abs(y[np.isfinite(y)]).max(initial=0.0)) for y in lines), default=0.0)
-    for sign in (-1, 1) if both else (1,):
-        axes.axhline(sign * value, **BOUND)
+    drawn = [line for line in axes.lines if line.get_gid() != BOUND_LINE]
+    reach = max((_reach(line) for line in drawn), default=0.0)
     height, side = where.split()
+    if axes.get_yscale() != "log" and 0 < BEYOND * reach < abs(value):
+        _point_to_bound(axes, value, text, side, both=both)
+        return
+    for sign in (-1, 1) if both else (1,):
+        axes.axhline(sign * value, gid=BOUND_LINE, **BOUND)
     axes.annotate(
         text,
         ({"left": 0.015, "right": 0.985}[side], -value if height == "under" else value),
@@ -200,7 +214,7 @@ def draw_bound(
         va="bottom" if height == "above" else "top",
         **NOTE | PAPER,
     )
-    room = max(1.25 * abs(value), 1.1 * reach)
+    room = max(1.25 * abs(value), 1.1 * max(map(_reach, axes.lines)))
     if both:
         axes.set_ylim(-room, room)
     elif axes.get_yscale() == "log":
@@ -209,6 +223,27 @@ def draw_bound(
         axes.set_ylim(top=room)
     elif height == "below":
         axes.set_ylim(bottom=-room)
+
+
+def _reach(line: Line2D) -> float:
+    """The largest size of the values of a line."""
+    y = np.asarray(line.get_ydata(), dtype=float)
+    return float(np.abs(y[np.isfinite(y)]).max(initial=0.0))
+
+
+def _point_to_bound(axes: Axes, value: float, text: str, side: str, *, both: bool) -> None:
+    """Name a bound beyond the axes, with an arrow towards it, at the upper edge or, of a negative one, at the lower."""
+    up = both or value > 0
+    told = f"{text} {'±' if both else ''}{value:.3g} {'↕' if both else '↑' if up else '↓'}"
+    above = sum(note.get_gid() == BOUND_LINE for note in axes.texts)  # other bounds at the edge
+    axes.annotate(
+        told.replace("-", "−"), ({"left": 0.015, "right": 0.985}[side], 1.0 if up else 0.0), xycoords="axes fraction",
+        xytext=(0, (-3 - 11 * above) if up else (3 + 11 * above)), textcoords="offset points",
+        ha=side, va="top" if up else "bottom", gid=BOUND_LINE, **NOTE | PAPER,
+    )  # fmt: skip
+    low, high = axes.get_ylim()
+    room = 0.14 * (high - low)  # for the text
+    axes.set_ylim(low - (0 if up else room), high + (room if up else 0))
 
 
 def label_upright(axes: Axes, x: float, height: float, text: str, *, ha: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from malta.errors import CheckError, InputError
 from malta.loops.curves import loop_curves
 from malta.loops.sampled_loops import LAST
-from malta.margins.loop_report import BANDWIDTHS, figure, in_groups, zone
+from malta.margins.loop_report import BANDWIDTHS, figure, in_groups
 from malta.model.data import plant_of
 from malta.model.linear import is_linear
 from malta.model.parameters import units_of
@@ -355,45 +355,9 @@ class KeyFigure(NamedTuple):
 
 
 def key_figures(a: Analysis) -> list[KeyFigure]:
-    """List the figures that a reader looks for first: stability, margin, peak |S|, bandwidth, noise, main job."""
-    parts = (_stability, _margin, _peak, _bandwidth, _noise, _job, _requirements)
+    """List the figures that a reader looks for after the verdict: bandwidth, noise, main job."""
+    parts = (_bandwidth, _noise, _job)
     return [figure for part in parts for figure in part(a)]
-
-
-def _stability(a: Analysis) -> Iterator[KeyFigure]:
-    stable = a.report.stable
-    largest = a.report.stages[-1].spectral_radius
-    note = "with hold, delay and current loops" if stable else f"a pole at |λ| = {largest:.6f}"
-    yield KeyFigure("Loop", "stable" if stable else "UNSTABLE", note, "good" if stable else "bad")
-
-
-def _margin(a: Analysis) -> Iterator[KeyFigure]:
-    label, margin = "Margin of the parameters", a.report.robust
-    if not a.subject.box:
-        yield KeyFigure(label, "not asked", "the gain file names no uncertain parameters")
-    elif not a.report.stable:
-        yield KeyFigure(label, "none", "the loop is unstable already", "bad")
-    elif margin is None:
-        yield KeyFigure(label, "not proven", "left out by --no-proof")
-    elif margin.lower is None:
-        yield KeyFigure(label, "nothing proven", margin.reason, "bad")
-    else:
-        box = ", ".join(f"{name} ±{100 * share:g} %" for name, share in a.subject.box.items())
-        state = "good" if margin.lower >= 1 else "bad"
-        where = f" {a.report.extent}" if str(a.report.extent) else ""
-        more = "at least " if margin.exhausted else ""
-        yield KeyFigure("Proven margin", f"{more}{100 * margin.lower:.1f} %", f"of {box}{where}", state)
-
-
-def _peak(a: Analysis) -> Iterator[KeyFigure]:
-    if not a.report.stable:
-        return
-    peaks = {name: peak for name, peak in a.report.peak_sensitivity.items() if name != "sigma_max"}
-    name = max(peaks, key=lambda sensor: peaks[sensor])
-    found = zone(peaks[name])
-    state = {"A": "good", "B": "near"}.get(found, "bad")
-    note = f"zone {found} of ISO 14839-3, worst at {name}"
-    yield KeyFigure("Peak |S|", f"{peaks[name]:.2f}", note, state)
 
 
 def _bandwidth(a: Analysis) -> Iterator[KeyFigure]:
@@ -437,16 +401,6 @@ def _job(a: Analysis) -> Iterator[KeyFigure]:
             yield KeyFigure(merit.label.capitalize(), merit_phrase(merit), label.lower())
 
 
-def _requirements(a: Analysis) -> Iterator[KeyFigure]:
-    asked = [one for one in a.report.requirements if one.asked is not None]
-    if asked:
-        held = sum(one.holds for one in asked)
-        open_ = sum(one.verdict == "undecided" for one in asked)
-        state = "good" if held == len(asked) else "bad"
-        words = f"{held} of {len(asked)} hold" + (f", {open_} undecided" if open_ else "")
-        yield KeyFigure("Requirements", words, "[specification] of the design file", state)
-
-
 def summary_sentences(a: Analysis) -> list[str]:
     """Say in words what the design is."""
     c, plant = a.subject.controller, a.plant
@@ -462,19 +416,19 @@ def summary_sentences(a: Analysis) -> list[str]:
     sentences = [text]
     parts = []
     if c.integrating:
-        parts.append("sums the errors")
+        parts.append("integrates the errors")
     if c.observed:
-        parts.append("observes constant forces of disturbance")
+        parts.append("estimates constant disturbance forces")
     if c.lagging:
-        parts.append("has the lag of the current loops in its model")
+        parts.append("models the lag of the current loops")
     if c.delay:
-        parts.append(f"has a delay of {_count(c.delay, 'sample')} in its model")
+        parts.append(f"models a delay of {_count(c.delay, 'sample')}")
     if c.commutation is not None:
-        parts.append("commutates for the predicted place")
+        parts.append("commutates for the predicted position")
     if parts:
         sentences.append(f"It {_list_in_words(parts)}.")
     if plant.has_stroke:
-        sentences.append(f"The stroke moves {plant.stroke} by ±{in_unit(plant.travel, 'mm'):g} mm.")
+        sentences.append(f"The travel of {plant.stroke} is ±{in_unit(plant.travel, 'mm'):g} mm.")
     spec = a.subject.written_from
     if spec is not None and spec.summary:
         sentences.insert(0, f"{spec.summary.rstrip('.')}.")

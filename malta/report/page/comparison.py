@@ -14,15 +14,16 @@ from rich.text import Text
 
 from malta.errors import InputError
 from malta.margins.loop_report import LoopFigure, best_of
-from malta.report.figures.drawing import micro
 from malta.report.page.analysis import GROUPS, Entry, design_entries, display_unit
-from malta.report.tables.layout import new_table
+from malta.report.tables.layout import Paragraph, new_table
+from malta.report.verdict import verdict_lines
 from malta.simulation.experiments import progress_of_part
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from malta.report.page.analysis import Analysis, Subject
+    from malta.report.verdict import VerdictLine
 
 
 LEAST, MOST = 2, 8  # designs
@@ -141,6 +142,24 @@ class Comparison:
             rows.append(Row(first.meaning.group, key, first.heading, scores, best))
         order = list(dict.fromkeys(row.group for row in rows))
         return tuple(sorted(rows, key=lambda row: order.index(row.group)))
+
+    @cached_property
+    def verdicts(self) -> tuple[tuple[VerdictLine, ...], ...]:
+        """The verdict on each design."""
+        return tuple(verdict_lines(a.report, a.campaigns) for a in self.designs)
+
+    @property
+    def judged_text(self) -> str:
+        """In how many of the figures that the design files bound each design is better; other figures are no score."""
+        judged = [
+            row
+            for row in self.rows
+            if sum(one is not None and one.bound is not None for one in row.scores) > 1
+        ]
+        if not judged:
+            return "No figure is bounded by the [specification] of two designs: none counts as better."
+        counts = (f"{name} in {sum(row.best[k] for row in judged)}" for k, name in enumerate(self.names))
+        return f"Better in the {len(judged)} figures that [specification] bounds: {', '.join(counts)}."
 
     @cached_property
     def one_machine(self) -> bool:
@@ -276,6 +295,14 @@ EDGE = 2  # letters at both ends of a line
 def comparison_tables(found: Comparison, width: int = 80) -> Group:
     """What differs in the designs, and their figures of merit, in blocks of designs that fit in `width` columns."""
     parts: list[Any] = []
+    verdict = [
+        Line("", lines[0].label, tuple(line.value for line in lines), tuple(False for _ in lines))
+        for lines in zip(*found.verdicts, strict=True)
+    ]
+    parts += [
+        _table("Verdict", found.names, verdict, columns) for columns in _blocks(found.names, verdict, width)
+    ]
+    parts.append(Paragraph(f"{found.judged_text}\n"))
     for title, lines in (
         ("What differs in the designs", found.difference_lines),
         (f"Figures of merit ({BEST} and bold: better)", found.figure_lines),
@@ -283,7 +310,7 @@ def comparison_tables(found: Comparison, width: int = 80) -> Group:
         for columns in _blocks(found.names, lines, width):
             parts.append(_table(title, found.names, lines, columns))
     if not found.differences:
-        parts.insert(0, Text("The designs do not differ.\n"))
+        parts.append(Text("The designs do not differ.\n"))
     parts += [Text(remark) for remark in found.remarks]
     return Group(*parts)
 
@@ -326,5 +353,5 @@ def _table(title: str, names: Sequence[str], lines: Sequence[Line], columns: Seq
             else Text(line.texts[k] + blank)
             for k in columns
         ]
-        table.add_row(Text(micro(line.heading)), *cells)
+        table.add_row(Text(line.heading), *cells)
     return table

@@ -215,6 +215,7 @@ class Front:
     about: str
     figures: Sequence[KeyFigure] = ()
     foot: str = ""
+    verdict: str = ""  # an element of HTML
 
 
 def render(
@@ -246,7 +247,8 @@ def render(
     title = f"{front.heading}: {front.kind.lower()}"
     text = _environment().get_template("page.html.jinja").render(
         title=title, kind=front.kind, heading=front.heading, about=front.about, figures=front.figures,
-        foot=front.foot, sections=parts, style=Markup(_style()), inks=Markup(f"{_inks([rules])}\n{rules}"),
+        foot=front.foot, verdict=Markup(front.verdict),
+        sections=parts, style=Markup(_style()), inks=Markup(f"{_inks([rules])}\n{rules}"),
     )  # fmt: skip
     return Page(title, text, tuple((picture.caption, picture) for picture in pictures))
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from malta.model.signals import FINE
 from malta.report import plots
 from malta.report.figures.drawing import MORE, STYLES, draw_line, finish_axes, micro, new_figure
-from malta.report.page.analysis import KeyFigure
 from malta.report.page.document import Front, Page, render
 from malta.report.page.sections import Item, Picture, Section, Sheet, distinct_channels, polish
+from malta.report.verdict import SIGNS
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -132,11 +132,13 @@ def page_of(found: Analysis, progress: Callable[[float], None] | None = None) ->
     from malta.report.page.analysis import key_figures
     from malta.report.page.document import Front, render
     from malta.report.page.sections import report_sections
+    from malta.report.verdict import verdict_html, verdict_lines
 
     c = found.subject.controller
     changes = f", changed: {', '.join(found.subject.changes)}" if found.subject.changes else ""
     about = f"Machine {found.plant.name}, preset {found.subject.parameters.preset}{changes}"
-    front = Front("Design report", c.name, about, key_figures(found), _foot(found))
+    verdict = verdict_html(verdict_lines(found.report, found.campaigns))
+    front = Front("Design report", c.name, about, key_figures(found), _foot(found), verdict)
     return render(front, report_sections(found), progress)
 
 
@@ -272,30 +274,26 @@ def comparison_page(found: Comparison, progress: Callable[[float], None] | None 
         "Comparison of designs",
         " · ".join(found.names),
         f"Machine {machines}",
-        _heads(found),
-        "malta compare",
+        foot="malta compare",
     )
     sections = (
-        Section("differences", "What differs in the designs", tuple(_differences(found))),
-        Section("figures", "Figures of merit", tuple(_figures(found))),
+        Section("verdict", "Verdict", tuple(_verdicts(found))),
         Section("curves", "Curves", tuple(overlaid(found))),
+        Section("figures", "Figures of merit", tuple(_figures(found))),
+        Section("differences", "What differs in the designs", tuple(_differences(found))),
     )
     return render(front, [section for section in sections if section.items], progress)
 
 
-def _heads(found: Comparison) -> list[KeyFigure]:
-    """One figure for each design: whether it is stable, its margin, and in how many rows it is better."""
-    heads = []
-    for k, (name, a) in enumerate(zip(found.names, found.designs, strict=True)):
-        better = sum(row.best[k] for row in found.rows)
-        margin = a.report.robust
-        proven = (
-            f"margin {100 * margin.lower:.1f} %, " if margin is not None and margin.lower is not None else ""
-        )
-        stable = "stable" if a.report.stable else "UNSTABLE"
-        note = f"{proven}better in {better} of {len(found.rows)} figures"
-        heads.append(KeyFigure(name, stable, note, "good" if a.report.stable else "bad"))
-    return heads
+def _verdicts(found: Comparison) -> Iterator[Item]:
+    """The five lines of each design's verdict, beside each other."""
+    rows, marks = [], []
+    for lines in zip(*found.verdicts, strict=True):
+        rows.append((lines[0].label, *(polish(f"{SIGNS[line.state]} {line.value}") for line in lines)))
+        marks.append(("", *(line.state for line in lines)))
+    left = tuple(False for _ in found.names)
+    yield Sheet("", ("", *found.names), tuple(rows), (False, *left), tuple(marks))
+    yield found.judged_text
 
 
 def _differences(found: Comparison) -> Iterator[Item]:

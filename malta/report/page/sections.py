@@ -20,7 +20,7 @@ from malta.margins.loop_report import four_digits
 from malta.model.data import published_figures
 from malta.model.plant import Signal
 from malta.model.signals import FINE
-from malta.report.figures.drawing import UNITS, micro
+from malta.report.figures.drawing import micro
 from malta.report.page.analysis import design_entries, display_unit, summary_sentences
 from malta.report.tables.campaign import box_text, campaign_tables, run_text
 from malta.report.tables.design import (
@@ -40,7 +40,6 @@ from malta.report.tables.margins import (
     tolerance_table,
     worst_case_table,
 )
-from malta.report.tables.tuning import found_text
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -183,6 +182,7 @@ def _entry(value: float) -> str:
 
 
 NARROW = 3  # columns of a table
+RANKS = {"fails": 0, "undecided": 1, "holds": 2}
 NEAR = 0.95  # of a bound: a requirement holds, but hardly
 
 
@@ -257,16 +257,11 @@ def _requirements(a: Analysis) -> Iterator[Item]:
     if a.subject.written_from is None:
         yield "The design file was changed after the gain file was written: these are its present requirements."
     rows, marks = [], []
-    for one in a.report.requirements:
+    ranked = sorted(a.report.requirements, key=lambda one: (RANKS[one.verdict], one.asked is None))
+    for one in ranked:  # failures first
         state, word = _light(one)
-        scale, unit = UNITS.get(one.unit, (1.0, ""))
-        shown = f" {unit}" if unit else ""
-        asked = "as little as possible"
-        if one.asked is not None:
-            sign = ">=" if one.at_least else "<="
-            asked = f"{sign} {one.asked * scale:.4g}{shown}"
         of = "" if one.asked is None else f"{100 * one.ratio:.1f} %"
-        rows.append([word, one.words, asked, found_text(one), of, one.how])
+        rows.append([word, one.words, one.asked_text, one.found_text, of, one.how])
         marks.append((state, "", "", "", "", ""))
     heads = ("", "requirement", "asked", "found", "of the limit", "from")
     sheet = plain_sheet("[specification] of the design file, measured with these gains", heads, rows)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from malta.errors import InputError
 from malta.loops.curves import loop_curves
-from malta.loops.locus import GAIN, RootLocus
+from malta.loops.locus import DELAY, GAIN, RootLocus
 from malta.loops.locus import root_locus as locus_of
 from malta.report.figures.drawing import new_figure, number
 from malta.report.plots.frequency import title_of
@@ -19,6 +20,7 @@ from malta.report.plots.panels import Sheet, add_legend, head_of, loops_of, plai
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from numpy.typing import NDArray
 
     from malta.loops.curves import LoopCurves
     from malta.loops.linear_loops import Place
@@ -29,6 +31,9 @@ MARKERS = ("x", "s", "D", "^", "v", "p", "h", "*")  # of the closed loops
 NEAR = 2.5  # times the highest crossing of unit gain: the panel of the slow poles
 STRIP = 1.6  # times the Nyquist frequency: sampled poles beyond are next to pure delay
 GREY = "#dcdcdc"
+BEND = np.linspace(0.0, 1.0, 13)[:-1] ** 2  # shares of an interval about the point where two poles meet
+JUMP = 0.8  # of the strip: motions of an imaginary part that are jumps of ln(z)
+SAME = 1e-9  # of a pole: imaginary parts that are none
 
 
 def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float | None = None) -> Figure:
@@ -284,13 +289,13 @@ def _changes_text(found: RootLocus, unit: str) -> str:
 
 
 def _draw_branches(axes: Axes, found: RootLocus, window: Window) -> None:
-    """Lines that are interrupted where ln(z) jumps from one edge of its strip to the other."""
-    strip = np.inf if found.sample_time is None else np.pi / found.sample_time
-    for branch in found.poles.T[np.isfinite(found.poles).any(axis=0)]:
-        line = branch.copy()
-        jumps = np.flatnonzero(np.abs(np.diff(branch.imag)) > strip)
-        line = np.insert(line, jumps + 1, complex(np.nan, np.nan))
-        axes.plot(line.real, line.imag, color="#000000", linewidth=1.1, zorder=3)
+    """Every branch, through the points where pairs meet and part; poles at the edge of the strip are at both edges."""
+    strip = math.inf if found.sample_time is None else math.pi / found.sample_time
+    for line in branch_paths(found):
+        edge = np.where(np.abs(line.imag) > (1 - SAME) * strip, line.conj(), complex(np.nan, np.nan))
+        for path in (line, edge):
+            if np.isfinite(path).any():
+                axes.plot(path.real, path.imag, color="#000000", linewidth=1.1, zorder=3)
     colour = "#c1440e"
     drawn: tuple[tuple[ComplexArray, dict[str, Any]], ...] = (
         (
@@ -303,3 +308,61 @@ def _draw_branches(axes: Axes, found: RootLocus, window: Window) -> None:
     for values, look in drawn:
         shown = window.inside(values)
         axes.plot(shown.real, shown.imag, linestyle="none", zorder=4, **look)
+
+
+def branch_paths(found: RootLocus) -> list[ComplexArray]:
+    """The branches as lines, with the points between samples where two poles meet or part, NaN where ln(z) jumps.
+
+    The mean of two such poles and the square of half their difference are smooth in the parameter, and their straight
+    lines between two samples are the branches there: the poles leave the real axis at a right angle. Sampled poles
+    next to pure delay, `|z| < 0.02`, are left out: they turn about z = 0 from one sample to the next.
+    """
+    T = found.sample_time
+    strip = math.inf if T is None else math.pi / T
+    lines = [[complex(pole)] for pole in found.poles[0]]
+    for before, after in pairwise(found.poles):
+        parting = {k: path[::-1] for k, path in _meeting(after, before, strip).items()}
+        between = _meeting(before, after, strip) | parting
+        for k, line in enumerate(lines):
+            line += [*between.get(k, ()), complex(after[k])]
+    paths = [np.array(line) for line in lines]
+    if T is not None:
+        paths = [np.where(path.real < math.log(DELAY) / T, complex(np.nan, np.nan), path) for path in paths]
+    return [_cut(path, strip) for path in paths if np.isfinite(path).any()]
+
+
+def _meeting(pairs: ComplexArray, real: ComplexArray, strip: float) -> dict[int, ComplexArray]:
+    """Points from conjugate pairs to the real poles that they become, by branch; real: or on the edge of the strip."""
+    edge, flat = (_is_flat(poles, strip) for poles in (real, pairs))
+    on_edge = np.abs(real.imag) > strip / 2
+    turned = edge & ~flat
+    found: dict[int, ComplexArray] = {}
+    for i in np.flatnonzero(turned & (pairs.imag > 0)):
+        twins = [j for j in np.flatnonzero(turned & (pairs.imag < 0)) if j not in found]
+        if not twins:
+            continue
+        j = min(twins, key=lambda k: abs(pairs[k] - pairs[i].conj()))
+        lift = 1j * strip if on_edge[i] else 0.0  # the edge becomes the real axis
+        start, one, other = pairs[i] - lift, real[i].real, real[j].real
+        before, after = -(start.imag**2), (one - other) ** 2 / 4  # squares of half the difference
+        meets = before / (before - after) if after > 0 else 1.0  # share of the interval
+        shares = np.concatenate([meets * (1 - BEND[::-1]), meets + (1 - meets) * BEND[1:]])
+        middle = start.real + shares * ((one + other) / 2 - start.real)
+        half = np.sqrt(np.abs(before + shares * (after - before)))
+        paired = shares <= meets
+        upper = np.where(paired, 1j * np.sign(start.imag), np.sign(one - other)) * half
+        found[int(i)] = middle + upper + lift
+        found[int(j)] = middle + np.where(paired, upper.conj() - lift, lift - upper)
+    return found
+
+
+def _is_flat(poles: ComplexArray, strip: float) -> NDArray[np.bool_]:
+    """Whether poles are real, or those of sampled loops real and negative in z, up to rounding."""
+    height = np.abs(poles.imag)
+    return (height <= SAME * np.abs(poles)) | (height >= (1 - SAME) * strip)
+
+
+def _cut(line: ComplexArray, strip: float) -> ComplexArray:
+    """A line that is interrupted where ln(z) jumps: across the strip, or from its middle to its edge through z = 0."""
+    jumps = np.flatnonzero(np.abs(np.diff(line.imag)) > JUMP * strip)
+    return np.insert(line, jumps + 1, complex(np.nan, np.nan))

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 SHOWN = 1.6  # times the longest settling time
 LONGEST = 60.0  # times the shortest rise or time to the peak
 FEW = 60  # samples in a window: each gets a dot
+APART = 20.0  # of the largest to the smallest peak of several lines: a logarithmic axis
 POINTS = 1500  # of a line
 TIMES = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6))
 
@@ -173,6 +174,19 @@ def _hold_range(
         axes.set_ylim(float(min(known.min(), 0.0)) - 0.6 * reach, float(known.max()) + 0.6 * reach)
 
 
+def _spread_apart(axes: Axes, peaks: Sequence[float]) -> None:
+    """A symmetric logarithmic axis where the largest values of the lines are far apart: the small ones are seen."""
+    from matplotlib.ticker import NullLocator, SymmetricalLogLocator
+
+    sizes = [abs(peak) for peak in peaks if peak]
+    if len(sizes) < 2 or max(sizes) < APART * min(sizes):
+        return
+    linear = 10.0 ** math.floor(math.log10(min(sizes) / 3))
+    axes.set_yscale("symlog", linthresh=linear)
+    axes.yaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=linear))
+    axes.yaxis.set_minor_locator(NullLocator())
+
+
 def _finish_time(axes: Axes, window: float, y: str) -> None:
     """A linear axis of time in a unit that fits."""
     from matplotlib.ticker import FuncFormatter, MaxNLocator
@@ -246,6 +260,7 @@ def load_response(
                 mark(upper, found_figures.peak_time, found_figures.peak * scale, style)
                 mark(lower, curves.w[int(size.argmax())], size.max(), style)
         _hold_range(upper, rows, window, scale)
+        _spread_apart(upper, [scale * f.peak for f, c in zip(figures, shown, strict=True) if c.stable])
         _finish_time(upper, window, f"{output} [{_over(fine, units[1])}]")
         lower.set_yscale("log")
         low, high = lower.get_ylim()

@@ -159,26 +159,32 @@ def sensitivity_table(margins: LoopReport) -> Table:
     >>> model = malta.linearize(spec.plant, spec.plant.at())
     >>> controller = malta.synthesize(spec, model)
     >>> rich.print(malta.report.sensitivity_table(malta.verify(model, controller)))
-    Peak sensitivity (ISO 14839-3 zone: A < 3, B < 4, C < 5)
+    Peak sensitivity (ISO 14839-3 zone of the worst: A < 3, B < 4, C < 5)
     <BLANKLINE>
-     loop                   y   sigma_max   at rad/s
-     ───────────────────────────────────────────────
-     sampled           1.71 A        1.71        542
-     + current loops   1.71 A        1.71        542
-     machine           1.57 A        1.57        584
+     loop                 y   zone   sigma_max   at rad/s
+     ────────────────────────────────────────────────────
+     sampled           1.71      A        1.71        542
+     + current loops   1.71      A        1.71        542
+     machine           1.57      A        1.57        584
     <BLANKLINE>
     """
     sensors = [k for k in margins.peak_sensitivity if k != "sigma_max"]
     limits = ", ".join(f"{name} < {limit:g}" for limit, name in ZONES if math.isfinite(limit))
     table = new_table(
-        f"Peak sensitivity (ISO 14839-3 zone: {limits})", "loop", *sensors, "sigma_max", "at rad/s"
+        f"Peak sensitivity (ISO 14839-3 zone of the worst: {limits})",
+        "loop",
+        *sensors,
+        "zone",
+        "sigma_max",
+        "at rad/s",
     )
     for stage in margins.stages:
-        peaks = [f"{stage.peak_sensitivity[s]:.2f} {zone(stage.peak_sensitivity[s])}" for s in sensors]
+        peaks = [stage.peak_sensitivity[s] for s in sensors]
         add_row(
             table,
             stage.name,
-            *peaks,
+            *(f"{peak:.2f}" for peak in peaks),
+            zone(max(peaks)),
             f"{stage.peak_sensitivity['sigma_max']:.2f}",
             f"{stage.peak_frequency:.3g}",
         )
@@ -280,7 +286,7 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
                       moves   after   after   after     peak
      load    output      by   0.1 s   0.3 s     [s]   over w   at rad/s
      ──────────────────────────────────────────────────────────────────
-     1 N w   y [um]   343.4   94.98   1.722   0.266    430.5       42.8
+     1 N w   y [µm]   343.4   94.98   1.722   0.266    430.5       42.8
     <BLANKLINE>
     """
     units = {s.name: s.unit for s in plant.disturbances}

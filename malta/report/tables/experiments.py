@@ -84,8 +84,8 @@ def experiment_table(e: Experiment, published: Published | None = None) -> Group
     <BLANKLINE>
      figure                       ours
      ─────────────────────────────────
-     y moves by [um]             34.29
-     y, left at the end [um]   0.05314
+     y moves by [µm]             34.29
+     y, left at the end [µm]   0.05314
     <BLANKLINE>
     """
     tables: list[Table | Paragraph] = [Paragraph(CUT)] if e.cut else []

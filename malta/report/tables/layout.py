@@ -17,6 +17,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from malta.display import micro
 from malta.report.figures.drawing import Published, number, published_in_unit
 from malta.units import in_unit
 
@@ -56,17 +57,17 @@ def glue(text: str) -> str:
 def fold(text: str, width: int) -> list[str]:
     """Fold a text into lines of at most `width` letters, at spaces that do not part a number from its unit.
 
-    Only a word or a number with its unit that is longer than a line is broken.
+    Microns are written as µm. Only a word or a number with its unit that is longer than a line is broken.
 
     >>> fold("moves by 353.3 um in all", 12)
-    ['moves by', '353.3 um in', 'all']
+    ['moves by', '353.3 µm in', 'all']
     """
     lines = [
         line
         for part in text.split("\n")
         for line in textwrap.wrap(glue(part), max(width, 1), break_on_hyphens=False) or [""]
     ]
-    return [line.replace(_JOINT, " ") for line in lines]
+    return [micro(line.replace(_JOINT, " ")) for line in lines]
 
 
 def longest_word(text: str) -> int:
@@ -219,7 +220,7 @@ class Paragraph:
 
     >>> import malta, rich
     >>> rich.print(malta.report.Paragraph("F_x moves x2 by 52.9 um", style="bold"))
-    F_x moves x2 by 52.9 um
+    F_x moves x2 by 52.9 µm
     """
 
     text: str

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from malta.report.figures.drawing import Published
     from malta.synthesis.spec import Spec
 
+PROVEN = ("proven", "lost at", "rad/s", "first to give")  # headings of a proof
 WAYS = ("down", "up")
 NEAREST = 3  # requirements that are named though they hold
 
@@ -70,8 +71,11 @@ def _margin_tables(found: LoopReport) -> Iterator[Table | Paragraph]:
         yield Paragraph(f"Not in the last stage: {missing}\n")
     if bounds := open_bounds(found):
         yield Paragraph("\n".join(bounds) + "\n")
-    for tabulate in (disk_table, gang_table, tolerance_table, places_table):
-        yield tabulate(found)
+    yield disk_table(found)
+    yield gang_table(found)
+    if found.tolerance or found.mass is not None or found.payload is not None:
+        yield tolerance_table(found)
+    yield places_table(found)
 
 
 def _requirements(found: LoopReport, spec: Spec) -> Iterator[Table | Paragraph]:
@@ -110,45 +114,45 @@ def chain_table(found: LoopReport) -> Table:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
     >>> rich.print(malta.report.chain_table(found))
-    Where the margin goes: multiples of the uncertainty that no parameter set may
-    exceed
+    Where the margin goes: margin in multiples of the uncertainty box, 100 % is the
+    box
     <BLANKLINE>
-                                              first to
-     stage       proven     lost at   rad/s       give   peak |S|                of
+                                              first
+                                                 to   peak
+     stage       proven     lost at   rad/s    give    |S|   zone                of
      ──────────────────────────────────────────────────────────────────────────────
-     LQR       499.95 %   not found                          1.00            forces
-     LQI       499.95 %   not found                          1.00            forces
-     LQG       390.34 %    390.34 %    1006         m-     1.60 A           sensors
-     LQGI      386.27 %    386.27 %    1010         m-     1.64 A           sensors
-     sampled   390.69 %    390.69 %    1047         m-     1.57 A   sensors, loaded
+     LQR       499.95 %   not found                   1.00                   forces
+     LQI       499.95 %   not found                   1.00                   forces
+     LQG       390.34 %    390.34 %    1006      m-   1.60      A           sensors
+     LQGI      386.27 %    386.27 %    1010      m-   1.64      A           sensors
+     sampled   390.69 %    390.69 %    1047      m-   1.57      A   sensors, loaded
     <BLANKLINE>
     """
+    proven = any(link.margin is not NOT_PROVEN for link in found.chain)
     table = new_table(
-        "Where the margin goes: multiples of the uncertainty that no parameter set may exceed",
-        "stage", "proven", "lost at", "rad/s", "first to give", "peak |S|", "of",
+        "Where the margin goes: margin in multiples of the uncertainty box, 100 % is the box" if proven
+        else "Peak sensitivity by stage",
+        "stage", *(PROVEN if proven else ()), "peak |S|", "zone", "of",
     )  # fmt: skip
     for link in found.chain:
-        peak = "unstable" if math.isnan(link.peak) else f"{link.peak:.2f}"
-        if link.broken_at == "sensors" and not math.isnan(link.peak):
-            peak += f" {zone(link.peak)}"
+        unstable = math.isnan(link.peak)
+        sensed = link.broken_at == "sensors" and not unstable
         add_row(
             table,
             link.name,
-            *_margin_cells(link.margin),
-            _limiting_parameters(link.margin),
-            peak,
+            *(_proof_cells(link.margin) if proven else ()),
+            "unstable" if unstable else f"{link.peak:.2f}",
+            zone(link.peak) if sensed else "",
             f"{link.broken_at}, loaded" if link.loaded else link.broken_at,
         )
-    if found.extent.intervals:
-        add_row(
-            table,
-            _coverage_text(found),
-            *_margin_cells(found.travel),
-            _limiting_parameters(found.travel),
-            "",
-            "",
-        )
+    if found.extent.intervals and proven:
+        add_row(table, _coverage_text(found), *_proof_cells(found.travel), "", "", "")
     return table
+
+
+def _proof_cells(margin: Margin) -> tuple[str, ...]:
+    """The cells of a margin under the headings PROVEN."""
+    return *_margin_cells(margin), _limiting_parameters(margin)
 
 
 def open_bounds(found: LoopReport) -> list[str]:
@@ -233,7 +237,7 @@ def disk_table(found: LoopReport) -> Table:
      sensors                0.810   0.42 .. 2.36        +-44.1   66.57
      forces and sensors     0.400   0.67 .. 1.50        +-22.6   314.4
      y alone                0.810   0.42 .. 2.36        +-44.1   66.57
-     delay at y alone     2719 us   13.6 samples
+     delay at y alone     2719 µs   13.6 samples
     <BLANKLINE>
     """
     table = new_table(
@@ -286,7 +290,7 @@ def gang_table(found: LoopReport) -> Table:
     >>> rich.print(malta.report.gang_table(found))
     Gang of four, largest over frequency
     <BLANKLINE>
-     sensor    |S|    |T|   from force |SP| [um/N]   to force |FS| [N/um]
+     sensor    |S|    |T|   from force |SP| [µm/N]   to force |FS| [N/µm]
      ────────────────────────────────────────────────────────────────────
      y        1.57   1.72                    430.5                  0.034
     <BLANKLINE>
@@ -410,10 +414,11 @@ def places_table(found: LoopReport) -> Table:
     >>> rich.print(malta.report.places_table(found))
     The machine's loop: margins without the loads, the rest under them
     <BLANKLINE>
-                                              peak  disk,
-     at            proven   lost at  rad/s     |S|    all                  delay
-     ───────────────────────────────────────────────────────────────────────────
-     its values  390.69 %  390.69 %   1047  1.57 A  0.400  2719 us, 13.6 samples
+                                            peak        disk,
+     at            proven   lost at  rad/s   |S|  zone    all         delay
+     ──────────────────────────────────────────────────────────────────────
+     its values  390.69 %  390.69 %   1047  1.57     A  0.400      2719 µs,
+                                                               13.6 samples
     <BLANKLINE>
     """
     extent = found.extent
@@ -423,24 +428,25 @@ def places_table(found: LoopReport) -> Table:
         title = "Along the travel, either way"
     else:
         title = "In the middle of the travel and at its ends (margin: at the positive one)"
-    title += ": margins without the loads, the rest under them"
+    proven = any(place.margin is not NOT_PROVEN for place in found.places)
+    title += ": margins without the loads, the rest under them" if proven else ", under its loads"
     table = new_table(
         title,
         f"at [{'mm' if extent.stroke else extent.unit}]" if extent.course else "at",
-        "proven",
-        "lost at",
-        "rad/s",
+        *(PROVEN[:3] if proven else ()),
         "peak |S|",
+        "zone",
         "disk, all",
         "delay",
     )
     for place in found.places:
-        peak = "unstable" if math.isnan(place.peak) else f"{place.peak:.2f} {zone(place.peak)}"
+        unstable = math.isnan(place.peak)
         add_row(
             table,
             _position_text(extent, place.position),
-            *_margin_cells(place.margin),
-            peak,
+            *(_margin_cells(place.margin) if proven else ()),
+            "unstable" if unstable else f"{place.peak:.2f}",
+            "" if unstable else zone(place.peak),
             "none" if math.isnan(place.disk) else f"{place.disk:.3f}",
             ", ".join(cell for cell in _delay_cells(place.delay, found.controller.sample_time) if cell),
         )
@@ -450,5 +456,5 @@ def places_table(found: LoopReport) -> Table:
 def _position_text(extent: Extent, position: float) -> str:
     """A place along the travel, mm, or along a parameter."""
     if extent.stroke:
-        return f"{position * 1e3:.1f}"
+        return f"{round(position * 1e3, 6):.4g}"
     return f"{position:.4g}" if extent.course else "its values"

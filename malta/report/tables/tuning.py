@@ -29,39 +29,18 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
     >>> rich.print(malta.report.requirements_table([margin]))
     Requirements
     <BLANKLINE>
-     requirement   asked   found   of the limit                             from
-     ───────────────────────────────────────────────────────────────────────────
-     margin         >= 3     3.6         83.3 %   holds   proven over the travel
+     requirement      asked   found   of the limit                             from
+     ──────────────────────────────────────────────────────────────────────────────
+     margin        >= 300 %   360 %         83.3 %   holds   proven over the travel
     <BLANKLINE>
     """
     table = new_table("Requirements", "requirement", "asked", "found", "of the limit", "", "from")
     for r in requirements:
-        scale, unit = UNITS.get(r.unit, (1.0, ""))
-        found = found_text(r)
-        if r.asked is None:
-            add_row(table, r.name.replace("_", " "), "least", found, "", "", r.how)
-            continue
-        bound = ">=" if r.at_least else "<="
-        add_row(
-            table,
-            r.name.replace("_", " "),
-            f"{bound} {r.asked * scale:.4g} {unit}".rstrip(),
-            found,
-            f"{100 * r.ratio:.1f} %",
-            "FAILS" if r.verdict == "fails" else r.verdict,
-            r.how,
-        )
+        ratio, verdict = "", ""
+        if r.asked is not None:
+            ratio, verdict = f"{100 * r.ratio:.1f} %", "FAILS" if r.verdict == "fails" else r.verdict
+        add_row(table, r.words, r.asked_text, r.found_text, ratio, verdict, r.how)
     return table
-
-
-def found_text(outcome: Outcome) -> str:
-    """Write what was found in the unit that is shown; of a mean over seeds with half the width of its interval."""
-    scale, unit = UNITS.get(outcome.unit, (1.0, ""))
-    text = f"{outcome.found * scale:.4g}"
-    if outcome.interval is not None:
-        low, high = outcome.interval
-        text += f" ± {(high - low) / 2 * scale:.2g}"
-    return f"{text} {unit}".rstrip()
 
 
 def _front_columns(tuned: Tuned) -> dict[str, tuple[str, float, str]]:
@@ -126,7 +105,7 @@ def front_table(tuned: Tuned) -> Table:
     >>> rich.print(malta.report.front_table(tuned))
     What the margin costs (* chosen)
     <BLANKLINE>
-     margin, proven [%]   f [N rms]   y motion [um rms]
+     margin, proven [%]   f [N rms]   y motion [µm rms]
      ──────────────────────────────────────────────────────
      328                     0.0122               0.523
      363                     0.0414               0.501   *
