@@ -160,6 +160,7 @@ def test_a_root_locus_mirrors_and_its_branches_have_no_gaps(name: str) -> None:
     """Sampled loops: each branch has a mirror image among the branches, and no step in it is longer than a tenth."""
     controller = malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
     found = root_locus(malta.plant_of(controller.parameters), controller)
+    assert found.sample_time is not None
     strip = np.pi / found.sample_time
     for row in found.poles:
         known = row[np.isfinite(row) & (row.real > -1.2 * strip)]
