@@ -67,14 +67,14 @@ def published(runs: int) -> list[Result]:
     return [row for case in CASES for row in _rows(case, runs, with_slycot)]
 
 
-def _proven(case: Polynomial | Loop) -> malta.Margin:
+def _proven(case: Polynomial | Loop) -> malta.proof.Margin:
     """Without what is remembered of the loop."""
     problem_of.cache_clear()
     if isinstance(case, Polynomial):
-        return malta.margin_of_polynomial(case.coefficients, case.box, case.nominal)
+        return malta.proof.margin_of_polynomial(case.coefficients, case.box, case.nominal)
     system = malta.uncertain(case.matrices, case.nominal, limits=case.limits)
     if case.dynamics:
-        return malta.dynamic_margin(system, case.law, case.box, malta.Dynamic(case.dynamics))
+        return malta.dynamic_margin(system, case.law, case.box, malta.proof.Dynamic(case.dynamics))
     return malta.robust_margin(system, case.law, case.box)
 
 

@@ -87,11 +87,11 @@ class OfLoop:
         return 0.98 / float((1 - least / nominal).max())
 
     @cached_property
-    def system(self) -> malta.UncertainSystem:
+    def system(self) -> malta.proof.UncertainSystem:
         return malta.uncertain(self.case.matrices, self.case.nominal)
 
     @cached_property
-    def law(self) -> malta.Compensator:
+    def law(self) -> malta.proof.Compensator:
         return law_of(self.system, self.case.law)
 
     @cached_property

@@ -214,7 +214,7 @@ def campaigns(runs: int) -> list[Result]:
     """
     plant, work = workload("calibrated")
     names = ("m", "K_A", "K_B", "K_D")
-    plan = malta.Plan(
+    plan = malta.campaigns.Plan(
         work.controller, "stroke", dict.fromkeys(names, 0.2), samples=4096, options={"fidelity": "force"}
     )
 
@@ -224,7 +224,7 @@ def campaigns(runs: int) -> list[Result]:
 
     def summarized() -> object:
         with tempfile.TemporaryDirectory() as folder:
-            return malta.summarize(replace(plan, samples=MANY), folder)
+            return malta.campaigns.summarize(replace(plan, samples=MANY), folder)
 
     peers: dict[str, tuple[int, Callable[[], object]]] = {}
     loop = joblib_loop(plant, work, names)
@@ -281,13 +281,13 @@ def studies(runs: int) -> list[Result]:
     single = [] if loop is None else medians(loop, runs=runs, what="python-control")
     rows: list[Result] = []
     for spread in (0.06, 0.055):
-        plan = malta.Plan(
+        plan = malta.campaigns.Plan(
             work.controller, "stroke", dict.fromkeys(names, spread), samples=2000, options=options
         )
-        limit = malta.limit_of(plan, "touchdown")
-        found = malta.rare_event(plan, limit).found
+        limit = malta.campaigns.limit_of(plan, "touchdown")
+        found = malta.campaigns.rare_event(plan, limit).found
         ours, plain = medians(
-            partial(malta.rare_event, plan, limit),
+            partial(malta.campaigns.rare_event, plan, limit),
             partial(malta.campaign, replace(plan, samples=4096)),
             runs=runs,
             what="rare event",
@@ -296,12 +296,12 @@ def studies(runs: int) -> list[Result]:
         rows.append(Result(what, ours, "plain sampling, malta", plain / 4096 * found.plain, ""))
         rows += [Result(what, ours, LOOP, seconds / LOOPED * found.plain, "") for seconds in single]
     if optional("SALib"):
-        plan = malta.Plan(
+        plan = malta.campaigns.Plan(
             work.controller, "stroke", dict.fromkeys(names, 0.05), samples=4096, options=options
         )
-        count = malta.sensitivity(plan, limit).runs
+        count = malta.campaigns.sensitivity(plan, limit).runs
         ours, alone = medians(
-            partial(malta.sensitivity, plan, limit),
+            partial(malta.campaigns.sensitivity, plan, limit),
             partial(malta.simulate, plant, work.controller, SCENARIO),
             runs=runs,
             what="Sobol indices",
@@ -347,7 +347,7 @@ def decoupling(runs: int) -> list[Result]:
     own, plain, *compiled_times = medians(by_malta, by_hand, *ours.values(), runs=runs, what="planar")
     own, plain = own / few, plain / few
     seconds = dict(zip(ours, (taken / calls for taken in compiled_times), strict=True))
-    printed = malta.published(ROOT / "data" / "planar.toml")
+    printed = malta.model.published(ROOT / "data" / "planar.toml")
     loop = published_value(printed, "real_time.mean")
     numpy_loop = "numpy, a loop and pinv"
     return [

@@ -70,10 +70,10 @@ def handbook_values(w: FloatArray, u: FloatArray, t: float) -> ComplexArray:
     return np.asarray(sum(row * (1j * w[:, None]) ** (4 - k) for k, row in enumerate(rows)))
 
 
-def handbook_margin() -> malta.Margin:
+def handbook_margin() -> malta.proof.Margin:
     """The margin of the polynomial, proven."""
     box = {f"q{k + 1}": (MIDDLE[k] - WIDTH[k], MIDDLE[k] + WIDTH[k]) for k in range(3)}
-    return malta.margin_of_polynomial(handbook, box, dict(zip(box, MIDDLE.tolist(), strict=True)))
+    return malta.proof.margin_of_polynomial(handbook, box, dict(zip(box, MIDDLE.tolist(), strict=True)))
 
 
 def value_sets() -> Figure:
@@ -149,7 +149,7 @@ def cell() -> Figure:
     return figure
 
 
-def gain_loop() -> tuple[malta.UncertainSystem, Any]:
+def gain_loop() -> tuple[malta.proof.UncertainSystem, Any]:
     """A levitated mass with an uncertain force constant b, closed by a lead at 1 kHz."""
     mass = malta.uncertain(lambda b: ([[0, 1], [100.0, 0]], [[0], [b]], [[1, 0]]), {"b": 1.0})
     lead = control.c2d(-control.tf([8.0, 400.0], [0.004, 1]), 1e-3, "tustin")
@@ -249,7 +249,7 @@ def continuation() -> Figure:
     return figure
 
 
-def roots_at(par: Any, law: malta.Controller, values: dict[str, float], z: float) -> ComplexArray:
+def roots_at(par: Any, law: malta.synthesis.Controller, values: dict[str, float], z: float) -> ComplexArray:
     """Poles of the sampled loop on another machine, as ln(z) / Ts."""
     from dataclasses import replace
 
@@ -266,7 +266,7 @@ def discs() -> Figure:
     L = (plant * pid)(1j * w)
     margin = malta.dynamic_margin(
         malta.uncertain(lambda k: ([[0, 1], [-k, -1.8]], [[0], [18]], [[1, 0]]), {"k": 10.0}),
-        -pid, {}, malta.Dynamic(0.5),
+        -pid, {}, malta.proof.Dynamic(0.5),
     )  # fmt: skip
     figure, panels = new_figure(2, height=3.8)
     for axes, t in zip(panels, (1.0, margin.upper), strict=True):

@@ -32,7 +32,7 @@ Path("build").mkdir(exist_ok=True)
 
 # %%
 specs = {name: malta.read_design(f"design/{name}.toml") for name in ("table2", "calibrated")}
-published = malta.published("data/tubular.toml")
+published = malta.model.published("data/tubular.toml")
 for spec in specs.values():
     print(f"{spec.name}: {spec.summary}; {spec.discretization}")
 
@@ -52,7 +52,7 @@ model = malta.linearize(plant, plant.at(z=0.0))
 # %%
 w_n = {}
 for spec in specs.values():
-    K = malta.lqr(model, spec.weights)
+    K = malta.synthesis.lqr(model, spec.weights)
     stiffness = (model.force_map @ K[:, :5]).diagonal()
     ratio = stiffness[[0, 3]] / model.stiffness.diagonal()[[0, 3]]
     w_n[spec.name] = float(np.sqrt((stiffness - model.stiffness.diagonal()).max()))
@@ -68,7 +68,7 @@ for spec in specs.values():
 # The bases in `design/calibrated.toml` are solved, not chosen:
 
 # %%
-solved = malta.calibrate(model, specs["table2"].weights, stiffness_ratio=4.0)
+solved = malta.synthesis.calibrate(model, specs["table2"].weights, stiffness_ratio=4.0)
 assert np.allclose(solved.q_base, specs["calibrated"].weights.q_base, rtol=1e-5)
 
 # %%
@@ -119,7 +119,7 @@ par: Any = plant.parameters
 slope = 2 * np.pi / par.L_p * par.F_c
 moved = {}
 for name, controller in controllers.items():
-    (axial,) = malta.recovery(plant, controller, {"1 N": {"F_z": 1.0}})
+    (axial,) = malta.loops.recovery(plant, controller, {"1 N": {"F_z": 1.0}})
     moved[name] = axial.outputs[plant.stroke_output].largest
     peaks = margins[name].stages[0].peak_sensitivity["sigma_max"], margins[name].peak_sensitivity["z"]
     print(
@@ -158,7 +158,7 @@ figure.savefig("build/02_lqg_sensitivity.png", dpi=120)
 # %%
 for name, controller in controllers.items():
     run = malta.simulate(plant, controller, malta.Scenario.stroke(10e-3))
-    figures = malta.stroke_figures(run)
+    figures = malta.simulation.stroke_figures(run)
     print(
         f"{name}: rise {figures.rise * 1e3:.2f} ms, overshoot {figures.overshoot * 100:.2f} %, "
         f"axial error {figures.axial_error * 1e3:.3f} mm, y1 {figures.radial['y1'] * 1e6:.2f} um"

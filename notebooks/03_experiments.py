@@ -28,7 +28,7 @@ Path("build").mkdir(exist_ok=True)
 # %%
 NAMES = ("table2", "calibrated", "robust")
 controllers = {name: malta.gains.read(f"design/gains/{name}.json") for name in NAMES}
-published = malta.published("data/tubular.toml")
+published = malta.model.published("data/tubular.toml")
 plants = {name: malta.plant_of(c.parameters) for name, c in controllers.items()}
 
 # %% [markdown]
@@ -43,14 +43,14 @@ for key, controller in controllers.items():
     display(malta.report.experiment(e, f"build/03_{key}_stroke.png", published))
     print(f"{key}, {e}")
 lagged = malta.experiment("stroke", plants["calibrated"], controllers["calibrated"], fidelity="force")
-figures = malta.stroke_figures(lagged.run)
-with_pi = malta.stroke_figures(strokes["calibrated"].run).axial_error
+figures = malta.simulation.stroke_figures(lagged.run)
+with_pi = malta.simulation.stroke_figures(strokes["calibrated"].run).axial_error
 print(
     f"calibrated: axial error {figures.axial_error * 1e3:.2f} mm with first-order lags, {with_pi * 1e3:.2f} mm with PI"
 )
 assert figures.axial_error > 2 * with_pi
 for e in strokes.values():
-    f = malta.stroke_figures(e.run)
+    f = malta.simulation.stroke_figures(e.run)
     assert f.overshoot < 0.015
     assert f.axial_error < 0.6e-3
     assert max(f.radial.values()) < 20e-6
@@ -147,7 +147,7 @@ for key, e in tilts.items():
 # Not shown in the paper, or only in words.
 
 # %%
-others: dict[str, dict[str, malta.Experiment]] = {}
+others: dict[str, dict[str, malta.simulation.Experiment]] = {}
 for name in ("lift-off", "payload", "faults"):
     others[name] = {}
     for key, controller in controllers.items():

@@ -134,10 +134,12 @@ for name, completed in yields.items():
 # The ones that come closest to the touchdown bearings, in the modelled box.
 
 # %%
-plan = malta.Plan(controllers["calibrated"], "stroke", BOX, samples=1024, options={"fidelity": "force"})
+plan = malta.campaigns.Plan(
+    controllers["calibrated"], "stroke", BOX, samples=1024, options={"fidelity": "force"}
+)
 folder = f"build/04_campaign_{plan.identity[:8]}"
 campaign = malta.campaign(plan, folder)
-display(malta.report.campaign(campaign, folder, malta.published("data/tubular.toml")))
+display(malta.report.campaign(campaign, folder, malta.model.published("data/tubular.toml")))
 assert campaign.completed.all()
 
 # %% [markdown]

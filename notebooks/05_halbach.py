@@ -19,7 +19,7 @@ import malta
 from malta.machines.halbach import electronics
 from malta.machines.halbach import electronics as motor
 from malta.machines.halbach import plant as halbach
-from malta.synthesis.kalman import sampled_model
+from malta.synthesis.filters import sampled_model
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))
@@ -31,7 +31,7 @@ Path("build").mkdir(exist_ok=True)
 
 # %%
 par = malta.read("data/halbach.toml")
-published = malta.published("data/halbach.toml")
+published = malta.model.published("data/halbach.toml")
 print(f"A = {par.A} N/A, k = {par.k} rad/m, m = {par.m} kg, b = {par.b} N s/m, F_z = {par.F_z} N")
 
 # %% [markdown]

@@ -34,7 +34,7 @@ Path("build").mkdir(exist_ok=True)
 # %%
 par = malta.read("data/planar.toml")
 assert isinstance(par, planar.Parameters)
-published = malta.published("data/planar.toml")
+published = malta.model.published("data/planar.toml")
 print(f"pole pitch {par.tau_n * 1e3:g} mm, coil pitch {par.coil_pitch / par.tau_n:.4g} pole pitches")
 
 # %% [markdown]

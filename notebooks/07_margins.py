@@ -63,7 +63,7 @@ assert abs(found.frequency - 575.034) < 0.5
 
 # %%
 middle, width = np.array([2.25, 1.5, 1.5]), np.array([0.25, 0.5, 1.5])
-found = malta.margin_of_polynomial(
+found = malta.proof.margin_of_polynomial(
     lambda q1, q2, q3: [
         16,
         16 * q1 - 24,
@@ -167,7 +167,7 @@ proven = []
 for q in weights:
     K = care(A, B, q * np.ones((2, 2)), np.eye(1)).K
     L = K.T  # the problem is its own dual
-    law = malta.Compensator(A - B @ K - L @ C, L, -K, np.zeros((1, 1)))
+    law = malta.proof.Compensator(A - B @ K - L @ C, L, -K, np.zeros((1, 1)))
     margin = malta.robust_margin(doyle, law, {"m": (1.0, 2.0)})
     assert margin.lower is not None
     proven.append((margin.lower, margin.upper))
@@ -194,7 +194,7 @@ figure.savefig("build/07_doyle.png", dpi=120)
 # %%
 r = 0.1
 BOX = {"q1": (0.3, 2.5), "q2": (0.0, 1.7)}
-island = malta.margin_of_polynomial(
+island = malta.proof.margin_of_polynomial(
     lambda q1, q2: [1, q1 + q2 + 1, q1 + q2 + 3, 1 + r * r + 6 * (q1 + q2) + 2 * q1 * q2], BOX
 )
 exact = (1.4 - (1 + r)) / 1.1  # the left side of the box comes to the disk
@@ -232,14 +232,14 @@ assert hits <= 6
 # %%
 second_order = malta.uncertain(lambda k: ([[0, 1], [-k, -1.8]], [[0], [18]], [[1, 0]]), {"k": 10.0})
 law = -(2.3 + control.tf([3], [1, 0]) + control.tf([0.38, 0], [0.001, 1]))
-found = malta.dynamic_margin(second_order, law, {"k": 0.4}, malta.Dynamic(0.5))
+found = malta.dynamic_margin(second_order, law, {"k": 0.4}, malta.proof.Dynamic(0.5))
 assert found.lower is not None
 print(f"robstab 1.5960 .. 1.5993, ours {found.lower:.4f} .. {found.upper:.4f}")
 assert 1.5960 <= found.lower <= found.upper <= 1.5993
 
 integrator = malta.uncertain(lambda a: ([[a]], [[1]], [[1]]), {"a": 0.0})
 derivative = -(2 + control.tf([-0.04, 0], [0.02, 1]))
-additive = malta.Dynamic(0.4, "additive", channel=(0, 0))
+additive = malta.proof.Dynamic(0.4, "additive", channel=(0, 0))
 peak = malta.worst_case_gain(integrator, derivative, {}, dynamics=[additive], tolerance=1e-3)
 assert peak.upper is not None
 print(f"wcgain 5.1036 .. 5.1140, ours {peak.lower:.4f} .. {peak.upper:.4f} at {peak.frequency:.2f} rad/s")
@@ -275,7 +275,7 @@ assert peak.lower * (1 - 1e-3) <= envelope.max() <= peak.upper
 # unstable, and prints 1.2069.
 
 # %%
-bus = malta.margin_of_polynomial(
+bus = malta.proof.margin_of_polynomial(
     lambda v, m: [
         v**2 * m**2,
         50 * v**2 * m**2 + 1080 * v * m,

@@ -61,7 +61,10 @@ if can_build:
 scenario = malta.Scenario.stroke(10e-3, fidelity="phase", noise=1.0)
 own = malta.simulate(plant, c, scenario)
 if can_build:
-    flown = {p: malta.simulate(plant, c, scenario, engine=malta.engine_of_c(p)) for p in ("double", "float")}
+    flown = {
+        p: malta.simulate(plant, c, scenario, engine=malta.firmware.engine_of_c(p))
+        for p in ("double", "float")
+    }
     for double, single in zip(*(differences(own, run) for run in flown.values()), strict=True):
         print(f"{double.name:8} double {double.share:.0e}, float {single.share:.0e} of its range")
         assert double.share < 1e-12

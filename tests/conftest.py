@@ -202,22 +202,22 @@ def _remembering(answers: Answers) -> Iterator[None]:
     """Questions that are answered already are not searched again."""
     searched, largest = robust.margin_of, gain.worst_case_gain
 
-    def margin_of(problem: Problem, box: Box, effort: robust.Effort) -> malta.Margin:
+    def margin_of(problem: Problem, box: Box, effort: robust.Effort) -> malta.proof.Margin:
         question = _question(problem, box, effort)
         if question is None:
             return searched(problem, box, effort)
-        found: malta.Margin = answers.of(
+        found: malta.proof.Margin = answers.of(
             question, lambda: searched(problem, box, effort), lambda margin: not margin.reason
         )
         if effort.progress is not None:
             effort.progress(found.lower or 0.0, found.upper)
         return found
 
-    def worst_case_gain(system: UncertainSystem, law: Any, *of: Any, **options: Any) -> malta.Gain:
+    def worst_case_gain(system: UncertainSystem, law: Any, *of: Any, **options: Any) -> malta.proof.Gain:
         if not isinstance(law, Compensator):
             return largest(system, law, *of, **options)
         question = pickle.dumps((_loop(system, law), of, options))
-        found: malta.Gain = answers.of(
+        found: malta.proof.Gain = answers.of(
             question, lambda: largest(system, law, *of, **options), lambda found: not found.reason
         )
         return found

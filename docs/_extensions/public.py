@@ -18,17 +18,30 @@ from typing import Any
 import malta
 
 MODULES = tuple(name for name in malta.__all__ if isinstance(getattr(malta, name), ModuleType))
+# Packages that pass on names of their own, on the page of the package.
+LISTS = (
+    "model",
+    "synthesis",
+    "proof",
+    "loops",
+    "margins",
+    "firmware",
+    "campaigns",
+    "identification",
+    "simulation",
+)
 
 
 def names_of(page: str) -> list[str]:
     """List the public names on a page of the reference.
 
-    page : a package, as "margins", for the names of malta itself that come from it; a public module, as
-        "malta.gains", for the names within it, or "malta.report:tables" for those from this part of it
+    page : a package, as "margins", for the names of malta itself that come from it, and for its own; a public module,
+        as "malta.gains", for the names within it, or "malta.report:tables" for those from this part of it
     """
     if not page.startswith("malta."):
         own = [name for name in malta.__all__ if name not in MODULES]
-        return [f"malta.{name}" for name in sorted(own, key=str.lower) if _package_of(name) == page]
+        flat = [f"malta.{name}" for name in sorted(own, key=str.lower) if _package_of(name) == page]
+        return flat + (names_of(f"malta.{page}") if page in LISTS else [])
     whole, _, part = page.partition(":")
     module = getattr(malta, whole.removeprefix("malta."))
     sources = dict(_passed_on(module))

@@ -1,6 +1,6 @@
 """What the page draws of a design at each move: poles, S and T, Nyquist, a run, a load, figures; numbers only, in SI.
 
-The loop is the machine's own, `malta.loop`, and the figures are those of malta.verify and malta.recovery.
+The loop is the machine's own, `malta.loop`, and the figures are those of malta.verify and malta.loops.recovery.
 Nothing here is proven: the eigenvalue margin is an upper bound, and the proof follows in proof.py.
 """
 

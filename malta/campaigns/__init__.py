@@ -1,6 +1,24 @@
 """Campaigns: one scenario on thousands of machines, or on a hundred million.
 
-sampling -> plan -> block -> store -> result -> statistics, with run.py above them and dask.py for a cluster
-                                   -> sketch -> summary -> survey, status: of any size, without the figures of each run
-limits -> rare, sensitivity, tolerance: studies on the box of a plan
+plan -> store -> result -> run, with dask.py for a cluster
+                        -> summary -> survey: of any size, without the figures of each run
+limits -> rare, studies: rare events, sensitivities and tolerances on the box of a plan
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from malta.contents import contents
+
+if TYPE_CHECKING:
+    from malta.campaigns.limits import limit_of as limit_of
+    from malta.campaigns.plan import Plan as Plan
+    from malta.campaigns.rare import rare_event as rare_event
+    from malta.campaigns.result import Campaign as Campaign
+    from malta.campaigns.studies import sensitivity as sensitivity
+    from malta.campaigns.studies import tolerances as tolerances
+    from malta.campaigns.summary import Summary as Summary
+    from malta.campaigns.survey import summarize as summarize
+
+__all__, __getattr__, __dir__ = contents(__name__, __file__)

@@ -412,7 +412,7 @@ def rare_event(
     Engineering Mechanics 16 (2001) 263-277.
 
     plan : the plan of the runs, at least 2000
-    limit : from `malta.limit_of`
+    limit : from `malta.campaigns.limit_of`
     folder : that of the plan's campaign, which keeps every repetition as soon as it is done; None: nothing is written
     workers : threads; None: one for each core
     progress : called with the share of the work that is done, 0 to 1
@@ -426,9 +426,9 @@ def rare_event(
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.2}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=2000, options=short)
-    >>> limit = malta.limit_of(plan, "deviation-y", 40e-6)
-    >>> event = malta.rare_event(plan, limit, workers=1)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=2000, options=short)
+    >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 40e-6)
+    >>> event = malta.campaigns.rare_event(plan, limit, workers=1)
     >>> low, high = event.found.interval()
     >>> 0.1 < low < event.found.probability < high < 1
     True

@@ -40,7 +40,7 @@ class Campaign:
     index : number of each run in the plan
     names : of the values that vary: parameters, then errors of the sensors
     values : the values that vary, runs x names, SI
-    batch : figures of the runs, see `malta.Batch`
+    batch : figures of the runs, see `malta.simulation.Batch`
     engines : which simulated them: "compiled" or "virtual machine"
     interrupted : whether Ctrl-C ended the campaign; it has the runs of the blocks before
     damaged : files of blocks that could not be read; their runs were simulated again
@@ -49,7 +49,7 @@ class Campaign:
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> short = {"duration": 0.01}  # s
-    >>> plan = malta.Plan(controller, "hold", {"m": 0.1}, samples=5, options=short)
+    >>> plan = malta.campaigns.Plan(controller, "hold", {"m": 0.1}, samples=5, options=short)
     >>> found = malta.campaign(plan, workers=1)
     >>> found.names, found.values.shape, found.ends
     (('m',), (5, 1), {'completed': 5})

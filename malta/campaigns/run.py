@@ -101,13 +101,14 @@ def campaign(
 
     Returns a Campaign. After Ctrl-C it has the blocks that are done, and says `interrupted`.
 
-    Raises InputError for more than IN_MEMORY runs, which `malta.summarize` takes; for a folder that has another
-    campaign or cannot be written to, and for a scheduler that does not answer; blocks that are done stay in the folder.
+    Raises InputError for more than IN_MEMORY runs, which `malta.campaigns.summarize` takes; for a folder that has
+    another campaign or cannot be written to, and for a scheduler that does not answer; blocks that are done stay in
+    the folder.
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> short = {"duration": 0.01}  # s
-    >>> plan = malta.Plan(controller, "hold", {"m": 0.1}, samples=5, options=short)
+    >>> plan = malta.campaigns.Plan(controller, "hold", {"m": 0.1}, samples=5, options=short)
     >>> found = malta.campaign(plan, workers=1)
     >>> found.rate.passed, found.rate.runs
     (5, 5)
@@ -115,7 +116,7 @@ def campaign(
     True
     """
     if plan.samples > IN_MEMORY:
-        expected = f"at most {IN_MEMORY} in memory; malta.summarize needs none for its runs"
+        expected = f"at most {IN_MEMORY} in memory; malta.campaigns.summarize needs none for its runs"
         raise InputError("campaign", "samples", str(plan.samples), expected)
     done: dict[int, Block] = {}
     session = Session(workers, cluster, block, progress)
@@ -361,7 +362,7 @@ def main_yields(
         for them, and with empty integrals
 
     spec, controller = malta.read_design("design/robust.toml"), malta.gains.read("design/gains/robust.json")
-    print(main_yields(controller, spec, malta.published("data/tubular.toml"), machines=1000).published)
+    print(main_yields(controller, spec, malta.model.published("data/tubular.toml"), machines=1000).published)
     """
     return yields_of(
         main_campaign(controller, spec, machines, settle=settle, progress=progress), published, spec

@@ -99,7 +99,7 @@ def sensitivity(
     `scipy.stats.sobol_indices`. Source: A. Saltelli et al., Computer Physics Communications 181 (2010) 259-270.
 
     plan : the plan of the runs
-    limit : from `malta.limit_of`; a run within it counts for the yield
+    limit : from `malta.campaigns.limit_of`; a run within it counts for the yield
     workers : threads; None: one for each core
     progress : called with the share of the runs that is done, 0 to 1
 
@@ -111,8 +111,8 @@ def sensitivity(
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> box, options = {"m": 0.2, "C": 0.2}, {"duration": 0.02, "noise": 0.0}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=64, options=options)
-    >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=64, options=options)
+    >>> found = malta.campaigns.sensitivity(plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1)
     >>> mass, constant = found.of_merits["deviation y"]
     >>> found.factors, constant.total > mass.total  # magnets matter more
     (('m', 'C'), True)
@@ -244,7 +244,7 @@ def tolerances(
     machine cannot exist counts as one that loses the yield.
 
     plan : the plan, whose spreads are today's
-    limit : from `malta.limit_of`
+    limit : from `malta.campaigns.limit_of`
     wanted : share of the plan's machines within the limit, above 0 and up to 1
     workers : threads; None: one for each core
     progress : called with the share of the work that is done, 0 to 1
@@ -258,9 +258,9 @@ def tolerances(
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.1}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=20, options=short)
-    >>> limit = malta.limit_of(plan, "deviation-y", 50e-6)
-    >>> found = malta.tolerances(plan, limit, 0.95, workers=1)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=20, options=short)
+    >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 50e-6)
+    >>> found = malta.campaigns.tolerances(plan, limit, 0.95, workers=1)
     >>> found.today.share, found.spreads[0].name, found.spreads[0].factor > 1
     (1.0, 'm', True)
     """

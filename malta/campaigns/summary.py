@@ -251,8 +251,8 @@ class Summary:
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> short = {"duration": 0.01}  # s
-    >>> plan = malta.Plan(controller, "hold", {"m": 0.1}, samples=5, options=short)
-    >>> found = malta.summarize(plan, workers=1)
+    >>> plan = malta.campaigns.Plan(controller, "hold", {"m": 0.1}, samples=5, options=short)
+    >>> found = malta.campaigns.summarize(plan, workers=1)
     >>> found.runs, found.ends, [merit.label for merit in found.merits][:2]
     (5, {'completed': 5}, ['deviation of z', 'deviation x1'])
     """

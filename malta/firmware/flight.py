@@ -195,7 +195,7 @@ def engine_of_c(
     >>> plant = malta.plant_of(controller.parameters)
     >>> off = {"x": 20e-6}  # m
     >>> hold = malta.Scenario("hold", 2e-3, malta.references.hold, off, fidelity="force")
-    >>> exported = malta.engine_of_c("double")
+    >>> exported = malta.firmware.engine_of_c("double")
     >>> flown = malta.simulate(plant, controller, hold, engine=exported)
     >>> run = malta.simulate(plant, controller, hold)
     >>> flown.engine, bool(abs(flown.v - run.v).max() < 1e-9)  # N

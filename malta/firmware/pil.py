@@ -264,7 +264,7 @@ class Replay:
 
     >>> import malta
     >>> one = malta.firmware.pil.ReplayedVector("stroke", 60, differs=-1, largest=0.0)
-    >>> found = malta.Replay("float", (one,), seconds=0.5, repeated=0, counts=0)
+    >>> found = malta.firmware.Replay("float", (one,), seconds=0.5, repeated=0, counts=0)
     >>> found.samples_per_second
     120.0
     """
@@ -321,7 +321,7 @@ def replay_on_target(
 
     >>> import malta
     >>> try:
-    ...     malta.replay_on_target("design/gains/halbach.json", "/dev/nothing")
+    ...     malta.firmware.replay_on_target("design/gains/halbach.json", "/dev/nothing")
     ... except malta.InputError as error:
     ...     print(error.found)
     No such file or directory

@@ -15,7 +15,7 @@ import numpy as np
 from malta.errors import CheckError
 from malta.firmware.signals import Target
 from malta.synthesis.controller import Controller
-from malta.synthesis.kalman import noise_input
+from malta.synthesis.filters import noise_input
 from malta.synthesis.riccati import dare, eigenvalues, sample
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ A machine with electronics of its own keeps its own voltages.
 
 A file of version 2 has one more table, law, and may have others: plant.linear of a machine from plain matrices, and
 commutation. What law.tracks, law.coordinates and commutation mean for the control law stands in synthesis/controller.py
-and synthesis/kalman.py.
+and synthesis/filters.py.
 
 There plant.parameters and its terms may be null, feedforward.rate without rates among the states, and limits.current
 and limits.force without limits. The states of a law of errors are its own, then its last errors. An

@@ -1,1 +1,21 @@
 """From the bench back to the design: logs, excitation, parameters with intervals, and what a stroke teaches."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from malta.contents import contents
+
+if TYPE_CHECKING:
+    from malta.identification.excite import ExcitationPlan as ExcitationPlan
+    from malta.identification.identify import Identified as Identified
+    from malta.identification.learn import Learned as Learned
+    from malta.identification.log import Log as Log
+    from malta.identification.log import log_of as log_of
+    from malta.identification.log import write_log as write_log
+    from malta.identification.measure import Measurement as Measurement
+    from malta.identification.measure import MeasurementPlan as MeasurementPlan
+    from malta.identification.replay import LawReplay as LawReplay
+    from malta.identification.replay import replay_law as replay_law
+
+__all__, __getattr__, __dir__ = contents(__name__, __file__)

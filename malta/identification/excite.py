@@ -21,7 +21,7 @@ from malta.identification.response import (
     well_found,
 )
 from malta.model.equilibrium import trim
-from malta.simulation.references import Multisine, interleaved_multisine
+from malta.simulation.excitation import Multisine, interleaved_multisine
 
 if TYPE_CHECKING:
     from malta.loops.loop import Loop

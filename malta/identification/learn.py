@@ -40,7 +40,7 @@ class Learned:
     >>> plant = malta.plant_of(controller.parameters)
     >>> weak = plant.variant(dataclasses.replace(plant.parameters, K_D=4.68))  # 10 % less
     >>> stroke = malta.Scenario.stroke(10e-3, noise=1.0)
-    >>> log = malta.log_of(malta.simulate(weak, controller, stroke))
+    >>> log = malta.identification.log_of(malta.simulate(weak, controller, stroke))
     >>> found = malta.learn(controller, log)
     >>> found.before, bool(abs(found.after - 4.68) < 0.05)
     (5.2, True)
@@ -90,7 +90,7 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
     >>> plant = malta.plant_of(controller.parameters)
     >>> weak = plant.variant(dataclasses.replace(plant.parameters, K_D=4.68))  # 10 % less
     >>> stroke = malta.Scenario.stroke(10e-3, noise=1.0)
-    >>> log = malta.log_of(malta.simulate(weak, controller, stroke))
+    >>> log = malta.identification.log_of(malta.simulate(weak, controller, stroke))
     >>> found = malta.learn(controller, log)
     >>> found.parameter, f"{found.factor:.2f}"
     ('K_D', '1.11')

@@ -22,8 +22,8 @@ from malta.files import read_file, replace_files
 from malta.gains.encodings import read_mat
 from malta.model.plant import Signal, readonly
 from malta.simulation.current_control import reading_errors
+from malta.simulation.excitation import Multisine
 from malta.simulation.layout import Loop
-from malta.simulation.references import Multisine
 from malta.simulation.simulate import prepare
 from malta.units import to_si
 
@@ -59,7 +59,7 @@ class Log:
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
-    >>> log = malta.log_of(run)
+    >>> log = malta.identification.log_of(run)
     >>> log.samples, log.names("y"), log.columns["i"].shape[1]
     (2000, ['x1', 'y1', 'x2', 'y2', 'z'], 12)
     """
@@ -224,7 +224,7 @@ def log_of(run: Trajectory) -> Log:
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
-    >>> malta.log_of(run).names("flags")[-1]
+    >>> malta.identification.log_of(run).names("flags")[-1]
     'current_limit'
     """
     plant, scenario = run.plant, run.scenario
@@ -304,7 +304,7 @@ def write_log(log: Log, path: str | Path) -> Path:
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
-    >>> malta.write_log(malta.log_of(run), "build/stand.npz").name
+    >>> malta.identification.write_log(malta.identification.log_of(run), "build/stand.npz").name
     'stand.npz'
     """
     path = Path(path)
@@ -379,7 +379,7 @@ def read_log(path: str | Path) -> Log:
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
-    >>> file = malta.write_log(malta.log_of(run), "build/stand.csv")
+    >>> file = malta.identification.write_log(malta.identification.log_of(run), "build/stand.csv")
     >>> malta.read_log(file).samples
     2000
     """

@@ -58,7 +58,7 @@ class LawReplay:
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
-    >>> found = malta.replay_law(controller, malta.log_of(run))
+    >>> found = malta.identification.replay_law(controller, malta.identification.log_of(run))
     >>> found.v.shape, found.innovation.shape
     ((2000, 5), (2000, 5))
     """
@@ -99,7 +99,7 @@ def replay_law(controller: Controller, log: Log) -> LawReplay:
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
-    >>> malta.replay_law(controller, malta.log_of(run)).same
+    >>> malta.identification.replay_law(controller, malta.identification.log_of(run)).same
     True
     """
     plant = plant_of(controller.parameters)

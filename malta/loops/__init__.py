@@ -1,8 +1,25 @@
 """The loop of a machine and its law, and everything linear that is asked of it.
 
-loop, sampled_loops         machine x law x operating point x parameters, over one sample
-linear_loops, loop_systems  any loop as matrices; systems of python-control
-classical, channels         disk, delay, gain and phase margins
-curves, locus               responses, poles, zeros; root loci
-steps, recovery             answers to references and loads
+loop, sampled_loops   machine x law x operating point x parameters, over one sample
+linear_loops          any loop as matrices; systems of python-control
+classical             disk, delay, gain and phase margins, one channel at a time too
+curves, locus         responses, poles, zeros; root loci
+time_domain           answers to references and loads, and what noise leaves at rest
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from malta.contents import contents
+
+if TYPE_CHECKING:
+    from malta.loops.curves import LoopCurves as LoopCurves
+    from malta.loops.curves import loop_curves as loop_curves
+    from malta.loops.linear_loops import LoopSystems as LoopSystems
+    from malta.loops.linear_loops import loop_systems as loop_systems
+    from malta.loops.loop import Loop as Loop
+    from malta.loops.time_domain import Recovery as Recovery
+    from malta.loops.time_domain import recovery as recovery
+
+__all__, __getattr__, __dir__ = contents(__name__, __file__)

@@ -85,7 +85,7 @@ class LoopCurves:
     responses : L, S, T at the sensors and at the forces, gang of four and compliance at the frequencies `w`
 
     >>> import control, malta
-    >>> curves = malta.loop_curves(control.tf([4], [1, 1, 0], name="servo"))
+    >>> curves = malta.loops.loop_curves(control.tf([4], [1, 1, 0], name="servo"))
     >>> curves.stable, curves.channels()[0].name
     (True, 'y[0]')
     >>> f"{curves.singular_values(curves.responses.S).max():.2f}"
@@ -219,8 +219,8 @@ def loop_curves(
 ) -> LoopCurves:
     """Compute the curves of a loop: frequency responses on a grid that fits them, poles, zeros, margins.
 
-    source : a malta.Loop; a plant; LoopSystems; a system of python-control, P or the loop gain L; or curves, which
-        are returned
+    source : a malta.loops.Loop; a plant; LoopSystems; a system of python-control, P or the loop gain L; or curves,
+        which are returned
     controller : of the plant, or the system C of the errors (L = P C, negative feedback); None: the source has it
     name : of the loop; "": that of the controller or of the system
     position : of the stroke, m, of a plant; None: the controller's operating point
@@ -232,7 +232,7 @@ def loop_curves(
     Raises InputError for what is no loop, and CheckError where no input holds the machine.
 
     >>> import control, malta
-    >>> unstable = malta.loop_curves(control.tf([3], [1, -1])).margins[0]
+    >>> unstable = malta.loops.loop_curves(control.tf([3], [1, -1])).margins[0]
     >>> [round(bound, 3) for bound in unstable.gain], unstable.encirclements
     ([0.333, inf], 1)
     """

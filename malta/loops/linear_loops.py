@@ -65,7 +65,7 @@ class LoopSystems:
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> loop = malta.loop_systems(malta.plant_of(controller.parameters), controller)
+    >>> loop = malta.loops.loop_systems(malta.plant_of(controller.parameters), controller)
     >>> loop.F.input_labels, loop.F.output_labels[:2], loop.S.dt
     (['x1', 'y1', 'x2', 'y2', 'z'], ['fx_B1', 'fy_B1'], 5e-05)
     """
@@ -113,7 +113,7 @@ def loop_systems(plant: Plant | Loop, controller: Controller | None = None) -> L
     >>> import numpy as np
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> loop = malta.loop_systems(spec.plant, controller)
+    >>> loop = malta.loops.loop_systems(spec.plant, controller)
     >>> w = np.logspace(0, 4, 200)  # rad/s
     >>> f"largest |S| {loop.S.frequency_response(w).magnitude.max():.2f}"
     'largest |S| 1.57'

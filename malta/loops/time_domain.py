@@ -72,7 +72,7 @@ class Recovery:
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> plant = malta.plant_of(controller.parameters)
-    >>> found = malta.recovery(plant, controller, {"payload": {"F_z": -2.0}})
+    >>> found = malta.loops.recovery(plant, controller, {"payload": {"F_z": -2.0}})
     >>> z = found[0].outputs[-1]
     >>> f"{found[0].name} moves {z.output} by {z.largest * 1e6:.0f} um"
     'payload moves z by 699 um'
@@ -122,7 +122,7 @@ def recovery(
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> found = malta.recovery(malta.plant_of(controller.parameters), controller)
+    >>> found = malta.loops.recovery(malta.plant_of(controller.parameters), controller)
     >>> x1 = found[0].outputs[0]
     >>> f"1 N of {found[0].name} moves {x1.output} by {x1.largest * 1e6:.1f} um"
     '1 N of F_x moves x1 by 48.2 um'

@@ -58,7 +58,7 @@ from malta.proof.responses import crossing, find_peaks
 from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator
 from malta.synthesis.controller import Controller
-from malta.synthesis.kalman import gain_at_rest
+from malta.synthesis.filters import gain_at_rest
 from malta.synthesis.lqg import kalman, lqi, lqr, weights_of
 from malta.synthesis.riccati import add_integrals, eigenvalues
 

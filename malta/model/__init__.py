@@ -1,1 +1,15 @@
 """Machines as records: parameters, plants in CasADi, rigid bodies, linearization, signals and units."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from malta.contents import contents
+
+if TYPE_CHECKING:
+    from malta.model.data import published as published
+    from malta.model.linearize import InverseCheck as InverseCheck
+    from malta.model.linearize import LinearModel as LinearModel
+    from malta.model.plant import OperatingPoint as OperatingPoint
+
+__all__, __getattr__, __dir__ = contents(__name__, __file__)

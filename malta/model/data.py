@@ -208,7 +208,7 @@ def published(machine_file: str | Path) -> dict[str, Any]:
     Raises InputError when neither file exists.
 
     >>> import malta
-    >>> printed = malta.published("data/tubular.toml")
+    >>> printed = malta.model.published("data/tubular.toml")
     >>> printed["table_I"]["poles"]["x"], printed["table_I"]["unit"]
     (218.92, 'rad/s')
     """

@@ -13,3 +13,19 @@ weak_coupling             held currents anywhere in the travel: coupled axes
 blocks                    unmodelled dynamics and worst-case gains
 certificate               the proof as a file, and the checker of its own
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from malta.contents import contents
+
+if TYPE_CHECKING:
+    from malta.proof.blocks.blocks import Dynamic as Dynamic
+    from malta.proof.blocks.gain import Gain as Gain
+    from malta.proof.margin import Margin as Margin
+    from malta.proof.robust import margin_of_polynomial as margin_of_polynomial
+    from malta.proof.uncertain import Compensator as Compensator
+    from malta.proof.uncertain import UncertainSystem as UncertainSystem
+
+__all__, __getattr__, __dir__ = contents(__name__, __file__)

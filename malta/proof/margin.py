@@ -53,7 +53,7 @@ class Margin:
     >>> import malta
     >>> def cubic(k):  # stable from -1 to 8
     ...     return [1, 3, 3, 1 + k]
-    >>> found = malta.margin_of_polynomial(cubic, {"k": 0.5}, {"k": 1})
+    >>> found = malta.proof.margin_of_polynomial(cubic, {"k": 0.5}, {"k": 1})
     >>> f"proven {found.lower:.2f}, lost at k = {found.witness['k']:.2f}"
     'proven 4.00, lost at k = -1.00'
     """

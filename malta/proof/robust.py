@@ -434,7 +434,7 @@ def margin_of_polynomial(
     >>> import malta
     >>> def cubic(k):  # stable while k < 8
     ...     return [1, 3, 3, 1 + k]
-    >>> found = malta.margin_of_polynomial(cubic, {"k": (1, 2)}, {"k": 1})
+    >>> found = malta.proof.margin_of_polynomial(cubic, {"k": (1, 2)}, {"k": 1})
     >>> f"{found.lower:.2f}, {found.upper:.2f}"
     '7.00, 7.00'
     """

@@ -106,7 +106,7 @@ class Compensator:
     >>> import malta
     >>> import numpy as np
     >>> one, Ts = np.eye(1), 1e-3  # PI: u = -2 y - 50 sum of Ts y
-    >>> law = malta.Compensator(one, Ts * one, -50 * one, -2 * one, 1, Ts, delay=1)
+    >>> law = malta.proof.Compensator(one, Ts * one, -50 * one, -2 * one, 1, Ts, delay=1)
     >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
     >>> f"{malta.robust_margin(motor, law, {'k': 0.2}).lower:.2f}"
     '5.00'

@@ -177,7 +177,7 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
     A verdict follows from the numbers: "reproduced", "within x %", "not reproduced" with the reason, and others.
 
     specs : designs of one machine, from `malta.read_design`
-    published : what the paper prints, from `malta.published`
+    published : what the paper prints, from `malta.model.published`
     progress : called with the share of the work that is done, 0 to 1
 
     Returns a Ledger: for each claim the paper's figure, that of each design, and the verdict.
@@ -186,7 +186,7 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
 
     >>> import malta
     >>> spec = malta.read_design("design/halbach_pid.toml")
-    >>> found = malta.ledger([spec], malta.published("data/halbach.toml"))
+    >>> found = malta.ledger([spec], malta.model.published("data/halbach.toml"))
     >>> pitch = found.claims[0]
     >>> found.designs, pitch.subject, pitch.published, pitch.ours
     (('halbach_pid',), 'pitch, 2π/k [mm]', '29.778', ('29.778',))

@@ -52,7 +52,7 @@ def design_page(
     model : the machine's linear model
     margins : from `malta.verify`
     flown : the experiment that is the machine's main job, from `malta.experiment`
-    published : figures of the machine's paper, from `malta.published`; None: none
+    published : figures of the machine's paper, from `malta.model.published`; None: none
 
     Returns a rich Group, which `rich.print` prints.
 
@@ -130,7 +130,7 @@ def stroke(run: Trajectory, path: str | Path | None = None, published: Published
 
     run : from `malta.simulate`
     path : .png, .svg or .pdf file; None: nothing is written
-    published : figures of the machine's paper, from `malta.published`; None: none
+    published : figures of the machine's paper, from `malta.model.published`; None: none
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -153,7 +153,7 @@ def experiment(e: Experiment, path: str | Path | None = None, published: Publish
 
     e : from `malta.experiment`
     path : .png, .svg or .pdf file; None: nothing is written
-    published : figures of the machine's paper, from `malta.published`; None: none
+    published : figures of the machine's paper, from `malta.model.published`; None: none
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -203,7 +203,7 @@ def loads(
     plant : the machine
     controller : its controller
     path : .png, .svg or .pdf file; None: nothing is written
-    found : from `malta.recovery`, where it is known already; None: it is computed
+    found : from `malta.loops.recovery`, where it is known already; None: it is computed
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -223,7 +223,7 @@ def loads(
 def sensitivity(found: Sensitivity, path: str | Path | None = None) -> Figure:
     """Draw the Sobol indices of a campaign's yield and merits, and save the figure where a path is given.
 
-    found : from `malta.sensitivity`
+    found : from `malta.campaigns.sensitivity`
     path : .png, .svg or .pdf file; None: nothing is written
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
@@ -235,8 +235,8 @@ def sensitivity(found: Sensitivity, path: str | Path | None = None) -> Figure:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> options = {"duration": 0.02, "noise": 0.0}
     >>> box = {"m": 0.2, "C": 0.2}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=64, options=options)
-    >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=64, options=options)
+    >>> found = malta.campaigns.sensitivity(plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1)
     >>> figure = malta.report.sensitivity(found)
     >>> figure.axes[0].get_ylabel()
     'share of the variance [-]'
@@ -255,7 +255,7 @@ class CampaignFigures(NamedTuple):
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
     >>> figures = malta.report.campaign(malta.campaign(plan, workers=1))
     >>> figures._fields
     ('distributions', 'endings', 'worst')
@@ -289,7 +289,7 @@ def campaign(
 
     found : the campaign, or its summary
     folder : of the files; None: nothing is written
-    published : figures of the machine's paper, from `malta.published`; None: none; a summary has its own
+    published : figures of the machine's paper, from `malta.model.published`; None: none; a summary has its own
 
     Returns CampaignFigures.
 
@@ -297,7 +297,7 @@ def campaign(
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
     >>> figures = malta.report.campaign(malta.campaign(plan, workers=1), "build")
     >>> figures.worst is figures[-1], malta.report.CAMPAIGN_FILES[-1]
     (True, 'worst.png')

@@ -1,13 +1,26 @@
 """Nonlinear simulation: control period, engines, scenarios, batches and experiments.
 
-layout, current_control, substep, period    one control period of machine and controller as CasADi functions
-expressions, working                        what is proven to be conserved or linear, and steps that make use of it
-instructions, once, translate               these functions as C
-compiled, engines                           libraries of C, or CasADi's virtual machine
-scenario, references, noise, inputs         the reference, and everything that disturbs the machine
-prepared, simulate, verdict                 one machine
-trajectory, start_up                        its time series, and its observer at the start
-batch, workers, digest                      thousands of machines, with the figures of each run
-experiments, generic, responses             scenarios with figures of merit
-time_optimal, inverter                      the fastest stroke, and half-bridges on a DC link
+layout, current_control, period          one control period of machine and controller as CasADi functions
+scenario, references, readings, inputs   the reference, and everything that disturbs the machine
+simulate, trajectory, start_up           one machine, its time series, and its observer at the start
+engine                                   the period as C or in CasADi, on one machine or on thousands
+experiments                              scenarios with figures of merit, the fastest stroke among them
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from malta.contents import contents
+
+if TYPE_CHECKING:
+    from malta.simulation.engine.batch import replayed as replayed
+    from malta.simulation.engine.digest import Batch as Batch
+    from malta.simulation.excitation import Multisine as Multisine
+    from malta.simulation.experiments import Experiment as Experiment
+    from malta.simulation.experiments.time_optimal import fastest_stroke as fastest_stroke
+    from malta.simulation.scenario import Fault as Fault
+    from malta.simulation.trajectory import Trajectory as Trajectory
+    from malta.simulation.trajectory import stroke_figures as stroke_figures
+
+__all__, __getattr__, __dir__ = contents(__name__, __file__)

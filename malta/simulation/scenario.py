@@ -54,7 +54,7 @@ class Fault(NamedTuple):
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> stuck = malta.Fault("stuck sensor", at=1e-3, until=2e-3, what="x1")
+    >>> stuck = malta.simulation.Fault("stuck sensor", at=1e-3, until=2e-3, what="x1")
     >>> hold = malta.Scenario("hold", 5e-3, malta.references.hold, faults=(stuck,))
     >>> plant = malta.plant_of(controller.parameters)
     >>> malta.simulate(plant, controller, hold).verdict.name
@@ -266,7 +266,7 @@ class Scenario:
     ) -> Scenario:
         """The machine held at its place while forces excite it, with sensors as built: a run for identification.
 
-        excitation : t (s, shape (k,)) -> forces beside the law's, k x inputs, N, as a `malta.Multisine`
+        excitation : t (s, shape (k,)) -> forces beside the law's, k x inputs, N, as a `malta.simulation.Multisine`
         duration : s
         options : fields of the scenario, as reference=..., seed=1; noise is 1.0 and quantize True unless they differ
 

@@ -160,7 +160,8 @@ def simulate(
     plant : the machine
     controller : its controller, which may have been designed for other parameters
     scenario : reference, start, disturbances, noise, faults and fidelity
-    engine : "auto" compiles where there is a C compiler; a function makes the engine of a run, as `malta.engine_of_c`
+    engine : "auto" compiles where there is a C compiler; a function makes the engine of a run, as
+        `malta.firmware.engine_of_c`
     progress : called now and then with the share of the samples that is done, 0 to 1
 
     Returns a Trajectory: time series in SI, a row for each sample.

@@ -28,7 +28,7 @@ from malta.simulation.layout import layout_of, numbers_of
 from malta.simulation.period import period_of, runge_kutta
 from malta.simulation.scenario import Simulation
 from malta.synthesis.controller import Controller, Noise
-from malta.synthesis.kalman import noise_input
+from malta.synthesis.filters import noise_input
 from malta.synthesis.riccati import sample
 
 if TYPE_CHECKING:

@@ -282,7 +282,7 @@ def stroke_figures(run: Trajectory) -> StrokeFigures:
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(10e-3))
-    >>> figures = malta.stroke_figures(run)
+    >>> figures = malta.simulation.stroke_figures(run)
     >>> f"{1e3 * figures.rise:.1f} ms, overshoot {figures.overshoot:.2%}"
     '15.8 ms, overshoot 0.00%'
     """

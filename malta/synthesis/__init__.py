@@ -1,1 +1,18 @@
 """Controllers: design files, Riccati equations, LQG, and the law that all else consumes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from malta.contents import contents
+
+if TYPE_CHECKING:
+    from malta.synthesis.controller import Controller as Controller
+    from malta.synthesis.lqg import kalman as kalman
+    from malta.synthesis.lqg import lqi as lqi
+    from malta.synthesis.lqg import lqr as lqr
+    from malta.synthesis.spec import Weights as Weights
+    from malta.synthesis.state_space import controller_of as controller_of
+    from malta.synthesis.stiffness_bases import calibrate as calibrate
+
+__all__, __getattr__, __dir__ = contents(__name__, __file__)

@@ -54,7 +54,7 @@ from malta.model.plant import Parameters, Signal, readonly
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
-    from malta.synthesis.kalman import Gains
+    from malta.synthesis.filters import Gains
     from malta.synthesis.spec import Coordinates
 
 
@@ -139,7 +139,7 @@ class Noise:
     process: FloatArray  # N^2, m forces; in the coordinates of the positions m^2 / s^4, n0 / 2 accelerations
     sensor: FloatArray  # m^2, p measurements
     drift: FloatArray  # the same, of a constant force of disturbance from sample to sample: m, or none
-    # n0 / 2, or none: see kalman.py
+    # n0 / 2, or none: see filters.py
     correlation: FloatArray = field(default_factory=lambda: np.zeros(0), metadata={"later": True})
 
     def __post_init__(self) -> None:

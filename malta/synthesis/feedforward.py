@@ -20,7 +20,7 @@ from malta.synthesis.controller import (
     Feedforward,
     Limits,
 )
-from malta.synthesis.kalman import held
+from malta.synthesis.filters import held
 from malta.synthesis.riccati import sample
 
 if TYPE_CHECKING:

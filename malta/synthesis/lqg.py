@@ -43,7 +43,7 @@ from malta.synthesis.controller import (
     stored_forces,
 )
 from malta.synthesis.feedforward import commutate_ahead, machine_part
-from malta.synthesis.kalman import (
+from malta.synthesis.filters import (
     Gains,
     Linear,
     held,
@@ -52,7 +52,7 @@ from malta.synthesis.kalman import (
     sampled_model,
     with_lags,
 )
-from malta.synthesis.kalman import kalman as kalman
+from malta.synthesis.filters import kalman as kalman
 from malta.synthesis.pid import pid
 from malta.synthesis.riccati import (
     add_integrals,
@@ -176,7 +176,7 @@ def lqr(model: Linear, weights: Weights) -> FloatArray:
     >>> import malta
     >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
     >>> weights = malta.weights(q=[16, 0], r=[1], w=[1], v=[1])
-    >>> K = malta.lqr(malta.linearize(cart, cart.at()), weights)
+    >>> K = malta.synthesis.lqr(malta.linearize(cart, cart.at()), weights)
     >>> K.round(6).tolist()  # w_n = 2 rad/s: K1 = w_n^2, K2 = sqrt(2) w_n
     [[4.0, 2.828427]]
     """
@@ -203,7 +203,7 @@ def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
     >>> import malta
     >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
     >>> weights = malta.weights([1, 0], [1], [1], [1], q_i=[4])
-    >>> K, Ki = malta.lqi(malta.linearize(cart, cart.at()), weights)
+    >>> K, Ki = malta.synthesis.lqi(malta.linearize(cart, cart.at()), weights)
     >>> K.round(3).tolist(), Ki.round(3).tolist()
     ([[3.375, 2.598]], [[2.0]])
     """

@@ -21,7 +21,7 @@ from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import machine_part
-from malta.synthesis.kalman import Gains
+from malta.synthesis.filters import Gains
 from malta.synthesis.spec import Pid
 
 if TYPE_CHECKING:

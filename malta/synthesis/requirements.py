@@ -27,7 +27,7 @@ from malta.model.plant import Plant, Signal
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Parameters
     from malta.synthesis.controller import Controller
-    from malta.synthesis.kalman import Gains, Linear
+    from malta.synthesis.filters import Gains, Linear
     from malta.synthesis.recovery import RecoveryBound, StepResponse
     from malta.synthesis.spec import Spec
 

@@ -53,7 +53,7 @@ def controller_of(
     >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
     >>> lead = control.ss(control.tf([200, 1000], [1 / 50, 1]))
     >>> lead = control.c2d(lead, 1e-3, "tustin")
-    >>> controller = malta.controller_of(lead, cart, name="lead")
+    >>> controller = malta.synthesis.controller_of(lead, cart, name="lead")
     >>> model = malta.linearize(cart, cart.at())
     >>> controller.sample_time, malta.verify(model, controller).stable
     (0.001, True)

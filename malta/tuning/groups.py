@@ -41,7 +41,7 @@ from malta.proof.machine.windings import (
 from malta.proof.responses import crossing
 from malta.synthesis.controller import linear_law_of
 from malta.synthesis.feedforward import current_loop_of, holding_gain, static_feedforward
-from malta.synthesis.kalman import gain_at_rest
+from malta.synthesis.filters import gain_at_rest
 from malta.synthesis.lqg import gains
 from malta.synthesis.recovery import step_response
 from malta.synthesis.requirements import Noise, TrialLoop, requirements_for
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
     from malta.model.plant import ComplexArray, FloatArray, Plant
     from malta.synthesis.controller import CurrentLoop, LinearLaw
-    from malta.synthesis.kalman import Gains
+    from malta.synthesis.filters import Gains
     from malta.synthesis.recovery import StepResponse
     from malta.synthesis.requirements import Requirement
 

@@ -83,7 +83,7 @@ def test_picture_has_the_figures_of_verify_and_recovery(design: Path) -> None:
     drawn = [max(row) for row in found["frequency"]["S"]]
     assert drawn == pytest.approx(peaks, rel=2e-3)
     if found["load"]:
-        of_load = malta.recovery(problem.plant, problem.controller)[0]
+        of_load = malta.loops.recovery(problem.plant, problem.controller)[0]
         assert found["load"]["largest"] == pytest.approx([d.largest for d in of_load.outputs], rel=1e-5)
     assert np.array_equal(problem.controller.K, malta.synthesize(spec, problem.model).K)
 

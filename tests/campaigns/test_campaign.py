@@ -94,7 +94,7 @@ def _files(folder: Path) -> dict[str, bytes]:
 
 def test_the_name_is_the_function() -> None:
     assert function is campaign is malta.campaign
-    assert malta.Plan is Plan
+    assert malta.campaigns.Plan is Plan
 
 
 @pytest.mark.slow
@@ -283,7 +283,7 @@ def test_a_case_is_chosen_by_its_label(controller: Controller) -> None:
 # --- runs ---
 
 
-def _assert_replayed(found: Campaign, row: int, single: malta.Experiment) -> None:
+def _assert_replayed(found: Campaign, row: int, single: malta.simulation.Experiment) -> None:
     """To the bit; the mean of squares is summed in another order."""
     run, batch = single.run, found.batch
     error = run.p - run.reference

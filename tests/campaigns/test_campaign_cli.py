@@ -327,7 +327,7 @@ def test_help_shows_an_example_and_no_cluster_is_imported() -> None:
     assert result.exit_code == 0
     assert "Example:" in result.output
     assert "--replay" in CliRunner().invoke(cli.app, ["simulate", "--help"]).output
-    code = "import sys, malta; malta.campaign, malta.Plan; sys.exit('distributed' in sys.modules)"
+    code = "import sys, malta; malta.campaign, malta.campaigns.Plan; sys.exit('distributed' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

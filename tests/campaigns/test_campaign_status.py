@@ -187,4 +187,4 @@ def test_the_pace_is_that_of_the_last_blocks(tmp_path: Path) -> None:
     found = status(tmp_path, controller)
     assert found.pace == pytest.approx(2, abs=0.1)
     assert found.left == pytest.approx(2, abs=0.1)
-    assert isinstance(found.summary, malta.Summary)
+    assert isinstance(found.summary, malta.campaigns.Summary)

@@ -33,6 +33,7 @@ from malta.campaigns.rare import (
 from malta.campaigns.result import runs_within_bounds
 from malta.campaigns.run import campaign, runs_within_specification
 from malta.campaigns.store import seal
+from malta.campaigns.summary import Bounds
 from malta.simulation.readings import keys
 
 if TYPE_CHECKING:
@@ -228,7 +229,7 @@ def test_severities_that_seldom_differ() -> None:
 def test_limits_are_those_of_the_campaign() -> None:
     plan = shaky(0.3, 256)
     found = campaign(plan)
-    published = malta.published("data/tubular.toml")
+    published = malta.model.published("data/tubular.toml")
     touched = limit_of(plan, "touchdown").severity(found.batch)
     np.testing.assert_array_equal(touched < 1, found.completed)
     assert 0 < found.completed.mean() < 1
@@ -236,7 +237,7 @@ def test_limits_are_those_of_the_campaign() -> None:
     np.testing.assert_array_equal(far < 1, found.completed & (found.batch.deviation[:, 1] <= 20e-6))
     y1 = found.batch.deviation[found.completed, 1]
     np.testing.assert_allclose(far[found.completed], y1 / 20e-6, rtol=1e-12)
-    bounds = malta.campaigns.limits.Bounds(published)
+    bounds = Bounds(published)
     outside = limit_of(plan, "published", bounds=bounds).severity(found.batch)
     np.testing.assert_array_equal(outside < 1, runs_within_bounds(found, published))
     assert slug("rise, 10-90 %") == "rise" in merits_of(plan)
@@ -256,7 +257,7 @@ def test_a_specification_is_a_limit() -> None:
     spec = malta.read_design("design/robust.toml")
     box = dict.fromkeys(BOX, 0.2)
     found = campaign(Plan(gains.read("design/gains/robust.json"), "stroke", box, samples=64))
-    limit = limit_of(found.plan, "specification", bounds=malta.campaigns.limits.Bounds(spec=spec))
+    limit = limit_of(found.plan, "specification", bounds=Bounds(spec=spec))
     within = runs_within_specification(found, spec)
     assert within is not None
     assert 0 < within.sum() < 64

@@ -208,9 +208,9 @@ def test_a_machine_that_changes_keeps_its_controller() -> None:
     c = malta.gains.read("design/gains/calibrated.json")
     plant = malta.plant_of(c.parameters)
     faults: Any = (
-        malta.Fault("lost sample", 0.01, 0.0102),
-        malta.Fault("missed step", 0.012, 0.0121),
-        malta.Fault("link sag", 0.015, 0.02, size=0.3),
+        malta.simulation.Fault("lost sample", 0.01, 0.0102),
+        malta.simulation.Fault("missed step", 0.012, 0.0121),
+        malta.simulation.Fault("link sag", 0.015, 0.02, size=0.3),
     )
     scenario = malta.Scenario.stroke(
         5e-3,

@@ -177,7 +177,7 @@ def test_loop_and_pair_fly_as_simulated(
     t = target(name, "double", fidelity)
     s, plant = scenario(t), silent(t)
     run = malta.simulate(plant, t.controller, s)
-    flown = malta.simulate(plant, t.controller, s, engine=malta.engine_of_c())
+    flown = malta.simulate(plant, t.controller, s, engine=malta.firmware.engine_of_c())
     assert run.verdict.completed
     motion = s.reference(plant)(run.t)
     loop = instance(t, "loop", fmi)
@@ -221,7 +221,7 @@ def known(run: Any, t: Target, group: str, k: int) -> Any:
 def test_single_precision_flies_as_the_exported_c(instance: Callable[..., Unit]) -> None:
     t = target("robust", "float")
     s = scenario(t)
-    flown = malta.simulate(t.believed, t.controller, s, engine=malta.engine_of_c("float"))
+    flown = malta.simulate(t.believed, t.controller, s, engine=malta.firmware.engine_of_c("float"))
     motion = s.reference(t.believed)(flown.t)
     loop = instance(t, "loop", 2)
     loop.begin()

@@ -187,7 +187,7 @@ def test_a_line_that_garbles_some_costs_time_only(target: str) -> None:
         return bytes(byte ^ 64 if place % 1499 == 700 else byte for place, byte in kept)
 
     between = Between(target, damage)
-    replay = malta.replay_on_target(GAINS, between.port, seconds=0.3)
+    replay = malta.firmware.replay_on_target(GAINS, between.port, seconds=0.3)
     between.close()
     assert replay.agrees
     assert replay.repeated > 5
@@ -313,7 +313,7 @@ def test_an_emulated_cortex_a9_passes(
 ) -> None:
     p = PROCESSORS["Cortex-A9"]
     program = build(p, write_target(tmp_path, precision), "-O2", main="_pil")
-    assert malta.replay_on_target(GAINS, wire([*p.runner, str(program)]), seconds=30).agrees
+    assert malta.firmware.replay_on_target(GAINS, wire([*p.runner, str(program)]), seconds=30).agrees
 
 
 @pytest.mark.slow
@@ -332,7 +332,7 @@ def test_a_board_with_a_serial_port_passes(precision: Precision, tmp_path: Path)
         found = re.search(r"(/dev/\S+)", said)
         try:
             assert found, said
-            replay = malta.replay_on_target(GAINS, found[1], seconds=30)
+            replay = malta.firmware.replay_on_target(GAINS, found[1], seconds=30)
         finally:
             board.kill()
     assert replay.agrees

@@ -886,7 +886,7 @@ def test_it_prevents_touchdowns(during: str, counts: tuple[int, int, int]) -> No
 
 def test_faults_are_chosen_by_a_word_and_fly_with_their_own_engine() -> None:
     c = TARGETS["robust"].controller
-    for engine in (malta.engine_of_c(), "virtual machine"):
+    for engine in (malta.firmware.engine_of_c(), "virtual machine"):
         with pytest.raises(InputError, match="expected auto"):
             malta.experiment("commissioning", malta.plant_of(c.parameters), c, engine=engine)
     with pytest.raises(InputError, match="only"):

@@ -67,7 +67,7 @@ def test_bounds_that_contradict_or_are_narrower_are_written(
 ) -> None:
     """A proof that ran out of time is no reason; a better one is, and one that contradicts the file."""
     controller, path = designs["calibrated"].controller, tmp_path / "mine.json"
-    bound = malta.Margin(2.0, 2.5, 1.0, None, {}, {}, (), 0.0, "")
+    bound = malta.proof.Margin(2.0, 2.5, 1.0, None, {}, {}, (), 0.0, "")
     proven = replace(margins, robust=bound, uncertainty={"m": 0.2})
     malta.gains.write(controller, proven, path)
     for lower, upper, same in ((1.5, 2.5, True), (2.0, 2.6, True), (2.2, 2.5, False), (2.6, 2.7, False)):

@@ -12,9 +12,10 @@ import pytest
 from conftest import Run
 
 import malta
+from malta.identification import ExcitationPlan, Log
 from malta.identification.data_file import read_identified, write_data
 from malta.identification.excite import model_at, predicted_spectra
-from malta.simulation.references import interleaved_multisine
+from malta.simulation.excitation import interleaved_multisine
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant
@@ -32,13 +33,13 @@ def plant() -> Plant:
 
 
 @pytest.fixture(scope="module")
-def plan(plant: Plant) -> malta.ExcitationPlan:
+def plan(plant: Plant) -> ExcitationPlan:
     return malta.excite(malta.loop(plant, CONTROLLER), **SHORT)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def log(plan: malta.ExcitationPlan) -> malta.Log:
-    return malta.log_of(excited(plan, TRUE))
+def log(plan: ExcitationPlan) -> Log:
+    return malta.identification.log_of(excited(plan, TRUE))
 
 
 def changed(values: dict[str, float]) -> Plant:
@@ -46,14 +47,14 @@ def changed(values: dict[str, float]) -> Plant:
     return malta.plant_of(replace(par, **values))
 
 
-def excited(plan: malta.ExcitationPlan, values: dict[str, float], **options: Any) -> malta.Trajectory:
+def excited(plan: ExcitationPlan, values: dict[str, float], **options: Any) -> malta.simulation.Trajectory:
     scenario = malta.Scenario.excited(plan.signal, plan.duration, **options)
     run = malta.simulate(changed(values), CONTROLLER, scenario)
     assert run.verdict.completed
     return run
 
 
-def with_columns(log: malta.Log, **tables: Any) -> malta.Log:
+def with_columns(log: Log, **tables: Any) -> Log:
     return replace(log, columns={**log.columns, **tables}, sha256="")
 
 
@@ -70,7 +71,7 @@ def test_a_multisine_has_its_lines_and_no_others() -> None:
         interleaved_multisine(0.5, 4.0, 10.0, inputs=3, lines=10)
 
 
-def test_the_linear_loop_predicts_the_flight(plant: Plant, plan: malta.ExcitationPlan) -> None:
+def test_the_linear_loop_predicts_the_flight(plant: Plant, plan: ExcitationPlan) -> None:
     """Motion, currents and commands at the lines, against the simulation without noise."""
     run = excited(plan, {}, noise=0.0, quantize=False)
     N = round(2 * plan.signal.period / CONTROLLER.sample_time)
@@ -84,7 +85,7 @@ def test_the_linear_loop_predicts_the_flight(plant: Plant, plan: malta.Excitatio
     assert moved == pytest.approx(list(plan.motion.values()), rel=0.03)
 
 
-def test_parameters_are_within_their_intervals(log: malta.Log, plan: malta.ExcitationPlan) -> None:
+def test_parameters_are_within_their_intervals(log: Log, plan: ExcitationPlan) -> None:
     found = malta.identify(CONTROLLER, log, parameters=ASKED)
     truth = np.array([TRUE.get(name, 1.3805e-3) for name in ASKED])
     assert found.refusal == ""
@@ -96,7 +97,7 @@ def test_parameters_are_within_their_intervals(log: malta.Log, plan: malta.Excit
     assert found.half_widths[0] / truth[0] < 1.5 * plan.accuracy["K_A"]
 
 
-def test_without_names_those_are_found_that_the_log_tells(log: malta.Log) -> None:
+def test_without_names_those_are_found_that_the_log_tells(log: Log) -> None:
     found = malta.identify(CONTROLLER, log)
     assert not found.dropped.keys() & set(found.names)
     assert {"K_A", "K_B", "K_D", "I_xx"} <= set(found.names)
@@ -105,7 +106,7 @@ def test_without_names_those_are_found_that_the_log_tells(log: malta.Log) -> Non
     assert found.held["m"] == 0.36
 
 
-def test_only_ratios_are_found_without_a_mass(log: malta.Log) -> None:
+def test_only_ratios_are_found_without_a_mass(log: Log) -> None:
     with pytest.raises(malta.CheckError, match=r"only ratios of .*Name one as known, as --known m=0.36"):
         malta.identify(CONTROLLER, log, parameters=[*ASKED, "m", "F_c"])
     heavier = malta.identify(
@@ -116,17 +117,17 @@ def test_only_ratios_are_found_without_a_mass(log: malta.Log) -> None:
 
 
 @pytest.mark.parametrize("known", [{"I_xx": 1.45e-3, "I_yy": 1.45e-3}, {"l_S": 0.09}, {"K_D": 5.2}])
-def test_a_wrong_model_is_refused(log: malta.Log, known: dict[str, float]) -> None:
+def test_a_wrong_model_is_refused(log: Log, known: dict[str, float]) -> None:
     found = malta.identify(CONTROLLER, log, parameters=["K_A", "K_B"], known=known)
     assert "does not explain the log" in found.refusal
 
 
-def test_currents_that_are_a_sample_late_are_refused(log: malta.Log) -> None:
+def test_currents_that_are_a_sample_late_are_refused(log: Log) -> None:
     late = with_columns(log, i=np.roll(log.columns["i"], 1, axis=0))
     assert malta.identify(CONTROLLER, late, parameters=ASKED).chi2 > 10
 
 
-def test_logs_that_tell_nothing_are_refused(log: malta.Log) -> None:
+def test_logs_that_tell_nothing_are_refused(log: Log) -> None:
     y, k = log.columns["y"], log.samples
     stuck, clipped, missing = np.array(y), np.clip(y, -12e-6, 12e-6), np.array(y)
     stuck[k // 2 :, 1] = stuck[k // 2, 1]
@@ -167,7 +168,7 @@ def test_an_excitation_that_cannot_be_is_refused(plant: Plant, options: dict[str
         malta.excite(malta.loop(plant, CONTROLLER), **options)
 
 
-def test_a_few_missing_samples_are_bridged(log: malta.Log) -> None:
+def test_a_few_missing_samples_are_bridged(log: Log) -> None:
     y = np.array(log.columns["y"])
     y[[1000, 5000, 5001]] = np.nan
     whole = malta.identify(CONTROLLER, log, parameters=ASKED)
@@ -175,14 +176,14 @@ def test_a_few_missing_samples_are_bridged(log: malta.Log) -> None:
     assert (np.abs(found.values - whole.values) < 0.5 * whole.half_widths).all()
 
 
-def test_errors_of_sensors_are_parameters_too(plan: malta.ExcitationPlan) -> None:
+def test_errors_of_sensors_are_parameters_too(plan: ExcitationPlan) -> None:
     run = excited(plan, {}, sensor_errors={"gain_x1": 0.02})
-    found = malta.identify(CONTROLLER, malta.log_of(run), parameters=["K_A", "gain_x1"])
+    found = malta.identify(CONTROLLER, malta.identification.log_of(run), parameters=["K_A", "gain_x1"])
     assert found.refusal == ""
     assert found.values[1] == pytest.approx(0.02, abs=1e-3)
 
 
-def test_the_data_file_keeps_intervals(log: malta.Log, tmp_path: Path) -> None:
+def test_the_data_file_keeps_intervals(log: Log, tmp_path: Path) -> None:
     found = malta.identify(CONTROLLER, log, parameters=ASKED)
     path = write_data(found, tmp_path / "found.toml", gains=ROBUST, known={})
     data = read_identified(path)
@@ -201,35 +202,35 @@ def test_one_stroke_teaches_the_thrust(K_D: float) -> None:
     stroke = malta.Scenario.stroke(10e-3, noise=1.0, quantize=True)
     machine = changed({"K_D": K_D, "F_c": 0.6})
     before = malta.simulate(machine, CONTROLLER, stroke)
-    found = malta.learn(CONTROLLER, malta.log_of(before))
+    found = malta.learn(CONTROLLER, malta.identification.log_of(before))
     assert found.parameter == "K_D"
     assert found.after == pytest.approx(K_D, rel=0.01)
     after = malta.simulate(machine, found.controller, stroke)
-    errors = [malta.stroke_figures(run).axial_error for run in (before, after)]
+    errors = [malta.simulation.stroke_figures(run).axial_error for run in (before, after)]
     assert errors[1] < 0.5 * errors[0]
 
 
 def test_a_law_replays_its_own_log_and_no_other() -> None:
     run = malta.simulate(changed({"m": 0.4}), CONTROLLER, malta.Scenario.stroke(10e-3, noise=1.0))
-    log = malta.log_of(run)
-    found = malta.replay_law(CONTROLLER, log)
+    log = malta.identification.log_of(run)
+    found = malta.identification.replay_law(CONTROLLER, log)
     assert found.same
     assert found.rms["x1"] == pytest.approx(np.std(run.y[1000:, 0] - run.p[1000:, 0]), rel=0.3)
-    other = malta.replay_law(malta.gains.read("design/gains/calibrated.json"), log)
+    other = malta.identification.replay_law(malta.gains.read("design/gains/calibrated.json"), log)
     assert not other.same
     assert other.difference["f_D"] > 0.01
 
 
-def test_excited_flights_are_replayed_too(log: malta.Log) -> None:
+def test_excited_flights_are_replayed_too(log: Log) -> None:
     part = replace(log, t=log.t[:4000], columns={name: table[:4000] for name, table in log.columns.items()})
-    found = malta.replay_law(CONTROLLER, part)
+    found = malta.identification.replay_law(CONTROLLER, part)
     assert max(found.at_once.values()) < 1e-9
 
 
-def test_exported_laws_have_no_excitation(plan: malta.ExcitationPlan) -> None:
+def test_exported_laws_have_no_excitation(plan: ExcitationPlan) -> None:
     scenario = malta.Scenario.excited(plan.signal, 0.01)
     with pytest.raises(malta.InputError, match="excitation"):
-        malta.simulate(changed({}), CONTROLLER, scenario, engine=malta.engine_of_c())
+        malta.simulate(changed({}), CONTROLLER, scenario, engine=malta.firmware.engine_of_c())
     with pytest.raises(malta.InputError, match="excitation"):
         malta.simulate(changed({}), CONTROLLER, malta.Scenario.excited(lambda t: np.zeros((len(t), 2)), 0.01))
 
@@ -265,7 +266,9 @@ def test_intervals_cover(plant: Plant) -> None:
             name: getattr(plant.parameters, name) * random.uniform(0.9, 1.1) for name in ("K_A", "K_B", "K_D")
         }
         found = malta.identify(
-            CONTROLLER, malta.log_of(excited(plan, values, seed=7, run=k)), parameters=list(values)
+            CONTROLLER,
+            malta.identification.log_of(excited(plan, values, seed=7, run=k)),
+            parameters=list(values),
         )
         assert found.refusal == ""
         inside += int((np.abs(found.values - list(values.values())) < found.half_widths).sum())

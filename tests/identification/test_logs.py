@@ -17,14 +17,16 @@ CONTROLLER = malta.gains.read(ROBUST)
 
 
 @pytest.fixture(scope="module")
-def log() -> malta.Log:
+def log() -> malta.identification.Log:
     stroke = malta.Scenario.stroke(10e-3, duration=0.02, noise=1.0, quantize=True)
-    return malta.log_of(malta.simulate(malta.plant_of(CONTROLLER.parameters), CONTROLLER, stroke))
+    return malta.identification.log_of(
+        malta.simulate(malta.plant_of(CONTROLLER.parameters), CONTROLLER, stroke)
+    )
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".mat"])
-def test_a_log_is_read_as_it_was_written(log: malta.Log, suffix: str, tmp_path: Path) -> None:
-    found = malta.read_log(malta.write_log(log, tmp_path / f"log{suffix}"))
+def test_a_log_is_read_as_it_was_written(log: malta.identification.Log, suffix: str, tmp_path: Path) -> None:
+    found = malta.read_log(malta.identification.write_log(log, tmp_path / f"log{suffix}"))
     assert (found.machine, found.controller, found.sample_time) == ("tubular", "robust", 50e-6)
     assert len(found.sha256) == 64
     for group in ("y", "v", "i", "u", "reference", "excitation", "flags"):
@@ -33,8 +35,8 @@ def test_a_log_is_read_as_it_was_written(log: malta.Log, suffix: str, tmp_path: 
     assert found.signals["y"] == log.signals["y"]
 
 
-def test_a_log_says_nothing_of_the_truth(log: malta.Log, tmp_path: Path) -> None:
-    heading = malta.write_log(log, tmp_path / "log.csv").read_text().split("\n")[5].split(",")
+def test_a_log_says_nothing_of_the_truth(log: malta.identification.Log, tmp_path: Path) -> None:
+    heading = malta.identification.write_log(log, tmp_path / "log.csv").read_text().split("\n")[5].split(",")
     assert heading[:6] == ["t [s]", "x1 [m]", "y1 [m]", "x2 [m]", "y2 [m]", "z [m]"]
     assert not any("hat" in name or "alpha" in name for name in heading)
 
@@ -43,7 +45,7 @@ def test_currents_are_those_that_the_sensors_read() -> None:
     par = replace(CONTROLLER.parameters, s_i=5e-3, q_i=1e-3)
     scenario = malta.Scenario("hold", 0.05, malta.references.hold, noise=1.0)
     run = malta.simulate(malta.plant_of(par), CONTROLLER, scenario)
-    off = malta.log_of(run).columns["i"] - run.i
+    off = malta.identification.log_of(run).columns["i"] - run.i
     # Three phases of 5 mA each, in amplitude-invariant axes: sqrt(2/3), and over three rows again sqrt(1/3) or more.
     assert 1e-3 < off[:, 2].std() < 5e-3
     assert abs(off[:, 2].mean()) < 3e-4
@@ -82,7 +84,7 @@ def test_what_is_no_log_is_refused(text: str, found: str, tmp_path: Path) -> Non
             malta.read_log(tmp_path / f"bad{suffix}")
 
 
-def test_gaps_stuck_and_clipped_sensors_are_seen(log: malta.Log) -> None:
+def test_gaps_stuck_and_clipped_sensors_are_seen(log: malta.identification.Log) -> None:
     y, t = np.array(log.columns["y"]), np.array(log.t)
     y[:, 4] += 1e-3 * np.sin(300 * t)
     y[100:, 0] = y[100, 0]

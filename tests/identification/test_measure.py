@@ -14,6 +14,7 @@ from conftest import Run
 from figure_checks import defects
 
 import malta
+from malta.identification import ExcitationPlan, Log, Measurement
 from malta.identification import measure as measuring
 from malta.identification.lines import _interpolate
 from malta.identification.measure import cut_loop
@@ -36,23 +37,23 @@ def changed(values: dict[str, float]) -> Plant:
     return malta.plant_of(replace(par, **values))
 
 
-def flown(plan: malta.ExcitationPlan, values: dict[str, float], **options: Any) -> malta.Log:
+def flown(plan: ExcitationPlan, values: dict[str, float], **options: Any) -> Log:
     scenario = malta.Scenario.excited(plan.signal, plan.duration, **options)
-    return malta.log_of(malta.simulate(changed(values), CONTROLLER, scenario))
+    return malta.identification.log_of(malta.simulate(changed(values), CONTROLLER, scenario))
 
 
 @pytest.fixture(scope="module")
-def plan() -> malta.ExcitationPlan:
+def plan() -> ExcitationPlan:
     return malta.excite(LOOP, **SHORT)
 
 
 @pytest.fixture(scope="module")
-def log(plan: malta.ExcitationPlan) -> malta.Log:
+def log(plan: ExcitationPlan) -> Log:
     return flown(plan, TRUE)
 
 
 @pytest.fixture(scope="module")
-def found(log: malta.Log) -> malta.Measurement:
+def found(log: Log) -> Measurement:
     return malta.measure(CONTROLLER, log)
 
 
@@ -62,7 +63,7 @@ def true_sensitivity(w: Any, values: dict[str, float] = TRUE) -> Any:
 
 def test_the_loop_that_is_cut_is_that_of_malta_loop() -> None:
     w = 2 * np.pi * np.geomspace(1.0, 5e3, 20)
-    cut, nominal = cut_loop(LOOP, w), malta.loop_curves(LOOP, w=w).responses
+    cut, nominal = cut_loop(LOOP, w), malta.loops.loop_curves(LOOP, w=w).responses
     S, SP = cut.S, cut.S @ cut.P
     assert pytest.approx(LOOP.sensitivity(w), abs=1e-9) == S
     assert pytest.approx(nominal.SP, abs=1e-9 * np.abs(nominal.SP).max()) == SP
@@ -73,7 +74,9 @@ def share_within(curve: Curve, truth: Any, factor: float = 1.96) -> float:
     return float((np.abs(curve.size - np.abs(truth)) < factor * curve.deviation).mean())
 
 
-def test_bands_hold_the_truth_of_a_machine_that_the_gain_file_does_not_know(found: malta.Measurement) -> None:
+def test_bands_hold_the_truth_of_a_machine_that_the_gain_file_does_not_know(
+    found: Measurement,
+) -> None:
     S = true_sensitivity(found.w)
     s = np.einsum("kpp->kp", S)
     for curve, truth in ((found.S, s), (found.T, 1 - s), (found.L, 1 / s - 1)):
@@ -88,7 +91,7 @@ def test_bands_hold_the_truth_of_a_machine_that_the_gain_file_does_not_know(foun
     assert found.zones == dict.fromkeys(found.sensors, "A")
 
 
-def test_disk_margins_are_those_of_the_machine_at_the_lines(found: malta.Measurement) -> None:
+def test_disk_margins_are_those_of_the_machine_at_the_lines(found: Measurement) -> None:
     S = true_sensitivity(found.w)
     for i, (disk, low) in enumerate(found.disks[:-1]):
         truth = 1 / np.abs(S[:, i, i] - 0.5).max()
@@ -97,7 +100,7 @@ def test_disk_margins_are_those_of_the_machine_at_the_lines(found: malta.Measure
     assert found.disks[-1][0].size <= min(disk.size for disk, _ in found.disks[:-1])
 
 
-def test_the_plan_expects_the_bands_that_are_found(plan: malta.ExcitationPlan) -> None:
+def test_the_plan_expects_the_bands_that_are_found(plan: ExcitationPlan) -> None:
     expected = malta.plan_measurement(LOOP, **SHORT)
     nominal = malta.measure(CONTROLLER, flown(plan, {}))
     ratio = 1.96 * nominal.S.deviation[:, :4] / expected.half_width[:, :4]
@@ -112,7 +115,7 @@ def test_the_plan_expects_the_bands_that_are_found(plan: malta.ExcitationPlan) -
         malta.plan_measurement(LOOP, width=-1.0)
 
 
-def test_the_verdict_is_of_the_tube(log: malta.Log, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_verdict_is_of_the_tube(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measuring, "SAMPLES", 3)
     wide = malta.measure(CONTROLLER, log, uncertainty={"K_A": 0.1, "K_B": 0.1, "K_D": 0.1})
     assert wide.refusal == ""
@@ -141,7 +144,7 @@ def test_interpolation_says_what_it_may_miss() -> None:
     assert error[known].max() == 0
 
 
-def test_logs_that_tell_nothing_are_refused(log: malta.Log) -> None:
+def test_logs_that_tell_nothing_are_refused(log: Log) -> None:
     columns, k = dict(log.columns), log.samples
     still = replace(log, columns=columns | {"excitation": 0 * columns["excitation"]})
     other = replace(log, columns=columns | {"v": 1.05 * columns["v"]})
@@ -165,7 +168,7 @@ def test_logs_that_tell_nothing_are_refused(log: malta.Log) -> None:
         malta.measure(CONTROLLER, log, uncertainty={"K_X": 0.1})
 
 
-def test_a_measured_loop_is_drawn(found: malta.Measurement) -> None:
+def test_a_measured_loop_is_drawn(found: Measurement) -> None:
     figure = measured_figure(found)
     assert len(figure.axes) == 20
     assert defects(figure) == []

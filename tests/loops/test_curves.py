@@ -219,7 +219,7 @@ def same(found: Any, wanted: Any, tolerance: float = 1e-7) -> bool:
 @pytest.mark.parametrize("name", ["calibrated", pytest.param("planar_pid", marks=pytest.mark.slow)])
 def test_responses_are_those_of_the_systems(name: str) -> None:
     plant, controller = shipped(name)
-    systems = malta.loop_systems(plant, controller)
+    systems = malta.loops.loop_systems(plant, controller)
     w = np.array([30.0, 500.0, 4000.0])
     found = respond(linear_loop(plant, controller), w)
     z = np.exp(1j * w * controller.sample_time)
@@ -315,7 +315,7 @@ def test_steps_are_those_of_python_control(name: str) -> None:
 
 def test_loads_are_those_of_recovery(machine: Machine) -> None:
     answer = loop_steps(linear_loop(*machine)).loads
-    for column, found in enumerate(malta.recovery(*machine)):
+    for column, found in enumerate(malta.loops.recovery(*machine)):
         for k, deviation in enumerate(found.outputs):
             largest = float(answer.largest[k, column])
             assert largest == pytest.approx(deviation.largest, rel=1e-6, abs=1e-15)

@@ -172,10 +172,10 @@ def test_one_loop_answers_all_questions() -> None:
     assert malta.loop(plant, c, z=5e-3) is malta.loop(plant, c, z=5e-3)
     assert one.stable
     assert one.left_out == ""
-    curves = malta.loop_curves(one)
+    curves = malta.loops.loop_curves(one)
     assert distance(one.poles, curves.poles["closed_loop"]) < 1e-9
     w = np.array([10.0, 300.0, 3000.0])
-    responses = malta.loop_curves(one, w=w).responses
+    responses = malta.loops.loop_curves(one, w=w).responses
     np.testing.assert_allclose(one.loop_gain(w), responses.L, rtol=0, atol=1e-7 * np.abs(responses.L).max())
     np.testing.assert_allclose(one.sensitivity(w), responses.S, rtol=0, atol=1e-7)
     np.testing.assert_allclose(one.sampled.sensitivity(w), responses.S, rtol=0, atol=1e-7)
@@ -184,12 +184,12 @@ def test_one_loop_answers_all_questions() -> None:
     assert ours.upper == pytest.approx(there.upper, rel=1e-9)
     assert ours.lower == pytest.approx(there.lower, rel=2e-3)
     moved = one.sampled.answer().largest[0, 0]
-    for found in (malta.recovery(one), malta.recovery(heavy, c, position=5e-3)):
+    for found in (malta.loops.recovery(one), malta.loops.recovery(heavy, c, position=5e-3)):
         assert found[0].outputs[0].largest == moved
-    systems = malta.loop_systems(one)
+    systems = malta.loops.loop_systems(one)
     assert distance(one.poles, np.log(systems.S.poles()) * 20e3) < 1e-6
     with pytest.raises(malta.InputError, match="found one beside a Loop"):
-        malta.recovery(one, c)
+        malta.loops.recovery(one, c)
 
 
 def test_what_a_loop_leaves_out_is_said() -> None:

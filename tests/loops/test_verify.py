@@ -188,7 +188,7 @@ def test_names_of_the_version_before_say_what_to_write() -> None:
     spec = malta.read_design("examples/ball/design/ball.toml")
     controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     with pytest.warns(DeprecationWarning, match=r"malta\.Margins goes: write malta\.LoopReport"):
-        assert malta.Margins is malta.LoopReport
+        assert malta.Margins is malta.margins.LoopReport
     with pytest.warns(DeprecationWarning, match="stages=True"):
         found = malta.robustness(spec.plant, controller, {"m": 0.2}, proof=False)
     assert [link.name for link in found.chain] == ["LQR", "LQI", "LQG", "LQGI", "sampled"]

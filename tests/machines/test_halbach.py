@@ -23,7 +23,7 @@ from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import published_value
 from malta.model.parameters import values_of
-from malta.synthesis.kalman import sampled_model
+from malta.synthesis.filters import sampled_model
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -51,7 +51,7 @@ def emf() -> Parameters:
 
 @pytest.fixture(scope="module")
 def printed() -> dict[str, Any]:
-    return malta.published("data/halbach.toml")
+    return malta.model.published("data/halbach.toml")
 
 
 def _array(value: Any) -> FloatArray:

@@ -39,7 +39,7 @@ from malta.simulation.experiments.catalogue import cases_of, experiment
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller, linear_law
-from malta.synthesis.kalman import sampled_model
+from malta.synthesis.filters import sampled_model
 from malta.synthesis.riccati import sample_noise
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ SCENARIOS = ("step", "stairs", "ramp", "force", "budget", "identify")
 
 @pytest.fixture(scope="module")
 def printed() -> dict[str, Any]:
-    return malta.published(ROOT / "data" / "halbach.toml")
+    return malta.model.published(ROOT / "data" / "halbach.toml")
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,7 @@ def par() -> Parameters:
 @pytest.fixture(scope="module")
 def paper(par: Parameters) -> Any:
     """The part of the evidence that needs no design."""
-    printed = malta.published("data/halbach.toml")
+    printed = malta.model.published("data/halbach.toml")
     return SimpleNamespace(par=par, value=lambda key: published_value(printed, key))
 
 

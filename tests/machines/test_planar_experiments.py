@@ -550,7 +550,7 @@ def test_simulate_json(run: Run) -> None:
 def test_a_campaign(lqg: Design, tmp_path: Path) -> None:
     """Machines whose coils, magnets and masses differ: all arrive; the unknown pitch tilts by some urad."""
     spread = {"m": 0.05, "B_r": 0.05, "I_x": 0.1, "coil_pitch": 0.002}
-    found = malta.campaign(malta.Plan(lqg.controller, "step", spread, samples=8), tmp_path)
+    found = malta.campaign(malta.campaigns.Plan(lqg.controller, "step", spread, samples=8), tmp_path)
     assert found.batch.completed.all()
     assert 1e-6 < found.batch.deviation[:, 3].max() < 20e-6
 

@@ -260,12 +260,12 @@ def test_a_mover_out_of_balance_hangs_as_a_pendulum() -> None:
 
 
 @pytest.fixture(scope="module")
-def controller() -> malta.Controller:
+def controller() -> malta.synthesis.Controller:
     return malta.gains.read(GAINS)
 
 
 @pytest.fixture(scope="module")
-def figure(controller: malta.Controller) -> Figure13:
+def figure(controller: malta.synthesis.Controller) -> Figure13:
     return figure_13(controller, 3.25, 20e-6)
 
 
@@ -323,7 +323,7 @@ def test_both_engines_agree_on_unlike_modules(controller: Any, fidelity: Any) ->
 
 def test_a_campaign_draws_modules_that_differ(controller: Any) -> None:
     """Spreads of differences are in their own unit, about 0; a run of the batch is the machine simulated alone."""
-    plan = malta.Plan(
+    plan = malta.campaigns.Plan(
         controller,
         spread={"m": 0.1, "dK_A": 0.05, "e_y": 2e-5, "c_x": 1e-4},
         samples=16,

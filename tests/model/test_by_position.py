@@ -15,7 +15,7 @@ import malta
 from malta import gains
 from malta.errors import InputError
 from malta.loops.sampled_loops import machine_loop
-from malta.synthesis.kalman import kalman, positions_from, sampled_filter
+from malta.synthesis.filters import kalman, positions_from, sampled_filter
 from malta.synthesis.lqg import integral_weight, lqg, lqi, weights_of
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Spec, Weights
@@ -216,7 +216,7 @@ def test_sums_wait_while_the_reference_moves(flagship: Flagship) -> None:
     other = malta.plant_of(replace(par, m=1.2 * par.m, K_D=0.8 * par.K_D))  # type: ignore[attr-defined]
     eager = replace(shipped, pause=np.zeros(0))
     overshoot = [
-        malta.stroke_figures(
+        malta.simulation.stroke_figures(
             malta.simulate(other, c, malta.Scenario.stroke(noise=0.0, quantize=False))
         ).overshoot
         for c in (shipped, eager)

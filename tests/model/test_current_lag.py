@@ -19,7 +19,7 @@ from malta.loops.sampled_loops import machine_loop, sampled_loop
 from malta.margins.verify import controller_poles
 from malta.simulation.inputs import lagging_references
 from malta.synthesis.controller import Controller
-from malta.synthesis.kalman import with_lags
+from malta.synthesis.filters import with_lags
 from malta.synthesis.lqg import gains, integral_weight, lqg, weights
 from malta.synthesis.riccati import add_integrals, delay_inputs, eigenvalues, sample, sample_cost
 from malta.synthesis.spec import Spec
@@ -92,7 +92,7 @@ def test_a_constant_disturbance_is_taken_off_by_an_observer_too(made: Made) -> N
     observing = replace(w, q_i=np.zeros(5), drift_variance=np.full(5, 1e-3))
     c = lqg(made.model, observing, TS, delay=1, current_lag=True)
     assert (c.lagging, c.delay, c.observed) == (1, 1, 1)
-    found = malta.recovery(made.spec.plant, c)[0].outputs[0]
+    found = malta.loops.recovery(made.spec.plant, c)[0].outputs[0]
     assert abs(found.final) < 1e-6 * found.largest
     assert math.isfinite(found.settled)
 
@@ -148,9 +148,9 @@ def test_the_references_of_lagging_forces_are_what_the_model_makes_of_the_comman
 def test_a_stroke_goes_as_with_the_flagship(made: Made, estimator: str) -> None:
     """The references of all states follow the stroke: what is left is cogging and gravity's coupling."""
     scenario = malta.Scenario.stroke(fidelity="force", noise=0.0, quantize=False, estimator=estimator)
-    figures = malta.stroke_figures(malta.simulate(made.spec.plant, made.controller, scenario))
+    figures = malta.simulation.stroke_figures(malta.simulate(made.spec.plant, made.controller, scenario))
     shipped = malta.gains.read(ROOT / "design" / "gains" / "robust.json")
-    flown = malta.stroke_figures(malta.simulate(made.spec.plant, shipped, scenario))
+    flown = malta.simulation.stroke_figures(malta.simulate(made.spec.plant, shipped, scenario))
     assert figures.axial_error < 1.2 * flown.axial_error
     assert max(figures.radial.values()) < 1.2 * max(flown.radial.values())
 

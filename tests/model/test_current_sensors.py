@@ -26,7 +26,7 @@ SMALL = 1e-12  # A
 
 
 @pytest.fixture(scope="module")
-def controller() -> malta.Controller:
+def controller() -> malta.synthesis.Controller:
     return malta.gains.read("design/gains/calibrated.json")
 
 

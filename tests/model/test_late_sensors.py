@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from conftest import Run, one_sentence
@@ -37,7 +38,7 @@ Ts = 50e-6
 
 
 @pytest.fixture(scope="module")
-def controller() -> malta.Controller:
+def controller() -> malta.synthesis.Controller:
     return malta.gains.read(GAINS)
 
 
@@ -142,7 +143,7 @@ def test_lags_multiply_the_transfer_function(n: int, p: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     A, B, C = rng.normal(size=(n, n)), rng.normal(size=(n, 2)), rng.normal(size=(p, n))
     lag = tuple(float(rng.choice([0.0, rng.uniform(0.1, 2)])) for _ in range(p))
-    longer = [np.array(malta.model.sensors.ca.DM(M)) for M in with_lags(LateSensors(lag, 0.0), A, B, C)]
+    longer = [np.array(ca.DM(M)) for M in with_lags(LateSensors(lag, 0.0), A, B, C)]
     s = complex(*rng.normal(size=2)) * 3
     short = C @ np.linalg.solve(s * np.eye(n) - A, B)
     found = longer[2] @ np.linalg.solve(s * np.eye(len(longer[0])) - longer[0], longer[1])

@@ -72,7 +72,7 @@ def _with(design: Design, **parameters: float) -> Plant:
     return malta.plant_of(replace(design.spec.parameters, **parameters))
 
 
-def _under_way(run: malta.Trajectory, series: FloatArray) -> FloatArray:
+def _under_way(run: malta.simulation.Trajectory, series: FloatArray) -> FloatArray:
     """What the half-bridges do at each sample: what was commanded one sample of computation before."""
     assert run.plant.actuator.delay(Ts) == 1
     return np.vstack([series[:1], series[:-1]])
@@ -397,7 +397,7 @@ def test_copper_loss_is_the_same_in_phases_axes_and_forces(calibrated: Design) -
 # Faults
 
 
-def _held_command(run: malta.Trajectory, column: int) -> FloatArray:
+def _held_command(run: malta.simulation.Trajectory, column: int) -> FloatArray:
     """What each force followed from sample to sample, recovered from its exact lag."""
     decay = math.exp(-3000 * Ts)
     return np.asarray((run.force[1:, column] - decay * run.force[:-1, column]) / (1 - decay))
@@ -551,7 +551,7 @@ def _rest(par: Any) -> float:
     return float((par.m * par.g + 2 * par.K_A * par.r_max) / (2 * par.k_t - 2 * par.K_A))
 
 
-def _energy(plant: Plant, par: Any, run: malta.Trajectory) -> FloatArray:
+def _energy(plant: Plant, par: Any, run: malta.simulation.Trajectory) -> FloatArray:
     """Kinetic and potential, J, and what the bearings are compressed by."""
     x = ca.SX.sym("x", 12)
     energy = np.array(ca.Function("energy", [x], [tubular.energy(par, x)]).map(len(run.t))(run.x.T)).ravel()
@@ -737,7 +737,7 @@ def test_several_changes_take_effect_in_their_order(calibrated: Design) -> None:
 
 def _corrected(
     design: Design, update: Callable[[float, FloatArray], FloatArray], every: float = 1e-3
-) -> malta.Trajectory:
+) -> malta.simulation.Trajectory:
     scenario = _hold(0.02, fidelity="force", correction=Correction(every, update))
     return malta.simulate(design.plant, design.controller, scenario)
 
@@ -861,7 +861,7 @@ def test_the_smaller_limit_counts_of_the_machine_and_of_its_gain_file(
     assert run.limits == ("current limit",)
 
 
-def _largest_phase_voltage(run: malta.Trajectory, fidelity: str) -> float:
+def _largest_phase_voltage(run: malta.simulation.Trajectory, fidelity: str) -> float:
     """V, of all phases; from the axes their upper bound, by which they are limited."""
     if fidelity == "phase":
         return float(np.abs((run.duty - 0.5) * run.link).max())

@@ -21,6 +21,7 @@ from malta.gains import encodings
 from malta.loops.sampled_loops import machine_system
 from malta.model.plant import Plant, Signal
 from malta.simulation.experiments.catalogue import jump
+from malta.synthesis.pid import pid as design_pid
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -140,7 +141,7 @@ def test_simulation_is_the_step_response_of_the_loop(motor: Plant, driven: Contr
     scenario = malta.Scenario("step", 0.4, partial(jump, output=0, size=1e-3, at=9.5e-3), fidelity="force")
     run = malta.simulate(motor, driven, scenario)
     first = int(np.argmax(run.reference[:, 0] > 0))
-    response = control.step_response(malta.loop_systems(motor, driven).tracking, run.t[:-first])
+    response = control.step_response(malta.loops.loop_systems(motor, driven).tracking, run.t[:-first])
     assert np.abs(run.p[first:, 0] - 1e-3 * response.outputs.ravel()).max() < 1e-12 * 1e-3
     assert run.p[-1, 0] == pytest.approx(0.44e-3, abs=0.01e-3)
 
@@ -158,7 +159,7 @@ def test_the_reference_is_the_rest_with_these_outputs(motor: Plant, driven: Cont
 
 
 def test_a_campaign_varies_the_entries(driven: Controller) -> None:
-    plan = malta.Plan(driven, "step", {"k": 0.2}, samples=24, options={"time": 0.1})
+    plan = malta.campaigns.Plan(driven, "step", {"k": 0.2}, samples=24, options={"time": 0.1})
     found = malta.campaign(plan)
     assert found.rate.passed == 24
     one, values = found.batch.deviation[5, 0], dict(zip(found.names, found.values[5], strict=True))
@@ -213,7 +214,7 @@ def test_what_needs_positions_and_rates_says_so(motor: Plant, driven: Controller
     pid = malta.synthesis.spec.Pid(np.ones(1), np.ones(1), np.ones(1), 0.0)
     asked: dict[str, Callable[[], object]] = {
         "stiffness": lambda: model.stiffness,
-        "pid": lambda: malta.synthesis.lqg.pid(model, pid, 1e-3),
+        "pid": lambda: design_pid(model, pid, 1e-3),
         "estimator kalman": lambda: malta.simulate(motor, driven, kalman),
         "feedforward attraction": lambda: malta.simulate(motor, driven, attraction),
     }

@@ -221,7 +221,7 @@ def test_nothing_is_proven_at_a_command_that_is_no_formula() -> None:
     A, B, C = (M[0] for M in system.at(system.nominal))
     inverse, w, fast = np.linalg.inv(B[2:]), 60.0, 2e3  # PD with a fast filter
     K, D, one = inverse @ (A[2:, :2] + w**2 * np.eye(2)), 1.4 * w * inverse, np.eye(2)
-    law = malta.Compensator(-fast * one, fast * one, fast * D, -K - fast * D)
+    law = malta.proof.Compensator(-fast * one, fast * one, fast * D, -K - fast * D)
     for refused in (system, replace(system, approximate="")):  # and by the operation that no enclosure knows
         found = malta.robust_margin(refused, law, {"m": 0.2, "C": 0.2}, time=1.0)
         assert found.lower is None

@@ -28,43 +28,49 @@ def spec() -> malta.Spec:
 
 
 @pytest.fixture(scope="module")
-def law(spec: malta.Spec) -> malta.Controller:
+def law(spec: malta.Spec) -> malta.synthesis.Controller:
     return malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
 
 
-def _plan(c: malta.Controller, samples: int = 8) -> malta.Plan:
-    return malta.Plan(c, "disturbance", {"m": 0.1}, samples=samples, options=SHORT)
+def _plan(c: malta.synthesis.Controller, samples: int = 8) -> malta.campaigns.Plan:
+    return malta.campaigns.Plan(c, "disturbance", {"m": 0.1}, samples=samples, options=SHORT)
 
 
 # each with a word of its text that stands for a figure
-RESULTS: dict[str, tuple[Callable[[malta.Spec, malta.Controller], Any], str]] = {
+RESULTS: dict[str, tuple[Callable[[malta.Spec, malta.synthesis.Controller], Any], str]] = {
     "spec": (lambda s, _: s, "LQG, sampled-data, every 200 us, delay 1"),
     "plant": (lambda s, _: s.plant, "states         q q_dot"),
     "loop": (lambda s, c: malta.loop(s.plant, c), "stable"),
-    "systems": (lambda s, c: malta.loop_systems(s.plant, c), "1 inputs, 1 outputs"),
-    "curves": (lambda s, c: malta.loop_curves(s.plant, c), "largest |S|  1.57"),
+    "systems": (lambda s, c: malta.loops.loop_systems(s.plant, c), "1 inputs, 1 outputs"),
+    "curves": (lambda s, c: malta.loops.loop_curves(s.plant, c), "largest |S|  1.57"),
     "margins": (lambda s, c: malta.verify(malta.linearize(s.plant, s.plant.at()), c), "delay margin, smallest [µs]"),
     "margin": (lambda s, c: malta.loop(s.plant, c).margin({"m": 0.2}), "proven 3"),
-    "recovery": (lambda s, c: malta.recovery(s.plant, c, {"push": {"w": 0.01}})[0], "y  moves"),
+    "recovery": (lambda s, c: malta.loops.recovery(s.plant, c, {"push": {"w": 0.01}})[0], "y  moves"),
     "stages": (lambda s, c: malta.verify(s.plant, c, {"m": 0.2}, stages=True), "proven 3"),
     "run": (lambda s, c: malta.experiment("disturbance", s.plant, c, size=0.1, **SHORT).run, "completed at 20 ms"),
     "experiment": (lambda s, c: malta.experiment("disturbance", s.plant, c, size=0.1, **SHORT), "y moves by"),
     "campaign": (lambda _, c: malta.campaign(_plan(c), workers=1), "8 of 8: 100 %"),
-    "summary": (lambda _, c: malta.summarize(_plan(c), workers=1), "8 of 8: 100 %"),
+    "summary": (lambda _, c: malta.campaigns.summarize(_plan(c), workers=1), "8 of 8: 100 %"),
     "batch": (lambda _, c: malta.campaign(_plan(c), workers=1).batch, "8 of 8 runs"),
     "rare": (
-        lambda _, c: malta.rare_event(_plan(c, 2000), malta.limit_of(_plan(c), "deviation-y", 1e-9), workers=1),
+        lambda _, c: malta.campaigns.rare_event(
+            _plan(c, 2000), malta.campaigns.limit_of(_plan(c), "deviation-y", 1e-9), workers=1
+        ),
         "probability  1, ",
     ),
     "tolerances": (
-        lambda _, c: malta.tolerances(_plan(c), malta.limit_of(_plan(c), "touchdown"), 0.9, workers=1),
+        lambda _, c: malta.campaigns.tolerances(
+            _plan(c), malta.campaigns.limit_of(_plan(c), "touchdown"), 0.9, workers=1
+        ),
         "m      9.5 times, 8 of 8",
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", RESULTS)
-def test_a_result_prints_itself_in_ten_lines(name: str, spec: malta.Spec, law: malta.Controller) -> None:
+def test_a_result_prints_itself_in_ten_lines(
+    name: str, spec: malta.Spec, law: malta.synthesis.Controller
+) -> None:
     made, word = RESULTS[name]
     result = made(spec, law)
     text = repr(result)
@@ -80,10 +86,10 @@ def test_the_flagship_stays_within_ten_lines() -> None:
     """Five sensors, eleven figures: what does not fit is counted, and stands in the notebook's table."""
     c = malta.gains.read("design/gains/robust.json")
     plant = malta.plant_of(c.parameters)
-    curves = malta.loop_curves(plant, c)
+    curves = malta.loops.loop_curves(plant, c)
     assert "largest |S|  2.44 at 2.17e+03 rad/s" in repr(curves)
     assert curves.description.html.count("<svg") == 1
-    for result in (plant, malta.loop(plant, c), malta.loop_systems(plant, c), curves):
+    for result in (plant, malta.loop(plant, c), malta.loops.loop_systems(plant, c), curves):
         assert len(repr(result).splitlines()) <= LINES
         assert max(len(line) for line in repr(result).splitlines()) <= COLUMNS
 

@@ -29,12 +29,12 @@ FOLDERS = ("data", "design", "examples")  # that examples read
 # The examples that take longest, compilers included; the others together take some two seconds of processor time.
 SLOW = {
     "malta.app_widget",
-    "malta.engine_of_c",
+    "malta.firmware.engine_of_c",
     "malta.export_c",
     "malta.export_fmu",
-    "malta.fastest_stroke",
+    "malta.simulation.fastest_stroke",
     "malta.ledger",
-    "malta.replayed",
+    "malta.simulation.replayed",
     "malta.report.CampaignFigures",
     "malta.report.campaign",
     "malta.report.chain_figure",
@@ -63,7 +63,7 @@ SLOW = {
     "malta.report.tolerance_sentence",
     "malta.report.tolerance_table",
     "malta.report.worst_figure",
-    "malta.sensitivity",
+    "malta.campaigns.sensitivity",
     "malta.tune",
 }
 WIDEST = 86  # letters of an example's line, prompt and all, that a page shows without scrolling
@@ -158,7 +158,7 @@ def test_a_missing_and_an_invented_parameter_are_found() -> None:
     """The checks above can fail."""
     without_wanted = "Do it.\n\nplan, limit : of it\nother : nothing\n    more : text"
     assert _explained(without_wanted) == {"plan", "limit", "other"}
-    needed, allowed = _parameters(malta.tolerances)
+    needed, allowed = _parameters(malta.campaigns.tolerances)
     assert {"wanted"} <= needed - _explained(without_wanted)
     assert _explained(without_wanted) - needed - allowed == {"other"}
 

@@ -56,7 +56,7 @@ def test_backward_euler_separates_on_its_own_model(designs: dict[str, Design]) -
     design = designs["table2"]
     c = design.controller
     A, C, Ts = design.model.A, design.model.C, c.sample_time
-    L = malta.kalman(design.model, design.spec.weights)
+    L = malta.synthesis.kalman(design.model, design.spec.weights)
     implicit = np.linalg.inv(
         np.eye(10) - Ts * (A - L @ C)
     )  # xi_hat = implicit (xi_hat_old + Ts B v + Ts L y)

@@ -36,7 +36,7 @@ def test_table_IV_alone_gives_other_poles_than_table_I() -> None:
 
 def test_lqr_of_table_II_as_plain_SI(designs: dict[str, Design]) -> None:
     design = designs["table2"]
-    K = malta.lqr(design.model, design.spec.weights)
+    K = malta.synthesis.lqr(design.model, design.spec.weights)
     poles = np.sort(np.linalg.eigvals(design.model.A - design.model.B @ K).real)
     expected = [-255.32, -255.32, -225.22, -225.22, -212.80, -212.80, -97.20, -97.20, -4.70, -1.02]
     assert poles == pytest.approx(expected, abs=0.005)
@@ -46,7 +46,7 @@ def test_lqr_of_table_II_with_table_IV(designs: dict[str, Design]) -> None:
     weights = designs["table2"].spec.weights
     plant = malta.plant_of(malta.read("data/tubular.toml", preset="table4"))
     model = malta.linearize(plant, plant.at())
-    poles = np.sort(np.linalg.eigvals(model.A - model.B @ malta.lqr(model, weights)).real)
+    poles = np.sort(np.linalg.eigvals(model.A - model.B @ malta.synthesis.lqr(model, weights)).real)
     expected = [-257.35, -257.35, -221.42, -221.42, -209.00, -209.00, -96.43, -96.43]
     assert poles[:8] == pytest.approx(expected, abs=0.005)
 
@@ -54,7 +54,7 @@ def test_lqr_of_table_II_with_table_IV(designs: dict[str, Design]) -> None:
 def test_table_II_integrators_settle_in_minutes(designs: dict[str, Design]) -> None:
     design = designs["table2"]
     A, B, C = design.model.A, design.model.B, design.model.C
-    K, Ki = malta.lqi(design.model, design.spec.weights)
+    K, Ki = malta.synthesis.lqi(design.model, design.spec.weights)
     poles = np.linalg.eigvals(np.block([[A - B @ K, B @ Ki], [-C, np.zeros((5, 5))]]))
     slow = np.sort(poles.real)[-4:]
     assert slow == pytest.approx([-0.0022, -0.0022, -0.0010, -0.0010], abs=5e-5)
@@ -64,7 +64,7 @@ def test_table_II_integrators_settle_in_minutes(designs: dict[str, Design]) -> N
 
 def test_table_II_kalman_poles(designs: dict[str, Design]) -> None:
     design = designs["table2"]
-    L = malta.kalman(design.model, design.spec.weights)
+    L = malta.synthesis.kalman(design.model, design.spec.weights)
     poles = np.linalg.eigvals(design.model.A - L @ design.model.C)
     expected = [-220.9 + 29.8j, -220.2 + 24.0j, -163.5 + 43.9j, -161.5 + 35.6j, -28.02 + 28.02j]
     assert np.sort_complex(poles[poles.imag > 0]) == pytest.approx(expected, abs=0.06)
@@ -86,7 +86,7 @@ def test_the_published_margin_needs_four_times_the_stiffness(designs: dict[str, 
     """K1/k = 2 with plain SI weights, 4 on the calibrated bases; then w_n is the bandwidth of about 400 rad/s."""
     for name, ratio in (("table2", 2.0), ("calibrated", 4.0)):
         design = designs[name]
-        K = malta.lqr(design.model, design.spec.weights)
+        K = malta.synthesis.lqr(design.model, design.spec.weights)
         k = np.diag(design.model.stiffness)
         K1 = np.diag(design.model.force_map @ K[:, :5])
         radial = [0, 1, 3, 4]
@@ -98,7 +98,7 @@ def test_the_published_margin_needs_four_times_the_stiffness(designs: dict[str, 
 
 def test_calibrated_bases_are_what_calibrate_solves(designs: dict[str, Design]) -> None:
     design = designs["calibrated"]
-    solved = malta.calibrate(design.model, design.spec.weights, stiffness_ratio=4.0)
+    solved = malta.synthesis.calibrate(design.model, design.spec.weights, stiffness_ratio=4.0)
     assert design.spec.weights.q_base == pytest.approx(solved.q_base, rel=1e-5)
     assert design.spec.weights.q_i_base == pytest.approx(solved.q_i_base, rel=1e-5)
 
@@ -117,7 +117,7 @@ def test_bandwidth_is_about_400_by_one_definition_at_least(design: Design, publi
 
 def test_stroke_meets_the_published_bounds(design: Design, published: dict[str, Any]) -> None:
     run = malta.simulate(design.plant, design.controller, malta.Scenario.stroke(10e-3))
-    figures = malta.stroke_figures(run)
+    figures = malta.simulation.stroke_figures(run)
     assert run.verdict.completed
     rise = published["figure_12"]["rise_time"]["value"] * 1e-3
     assert figures.rise == pytest.approx(rise, abs=1e-3)
@@ -135,7 +135,7 @@ def test_stroke_meets_the_published_bounds(design: Design, published: dict[str, 
 def test_stroke_of_table2_agrees_with_an_independent_simulation(designs: dict[str, Design]) -> None:
     """16.2 ms, 0.24 mm, below 1 % overshoot and 10 um were found by a simulation independent of this project."""
     design = designs["table2"]
-    figures = malta.stroke_figures(
+    figures = malta.simulation.stroke_figures(
         malta.simulate(
             design.plant, design.controller, malta.Scenario.stroke(10e-3, delay=0, fidelity="force")
         )

@@ -96,7 +96,7 @@ def test_the_table_of_claims_is_computed(
     """Yields, of 4000 machines on the pages, are computed of FEW: they lie within the interval of these."""
     monkeypatch.setattr("malta.machines.tubular.evidence.MACHINES", FEW)
     specs = [malta.read_design(f"design/{name}.toml") for name in designs]
-    ledger = malta.ledger(specs, malta.published(f"data/{machine}.toml"))
+    ledger = malta.ledger(specs, malta.model.published(f"data/{machine}.toml"))
     found, shown = _cells(ledger.markdown()), _shown(ledger.title, designs)
     assert list(shown) == list(found)
     assert len(found) > 35
@@ -138,7 +138,7 @@ def _is_of_sample(count: int, shown: float | None, found: float | None) -> bool:
 def test_yields_of_the_flagship_are_those_of_all_machines() -> None:
     """All of them; the last digits of the arithmetic decide for machines at a bound."""
     shown = _shown(f"tubular, {SOURCE}", DESIGNS["tubular"])
-    published = malta.published("data/tubular.toml")
+    published = malta.model.published("data/tubular.toml")
     for name in ("robust",):
         k = DESIGNS["tubular"].index(name)
         controller = malta.gains.read(f"design/gains/{name}.json")

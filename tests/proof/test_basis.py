@@ -22,7 +22,7 @@ FASTEST = 20000 * math.pi / 30  # rad/s
 RANGES = {"m": 0.1, "k_s": 0.1, "k_i": 0.1}
 
 
-def rotor(T: Any) -> malta.UncertainSystem:
+def rotor(T: Any) -> malta.proof.UncertainSystem:
     """m x'' = F about the centre of gravity, in the coordinates q = T (x, y, alpha, beta)."""
     back = np.linalg.inv(T)
     reads = BEARINGS @ back
@@ -39,14 +39,14 @@ def rotor(T: Any) -> malta.UncertainSystem:
     return malta.uncertain(f, NOMINAL)
 
 
-def derivative_law(T: float | None = None) -> malta.Compensator:
+def derivative_law(T: float | None = None) -> malta.proof.Compensator:
     """Proportional and filtered derivative, from each sensor to the bearing beside it."""
     gain, late, one = 2.5 * 144e3 / 38, 1e-4, np.eye(4)
     rate = gain / 500 / late
     if T is None:
-        return malta.Compensator(-one / late, one / late, rate * one, -(gain + rate) * one)
+        return malta.proof.Compensator(-one / late, one / late, rate * one, -(gain + rate) * one)
     keep = math.exp(-T / late)
-    return malta.Compensator(keep * one, (1 - keep) * one, rate * one, -(gain + rate) * one, 0, T)
+    return malta.proof.Compensator(keep * one, (1 - keep) * one, rate * one, -(gain + rate) * one, 0, T)
 
 
 def coordinates() -> list[Any]:
@@ -88,7 +88,7 @@ def test_the_loop_in_another_basis_is_the_same_loop() -> None:
     assert changed > 3
 
 
-def _in_masses(where: Any, force: Any) -> malta.UncertainSystem:
+def _in_masses(where: Any, force: Any) -> malta.proof.UncertainSystem:
     inverse = np.linalg.inv(where)
 
     def f(m: Any, k: Any) -> Any:

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta import Dynamic
 from malta.errors import InputError
+from malta.proof import Dynamic
 from malta.proof.blocks.blocks import Block, probe, weight_of
 from malta.proof.blocks.transfer import Signals, mu_bound, performance, transfer
 from malta.proof.responses import responses
@@ -22,9 +22,9 @@ from malta.proof.responses import responses
 ONE = weight_of(1.0, "")
 
 
-def law_of(A: Any, B: Any, C: Any, D: Any, **more: Any) -> malta.Compensator:
+def law_of(A: Any, B: Any, C: Any, D: Any, **more: Any) -> malta.proof.Compensator:
     a, b, c, d = (np.array(M, dtype=float) for M in (A, B, C, D))
-    return malta.Compensator(a, b, c, d, **more)
+    return malta.proof.Compensator(a, b, c, d, **more)
 
 
 def pid(Kp: float, Ki: float, Kd: float, Tf: float) -> control.TransferFunction:
@@ -47,7 +47,7 @@ def test_the_worst_case_gain_of_an_integrator_with_additive_dynamics() -> None:
     assert m.lower == pytest.approx(float((S / (1 - 0.4 * np.abs(K) * S)).max()), rel=1e-7)
 
 
-def satellite() -> tuple[malta.UncertainSystem, malta.Compensator]:
+def satellite() -> tuple[malta.proof.UncertainSystem, malta.proof.Compensator]:
     """A spinning satellite (Doyle; Skogestad and Postlethwaite, section 3.7): T = [[1, 10], [-10, 1]] / (s + 1)."""
     s = malta.uncertain(lambda a: ([[0, a], [-a, 0]], np.eye(2), [[1, 10], [-10, 1]]), {"a": 10.0})
     return s, law_of(np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((2, 0)), -np.eye(2))
@@ -336,7 +336,7 @@ def test_the_time_is_kept() -> None:
     ("blocks", "says"),
     [
         ([], "at least one"),
-        (None, "malta.Dynamic, one or a list"),
+        (None, "malta.proof.Dynamic, one or a list"),
         ([Dynamic(control.tf([[[1], [5]], [[5], [5]]], [[[1], [1]], [[1], [1]]]))], "one of each"),
         ([Dynamic(10**400)], "above zero"),
         ([Dynamic(True)], "a number above zero"),
@@ -346,8 +346,8 @@ def test_the_time_is_kept() -> None:
         ([Dynamic(0.1, "additive")], "of an additive block"),
         ([Dynamic(0.1, "additive", channel=(0, 2))], "0, forces are counted|forces from 0"),
         ([Dynamic(0.1, channel=(1, 1))], "each of the sensors once"),
-        ([Dynamic(0.1, channel=1.0)], "sensors from 0 to 1"),  # type: ignore[arg-type]
-        (["much"], "malta.Dynamic, one or a list"),
+        ([Dynamic(0.1, channel=1.0)], "sensors from 0 to 1"),
+        (["much"], "malta.proof.Dynamic, one or a list"),
     ],
 )
 def test_blocks_that_cannot_be_taken_get_one_sentence(blocks: Any, says: str) -> None:

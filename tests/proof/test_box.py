@@ -106,6 +106,6 @@ def test_a_box_of_a_few_digits() -> None:
     lost = nominal - 38 * digit
     for digits in (10, 19, 30):
         box = (nominal - digits * digit, nominal + digits * digit)
-        found = malta.margin_of_polynomial(lambda p: [1, p - lost], {"p": box}, {"p": nominal})
+        found = malta.proof.margin_of_polynomial(lambda p: [1, p - lost], {"p": box}, {"p": nominal})
         assert found.lower is not None
         assert 0.8 * 38 / digits <= found.lower <= 38 / digits

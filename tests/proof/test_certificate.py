@@ -555,7 +555,7 @@ def test_designs_whose_rounding_couples_all_states(tmp_path: Path, name: str) ->
     controller = malta.gains.read(gains)
     plant = malta.plant_of(controller.parameters)
     ranges = malta.read_design(ROOT / "design" / f"{name}.toml").uncertainty
-    margin = malta.Margin(
+    margin = malta.proof.Margin(
         3.2, math.inf, None, None, {}, {}, (), 0.0
     )  # below what `verify` proves, 3.6 and 3.9
     places, over = travel_loops(plant, controller, tuple(ranges))

@@ -43,7 +43,7 @@ def certified(
     controller = malta.gains.read(gains)
     plant = malta.plant_of(controller.parameters)
     places, over = travel_loops(plant, controller, tuple(ranges), stage)
-    margin = malta.Margin(lower, math.inf, None, None, {}, {}, (), 0.0)
+    margin = malta.proof.Margin(lower, math.inf, None, None, {}, {}, (), 0.0)
     origin = origin_of(gains, plant, controller, stage, len(places))
     return certificate.write(path, places, ranges, over, margin, origin)
 
@@ -301,8 +301,8 @@ def test_boxes_hold_their_shares_exactly() -> None:
             return [[0, 1], [-9 - k, -4 - m]], [[0], [1]], [[1, 0]]
 
         system = malta.uncertain(matrices, {"m": m, "k": k})
-        law = malta.Compensator(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.zeros((1, 1)))
-        margin = malta.Margin(0.1, math.inf, None, None, {}, {}, (), 0.0)
+        law = malta.proof.Compensator(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.zeros((1, 1)))
+        margin = malta.proof.Margin(0.1, math.inf, None, None, {}, {}, (), 0.0)
         content = certificate.certificate_of([(system, law)], {"m": share}, {"k": (k - end, k + 1)}, margin)
         one, two = content["claim"]["parameters"]
         assert exactly(one["down"]) == exactly(one["up"]) >= exactly(m) * exactly(share)

@@ -102,7 +102,7 @@ def uncertain(discrete: bool) -> tuple[Any, dict[str, tuple[float, float]]]:
 def test_fourteen_parameters_are_proven(discrete: bool) -> None:
     """Up to a few thousandths below the witness; corners and places inside the proven box have stable roots."""
     f, box = uncertain(discrete)
-    m = malta.margin_of_polynomial(f, box, discrete=discrete, time=60)
+    m = malta.proof.margin_of_polynomial(f, box, discrete=discrete, time=60)
     assert m.lower is not None
     assert m.lower > 0.99 * m.upper
     rng = np.random.default_rng(0)

@@ -19,7 +19,7 @@ from malta.proof.robust import law_of, problem_of
 DAMPING = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
 
 
-def one_mode(zeta: float) -> malta.UncertainSystem:
+def one_mode(zeta: float) -> malta.proof.UncertainSystem:
     """w = 100 rad/s, force in, velocity out."""
 
     def f(w: Any) -> Any:
@@ -28,7 +28,7 @@ def one_mode(zeta: float) -> malta.UncertainSystem:
     return malta.uncertain(f, {"w": 100.0})
 
 
-def two_modes(zeta: float, a: float = 100.0, b: float = 1000.0) -> malta.UncertainSystem:
+def two_modes(zeta: float, a: float = 100.0, b: float = 1000.0) -> malta.proof.UncertainSystem:
     """Two modes under one force, and the velocity beside it."""
 
     def f(a: Any, b: Any) -> Any:
@@ -38,9 +38,9 @@ def two_modes(zeta: float, a: float = 100.0, b: float = 1000.0) -> malta.Uncerta
     return malta.uncertain(f, {"a": a, "b": b})
 
 
-def feedback(gain: float, T: float | None) -> malta.Compensator:
+def feedback(gain: float, T: float | None) -> malta.proof.Compensator:
     none = np.zeros((0, 0))
-    return malta.Compensator(none, np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-gain]]), 0, T)
+    return malta.proof.Compensator(none, np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-gain]]), 0, T)
 
 
 @pytest.mark.parametrize("T", [None, 1e-3])
@@ -77,7 +77,7 @@ def test_damping_that_a_stiffness_takes_away(zeta: float) -> None:
     assert found.upper == pytest.approx(4, rel=0.01)
 
 
-def _first_loss(system: malta.UncertainSystem, sign: int) -> float:
+def _first_loss(system: malta.proof.UncertainSystem, sign: int) -> float:
     """The least |k| of that sign at which the poles are unstable, bisected."""
     low, high = 0.0, 1e-9
     while high < 1e9 and np.linalg.eigvals(system.at(np.array([[sign * high]]))[0][0]).real.max() < 0:

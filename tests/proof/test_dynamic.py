@@ -10,14 +10,15 @@ import pytest
 from published_cases import ROBSTAB, Loop, pid
 
 import malta
-from malta import Dynamic, dynamic_margin, gains
+from malta import dynamic_margin, gains
 from malta.errors import InputError
 from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
+from malta.proof import Dynamic
 from malta.proof.responses import responses
 
 
-def robstab() -> malta.UncertainSystem:
+def robstab() -> malta.proof.UncertainSystem:
     """18 / (s^2 + 1.8 s + k): the example of robstab's reference page."""
     return malta.uncertain(ROBSTAB[0].matrices, ROBSTAB[0].nominal)
 
@@ -106,7 +107,7 @@ def test_an_unstable_loop_has_no_margin() -> None:
         (Dynamic(control.tf([1], [1, -1])), "stable, proper"),
         (Dynamic(control.tf([1], [1, 0.5], 0.1)), "stable, proper"),
         (Dynamic(0.5, channel=3), "sensors are counted from 0"),
-        (Dynamic(0.5, at="here"), "sensors or forces"),  # type: ignore[arg-type]
+        (Dynamic(0.5, at="here"), "sensors or forces"),
     ],
 )
 def test_bad_input_gets_one_sentence(dynamic: Dynamic, says: str) -> None:

@@ -25,7 +25,7 @@ from malta.proof.responses import responses
 from malta.proof.robust import problem_of
 
 
-def first_order(k: float = 1.0) -> malta.UncertainSystem:
+def first_order(k: float = 1.0) -> malta.proof.UncertainSystem:
     return malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": k})
 
 
@@ -137,7 +137,7 @@ def test_random_loops_stay_below_what_is_proven(seed: int) -> None:
         return
     w = np.geomspace(1e-2, 1e2, 300)
     for k, d in rng.uniform([0.6, 0.25], [1.4, 0.75], (30, 2)):
-        law = malta.Compensator(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[0.3]]))
+        law = malta.proof.Compensator(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[0.3]]))
         P, _, _, F = responses(s, law, np.array([k, d]), w)
         assert (np.abs(1 / (1 - (P @ F)[:, 0, 0])) <= m.upper).all()
 
@@ -181,7 +181,7 @@ def test_an_unstable_box_has_no_bound() -> None:
         ({"of": "compliance"}, "\\(sensors, forces\\) of compliance"),
         ({"of": "effort", "channel": (0, 1)}, "sensors are counted from 0"),
         ({"channel": (0, 0)}, "each of the sensors once"),
-        ({"dynamics": ["much"]}, "malta.Dynamic, one or a list"),
+        ({"dynamics": ["much"]}, "malta.proof.Dynamic, one or a list"),
     ],
 )
 def test_bad_input_gets_one_sentence(more: dict[str, Any], says: str) -> None:
@@ -203,5 +203,5 @@ def test_no_bound_is_proven_of_a_loop_whose_stability_is_not(monkeypatch: pytest
     monkeypatch.setattr(Blocks, "stable", lambda _: False)
     T = malta.worst_case_gain(first_order(), [[-2.0]], {"k": 0.5}, of="complementary")
     assert (T.upper, T.reason) == (None, "the nominal loop is not proven stable")
-    m = malta.dynamic_margin(first_order(), [[-2.0]], {"k": 0.5}, malta.Dynamic(0.1))
+    m = malta.dynamic_margin(first_order(), [[-2.0]], {"k": 0.5}, malta.proof.Dynamic(0.1))
     assert (m.lower, m.reason) == (None, "the nominal loop is not proven stable")

@@ -28,7 +28,7 @@ from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller, linear_law
-from malta.synthesis.kalman import held, sampled_model
+from malta.synthesis.filters import held, sampled_model
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
 from malta.synthesis.riccati import sample

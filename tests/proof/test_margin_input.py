@@ -85,7 +85,7 @@ def test_ranges_that_overflow_are_refused(value: Any) -> None:
     with pytest.raises(InputError, match=says):
         malta.robust_margin(motor(), [[-2.0]], {"k": value})
     with pytest.raises(InputError, match=says):
-        malta.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": value}, {"k": 1})
+        malta.proof.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": value}, {"k": 1})
 
 
 @pytest.mark.parametrize("power", [1, 2, 3, 5])
@@ -93,7 +93,9 @@ def test_ranges_that_overflow_are_refused(value: Any) -> None:
 def test_numbers_that_overflow_prove_nothing(decades: int, power: int) -> None:
     """(s + 1)^3 + k^n is unstable beyond k^n = 8."""
     R = 10.0**decades
-    m = malta.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k**power], {"k": (-R, R)}, {"k": 0.0}, time=0.4)
+    m = malta.proof.margin_of_polynomial(
+        lambda k: [1, 3, 3, 1 + k**power], {"k": (-R, R)}, {"k": 0.0}, time=0.4
+    )
     assert m.lower is None or m.lower * R <= 8 ** (1 / power) * (1 + 1e-9)
     system = malta.uncertain(lambda k: ([[-1.0, 0], [0, -2]], [[k**power], [1]], [[1.0, 1]]), {"k": 0.0})
     m = malta.robust_margin(system, [[-2.0]], {"k": (-R, R)}, time=0.4)
@@ -138,7 +140,7 @@ def test_what_is_no_range_is_said(value: Any) -> None:
     with pytest.raises(InputError, match=r"^margin: " + says):
         common_margin([(motor(), [[-2.0]])], {"k": value})
     with pytest.raises(InputError, match=r"^margin_of_polynomial: " + says):
-        malta.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": value}, {"k": 1})
+        malta.proof.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": value}, {"k": 1})
     two = malta.uncertain(lambda k, c: ([[-c]], [[k]], [[1.0]]), {"k": 1.0, "c": 1.0})
     with pytest.raises(InputError, match=r"^robust_margin: " + says):
         malta.robust_margin(two, [[-2.0]], {"c": 0.1}, {"k": value})
@@ -151,7 +153,7 @@ def test_ranges_are_given_by_name(ranges: Any) -> None:
     with pytest.raises(InputError, match=r"^margin: ranges: found .* as {"):
         common_margin([(motor(), [[-2.0]])], ranges)
     with pytest.raises(InputError, match=r"^margin_of_polynomial: box: found .* as {"):
-        malta.margin_of_polynomial(lambda k: [1, 1 + k], ranges)
+        malta.proof.margin_of_polynomial(lambda k: [1, 1 + k], ranges)
     if ranges is not None:
         with pytest.raises(InputError, match=r"^robust_margin: over: found .* as {"):
             malta.robust_margin(motor(), [[-2.0]], {"k": 0.1}, ranges)
@@ -160,7 +162,7 @@ def test_ranges_are_given_by_name(ranges: Any) -> None:
 def test_an_interval_may_be_a_list() -> None:
     one, two = (malta.robust_margin(motor(), [[-2.0]], {"k": sides}) for sides in ([0.5, 1.5], (0.5, 1.5)))
     assert one.lower == pytest.approx(two.lower, rel=1e-3)
-    m = malta.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": [0, 2]})
+    m = malta.proof.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": [0, 2]})
     assert m.upper == pytest.approx(2, rel=1e-6)
 
 
@@ -173,7 +175,7 @@ def test_tolerance_and_time_are_numbers_above_zero(name: str, value: Any) -> Non
     with pytest.raises(InputError, match=r"^margin" + says):
         common_margin([(motor(), [[-2.0]])], {"k": 0.1}, **{name: value})
     with pytest.raises(InputError, match=r"^margin_of_polynomial" + says):
-        malta.margin_of_polynomial(lambda k: [1, 1 + k], {"k": (1, 2)}, **{name: value})
+        malta.proof.margin_of_polynomial(lambda k: [1, 1 + k], {"k": (1, 2)}, **{name: value})
 
 
 def test_time_may_be_infinite() -> None:
@@ -284,30 +286,33 @@ def test_what_is_no_system_is_said(made: Callable[[], Any], says: str) -> None:
 
 
 POLYNOMIALS: dict[str, tuple[Callable[[], Any], str]] = {
-    "None": (lambda: malta.margin_of_polynomial(None, {"k": (1, 2)}), "coefficients: found None"),
-    "a string": (lambda: malta.margin_of_polynomial("abc", {"k": (1, 2)}), "coefficients: found 'abc'"),
+    "None": (lambda: malta.proof.margin_of_polynomial(None, {"k": (1, 2)}), "coefficients: found None"),
+    "a string": (lambda: malta.proof.margin_of_polynomial("abc", {"k": (1, 2)}), "coefficients: found 'abc'"),
     "NaN": (
-        lambda: malta.margin_of_polynomial(lambda k: [1, math.nan, k], {"k": (1, 2)}),
+        lambda: malta.proof.margin_of_polynomial(lambda k: [1, math.nan, k], {"k": (1, 2)}),
         "coefficients: found nan, expected finite numbers",
     ),
     "a string inside": (
-        lambda: malta.margin_of_polynomial(lambda k: ["a", k], {"k": (1, 2)}),
+        lambda: malta.proof.margin_of_polynomial(lambda k: ["a", k], {"k": (1, 2)}),
         "coefficients: found 'a', expected finite numbers",
     ),
     "degree zero": (
-        lambda: malta.margin_of_polynomial(lambda k: [k], {"k": (1, 2)}),
+        lambda: malta.proof.margin_of_polynomial(lambda k: [k], {"k": (1, 2)}),
         "coefficients: found 1 coefficient,",
     ),
-    "raises": (lambda: malta.margin_of_polynomial(lambda k: 1 / 0, {"k": (1, 2)}), "source: .*ZeroDivision"),
+    "raises": (
+        lambda: malta.proof.margin_of_polynomial(lambda k: 1 / 0, {"k": (1, 2)}),
+        "source: .*ZeroDivision",
+    ),
     "nominal": (
-        lambda: malta.margin_of_polynomial(lambda k: [1, k], {"k": (1, 2)}, {"k": LETTER}),
+        lambda: malta.proof.margin_of_polynomial(lambda k: [1, k], {"k": (1, 2)}, {"k": LETTER}),
         "k: found 'a', expected a finite number",
     ),
     "box": (
-        lambda: malta.margin_of_polynomial(lambda k: [1, k], {"k": (LETTER, LETTER)}),
+        lambda: malta.proof.margin_of_polynomial(lambda k: [1, k], {"k": (LETTER, LETTER)}),
         r"k: found \('a', 'a'\)",
     ),
-    "empty": (lambda: malta.margin_of_polynomial(lambda k: [1, k], {}), "box: found no parameters"),
+    "empty": (lambda: malta.proof.margin_of_polynomial(lambda k: [1, k], {}), "box: found no parameters"),
 }
 
 

@@ -30,7 +30,7 @@ def chain(mass: float, *, explicit: bool) -> tuple[Any, Any]:
             return A, B, C
         return A, B, C, ca.DM(1, 1), ca.diag(ca.DM([1, 1, 1, m, m, m]))
 
-    law = malta.Compensator(
+    law = malta.proof.Compensator(
         np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[0.2]]), sample_time=0.5
     )
     return malta.uncertain(matrices, {"k": 1.0}), law
@@ -59,7 +59,7 @@ def test_an_uncertain_mass_in_E(unit: float) -> None:
         A = ca.blockcat([[0, 1], [-k, -0.1 * unit]])
         return A, ca.DM([[0], [unit]]), ca.DM([[1, 0]]), ca.DM(1, 1), ca.diag(ca.vertcat(1, m))
 
-    law = malta.Compensator(
+    law = malta.proof.Compensator(
         np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[0.2]]), sample_time=0.5
     )
     system = malta.uncertain(matrices, {"m": unit, "k": unit})
@@ -83,7 +83,7 @@ def weakly_coupled(E: Any, sample_time: float | None) -> tuple[Any, Any]:
         C = ca.DM([[1, 0, 0, 0], [0, 0, 1, 0]])
         return ca.DM(E @ A), ca.mtimes(ca.DM(E), B), C, ca.DM(2, 2), ca.DM(E)
 
-    law = malta.Compensator(
+    law = malta.proof.Compensator(
         np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((2, 0)), np.array([[0, 1e-13], [1e-13, 0]]),
         sample_time=sample_time,
     )  # fmt: skip
@@ -145,7 +145,7 @@ def test_units_of_a_sampled_system(unit: float) -> None:
             return [[-0.1, unit], [-k / unit, -0.2]], [[0], [1 / unit]], [[1, 0]]
 
         system = malta.uncertain(matrices, {"k": 1.0})
-        law = malta.Compensator(
+        law = malta.proof.Compensator(
             np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[0.3]]), sample_time=0.5
         )
         return malta.robust_margin(system, law, {"k": 0.2}, time=10.0).lower

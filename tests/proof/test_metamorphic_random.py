@@ -37,7 +37,7 @@ class Case:
     right: Matrix = field(default_factory=lambda: np.eye(1))  # x = right times the states
     copies: int = 1
 
-    def loop(self) -> tuple[malta.UncertainSystem, malta.Compensator]:
+    def loop(self) -> tuple[malta.proof.UncertainSystem, malta.proof.Compensator]:
         n, discrete = len(self.B), self.clock == "discrete"
         T = None if self.clock is None else (1.0 if discrete else self.clock) / self.seconds
         left, right = (M if len(M) == n else M[0, 0] * np.eye(n) for M in (self.left, self.right))
@@ -63,9 +63,9 @@ class Case:
         )
         a, b, c, d = (np.kron(np.eye(self.copies), M) for M in self.law)
         rate = self.seconds if T is None else 1.0
-        return system, malta.Compensator(a * rate, b * rate, c, d, sample_time=T)
+        return system, malta.proof.Compensator(a * rate, b * rate, c, d, sample_time=T)
 
-    def margin(self, seconds: float = 3.0) -> malta.Margin:
+    def margin(self, seconds: float = 3.0) -> malta.proof.Margin:
         low, high = self.over
         over = (1 / high, 1 / low) if self.inverse else self.over
         return malta.robust_margin(*self.loop(), {"k": 0.3}, {"p": over}, time=seconds)
@@ -123,7 +123,7 @@ CHANGES: dict[str, Callable[[Case, Any], Case]] = {
 }
 
 
-def agree(one: malta.Margin, other: malta.Margin) -> None:
+def agree(one: malta.proof.Margin, other: malta.proof.Margin) -> None:
     """No proof exceeds a witness of the same loop; where both are settled they are the same."""
     a, b, upper = one.lower or 0.0, other.lower or 0.0, min(one.upper, other.upper)
     assert max(a, b) <= upper * (1 + 1e-9)
@@ -133,7 +133,7 @@ def agree(one: malta.Margin, other: malta.Margin) -> None:
             assert a == pytest.approx(b, rel=1e-6)
 
 
-def stable_below(case: Case, margin: malta.Margin, rng: Any) -> bool:
+def stable_below(case: Case, margin: malta.proof.Margin, rng: Any) -> bool:
     """Whether loops at corners and within the box, a little below the proven margin, are stable by their poles."""
     if not margin.lower:
         return True

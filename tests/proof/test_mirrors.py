@@ -18,7 +18,7 @@ ONE, TWO = Places((0, 1), (1,)), Places((2, 3), (1,))
 
 def planes(
     stiffness: float = 4.0, signs: tuple[float, float, float] = (-1.0, -1.0, 1.0)
-) -> malta.UncertainSystem:
+) -> malta.proof.UncertainSystem:
     """Two planes x, v and y, w; signs: of y' = w, w' = y, and the second reading, a force along -w."""
     a, b, c = signs
     return malta.uncertain(
@@ -37,7 +37,7 @@ def law(gain: float = 1.0) -> Compensator:
     return Compensator(A, B, np.diag([1000.0, gain * 1000.0]), np.diag([-1030.0, gain * -1030.0]))
 
 
-def image(system: malta.UncertainSystem) -> Image | None:
+def image(system: malta.proof.UncertainSystem) -> Image | None:
     loop = loop_of(system, law())
     assert loop.symbolic is not None
     return image_of(loop.symbolic, ONE, TWO)
@@ -64,7 +64,7 @@ def test_planes_that_differ_in_signs_alone_are_mirror_images(
         planes(signs=(-2.0, -0.5, 1.0)),  # other units: equal but for a factor that is no sign
     ],
 )
-def test_planes_that_differ_in_more_than_signs_are_none(system: malta.UncertainSystem) -> None:
+def test_planes_that_differ_in_more_than_signs_are_none(system: malta.proof.UncertainSystem) -> None:
     assert image(system) is None
 
 
@@ -83,7 +83,7 @@ def test_the_margin_of_mirror_images_is_that_without_sharing(
 ) -> None:
     """The second plane has the smaller gain, and loses stability first: the first plane's proof is not enough."""
 
-    def margin(gain: float) -> malta.Margin:
+    def margin(gain: float) -> malta.proof.Margin:
         return malta.robust_margin(planes(signs=(-1.0, -1.0, sign)), law(sign * gain), {"k": 0.2})
 
     shared = margin(0.5)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from published_cases import Box, Coefficients, Polynomial
 
-    from malta import Margin
+    from malta.proof import Margin
 
 
 def bracketed(m: Margin, number: float, rounding: float = 1e-9) -> None:
@@ -46,7 +46,7 @@ def margin(
     discrete: bool = False,
 ) -> Margin:
     """A margin that roots agree with: unstable beyond its witness, stable at random inside its box and at corners."""
-    m = malta.margin_of_polynomial(coefficients, box, nominal, discrete=discrete)
+    m = malta.proof.margin_of_polynomial(coefficients, box, nominal, discrete=discrete)
     assert m.lower is not None, m.reason
     assert m.witness is not None
     middle = {k: (low + high) / 2 for k, (low, high) in box.items()} | dict(nominal or {})
@@ -118,7 +118,7 @@ def test_the_bus_of_handbook_7_3_5_is_lost_beyond_its_frequencies() -> None:
 
 def test_ackermanns_bus_is_lost_where_it_stands() -> None:
     """v in 3 .. 20 m/s, m in 9.95 .. 32 t: to v = 0, where two roots come to zero and two go to infinity."""
-    m = malta.margin_of_polynomial(cases.bus, {"v": (3, 20), "m": (9.95, 32)})
+    m = malta.proof.margin_of_polynomial(cases.bus, {"v": (3, 20), "m": (9.95, 32)})
     bracketed(m, 11.5 / 8.5)
 
 

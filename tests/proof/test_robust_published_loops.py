@@ -19,7 +19,7 @@ import malta
 if TYPE_CHECKING:
     from published_cases import Loop
 
-    from malta import UncertainSystem
+    from malta.proof import UncertainSystem
 
 
 def system_of(case: Loop) -> UncertainSystem:

@@ -204,7 +204,7 @@ def test_an_uncertain_speed_is_no_interval(
 
 
 def agree(
-    loop: Any, margin: malta.Margin, nominal: dict[str, float], box: dict[str, float], speeds: Any
+    loop: Any, margin: malta.proof.Margin, nominal: dict[str, float], box: dict[str, float], speeds: Any
 ) -> None:
     """Eigenvalues at the corners of the proven box, speed by speed: all stable; at the witness just not."""
     system, law = loop
@@ -319,7 +319,7 @@ def test_rotors_that_differ_are_flown_and_listed(
     plant: Plant, controllers: dict[str, Controller], tmp_path: Path
 ) -> None:
     """Without a stroke, and with nothing to touch but what carries it."""
-    plan = malta.Plan(controllers["rotor"], "lift-off", {"m": 0.1, "k_s": 0.1}, samples=8)
+    plan = malta.campaigns.Plan(controllers["rotor"], "lift-off", {"m": 0.1, "k_s": 0.1}, samples=8)
     found = malta.campaign(plan, tmp_path / "campaign")
     assert found.completed.tolist() == [True] * 8
     labels = [listed.label for listed in figures_of(found)]

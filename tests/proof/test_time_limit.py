@@ -99,7 +99,7 @@ def plain(matrices: Any, count: int) -> tuple[Any, dict[str, tuple[float, float]
 
 def of_polynomial(count: int) -> Any:
     box = dict.fromkeys([f"q{i}" for i in range(count)], (-0.1, 0.1))
-    return malta.margin_of_polynomial(named(coefficients, count), box, time=LIMIT)
+    return malta.proof.margin_of_polynomial(named(coefficients, count), box, time=LIMIT)
 
 
 def of_loop(search: Search, made: tuple[Any, Any], law: Any, *more: Any) -> Any:
@@ -114,7 +114,7 @@ KINDS: dict[str, Callable[[], Any]] = {
     "polynomial of 14 parameters": lambda: of_polynomial(14),
     "functions of parameters": lambda: of_loop(malta.robust_margin, plain(functions, 6), [[-0.1]]),
     "quotients in every entry": lambda: of_loop(malta.robust_margin, plain(dense, 8), [[-0.1]]),
-    "dynamics": lambda: of_loop(malta.dynamic_margin, chain(4), SAMPLED, malta.Dynamic(0.1)),
+    "dynamics": lambda: of_loop(malta.dynamic_margin, chain(4), SAMPLED, malta.proof.Dynamic(0.1)),
     "gain": lambda: of_loop(malta.worst_case_gain, chain(4), SAMPLED),
 }
 

@@ -78,12 +78,12 @@ def test_the_checks_find_what_is_wrong(spoil: Callable[[Axes], object], said: li
 
 
 @cache
-def machine(name: str) -> tuple[malta.Plant, malta.Controller, Any]:
+def machine(name: str) -> tuple[malta.Plant, malta.synthesis.Controller, Any]:
     """The plant and the controller of a shipped gain file, and what its paper prints."""
     c = malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
     plant = malta.plant_of(c.parameters)
     kind = next((kind for kind in ("halbach", "planar") if name.startswith(kind)), "tubular")
-    return plant, c, malta.published(ROOT / "data" / f"{kind}.toml")
+    return plant, c, malta.model.published(ROOT / "data" / f"{kind}.toml")
 
 
 def drawn_experiments() -> list[Any]:
@@ -147,7 +147,7 @@ def campaign_of(name: str, scenario: str, samples: int, share: float = 1.0, **op
     plant, c, _ = machine(name)
     box = read_shares(ROOT / "design" / "gains" / f"{name}.json", [], plant.parameters, None)
     spread = {key: share * value for key, value in box.items()}
-    return malta.campaign(malta.Plan(c, scenario, spread, samples=samples, **options))
+    return malta.campaign(malta.campaigns.Plan(c, scenario, spread, samples=samples, **options))
 
 
 def test_a_campaign_without_failures_shows_how_near_they_are() -> None:

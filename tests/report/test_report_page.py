@@ -50,7 +50,7 @@ def cart_controller(name: str = "cart design", base: float = 1e-4) -> Controller
         noise=1e-6, nominal={"k": 1.0}, terms={"k": ([[0, 0], [50, 0]],)},
     )  # fmt: skip
     one = np.ones(1)
-    weights = malta.Weights(
+    weights = malta.synthesis.Weights(
         np.ones(2), np.array([base, 0.1]), one, one, one, np.array([base]), 1e-2 * one, 1e-12 * one
     )
     return malta.lqg(malta.linearize(cart, cart.at()), weights, 1e-3, name=name)

@@ -56,11 +56,11 @@ def test_a_rest_is_the_same_stroke_begun_later() -> None:
     assert run.verdict == ("completed", 0.1)
     for name in ("p", "y", "v", "i", "reference"):
         np.testing.assert_allclose(getattr(run, name), getattr(longer, name)[400:], rtol=0, atol=1e-9)
-    figures = malta.stroke_figures(run)
+    figures = malta.simulation.stroke_figures(run)
     assert figures.axial_error == pytest.approx(np.abs(longer.p - longer.reference)[400:, 4].max(), rel=1e-9)
 
 
-def _figures(run: malta.Trajectory) -> dict[str, Any]:
+def _figures(run: malta.simulation.Trajectory) -> dict[str, Any]:
     error = run.p - run.reference
     return {
         "duration": run.verdict.time,
@@ -69,8 +69,8 @@ def _figures(run: malta.Trajectory) -> dict[str, Any]:
         "rms": np.sqrt((error**2).mean(axis=0)),
         "force": np.abs(run.v).max(axis=0),
         "contact": run.contact.max(axis=0),
-        "rise": malta.stroke_figures(run).rise,
-        "overshoot": malta.stroke_figures(run).overshoot,
+        "rise": malta.simulation.stroke_figures(run).rise,
+        "overshoot": malta.simulation.stroke_figures(run).overshoot,
         "last": error[-1],
     }
 
@@ -85,7 +85,7 @@ def test_figures_of_many_machines_are_of_the_stroke_alone(bearing: bool) -> None
     assert batch.completed[0] == 1
     assert batch.duration.min() < 0 < batch.duration.max() == 0.1
     for k in range(len(pull["K_A"])):
-        machine, own = malta.replayed(plant, scenario, pull, k)
+        machine, own = malta.simulation.replayed(plant, scenario, pull, k)
         for name, wanted in _figures(malta.simulate(machine, controller, own)).items():
             found = getattr(batch, name)[k]
             if name == "last" and bearing and not batch.completed[k]:

@@ -53,7 +53,7 @@ class Design(NamedTuple):
     """A shipped LQG with all that it and its continuous stages ask."""
 
     model: LinearModel
-    weights: malta.Weights
+    weights: malta.synthesis.Weights
     continuous: list[Question]
     sampled: list[Question]
 
@@ -92,11 +92,11 @@ def apart(found: FloatArray, expected: FloatArray) -> float:
 def test_control_lqr_gives_the_continuous_gains(shipped: Design) -> None:
     m, w = shipped.model, shipped.weights
     K = control.lqr(m.A, m.B, w.Q, w.R, method="scipy")[0]
-    assert apart(K, malta.lqr(m, w)) < 1e-9
+    assert apart(K, malta.synthesis.lqr(m, w)) < 1e-9
     if w.q_i.any():
         Q = linalg.block_diag(w.Q, lqg.integral_weight(m, w))
         K = control.lqr(m.A, m.B, Q, w.R, integral_action=m.C, method="scipy")[0]
-        assert apart(K, np.hstack(malta.lqi(m, w))) < 1e-12
+        assert apart(K, np.hstack(malta.synthesis.lqi(m, w))) < 1e-12
 
 
 def test_control_dlqr_gives_the_sampled_gains(shipped: Design) -> None:
@@ -146,7 +146,7 @@ def table2() -> Controller:
 @pytest.fixture(scope="module")
 def loop(plant: Plant, table2: Controller) -> LoopSystems:
     """The systems of its loop."""
-    return malta.loop_systems(plant, table2)
+    return malta.loops.loop_systems(plant, table2)
 
 
 def at(system: Any, w: float) -> Any:
@@ -202,7 +202,7 @@ def plant_positions(plant: Plant) -> FloatArray:
 def test_loops_are_those_of_verify(name: str) -> None:
     controller = malta.gains.read(f"design/gains/{name}.json")
     plant = malta.plant_of(controller.parameters)
-    systems = malta.loop_systems(plant, controller)
+    systems = malta.loops.loop_systems(plant, controller)
     model = malta.linearize(plant, plant.point(controller.operating_point[0]))
     verified = machine_loop(model, controller)
     one = np.eye(len(plant.outputs))
@@ -273,7 +273,7 @@ def h_infinity(ball: Plant) -> Controller:
     K, _, gamma, _ = control.hinfsyn(augmented, 1, 1)
     assert gamma == pytest.approx(1.6, abs=0.1)
     sampled = control.c2d(control.ss(K.A, K.B, unit * K.C, unit * K.D), 1e-4, "tustin")
-    return malta.controller_of(sampled, ball, name="h-infinity")
+    return malta.synthesis.controller_of(sampled, ball, name="h-infinity")
 
 
 def test_an_h_infinity_controller_is_verified(ball: Plant, h_infinity: Controller) -> None:
@@ -313,7 +313,7 @@ def test_an_h_infinity_controller_in_the_simulated_loop(ball: Plant, h_infinity:
     scenario = malta.Scenario("step", 0.05, partial(jump, output=0, size=1e-4, at=0.95e-4), fidelity="force")
     run = malta.simulate(ball, h_infinity, scenario)
     assert not run.saturated.any()
-    response = control.step_response(malta.loop_systems(ball, h_infinity).tracking, run.t[:-1])
+    response = control.step_response(malta.loops.loop_systems(ball, h_infinity).tracking, run.t[:-1])
     assert np.abs(run.p[1:, 0] - 1e-4 * response.outputs.ravel()).max() < 1e-10 * 1e-4
     pushed = malta.experiment("disturbance", ball, h_infinity).cases[0].run
     assert pushed.verdict.completed
@@ -321,7 +321,7 @@ def test_an_h_infinity_controller_in_the_simulated_loop(ball: Plant, h_infinity:
 
 
 def test_an_h_infinity_controller_in_a_campaign(h_infinity: Controller) -> None:
-    plan = malta.Plan(h_infinity, "hold", {"k": 0.2}, samples=16, options={"time": 0.05})
+    plan = malta.campaigns.Plan(h_infinity, "hold", {"k": 0.2}, samples=16, options={"time": 0.05})
     found = malta.campaign(plan)
     assert found.rate.passed == 16
     assert 1e-8 < found.batch.rms.min() < found.batch.rms.max() < 1e-6
@@ -333,7 +333,7 @@ def test_a_law_of_errors_is_the_law_of_states_at_rest(
 ) -> None:
     """MALTA's LQG from its measurements to its forces, turned round: the same loop, the same noise, the same run."""
     measured = [s.name for s in plant.outputs]
-    again = malta.controller_of(-table2.sys[:, measured], plant, name="turned round")
+    again = malta.synthesis.controller_of(-table2.sys[:, measured], plant, name="turned round")
     assert again.tracks == "errors"
     first, second = (malta.verify(model, controller) for controller in (table2, again))
     assert second.stages[1].peak_sensitivity == pytest.approx(first.stages[1].peak_sensitivity, rel=1e-9)
@@ -358,7 +358,7 @@ def test_a_law_of_errors_is_the_law_of_states_at_rest(
 def test_a_law_of_errors_on_the_windings(plant: Plant, table2: Controller) -> None:
     """Where the mover is the current controllers take from the measurements."""
     measured = [s.name for s in plant.outputs]
-    again = malta.controller_of(-table2.sys[:, measured], plant)
+    again = malta.synthesis.controller_of(-table2.sys[:, measured], plant)
     runs = [malta.simulate(plant, c, malta.Scenario.stroke(2e-3, duration=0.06)) for c in (table2, again)]
     assert all(run.verdict.completed for run in runs)
     assert np.abs(runs[1].p[-1] - runs[1].reference[-1]).max() < 20e-6
@@ -371,7 +371,7 @@ def test_the_law_of_errors_as_a_system(ball: Plant) -> None:
     given = control.ss(
         [[0.5, 0.1], [0.0, 0.2]], [[1.0], [2.0]], [[3.0, 4.0]], [[5.0]], 1e-4, states=["a", "b"]
     )
-    controller = malta.controller_of(given, ball)
+    controller = malta.synthesis.controller_of(given, ball)
     assert [s.name for s in controller.states] == ["a", "b", "x[e]"]
     assert (controller.delay, controller.observed) == (0, 0)
     found, z = controller.sys, np.exp(0.3j)
@@ -390,11 +390,11 @@ def test_the_law_of_errors_as_a_system(ball: Plant) -> None:
 )
 def test_bad_systems_get_one_sentence(sys: Any, found: str, ball: Plant) -> None:
     with pytest.raises(malta.InputError, match=found):
-        malta.controller_of(sys, ball)
+        malta.synthesis.controller_of(sys, ball)
 
 
 def test_what_a_law_of_errors_cannot_do(ball: Plant) -> None:
-    controller = malta.controller_of(control.ss([], [], [], [[3000.0]], 1e-4), ball)
+    controller = malta.synthesis.controller_of(control.ss([], [], [], [[3000.0]], 1e-4), ball)
     for option, found in (("scheduled", "a law of errors"), ("estimator", "a law of errors")):
         value: Any = True if option == "scheduled" else "kalman"
         scenario = malta.Scenario("hold", 0.01, malta.references.hold, fidelity="force", **{option: value})
@@ -411,7 +411,7 @@ def test_what_a_law_of_errors_cannot_do(ball: Plant) -> None:
 )
 def test_a_file_whose_law_is_not_of_errors(table: str, key: str, ball: Plant, tmp_path: Path) -> None:
     lead = control.c2d(control.ss(control.tf([30.0, 4000.0], [5e-4, 1])), 1e-4, "tustin")
-    controller = malta.controller_of(lead, ball)
+    controller = malta.synthesis.controller_of(lead, ball)
     path = tmp_path / "law.json"
     malta.gains.write(controller, malta.verify(malta.linearize(ball, ball.at()), controller), path)
     content = json.loads(path.read_text())

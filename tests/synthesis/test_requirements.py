@@ -292,7 +292,7 @@ def test_loads_from_outside_are_bounded_and_the_search_sees_them_as_the_judge_do
     assert bearing.outputs == ("y1", "y2")
     assert bearing.load_at(15e-3) == pytest.approx((0, 1, 0, 0.060, 0, 0))
     rows = {r.name: r for r in judge(spec)}
-    (pushed,) = malta.recovery(spec.plant, model_and_controller(spec)[1], {"": {"F_x": 1.0}})
+    (pushed,) = malta.loops.recovery(spec.plant, model_and_controller(spec)[1], {"": {"F_x": 1.0}})
     assert rows[names[0]].found == pytest.approx(max(d.largest for d in pushed.outputs), rel=1e-9)
     assert rows[names[2]].found == pytest.approx(max(d.left[1] for d in pushed.outputs), rel=1e-9)
     assert rows[names[3]].found > 1.02 * rows[names[0]].found

@@ -195,7 +195,7 @@ def test_delayed_inputs_act_late() -> None:
 
 def test_systems_that_do_not_touch_are_solved_apart(design: Design) -> None:
     """Gains between the planes x-beta, y-alpha and the axis z are zero, not small."""
-    K = malta.lqr(design.model, design.spec.weights)
+    K = malta.synthesis.lqr(design.model, design.spec.weights)
     groups = [({0, 4, 5, 9}, {0, 2}), ({1, 3, 6, 8}, {1, 3}), ({2, 7}, {4})]
     for states, inputs in groups:
         outside = [i for i in range(10) if i not in states]

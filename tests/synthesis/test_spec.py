@@ -398,7 +398,7 @@ def test_weights_refuse_what_is_no_weight(
 ) -> None:
     weights = designs["table2"].spec.weights
     given = {k: getattr(weights, k) for k in weights.__dataclass_fields__} | {name: np.array(value)}
-    error = refusal(lambda: malta.Weights(**given), Path("Weights"))
+    error = refusal(lambda: malta.synthesis.Weights(**given), Path("Weights"))
     assert expected in error.expected
 
 

@@ -11,7 +11,7 @@ import pytest
 import malta
 from malta.margins.verify import controller_poles
 from malta.synthesis.feedforward import pi_current_loop, static_feedforward
-from malta.synthesis.kalman import sampled_model
+from malta.synthesis.filters import sampled_model
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def test_the_three_ways_agree_as_the_sample_time_falls(designs: dict[str, Design]) -> None:
     design = designs["calibrated"]
-    K, Ki = malta.lqi(design.model, design.spec.weights)
+    K, Ki = malta.synthesis.lqi(design.model, design.spec.weights)
     ways: tuple[Discretization, ...] = ("backward-euler", "zoh", "sampled-data")
     for way in ways:
         errors = []
@@ -90,18 +90,18 @@ def test_calibrate_refuses_what_has_no_answer(
 ) -> None:
     weights = designs["table2"].spec.weights
     with pytest.raises(malta.InputError, match="stiffness_ratio: found 2, expected more than 2"):
-        malta.calibrate(model, weights, 2.0)
+        malta.synthesis.calibrate(model, weights, 2.0)
     coupled = malta.linearize(plant, plant.at(z=10e-3))
     with pytest.raises(malta.InputError, match="decoupled"):
-        malta.calibrate(coupled, weights, 4.0)
+        malta.synthesis.calibrate(coupled, weights, 4.0)
 
 
 @pytest.mark.parametrize(("ratio", "axial"), [(2.5, 0.5), (4.0, 1.0), (6.0, 2.0)])
 def test_calibrate_reaches_any_stiffness(
     model: LinearModel, designs: dict[str, Design], ratio: float, axial: float
 ) -> None:
-    weights = malta.calibrate(model, designs["table2"].spec.weights, ratio, axial)
-    K1 = np.diag(model.force_map @ malta.lqr(model, weights)[:, :5])
+    weights = malta.synthesis.calibrate(model, designs["table2"].spec.weights, ratio, axial)
+    K1 = np.diag(model.force_map @ malta.synthesis.lqr(model, weights)[:, :5])
     k = np.diag(model.stiffness)
     radial = [0, 1, 3, 4]
     assert K1[radial] / k[radial] == pytest.approx([ratio] * 4, rel=1e-9)
@@ -182,9 +182,9 @@ def test_a_model_with_its_loads_is_not_designed_on(plant: Plant, designs: dict[s
 def test_calibrate_needs_an_unstable_first_mode(plant: Plant, designs: dict[str, Design]) -> None:
     free = malta.plant_of(replace(plant.parameters, K_A=0.0))
     with pytest.raises(malta.InputError, match="an unstable first mode"):
-        malta.calibrate(malta.linearize(free, free.at()), designs["table2"].spec.weights, 4.0)
+        malta.synthesis.calibrate(malta.linearize(free, free.at()), designs["table2"].spec.weights, 4.0)
     with pytest.raises(malta.InputError, match="axial_ratio: found -1, expected more than 0"):
-        malta.calibrate(designs["table2"].model, designs["table2"].spec.weights, 4.0, -1.0)
+        malta.synthesis.calibrate(designs["table2"].model, designs["table2"].spec.weights, 4.0, -1.0)
 
 
 def test_arrays_of_a_controller_are_read_only(designs: dict[str, Design]) -> None:

@@ -21,7 +21,7 @@ from malta.model.linearize import LinearModel
 from malta.report.ledger import case_merit, run_design
 from malta.simulation.experiments import Experiment, Progress
 from malta.synthesis.controller import Controller
-from malta.synthesis.kalman import sampled_model
+from malta.synthesis.filters import sampled_model
 from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:

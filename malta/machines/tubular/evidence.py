@@ -36,11 +36,11 @@ from malta.simulation.experiments.catalogue import experiment
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import StrokeFigures, stroke_figures
-from malta.synthesis.calibrate import calibrate
 from malta.synthesis.controller import Controller
 from malta.synthesis.lqg import lqr
 from malta.synthesis.riccati import add_integrals
 from malta.synthesis.spec import Spec
+from malta.synthesis.stiffness_bases import calibrate
 
 if TYPE_CHECKING:
     from malta.campaigns.result import Rate

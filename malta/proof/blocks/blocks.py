@@ -178,7 +178,7 @@ class Dynamic:
     >>> import control, malta
     >>> W = control.tf([1 / 500, 0.1], [1 / 5000, 1])  # 10 %, from 50 rad/s on more
     >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
-    >>> found = malta.dynamic_margin(motor, [[-2.0]], {}, malta.Dynamic(W))
+    >>> found = malta.dynamic_margin(motor, [[-2.0]], {}, malta.proof.Dynamic(W))
     >>> f"{found.lower:.1f}"  # |T| = 2 / 3 and |W| = 0.1 at w = 0
     '15.0'
     """
@@ -223,7 +223,9 @@ def blocks_of(system: UncertainSystem, declared: Any, where: str) -> list[Block]
     several = [declared] if isinstance(declared, Dynamic) else declared
     if not isinstance(several, (list, tuple)) or not all(isinstance(d, Dynamic) for d in several):
         found = ", ".join(type(d).__name__ for d in several) if isinstance(several, (list, tuple)) else ""
-        raise InputError(where, "dynamics", found or type(declared).__name__, "malta.Dynamic, one or a list")
+        raise InputError(
+            where, "dynamics", found or type(declared).__name__, "malta.proof.Dynamic, one or a list"
+        )
     return [_block_of(system, d, where) for d in several]
 
 

@@ -114,7 +114,7 @@ def dynamic_margin(
 
     >>> import malta
     >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
-    >>> found = malta.dynamic_margin(motor, [[-2.0]], {}, malta.Dynamic(0.5))
+    >>> found = malta.dynamic_margin(motor, [[-2.0]], {}, malta.proof.Dynamic(0.5))
     >>> round(found.upper, 3)  # |T| = 2 / 3 at w = 0
     3.0
     """
@@ -123,7 +123,7 @@ def dynamic_margin(
     check_effort("dynamic_margin", tolerance, time)
     blocks = blocks_of(system, dynamic, "dynamic_margin")
     if not blocks:
-        raise InputError("dynamic_margin", "dynamic", "no block", "at least one malta.Dynamic")
+        raise InputError("dynamic_margin", "dynamic", "no block", "at least one malta.proof.Dynamic")
     asked = Blocks.of(system, law, box, blocks, "dynamic_margin")
     if asked.unstable():
         reason = "the nominal loop is unstable"

@@ -61,7 +61,7 @@ def experiment_figure(e: Experiment, published: Published | None = None) -> Figu
     """Draw an experiment: the machine's own figure of it, or that of its first run.
 
     e : the experiment
-    published : figures of the machine's paper, from `malta.published`; None: none
+    published : figures of the machine's paper, from `malta.model.published`; None: none
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -91,7 +91,7 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     """Draw a run: the machine's own figure of a stroke; of a machine without one, errors, forces and clearances.
 
     run : from `malta.simulate`
-    published : figures of the machine's paper, from `malta.published`; None: none
+    published : figures of the machine's paper, from `malta.model.published`; None: none
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -99,7 +99,7 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(10e-3))
-    >>> figure = malta.report.stroke_figure(run, malta.published("data/tubular.toml"))
+    >>> figure = malta.report.stroke_figure(run, malta.model.published("data/tubular.toml"))
     >>> len(figure.axes) > 2
     True
     """

@@ -62,7 +62,7 @@ def distributions_figure(found: Campaign | Summary, published: Published | None 
     A figure that is the same in every run, or that the reference makes by a jump, is told in a sentence.
 
     found : the campaign, or its summary
-    published : figures of the machine's paper, from `malta.published`; None: none; a summary has its own
+    published : figures of the machine's paper, from `malta.model.published`; None: none; a summary has its own
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -70,7 +70,7 @@ def distributions_figure(found: Campaign | Summary, published: Published | None 
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
     >>> figure = malta.report.distributions_figure(malta.campaign(plan, workers=1))
     >>> [axes.get_xlabel() for axes in figure.axes][:2]
     ['deviation y [µm]', 'largest f [N]']
@@ -182,7 +182,7 @@ def yield_figure(found: Campaign | Summary, published: Published | None = None) 
     Where all are completed alike there is nothing to tell apart, and `nearest_figure` stands in its place.
 
     found : the campaign, or its summary
-    published : figures of the machine's paper, from `malta.published`; None: none; a summary has its own
+    published : figures of the machine's paper, from `malta.model.published`; None: none; a summary has its own
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -190,7 +190,7 @@ def yield_figure(found: Campaign | Summary, published: Published | None = None) 
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
     >>> figure = malta.report.yield_figure(malta.campaign(plan, workers=1))
     >>> [axes.get_xlabel() for axes in figure.axes]
     ['m [kg]']

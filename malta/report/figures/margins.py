@@ -241,7 +241,7 @@ RECOVERY_LOOKS = (
 def recovery_figure(plant: Plant, controller: Controller, found: Sequence[Recovery]) -> Figure:
     """Deviation after a unit step of every disturbance, and compliance over frequency, of the output furthest off.
 
-    found : the answers of this machine to its disturbances, as malta.recovery(plant, controller) gives them
+    found : the answers of this machine to its disturbances, as malta.loops.recovery(plant, controller) gives them
 
     A row for each pair of units, as um under N. Raises CheckError for an unstable loop.
     """

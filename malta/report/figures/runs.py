@@ -158,7 +158,7 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
     """Draw the worst runs of a campaign: the places of their machines in the box, and their largest errors.
 
     found : the campaign, or its summary
-    published : figures of the machine's paper, from `malta.published`; None: none; a summary has its own
+    published : figures of the machine's paper, from `malta.model.published`; None: none; a summary has its own
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -166,7 +166,7 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
     >>> figure = malta.report.worst_figure(malta.campaign(plan, workers=1))
     >>> len(figure.axes)
     2

@@ -35,7 +35,7 @@ def run_text(plan: Plan) -> str:
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> malta.report.run_text(malta.Plan(controller, "stroke", spread={"m": 0.1}))
+    >>> malta.report.run_text(malta.campaigns.Plan(controller, "stroke", spread={"m": 0.1}))
     'stroke, fidelity dq'
     """
     from malta.campaigns.plan import planned_run
@@ -54,7 +54,7 @@ def box_text(plan: Plan) -> str:
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> malta.report.box_text(malta.Plan(controller, spread={"m": 0.1, "K_A": 0.05}))
+    >>> malta.report.box_text(malta.campaigns.Plan(controller, spread={"m": 0.1, "K_A": 0.05}))
     'm ±10 %, K_A ±5 %'
     """
     from malta.campaigns.result import spread_text
@@ -74,7 +74,7 @@ def campaign_tables(
     """Tabulate how the runs of a campaign end, their figures of merit beside the published bounds, and the worst runs.
 
     found : the campaign, or its summary
-    published : figures of the machine's paper, from `malta.published`; None: none; a summary has its own
+    published : figures of the machine's paper, from `malta.model.published`; None: none; a summary has its own
     worst : number of the worst runs that are listed
     spec : the design whose [specification] bounds the runs as well; a summary has its own
 
@@ -84,7 +84,7 @@ def campaign_tables(
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
     >>> tables = malta.report.campaign_tables(malta.campaign(plan, workers=1))
     >>> rich.print(tables.renderables[0])
     How the runs end
@@ -205,7 +205,7 @@ def _deviation_text(plan: Plan, name: str, value: float) -> str:
 def rare_event_tables(event: RareEvent) -> Group:
     """Tabulate the probability of a rare event with its interval, the repetitions behind it, and its design point.
 
-    event : from `malta.rare_event`
+    event : from `malta.campaigns.rare_event`
 
     Returns a rich Group of tables, which `rich.print` prints.
 
@@ -214,9 +214,9 @@ def rare_event_tables(event: RareEvent) -> Group:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.2}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=2000, options=short)
-    >>> limit = malta.limit_of(plan, "deviation-y", 40e-6)
-    >>> event = malta.rare_event(plan, limit, workers=1)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=2000, options=short)
+    >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 40e-6)
+    >>> event = malta.campaigns.rare_event(plan, limit, workers=1)
     >>> tables = malta.report.rare_event_tables(event).renderables
     >>> [str(table.title) for table in tables][:2]
     ['Rare event: deviation y above 40 um or an earlier end', 'Repetitions: 1 is the limit']
@@ -230,7 +230,7 @@ def rare_event_tables(event: RareEvent) -> Group:
 def rare_event_sentence(event: RareEvent) -> str:
     """Say what is known of a rare event where no run failed.
 
-    event : from `malta.rare_event`
+    event : from `malta.campaigns.rare_event`
 
     Returns a sentence; "" where runs failed.
 
@@ -239,9 +239,9 @@ def rare_event_sentence(event: RareEvent) -> str:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.1}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=2000, options=short)
-    >>> limit = malta.limit_of(plan, "deviation-y", 40e-6)
-    >>> event = malta.rare_event(plan, limit, workers=1)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=2000, options=short)
+    >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 40e-6)
+    >>> event = malta.campaigns.rare_event(plan, limit, workers=1)
     >>> malta.report.rare_event_sentence(event).partition(", as")[0]
     'no run failed: deviation y above 40 um or an earlier end has a probability below 2.4e-08'
     """
@@ -306,7 +306,7 @@ def _design_point_table(event: RareEvent) -> Table:
 def sensitivity_tables(found: Sensitivity) -> Group:
     """Tabulate total and first-order Sobol indices of the yield and of each figure of merit, by what varies.
 
-    found : from `malta.sensitivity`
+    found : from `malta.campaigns.sensitivity`
 
     Returns a rich Group of tables, which `rich.print` prints.
 
@@ -315,8 +315,8 @@ def sensitivity_tables(found: Sensitivity) -> Group:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> options = {"duration": 0.02, "noise": 0.0}
     >>> box = {"m": 0.2, "C": 0.2}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=64, options=options)
-    >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=64, options=options)
+    >>> found = malta.campaigns.sensitivity(plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1)
     >>> rich.print(malta.report.sensitivity_tables(found).renderables[0])
     yield: 100 % (89.11 to 100 %) of the machines without touchdown; 64 runs
     """
@@ -332,7 +332,7 @@ def sensitivity_tables(found: Sensitivity) -> Group:
 def sensitivity_sentence(found: Sensitivity) -> str:
     """Say why figures have no indices.
 
-    found : from `malta.sensitivity`
+    found : from `malta.campaigns.sensitivity`
 
     Returns a sentence; "" where all figures have indices.
 
@@ -341,8 +341,8 @@ def sensitivity_sentence(found: Sensitivity) -> str:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> options = {"duration": 0.02, "noise": 0.0}
     >>> box = {"m": 0.2, "C": 0.2}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=64, options=options)
-    >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=64, options=options)
+    >>> found = malta.campaigns.sensitivity(plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1)
     >>> malta.report.sensitivity_sentence(found)
     'every run is without touchdown: the yield has no indices'
     """
@@ -370,7 +370,7 @@ def _index_table(title: str, found: Sensitivity, *, total: bool) -> Table:
 def spreads_table(found: Tolerances) -> Table:
     """Tabulate the largest spread of each parameter that keeps the wanted yield, beside today's.
 
-    found : from `malta.tolerances`
+    found : from `malta.campaigns.tolerances`
 
     Returns a rich Table, which `rich.print` prints.
 
@@ -379,9 +379,9 @@ def spreads_table(found: Tolerances) -> Table:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.1}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=20, options=short)
-    >>> limit = malta.limit_of(plan, "deviation-y", 50e-6)
-    >>> found = malta.tolerances(plan, limit, 0.95, workers=1)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=20, options=short)
+    >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 50e-6)
+    >>> found = malta.campaigns.tolerances(plan, limit, 0.95, workers=1)
     >>> table = malta.report.spreads_table(found)
     >>> [str(column.header) for column in table.columns][:4], table.row_count
     (['parameter', 'today', 'largest', 'times'], 1)
@@ -408,7 +408,7 @@ def spreads_table(found: Tolerances) -> Table:
 def tolerance_sentence(found: Tolerances) -> str:
     """Name the parameters that keep the yield again with a wider spread.
 
-    found : from `malta.tolerances`
+    found : from `malta.campaigns.tolerances`
 
     Returns a sentence; "" where none does.
 
@@ -417,9 +417,9 @@ def tolerance_sentence(found: Tolerances) -> str:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.1}
-    >>> plan = malta.Plan(controller, "disturbance", box, samples=20, options=short)
-    >>> limit = malta.limit_of(plan, "deviation-y", 50e-6)
-    >>> found = malta.tolerances(plan, limit, 0.95, workers=1)
+    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=20, options=short)
+    >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 50e-6)
+    >>> found = malta.campaigns.tolerances(plan, limit, 0.95, workers=1)
     >>> malta.report.tolerance_sentence(found)
     ''
     """

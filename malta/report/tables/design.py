@@ -35,14 +35,14 @@ def poles_table(model: LinearModel, published: Published | None) -> Table:
     A damped plant has no pairs of opposite poles: all its poles are listed.
 
     model : the machine's linear model
-    published : figures of the machine's paper, from `malta.published`; None: none
+    published : figures of the machine's paper, from `malta.model.published`; None: none
 
     Returns a rich Table, which `rich.print` prints.
 
     >>> import malta, rich
     >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
     >>> model = malta.linearize(plant, plant.at())
-    >>> printed = malta.published("data/tubular.toml")
+    >>> printed = malta.model.published("data/tubular.toml")
     >>> rich.print(malta.report.poles_table(model, printed))
     Open-loop poles [rad/s]
     <BLANKLINE>
@@ -113,7 +113,7 @@ def bandwidth_table(margins: LoopReport, published: Published | None) -> Table:
     """Tabulate the bandwidth by each definition; a paper may print one figure without saying which it is.
 
     margins : from `malta.verify`
-    published : figures of the machine's paper, from `malta.published`; None: none
+    published : figures of the machine's paper, from `malta.model.published`; None: none
 
     Returns a rich Table, which `rich.print` prints.
 
@@ -270,7 +270,7 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
 
     The peak over frequency is the amplitude of the output under a load of this amplitude.
 
-    found : from `malta.recovery`
+    found : from `malta.loops.recovery`
     plant : the machine
 
     Returns a rich Table, which `rich.print` prints.
@@ -278,7 +278,7 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
     >>> import malta, rich
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> found = malta.recovery(spec.plant, controller)
+    >>> found = malta.loops.recovery(spec.plant, controller)
     >>> rich.print(malta.report.recovery_table(found, spec.plant))
     A constant load from outside, and the output that it moves furthest
     <BLANKLINE>

@@ -70,7 +70,7 @@ def experiment_table(e: Experiment, published: Published | None = None) -> Group
     Where the experiment has no figures of merit of its own, each case has a row.
 
     e : from `malta.experiment`
-    published : figures of the machine's paper, from `malta.published`; None: none
+    published : figures of the machine's paper, from `malta.model.published`; None: none
 
     Returns a rich Group of tables, which `rich.print` prints.
 

@@ -34,7 +34,7 @@ def loop_tables(
     """Tabulate all that is known of a loop, as `malta verify` prints it.
 
     found : from `malta.verify`; without `stages` what is linear alone
-    published : figures of the machine's paper, from `malta.published`; None: none
+    published : figures of the machine's paper, from `malta.model.published`; None: none
     spec : the design file, whose requirements were judged; None: none
 
     Returns an iterator of what `rich.print` prints.

@@ -145,7 +145,7 @@ def simulate_many(
     first : index of the first run; noise depends on scenario.seed and on the index
     noise : runs x parts: each of these equal parts of a run has the noise of the run of this index; None: its own
     workers : threads; None: one for each core
-    engine : makes the engine of each run, one after the other, as `malta.engine_of_c`; None: all machines at once
+    engine : makes the engine of each run, one after the other, as `malta.firmware.engine_of_c`; None: all at once
     progress : called now and then with the share of the runs that is done, 0 to 1
 
     Returns a Batch: figures of each run, not its time series.
@@ -333,7 +333,7 @@ def replayed(
     >>> hold = malta.Scenario("hold", 5e-3, malta.references.hold, noise=1.0)
     >>> masses = {"m": [0.3, 0.4]}
     >>> batch = malta.simulate_many(plant, controller, hold, masses, workers=1)
-    >>> machine, scenario = malta.replayed(plant, hold, masses, index=1)
+    >>> machine, scenario = malta.simulation.replayed(plant, hold, masses, index=1)
     >>> run = malta.simulate(machine, controller, scenario)
     >>> bool(abs(run.v).max() > 0.999 * batch.force[1].max())
     True

@@ -165,7 +165,7 @@ def fastest_stroke(
     >>> import malta
     >>> parameters = malta.read("data/tubular.toml")
     >>> plant = malta.plant_of(parameters)
-    >>> fastest = malta.fastest_stroke(plant, 10e-3, parameters.K_ind)
+    >>> fastest = malta.simulation.fastest_stroke(plant, 10e-3, parameters.K_ind)
     >>> f"{fastest.duration * 1e3:.1f} ms, 10 to 90 % in {fastest.rise * 1e3:.1f} ms"
     '17.4 ms, 10 to 90 % in 9.3 ms'
     """
