@@ -268,7 +268,11 @@ def identifier(label: str, unit: str) -> str:
 
     A range in per cent at the end of a label, as that of a rise, is left out.
 
-    >>> identifier("rise, 10-90 %", "ms"), identifier("deviation x1", "um"), identifier("overshoot", "percent")
+    >>> (
+    ...     identifier("rise, 10-90 %", "ms"),
+    ...     identifier("deviation x1", "um"),
+    ...     identifier("overshoot", "percent"),
+    ... )
     ('rise_s', 'deviation_x1_m', 'overshoot_share')
     """
     words = re.findall(r"\w+", re.sub(r",? \d+-\d+ %$", "", label))

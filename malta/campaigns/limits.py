@@ -69,7 +69,9 @@ def limit_of(plan: Plan, name: str, bound: float | None = None, bounds: Bounds =
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> box = {"m": 0.2}
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, options={"duration": 0.1})
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", box, options={"duration": 0.1}
+    ... )
     >>> malta.campaigns.limit_of(plan, "deviation-y", 50e-6).text
     'deviation y above 50 um or an earlier end'
     """

@@ -293,7 +293,9 @@ class Plan:
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> plan = malta.campaigns.Plan(controller, spread={"m": 0.1, "K_A": 0.05}, samples=200, seed=1)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, spread={"m": 0.1, "K_A": 0.05}, samples=200, seed=1
+    ... )
     >>> plan.scenario, dict(plan.options), plan.plant.name
     ('stroke', {'noise': 1.0}, 'tubular')
     """

@@ -426,7 +426,9 @@ def rare_event(
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.2}
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=2000, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", box, samples=2000, options=short
+    ... )
     >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 40e-6)
     >>> event = malta.campaigns.rare_event(plan, limit, workers=1)
     >>> low, high = event.found.interval()

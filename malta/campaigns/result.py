@@ -49,7 +49,9 @@ class Campaign:
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> short = {"duration": 0.01}  # s
-    >>> plan = malta.campaigns.Plan(controller, "hold", {"m": 0.1}, samples=5, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "hold", {"m": 0.1}, samples=5, options=short
+    ... )
     >>> found = malta.campaign(plan, workers=1)
     >>> found.names, found.values.shape, found.ends
     (('m',), (5, 1), {'completed': 5})

@@ -108,7 +108,9 @@ def campaign(
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> short = {"duration": 0.01}  # s
-    >>> plan = malta.campaigns.Plan(controller, "hold", {"m": 0.1}, samples=5, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "hold", {"m": 0.1}, samples=5, options=short
+    ... )
     >>> found = malta.campaign(plan, workers=1)
     >>> found.rate.passed, found.rate.runs
     (5, 5)

@@ -111,8 +111,12 @@ def sensitivity(
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> box, options = {"m": 0.2, "C": 0.2}, {"duration": 0.02, "noise": 0.0}
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=64, options=options)
-    >>> found = malta.campaigns.sensitivity(plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", box, samples=64, options=options
+    ... )
+    >>> found = malta.campaigns.sensitivity(
+    ...     plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1
+    ... )
     >>> mass, constant = found.of_merits["deviation y"]
     >>> found.factors, constant.total > mass.total  # magnets matter more
     (('m', 'C'), True)
@@ -258,7 +262,9 @@ def tolerances(
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.1}
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=20, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", box, samples=20, options=short
+    ... )
     >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 50e-6)
     >>> found = malta.campaigns.tolerances(plan, limit, 0.95, workers=1)
     >>> found.today.share, found.spreads[0].name, found.spreads[0].factor > 1

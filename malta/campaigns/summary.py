@@ -90,7 +90,9 @@ def sketch_of(values: FloatArray) -> Sketch:
 def merge(one: Sketch, other: Sketch) -> Sketch:
     """The sketch of the values of two sketches.
 
-    >>> quantiles(merge(sketch_of(np.array([1.0, 2.0])), sketch_of(np.array([9.0]))), [0.5]).tolist()
+    >>> quantiles(
+    ...     merge(sketch_of(np.array([1.0, 2.0])), sketch_of(np.array([9.0]))), [0.5]
+    ... ).tolist()
     [2.0]
     """
     return _count_if_many(
@@ -251,7 +253,9 @@ class Summary:
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> short = {"duration": 0.01}  # s
-    >>> plan = malta.campaigns.Plan(controller, "hold", {"m": 0.1}, samples=5, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "hold", {"m": 0.1}, samples=5, options=short
+    ... )
     >>> found = malta.campaigns.summarize(plan, workers=1)
     >>> found.runs, found.ends, [merit.label for merit in found.merits][:2]
     (5, {'completed': 5}, ['deviation of z', 'deviation x1'])

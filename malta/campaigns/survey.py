@@ -67,7 +67,9 @@ def summarize(
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> short = {"duration": 0.01}  # s
-    >>> plan = malta.campaigns.Plan(controller, "hold", {"m": 0.1}, samples=16, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "hold", {"m": 0.1}, samples=16, options=short
+    ... )
     >>> rate = malta.campaigns.summarize(plan, workers=1).rate
     >>> f"{rate.passed} of {rate.runs}; with 95 % confidence above {rate.low:.2f}"
     '16 of 16; with 95 % confidence above 0.79'

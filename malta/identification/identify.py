@@ -79,7 +79,9 @@ class Identified:
     >>> true = plant.variant(dataclasses.replace(plant.parameters, K_A=9000.0))
     >>> excited = malta.Scenario.excited(plan.signal, plan.duration)
     >>> run = malta.simulate(true, controller, excited)
-    >>> found = malta.identify(controller, malta.identification.log_of(run), parameters=["K_A", "K_B"])
+    >>> found = malta.identify(
+    ...     controller, malta.identification.log_of(run), parameters=["K_A", "K_B"]
+    ... )
     >>> found.names, len(found.intervals["K_A"])
     (('K_A', 'K_B'), 2)
     """
@@ -188,7 +190,9 @@ def identify(
     >>> true = plant.variant(dataclasses.replace(plant.parameters, K_A=9000.0))
     >>> excited = malta.Scenario.excited(plan.signal, plan.duration)
     >>> run = malta.simulate(true, controller, excited)
-    >>> found = malta.identify(controller, malta.identification.log_of(run), parameters=["K_A", "K_B"])
+    >>> found = malta.identify(
+    ...     controller, malta.identification.log_of(run), parameters=["K_A", "K_B"]
+    ... )
     >>> found.refusal, bool(abs(found.values[0] - 9000) < 20)
     ('', True)
     """

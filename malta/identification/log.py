@@ -304,7 +304,9 @@ def write_log(log: Log, path: str | Path) -> Path:
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
-    >>> malta.identification.write_log(malta.identification.log_of(run), "build/stand.npz").name
+    >>> malta.identification.write_log(
+    ...     malta.identification.log_of(run), "build/stand.npz"
+    ... ).name
     'stand.npz'
     """
     path = Path(path)
@@ -379,7 +381,9 @@ def read_log(path: str | Path) -> Log:
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
-    >>> file = malta.identification.write_log(malta.identification.log_of(run), "build/stand.csv")
+    >>> file = malta.identification.write_log(
+    ...     malta.identification.log_of(run), "build/stand.csv"
+    ... )
     >>> malta.read_log(file).samples
     2000
     """

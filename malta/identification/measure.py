@@ -92,9 +92,15 @@ class Measurement:
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
-    >>> plan = malta.excite(malta.loop(plant, controller), period=0.5, periods=4, band=(4, 400))
-    >>> run = malta.simulate(plant, controller, malta.Scenario.excited(plan.signal, plan.duration))
-    >>> found = malta.measure(controller, malta.identification.log_of(run), uncertainty={"K_A": 0.2})
+    >>> plan = malta.excite(
+    ...     malta.loop(plant, controller), period=0.5, periods=4, band=(4, 400)
+    ... )
+    >>> run = malta.simulate(
+    ...     plant, controller, malta.Scenario.excited(plan.signal, plan.duration)
+    ... )
+    >>> found = malta.measure(
+    ...     controller, malta.identification.log_of(run), uncertainty={"K_A": 0.2}
+    ... )
     >>> found.refusal, found.zones["x1"]
     ('', 'A')
     """
@@ -200,10 +206,18 @@ def measure(
     >>> import dataclasses, malta
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
-    >>> plan = malta.excite(malta.loop(plant, controller), period=0.5, periods=4, band=(4, 400))
-    >>> strong = plant.variant(dataclasses.replace(plant.parameters, K_B=8.0))  # outside of the box
-    >>> run = malta.simulate(strong, controller, malta.Scenario.excited(plan.signal, plan.duration))
-    >>> found = malta.measure(controller, malta.identification.log_of(run), uncertainty={"K_B": 0.2})
+    >>> plan = malta.excite(
+    ...     malta.loop(plant, controller), period=0.5, periods=4, band=(4, 400)
+    ... )
+    >>> strong = plant.variant(
+    ...     dataclasses.replace(plant.parameters, K_B=8.0)
+    ... )  # outside of the box
+    >>> run = malta.simulate(
+    ...     strong, controller, malta.Scenario.excited(plan.signal, plan.duration)
+    ... )
+    >>> found = malta.measure(
+    ...     controller, malta.identification.log_of(run), uncertainty={"K_B": 0.2}
+    ... )
     >>> found.refusal.startswith("|S| of"), 2.2 < found.peaks["x1"][0] < 2.6
     (True, True)
     """

@@ -58,7 +58,9 @@ class LawReplay:
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
-    >>> found = malta.identification.replay_law(controller, malta.identification.log_of(run))
+    >>> found = malta.identification.replay_law(
+    ...     controller, malta.identification.log_of(run)
+    ... )
     >>> found.v.shape, found.innovation.shape
     ((2000, 5), (2000, 5))
     """

@@ -371,7 +371,9 @@ class Plant:
         Raises InputError for unknown names and values that are not finite.
 
         >>> import malta
-        >>> malta.read_design("examples/ball/design/ball.toml").plant.state({"q": 1e-3}).tolist()
+        >>> malta.read_design("examples/ball/design/ball.toml").plant.state(
+        ...     {"q": 1e-3}
+        ... ).tolist()
         [0.001, 0.0]
         """
         names = [s.name for s in self.states]

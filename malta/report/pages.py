@@ -235,8 +235,12 @@ def sensitivity(found: Sensitivity, path: str | Path | None = None) -> Figure:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> options = {"duration": 0.02, "noise": 0.0}
     >>> box = {"m": 0.2, "C": 0.2}
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=64, options=options)
-    >>> found = malta.campaigns.sensitivity(plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", box, samples=64, options=options
+    ... )
+    >>> found = malta.campaigns.sensitivity(
+    ...     plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1
+    ... )
     >>> figure = malta.report.sensitivity(found)
     >>> figure.axes[0].get_ylabel()
     'share of the variance [-]'
@@ -255,7 +259,9 @@ class CampaignFigures(NamedTuple):
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", {"m": 0.1}, samples=8, options=short
+    ... )
     >>> figures = malta.report.campaign(malta.campaign(plan, workers=1))
     >>> figures._fields
     ('distributions', 'endings', 'worst')
@@ -297,7 +303,9 @@ def campaign(
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", {"m": 0.1}, samples=8, options=short
+    ... )
     >>> figures = malta.report.campaign(malta.campaign(plan, workers=1), "build")
     >>> figures.worst is figures[-1], malta.report.CAMPAIGN_FILES[-1]
     (True, 'worst.png')

@@ -94,7 +94,9 @@ def step_response(M: FloatArray, g: FloatArray, C: FloatArray, Ts: float) -> Ste
     Raises CheckError for a loop that is not stable.
 
     >>> import numpy as np
-    >>> step_response(np.array([[0.5]]), np.array([[1.0]]), np.array([[1.0]]), 1e-3).final.tolist()
+    >>> step_response(
+    ...     np.array([[0.5]]), np.array([[1.0]]), np.array([[1.0]]), 1e-3
+    ... ).final.tolist()
     [[2.0]]
     """
     n, w = g.shape

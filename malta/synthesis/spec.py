@@ -64,7 +64,9 @@ class Weights:
     >>> import numpy as np
     >>> one = np.ones(1)
     >>> base = np.array([1e-4, 0.1])  # 0.1 mm and 0.1 m/s weigh as much as 1 N
-    >>> weights = malta.synthesis.Weights(np.ones(2), base, one, one, one, one, one, 1e-12 * one)
+    >>> weights = malta.synthesis.Weights(
+    ...     np.ones(2), base, one, one, one, one, one, 1e-12 * one
+    ... )
     >>> weights.Q.round(3).tolist(), weights.R.tolist()  # Bryson's rule
     ([[100000000.0, 0.0], [0.0, 100.0]], [[1.0]])
     """

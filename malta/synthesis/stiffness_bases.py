@@ -42,7 +42,9 @@ def calibrate(
     >>> import malta
     >>> spec = malta.read_design("design/calibrated.toml")
     >>> model = malta.linearize(spec.plant, spec.plant.at())
-    >>> K = malta.synthesis.lqr(model, malta.synthesis.calibrate(model, spec.weights, stiffness_ratio=4))
+    >>> K = malta.synthesis.lqr(
+    ...     model, malta.synthesis.calibrate(model, spec.weights, stiffness_ratio=4)
+    ... )
     >>> stiffness = (model.force_map @ K)[0, 0] / model.stiffness[0, 0]
     >>> f"K1 / k = {stiffness:.3f}"
     'K1 / k = 4.000'

@@ -91,7 +91,13 @@ def descend(look: Look, u: FloatArray, merit: Merit, trials: int) -> FloatArray:
 
     >>> import numpy as np
     >>> roof = lambda u: (0.0, np.array([u[0] - u[1], u[1] - 0.5, 0.3 - u[0]]))
-    >>> bool(np.allclose(descend(roof, np.array([0.9, 0.1]), Merit(), 200), [0.3667, 0.4333], atol=1e-3))
+    >>> bool(
+    ...     np.allclose(
+    ...         descend(roof, np.array([0.9, 0.1]), Merit(), 200),
+    ...         [0.3667, 0.4333],
+    ...         atol=1e-3,
+    ...     )
+    ... )
     True
     """
     start = look(u) if len(u) and trials > 0 else None

@@ -223,14 +223,14 @@ def verify(
     >>> controller = malta.synthesize(spec, model)
     >>> print(malta.verify(model, controller, spec.uncertainty))
     stable with hold, delay and current loops
-    peak |S|, sampled: y 1.71 A  all 1.71 (4.7 dB)
-    peak |S|, + current loops: y 1.71 A  all 1.71 (4.7 dB)
-    peak |S|, machine: y 1.57 A  all 1.57 (3.9 dB)
-    bandwidth, last -3 dB of sigma_max(T): 652.0 rad/s (103.76 Hz)
-    bandwidth, first -3 dB of sigma_min(T): 652.0 rad/s (103.76 Hz)
-    bandwidth, last 0 dB of sigma_max(L): 290.8 rad/s (46.29 Hz)
-    bandwidth, regulator's fastest natural frequency: 247.4 rad/s (39.37 Hz)
-    bandwidth, regulator's slowest natural frequency: 247.4 rad/s (39.37 Hz)
+    peak |S|, sampled: y 1.71, zone A  all 1.71 (4.7 dB)
+    peak |S|, + current loops: y 1.71, zone A  all 1.71 (4.7 dB)
+    peak |S|, machine: y 1.57, zone A  all 1.57 (3.9 dB)
+    bandwidth, last -3 dB of sigma_max(T): 103.76 Hz (652.0 rad/s)
+    bandwidth, first -3 dB of sigma_min(T): 103.76 Hz (652.0 rad/s)
+    bandwidth, last 0 dB of sigma_max(L): 46.29 Hz (290.8 rad/s)
+    bandwidth, regulator's fastest natural frequency: 39.37 Hz (247.4 rad/s)
+    bandwidth, regulator's slowest natural frequency: 39.37 Hz (247.4 rad/s)
     uncertainty: m +-20 %  C +-20 %
     robust: proven 320... %, lost at 320.61 % at 1047 rad/s
     >>> found = malta.verify(model, controller, {"m": 0.2}, stages=True)

@@ -346,7 +346,7 @@ def test_the_time_is_kept() -> None:
         ([Dynamic(0.1, "additive")], "of an additive block"),
         ([Dynamic(0.1, "additive", channel=(0, 2))], "0, forces are counted|forces from 0"),
         ([Dynamic(0.1, channel=(1, 1))], "each of the sensors once"),
-        ([Dynamic(0.1, channel=1.0)], "sensors from 0 to 1"),
+        ([Dynamic(0.1, channel=1.0)], "sensors from 0 to 1"),  # type: ignore[arg-type]
         (["much"], "malta.proof.Dynamic, one or a list"),
     ],
 )

@@ -107,7 +107,7 @@ def test_an_unstable_loop_has_no_margin() -> None:
         (Dynamic(control.tf([1], [1, -1])), "stable, proper"),
         (Dynamic(control.tf([1], [1, 0.5], 0.1)), "stable, proper"),
         (Dynamic(0.5, channel=3), "sensors are counted from 0"),
-        (Dynamic(0.5, at="here"), "sensors or forces"),
+        (Dynamic(0.5, at="here"), "sensors or forces"),  # type: ignore[arg-type]
     ],
 )
 def test_bad_input_gets_one_sentence(dynamic: Dynamic, says: str) -> None:

@@ -137,7 +137,9 @@ def determinant(a: Sequence[Any]) -> Any:
     """Hurwitz's determinant of order n - 1 of a_0 + a_1 s + ... + a_n s^n, as a ball.
 
     >>> from flint import arb
-    >>> print(determinant([arb(6), arb(11), arb(6), arb(1)]))  # (s + 1)(s + 2)(s + 3): 3 x 4 x 5
+    >>> print(
+    ...     determinant([arb(6), arb(11), arb(6), arb(1)])
+    ... )  # (s + 1)(s + 2)(s + 3): 3 x 4 x 5
     60.0000000000000
     """
     n = len(a) - 1

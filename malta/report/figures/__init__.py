@@ -99,7 +99,9 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(10e-3))
-    >>> figure = malta.report.stroke_figure(run, malta.model.published("data/tubular.toml"))
+    >>> figure = malta.report.stroke_figure(
+    ...     run, malta.model.published("data/tubular.toml")
+    ... )
     >>> len(figure.axes) > 2
     True
     """

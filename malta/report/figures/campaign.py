@@ -70,7 +70,9 @@ def distributions_figure(found: Campaign | Summary, published: Published | None 
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", {"m": 0.1}, samples=8, options=short
+    ... )
     >>> figure = malta.report.distributions_figure(malta.campaign(plan, workers=1))
     >>> [axes.get_xlabel() for axes in figure.axes][:2]
     ['deviation y [µm]', 'largest f [N]']
@@ -190,7 +192,9 @@ def yield_figure(found: Campaign | Summary, published: Published | None = None) 
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", {"m": 0.1}, samples=8, options=short
+    ... )
     >>> figure = malta.report.yield_figure(malta.campaign(plan, workers=1))
     >>> [axes.get_xlabel() for axes in figure.axes]
     ['m [kg]']

@@ -166,7 +166,9 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", {"m": 0.1}, samples=8, options=short
+    ... )
     >>> figure = malta.report.worst_figure(malta.campaign(plan, workers=1))
     >>> len(figure.axes)
     2

@@ -255,7 +255,8 @@ SIGN = "★"  # before the better value, beside bold letters
 def comparison_page(found: Comparison, progress: Callable[[float], None] | None = None) -> Page:
     """Write a comparison as one page in HTML that needs no network and no other file.
 
-    found : from `malta.report.compare_gains`; progress : takes the share of the figures that are drawn
+    found : from `malta.report.compare_gains`
+    progress : takes the share of the figures that are drawn
 
     Returns a Page: a notebook shows it, and its `save` writes it to a file.
 

@@ -35,7 +35,9 @@ def run_text(plan: Plan) -> str:
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> malta.report.run_text(malta.campaigns.Plan(controller, "stroke", spread={"m": 0.1}))
+    >>> malta.report.run_text(
+    ...     malta.campaigns.Plan(controller, "stroke", spread={"m": 0.1})
+    ... )
     'stroke, fidelity dq'
     """
     from malta.campaigns.plan import planned_run
@@ -54,7 +56,9 @@ def box_text(plan: Plan) -> str:
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> malta.report.box_text(malta.campaigns.Plan(controller, spread={"m": 0.1, "K_A": 0.05}))
+    >>> malta.report.box_text(
+    ...     malta.campaigns.Plan(controller, spread={"m": 0.1, "K_A": 0.05})
+    ... )
     'm ±10 %, K_A ±5 %'
     """
     from malta.campaigns.result import spread_text
@@ -84,7 +88,9 @@ def campaign_tables(
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", {"m": 0.1}, samples=8, options=short
+    ... )
     >>> tables = malta.report.campaign_tables(malta.campaign(plan, workers=1))
     >>> rich.print(tables.renderables[0])
     How the runs end
@@ -214,7 +220,9 @@ def rare_event_tables(event: RareEvent) -> Group:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.2}
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=2000, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", box, samples=2000, options=short
+    ... )
     >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 40e-6)
     >>> event = malta.campaigns.rare_event(plan, limit, workers=1)
     >>> tables = malta.report.rare_event_tables(event).renderables
@@ -239,7 +247,9 @@ def rare_event_sentence(event: RareEvent) -> str:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.1}
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=2000, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", box, samples=2000, options=short
+    ... )
     >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 40e-6)
     >>> event = malta.campaigns.rare_event(plan, limit, workers=1)
     >>> malta.report.rare_event_sentence(event).partition(", as")[0]
@@ -315,8 +325,12 @@ def sensitivity_tables(found: Sensitivity) -> Group:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> options = {"duration": 0.02, "noise": 0.0}
     >>> box = {"m": 0.2, "C": 0.2}
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=64, options=options)
-    >>> found = malta.campaigns.sensitivity(plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", box, samples=64, options=options
+    ... )
+    >>> found = malta.campaigns.sensitivity(
+    ...     plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1
+    ... )
     >>> rich.print(malta.report.sensitivity_tables(found).renderables[0])
     yield: 100 % (89.11 to 100 %) of the machines without touchdown; 64 runs
     """
@@ -341,8 +355,12 @@ def sensitivity_sentence(found: Sensitivity) -> str:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> options = {"duration": 0.02, "noise": 0.0}
     >>> box = {"m": 0.2, "C": 0.2}
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=64, options=options)
-    >>> found = malta.campaigns.sensitivity(plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", box, samples=64, options=options
+    ... )
+    >>> found = malta.campaigns.sensitivity(
+    ...     plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1
+    ... )
     >>> malta.report.sensitivity_sentence(found)
     'every run is without touchdown: the yield has no indices'
     """
@@ -379,7 +397,9 @@ def spreads_table(found: Tolerances) -> Table:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.1}
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=20, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", box, samples=20, options=short
+    ... )
     >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 50e-6)
     >>> found = malta.campaigns.tolerances(plan, limit, 0.95, workers=1)
     >>> table = malta.report.spreads_table(found)
@@ -417,7 +437,9 @@ def tolerance_sentence(found: Tolerances) -> str:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> short = {"duration": 0.02}  # s
     >>> box = {"m": 0.1}
-    >>> plan = malta.campaigns.Plan(controller, "disturbance", box, samples=20, options=short)
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "disturbance", box, samples=20, options=short
+    ... )
     >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 50e-6)
     >>> found = malta.campaigns.tolerances(plan, limit, 0.95, workers=1)
     >>> malta.report.tolerance_sentence(found)
