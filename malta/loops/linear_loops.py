@@ -190,6 +190,9 @@ class System(NamedTuple):
 class LinearLoop:
     """A plant y = P (v, r) + P_w w and its law (v, r) = F y: m inputs v, and readings r that held currents hang on.
 
+    What curves, steps and loci of any loop are computed from. That of a machine is derived from its Loop, in
+    differences; systems of python-control have no machine, and so no Loop.
+
     plant : inputs v, r, w (m, some or none, d); outputs y, then the true outputs where sensors read late
     law : inputs y; outputs v and r
     command : what a unit reference adds, one column each: in the law's states, and in v and r

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 
 FEW = 32  # frequencies at which a system is solved as a whole
-REMEMBERED = 64  # places, and grids of frequencies, that searches of several gains begin at
 
 
 class Responses(NamedTuple):
@@ -37,13 +36,8 @@ def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: Float
     G(s) = C (s E - A)^-1 B + D behind a lag w_c / (s + w_c); of a sampled loop the exact discrete system under a
     zero-order hold at z = e^(j w T), times z^-delay. Differences (z - 1) / T keep the digits of slow modes.
     """
-    return _responses(system, law, np.asarray(p, dtype=float).tobytes(), np.asarray(w, dtype=float).tobytes())
-
-
-@lru_cache(maxsize=REMEMBERED)
-def _responses(system: UncertainSystem, law: Compensator, place: bytes, frequencies: bytes) -> Responses:
-    A, B, C, D = _plant(system, law, place)
-    s, turned, F = _law(law, frequencies)
+    A, B, C, D = _plant(system, law, np.asarray(p, dtype=float).tobytes())
+    s, turned, F = _law(law, np.asarray(w, dtype=float).tobytes())
     m, q = len(law.D), C.shape[1] - len(law.D)
     G = (C @ _resolvent(s, A, B) + D) * turned[:, None, None]
     return Responses(G[:, :q, :m], G[:, :q, m:], G[:, q:, :m], F)
@@ -67,7 +61,7 @@ def _resolvent(s: ComplexArray, A: FloatArray, B: FloatArray) -> ComplexArray:
 Sides = tuple["FloatArray", "FloatArray", "FloatArray", "FloatArray"]
 
 
-@lru_cache(maxsize=REMEMBERED)  # records compare by identity
+@lru_cache(maxsize=4)  # an ascent moves p or w and returns; records compare by identity
 def _plant(system: UncertainSystem, law: Compensator, p: bytes) -> Sides:
     """A, B, C and D from commands and from forces on the plant to sensors and forces; in differences when sampled.
 
@@ -97,7 +91,7 @@ def _plant(system: UncertainSystem, law: Compensator, p: bytes) -> Sides:
     return A @ Phi / T, Phi @ into / T, out, through
 
 
-@lru_cache(maxsize=REMEMBERED)
+@lru_cache(maxsize=4)
 def _law(law: Compensator, w: bytes) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """s, or (z - 1) / T when sampled; z^-delay; and F: at frequencies w."""
     T = law.sample_time

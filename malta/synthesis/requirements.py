@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -27,7 +27,7 @@ from malta.model.plant import Plant, Signal
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Parameters
     from malta.synthesis.controller import Controller
-    from malta.synthesis.filters import Gains, Linear
+    from malta.synthesis.filters import Linear
     from malta.synthesis.recovery import RecoveryBound, StepResponse
     from malta.synthesis.spec import Spec
 
@@ -100,50 +100,27 @@ class Design(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class TrialLoop:
-    """The closed loop of a trial of the search: some outputs and inputs that nothing joins to the others.
-
-    closed = [Ad + Bd D Cd, Bd C; B Cd, A] of the sampled machine (Ad, Bd, Cd) and the law (A, B, C, D).
-    """
+class TrialFigures:
+    """What a trial of the search has computed of its loop: of outputs and inputs that nothing joins to the others."""
 
     plant: Plant
-    sample_time: float  # s
     outputs: tuple[int, ...]  # p of the plant's
     inputs: tuple[int, ...]  # m of the plant's
     model: Linear  # continuous, n states
-    gains: Gains
-    Bd: FloatArray  # of the sampled machine with hold, delay and current loops, as Cd
-    Cd: FloatArray
-    closed: FloatArray
     noise: Noise  # p motions and m forces
     margin: float | None  # None: not asked for
     peak_sensitivity: float
     bandwidth: float  # rad/s
     # Of a unit load on each of the plant's disturbances, at positions of the stroke, m, the operating point first.
-    answers: tuple[tuple[float, StepResponse], ...] = ()
-    recovery: Mapping[str, RecoveryBound] = field(default_factory=dict)  # what is asked of them
-    known: int = 0  # blocks of forces behind the lag and of the delay among the states of the law
-    # m x n / 2, N/m: fed forward of the positions at the reference; none: nothing
-    hold: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-
-    def follow(self, w: float, p: FloatArray, x: ComplexArray) -> ComplexArray:
-        """Return the true outputs as complex amplitudes while the reference is p exp(jwt), with states x exp(jwt).
-
-        p : p outputs;  x : n states;  w : rad/s
-        """
-        g, Ts, forces = self.gains, self.sample_time, self.Bd.shape[1]
-        v_ff = self.hold @ x[: len(x) // 2] if self.hold.size else np.zeros(forces)
-        xi = np.zeros(len(g.Ad), dtype=complex)
-        xi[: len(x)] = x
-        xi[len(x) :][: self.known * forces] = np.tile(v_ff, self.known)  # slow beside lag and delay
-        v = g.K @ xi + Ts * g.Ki @ p + v_ff
-        driven = np.concatenate([self.Bd @ v, g.Bd @ v, Ts * p])[: len(self.closed)]
-        states = np.linalg.solve(np.exp(1j * w * Ts) * np.eye(len(self.closed)) - self.closed, driven)
-        return np.asarray(self.Cd @ states[: self.Cd.shape[1]])
+    answers: tuple[tuple[float, StepResponse], ...]
+    recovery: Mapping[str, RecoveryBound]  # what is asked of them
+    # of w (rad/s), p and x: the true outputs, p complex amplitudes, while the reference is p exp(jwt) and the states
+    # that go with it are x exp(jwt)
+    follow: Callable[[float, FloatArray, ComplexArray], ComplexArray]
 
 
 Measure = Callable[[Design, float, str], Sequence[Figure]]  # of a bound that is asked for, of a signal or ""
-Estimate = Callable[[TrialLoop, str], float | None]  # None: the loop has no such figure
+Estimate = Callable[[TrialFigures, str], float | None]  # None: the trial has no such figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,8 +256,8 @@ def motion_of(name: str, outputs: Indices, heading: str) -> Requirement:
     def measure(design: Design, _asked: float, _signal: str) -> list[Figure]:
         return _worst(design, "motion", outputs(design.plant))
 
-    def estimate(loop: TrialLoop, _signal: str) -> float | None:
-        return _largest(loop.noise.motion, loop.outputs, outputs(loop.plant))
+    def estimate(trial: TrialFigures, _signal: str) -> float | None:
+        return _largest(trial.noise.motion, trial.outputs, outputs(trial.plant))
 
     meaning = f"{heading} motion at rest, rms, from the sensors' noise and steps"
     return Requirement(
@@ -301,8 +278,8 @@ def force_noise_of(name: str, inputs: Indices, heading: str) -> Requirement:
     def measure(design: Design, _asked: float, _signal: str) -> list[Figure]:
         return _worst(design, "force", inputs(design.plant))
 
-    def estimate(loop: TrialLoop, _signal: str) -> float | None:
-        return _largest(loop.noise.force, loop.inputs, inputs(loop.plant))
+    def estimate(trial: TrialFigures, _signal: str) -> float | None:
+        return _largest(trial.noise.force, trial.inputs, inputs(trial.plant))
 
     meaning = f"noise of the commanded {heading} at rest, rms"
     return Requirement(
@@ -366,28 +343,28 @@ def _motion(design: Design, _asked: float, signal: str) -> list[Figure]:
     return _worst(design, "motion", _index(design.plant.outputs, signal))
 
 
-def _motion_estimate(loop: TrialLoop, signal: str) -> float | None:
-    return _largest(loop.noise.motion, loop.outputs, _index(loop.plant.outputs, signal))
+def _motion_estimate(trial: TrialFigures, signal: str) -> float | None:
+    return _largest(trial.noise.motion, trial.outputs, _index(trial.plant.outputs, signal))
 
 
 def _force_noise(design: Design, _asked: float, signal: str) -> list[Figure]:
     return _worst(design, "force", _index(design.plant.inputs, signal))
 
 
-def _force_estimate(loop: TrialLoop, signal: str) -> float | None:
-    return _largest(loop.noise.force, loop.inputs, _index(loop.plant.inputs, signal))
+def _force_estimate(trial: TrialFigures, signal: str) -> float | None:
+    return _largest(trial.noise.force, trial.inputs, _index(trial.plant.inputs, signal))
 
 
 def _recovery(design: Design, _asked: float, signal: str) -> list[Figure]:
     return [design.deviation(design.spec.recovery[signal])]
 
 
-def _recovery_estimate(loop: TrialLoop, signal: str) -> float | None:
+def _recovery_estimate(trial: TrialFigures, signal: str) -> float | None:
     """The deviation of the loop's own outputs; at the ends of the travel where it is asked for anywhere."""
-    bound = loop.recovery[signal]
-    names = [loop.plant.outputs[k].name for k in loop.outputs]
+    bound = trial.recovery[signal]
+    names = [trial.plant.outputs[k].name for k in trial.outputs]
     chosen = [k for k, name in enumerate(names) if name in bound.outputs]
-    places = loop.answers if bound.anywhere else loop.answers[:1]
+    places = trial.answers if bound.anywhere else trial.answers[:1]
     answers = [one.of(bound.load_at(position)) for position, one in places]
     if not chosen or not any(one.y.any() for one in answers):
         return None
@@ -412,7 +389,7 @@ GENERIC = (
         _margin,
         at_least=True,
         laws=("LQG", "PID"),
-        estimate=lambda loop, _: loop.margin,
+        estimate=lambda trial, _: trial.margin,
         needs_stability=False,
         meaning="proven margin in multiples of the box of uncertainty, anywhere in the travel, at least",
     ),
@@ -421,7 +398,7 @@ GENERIC = (
         _peak_sensitivity,
         laws=("LQG", "PID"),
         above=1.0,
-        estimate=lambda loop, _: loop.peak_sensitivity,
+        estimate=lambda trial, _: trial.peak_sensitivity,
         needs_stability=False,
         heading="peak S",
         meaning="largest |S| of every sensor, on the machine",
@@ -432,7 +409,7 @@ GENERIC = (
         "rad/s",
         at_least=True,
         laws=("LQG", "PID"),
-        estimate=lambda loop, _: loop.bandwidth,
+        estimate=lambda trial, _: trial.bandwidth,
         needs_stability=False,
         heading="bandwidth",
         meaning="bandwidth by every definition of `malta verify`, at least",

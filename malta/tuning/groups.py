@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -44,7 +44,7 @@ from malta.synthesis.feedforward import current_loop_of, holding_gain, static_fe
 from malta.synthesis.filters import gain_at_rest
 from malta.synthesis.lqg import gains
 from malta.synthesis.recovery import step_response
-from malta.synthesis.requirements import Noise, TrialLoop, requirements_for
+from malta.synthesis.requirements import Noise, TrialFigures, requirements_for
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 from malta.synthesis.spec import Spec, Weights
 
@@ -467,34 +467,53 @@ def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
     except CheckError:
         return {}
     margins = None if group.corners is None else corner_margins(group.corners, _with_forecast(group, g, law))
-    loop = TrialLoop(
+    trial = TrialFigures(
         plant=spec.plant,
-        sample_time=Ts,
         outputs=group.outputs,
         inputs=group.inputs,
         model=group.model,
-        gains=g,
-        Bd=group.nominal.Bd[:, : len(group.inputs)],
-        Cd=group.nominal.Cd,
-        closed=closed,
         noise=_noise(group, steady, closed),
         margin=None if margins is None else float(margins.min()),
         peak_sensitivity=peak,
         bandwidth=bandwidth,
         answers=answers,
         recovery=spec.recovery,
-        known=known,
-        hold=holding_gain(group.model.A, group.model.B) if spec.position_feedforward else np.zeros((0, 0)),
+        follow=_follower(spec, group, g, closed, known),
     )
     figures = {}
     for name, signal, requirement in group.requirements:
         assert requirement.estimate is not None
-        value = requirement.estimate(loop, signal)
+        value = requirement.estimate(trial, signal)
         if value is not None:
             figures[name] = value
     if margins is not None:
         figures |= {f"margin {k}": value for k, value in enumerate(margins.tolist())}
     return figures
+
+
+def _follower(
+    spec: Spec, group: Group, g: Gains, closed: FloatArray, known: int
+) -> Callable[[float, FloatArray, ComplexArray], ComplexArray]:
+    """`TrialFigures.follow` of a trial.
+
+    closed : of the nominal machine and the law
+    known : blocks of forces behind the lag and of the delay among the states of the law
+    """
+    Ts, Bd = spec.sample_time, group.nominal.Bd[:, : len(group.inputs)]
+
+    def follow(w: float, p: FloatArray, x: ComplexArray) -> ComplexArray:
+        v_ff = np.zeros(Bd.shape[1], dtype=complex)
+        if spec.position_feedforward:
+            v_ff = holding_gain(group.model.A, group.model.B) @ x[: len(x) // 2]
+        xi = np.zeros(len(g.Ad), dtype=complex)
+        xi[: len(x)] = x
+        xi[len(x) :][: known * len(v_ff)] = np.tile(v_ff, known)  # slow beside lag and delay
+        v = g.K @ xi + Ts * g.Ki @ p + v_ff
+        driven = np.concatenate([Bd @ v, g.Bd @ v, Ts * p])[: len(closed)]
+        states = np.linalg.solve(np.exp(1j * w * Ts) * np.eye(len(closed)) - closed, driven)
+        return np.asarray(group.nominal.Cd @ states[: group.nominal.Cd.shape[1]])
+
+    return follow
 
 
 def _with_forecast(group: Group, g: Gains, law: LinearLaw) -> LinearLaw:

@@ -138,6 +138,9 @@ def test_the_machine_lies_within_its_enclosure(name: str) -> None:
         assert (own <= b).all()
         closest = max(closest, float(np.abs(e).max() / E.max()))
     assert closest > 0.6  # the bounds are not far away
+    near, proven = h.bounds_near(p), h.bounds([arb(x) for x in p.tolist()])
+    for one, two in zip(near, proven, strict=True):
+        assert one == pytest.approx(two, rel=1e-6, abs=1e-12)
 
 
 def sampled_deviation(
@@ -210,6 +213,25 @@ def test_adjugates_and_determinants_of_axes() -> None:
             wanted = np.linalg.inv(z * np.eye(len(A)) - A)
             scale = np.abs(wanted).max(axis=1, keepdims=True) * np.abs(wanted).max(axis=0, keepdims=True)
             assert (np.abs(inverse - wanted) <= 1e-6 * np.sqrt(scale) + 1e-6 * np.abs(wanted)).all()
+
+
+def test_a_side_without_width_has_one_node() -> None:
+    """The polynomials over such a box are the restrictions of those over the whole box, at the ends of the others."""
+    _, _, problem = machine()
+    sides = box_at(problem).sides(0.5)
+    for axis in range(len(sides)):
+        thin = np.tile(problem.machine.nominal[:, None], 2)
+        thin[axis] = sides[axis]
+        for g in problem.groups:
+            det, radius, N, slack = g.over(thin)
+            shape = g.degrees_over(thin)
+            assert [d for k, d in enumerate(shape) if k != axis] == [0] * (len(sides) - 1)
+            assert det.shape[1] == N.shape[3] == shape[axis] + 1
+            for end, node in ((0, 0), (1, -1)):
+                point = np.tile(thin[:, [end]], 2)
+                at, also, N_at, _ = g.over(point + [[-1e-12, 1e-12]] * point)
+                assert (np.abs(det[:, node] - at[:, 0]) <= 1e-9 * np.abs(at[:, 0]) + radius + also).all()
+                assert (np.abs(N[..., node] - N_at[..., 0]) <= 1e-9 * np.abs(N_at[..., 0]) + 2 * slack).all()
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from malta.synthesis.requirements import (
     Figure,
     Law,
     Requirement,
-    TrialLoop,
+    TrialFigures,
     force_noise_of,
     mean_over_seeds,
     motion_of,
@@ -82,20 +82,20 @@ def _of_strokes(index: int) -> Callable[[Design, float, str], list[Figure]]:
     return measure
 
 
-def _tilt_estimate(loop: TrialLoop, _signal: str) -> float | None:
+def _tilt_estimate(trial: TrialFigures, _signal: str) -> float | None:
     """Estimated deviation of the other sensor planes, m, while the first follows the circle of the tilt.
 
     The response of the linear loop, and SIGMAS times the motion at rest. None for a loop that is not the radial one.
     """
-    if len(loop.outputs) == 1 or loop.plant.stroke_output in loop.outputs:
+    if len(trial.outputs) == 1 or trial.plant.stroke_output in trial.outputs:
         return None
-    half, motion = len(loop.model.A) // 2, SIGMAS * float(loop.noise.motion.max())
-    C = loop.model.C[:, :half]
+    half, motion = len(trial.model.A) // 2, SIGMAS * float(trial.noise.motion.max())
+    C = trial.model.C[:, :half]
     if C.shape[0] != half:
         return motion
     p, rate = TILT * np.eye(half)[0], 2 * math.pi * TILTING
     q = np.linalg.solve(C, p)
-    moved = loop.follow(rate, p, np.concatenate([q, 1j * rate * q]))
+    moved = trial.follow(rate, p, np.concatenate([q, 1j * rate * q]))
     return float(np.abs(moved[1:]).max()) + motion
 
 

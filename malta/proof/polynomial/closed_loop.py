@@ -337,10 +337,10 @@ def _heights(full: FloatArray) -> FloatArray:
     d = np.ones(full.shape[:2])
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for _ in range(ROUNDS):
-            rows = np.einsum("kij,kj->ki", full, d)
-            columns = np.einsum("kij,ki->kj", full, 1 / np.where(rows > 0, rows, 1))
+            rows = (full @ d[:, :, None])[:, :, 0]
+            columns = ((1 / np.where(rows > 0, rows, 1))[:, None] @ full)[:, 0]
             d = 1 / np.where(columns > 0, columns, 1)
         d = np.exp2(np.round(np.log2(np.clip(d, 1e-200, 1e200))))
-        rows = np.einsum("kij,kj->ki", full, d)
+        rows = (full @ d[:, :, None])[:, :, 0]
         heights = np.log2(rows * SAFE).sum(axis=1) - np.log2(d).sum(axis=1)
     return np.where(np.isnan(heights), np.inf, heights)

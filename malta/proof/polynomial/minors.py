@@ -294,7 +294,14 @@ class Minors:
         known, key = self.resolvents, tuple((part.shape, part.tobytes()) for part in parts)
         if key in known:  # of an image
             return cast("Sizes", known[key])
-        a, into, c, _ = driven_bounds(self.loop, (a, np.eye(len(a))[:, list(self.rows)], c, None), diagonal)
+        driven = ("driven", self.rows, a.tobytes(), diagonal.tobytes())
+        if driven not in known:  # of other outputs
+            none = np.zeros((0, len(a)))
+            known[driven] = driven_bounds(
+                self.loop, (a, np.eye(len(a))[:, list(self.rows)], none, None), diagonal
+            )[:2]
+        a, into = known[driven]
+        c = np.hstack([c, np.zeros((len(c), len(a) - c.shape[1]))])
         pi: dict[Pair, Any] = {((), ()): coefficient_bounds(a, np.ones(len(a)))}
         for k in range(1, self.order + 1):
             places = [
@@ -302,7 +309,11 @@ class Minors:
                 for S in itertools.combinations(range(len(self.outputs)), k)
                 for R in itertools.combinations(range(len(self.rows)), k)
             ]
-            pi |= zip(places, _bounds(a, [(into[:, list(R)], c[list(S)]) for S, R in places]), strict=True)
+            sides = {at: (into[:, list(at[1])], c[list(at[0])]) for at in places}
+            keys = {at: (*driven, *(M.tobytes() for M in sides[at])) for at in places}
+            new = {key: at for at, key in keys.items() if key not in known}
+            known |= zip(new, _bounds(a, [sides[at] for at in new.values()]) if new else [], strict=True)
+            pi |= {at: known[key] for at, key in keys.items()}
         beta = {
             (R, T): float(np.prod(b[np.ix_(R, T)].sum(axis=1))) * (1 + 1e-9)
             for k in range(1, self.order + 1)
