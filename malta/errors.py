@@ -61,14 +61,17 @@ class InputError(ValueError):
 
 def _suggestion(field: str, found: str, expected: str) -> str:
     """The question that ends a refusal, where the expected names have one that is like the one that was typed."""
-    if not expected.startswith("one of "):
+    if re.fullmatch(r"[\w-]+( or [\w-]+)+", expected):
+        names = expected.replace(" or ", ", ")
+    elif expected.startswith("one of "):
+        names = expected.removeprefix("one of ").partition(", or ")[0].replace("'", "")
+    else:
         return ""
     from difflib import get_close_matches  # where something is wrong already
 
-    names = expected.removeprefix("one of ").partition(", or ")[0].replace("'", "")
     known = {name.lower(): name for name in (names.split(", ") if ", " in names else names.split())}
     quoted = re.findall(r"'([^']+)'", found)
-    for typed in [*quoted, *([] if quoted else [field.rpartition(".")[2]])]:
+    for typed in [*quoted, *([] if quoted else [re.split(r"[.:] ?", field)[-1]])]:
         close = get_close_matches(typed.lower(), known, n=1)
         if close and known[close[0]] != typed:
             return f" (did you mean {known[close[0]]!r}?)"

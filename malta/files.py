@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
@@ -93,6 +94,7 @@ def _usual_handler() -> Handler | None:
 PACKAGE = Path(__file__).resolve().parent
 FOLDERS = ("data", "design", "notebooks", "examples")  # that come with malta
 LARGEST = 100_000_000  # bytes of a file to read
+MANY = 1000  # entries of a folder that a missing file's name is compared with
 _Content = TypeVar("_Content", str, bytes)
 
 
@@ -277,13 +279,25 @@ def read_file(
     except InputError:
         raise
     except FileNotFoundError as error:
-        raise InputError(path, "", "no such file", f"a {kind}") from error
+        raise InputError(path, "", "no such file", f"a {kind}{_neighbour(path)}") from error
     except UnicodeDecodeError as error:
         raise InputError(path, "", "bytes that are not UTF-8 text", f"a {kind}") from error
     except (OSError, ValueError) as error:
         words = getattr(error, "strerror", None) or str(error)
         found = "a null byte in its name" if "\0" in str(path) else words
         raise InputError(path, "", found, f"a readable {kind}") from error
+
+
+def _neighbour(path: Path) -> str:
+    """The question that ends a refusal, where a file of nearly that name stands beside it."""
+    from difflib import get_close_matches  # where something is wrong already
+
+    try:
+        names = [entry.name for entry in islice(path.parent.iterdir(), MANY) if entry.suffix == path.suffix]
+    except OSError:
+        return ""
+    close = get_close_matches(path.name, names, n=1, cutoff=0.8)
+    return f" (did you mean {path.with_name(close[0])}?)" if close else ""
 
 
 def _refused(path: Path, error: OSError | ValueError) -> InputError:

@@ -84,7 +84,11 @@ def explain(error: ValidationError, where: str | Path, model: type[BaseModel] | 
     where : the file that it names
     model : of the whole document, whose keys it names
     """
-    first = error.errors(include_url=False)[0]
+    errors = error.errors(include_url=False)
+    first = errors[0]
+    if first["type"] == "missing":  # a key that is typed wrong is both missing and unknown
+        extra = (e for e in errors if e["type"] == "extra_forbidden" and e["loc"][:-1] == first["loc"][:-1])
+        first = next(extra, first)
     name = ".".join(str(part) for part in first["loc"] if not str(part).startswith("function-"))
     kind, message = first["type"], first["msg"]
     if kind == "missing":

@@ -221,7 +221,11 @@ def inside(root: Path, relative: str) -> Path:
     try:
         if usable and target.resolve() == target:
             return target
-    except (OSError, RuntimeError):  # a loop of links, a folder that may not be looked into
+    except (
+        OSError,
+        RuntimeError,
+        UnicodeError,
+    ):  # a loop of links, a folder that may not be looked into, half a letter
         pass
     raise InputError(
         "save", "file", repr(relative), "a file inside the folder that malta app was started in, no link"

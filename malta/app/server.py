@@ -16,7 +16,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from malta.app.session import Document, Session
 from malta.errors import InputError
@@ -82,7 +82,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """A file of the page; the page itself only with the token."""
-        address = urlsplit(self.path)
+        address = self._address()
         if not self._is_from_here():
             return
         if address.path not in PAGES:
@@ -104,7 +104,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._knows(self.headers.get("X-Malta-Token", "")):
             self._refuse(HTTPStatus.FORBIDDEN, "a wrong token")
             return
-        if urlsplit(self.path).path != "/ask":
+        if self._address().path != "/ask":
             self._refuse(HTTPStatus.NOT_FOUND, "no such page")
             return
         if self.headers.get_content_type() != "application/json":
@@ -114,7 +114,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not (length.isascii() and length.isdigit()):
             self._refuse(HTTPStatus.LENGTH_REQUIRED, "no length")
             return
-        if int(length) > LARGEST:
+        if len(length) > len(str(LARGEST)) or int(length) > LARGEST:
             self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {LARGEST} bytes")
             return
         try:
@@ -129,6 +129,13 @@ class _Handler(BaseHTTPRequestHandler):
         self._refuse(HTTPStatus.METHOD_NOT_ALLOWED, "GET or POST")
 
     do_HEAD = do_PUT = do_DELETE = do_PATCH = do_OPTIONS = do_TRACE = do_CONNECT = _refuse_method
+
+    def _address(self) -> SplitResult:
+        """The parts of the address that was asked for; no path where it is none."""
+        try:
+            return urlsplit(self.path)
+        except ValueError:
+            return SplitResult("", "", "", "", "")
 
     def _is_from_here(self) -> bool:
         """Whether a request is for this address and of this page; else it is refused."""

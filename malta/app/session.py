@@ -225,9 +225,10 @@ class Session:
             "gains": self.gains,
         }
         try:
-            if not isinstance(body, dict) or body.get("ask") not in doors:
+            ask = body.get("ask") if isinstance(body, dict) else None
+            if not isinstance(body, dict) or not isinstance(ask, str) or ask not in doors:
                 raise InputError("malta app", "ask", "another document", "one of " + ", ".join(doors))
-            return doors[body["ask"]](body)
+            return doors[ask](body)
         except Exception as error:
             return {"error": shorten(describe_error(error))}
 

@@ -305,9 +305,10 @@ def read_limit(text: str, plan: Plan, bounds: Bounds) -> Limit:
             number = re.fullmatch(NUMBER, value)
             if number is None:
                 raise InputError("--limit", name, repr(value), "a number with its unit, as 20um")
-            _, shown = merits_of(plan).get(slug(name), ("", "percent"))
+            known = merits_of(plan)
+            _, shown = known.get(slug(name), ("", ""))
             bound = float(number[1])
-            if number[2]:
+            if number[2] and slug(name) in known:
                 unit = number[2].replace("%", "percent")
                 bound = to_si(bound, unit, shown, "--limit", name) * unit_factor(shown, name)
         return limit_of(plan, name, bound, bounds)

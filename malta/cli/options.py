@@ -171,7 +171,7 @@ def read_options(texts: list[str] | None, scenario: str, plant: Plant) -> dict[s
         name, value = _split(text)
         if not (name and value):
             raise InputError("--option", "", repr(text), "NAME=VALUE")
-        default = GENERAL[name].default if name in GENERAL else option_of(scenario, plant, name)
+        default = GENERAL[name].default if name in GENERAL else option_of(scenario, plant, name, GENERAL)
         _require_once("--option", name, value, merged)
         merged[name] = _read_like(default, value, units.get(name, "1"), name)
     return merged

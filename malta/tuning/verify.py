@@ -150,7 +150,9 @@ def outcomes_of(design: SynthesizedDesign, name: str) -> list[Outcome]:
     """
     spec, known = design.spec, requirements_for(design.plant)
     if base_of(name) not in known:
-        raise InputError(spec.path, f"specification.{name}", "an unknown requirement", " ".join(known))
+        raise InputError(
+            spec.path, f"specification.{name}", "an unknown requirement", "one of " + " ".join(known)
+        )
     requirement, signal, asked = known[base_of(name)], name.partition(" ")[2], spec.specification[name]
     unit = requirement.unit_of(spec, signal)
     return [

@@ -203,6 +203,7 @@ def test_every_field_moves_the_design_or_says_why_not(design: Path, tmp_path: Pa
 def test_unknown_questions_are_refused(tmp_path: Path) -> None:
     client = Client(copied(tmp_path), tmp_path)
     bodies: list[Any] = [None, [], {}, {"ask": "close"}, {"ask": "evaluate"}, {"ask": "news", "after": "x"}]
+    bodies += [{"ask": []}, {"ask": {}}, {"ask": "save", "file": "\ud800.toml"}, {"ask": "save", "file": [1]}]
     for body in bodies:
         assert "expected" in client.session.answer(body)["error"]
 
@@ -257,7 +258,8 @@ def test_published_numbers_and_si_bases_are_written_out_where_they_change(tmp_pa
 
 
 @pytest.mark.parametrize(
-    "file", ["../x.toml", "/tmp/x.toml", "a/../../x.toml", "x.txt", "x y.toml", "", "link/x.toml"]
+    "file",
+    ["../x.toml", "/tmp/x.toml", "a/../../x.toml", "x.txt", "x y.toml", "", "link/x.toml", "\ud800.toml"],
 )
 def test_nothing_is_saved_outside_of_the_folder(tmp_path: Path, file: str) -> None:
     root, other = tmp_path / "root", tmp_path / "other"
@@ -401,6 +403,8 @@ def test_the_page_is_served_to_whoever_has_its_address(server: Server) -> None:
         ("POST", "/ask", {"Content_Type": "text/plain"}, 415),
         ("POST", "/ask", {"Content_Length": str(LARGEST + 1)}, 413),
         ("POST", "/ask", {"Content_Length": "-1"}, 411),
+        ("POST", "/ask", {"Content_Length": "9" * 5000}, 413),  # more digits than Python reads
+        ("GET", "//[x", {}, 404),
         ("POST", "/save", {}, 404),
         ("PUT", "/ask", {}, 405),
         ("DELETE", "/ask", {}, 405),

@@ -14,9 +14,13 @@ ODD: tuple[Any, ...] = (
     math.nan, math.inf, -math.inf, "", "x", "nan", "m", "kg m^2", "1e400", "../x", "x.py", "two\nlines", "\x00",
     "\x1b[2J", "γ\u202e", "\ud800", "w" * 3000, [], {}, [[]], [{}], [0.0] * 3, [[1.0, 2.0], [3.0]],
     {"value": 1.0, "unit": "m"},
+    "$x_{1}$", "$", "a\\b", "\\frac{", "50%", "%s", "{x}", "*/", "??/", '"', "\t", "\x7f", "\u2028",
     {"published": "table_II.state"}, {"published": 3}, list(range(200)),
 )  # fmt: skip
-NAMES = ("x", "", "a b", "a.b", "γ", "two\nlines", "__class__", "w" * 300)
+NAMES = (
+    "x", "", "a b", "a.b", "γ", "two\nlines", "__class__", "w" * 300, "$", "$x_{1}$", "a\\b", "\\frac{", "50%", "%s",
+    "{", "{x}", "}", "*/", "??/", '"', "'", "\t", "\x00", "\x1b[2J", "\x7f", "[red]x[/]",
+)  # fmt: skip
 
 
 class Edit(NamedTuple):

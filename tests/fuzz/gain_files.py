@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import subprocess
 import zipfile
 from collections.abc import Callable
 from functools import cache
@@ -21,6 +22,7 @@ from malta.campaigns.plan import box_of
 from malta.gains import encodings
 from malta.gains.file import content_of
 from malta.gains.schema import GainFile
+from malta.simulation.engine.compiled import compiler
 
 
 @cache
@@ -109,6 +111,30 @@ def read_shares_of(case: Case, folder: Path) -> Ended | None:
     path.write_bytes(_gain_json(signed(document), case))
     read = observe(lambda: malta.gains.read(path), folder, [str(path)])
     return observe(lambda: box_of(path), folder, [str(path)]) if read.code == 0 else read
+
+
+def export_as_c(case: Case, folder: Path) -> Ended | None:
+    """`malta export FILE`: whatever names signals have, it is C that a compiler reads."""
+    path, out = folder / "mine.json", folder / "c"
+    document = edited(gain_document(case.base), case.edits)
+    path.write_bytes(_gain_json(signed(document), case))
+    ended = observe(line("export", str(path), "--out", str(out)), folder, [str(path)], writes=True)
+    sources, cc = [str(file) for file in out.rglob("*.c")], compiler()
+    if ended.code == 0 and sources and cc is not None:
+        command = [*cc, "-std=c99", "-fsyntax-only", "-Wcomment", "-Werror", f"-I{out}", *sources]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise Defect(f"C that is none: {done.stderr[:500]}")
+    return ended
+
+
+def draw_figures(case: Case, folder: Path) -> Ended | None:
+    """`malta plot FILE`: names of signals stand in titles and legends."""
+    path = folder / "mine.json"
+    document = edited(gain_document(case.base), case.edits)
+    path.write_bytes(_gain_json(signed(document), case))
+    drawn = line("plot", str(path), "step", "--out", str(folder / "step.png"))
+    return observe(drawn, folder, [str(path)], writes=True)
 
 
 def show_scenarios(case: Case, folder: Path) -> Ended | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import tempfile
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,9 @@ import malta
 from fuzz.cases import ROOT, Case
 from fuzz.edits import cut, edited
 from fuzz.oracle import Defect, Ended, observe
+from malta.campaigns.limits import limit_of
 from malta.campaigns.plan import Plan
+from malta.campaigns.rare import rare_event, read_design_point, write_event
 from malta.campaigns.run import campaign
 from malta.campaigns.store import MANIFEST, block_name, read_plan, seal
 from malta.proof.certificate import certificate, checked_file
@@ -25,6 +28,7 @@ from malta.report import campaign_tables
 from malta.simulation.experiments.recording import columns_of_log, read_log, record
 from malta.tuning.search import Journal
 
+RARE, BOUND = "deviation-y1", 1.1e-6  # m, which few runs exceed
 PATIENCE = 3.0  # s for the check of a certificate
 
 
@@ -68,6 +72,41 @@ def read_campaign(case: Case, folder: Path) -> Ended | None:
     return ended
 
 
+@cache
+def _event_files() -> dict[str, bytes]:
+    """The files of a sound rare event: its repetitions, and its record."""
+    with tempfile.TemporaryDirectory() as folder:
+        event = rare_event(_rare_plan(), limit_of(_rare_plan(), RARE, BOUND), folder, workers=1)
+        write_event(event, Path(folder))
+        return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+
+
+def _rare_plan() -> Plan:
+    return replace(_plan(), samples=2000, options=QUICK | {"duration": 1e-3, "noise": 0.0})
+
+
+def read_rare_event(case: Case, folder: Path) -> Ended | None:
+    """Go on with a rare event whose first repetition was edited, or read its edited record."""
+    files = dict(_event_files())
+    name = sorted(files)[0 if case.base == "record" else 1]
+    path = folder / name
+    try:
+        files[name] = _manifest(files[name], case) if case.base == "record" else _block(files[name], case, 0)
+    except Exception:  # numpy does not write every array
+        return None
+    for key, data in files.items():
+        (folder / key).write_bytes(data)
+    if case.base == "record":
+        return observe(lambda: read_design_point(path, _rare_plan()), folder, [str(path)])
+    limit = limit_of(_rare_plan(), RARE, BOUND)
+    ended = observe(lambda: rare_event(_rare_plan(), limit, folder, workers=1), None, [str(path)])
+    if ended.code == 0:
+        low, high = ended.value.found.interval()
+        if not 0 <= low <= ended.value.found.probability <= high <= 1:
+            raise Defect(f"{low} .. {high} about {ended.value.found.probability}")
+    return ended
+
+
 def _without_block(manifest: bytes) -> dict[str, Any]:
     content: dict[str, Any] = json.loads(manifest)
     return {key: value for key, value in content.items() if key != "block"}
@@ -85,7 +124,7 @@ def _manifest(data: bytes, case: Case) -> bytes:
     return cut(json.dumps(edited(json.loads(data), case.edits)).encode(), case.cuts)
 
 
-def _block(data: bytes, case: Case) -> bytes:
+def _block(data: bytes, case: Case, first: int = 8) -> bytes:
     """A block with edited arrays and a new seal; cuts change the file, and the old seal stays."""
     if case.cuts:
         return cut(data, case.cuts)
@@ -93,7 +132,7 @@ def _block(data: bytes, case: Case) -> bytes:
         tree = {name: file[name].tolist() for name in file.files}
     arrays: dict[str, Any] = {name: np.array(value) for name, value in edited(tree, case.edits).items()}
     if case.sealed:
-        arrays["seal"] = np.array(seal({k: v for k, v in arrays.items() if k != "seal"}, 8))
+        arrays["seal"] = np.array(seal({k: v for k, v in arrays.items() if k != "seal"}, first))
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     return buffer.getvalue()

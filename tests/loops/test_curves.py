@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import control
@@ -13,10 +14,10 @@ from conftest import ROOT
 from flight import default_of
 
 import malta
-from malta.loops.classical import delay_margins
+from malta.loops.classical import delay_margins, find_tops
 from malta.loops.curves import LoopCurves, loop_curves, respond
 from malta.loops.linear_loops import linear_loop
-from malta.loops.locus import root_locus
+from malta.loops.locus import _changes, root_locus
 from malta.loops.time_domain import loop_steps, step_figures
 from malta.simulation.references import Motion
 
@@ -406,3 +407,28 @@ def test_a_pole_that_stays_on_the_boundary_changes_no_stability() -> None:
     """z^2 + (0.02 k - 2 cos 0.3) z + 1 has both roots at |z| = 1 for every k from 0.1 to 10."""
     L = control.tf([0.02, 0], [1, -2 * math.cos(0.3), 1], 0.01)
     assert root_locus(L).changes == ()
+
+
+def test_stability_that_changes_from_sample_to_sample() -> None:
+    """Every interval has its own change, the last one too."""
+
+    def poles(value: float) -> Any:
+        return np.array([math.cos(math.pi * value) + 0j])
+
+    values = np.arange(4.0)
+    found = _changes(poles, values, np.array([poles(v) for v in values]), None)
+    assert found == pytest.approx((0.5, 1.5, 2.5), abs=1e-6)
+
+
+def test_a_top_between_three_frequencies() -> None:
+    """A parabola over log w, with its top of 1 at 1 rad/s beside the middle one."""
+
+    def see(w: Any) -> Any:
+        return SimpleNamespace(w=np.asarray(w))
+
+    def measure(seen: Any) -> Any:
+        return np.atleast_2d(1 - np.log(seen.w) ** 2).T
+
+    best, at = find_tops(see, see(np.exp([-1.0, 0.2, 1.0])), measure)
+    assert best == pytest.approx([1.0], abs=1e-9)
+    assert at == pytest.approx([1.0], rel=1e-4)

@@ -24,6 +24,11 @@ class Mutant(NamedTuple):
     tests: tuple[str, ...]
     equivalent: str  # why no test can notice; "" where one has to
 
+    @property
+    def drawn(self) -> bool:
+        """Whether it was drawn at random: see draw.py."""
+        return self.name.startswith("drawn")
+
     def applied(self, text: str) -> str:
         """The text of the file with the fault. Raises ValueError where `old` does not stand in it exactly once."""
         if text.count(self.old) != 1:

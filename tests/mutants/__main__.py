@@ -1,5 +1,7 @@
 """`make mutants`: run the tests of every mutant on a copy of the project, and list those that no test notices.
 
+The output says which share was noticed, and by which modules of tests. Of drawn mutants the fast tests run alone.
+
 MUTANTS=gains,margins runs the lists of these names alone, MUTANT_JOBS=1 one mutant at a time; MUTANT_SECONDS=60 ends
 the tests of a mutant that hangs. The tests have to pass without a mutant first. Exit code 1 where a mutant survives
 without a reason, or is noticed in spite of one.
@@ -8,11 +10,13 @@ without a reason, or is noticed in spite of one.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -47,13 +51,18 @@ def main() -> int:
         folders: Queue[Path] = Queue()
         for k in range(jobs):
             folders.put(_copy(Path(scratch) / str(k)))
-        if not _pass(folders.queue[0], sorted({test for one in chosen for test in one.tests}), None):
-            print("mutants: the tests fail without any")
-            return 1
+        for quick in (False, True):
+            tests = sorted({test for one in chosen if one.drawn is quick for test in one.tests})
+            if tests and _failure(folders.queue[0], tests, None, quick=quick):
+                print("mutants: the tests fail without any")
+                return 1
         with ThreadPoolExecutor(jobs) as pool:
             noticed = list(pool.map(lambda one: _try(one, folders), chosen))
-    wrong = [one for one, seen in zip(chosen, noticed, strict=True) if seen == bool(one.equivalent)]
-    print(f"mutants: {sum(noticed)} of {len(chosen)} noticed, {time.monotonic() - begun:.0f} s")
+    wrong = [one for one, by in zip(chosen, noticed, strict=True) if bool(by) == bool(one.equivalent)]
+    modules = Counter(by for by in noticed if by)
+    print(f"mutants: {modules.total()} of {len(chosen)} noticed, {time.monotonic() - begun:.0f} s")
+    for module, count in modules.most_common():
+        print(f"mutants: {count:4} by {module}")
     for one in wrong:
         print(f"mutants: {one.name}: {'noticed in spite of its reason' if one.equivalent else 'survives'}")
     return int(bool(wrong))
@@ -70,36 +79,50 @@ def _copy(target: Path) -> Path:
     return target
 
 
-def _try(mutant: Mutant, folders: Queue[Path]) -> bool:
-    """Whether the tests notice a mutant."""
+def _try(mutant: Mutant, folders: Queue[Path]) -> str:
+    """The module whose tests notice a mutant; "" where none does."""
     folder = folders.get()
     path = folder / mutant.file
     text = path.read_text(encoding="utf-8")
     begun = time.monotonic()
     try:
         path.write_text(mutant.applied(text), encoding="utf-8")
-        noticed = not _pass(folder, mutant.tests, SECONDS)
+        by = _failure(folder, mutant.tests, SECONDS, quick=mutant.drawn)
     finally:
         path.write_text(text, encoding="utf-8")
         folders.put(folder)
-    said = "noticed" if noticed else "equivalent" if mutant.equivalent else "SURVIVES"
-    print(f"{said:10} {mutant.name:16} {time.monotonic() - begun:5.0f} s  {mutant.file}", flush=True)
-    return noticed
+    said = "noticed" if by else "equivalent" if mutant.equivalent else "SURVIVES"
+    print(f"{said:10} {mutant.name:16} {time.monotonic() - begun:5.0f} s  {mutant.file}  {by}", flush=True)
+    return by
 
 
-def _pass(folder: Path, tests: Sequence[str], seconds: float | None) -> bool:
-    """Whether tests pass in time in a folder, whose malta is imported."""
-    command = [sys.executable, "-B", "-m", "pytest", "-q", "-x", "-n0", "-p", "no:cacheprovider", *tests]
+def _failure(folder: Path, tests: Sequence[str], seconds: float | None, *, quick: bool) -> str:
+    """The first module of tests that fails or does not end in a folder, whose malta is imported; "" where all pass."""
+    fast = ["-m", "not slow"] if quick else []
+    command = [
+        sys.executable,
+        "-B",
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-n0",
+        "-p",
+        "no:cacheprovider",
+        *fast,
+        *tests,
+    ]
     environment = os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     try:
         done = subprocess.run(
             command, cwd=folder, env=environment, timeout=seconds, capture_output=True, check=False
         )
     except subprocess.TimeoutExpired:
-        return False
+        return f"no end in {seconds:.0f} s"
     if done.returncode not in (0, 1, 2, 3):  # 2: not even collected; 4, 5: no such tests
         raise RuntimeError(f"pytest ended with {done.returncode}: {done.stdout[-2000:].decode()}")
-    return done.returncode == 0
+    found = re.search(r"^(?:FAILED|ERROR) (\S+?\.py)", done.stdout.decode(), re.MULTILINE)
+    return "" if done.returncode == 0 else found[1] if found else tests[0].partition("::")[0]
 
 
 if __name__ == "__main__":

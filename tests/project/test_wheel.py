@@ -38,7 +38,7 @@ SHORTER = {  # commands of the page that take minutes, or a target, as the same 
     "--replay campaign:17",
     "malta campaign --status FOLDER": "malta campaign --status campaign",
     "malta campaign design/gains/table2.json --spread 5.5% --study rare": "malta campaign design/gains/table2.json "
-    "--spread 20% --option duration=20ms --study rare --limit touchdown --samples 2000",
+    "--spread 20% --study rare --limit touchdown --samples 2000",
     "malta campaign design/gains/robust.json --study tolerances --keep 99% --limit published": "malta campaign "
     "design/gains/robust.json --study tolerances --keep 99% --limit published --samples 64",
     "malta export design/gains/robust.json --to fmu --platforms all": "malta export design/gains/robust.json --to fmu",

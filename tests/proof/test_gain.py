@@ -205,3 +205,15 @@ def test_no_bound_is_proven_of_a_loop_whose_stability_is_not(monkeypatch: pytest
     assert (T.upper, T.reason) == (None, "the nominal loop is not proven stable")
     m = malta.dynamic_margin(first_order(), [[-2.0]], {"k": 0.5}, malta.proof.Dynamic(0.1))
     assert (m.lower, m.reason) == (None, "the nominal loop is not proven stable")
+
+
+def test_a_peak_without_a_proof_has_the_zone_that_it_reached() -> None:
+    """2.22 lies in zone A, and nobody knows whether that is all."""
+    reached = gain.Gain(2.22, None, 3.0, {}, 0, 0.0, "not settled")
+    lost = gain.Gain(math.inf, None, math.nan, {}, 0, 0.0, "the nominal loop is unstable")
+    table = malta.report.worst_case_table({"x": reached, "y": lost})
+    rows = list(zip(*(map(str, column.cells) for column in table.columns), strict=True))
+    assert rows == [
+        ("x", "2.220", "3", "nothing proven", "A or worse"),
+        ("y", "unstable", "", "nothing proven", "D"),
+    ]

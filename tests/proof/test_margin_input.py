@@ -346,3 +346,11 @@ def test_a_loss_where_a_mass_is_zero_has_an_answer() -> None:
     for time in (0.05, 2.0):
         m = malta.robust_margin(s, [[-0.5]], {"m": 0.1}, time=time)
         assert m.lower is None or m.lower <= 10 <= m.upper * (1 + 1e-9)
+
+
+def test_a_settled_margin_gives_no_reason() -> None:
+    system = malta.uncertain(lambda k: ([[0, 1], [-k, -1]], [[0], [1]], [[1, 0]]), {"k": 4.0})
+    found = malta.robust_margin(system, [[-5.0]], {"k": 0.2})
+    assert found.lower is not None
+    assert found.lower > 0
+    assert found.reason == ""

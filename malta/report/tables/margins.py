@@ -393,8 +393,13 @@ def worst_case_table(gains: Mapping[str, Gain]) -> Table:
     title = "Worst-case peak |S| over the uncertainty and all that the margin covers, without loads"
     table = new_table(title, "sensor", "found", "at rad/s", "proven below", "zone")
     for name, gain in gains.items():
-        high = "nothing proven" if gain.upper is None else f"{gain.upper:.3f}"
-        add_row(table, name, f"{gain.lower:.3f}", f"{gain.frequency:.4g}", high, zone(gain.upper or math.inf))
+        found, at = (
+            ("unstable", "") if math.isinf(gain.lower) else (f"{gain.lower:.3f}", f"{gain.frequency:.4g}")
+        )
+        proven = "nothing proven" if gain.upper is None else f"{gain.upper:.3f}"
+        reached = zone(gain.lower if gain.upper is None else gain.upper)
+        worse = " or worse" if gain.upper is None and reached != zone(math.inf) else ""
+        add_row(table, name, found, at, proven, reached + worse)
     return table
 
 

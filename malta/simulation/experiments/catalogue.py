@@ -26,7 +26,7 @@ and, where they differ from the defaults,
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from numbers import Real
@@ -367,14 +367,21 @@ def options_of(name: str, plant: Plant) -> dict[str, Any]:
     return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY and p.name != "progress"}
 
 
-def option_of(name: str, plant: Plant, option: str) -> Any:
-    """The default of one of these options. Raises InputError for an option that the experiment does not have."""
+def option_of(name: str, plant: Plant, option: str, general: Iterable[str] = sorted(OPTIONS)) -> Any:
+    """The default of one of these options. Raises InputError for an option that the experiment does not have.
+
+    general : options of every experiment, for the sentence
+    """
     mine = options_of(name, plant)
     if option not in mine:
         others = {o for other in experiments_of(plant) for o in options_of(other, plant)}
-        found = "an option of another scenario" if option in others else "an unknown option"
-        expected = " ".join(sorted(mine)) or "none of its own"
-        raise InputError("simulate", f"{name}: {option}", found, expected)
+        own = " ".join(sorted(mine))
+        if option in others:
+            raise InputError(
+                "simulate", f"{name}: {option}", "an option of another scenario", own or "none of its own"
+            )
+        known = " ".join([own, *general]).strip()
+        raise InputError("simulate", f"{name}: {option}", "an unknown option", f"one of {known}")
     return mine[option]
 
 
