@@ -20,6 +20,7 @@ from typer.core import TyperCommand, TyperGroup
 from malta.cli.app import app as live_page
 from malta.cli.campaign import campaign
 from malta.cli.claims import claims, schema
+from malta.cli.commission import commission
 from malta.cli.design import design, new, tune
 from malta.cli.export import export, pil
 from malta.cli.identification import excite, identify, learn, log, replay
@@ -148,7 +149,7 @@ def _first_line(command: Callable[..., None]) -> str:
 
 GROUPS: dict[str, tuple[Callable[..., None], ...]] = {  # the order of the help
     "Commands": (design, verify, check, simulate, campaign, tune),
-    "From the bench": (excite, log, identify, learn, replay, measure),
+    "From the bench": (excite, log, identify, learn, replay, measure, commission),
     "Pages and pictures": (plot, report, compare, live_page, claims),
     "For other programs": (export, pil, schema),
     "A machine of your own": (new,),

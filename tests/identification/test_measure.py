@@ -176,23 +176,24 @@ def test_a_measured_loop_is_drawn(found: Measurement) -> None:
 
 @pytest.mark.slow
 def test_bands_cover() -> None:
-    """95 % bands of S and T of random machines, interpolated in one flight and of five flights: 2400 each."""
+    """95 % bands of S and T of random machines, interpolated in one flight and of five flights: 1200 each."""
     fly = partial(malta.excite, LOOP, **SHORT)
     plans, random = [fly(shift=k) for k in range(5)], np.random.default_rng(5)
     within: dict[int, list[float]] = {1: [], 5: []}
-    for seed in range(4):
+    for seed in range(2):
         values = {name: getattr(PLANT.parameters, name) * random.uniform(0.85, 1.15) for name in TRUE}
         logs = [flown(one, values, seed=seed, run=k) for k, one in enumerate(plans)]
         for count, shares in within.items():
             found = malta.measure(CONTROLLER, *logs[:count])
             s = np.einsum("kpp->kp", true_sensitivity(found.w, values))
             shares += [share_within(found.S, s), share_within(found.T, 1 - s)]
-    assert 0.93 < np.mean(within[5]) < 0.975
+    assert 0.92 < np.mean(within[5]) < 0.98
     assert 0.94 < np.mean(within[1]) < 0.995
 
 
 @pytest.mark.slow
-def test_commands_from_plan_to_verdict(run: Run, tmp_path: Path) -> None:
+def test_commands_from_plan_to_verdict(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measuring, "SAMPLES", 4)
     planned = run("measure", ROBUST, "--plan", "--width", "4%", "--band", "4..400", "--json")
     assert json.loads(planned.out)["flights"] == 1
     flown, short = tmp_path / "flown.npz", ("--period", "0.5", "--periods", "3", "--band", "4..400")

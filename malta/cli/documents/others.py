@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
+    from malta.identification.commission import Commissioning
     from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
     from malta.identification.learn import Learned
@@ -228,7 +229,7 @@ def claims_output(ledgers: Sequence[Ledger]) -> ClaimsOutput:
     )
 
 
-# The documents of `malta excite`, `log`, `identify`, `learn`, `replay` and `measure`.
+# The documents of `malta excite`, `log`, `identify`, `learn`, `replay`, `measure` and `commission`.
 
 
 class ExciteOutput(Part):
@@ -396,6 +397,46 @@ class MeasurePlanOutput(Part):
     current_A: dict[str, float] = Field(description="largest deviation of each current from that at rest")
 
 
+class CommissionFinding(Part):
+    """A figure of a step, with half of its 95 % interval and its limits."""
+
+    name: str
+    unit: str
+    value: Number
+    half: Number
+    low: Number
+    high: Number
+    holds: bool
+
+
+class CommissionStep(Part):
+    """What a step of the checklist found."""
+
+    name: str
+    question: str
+    passed: bool
+    refusal: str
+    log: str
+    sha256: str
+    findings: list[CommissionFinding]
+
+
+class CommissionOutput(Part):
+    """What `malta commission --json` prints."""
+
+    kind: Literal["malta-commission-output"] = Field(default="malta-commission-output", alias="schema")
+    version: Literal[1] = 1
+    gains: str
+    sha256: str
+    machine: str
+    passed: bool
+    steps: list[CommissionStep] = Field(description="as far as they were gone")
+    left: list[str] = Field(description="steps that were not gone")
+    kept: list[str] = Field(description="steps that an earlier call had gone")
+    signature: str
+    files: Files
+
+
 def excite_output(gains: Path, plan: ExcitationPlan, files: Iterable[Path]) -> ExciteOutput:
     """The document of an excitation."""
     return ExciteOutput(
@@ -541,4 +582,34 @@ def measure_plan_output(gains: Path, plan: MeasurementPlan) -> MeasurePlanOutput
         coherence={name: values.tolist() for name, values in plan.coherence.items()},
         motion={name: max(one.motion[name] for one in plan.excitations) for name in first.motion},
         current_A={name: max(one.current[name] for one in plan.excitations) for name in first.current},
+    )
+
+
+def commission_output(done: Commissioning, files: Iterable[Path]) -> CommissionOutput:
+    """The document of a commissioning."""
+    steps = []
+    for e in done.entries:
+        findings = [
+            CommissionFinding(
+                name=one.name,
+                unit=one.found.unit,
+                value=one.found.value,
+                half=one.found.half,
+                low=one.low,
+                high=one.high,
+                holds=one.holds,
+            )
+            for one in e.findings
+        ]
+        steps.append(CommissionStep.of(e, findings=findings))
+    return CommissionOutput(
+        gains=done.gains,
+        sha256=done.sha256,
+        machine=done.machine,
+        passed=done.passed,
+        steps=steps,
+        left=list(done.steps[len(done.entries) :]),
+        kept=list(done.kept),
+        signature=done.signature,
+        files=list(map(str, files)),
     )

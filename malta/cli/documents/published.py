@@ -19,6 +19,7 @@ from malta.cli.documents.loops import CompareOutput, Part, ReportOutput, VerifyO
 from malta.cli.documents.others import (
     CheckOutput,
     ClaimsOutput,
+    CommissionOutput,
     ExciteOutput,
     ExportOutput,
     IdentifyOutput,
@@ -53,6 +54,7 @@ MODELS: dict[str, type[Part]] = {
     "replay-output": ReplayOutput,
     "measure-output": MeasureOutput,
     "measure-plan-output": MeasurePlanOutput,
+    "commission-output": CommissionOutput,
     "plot-output": PlotOutput,
     "report-output": ReportOutput,
     "compare-output": CompareOutput,

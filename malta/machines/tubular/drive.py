@@ -121,13 +121,25 @@ def hall_position(z: Any, x: Any, y: Any, pole: Any, errors: Any) -> Any:
               sensitivity that averaging leaves (0 as built, 1 for a single sensor on +x)
     """
     k = math.pi / pole
-    amplitude, phase, single = errors
-    cosine, sine = (
-        (1 - single) * (ca.cosh(k * x[i]) + ca.cosh(k * y[i])) / 2 + single * ca.exp(k * x[i]) for i in (0, 1)
-    )
-    angle = ca.atan2((1 + amplitude) * sine * ca.sin(k * z + phase), cosine * ca.cos(k * z))
+    cosine, sine = hall_signals(z, x, y, pole, errors)
+    angle = ca.atan2(sine, cosine)
     turns = (k * z - angle) / (2 * math.pi)
     return (angle + 2 * math.pi * ca.floor(turns + 0.5)) / k  # counts periods: never wrong by one
+
+
+def hall_signals(z: Any, x: Any, y: Any, pole: Any, errors: Any, functions: Any = ca) -> tuple[Any, Any]:
+    """Averaged Hall signals of both planes, cosine and sine, over the field's amplitude; arguments of hall_position.
+
+    functions : CasADi, or numpy for arrays
+    """
+    k = math.pi / pole
+    amplitude, phase, single = errors
+    cosine, sine = (
+        (1 - single) * (functions.cosh(k * x[i]) + functions.cosh(k * y[i])) / 2
+        + single * functions.exp(k * x[i])
+        for i in (0, 1)
+    )
+    return cosine * functions.cos(k * z), (1 + amplitude) * sine * functions.sin(k * z + phase)
 
 
 # The two stator modules, which may differ, and whose magnetic centre may lie off the sensors' centre.

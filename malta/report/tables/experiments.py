@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -22,6 +23,7 @@ from malta.report.tables.layout import (
     fold,
     merit_heading,
     merit_text,
+    new_sheet,
     new_table,
     published_text,
 )
@@ -31,6 +33,7 @@ from malta.simulation.experiments.catalogue import experiments_of, options_of
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderResult
 
+    from malta.identification.commission import Commissioning, Finding, Step
     from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
     from malta.identification.log import Log
@@ -309,6 +312,42 @@ def measurement_plan_table(plan: MeasurementPlan) -> Table:
         cells = (f"{gamma.min():.4f}", f"{np.median(gamma):.4f}", f"{100 * share[k, i]:.2g}")
         add_row(table, name, *cells, f"{plan.w[k] / (2 * np.pi):.4g}")
     return table
+
+
+def checklist_table(steps: Sequence[Step]) -> Table:
+    """The steps of a commissioning: what each asks, needs, aborts at and writes."""
+    heads = ("step", "question", "needs", "aborts at", "writes")
+    table = new_sheet("Checklist", [(head, "left") for head in heads])
+    for step in steps:
+        add_row(table, step.name, step.question, step.needs, step.aborts, f"{step.name}.npz")
+    return table
+
+
+def findings_table(done: Commissioning) -> Table:
+    """What the steps of a commissioning found."""
+    sides = ("left", "left", "right", "right", "right", "left")
+    heads = ("step", "finding", "found", "95 %", "limits", "")
+    table = new_sheet("Commissioning", list(zip(heads, sides, strict=True)))
+    for entry in done.entries:
+        name = f"{entry.name} {'passed' if entry.passed else 'FAILED'}"
+        for one in entry.findings:
+            add_row(table, name, *finding_cells(one))
+            name = ""
+        if entry.refusal:
+            add_row(table, name, entry.refusal, "", "", "", "")
+    return table
+
+
+def finding_cells(one: Finding) -> tuple[str, str, str, str, str]:
+    """Name, value, half of the interval, limits, and a word where they are not kept."""
+    value, half, unit = one.found
+    scale, shown = (1e6, "um") if unit == "m" else (1.0, unit)
+    name = one.name if unit == "1" else f"{one.name} [{shown}]"
+    ends = [f"{scale * end:.4g}" for end in (one.low, one.high) if math.isfinite(end)]
+    limits = " .. ".join(ends)
+    if len(ends) == 1:
+        limits = f">= {ends[0]}" if math.isfinite(one.low) else f"<= {ends[0]}"
+    return name, f"{scale * value:.4g}", f"{scale * half:.2g}", limits, "" if one.holds else "FAILS"
 
 
 # The ledger of published numbers, a line a claim.

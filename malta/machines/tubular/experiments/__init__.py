@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from malta.errors import InputError
 from malta.machines.tubular.experiments.commissioning import commissioning, supervised_faults
@@ -51,6 +51,9 @@ from malta.simulation.experiments import (
     Experiment,
     PlannedRun,
 )
+
+if TYPE_CHECKING:
+    from malta.identification.commission import Step
 
 EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "stroke": stroke,
@@ -138,3 +141,10 @@ def _is_published(scenario: str, options: Mapping[str, Any]) -> bool:
     """Whether a scenario is the stroke that the paper flies."""
     asked = {"distance": DISTANCE, "rise": RISE, "profile": "logistic"}
     return scenario == "stroke" and all(options.get(name, value) == value for name, value in asked.items())
+
+
+def commissioning_steps(box: Mapping[str, float]) -> tuple[Step, ...]:
+    """The checklist of `malta commission`."""
+    from malta.machines.tubular.bench import steps
+
+    return steps(box)

@@ -1,0 +1,416 @@
+"""Commissioning: the checklist of the first day as steps, each with a log, findings and limits, and a signed journal.
+
+A step records a log, on the simulated machine or from a file of a bench, and judges it by the gain file alone. The
+journal keeps what passed, so that an interrupted day goes on where it stopped. A machine offers its own steps as
+`commissioning_steps(box)` beside its experiments; others have those of `general_steps`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from malta.display import Description, display
+from malta.errors import CheckError, InputError
+from malta.files import json_text, read_file, replace_files
+from malta.gains.file import content_of
+from malta.identification.calibration import Estimate, at_rest
+from malta.identification.learn import FACTORS, learn
+from malta.identification.log import log_of, read_log, write_log
+from malta.identification.measure import SAME_LAW, measure, plan_measurement
+from malta.loops.loop import loop
+from malta.model.data import plant_of
+from malta.model.machines import attribute_of
+from malta.simulation import references
+from malta.simulation.scenario import Scenario
+from malta.simulation.simulate import simulate
+
+if TYPE_CHECKING:
+    from malta.identification.log import Log
+    from malta.model.plant import Plant
+    from malta.synthesis.controller import Controller
+
+JOURNAL = "journal.json"
+LARGEST = 10_000_000  # bytes of a journal
+VERSION = 1
+ENDS = ("completed", "not lifted")  # of flights in which nothing went wrong
+NOISY = 1.5  # times the noise and steps of a sensor that the gain file believes
+STILL = 0.3  # s, of a rest
+ERROR = 0.1  # of the travel: the largest error of a stroke
+WORST = 3.0  # largest |S|: the end of zone A of ISO 14839-3, which a new machine is asked for
+
+
+class Finding(NamedTuple):
+    """A figure of a step with its interval, and the limits between which all of it has to be, SI."""
+
+    name: str
+    found: Estimate
+    low: float = -math.inf
+    high: float = math.inf
+
+    @property
+    def holds(self) -> bool:
+        """Whether the whole interval is within the limits."""
+        return (
+            self.low <= self.found.value - self.found.half and self.found.value + self.found.half <= self.high
+        )
+
+
+class Bench(NamedTuple):
+    """Where steps record: a machine that the gain file does not know, under its law. Judges do not see it."""
+
+    controller: Controller
+    truth: Plant
+    errors: Mapping[str, float]  # of its sensors, SI
+    seed: int
+
+
+class Step(NamedTuple):
+    """A line of the checklist.
+
+    name : of one word
+    question : that it answers
+    needs : what has to be there
+    aborts : at what it ends early
+    record : on the simulated machine
+    judge : (controller, log) -> findings
+    """
+
+    name: str
+    question: str
+    needs: str
+    aborts: str
+    record: Callable[[Bench], Log]
+    judge: Callable[[Controller, Log], Sequence[Finding]]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What a step found: its log with its sha256, findings, and why it was refused; "": it was judged."""
+
+    name: str
+    question: str
+    log: str
+    sha256: str
+    findings: tuple[Finding, ...] = ()
+    refusal: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether it was judged and all findings are within their limits."""
+        return not self.refusal and all(one.holds for one in self.findings)
+
+
+@display
+@dataclass(frozen=True)
+class Commissioning:
+    """A day's journal: entries in the order of the checklist, as far as they went.
+
+    gains : the gain file
+    sha256 : of it
+    machine : its name
+    bench : digest of the simulated machine; "" where logs are a bench's own
+    entries : by step
+    steps : names of all steps of the checklist
+    kept : names of steps whose entries are those of an earlier run
+    """
+
+    gains: str
+    sha256: str
+    machine: str
+    bench: str
+    entries: tuple[Entry, ...]
+    steps: tuple[str, ...]
+    kept: tuple[str, ...] = field(default=(), compare=False)
+
+    @property
+    def passed(self) -> bool:
+        """Whether all steps were gone and passed."""
+        return len(self.entries) == len(self.steps) and all(entry.passed for entry in self.entries)
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The journal as JSON holds it, without its signature."""
+        entries = [
+            {"step": e.name, "question": e.question, "log": e.log, "sha256": e.sha256, "refusal": e.refusal}
+            | {"findings": [_finding_table(one) for one in e.findings]}
+            for e in self.entries
+        ]
+        return {
+            "schema": "malta-commissioning-journal",
+            "version": VERSION,
+            "gains": self.gains,
+            "sha256": self.sha256,
+            "machine": self.machine,
+            "bench": self.bench,
+            "steps": list(self.steps),
+            "entries": entries,
+        }
+
+    @property
+    def signature(self) -> str:
+        """The sha256 of the journal with those of the gain file and of all logs: it changes with any of them."""
+        text = json.dumps(json.loads(json_text(self.document)), sort_keys=True, separators=(",", ":"))
+        return sha256(text.encode()).hexdigest()
+
+    @property
+    def description(self) -> Description:
+        """Which steps passed."""
+        states = [f"{e.name} {'passed' if e.passed else 'FAILED'}" for e in self.entries]
+        rows = (
+            ("gain file", f"{self.gains}, sha256 {self.sha256[:16]}"),
+            ("steps", ", ".join(states) or "none"),
+            ("left", ", ".join(self.steps[len(self.entries) :]) or "none"),
+            ("signature", self.signature),
+        )
+        return Description(f"Commissioning of a {self.machine}", rows)
+
+
+def _finding_table(one: Finding) -> dict[str, Any]:
+    value, half, unit = one.found
+    return {"name": one.name, "value": value, "half": half, "unit": unit, "low": one.low, "high": one.high}
+
+
+def commission(
+    gains: str | Path,
+    controller: Controller,
+    folder: str | Path,
+    *,
+    truth: Plant | None = None,
+    errors: Mapping[str, float] | None = None,
+    logs: str | Path | None = None,
+    steps: Sequence[Step] | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Commissioning:
+    """Go through the checklist until a step fails, and write a log for each and the journal.
+
+    gains : the gain file, whose sha256 is signed
+    controller : what it holds
+    folder : for logs and journal; steps that passed in it with these gains and logs are kept
+    truth : the simulated machine; None: that of the gain file
+    errors : of its sensors by name, SI
+    logs : folder of a bench with logs NAME.npz, .csv or .mat of the steps; a step without one waits for it. None: the
+        simulated machine
+    steps : None: those of the machine
+    seed : of the noise
+    progress : called with the name of each step that begins
+
+    Returns a Commissioning. Raises InputError for a damaged journal, and a folder that cannot be written.
+
+        commission("design/gains/robust.json", controller, "build/day")
+    """
+    path, folder = Path(gains), Path(folder)
+    digest = sha256(read_file(path, "gain file", Path.read_bytes)).hexdigest()
+    plant = plant_of(controller.parameters)
+    box = content_of(path)[0].uncertainty or {}
+    list_of = tuple(steps if steps is not None else steps_of(plant, box))
+    bench = Bench(controller, truth or plant, dict(errors or {}), seed)
+    simulated = "" if logs else _digest_of(bench)
+    entries: list[Entry] = []
+    kept: list[str] = []
+    done = Commissioning(str(path), digest, plant.name, simulated, (), tuple(step.name for step in list_of))
+    before = {} if logs else _entries_before(folder, done)
+    for step in list_of:
+        entry = before.get(step.name)
+        if entry is None:
+            if progress is not None:
+                progress(step.name)
+            entry = _gone(step, bench, folder, None if logs is None else Path(logs))
+        else:
+            kept.append(step.name)
+        entries.append(entry)
+        done = replace(done, entries=tuple(entries), kept=tuple(kept))
+        content = json_text(done.document | {"signature": done.signature})
+        replace_files({folder / JOURNAL: content.encode()})
+        if not entry.passed:
+            break
+    return done
+
+
+def steps_of(plant: Plant, box: Mapping[str, float]) -> tuple[Step, ...]:
+    """The checklist of a machine, its own or else the general one; box: share by which each parameter may differ."""
+    own: Callable[[Mapping[str, float]], tuple[Step, ...]] | None
+    own = attribute_of(plant, "experiments", "commissioning_steps")
+    return general_steps(plant, box) if own is None else own(box)
+
+
+def _gone(step: Step, bench: Bench, folder: Path, logs: Path | None) -> Entry:
+    """Record or read the log of a step, and judge it."""
+    try:
+        if logs is None:
+            path = write_log(step.record(bench), folder / f"{step.name}.npz")
+        else:
+            found = [logs / f"{step.name}{suffix}" for suffix in (".npz", ".csv", ".mat")]
+            path = next((file for file in found if file.exists()), found[0])
+            if not path.exists():
+                return Entry(step.name, step.question, str(path), "", (), f"waits for {path}: {step.needs}")
+        log = read_log(path)
+    except CheckError as error:
+        return Entry(step.name, step.question, "", "", (), str(error))
+    try:
+        findings = tuple(step.judge(bench.controller, log))
+    except CheckError as error:
+        return Entry(step.name, step.question, str(path), log.sha256, (), str(error))
+    return Entry(step.name, step.question, str(path), log.sha256, findings)
+
+
+def _digest_of(bench: Bench) -> str:
+    """A digest of the simulated machine: its parameters, the errors of its sensors, and the seed."""
+    text = f"{bench.truth.parameters!r} {sorted(bench.errors.items())!r} {bench.seed}"
+    return sha256(text.encode()).hexdigest()
+
+
+def _entries_before(folder: Path, now: Commissioning) -> dict[str, Entry]:
+    """The entries of a journal that passed with these gains on this bench, and whose logs are as they were.
+
+    Raises InputError for a journal that is none, or whose signature is not its own.
+    """
+    path = folder / JOURNAL
+    if not path.exists():
+        return {}
+    done, signature = read_journal(path)
+    if done.signature != signature:
+        raise InputError(path, "signature", signature[:16], f"{done.signature[:16]}, that of its entries")
+    if (done.sha256, done.bench) != (now.sha256, now.bench):
+        return {}
+    kept = {}
+    for entry in done.entries:
+        log = Path(entry.log)
+        if entry.passed and log.exists() and sha256(log.read_bytes()).hexdigest() == entry.sha256:
+            kept[entry.name] = entry
+    return kept
+
+
+def read_journal(path: Path) -> tuple[Commissioning, str]:
+    """A journal and the signature that stands in it. Raises InputError for a file that is none."""
+    try:
+        content = json.loads(read_file(path, "journal", Path.read_bytes, LARGEST))
+        entries = []
+        for e in content["entries"]:
+            findings = tuple(_finding_of(one) for one in e["findings"])
+            name, question, log, digest, refusal = (
+                str(e[key]) for key in ("step", "question", "log", "sha256", "refusal")
+            )
+            entries.append(Entry(name, question, log, digest, findings, refusal))
+        gains, digest, machine, bench = (str(content[key]) for key in ("gains", "sha256", "machine", "bench"))
+        if content["version"] != VERSION:
+            raise InputError(path, "version", str(content["version"]), str(VERSION))
+        done = Commissioning(gains, digest, machine, bench, tuple(entries), tuple(map(str, content["steps"])))
+        return done, str(content["signature"])
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(path, "", f"no journal ({error!r})", "one that malta commission wrote") from error
+
+
+def _finding_of(table: Mapping[str, Any]) -> Finding:
+    ends = {"low": -math.inf, "high": math.inf} | {
+        k: float(table[k]) for k in ("low", "high") if table[k] is not None
+    }
+    value, half = (math.nan if table[k] is None else float(table[k]) for k in ("value", "half"))
+    return Finding(str(table["name"]), Estimate(value, half, str(table["unit"])), **ends)
+
+
+def fly(bench: Bench, scenario: Scenario, *, ends: Iterable[str] = ENDS) -> Log:
+    """Fly a scenario with the bench's noise, steps and errors of sensors. Raises CheckError where it ends otherwise."""
+    own: dict[str, Any] = {"noise": 1.0, "quantize": True, "seed": bench.seed}
+    own["sensor_errors"] = dict(bench.errors) or None
+    own |= {} if bench.truth.windings is not None else {"fidelity": "force"}
+    run = simulate(bench.truth, bench.controller, scenario.replace(**own))
+    if run.verdict.name not in ends:
+        raise CheckError(f"{scenario.name}: {run.verdict.name} at {run.verdict.time:.4g} s")
+    return log_of(run)
+
+
+def general_steps(plant: Plant, box: Mapping[str, float]) -> tuple[Step, ...]:
+    """The checklist of any machine that levitates: rest in flight, the loop, and a stroke where it has one."""
+    noise = Step(
+        "still", "Do the sensors read as quietly as the filter believes?", "the mover held at its place",
+        "touchdown", lambda bench: fly(bench, Scenario("still", STILL, references.hold)), judge_noise,
+    )  # fmt: skip
+    steps = (noise, loop_step(box))
+    return (*steps, stroke_step()) if plant.has_stroke else steps
+
+
+def stroke_step() -> Step:
+    """The step that flies a stroke, and learns from it."""
+    return Step(
+        "stroke", "Does it follow a stroke, and with which thrust?", "the travel free, |S| as predicted",
+        "touchdown, end stop, current limit", _record_stroke, judge_stroke,
+    )  # fmt: skip
+
+
+def judge_noise(controller: Controller, log: Log) -> list[Finding]:
+    """The noise of each position sensor beside what the gain file's machine has."""
+    plant = plant_of(controller.parameters)
+    found = at_rest(log)
+    return [
+        Finding(f"noise of {s.name}", found[s.name][1], 0.0, NOISY * math.hypot(noise, step) + 1e-12)
+        for s, noise, step in zip(plant.outputs, plant.noise, plant.resolution, strict=True)
+    ]
+
+
+def loop_step(box: Mapping[str, float], **options: Any) -> Step:
+    """The step that measures the loop; `options` are those of `malta.excite`."""
+    return Step(
+        "loop", "Is the loop as predicted, and in zone A?", "the mover in flight, the excitation in the law",
+        "touchdown, a force at its limit", partial(_record_loop, options), partial(judge_loop, box=box),
+    )  # fmt: skip
+
+
+def _record_loop(options: Mapping[str, Any], bench: Bench) -> Log:
+    believed = plant_of(bench.controller.parameters)
+    plan = plan_measurement(loop(believed, bench.controller), **options).excitations[0]
+    return fly(bench, Scenario.excited(plan.signal, plan.duration))
+
+
+def judge_loop(controller: Controller, log: Log, box: Mapping[str, float]) -> list[Finding]:
+    """The largest |S| of each sensor and the disk margin.
+
+    box : parameters that are uncertain, each with its share; without any, |S| is compared with no prediction
+
+    Raises CheckError where another law flew, or |S| or |T| is not as predicted.
+    """
+    found = measure(controller, log, uncertainty=box)
+    if found.refusal and (box or found.law > SAME_LAW):
+        raise CheckError(f"{log.source}: {found.refusal}")
+    peaks = [
+        Finding(f"largest |S| of {name}", Estimate(value, high - value), 0.0, WORST)
+        for name, (value, high, _) in found.peaks.items()
+    ]
+    disk, low = found.disks[-1]
+    return [*peaks, Finding("disk margin of all sensors", Estimate(disk.size, disk.size - low), 0.2)]
+
+
+def _record_stroke(bench: Bench) -> Log:
+    return fly(bench, Scenario.stroke(2 * bench.truth.travel / 3, settle=0.3))
+
+
+def judge_stroke(controller: Controller, log: Log) -> list[Finding]:
+    """The largest error along the stroke, and the thrust that it took over what the law expects."""
+    plant = plant_of(controller.parameters)
+    error = log.table("y", [plant.stroke]) - log.table("reference", [plant.stroke])
+    noise = float(plant.noise[plant.stroke_output])
+    taught = learn(controller, log)
+    return [
+        Finding(
+            "largest axial error",
+            Estimate(float(np.abs(error).max()), 2 * noise, "m"),
+            0,
+            ERROR * plant.travel,
+        ),
+        Finding(
+            f"thrust over that of {taught.parameter}",
+            Estimate(taught.factor, 1.96 * taught.deviation),
+            *FACTORS,
+        ),
+    ]

@@ -1,0 +1,223 @@
+"""Calibration against simulated truths, and the checklist: limits, journal, signature, page."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from conftest import Run
+
+import malta
+from malta.errors import CheckError, InputError
+from malta.identification import calibration
+from malta.identification import measure as measuring
+from malta.identification.calibration import Estimate
+from malta.identification.commission import JOURNAL, Bench, Finding, Step, commission, read_journal, steps_of
+from malta.machines.tubular import bench as tubular
+from malta.report.page.binder import binder_page, binder_text
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+ROBUST = "design/gains/robust.json"
+CONTROLLER = malta.gains.read(ROBUST)
+PLANT = malta.plant_of(CONTROLLER.parameters)
+TRUE = {"K_A": 9000.0, "F_c": 0.6, "phi_c": 0.3, "e_x": 8e-6, "e_y": -5e-6}
+ERRORS = {"gain_x1": 0.02, "offset_x1": 5e-6, "hall_amplitude": 0.01, "hall_phase": 0.005}
+
+
+@cache
+def bench(*, errors: bool = True) -> Bench:
+    par: Any = CONTROLLER.parameters
+    return Bench(CONTROLLER, malta.plant_of(replace(par, **TRUE)), ERRORS if errors else {}, 0)
+
+
+def found_in(step: str, *, errors: bool = True) -> dict[str, Estimate]:
+    one = next(one for one in steps_of(PLANT, {}) if one.name == step)
+    return {
+        finding.name: finding.found for finding in one.judge(CONTROLLER, one.record(bench(errors=errors)))
+    }
+
+
+def holds(found: Estimate, truth: float, times: float = 1.5) -> bool:
+    """Whether a truth is near an interval of 95 %: 1.5 times it has 99.7 %."""
+    return abs(found.value - truth) < times * found.half
+
+
+def a_log(t: Any, **columns: tuple[list[str], Any]) -> malta.Log:
+    signals = {
+        g: tuple(malta.Signal(n, "m" if g == "y" else "N") for n in names)
+        for g, (names, _) in columns.items()
+    }
+    return malta.Log(
+        "made", "", "", float(t[1]), 0.0, t, {g: table for g, (_, table) in columns.items()}, signals
+    )
+
+
+def test_a_ring_tells_gains_cross_talk_and_offsets() -> None:
+    """Intervals of five figures over 30 runs: 150 of them, of which 95 % hold the truth."""
+    E, offset, r, inside = np.array([[1.03, 0.01], [0.01, 0.98]]), np.array([4e-6, -7e-6]), 0.6e-3, 0
+    truth = [0.03, -0.02, 0.01, *offset]
+    t = 1e-3 * np.arange(2000)
+    for seed in range(30):
+        angle = 20 * t + 0.3 * np.sin(5 * t)
+        p = r * np.column_stack([np.cos(angle), np.sin(angle)])
+        y = p @ E.T + offset + np.random.default_rng(seed).normal(0, 1e-6, p.shape)
+        found = calibration.ring(a_log(t, y=(["a", "b"], y)), ("a", "b"), r)
+        inside += sum(holds(one, value, 1.0) for one, value in zip(found, truth, strict=True))
+    assert 134 <= inside <= 149
+    with pytest.raises(CheckError, match=r"leaves 1.. degrees of the ring out"):
+        calibration.ring(a_log(t[:200], y=(["a", "b"], y[:200])), ("a", "b"), r)
+
+
+def test_quadrature_needs_a_period_and_finds_its_errors() -> None:
+    inside, phase = 0, np.linspace(0, 6.5, 1500)
+    for seed in range(30):
+        noise = np.random.default_rng(seed).normal(0, 5e-3, (2, len(phase)))
+        cosine = 2 * (np.cos(phase) + 0.01 + noise[0])
+        found = calibration.quadrature(cosine, 2 * (1.05 * np.sin(phase - 0.02) - 0.02 + noise[1]))
+        inside += sum(holds(e, v, 1.0) for e, v in zip(found, (0.05, -0.02, 0.01, -0.02), strict=True))
+    assert 106 <= inside <= 119
+    with pytest.raises(CheckError, match="degrees of a period"):
+        calibration.quadrature(np.cos(phase[:900]), np.sin(phase[:900]))
+
+
+def test_rest_is_judged_by_its_noise_and_not_by_what_rolls() -> None:
+    t, random = 1e-4 * np.arange(4000), np.random.default_rng(1)
+    y = 5e-6 + random.normal(0, 1e-6, (4000, 1))
+    log = a_log(t, y=(["a"], y + 20e-6 * np.sin(30 * t)[:, None]))
+    mean, deviation = calibration.at_rest(log)["a"]
+    assert holds(deviation, 1e-6)
+    assert deviation.half < 5e-8
+    assert holds(mean, 5e-6)
+    with pytest.raises(InputError, match="no such columns"):
+        calibration.at_rest(log, "i")
+    with pytest.raises(CheckError, match="100 samples, at least 200"):
+        calibration.at_rest(a_log(t[:100], y=(["a"], y[:100])))
+
+
+def test_polarity_is_the_sign_of_a_slope() -> None:
+    t, random = 1e-3 * np.arange(2000), np.random.default_rng(2)
+    u = np.sign(np.cos(2 * np.pi * 25 * t))[:, None]
+    y = -3e-6 * u + random.normal(0, 1e-6, u.shape)
+    found = calibration.slope(a_log(t, y=(["a"], y), v=(["f"], u)), ("v", "f"), "a")
+    assert (holds(found, -3e-6), found.unit) == (True, "m/N")
+    assert found.value < -10 * found.half
+    with pytest.raises(CheckError, match="f has no pulses"):
+        calibration.slope(a_log(t, y=(["a"], y), v=(["f"], u * (t > 1)[:, None])), ("v", "f"), "a")
+
+
+def test_the_ring_of_the_machine_reads_its_sensors() -> None:
+    found = found_in("ring")
+    for name, truth in (
+        ("gain of x1", 0.02),
+        ("gain of y2", 0.0),
+        ("offset of x1", 5e-6),
+        ("offset of y1", 0.0),
+    ):
+        assert holds(found[name], truth)
+    assert all(
+        found[f"{s} by f{s[0]}_B{s[1]}"].value > found[f"{s} by f{s[0]}_B{s[1]}"].half for s in ("x1", "y2")
+    )
+    hall = found_in("hall")
+    assert holds(hall["hall amplitude"], 0.01)
+    assert holds(hall["hall phase"], 0.005)
+
+
+@pytest.mark.slow
+def test_polarity_centre_cogging_and_fall_of_the_machine() -> None:
+    thrust = found_in("polarity")["z'' by f_D"]
+    assert thrust.value == pytest.approx(1 / 0.36, rel=0.05)
+    centre = found_in("centre", errors=False)
+    for name, truth in (("x1", 8e-6), ("y1", -5e-6), ("x2", 8e-6), ("y2", -5e-6)):
+        assert centre[f"magnetic centre, {name}"].value == pytest.approx(truth, abs=0.2e-6)
+    assert centre["K_A / K_B over the gain file's"].value == pytest.approx(9000 / 8626.7, rel=3e-3)
+    cogging = found_in("cogging")
+    assert holds(cogging["cogging"], 0.6)
+    assert holds(cogging["phase of the cogging"], 0.3)
+    assert holds(found_in("drop")["unstable pole over the gain file's"], math.sqrt(9000 / 8626.7))
+
+
+def made_steps(limit: float, flown: list[str]) -> tuple[Step, ...]:
+    """Two steps that record without a machine, and note that they did; the second has a limit."""
+
+    def record(name: str, _: Bench) -> malta.Log:
+        flown.append(name)
+        return a_log(1e-3 * np.arange(400), y=(["a"], np.random.default_rng(0).normal(0, 1, (400, 1))))
+
+    def judge(high: float, _: Any, log: malta.Log) -> Sequence[Finding]:
+        return [Finding("noise", calibration.at_rest(log)["a"][1], 0.0, high)]
+
+    from functools import partial
+
+    return tuple(
+        Step(name, f"Is {name} quiet?", "nothing", "nothing", partial(record, name), partial(judge, high))
+        for name, high in (("one", math.inf), ("two", limit))
+    )
+
+
+def test_a_day_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    flown: list[str] = []
+    first = commission(ROBUST, CONTROLLER, tmp_path, steps=made_steps(0.5, flown))
+    assert (first.passed, [e.passed for e in first.entries]) == (False, [True, False])
+    again = commission(ROBUST, CONTROLLER, tmp_path, steps=made_steps(2.0, flown))
+    assert (again.passed, again.kept, flown) == (True, ("one",), ["one", "two", "two"])
+    assert again.signature != first.signature
+    assert read_journal(tmp_path / JOURNAL) == (again, again.signature)
+    assert "two passed" in str(again)
+    # A log that was changed is recorded anew; another machine begins anew.
+    (tmp_path / "one.npz").write_bytes(b"changed")
+    assert commission(ROBUST, CONTROLLER, tmp_path, steps=made_steps(2.0, flown)).kept == ("two",)
+    assert commission(ROBUST, CONTROLLER, tmp_path, steps=made_steps(2.0, flown), seed=1).kept == ()
+
+
+def test_a_journal_that_was_written_over_is_refused(tmp_path: Path) -> None:
+    commission(ROBUST, CONTROLLER, tmp_path, steps=made_steps(0.5, []))
+    journal = tmp_path / JOURNAL
+    journal.write_text(journal.read_text().replace('"high": 0.5', '"high": 5.0'))
+    with pytest.raises(InputError, match="signature"):
+        commission(ROBUST, CONTROLLER, tmp_path, steps=made_steps(0.5, []))
+    for text in ("{}", "[]", "no", '{"entries": [1]}'):
+        journal.write_text(text)
+        with pytest.raises(InputError, match="no journal"):
+            read_journal(journal)
+
+
+def test_logs_of_a_bench_are_judged_and_waited_for(tmp_path: Path) -> None:
+    steps = made_steps(2.0, [])
+    malta.write_log(steps[0].record(bench()), tmp_path / "one.csv")
+    done = commission(ROBUST, CONTROLLER, tmp_path / "day", steps=steps, logs=tmp_path)
+    assert [entry.passed for entry in done.entries] == [True, False]
+    assert "waits for" in done.entries[1].refusal
+    text, page = binder_text(done), binder_page(done).html
+    for said in (done.signature, "waits for", "two: Is two quiet? FAILED", done.entries[0].sha256):
+        assert said in text
+    assert done.signature in page
+
+
+def test_a_finding_holds_where_all_of_its_interval_does() -> None:
+    assert Finding("a", Estimate(1.0, 0.1), 0.9, 1.2).holds
+    assert not Finding("a", Estimate(1.0, 0.3), 0.9, 1.2).holds
+    assert not Finding("a", Estimate(math.nan, 0.0), 0.0, 1.0).holds
+
+
+@pytest.mark.slow
+def test_commission_from_the_shell(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measuring, "SAMPLES", 4)
+    monkeypatch.setattr(measuring, "CORNERS", 0)
+    listed = run("commission", ROBUST, "--plan").out
+    assert all(step.name in listed for step in tubular.steps({}))
+    failed = run("commission", ROBUST, "--sensor", "gain_x1=0.1", "--out", tmp_path / "bad", "--json")
+    assert (failed.code, "step ring failed" in failed.err) == (1, True)
+    assert json.loads(failed.out)["left"][0] == "hall"
+    said = run("commission", ROBUST, "--set", "K_A=9000", "--out", tmp_path / "day", "--json")
+    document = json.loads(said.out)
+    assert (said.code, document["passed"], document["left"]) == (0, True, [])
+    assert document["signature"] in (tmp_path / "day" / "binder.txt").read_text()
+    assert run("commission", ROBUST, "--sensor", "gain_q=1").code == 2
