@@ -51,12 +51,16 @@ def identify(
         Path | None,
         typer.Option("--out", "-o", metavar="FILE", help="Write a data file, as robust-identified.toml."),
     ] = None,
+    robust: Annotated[
+        bool, typer.Option("--robust", help="Take outliers for missing (Student's likelihood in time).")
+    ] = False,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Identify parameters of the machine from a log under excitation, each with its 95 % interval.
 
-    Maximum likelihood at the excited lines, from measured currents to measured outputs; feedback does not bias it.
+    Maximum likelihood at the excited lines, from measured currents to measured outputs; feedback does not bias it. Then
+    prediction errors in time, on the machine without linearization: both have to agree.
     A log that the machine's model does not explain is refused with exit code 1, and no file is written.
 
     \b
@@ -67,12 +71,14 @@ def identify(
     from malta.identification.log import read_log
     from malta.identification.response import units_of_model
     from malta.model.data import plant_of
-    from malta.report.tables.experiments import identified_table, quality_table
+    from malta.report.tables.experiments import identified_table, in_time_table, quality_table
 
     controller = read_controller(gains, machine)
     values = read_assignments("--known", known, units_of_model(plant_of(controller.parameters)))
     with working(f"identifying from {log}"):
-        found = identify_parameters(controller, read_log(log), parameters=parameters or (), known=values)
+        found = identify_parameters(
+            controller, read_log(log), parameters=parameters or (), known=values, robust=robust
+        )
     files = []
     if out is not None and not found.refusal:
         files.append(write_data(found, out, gains=str(gains), known=values))
@@ -84,6 +90,8 @@ def identify(
         console = make_console()
         console.print(identified_table(found))
         console.print(quality_table(found))
+        if found.in_time is not None:
+            console.print(in_time_table(found, found.in_time))
         held = ", ".join(f"{name} = {value:.5g}" for name, value in found.held.items())
         print_text(console, f"taken as known, SI: {held or 'nothing'}")
         if found.dropped:

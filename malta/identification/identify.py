@@ -13,6 +13,11 @@ from scipy.stats import chi2 as chi2_distribution
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.identification.log import Log
+from malta.identification.prediction import (
+    Predicted,
+    noise_between_lines,
+    predict,
+)
 from malta.identification.response import (
     ResponseModel,
     acting,
@@ -22,6 +27,14 @@ from malta.identification.response import (
     require_parameters,
     units_of_model,
     well_found,
+)
+from malta.identification.spectra import (
+    Spectrum,
+    between_neighbours,
+    readings,
+    spectrum_of,
+    straightened,
+    whole,
 )
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names, twins_of
@@ -34,18 +47,16 @@ if TYPE_CHECKING:
 
     IntArray = NDArray[np.integer[Any]]
 
-NEIGHBOURS = 16  # bins between lines, nearest to a line, that tell the noise there
 WINDOW = 3  # lines to either side whose bins are taken together
-EXCITED = 1e-6  # of the largest line of an excitation: what is above is a line
-FEWEST = 3  # periods
-WIDER = 2  # times the highest line: up to there motion counts that curvature multiplies
 SIGMA = 1.959963984540054  # half of a 95 % interval
 SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
 LOST = 1.0  # of its value: a combination of parameters that is found worse is not found
 LIKELY = 1e-6  # probability below which chi2 refuses the model
 SLACK = 1.1  # factor of chi2: the noise's covariance is estimated too
 WHITE = 5.0  # standard deviations of the correlation between neighbouring lines
-REPAIRED = 1e-3  # of the samples that may be missing
+STRAIGHTENED = 6  # estimates at most, each with the curvature of the one before
+SETTLED = 0.01  # standard deviations: what moves by less is settled
+DIFFERENT = 3.0  # standard deviations between the estimates at the lines and in time
 QUIET = (
     4.0  # power at the lines over the noise, of the output that moves most, without which nothing was excited
 )
@@ -70,6 +81,8 @@ class Identified:
     distortion : power at multiples of 1 / period that were not excited, over the noise; 1 of a linear machine
     by_output : chi2 of each output
     dropped : parameters that this log does not tell by themselves, with their standard deviation as a share
+    in_time : the same parameters from prediction errors in time; None where the machine's sensors lag, or its states
+        are not (q, q')
 
     >>> import dataclasses, malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -100,6 +113,7 @@ class Identified:
     distortion: float
     by_output: Mapping[str, float]
     dropped: Mapping[str, float]
+    in_time: Predicted | None = None
 
     @property
     def half_widths(self) -> FloatArray:
@@ -124,6 +138,18 @@ class Identified:
         return float(np.sqrt(chi2_distribution.ppf(0.95, len(self.names))) / SIGMA)
 
     @property
+    def differences(self) -> dict[str, float]:
+        """By parameter: the estimate in time less that at the lines, in standard deviations of the larger one.
+
+        Both use the same readings, so that right models differ by much less than the deviation of either.
+        """
+        if self.in_time is None:
+            return {}
+        variance = np.maximum(np.diag(self.covariance), np.diag(self.in_time.covariance))
+        off = (self.in_time.values - self.values) / np.sqrt(variance)
+        return dict(zip(self.names, off.tolist(), strict=True))
+
+    @property
     def refusal(self) -> str:
         """Why the model does not explain the log; "": it does."""
         worst = max(self.by_output, key=lambda name: self.by_output[name])
@@ -137,6 +163,15 @@ class Identified:
                 f"residuals of neighbouring lines are correlated by {self.whiteness:.1f} standard deviations, at "
                 f"most {WHITE:g} is noise: the machine's model lacks something"
             )
+        if self.differences and self.in_time is not None:
+            name, off = max(self.differences.items(), key=lambda item: abs(item[1]))
+            k = self.names.index(name)
+            if abs(off) > DIFFERENT:
+                return (
+                    f"{name} is {self.values[k]:.5g} at the lines and {self.in_time.values[k]:.5g} in time, "
+                    f"{abs(off):.1f} standard deviations apart, at most {DIFFERENT:g} is noise: the machine's model "
+                    "lacks something"
+                )
         return ""
 
     @property
@@ -158,6 +193,8 @@ def identify(
     parameters: Sequence[str] = (),
     known: Mapping[str, float] | None = None,
     start: Mapping[str, float] | None = None,
+    robust: bool = False,
+    in_time: bool = True,
 ) -> Identified:
     """Identify parameters of a machine from a log under a periodic excitation, with intervals.
 
@@ -168,7 +205,12 @@ def identify(
 
     in which C moves with theta: so the noise that the loop feeds back into the currents does not bias the result
     (maximum likelihood with errors in the variables; Pintelon and Schoukens, System Identification, 2nd ed., ch. 9).
-    Loads act at the place where the log was made, with the mean currents there.
+    Loads act at the place where the log was made, with the mean currents there. What the machine's curvature adds at
+    the lines is computed from the measured motion and taken off.
+
+    Then the same parameters are estimated from prediction errors in time (`malta.identification.prediction`), with the
+    process noise that is found between the lines. Both are reported; a model that lacks something makes them differ.
+    A machine whose sensors lag, or whose states are not (q, q'), is estimated at the lines alone.
 
     controller : the gain file that flew; its machine's parameters are where the search starts
     log : with measured currents and an excitation of whole periods
@@ -176,6 +218,10 @@ def identify(
         masses and lengths, which are held
     known : parameters with values that were weighed or measured otherwise, SI
     start : values from which the search starts, SI
+    robust : take outliers among the readings for missing, with Student's likelihood in time
+    in_time : whether to estimate in time too, where the estimate at the lines is not refused
+
+    Up to 20 % of the readings may be missing: they are filled in with the predictions of the filter.
 
     Returns an Identified, also where its `refusal` says that the model does not explain the log.
 
@@ -198,14 +244,20 @@ def identify(
     """
     plant = _known_plant(plant_of(controller.parameters), known or {}, start or {})
     _require_machine(controller, plant, log)
-    spectrum = _spectrum(log)
+    y, i = readings(log, robust=robust), whole(log, "i")
+    spectrum = spectrum_of(log, between_neighbours(y), i)
     names = require_parameters(plant, parameters) or candidates(plant)
     names = tuple(name for name in names if name not in (known or {}))
-    i, y = spectrum.currents[0].real, spectrum.outputs[0].real
-    model = ResponseModel(plant, names, tuple(log.names("i")), y, i, log.sample_time)
-    measured, spectrum = spectrum, _straightened(model, spectrum, model.start)
+    model = ResponseModel(
+        plant,
+        names,
+        tuple(log.names("i")),
+        spectrum.outputs[0].real,
+        spectrum.currents[0].real,
+        log.sample_time,
+    )
     dropped: dict[str, float] = {}
-    F = _information(model, spectrum)
+    F = _information(model, straightened(model, spectrum, model.start))
     if not parameters:
         left = well_found(F, names, SHARE / SIGMA)
         sigma = deviations(F)
@@ -213,8 +265,46 @@ def identify(
         model = replace(model, names=tuple(names[k] for k in left))
         F = F[np.ix_(left, left)]
     _require_identifiable(model, F, log.source)
-    first = _estimate(model, spectrum, log, dropped)
-    return _estimate(model, _straightened(model, measured, first.values), log, dropped)
+    found = _estimate_straightened(model, spectrum, log, dropped)
+    filled = robust or bool(np.isnan(y).any())
+    wanted = filled or (in_time and not found.refusal)
+    if not wanted or plant.sensors is not None or not plant.second_order:
+        return found
+    predicted = _predicted(model, spectrum, found, i, y, robust=robust)
+    if filled:  # once more, with predictions in their place
+        spectrum = spectrum_of(log, predicted.readings, i)
+        found = _estimate_straightened(model, spectrum, log, dropped)
+        told = float(np.isfinite(y).mean())  # what was filled in tells nothing
+        found = replace(found, covariance=found.covariance / told)
+        predicted = _predicted(model, spectrum, found, i, y, robust=robust)
+    return replace(found, in_time=predicted)
+
+
+def _estimate_straightened(
+    model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str, float]
+) -> Identified:
+    """The estimate at the lines, with the machine's curvature at what was found, until that moves no more."""
+    theta = model.start
+    for _ in range(STRAIGHTENED):
+        found = _estimate(model, straightened(model, s, theta), log, dropped, theta)
+        moved = np.abs(found.values - theta) / np.sqrt(np.diag(found.covariance))
+        theta = found.values
+        if (moved < SETTLED).all():
+            break
+    return found
+
+
+def _predicted(
+    model: ResponseModel, s: Spectrum, found: Identified, i: FloatArray, y: FloatArray, *, robust: bool
+) -> Predicted:
+    """The estimate in time, from that at the lines on."""
+    bins, places = np.unique(s.between.ravel(), return_index=True)
+    e = _residuals(model, straightened(model, s, found.values), found.values).between
+    samples = round(2 * np.pi / (s.rate * model.sample_time))
+    noise = noise_between_lines(
+        model, found.values, s.rate * bins, e.reshape(-1, e.shape[2])[places], samples
+    )
+    return predict(model, found.values, noise, i, y, source=s.source, robust=robust)
 
 
 def _known_plant(plant: Plant, known: Mapping[str, float], start: Mapping[str, float]) -> Plant:
@@ -255,102 +345,6 @@ def _require_machine(controller: Controller, plant: Plant, log: Log) -> None:
         raise CheckError(
             f"{log.source}: its samples jitter by {found.jitter:.3g} s, more than 1 % of {Ts:g} s"
         )
-
-
-class Spectrum(NamedTuple):
-    """Fourier coefficients of a log over whole periods, of bins 0 to half of the samples, with the lines."""
-
-    outputs: ComplexArray
-    currents: ComplexArray
-    lines: IntArray  # bins that were excited
-    axis: IntArray  # of each line, the input that it excites most
-    turn: ComplexArray  # of each line, the excitation's phase as a number of size 1
-    between: IntArray  # lines x NEIGHBOURS: the nearest bins with noise alone
-    harmonics: IntArray  # multiples of 1 / period that were not excited, in the band of the lines
-    rate: float  # rad/s of a bin
-    periods: int  # of the excitation in the record: every so many bins is a harmonic
-    source: str  # the log's
-    weight: (
-        FloatArray  # of each output: 1 over the size of its coefficients above the lines, where nothing moves
-    )
-
-
-def _spectrum(log: Log) -> Spectrum:
-    """The spectra of the last whole periods of a log. Raises CheckError for a log that tells nothing."""
-    excitation = _whole(log, "excitation")
-    if not excitation.size or not np.abs(excitation).max(initial=0.0):
-        raise CheckError(f"{log.source}: nothing was excited: its columns exc.* are missing or zero")
-    if not log.period:
-        raise CheckError(
-            f"{log.source}: no period of the excitation is given: a line '# period 1.0 s' in a .csv"
-        )
-    each = round(log.period / log.sample_time)
-    periods = log.samples // each
-    if periods > FEWEST:
-        periods -= 1  # the first one, in which the loop settles
-    if periods < FEWEST:
-        found = f"{log.samples * log.sample_time:.4g} s are {periods} periods of {log.period:g} s"
-        raise CheckError(f"{log.source}: too short: {found}, at least {FEWEST} and one to settle are needed")
-    N = each * periods
-    last = slice(log.samples - N, None)
-    outputs, currents, D = (
-        np.fft.rfft(table[last], axis=0) / N for table in (_whole(log, "y"), _whole(log, "i"), excitation)
-    )
-    size = np.abs(D[1:])
-    lines = 1 + np.flatnonzero((size > EXCITED * size.max()).any(axis=1))
-    if (lines % periods).any():
-        raise CheckError(
-            f"{log.source}: the excitation has not the period of {log.period:g} s that the log names"
-        )
-    axis = np.abs(D[lines]).argmax(axis=1)  # the input that a line excites most
-    pulse = D[lines, axis]
-    free = np.setdiff1d(np.arange(1, lines[-1] + 4 * periods), np.arange(0, len(D), periods))
-    nearest = np.argsort(np.abs(free - lines[:, None]), axis=1)[:, :NEIGHBOURS]
-    harmonics = np.setdiff1d(np.arange(lines[0], lines[-1] + 1, periods), lines)
-    rate = 2 * np.pi / (N * log.sample_time)
-    quiet = np.median(np.abs(outputs[len(outputs) // 2 :]), axis=0)
-    weight = 1 / np.maximum(quiet, 1e-300)
-    return Spectrum(
-        outputs,
-        currents,
-        lines,
-        axis,
-        pulse / np.abs(pulse),
-        free[nearest],
-        harmonics,
-        rate,
-        periods,
-        log.source,
-        weight,
-    )
-
-
-def _straightened(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Spectrum:
-    """The spectrum without what the machine's curvature adds at harmonics; see `ResponseModel.beyond_linear`.
-
-    Products of two lines fall on other lines. Without this they were taken for the machine's linear response.
-    """
-    last = min(WIDER * int(s.lines[-1]) // s.periods, (len(s.outputs) - 1) // s.periods)
-    places = s.periods * np.arange(last + 1)
-    outputs = np.array(s.outputs)
-    outputs[places] -= model.beyond_linear(theta, s.outputs[places], s.currents[places], s.rate * s.periods)
-    return s._replace(outputs=outputs)
-
-
-def _whole(log: Log, group: str) -> FloatArray:
-    """The columns of a group with missing samples between their neighbours. Raises CheckError for many of them."""
-    table = log.columns.get(group, np.zeros((log.samples, 0)))
-    steps = np.diff(log.t) / log.sample_time
-    missing = int((np.round(steps) - 1).sum()) + int((~np.isfinite(table)).any(axis=1).sum())
-    if missing > REPAIRED * log.samples:
-        share = 100 * missing / log.samples
-        raise CheckError(
-            f"{log.source}: {share:.3g} % of the samples of {group} are missing, at most 0.1 % may be"
-        )
-    if not missing:
-        return table
-    t = log.t[0] + log.sample_time * np.arange(1 + round((log.t[-1] - log.t[0]) / log.sample_time))
-    return np.column_stack([np.interp(t, log.t[np.isfinite(c)], c[np.isfinite(c)]) for c in table.T])
 
 
 class Residuals(NamedTuple):
@@ -450,8 +444,10 @@ def _starting(model: ResponseModel, name: str) -> float:
     return float(model.start[model.names.index(name)])
 
 
-def _estimate(model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str, float]) -> Identified:
-    """The most likely parameters, their covariance, and how white the residuals are."""
+def _estimate(
+    model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str, float], begin: FloatArray
+) -> Identified:
+    """The most likely parameters from `begin` on, their covariance, and how white the residuals are."""
     scale, start = model.scale, model.start
 
     def residuals(moved: FloatArray) -> FloatArray:
@@ -461,7 +457,7 @@ def _estimate(model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str,
             return np.full(2 * s.lines.size * s.outputs.shape[1], 1e6)
         return np.concatenate([e.real, e.imag])
 
-    found = least_squares(residuals, np.zeros(len(scale)), method="lm", x_scale="jac", xtol=1e-7)
+    found = least_squares(residuals, (begin - start) / scale, method="lm", x_scale="jac", xtol=1e-7)
     theta = start + scale * found.x
     white = _white_residuals(model, s, theta)
     dof = 2 * white.size - len(scale)
@@ -473,9 +469,13 @@ def _estimate(model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str,
     others = replace(model, names=tuple(n for n in acting(plant) if n not in model.names))
     slopes = others.slopes(others.start, s.rate * s.lines)
     held = {n: float(getattr(par, n)) for n, slope in zip(others.names, slopes, strict=True) if slope.any()}
+    try:
+        most_likely = _plant_with(plant, dict(zip(model.names, theta.tolist(), strict=True)))
+    except InputError as error:
+        raise CheckError(f"{s.source}: what explains the log best is no machine ({error})") from error
     return Identified(
         log=log,
-        plant=_plant_with(plant, dict(zip(model.names, theta.tolist(), strict=True))),
+        plant=most_likely,
         names=model.names,
         values=theta,
         start=start,

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
 
 STEP = 1e-5  # of a scale: for derivatives by differences
+ALIKE = 1e3  # condition number of eigenvectors, which are too much alike above it
 SCALES = {"1": 0.1, "m": 1e-3, "rad": 0.1, "s": 1e-4}  # of a parameter whose value is 0, SI
 
 
@@ -76,11 +77,9 @@ class ResponseModel:
         The second one is k x p x states: over a record of N samples the coefficients of outputs and currents obey
         Y = G I + T (x_0 - x_N) / N with the states x_0 and x_N at both ends.
         """
-        A, B, C, late = (np.array(M) for M in self._matrices(theta))
+        A, B, C, late = self.matrices(theta)
         n, m, Ts = len(A), B.shape[1], self.sample_time
-        actuator = self.plant.actuator
-        driven = actuator.R / actuator.L if self.plant.windings is not None and actuator.L else 0.0
-        rate = actuator.crossover if self.plant.windings is None else driven
+        rate = current_rate(self.plant)
         held = bool(np.isinf(rate))
         rate = 0.0 if held else rate
         whole = np.zeros((n + 2 * m,) * 2)
@@ -95,9 +94,12 @@ class ResponseModel:
         # What the current goes towards, from its values at both ends: its command behind a lag, else its growth.
         left = np.exp(-rate * Ts)
         part = growing / (1 - left) if rate else growing
-        into = at + 0 * z if held else (at - left * part) + z * part
-        ends = z * np.eye(n)
-        found = C @ np.linalg.solve(z * np.eye(n) - E[:n, :n], np.concatenate([into, ends], axis=2))
+        Phi, unit = E[:n, :n], np.eye(n)
+        forced = [at] if held else [at - left * part, part]
+        blocks = transfer(Phi, C, np.hstack([*forced, unit]), z[:, 0, 0])
+        found = np.concatenate([blocks[:, :, :m], z * blocks[:, :, -n:]], axis=2)
+        if not held:
+            found[:, :, :m] += z * blocks[:, :, m : 2 * m]
         found *= np.exp(-1j * np.asarray(w) * late.item())[:, None, None]
         return found[:, :, :m], found[:, :, m:]
 
@@ -124,6 +126,14 @@ class ResponseModel:
         forces = machine.forces(x, i) if plant.windings is None else machine.drive.force(i)
         rate, read = machine.f(x, forces, machine.load(x)), machine.sense(x, errors)
         return theta, x, i, rate, read, machine.sensors
+
+    def matrices(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """A, B and C of the states of the design model and of lagging readings, and the dead time of readings, s.
+
+        theta : parameters, SI
+        """
+        A, B, C, late = (np.array(M) for M in self._matrices(theta))
+        return A, B, C, late
 
     @cached_property
     def _matrices(self) -> ca.Function:
@@ -159,7 +169,7 @@ class ResponseModel:
         """
         if not self.plant.second_order:
             return np.zeros_like(outputs)
-        A, B, C, late = (np.array(M) for M in self._matrices(theta))
+        A, B, C, late = self.matrices(theta)
         count, n = len(outputs), len(self.plant.controlled)
         samples = 4 * count
 
@@ -168,7 +178,8 @@ class ResponseModel:
             whole[:count] = coefficients
             return np.asarray(np.fft.irfft(whole, samples, axis=0)) * samples
 
-        y, i, w = signal(outputs), signal(currents), rate * np.arange(count)
+        w = rate * np.arange(count)
+        y, i = signal(outputs), signal(currents * self._between_samples(w)[:, None])
         q = evaluate(self._positions.map(samples), y)[0]
         moving = np.fft.rfft(q, axis=0)[:count] / samples * (1j * w)[:, None]
         x = np.hstack([q, signal(moving)])
@@ -182,6 +193,18 @@ class ResponseModel:
         H[1:] += (C @ np.linalg.solve(s * np.eye(len(A)) - A, wide))[..., 0]
         H[0] = 0
         return np.asarray(H * np.exp(-1j * w * late.item())[:, None])
+
+    def _between_samples(self, w: FloatArray) -> ComplexArray:
+        """Spectrum of a current between samples over that of its samples, at frequencies w from 0 on."""
+        rate, Ts = current_rate(self.plant), self.sample_time
+        s = 1j * w[1:]
+        whole = (1 - np.exp(-s * Ts)) / (s * Ts)
+        if np.isinf(rate):
+            return np.concatenate([[1.0 + 0j], whole])
+        if rate == 0:
+            return np.concatenate([[1.0 + 0j], np.abs(whole) ** 2])
+        risen = whole - (1 - np.exp(-(s + rate) * Ts)) / ((s + rate) * Ts)
+        return np.concatenate([[1.0 + 0j], whole + (np.exp(s * Ts) - 1) * risen / (1 - np.exp(-rate * Ts))])
 
     @cached_property
     def _positions(self) -> ca.Function:
@@ -220,9 +243,28 @@ class ResponseModel:
         return [known.index(name) for name in self.currents]
 
 
+def current_rate(plant: Plant) -> float:
+    """With which a current goes from one measured value to the next, 1/s; 0: evenly; infinite: it is held."""
+    actuator = plant.actuator
+    if plant.windings is None:
+        return actuator.crossover
+    return actuator.R / actuator.L if actuator.L else 0.0
+
+
 def axes_of(plant: Plant) -> tuple[Any, ...]:
     """The signals of the currents that a log may have: axes of the drive, or coils of a machine without windings."""
     return plant.actuator.coils if plant.windings is None else plant.drive.axes
+
+
+def transfer(A: FloatArray, C: FloatArray, B: FloatArray, z: ComplexArray) -> ComplexArray:
+    """C (z - A)^-1 B at many z: by eigenvectors, or where these are nearly alike by a solution for each."""
+    values, V = np.linalg.eig(A)
+    if np.linalg.cond(V) > ALIKE:
+        return np.asarray(C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B))
+    seen, driven = C @ V, np.linalg.solve(V, B.astype(complex))
+    outer = seen.T[:, :, None] * driven[:, None, :]
+    found = (1 / (z[:, None] - values)) @ outer.reshape(len(A), -1)
+    return np.asarray(found.reshape(len(z), len(C), B.shape[1]))
 
 
 def units_of_model(plant: Plant) -> dict[str, str]:

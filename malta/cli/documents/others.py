@@ -284,6 +284,8 @@ class IdentifiedParameter(Part):
     low: float = Field(description="end of the 95 % interval")
     high: float
     start: float = Field(description="value of the gain file")
+    in_time: Number | None = Field(description="from prediction errors in time; null: not estimated")
+    apart_sigma: Number | None = Field(description="of the two estimates, in standard deviations")
 
 
 class IdentifyOutput(Part):
@@ -477,11 +479,20 @@ def log_output(log: Log, files: Iterable[Path]) -> LogOutput:
 def identify_output(gains: Path, found: Identified, files: Iterable[Path]) -> IdentifyOutput:
     """The document of an identification."""
     units = units_of_model(found.plant)
+    in_time = (
+        None if found.in_time is None else dict(zip(found.names, found.in_time.values.tolist(), strict=True))
+    )
     parameters = {
-        name: IdentifiedParameter(unit=units[name], value=value, low=low, high=high, start=start)
-        for (name, (low, high)), value, start in zip(
-            found.intervals.items(), found.values.tolist(), found.start.tolist(), strict=True
+        name: IdentifiedParameter(
+            unit=units[name],
+            value=float(found.values[k]),
+            low=found.intervals[name][0],
+            high=found.intervals[name][1],
+            start=float(found.start[k]),
+            in_time=None if in_time is None else in_time[name],
+            apart_sigma=found.differences.get(name),
         )
+        for k, name in enumerate(found.names)
     }
     return IdentifyOutput(
         gains=str(gains),

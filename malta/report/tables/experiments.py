@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
     from malta.identification.log import Log
-    from malta.identification.measure import Measurement, MeasurementPlan
+    from malta.identification.prediction import Predicted
     from malta.identification.replay import LawReplay
     from malta.model.plant import Plant
     from malta.report.ledger import Claim, Ledger
@@ -254,6 +254,18 @@ def identified_table(found: Identified) -> Table:
         share = f"{100 * half / abs(value):.2g}" if value else "-"
         ends = f"{value - half:.6g} .. {value + half:.6g}"
         add_row(table, f"{name}{unit}", f"{value:.5g}", ends, share, f"{start:.5g}")
+    return table
+
+
+def in_time_table(found: Identified, in_time: Predicted) -> Table:
+    """The same parameters from prediction errors in time, and how far apart both estimates are."""
+    table = new_table("The same from prediction errors in time", "figure", "found", "if the model is right")
+    for name, value in zip(found.names, in_time.values.tolist(), strict=True):
+        add_row(table, name, f"{value:.5g}", f"{found.differences[name]:.1g} sigma off, at most 3")
+    for name, value in zip(found.by_output, in_time.rms.tolist(), strict=True):
+        add_row(table, f"innovation of {name} over its expected size", f"{value:.3g}", "1")
+    add_row(table, "missing readings", str(in_time.missing), "")
+    add_row(table, "outliers, beyond 6 sigma", str(in_time.outliers), "0")
     return table
 
 

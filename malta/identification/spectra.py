@@ -1,0 +1,146 @@
+"""The spectra of a log over whole periods of its excitation: lines, the noise between them, and what is curved."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from malta.errors import CheckError
+from malta.identification.log import Log
+from malta.identification.prediction import without_spikes
+from malta.identification.response import ResponseModel
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from malta.model.plant import ComplexArray, FloatArray
+
+    IntArray = NDArray[np.integer[Any]]
+
+NEIGHBOURS = 16  # bins between lines, nearest to a line, that tell the noise there
+EXCITED = 1e-6  # of the largest line of an excitation: what is above is a line
+FEWEST = 3  # periods
+WIDER = 2  # times the highest line: up to there motion counts that curvature multiplies
+REPAIRED = 1e-3  # of the currents that may be missing
+FILLED = 0.2  # of the readings that may be missing
+
+
+class Spectrum(NamedTuple):
+    """Fourier coefficients of a log over whole periods, of bins 0 to half of the samples, with the lines."""
+
+    outputs: ComplexArray
+    currents: ComplexArray
+    lines: IntArray  # bins that were excited
+    axis: IntArray  # of each line, the input that it excites most
+    turn: ComplexArray  # of each line, the excitation's phase as a number of size 1
+    between: IntArray  # lines x NEIGHBOURS: the nearest bins with noise alone
+    harmonics: IntArray  # multiples of 1 / period that were not excited, in the band of the lines
+    rate: float  # rad/s of a bin
+    periods: int  # of the excitation in the record: every so many bins is a harmonic
+    source: str  # the log's
+    weight: (
+        FloatArray  # of each output: 1 over the size of its coefficients above the lines, where nothing moves
+    )
+
+
+def spectrum_of(log: Log, y: FloatArray, i: FloatArray) -> Spectrum:
+    """The spectra of the last whole periods of a log. Raises CheckError for a log that tells nothing."""
+    excitation = whole(log, "excitation")
+    if not excitation.size or not np.abs(excitation).max(initial=0.0):
+        raise CheckError(f"{log.source}: nothing was excited: its columns exc.* are missing or zero")
+    if not log.period:
+        raise CheckError(
+            f"{log.source}: no period of the excitation is given: a line '# period 1.0 s' in a .csv"
+        )
+    each = round(log.period / log.sample_time)
+    periods = len(y) // each
+    if periods > FEWEST:
+        periods -= 1  # the first one, in which the loop settles
+    if periods < FEWEST:
+        found = f"{len(y) * log.sample_time:.4g} s are {periods} periods of {log.period:g} s"
+        raise CheckError(f"{log.source}: too short: {found}, at least {FEWEST} and one to settle are needed")
+    N = each * periods
+    outputs, currents, D = (np.fft.rfft(table[len(y) - N :], axis=0) / N for table in (y, i, excitation))
+    size = np.abs(D[1:])
+    lines = 1 + np.flatnonzero((size > EXCITED * size.max()).any(axis=1))
+    if (lines % periods).any():
+        raise CheckError(
+            f"{log.source}: the excitation has not the period of {log.period:g} s that the log names"
+        )
+    axis = np.abs(D[lines]).argmax(axis=1)  # the input that a line excites most
+    pulse = D[lines, axis]
+    free = np.setdiff1d(np.arange(1, lines[-1] + 4 * periods), np.arange(0, len(D), periods))
+    nearest = np.argsort(np.abs(free - lines[:, None]), axis=1)[:, :NEIGHBOURS]
+    harmonics = np.setdiff1d(np.arange(lines[0], lines[-1] + 1, periods), lines)
+    rate = 2 * np.pi / (N * log.sample_time)
+    quiet = np.median(np.abs(outputs[len(outputs) // 2 :]), axis=0)
+    weight = 1 / np.maximum(quiet, 1e-300)
+    return Spectrum(
+        outputs,
+        currents,
+        lines,
+        axis,
+        pulse / np.abs(pulse),
+        free[nearest],
+        harmonics,
+        rate,
+        periods,
+        log.source,
+        weight,
+    )
+
+
+def straightened(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Spectrum:
+    """The spectrum without what the machine's curvature adds at harmonics; see `ResponseModel.beyond_linear`.
+
+    Products of two lines fall on other lines. Without this they were taken for the machine's linear response.
+    """
+    last = min(WIDER * int(s.lines[-1]) // s.periods, (len(s.outputs) - 1) // s.periods)
+    places = s.periods * np.arange(last + 1)
+    outputs = np.array(s.outputs)
+    outputs[places] -= model.beyond_linear(theta, s.outputs[places], s.currents[places], s.rate * s.periods)
+    return s._replace(outputs=outputs)
+
+
+def readings(log: Log, *, robust: bool) -> FloatArray:
+    """The measured outputs at even times, NaN where one is missing, or sticks out where outliers are looked for."""
+    y = _at_even_times(log, "y")
+    missing = float(np.isnan(y).any(axis=1).mean())
+    if missing > FILLED:
+        raise CheckError(
+            f"{log.source}: {100 * missing:.3g} % of the samples of y are missing, at most 20 % may be"
+        )
+    return without_spikes(y) if robust else y
+
+
+def _at_even_times(log: Log, group: str) -> FloatArray:
+    """The columns of a group, a row for each sample time; NaN where the log has none."""
+    table = log.columns.get(group, np.zeros((log.samples, 0)))
+    k = np.round((log.t - log.t[0]) / log.sample_time).astype(int)
+    if k[-1] == log.samples - 1:
+        return table
+    if k[-1] > (1 + FILLED) * log.samples:
+        raise CheckError(f"{log.source}: {k[-1] + 1 - log.samples} samples are missing in its gaps")
+    whole = np.full((k[-1] + 1, table.shape[1]), np.nan)
+    whole[k] = table
+    return whole
+
+
+def between_neighbours(table: FloatArray) -> FloatArray:
+    """A table with missing entries on lines between their neighbours."""
+    if np.isfinite(table).all():
+        return table
+    t = np.arange(len(table))
+    return np.column_stack([np.interp(t, t[np.isfinite(c)], c[np.isfinite(c)]) for c in table.T])
+
+
+def whole(log: Log, group: str) -> FloatArray:
+    """The columns of a group with missing samples between their neighbours. Raises CheckError for many of them."""
+    table = _at_even_times(log, group)
+    missing = float(np.isnan(table).any(axis=1).mean())
+    if missing > REPAIRED:
+        raise CheckError(
+            f"{log.source}: {100 * missing:.3g} % of the samples of {group} are missing, at most 0.1 % may be"
+        )
+    return between_neighbours(table)
