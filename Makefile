@@ -81,6 +81,7 @@ figures: $(VENV)/runtime  # the pictures of the README and of the theory pages
 	$(BIN)/python -c "import malta; c = malta.gains.read('design/gains/calibrated.json'); \
 	  run = malta.simulate(malta.plant_of(c.parameters), c, malta.Scenario.stroke()); \
 	  malta.report.stroke(run, 'design/figures/stroke.svg', malta.published('data/tubular.toml'))"
+	$(BIN)/malta plot design/gains/calibrated.json marginmap --x K_A --y K_B --out design/figures/margin_map.svg
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \

@@ -143,6 +143,19 @@ display(malta.report.campaign(campaign, folder, malta.model.published("data/tubu
 assert campaign.completed.all()
 
 # %% [markdown]
+# ## The plane of two parameters
+# Blue: proven stable anywhere in the travel. Line: where eigenvalues become unstable, computed another way. Dots: the
+# machines of the campaign, all within the dashed box.
+
+# %%
+plant = malta.plant_of(controllers["calibrated"].parameters)
+display(
+    malta.report.margin_map(
+        plant, controllers["calibrated"], x="K_A", y="K_B", uncertainty=BOX, campaigns=[campaign]
+    )
+)
+
+# %% [markdown]
 # ## What it costs
 # More margin costs force noise. `malta tune` draws the front: the least noise at each margin, everything else as
 # specified (design/figures/robust_front.svg).

@@ -432,15 +432,19 @@ def worst_runs(summary: Summary, count: int) -> Runs:
     Closeness is relative to the median of the completed runs, because the scenario itself may come near an end stop.
     """
     runs = summary.kept
-    medians = [m.percentiles([50])[0] for m in summary.listed if m.kind == CLEARANCE]
-    contact = np.nan_to_num(runs.batch.contact, posinf=LARGEST_FIGURE, neginf=-LARGEST_FIGURE)
-    away = np.clip(contact, -LARGEST_FIGURE, LARGEST_FIGURE) - np.array(
-        medians
-    )  # a run that diverged may have any
-    closest = -away.max(axis=1) if away.shape[1] else np.zeros(len(runs.index))
     completed = runs.batch.completed == 1
+    closest = -closeness(summary, runs)
     order = np.lexsort((runs.index, np.where(completed, closest, runs.batch.duration), completed))
     return runs.take(order[: min(count, KEPT)])
+
+
+def closeness(summary: Summary, runs: Runs) -> FloatArray:
+    """How much more of its clearance each run uses up than the median of the completed runs, at its worst contact."""
+    medians = [m.percentiles([50])[0] for m in summary.listed if m.kind == CLEARANCE]
+    contact = np.nan_to_num(runs.batch.contact, posinf=LARGEST_FIGURE, neginf=-LARGEST_FIGURE)
+    # a run that diverged may have any
+    away = np.clip(contact, -LARGEST_FIGURE, LARGEST_FIGURE) - np.array(medians)
+    return np.asarray(away.max(axis=1) if away.shape[1] else np.zeros(len(runs.index)))
 
 
 def worst_of(found: Campaign, count: int) -> list[int]:

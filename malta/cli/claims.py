@@ -21,6 +21,7 @@ def claims(
     designs: Annotated[
         list[Path] | None,
         typer.Argument(
+            metavar="[DESIGN]...",
             help="Design files; of design/ those meant to reproduce a paper if none is named.",
             autocompletion=complete_designs,
         ),

@@ -44,7 +44,9 @@ def design(
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Design files; all of design/ if none is named.", autocompletion=complete_designs
+            metavar="[DESIGN]...",
+            help="Design files; all of design/ if none is named.",
+            autocompletion=complete_designs,
         ),
     ] = None,
     change: DesignChanges = None,
@@ -275,7 +277,7 @@ def tune(
     file: Annotated[
         Path,
         typer.Argument(
-            metavar="SPEC",
+            metavar="DESIGN",
             help="A design file with [specification] and [search].",
             autocompletion=complete_designs,
         ),

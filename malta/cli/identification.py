@@ -234,7 +234,7 @@ def _fly(plan: ExcitationPlan, plant: Plant, controller: Controller, path: Path,
 
 
 def log(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A log: .csv, .npz or .mat.")],
+    file: Annotated[Path, typer.Argument(metavar="LOG", help="A log: .csv, .npz or .mat.")],
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw it: a .png, .svg or .pdf file.")
     ] = None,

@@ -56,11 +56,18 @@ class Command(TyperCommand):
         renewed = renew(args) if self.name in ("simulate", "campaign") else args
         return list(super().parse_args(ctx, renewed))
 
+    def format_usage(self, ctx: Any, formatter: Any) -> None:
+        """Write the line of usage: each argument by the one name that it has in all commands."""
+        names = [_name_of(param) for param in self.get_params(ctx) if param.param_type_name == "argument"]
+        formatter.write_usage(ctx.command_path, " ".join(["[OPTIONS]", *names]))
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the panels, in the order of their first options."""
         panels: dict[str, list[tuple[str, str]]] = {"Arguments": []}
         for param in self.get_params(ctx):
             record = param.get_help_record(ctx)
+            if record is not None and param.param_type_name == "argument":
+                record = _name_of(param), record[1]
             if record is not None:
                 own = getattr(param, "rich_help_panel", None) or REST
                 panels.setdefault("Arguments" if param.param_type_name == "argument" else own, []).append(
@@ -71,6 +78,12 @@ class Command(TyperCommand):
             if rows:
                 with formatter.section(heading):
                     formatter.write_dl(rows)
+
+
+def _name_of(argument: Any) -> str:
+    """How a help names an argument: GAINS, [GAINS] where it may be left out, GAINS... where there may be several."""
+    name = (argument.metavar or argument.human_readable_name.upper()).strip("[].")
+    return (name if argument.required else f"[{name}]") + ("..." if argument.nargs == -1 else "")
 
 
 def renew(args: list[str]) -> list[str]:

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from malta.loops.curves import LoopCurves
     from malta.loops.linear_loops import Place
     from malta.loops.locus import RootLocus
+    from malta.margins.margin_map import MarginMap
     from malta.model.plant import Plant
     from malta.report.page.analysis import Subject
     from malta.synthesis.controller import Controller
@@ -164,11 +165,24 @@ def _campaigns_of(folders: Sequence[Path] | None, controller: Controller, spec: 
 # `malta plot`: the plots of a control engineer of one or several gain files.
 
 
-KINDS = ("bode", "nyquist", "nichols", "pzmap", "sigma", "sensitivity", "gang", "step", "load", "rootlocus")
-LOCUS = "rootlocus"
+KINDS = (
+    "bode",
+    "nyquist",
+    "nichols",
+    "pzmap",
+    "sigma",
+    "sensitivity",
+    "gang",
+    "step",
+    "load",
+    "rootlocus",
+    "marginmap",
+)
+LOCUS, MAP = "rootlocus", "marginmap"
 GAIN = "gain"
 SUFFIXES = (".png", ".svg", ".pdf")
 Machines = Mapping[str, tuple["Plant", "Controller"]]  # by the names of their loops
+Given = Mapping[str, "str | None"]  # option -> what was given
 
 
 class Picture(NamedTuple):
@@ -203,6 +217,13 @@ def plot(
             help="Root locus: multiples of the nominal value, or values with units. [0.5..1.5, gain 0.1..10]",
         ),
     ] = None,
+    x: Annotated[
+        str | None, typer.Option("--x", metavar="NAME", help="Margin map: the parameter along x. [the first]")
+    ] = None,
+    y: Annotated[
+        str | None,
+        typer.Option("--y", metavar="NAME", help="Margin map: the parameter along y. [the second]"),
+    ] = None,
     change: Changes = None,
     machine: MachineFile = None,
     out: Annotated[
@@ -217,16 +238,18 @@ def plot(
 
     bode, nyquist, nichols: loop gain with margins. sigma: singular values of L, S, T. sensitivity: |S|, |T| with the
     zones of ISO 14839-3. gang: gang of four. pzmap: poles and zeros. step: references. load: 1 N or 1 N m from
-    outside, and compliance. rootlocus: poles over the loop gain or a parameter.
+    outside, and compliance. rootlocus: poles over the loop gain or a parameter. marginmap: the proven box in the plane
+    of two uncertain parameters, and the boundary of stability by eigenvalues.
 
     The loop is the machine's: sampled, with hold, delay and current loops. The machine is the one in the file, with
     the changes given by --set.
 
     \b
     Examples:  malta plot design/gains/robust.json bode nyquist
+               malta plot design/gains/robust.json marginmap --x K_A --y m
                malta plot design/gains/robust.json rootlocus --parameter m
     """
-    _require_kinds(kinds, at, out, parameter, span)
+    _require_kinds(kinds, at, out, {"--parameter": parameter, "--range": span}, {"--x": x, "--y": y})
     machines = _read_machines([gains, *(locate(path) for path in others or ())], machine, change)
     from malta.loops.curves import loop_curves
 
@@ -234,13 +257,17 @@ def plot(
     loops = {name: loop_curves(*pair, name=name) for name, pair in machines.items()}
     channels = _channels(loops, kinds, channel, place)
     loci = _loci(machines, parameter or GAIN, span, channels, place) if LOCUS in kinds else ()
+    maps = _maps([gains, *(others or ())], machines, x, y) if MAP in kinds else ()
     names = [*dict.fromkeys(kinds)]
-    pictures = _draw(loops, names, channels, place, loci)
+    shown, note = _distinct(loops, names, place) if channels is None else (channels, "")
+    pictures = _draw(loops, names, shown, place, (*loci, *maps), named=channels is not None)
     files = _save(pictures, out)
+    if note:
+        print_note(note)
     if as_json:
         from malta.cli.documents.plots import plot_output
 
-        print_document(plot_output(loops.values(), names, channels, place, loci, files))
+        print_document(plot_output(loops.values(), names, channels, place, (loci, maps), files))
     else:
         print_written(make_console(), files)
     for name, curves in loops.items():
@@ -249,17 +276,22 @@ def plot(
 
 
 def _require_kinds(
-    kinds: Sequence[str], at: str, out: Path | None, parameter: str | None, span: str | None
+    kinds: Sequence[str],
+    at: str,
+    out: Path | None,
+    of_locus: Mapping[str, str | None],
+    of_map: Mapping[str, str | None],
 ) -> None:
-    """Raise InputError for an unknown kind or place, options without a root locus, and a file for several pictures."""
+    """Raise InputError for an unknown kind or place, options without their kind, and a file for several pictures."""
     for kind in kinds:
         if kind not in KINDS:
             raise InputError("plot", "KIND", repr(kind), "one of " + " ".join(KINDS))
     if at not in ("sensors", "forces"):
         raise InputError("--at", "", repr(at), "sensors or forces")
-    for option, given in (("--parameter", parameter), ("--range", span)):
-        if given is not None and LOCUS not in kinds:
-            raise InputError(option, "", f"no {LOCUS} among the kinds", f"{LOCUS}, which it is for")
+    for kind, options in ((LOCUS, of_locus), (MAP, of_map)):
+        for option, given in options.items():
+            if given is not None and kind not in kinds:
+                raise InputError(option, "", f"no {kind} among the kinds", f"{kind}, which it is for")
     if out is not None and out.suffix and out.suffix not in SUFFIXES and not out.is_dir():
         raise InputError("--out", "", str(out), "a folder, or a file " + ", ".join(SUFFIXES))
     if out is not None and out.suffix in SUFFIXES and len({*kinds}) > 1:
@@ -298,6 +330,18 @@ def _channels(
     return named
 
 
+def _distinct(
+    loops: Mapping[str, LoopCurves], kinds: Sequence[str], at: Place
+) -> tuple[list[str] | None, str]:
+    """The channels to draw where none is named, and a sentence on those that have the curves of others."""
+    from malta.report.page.sections import distinct_channels
+
+    if at != "sensors" or not {*kinds} & {"bode", "nyquist", "nichols", "sensitivity", "gang", "step"}:
+        return None, ""
+    panels = distinct_channels(loops)
+    return (list(panels.channels), f"not drawn twice: {panels.note.strip()}") if panels.note else (None, "")
+
+
 def _loci(
     machines: Machines,
     parameter: str,
@@ -321,6 +365,24 @@ def _loci(
                 plant, controller, parameter=parameter, span=ends, channel=only, at=at, progress=progress
             )
         found.append(replace(one, name=name))
+    return found
+
+
+def _maps(files: Sequence[Path], machines: Machines, x: str | None, y: str | None) -> Sequence[MarginMap]:
+    """The margin map of each loop over two parameters that its gain file names as uncertain. Raises InputError."""
+    from malta.cli.options import read_uncertainty
+    from malta.margins.margin_map import margin_map_of
+    from malta.model.data import published_figures
+
+    found = []
+    for file, (name, (plant, controller)) in zip(files, machines.items(), strict=True):
+        box = read_uncertainty(file, None, plant.parameters, published_figures(plant.name))
+        if len(box) < 2:
+            raise InputError(file, "uncertainty", f"{len(box)} parameters", f"two at least for a {MAP}")
+        free = [one for one in box if one not in (x, y)]
+        names = x or free.pop(0), y or free.pop(0)
+        with progress_bar(f"margin map of {name}"):
+            found.append(replace(margin_map_of(plant, controller, names, box), name=name))
     return found
 
 
@@ -362,9 +424,15 @@ def _draw(
     kinds: Sequence[str],
     channels: list[str] | None,
     at: Place,
-    loci: Sequence[RootLocus],
+    planes: Sequence[RootLocus | MarginMap],
+    *,
+    named: bool,
 ) -> list[Picture]:
-    """The pictures of all kinds; a root locus is drawn of each loop."""
+    """The pictures of all kinds; a root locus and a margin map are drawn of each loop.
+
+    named : whether the user named the channels
+    """
+    from malta.margins.margin_map import MarginMap
     from malta.report import plots
 
     outputs = None
@@ -380,15 +448,19 @@ def _draw(
         "sensitivity": lambda: plots.sensitivity_curves(loops, channel=channels, at=at),
         "gang": lambda: plots.gang_of_four(loops, channel=outputs),
         "step": lambda: plots.step(loops, channel=outputs),
-        "load": lambda: plots.load_response(loops, channel=outputs),
+        "load": lambda: plots.load_response(loops, channel=outputs if named else None),
     }
     first = next(iter(loops))
     pictures = []
     for kind in kinds:
         if kind == LOCUS:
+            loci = [found for found in planes if not isinstance(found, MarginMap)]
             pictures += [
                 Picture(f"{found.name}_{LOCUS}", plots.root_locus(found, loops[found.name])) for found in loci
             ]
+        elif kind == MAP:
+            maps = [found for found in planes if isinstance(found, MarginMap)]
+            pictures += [Picture(f"{found.name}_{MAP}", plots.margin_map(found)) for found in maps]
         else:
             pictures.append(Picture(f"{first}_{kind}", draw[kind]()))
     return pictures

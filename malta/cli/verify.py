@@ -202,8 +202,7 @@ def _print_tables(
     preset = f"{controller.parameters.preset} {' '.join(changes)}".rstrip()
     verdict = report.verdict_text(found)
     print_text(console, f"{gains}: {controller.name}, {found.plant.name}, preset {preset}")
-    console.print(verdict)
-    console.print()
+    console.print(verdict, "\n")
     console.print(report.poles_table(found.model, None if changes else published))
     for table in report.loop_tables(found, published, spec):
         console.print(table)
@@ -214,7 +213,7 @@ def _print_tables(
 
 
 def check(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A certificate that verify wrote.")],
+    file: Annotated[Path, typer.Argument(metavar="CERTIFICATE", help="A certificate that verify wrote.")],
     gains: Annotated[
         Path | None,
         typer.Option(metavar="GAINS", help="The gain file that it has to be of: loops, box and travel."),

@@ -68,6 +68,7 @@ if TYPE_CHECKING:  # loaded when the first one is drawn: commands that draw none
     from malta.report.plots import bode as bode
     from malta.report.plots import gang_of_four as gang_of_four
     from malta.report.plots import load_response as load_response
+    from malta.report.plots import margin_map as margin_map
     from malta.report.plots import nichols as nichols
     from malta.report.plots import nyquist as nyquist
     from malta.report.plots import pzmap as pzmap
@@ -77,7 +78,7 @@ if TYPE_CHECKING:  # loaded when the first one is drawn: commands that draw none
     from malta.report.plots import step as step
 
 _PLOTS = {
-    *("bode", "gang_of_four", "load_response", "nichols", "nyquist"),
+    *("bode", "gang_of_four", "load_response", "margin_map", "nichols", "nyquist"),
     *("pzmap", "root_locus", "sensitivity_curves", "sigma", "step"),
 }
 

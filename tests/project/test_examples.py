@@ -49,6 +49,7 @@ SLOW = {
     "malta.report.load_response",
     "malta.report.loads",
     "malta.report.loop_tables",
+    "malta.report.margin_map",
     "malta.report.open_bounds",
     "malta.report.places_table",
     "malta.report.rare_event_sentence",

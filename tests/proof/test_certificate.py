@@ -514,7 +514,7 @@ def test_verify_writes_and_check_confirms(run: Run, tmp_path: Path) -> None:
 def test_a_first_look_without_the_proof(run: Run) -> None:
     code, out, err = run("verify", str(HALBACH), "--uncertain", "b=20%", "--no-proof")
     assert (code, err) == (0, "")
-    assert "not asked" in out
+    assert "not proven" in out
     assert run("verify", str(HALBACH), "--no-proof", "--certificate", "c.json")[0] == 2
     assert run("verify", str(HALBACH), "--time", "0")[0] == 2
 

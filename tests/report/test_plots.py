@@ -21,6 +21,7 @@ from malta import report
 from malta.cli.documents.published import output_schema
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.locus import root_locus
+from malta.margins.margin_map import margin_map_of
 from malta.model.signals import axis_units
 from malta.report.plots.plane import Window, branch_paths
 
@@ -170,6 +171,28 @@ def test_a_root_locus_mirrors_and_its_branches_have_no_gaps(name: str) -> None:
         step = np.abs(np.diff(path))
         size = np.maximum(np.abs(path[1:]), 0.02 * strip)
         assert np.nanmax(step / size, initial=0.0) < 0.2
+
+
+def test_a_margin_map_proves_no_unstable_machine_and_meets_its_witness() -> None:
+    """Two routes: no eigenvalue in the proven box is unstable, and the witness lies on the boundary that they show."""
+    controller = malta.gains.read(GAINS / "halbach.json")
+    plant, box = malta.plant_of(controller.parameters), {"m": 0.1, "A": 0.1}
+    found = margin_map_of(plant, controller, ("m", "A"), box)
+    X, Y = np.meshgrid(found.x_values, found.y_values)
+    off = [np.abs(V - m) / h for V, m, h in zip((X, Y), found.nominal, found.half, strict=True)]
+    inside = np.maximum(*off) <= found.proven * (1 - 1e-9)
+    assert inside.sum() > 50
+    assert found.growth[inside].max() < 0
+    assert found.growth.max() > 0
+    assert found.witness is not None
+    near = np.hypot((X - found.witness[0]) / found.half[0], (Y - found.witness[1]) / found.half[1]) < 0.2
+    assert found.growth[near].min() < 0 < found.growth[near].max()
+    figure = report.margin_map(found)
+    assert defects(figure) == []
+    assert f"proven {math.floor(1000 * found.proven) / 10:g} %" in " ".join(texts_of(figure))
+    for names, what in ((("m", "q"), "--y"), (("m", "m"), "--y")):
+        with pytest.raises(malta.InputError, match=what):
+            margin_map_of(plant, controller, names, box)
 
 
 def test_a_root_locus_leaves_the_axis_at_a_right_angle_and_ends_at_zeros() -> None:

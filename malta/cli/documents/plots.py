@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from malta.loops.curves import LoopCurves
     from malta.loops.linear_loops import Place
     from malta.loops.locus import RootLocus
+    from malta.margins.margin_map import MarginMap
     from malta.synthesis.recovery import StepResponse
 
 Line = Annotated[list[Number], Field(description="one number for each frequency, time or value")]
@@ -154,6 +155,24 @@ class LocusPart(Part):
     nominal_rad_per_s: Poles
 
 
+class MapPart(Part):
+    """A margin map: growth of the worst pole over two parameters, and the proven box."""
+
+    READS: ClassVar = {"x_values_si": "x_values", "y_values_si": "y_values", "growth_per_s": "growth"}
+
+    name: str
+    x: str
+    y: str
+    units: list[str] = Field(description="SI units of x and y")
+    nominal: list[float]
+    half: list[float] = Field(description="half widths of the uncertainty box")
+    proven: float = Field(description="margin in multiples of the box that is proven for x and y; 0: nothing")
+    witness: list[float] | None = Field(description="values of x and y at the limit of stability")
+    x_values_si: list[float]
+    y_values_si: list[float]
+    growth_per_s: list[list[Number]] = Field(description="a row for each y, positive where unstable")
+
+
 class PlotOutput(Part):
     """What `malta plot --json` prints."""
 
@@ -162,6 +181,7 @@ class PlotOutput(Part):
     at: Literal["sensors", "forces"]
     loops: list[LoopPart]
     root_loci: list[LocusPart]
+    margin_maps: list[MapPart]
     files: Files
 
 
@@ -170,15 +190,32 @@ def plot_output(
     kinds: Sequence[str],
     channels: Sequence[str] | None,
     at: Place,
-    loci: Iterable[RootLocus],
+    planes: tuple[Iterable[RootLocus], Iterable[MarginMap]],
     files: Iterable[Path],
 ) -> PlotOutput:
     """The document of plots of these kinds; channels : by name; None: all."""
     return PlotOutput(
         at=at,
         loops=[_loop_part(curves, kinds, channels, at) for curves in loops],
-        root_loci=[_locus_part(found) for found in loci],
+        root_loci=[_locus_part(found) for found in planes[0]],
+        margin_maps=[_map_part(found) for found in planes[1]],
         files=list(map(str, files)),
+    )
+
+
+def _map_part(found: MarginMap) -> MapPart:
+    return MapPart(
+        name=found.name,
+        x=found.x,
+        y=found.y,
+        units=list(found.units),
+        nominal=list(found.nominal),
+        half=list(found.half),
+        proven=found.proven,
+        witness=None if found.witness is None else list(found.witness),
+        x_values_si=found.x_values.tolist(),
+        y_values_si=found.y_values.tolist(),
+        growth_per_s=found.growth.tolist(),
     )
 
 

@@ -53,16 +53,21 @@ def campaign_page(found: Summary, what: str, **places: Any) -> Figure:
     """An empty figure whose title names the campaign, with its yield."""
     from malta.campaigns.plan import planned_run
 
-    plan, share = found.plan, found.rate
+    plan, yields = found.plan, found.yields
     wanted = planned_run(plan)
     flown = plan.scenario if wanted.label == plan.scenario else f"{plan.scenario} ({wanted.label})"
     title = f"{plan.controller.name}, {flown}, fidelity {wanted.scenario.fidelity}: {what}"
+    bounded = yields.specified or yields.published
+    share = bounded or yields.completed
     done = "all" if share.passed == share.runs else f"{share.passed} of"
-    text = f"{done} {share.runs} runs completed: {100 * share.share:.4g} % "
+    ends = "completed" if bounded is None else "within bounds"
+    text = f"{done} {share.runs} runs {ends}: {100 * share.share:.4g} % "
     text += f"(95 %: {100 * share.low:.4g} to {100 * share.high:.4g} %)"
+    if bounded is not None:
+        text += f"; completed {100 * found.rate.share:.4g} %"
     if found.runs < plan.samples:
         text += f"; not final: {plan.samples} runs are planned"
-    return new_figure(title, text, **places)
+    return new_figure(title, text, **{"right": 0.965} | places)
 
 
 def panels_over_parameters(
@@ -180,7 +185,9 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
     summary = as_summary(found, Bounds(published))
     plan, names = summary.plan, varied_names(summary.plan)
     runs = worst_runs(summary, len(STYLES) + len(MORE))
-    figure = campaign_page(summary, "the worst runs and their machines", wspace=0.42, top=0.84, bottom=0.13)
+    figure = campaign_page(
+        summary, "the worst runs and their machines", wspace=0.42, top=0.84, bottom=0.13, right=0.95
+    )
     box, far = figure.subplots(1, 2, width_ratios=(1.7, 1))
     labels = [_run_label(plan, index, end) for index, end in zip(runs.index, runs.batch.verdict, strict=True)]
     at = np.arange(len(names))
@@ -205,8 +212,9 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
 
 
 def _draw_errors(axes: Axes, summary: Summary, runs: Runs) -> None:
-    """The largest deviation of each run with its value, beside its bounds; where the reference jumps, its nearness."""
+    """What ranks the runs: how near they came to a contact; of runs that ended early their largest deviation."""
     from malta.campaigns.result import bounds_of
+    from malta.campaigns.summary import closeness
 
     plan, plant, published = summary.plan, summary.plan.plant, summary.bounds.published
     across, completed = lateral_outputs(plant)[0], runs.batch.completed == 1
@@ -218,10 +226,9 @@ def _draw_errors(axes: Axes, summary: Summary, runs: Runs) -> None:
     key = bounds_of(plan).get(across.unit)
     if published is not None and key is not None:
         bounds["published bound"] = published_in_unit(published, key, across.fine)
-    alike = len(values) > 1 and bool(completed.all()) and np.ptp(values) < 0.01 * values.max()
-    if plant.contacts and alike:
-        values, label = _nearness(summary, runs)
-        unit, bounds = "%", {"touched": 100.0}
+    if plant.contacts and completed.all():  # what the runs are ranked by
+        values, label = 100 * closeness(summary, runs), "clearance used up beyond median [%]"
+        unit, bounds = "%", {}
     most = float(values.max(initial=0.0))
     bounds = {text: v for text, v in bounds.items() if math.isfinite(v) and v < 30 * most}
     _set_reach(axes, values, list(bounds.values()))

@@ -306,6 +306,7 @@ def _margins(a: Analysis) -> Iterator[Item]:
                 "Margins stage by stage, from full state feedback to the machine's own loop, and the peak sensitivity "
                 "of each stage with the zones of ISO 14839-3.",
             )
+        yield from _margin_map(a)
         yield from sheets_of([chain_table(found)])
         if missing := found.left_out:
             yield f"Not in the last stage: {missing}."
@@ -319,6 +320,24 @@ def _margins(a: Analysis) -> Iterator[Item]:
         yield _classical_sheet(found, found.classical)
     if found.worst:
         yield from sheets_of([worst_case_table(found.worst)])
+
+
+def _margin_map(a: Analysis) -> Iterator[Item]:
+    """The plane of the two parameters that the margin depends on most; nothing of a single parameter."""
+    from malta.margins.margin_map import margin_map_of
+    from malta.report import plots
+
+    found = a.report
+    if found.robust is None or not found.robust.lower or len(found.uncertainty) < 2:
+        return
+    shares = found.robust.sensitivity
+    x, y, *_ = sorted(found.uncertainty, key=lambda name: -shares.get(name, 0.0))
+    drawn = margin_map_of(a.plant, a.subject.controller, (x, y), found.uncertainty, margin=found.robust)
+    yield Picture(
+        lambda: plots.margin_map(drawn, campaigns=a.campaigns),
+        f"Margin map over {x} and {y}: every machine in the blue box is proven stable. The line is the boundary of "
+        "stability by eigenvalues, the other parameters being nominal: another route, which proves nothing.",
+    )
 
 
 def _classical_sheet(found: LoopReport, classical: Classical) -> Sheet:

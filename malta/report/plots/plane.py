@@ -31,6 +31,8 @@ MARKERS = ("x", "s", "D", "^", "v", "p", "h", "*")  # of the closed loops
 NEAR = 2.5  # times the highest crossing of unit gain: the panel of the slow poles
 STRIP = 1.6  # times the Nyquist frequency: sampled poles beyond are next to pure delay
 GREY = "#dcdcdc"
+WIDE = 30.0  # from the slowest pole to the reach of a panel: beyond, its axes are logarithmic
+SLOWEST = 1e-6  # of the reach: slower poles are at zero
 BEND = np.linspace(0.0, 1.0, 13)[:-1] ** 2  # shares of an interval about the point where two poles meet
 JUMP = 0.8  # of the strip: motions of an imaginary part that are jumps of ln(z)
 SAME = 1e-9  # of a pole: imaginary parts that are none
@@ -39,8 +41,9 @@ SAME = 1e-9  # of a pole: imaginary parts that are none
 def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float | None = None) -> Figure:
     """Draw poles of the closed loop and of the plant, and zeros of L, with rays of damping and circles of frequency.
 
-    Left: all of them; right: those slower than `reach`. Sampled loops: ln(z) / T, without the poles of pure delay; the
-    unit circle is the imaginary axis, and levels at pi / T are the Nyquist frequency.
+    Left: all of them; right: those slower than `reach`, on logarithmic axes where they lie decades apart. Sampled
+    loops: ln(z) / T, without the poles of pure delay; the unit circle is the imaginary axis, and levels at pi / T are
+    the Nyquist frequency.
 
     source : a plant; LoopSystems; a system of python-control, the loop gain L of negative feedback or the plant P of
         L = P C; or a table name -> loop, where a pair is a tuple
@@ -67,7 +70,9 @@ def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float
     sheet, reaches = _plane_sheet((f"{title_of(loops)}: poles and zeros", told), loops, axes, reaches)
     for (panel,), size in zip(sheet.panels, reaches, strict=True):
         window = Window.about(everything, size)
-        _draw_plane(panel, window, times)
+        slowest = np.abs(everything[np.abs(everything) > SLOWEST * size]).min(initial=size)
+        wide = panel is sheet.panels[-1][0] and slowest < size / WIDE
+        _draw_plane(panel, window, times, linear=_round(slowest / 2) if wide else None)
         for k, (name, curves) in enumerate(loops.items()):
             look = {"color": styles[name]["color"], "marker": MARKERS[k % len(MARKERS)]}
             _draw_poles(panel, curves, look, window, list(loops.values())[:k])
@@ -139,8 +144,13 @@ def _plane_sheet(
     return Sheet(figure, [(panel,) for panel in np.ravel(figure.subplots(1, len(reaches)))]), reaches
 
 
-def _draw_plane(axes: Axes, window: Window, times: Sequence[float | None]) -> None:
-    """Axes of equal scale with a grid of damping and frequency, the unstable half grey, and the Nyquist frequency."""
+def _draw_plane(
+    axes: Axes, window: Window, times: Sequence[float | None], linear: float | None = None
+) -> None:
+    """Axes of equal scale with a grid of damping and frequency, the unstable half grey, and the Nyquist frequency.
+
+    linear : rad/s, beyond which the axes are logarithmic either way; None: nowhere
+    """
     left, right, height = window
     reach = -left
     axes.set_xlim(left, right)
@@ -153,13 +163,18 @@ def _draw_plane(axes: Axes, window: Window, times: Sequence[float | None]) -> No
     for damping in DAMPING:
         slope = math.sqrt(1 - damping**2) / damping
         end = min(reach, height / slope)
+        along = end * np.append(0, np.geomspace(1e-4, 1, 60))
         for sign in (1, -1):
-            axes.plot([0, -end], [0, sign * slope * end], color=GREY, linewidth=0.8, zorder=0.5)
-        axes.annotate(f"ζ {damping:g}", (-0.8 * end, 0.8 * slope * end), ha="center", va="center",
+            axes.plot(-along, sign * slope * along, color=GREY, linewidth=0.8, zorder=0.5)
+        if linear is None:
+            axes.annotate(f"ζ {damping:g}", (-0.8 * end, 0.8 * slope * end), ha="center", va="center",
                       bbox={"facecolor": "#ffffff", "edgecolor": "none", "pad": 0.3}, **small)  # fmt: skip
     turn = np.linspace(np.pi / 2, 3 * np.pi / 2, 121)
     step = _round(reach / 3)
-    for radius in np.arange(step, math.hypot(reach, height), step).tolist():
+    circles = np.arange(step, math.hypot(reach, height), step)
+    if linear is not None:
+        circles = 10.0 ** np.arange(math.ceil(math.log10(linear)), math.log10(math.hypot(reach, height)))
+    for radius in circles.tolist():
         x, y = radius * np.cos(turn), radius * np.sin(turn)
         inside = (x > -reach) & (np.abs(y) < height)
         axes.plot(
@@ -172,9 +187,26 @@ def _draw_plane(axes: Axes, window: Window, times: Sequence[float | None]) -> No
     axes.tick_params(labelsize=8)
     for edge in ("top", "right"):
         axes.spines[edge].set_visible(False)
-    axes.locator_params(nbins=5)
+    if linear is None:
+        axes.locator_params(nbins=5)
+    else:
+        _set_logarithmic(axes, linear)
     axes.set_xlabel("real part [rad/s]", fontsize=8.5)
     axes.set_ylabel("imaginary part [rad/s]", fontsize=8.5)
+
+
+def _set_logarithmic(axes: Axes, linear: float) -> None:
+    """Make both axes logarithmic either way beyond +-linear, with numbers at decades."""
+    from matplotlib.ticker import NullLocator, SymmetricalLogLocator
+
+    for side, limits, set_limits in (
+        (axes.xaxis, axes.get_xlim(), axes.set_xlim),
+        (axes.yaxis, axes.get_ylim(), axes.set_ylim),
+    ):
+        getattr(axes, f"set_{side.axis_name}scale")("symlog", linthresh=linear)
+        side.set_major_locator(SymmetricalLogLocator(base=10, linthresh=linear))
+        side.set_minor_locator(NullLocator())
+        set_limits(*limits)
 
 
 def _round(value: float) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rich.table import Table
+from rich.text import Text
 
 from malta.report.figures.drawing import UNITS, front_lines
 from malta.report.tables.layout import add_row, new_table
@@ -14,6 +15,9 @@ from malta.synthesis.requirements import Trade, requirements_for
 if TYPE_CHECKING:
     from malta.margins.loop_report import Outcome
     from malta.tuning.tune import Tuned
+
+
+COLOURS = {"holds": "green", "undecided": "bold yellow", "fails": "bold red"}  # beside their words
 
 
 def requirements_table(requirements: Sequence[Outcome]) -> Table:
@@ -39,7 +43,9 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
         ratio, verdict = "", ""
         if r.asked is not None:
             ratio, verdict = f"{100 * r.ratio:.1f} %", "FAILS" if r.verdict == "fails" else r.verdict
-        add_row(table, r.words, r.asked_text, r.found_text, ratio, verdict, r.how)
+        cells = [Text(cell) for cell in (r.words, r.asked_text, r.found_text, ratio, verdict, r.how)]
+        cells[4].style = COLOURS[r.verdict]
+        table.add_row(*cells)
     return table
 
 
