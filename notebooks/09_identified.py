@@ -41,7 +41,7 @@ hidden = believed.variant(replace(controller.parameters, **values, I_yy=values["
 # %%
 plan = malta.excite(loop, motion=40e-6, periods=4)
 run = malta.simulate(hidden, controller, malta.Scenario.excited(plan.signal, plan.duration))
-log = malta.log_of(run)
+log = malta.identification.log_of(run)
 found = malta.identify(controller, log, parameters=names)
 display(plan, found)
 assert found.refusal == ""
@@ -75,9 +75,9 @@ display(
 # %%
 stroke = malta.Scenario.stroke(10e-3, noise=1.0, quantize=True)
 first = malta.simulate(hidden, controller, stroke)
-taught = malta.learn(controller, malta.log_of(first))
+taught = malta.learn(controller, malta.identification.log_of(first))
 second = malta.simulate(hidden, taught.controller, stroke)
-errors = [1e6 * malta.stroke_figures(one).axial_error for one in (first, second)]
+errors = [1e6 * malta.simulation.stroke_figures(one).axial_error for one in (first, second)]
 assert errors[1] < errors[0]
 display(
     Markdown(

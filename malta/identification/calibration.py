@@ -64,7 +64,9 @@ def at_rest(log: Log, group: str = "y") -> dict[str, tuple[Estimate, Estimate]]:
     >>> from malta.identification.calibration import at_rest
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> still = malta.Scenario("still", 0.2, malta.references.hold, noise=1.0)
-    >>> log = malta.log_of(malta.simulate(malta.plant_of(controller.parameters), controller, still))
+    >>> log = malta.identification.log_of(
+    ...     malta.simulate(malta.plant_of(controller.parameters), controller, still)
+    ... )
     >>> mean, deviation = at_rest(log)["z"]
     >>> abs(deviation.value - 15e-6) < 2 * deviation.half, deviation.unit
     (True, 'm')
@@ -185,7 +187,10 @@ def quadrature(cosine: FloatArray, sine: FloatArray) -> Quadrature:
 
     >>> import numpy as np
     >>> from malta.identification.calibration import quadrature
-    >>> t, noise = np.linspace(0, 7, 2000), np.random.default_rng(0).normal(0, 1e-3, (2, 2000))
+    >>> t, noise = (
+    ...     np.linspace(0, 7, 2000),
+    ...     np.random.default_rng(0).normal(0, 1e-3, (2, 2000)),
+    ... )
     >>> found = quadrature(np.cos(t) + noise[0], 1.02 * np.sin(t + 0.01) + noise[1])
     >>> f"{found.amplitude.value:.3f} {found.phase.value:.3f}"
     '0.020 0.010'

@@ -13,13 +13,13 @@ import pytest
 from conftest import Run
 
 import malta
-from malta.identification import ExcitationPlan, Log
+from malta.identification import ExcitationPlan, Identified, Log
 from malta.identification.data_file import read_identified, write_data
 from malta.identification.excite import model_at, predicted_spectra
 from malta.identification.response import ResponseModel
 from malta.identification.spectra import spectrum_of, straightened
 from malta.machines.tubular.plant import plant as tubular
-from malta.simulation.references import interleaved_multisine
+from malta.simulation.excitation import interleaved_multisine
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant
@@ -47,7 +47,7 @@ def log(plan: ExcitationPlan) -> Log:
 
 
 @pytest.fixture(scope="module")
-def found(log: malta.Log) -> malta.Identified:
+def found(log: Log) -> Identified:
     return malta.identify(CONTROLLER, log, parameters=ASKED)
 
 
@@ -94,7 +94,7 @@ def test_the_linear_loop_predicts_the_flight(plant: Plant, plan: ExcitationPlan)
     assert moved == pytest.approx(list(plan.motion.values()), rel=0.03)
 
 
-def test_parameters_are_within_their_intervals(found: malta.Identified, plan: malta.ExcitationPlan) -> None:
+def test_parameters_are_within_their_intervals(found: Identified, plan: ExcitationPlan) -> None:
     truth = np.array([TRUE.get(name, 1.3805e-3) for name in ASKED])
     assert found.refusal == ""
     assert (np.abs(found.values - truth) < 2 * found.half_widths).all()
@@ -105,7 +105,7 @@ def test_parameters_are_within_their_intervals(found: malta.Identified, plan: ma
     assert found.half_widths[0] / truth[0] < 1.5 * plan.accuracy["K_A"]
 
 
-def test_without_names_those_are_found_that_the_log_tells(log: malta.Log) -> None:
+def test_without_names_those_are_found_that_the_log_tells(log: Log) -> None:
     found = malta.identify(CONTROLLER, log, in_time=False)
     assert not found.dropped.keys() & set(found.names)
     assert {"K_A", "K_B", "K_D", "I_xx"} <= set(found.names)
@@ -177,7 +177,7 @@ def test_an_excitation_that_cannot_be_is_refused(plant: Plant, options: dict[str
         malta.excite(malta.loop(plant, CONTROLLER), **options)
 
 
-def test_estimates_at_the_lines_and_in_time_agree(found: malta.Identified) -> None:
+def test_estimates_at_the_lines_and_in_time_agree(found: Identified) -> None:
     assert found.in_time is not None
     assert np.abs(list(found.differences.values())).max() < 2.5
     sigma = np.sqrt(np.diag(found.in_time.covariance))
@@ -190,7 +190,7 @@ def test_estimates_at_the_lines_and_in_time_agree(found: malta.Identified) -> No
 
 
 @pytest.mark.slow
-def test_missing_readings_are_filled_in(log: malta.Log, found: malta.Identified) -> None:
+def test_missing_readings_are_filled_in(log: Log, found: Identified) -> None:
     """5 % of the rows, and of one sensor 5 % more: intervals grow by little, and what is found stays."""
     y, random = np.array(log.columns["y"]), np.random.default_rng(1)
     y[random.random(len(y)) < 0.05] = np.nan
@@ -204,7 +204,7 @@ def test_missing_readings_are_filled_in(log: malta.Log, found: malta.Identified)
 
 
 @pytest.mark.slow
-def test_outliers_move_nothing(log: malta.Log, found: malta.Identified) -> None:
+def test_outliers_move_nothing(log: Log, found: Identified) -> None:
     y, random = np.array(log.columns["y"]), np.random.default_rng(1)
     for column in range(5):
         k = random.choice(len(y), 60, replace=False)
@@ -218,7 +218,7 @@ def test_outliers_move_nothing(log: malta.Log, found: malta.Identified) -> None:
 
 
 @pytest.mark.slow
-def test_a_torque_that_the_model_lacks_is_refused(plan: malta.ExcitationPlan) -> None:
+def test_a_torque_that_the_model_lacks_is_refused(plan: ExcitationPlan) -> None:
     """z m g about x, as of weights that are not where the forces are."""
 
     def variant(par: Any) -> Plant:
@@ -231,13 +231,13 @@ def test_a_torque_that_the_model_lacks_is_refused(plan: malta.ExcitationPlan) ->
 
     scenario = malta.Scenario.excited(plan.signal, plan.duration)
     run = malta.simulate(variant(CONTROLLER.parameters), CONTROLLER, scenario)
-    found = malta.identify(CONTROLLER, malta.log_of(run), parameters=ASKED)
+    found = malta.identify(CONTROLLER, malta.identification.log_of(run), parameters=ASKED)
     assert "does not explain the log" in found.refusal
 
 
-def test_curvature_is_taken_off_the_lines(plant: Plant, plan: malta.ExcitationPlan) -> None:
+def test_curvature_is_taken_off_the_lines(plant: Plant, plan: ExcitationPlan) -> None:
     """Without noise: what the linear response leaves is what lever arms that move with the stroke add."""
-    log = malta.log_of(excited(plan, {}, noise=0.0, quantize=False))
+    log = malta.identification.log_of(excited(plan, {}, noise=0.0, quantize=False))
     s = spectrum_of(log, log.columns["y"], log.columns["i"])
     y, i = s.outputs[0].real, s.currents[0].real
     model = ResponseModel(plant, ("K_A",), tuple(log.names("i")), y, i, log.sample_time)
@@ -259,7 +259,7 @@ def test_errors_of_sensors_are_parameters_too(plan: ExcitationPlan) -> None:
     assert found.values[1] == pytest.approx(0.02, abs=1e-3)
 
 
-def test_the_data_file_keeps_intervals(found: malta.Identified, tmp_path: Path) -> None:
+def test_the_data_file_keeps_intervals(found: Identified, tmp_path: Path) -> None:
     path = write_data(found, tmp_path / "found.toml", gains=ROBUST, known={})
     data = read_identified(path)
     assert found.values[0] == data.parameters.K_A
@@ -341,7 +341,7 @@ def test_the_field_of_the_planar_motor_is_found() -> None:
     true = {"B_r": 1.15, "I_x": 0.27, "I_y": 0.27, "I_z": 0.53}
     scenario = malta.Scenario.excited(plan.signal, plan.duration).replace(fidelity="force")
     run = malta.simulate(malta.plant_of(replace(par, **true)), controller, scenario)
-    found = malta.identify(controller, malta.log_of(run), parameters=["B_r", "I_x", "I_z"])
+    found = malta.identify(controller, malta.identification.log_of(run), parameters=["B_r", "I_x", "I_z"])
     assert found.refusal == ""
     assert (np.abs(found.values - [1.15, 0.27, 0.53]) < 2.5 * found.half_widths).all()
     assert (found.half_widths / found.values < 1e-3).all()
@@ -356,7 +356,7 @@ def test_stiffness_and_force_constant_of_a_rotor_are_found() -> None:
     plan = malta.excite(malta.loop(spec.plant, controller), period=0.5, periods=4, band=(4.0, 400.0), lines=8)
     scenario = malta.Scenario.excited(plan.signal, plan.duration).replace(fidelity="force", noise=1.0)
     run = malta.simulate(spec.plant.variant(replace(par, k_s=true[0], k_i=true[1])), controller, scenario)
-    found = malta.identify(controller, malta.log_of(run), parameters=["k_s", "k_i"])
+    found = malta.identify(controller, malta.identification.log_of(run), parameters=["k_s", "k_i"])
     assert found.refusal == ""
     assert (np.abs(found.values - true) < 2 * found.half_widths).all()
     assert (found.half_widths / true < 4e-3).all()
@@ -372,7 +372,7 @@ def test_intervals_cover(plant: Plant) -> None:
             name: getattr(plant.parameters, name) * random.uniform(0.9, 1.1) for name in ("K_A", "K_B", "K_D")
         }
         run = excited(plan, values, seed=7, run=k)
-        found = malta.identify(CONTROLLER, malta.log_of(run), parameters=list(values))
+        found = malta.identify(CONTROLLER, malta.identification.log_of(run), parameters=list(values))
         assert found.refusal == ""
         assert found.in_time is not None
         inside += int((np.abs(found.values - list(values.values())) < found.half_widths).sum())

@@ -72,7 +72,9 @@ def margin_map(
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> figure = malta.report.margin_map(spec.plant, controller, uncertainty={"m": 0.2, "C": 0.2})
+    >>> figure = malta.report.margin_map(
+    ...     spec.plant, controller, uncertainty={"m": 0.2, "C": 0.2}
+    ... )
     >>> figure.axes[0].get_xlabel()
     'm [kg]'
     """

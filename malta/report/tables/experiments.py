@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
     from malta.identification.log import Log
+    from malta.identification.measure import Measurement, MeasurementPlan
     from malta.identification.prediction import Predicted
     from malta.identification.replay import LawReplay
     from malta.model.plant import Plant

@@ -50,12 +50,12 @@ def holds(found: Estimate, truth: float, times: float = 1.5) -> bool:
     return abs(found.value - truth) < times * found.half
 
 
-def a_log(t: Any, **columns: tuple[list[str], Any]) -> malta.Log:
+def a_log(t: Any, **columns: tuple[list[str], Any]) -> malta.identification.Log:
     signals = {
         g: tuple(malta.Signal(n, "m" if g == "y" else "N") for n in names)
         for g, (names, _) in columns.items()
     }
-    return malta.Log(
+    return malta.identification.Log(
         "made", "", "", float(t[1]), 0.0, t, {g: table for g, (_, table) in columns.items()}, signals
     )
 
@@ -147,11 +147,11 @@ def test_polarity_centre_cogging_and_fall_of_the_machine() -> None:
 def made_steps(limit: float, flown: list[str]) -> tuple[Step, ...]:
     """Two steps that record without a machine, and note that they did; the second has a limit."""
 
-    def record(name: str, _: Bench) -> malta.Log:
+    def record(name: str, _: Bench) -> malta.identification.Log:
         flown.append(name)
         return a_log(1e-3 * np.arange(400), y=(["a"], np.random.default_rng(0).normal(0, 1, (400, 1))))
 
-    def judge(high: float, _: Any, log: malta.Log) -> Sequence[Finding]:
+    def judge(high: float, _: Any, log: malta.identification.Log) -> Sequence[Finding]:
         return [Finding("noise", calibration.at_rest(log)["a"][1], 0.0, high)]
 
     from functools import partial
@@ -191,7 +191,7 @@ def test_a_journal_that_was_written_over_is_refused(tmp_path: Path) -> None:
 
 def test_logs_of_a_bench_are_judged_and_waited_for(tmp_path: Path) -> None:
     steps = made_steps(2.0, [])
-    malta.write_log(steps[0].record(bench()), tmp_path / "one.csv")
+    malta.identification.write_log(steps[0].record(bench()), tmp_path / "one.csv")
     done = commission(ROBUST, CONTROLLER, tmp_path / "day", steps=steps, logs=tmp_path)
     assert [entry.passed for entry in done.entries] == [True, False]
     assert "waits for" in done.entries[1].refusal
