@@ -18,6 +18,7 @@ import malta
 
 # Each may import those before it; machines stand where nobody generic imports them.
 GROUND = (
+    "contents",
     "errors",
     "units",
     "files",
