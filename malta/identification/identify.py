@@ -54,7 +54,7 @@ LOST = 1.0  # of its value: a combination of parameters that is found worse is n
 LIKELY = 1e-6  # probability below which chi2 refuses the model
 SLACK = 1.1  # factor of chi2: the noise's covariance is estimated too
 WHITE = 5.0  # standard deviations of the correlation between neighbouring lines
-STRAIGHTENED = 6  # estimates at most, each with the curvature of the one before
+STRAIGHTENED = 12  # estimates at most, each with the curvature and the weights of the one before
 SETTLED = 0.01  # standard deviations: what moves by less is settled
 DIFFERENT = 3.0  # standard deviations between the estimates at the lines and in time
 QUIET = (
@@ -286,12 +286,13 @@ def _estimate_straightened(
     """The estimate at the lines, with the machine's curvature at what was found, until that moves no more."""
     theta = model.start
     for _ in range(STRAIGHTENED):
-        found = _estimate(model, straightened(model, s, theta), log, dropped, theta)
-        moved = np.abs(found.values - theta) / np.sqrt(np.diag(found.covariance))
-        theta = found.values
+        straight = straightened(model, s, theta)
+        found = _search(model, straight, theta)
+        moved = np.abs(found.theta - theta) / np.sqrt(np.diag(found.covariance))
+        theta = found.theta
         if (moved < SETTLED).all():
             break
-    return found
+    return _estimate(model, straight, log, dropped, found)
 
 
 def _predicted(
@@ -387,16 +388,19 @@ def _covariances(between: ComplexArray) -> tuple[ComplexArray, FloatArray]:
     return (sums[last] - sums[first]) / counts[:, None, None], counts.astype(float)
 
 
-def _white_residuals(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexArray:
-    """Residuals at the lines in standard deviations, lines x p; squares sum up to chi2 with twice as many entries.
+def _weights(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexArray:
+    """W at each line, so that W e has unit variance in every entry: the residuals between the lines are noise.
 
     The inverse of a covariance that is estimated from n bins is too large by n / (n - p).
     """
-    e = _residuals(model, s, theta)
-    C, counts = _covariances(e.between)
+    C, counts = _covariances(_residuals(model, s, theta).between)
     p = C.shape[1]
-    white = np.linalg.solve(np.linalg.cholesky(C), e.lines[..., None])[..., 0]
-    return np.asarray(white * np.sqrt((counts - p) / counts)[:, None])
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(C)) * np.sqrt((counts - p) / counts)[:, None, None])
+
+
+def _white_residuals(model: ResponseModel, s: Spectrum, theta: FloatArray, W: ComplexArray) -> ComplexArray:
+    """Residuals at the lines in standard deviations, lines x p; squares sum up to chi2 with twice as many entries."""
+    return np.asarray(np.einsum("kab,kb->ka", W, _residuals(model, s, theta).lines))
 
 
 def _information(model: ResponseModel, s: Spectrum) -> FloatArray:
@@ -444,26 +448,45 @@ def _starting(model: ResponseModel, name: str) -> float:
     return float(model.start[model.names.index(name)])
 
 
-def _estimate(
-    model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str, float], begin: FloatArray
-) -> Identified:
-    """The most likely parameters from `begin` on, their covariance, and how white the residuals are."""
-    scale, start = model.scale, model.start
+class Found(NamedTuple):
+    """What a search ends with: parameters, their covariance, residuals in standard deviations, chi2 / dof, dof."""
+
+    theta: FloatArray
+    covariance: FloatArray
+    white: ComplexArray
+    chi2: float
+    dof: int
+
+
+def _search(model: ResponseModel, s: Spectrum, begin: FloatArray) -> Found:
+    """The most likely parameters from `begin` on.
+
+    The weights stay those of `begin` while the parameters move: with their own, parameters that make more of noise
+    between the lines would look more likely.
+    """
+    scale, start, W = model.scale, model.start, _weights(model, s, begin)
 
     def residuals(moved: FloatArray) -> FloatArray:
         try:
-            e = np.sqrt(2) * _white_residuals(model, s, start + scale * moved).ravel()
+            e = np.sqrt(2) * _white_residuals(model, s, start + scale * moved, W).ravel()
         except (np.linalg.LinAlgError, ValueError):
             return np.full(2 * s.lines.size * s.outputs.shape[1], 1e6)
         return np.concatenate([e.real, e.imag])
 
-    found = least_squares(residuals, (begin - start) / scale, method="lm", x_scale="jac", xtol=1e-7)
+    found = least_squares(residuals, (begin - start) / scale, method="lm", x_scale="jac", xtol=1e-9)
     theta = start + scale * found.x
-    white = _white_residuals(model, s, theta)
+    white = _white_residuals(model, s, theta, W)
     dof = 2 * white.size - len(scale)
     chi2 = float(2 * (np.abs(white) ** 2).sum() / dof)
     covariance = _covariance(np.asarray(found.jac), np.asarray(found.fun), max(1.0, chi2))
-    covariance *= np.outer(scale, scale)
+    return Found(theta, covariance * np.outer(scale, scale), white, chi2, dof)
+
+
+def _estimate(
+    model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str, float], found: Found
+) -> Identified:
+    """The machine that was found, and how white the residuals are. Raises CheckError where it is none."""
+    theta, covariance, white, chi2, dof = found
     outputs = (np.abs(white) ** 2).mean(axis=0).tolist()
     par, plant = model.plant.parameters, model.plant
     others = replace(model, names=tuple(n for n in acting(plant) if n not in model.names))
@@ -478,7 +501,7 @@ def _estimate(
         plant=most_likely,
         names=model.names,
         values=theta,
-        start=start,
+        start=model.start,
         covariance=covariance,
         held=held,
         chi2=chi2,

@@ -251,7 +251,7 @@ def test_the_last_run_of_a_hundred_million_is_simulated_alone(shaky: Controller)
 
 def test_more_runs_than_arrays_take_are_refused(plan: Plan) -> None:
     large = Plan(plan.controller, "stroke", BOX, samples=10_000_001)
-    with pytest.raises(malta.InputError, match=r"at most 10000000 in memory; malta\.summarize"):
+    with pytest.raises(malta.InputError, match=r"at most 10000000 in memory; malta\.campaigns\.summarize"):
         campaign(large)
 
 

@@ -840,7 +840,7 @@ def test_claims_prints_the_ledger(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     [
         ("design nothing.toml", "nothing.toml: found no such file", "a TOML file"),
         ("design design", "design: found Is a directory", "a readable TOML file"),
-        ("design data/tubular.toml", "data/tubular.toml: name: found nothing", "this key"),
+        ("design data/tubular.toml", "data/tubular.toml: default_preset: found an unknown key", "name"),
         (f"design {BALL} --out pyproject.toml/gains", "pyproject.toml/gains/ball.json", "a place"),
         ("verify nothing.json", "nothing.json: found no such file", "a gain file"),
         ("verify nothing.txt", "nothing.txt: found suffix '.txt'", "one of .json, .npz, .mat"),

@@ -119,10 +119,10 @@ def test_an_experiment_of_another_machine_is_flown(toy: Plant, designs: dict[str
         ("twice", 1.0, "true or false"),
         ("axes", 1.0, "numbers"),
         ("axes", (), "numbers"),
-        ("rise", 1.0, "axes how often twice wait"),
+        ("rise", 1.0, "one of axes how often twice wait .*"),
     )
     for option, value, expected in refused:
-        with pytest.raises(malta.InputError, match=f"rest: {option}: found .*, expected {expected}$"):
+        with pytest.raises(malta.InputError, match=f"rest: {option}: found .*, expected {expected}"):
             malta.experiment("rest", toy, controller, **{option: value})
     with pytest.raises(malta.InputError, match="found 'stroke', expected one of rest"):
         malta.experiment("stroke", toy, controller)
@@ -210,10 +210,10 @@ def test_the_gang_of_four_of_angles_says_its_units(toy: Plant) -> None:
     gang = {"x1": (1.0, 1.0, 2e-6, 3e6), "a": (1.0, 1.0, 4e-6, 5e6)}
     found: Any = SimpleNamespace(gang=gang, extent=NOWHERE, plant=angles)
     text = printed(report.gang_table(found))
-    for cell in ("2.0 um/N", "3.000 N/um", "4.0 urad/(N m)", "5.000 N m/urad"):
+    for cell in ("2.0 µm/N", "3.000 N/µm", "4.0 µrad/(N m)", "5.000 N m/µrad"):
         assert cell in text
     found = SimpleNamespace(gang={"x1": gang["x1"]}, extent=NOWHERE, plant=toy)
-    assert "from force |SP| [um/N]" in printed(report.gang_table(found))
+    assert "from force |SP| [µm/N]" in printed(report.gang_table(found))
 
 
 def test_poles_of_damped_and_of_stable_machines(designs: dict[str, Design]) -> None:

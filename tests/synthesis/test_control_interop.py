@@ -21,7 +21,7 @@ from malta.campaigns.plan import fingerprint
 from malta.gains import encodings
 from malta.loops.sampled_loops import machine_loop
 from malta.simulation.experiments.catalogue import jump
-from malta.synthesis import kalman as kalman_filter
+from malta.synthesis import filters as kalman_filter
 from malta.synthesis import lqg, riccati
 
 if TYPE_CHECKING:
