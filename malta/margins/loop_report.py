@@ -450,9 +450,8 @@ class LoopReport:
     def __str__(self) -> str:
         lines = [f"{'stable' if self.stable else 'UNSTABLE'} with hold, delay and current loops"]
         for stage in self.stages:
-            peaks = "  ".join(
-                f"{k} {v:.2f}, zone {zone(v)}" for k, v in stage.peak_sensitivity.items() if k != "sigma_max"
-            )
+            own = {k: v for k, v in stage.peak_sensitivity.items() if k != "sigma_max"}
+            peaks = "  ".join(f"{k} {v:.2f}" for k, v in own.items()) + f", zone {zone(max(own.values()))}"
             largest = stage.peak_sensitivity["sigma_max"]
             lines.append(
                 f"peak |S|, {stage.name}: {peaks}  all {largest:.2f} ({20 * np.log10(largest):.1f} dB)"
