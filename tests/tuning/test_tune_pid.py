@@ -355,7 +355,7 @@ def test_bandwidth_and_margin_are_judge(motor: Spec, monkeypatch: pytest.MonkeyP
         bound: Any = SimpleNamespace(lower=1.25)
         return replace(linear_report(model, controller), robust=bound)
 
-    linear_report: Any = vars(outcomes)["linear_report"]
+    linear_report: Callable[..., LoopReport] = vars(outcomes)["linear_report"]
     monkeypatch.setattr(outcomes, "linear_report", proven)
     rows = {r.name: r for r in judge(spec)}
     assert rows["margin"].ratio == 0.8
