@@ -215,10 +215,10 @@ Try it, from the folder {name}/:
     malta design
     malta verify design/gains/{name}.json --machine {name}.py
     malta simulate design/gains/{name}.json --machine {name}.py --scenario step --out build
-    python server.py
+    python notebook.py
 
 Then make it yours:
-    {name}.py           parameters with their units, and the equations x' = f(x, u, w), y = h(x, u)
+    {name}.py           parameters with units, and x' = f(x, u, w), y = h(x, u)
     {name}.toml         values, each with its unit and where it comes from
     design/{name}.toml  weights, noise, and how far parameters vary
     test_{name}.py      numbers that you know by another way
@@ -261,7 +261,7 @@ def new(
     )
     console = make_console()
     print_written(console, renamed)
-    console.print(NEXT.format(name=name))
+    console.print(NEXT.format(name=name), soft_wrap=True)  # commands stay whole, to be copied
 
 
 def _is_source(path: Path) -> bool:
