@@ -192,7 +192,7 @@ def test_an_unstable_loop_has_a_page_that_says_so(tmp_path: Path, run: Run) -> N
     assert "unstable" in said.err
     html = out.read_text(encoding="utf-8")
     read_page(html)
-    assert '<dd class="value">UNSTABLE</dd>' in html
+    assert "<dd><b>✗ UNSTABLE</b>" in html
     assert "changed: K_B=15" in html
     assert "Gang of four" not in html
 

@@ -153,7 +153,7 @@ def encode_figure(figure: Figure, path: Path) -> bytes:
     """
     import matplotlib
 
-    from malta.report.figures.drawing import png_of
+    from malta.report.figures.inline import png_of
 
     if path.suffix not in (".png", ".svg", ".pdf"):
         raise InputError(path, "", f"suffix {path.suffix!r}", "one of .png, .svg, .pdf")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,8 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from malta.display import micro as micro
 from malta.display import number as number
@@ -25,6 +22,7 @@ from malta.units import in_unit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     from malta.model.plant import FloatArray
@@ -94,6 +92,8 @@ def new_figure(
     >>> figure.get_size_inches().tolist()
     [9.0, 4.6]
     """
+
+    from malta.report.figures.inline import InlineFigure
 
     figure, height = InlineFigure(figsize=size, dpi=120), size[1]
     usual = {"left": 0.085, "right": 0.98, "bottom": 0.51 / height, "top": 1 - 0.84 / height}
@@ -381,34 +381,6 @@ def front_lines(plant: Plant, names: Iterable[str], trade: Trade) -> list[tuple[
             unit = next((s.unit for s in r.signals(plant) if s.name == signal), r.unit)
             found.append((name, signal or r.heading, *UNITS[unit]))
     return found
-
-
-# A figure that shows itself in a notebook. Importing matplotlib takes long: `parts.new_figure` imports this late.
-
-
-class InlineFigure(Figure):
-    """A figure that a notebook shows as the value of a cell or by `display(figure)`, with or without pyplot.
-
-    pyplot does not know the figure, so no second picture follows when the cell ends.
-    """
-
-    def draw(self, renderer: Any) -> None:
-        """Draw with texts as they stand: they have names from files."""
-        show_plain_texts(self)
-        super().draw(renderer)
-
-    def _repr_png_(self) -> bytes:
-        """The picture, as IPython asks for it."""
-        return png_of(self)
-
-
-def png_of(figure: Figure) -> bytes:
-    """The content of a .png file of a figure; the same figure gives the same bytes."""
-    buffer = io.BytesIO()
-    # Figure.savefig first draws once for the layout, which only tight bounding boxes need.
-    canvas: Any = FigureCanvasAgg(figure)
-    canvas.print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": 1})
-    return buffer.getvalue()
 
 
 # Groups of lines, dots, noise and histograms in a panel.

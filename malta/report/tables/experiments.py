@@ -13,7 +13,6 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from malta.identification.response import units_of_model
 from malta.margins.loop_report import zone
 from malta.report.figures.drawing import Published
 from malta.report.tables.layout import (
@@ -246,6 +245,8 @@ def excitation_tables(plan: ExcitationPlan, plant: Plant) -> list[Table]:
 
 def identified_table(found: Identified) -> Table:
     """The identified parameters with their 95 % intervals."""
+    from malta.identification.response import units_of_model  # loads an optimizer
+
     table = new_table("Identified", "parameter", "value", "95 % interval", "half [%]", "gain file")
     units = units_of_model(found.plant)
     for name, value, half, start in zip(

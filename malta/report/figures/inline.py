@@ -1,0 +1,36 @@
+"""A figure that shows itself in a notebook. Importing matplotlib takes long: `drawing.new_figure` imports this late."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from malta.report.figures.drawing import show_plain_texts
+
+
+class InlineFigure(Figure):
+    """A figure that a notebook shows as the value of a cell or by `display(figure)`, with or without pyplot.
+
+    pyplot does not know the figure, so no second picture follows when the cell ends.
+    """
+
+    def draw(self, renderer: Any) -> None:
+        """Draw with texts as they stand: they have names from files."""
+        show_plain_texts(self)
+        super().draw(renderer)
+
+    def _repr_png_(self) -> bytes:
+        """The picture, as IPython asks for it."""
+        return png_of(self)
+
+
+def png_of(figure: Figure) -> bytes:
+    """The content of a .png file of a figure; the same figure gives the same bytes."""
+    buffer = io.BytesIO()
+    # Figure.savefig first draws once for the layout, which only tight bounding boxes need.
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": 1})
+    return buffer.getvalue()
