@@ -38,8 +38,7 @@ from timing import Result, medians, optional
 
 import malta
 from malta.machines.halbach.experiments.motions import steps_reference
-from malta.machines.planar import commutation
-from malta.machines.planar import field as coils
+from malta.machines.planar import commutation, field
 from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments.models import compile_function
 from malta.machines.planar.experiments.motions import CELLS
@@ -317,11 +316,11 @@ def decoupling(runs: int) -> list[Result]:
     peer = importlib.import_module("peer_planar")
     par = malta.read(ROOT / "data" / "planar.toml")
     assert isinstance(par, planar.Parameters)
-    exact = coils.simulation_model(par)
-    models: dict[str, coils.CoilModel] = {
-        "table": coils.table(par, exact, CELLS),
+    exact = field.simulation_model(par)
+    models: dict[str, field.CoilModel] = {
+        "table": field.table(par, exact, CELLS),
         "exact": exact,
-        "analytical": coils.Analytical(par),
+        "analytical": field.Analytical(par),
     }
     arms, calls, few = peer.coils(par), 2000, 50
     codes = {name: compile_function(commutation.decoupling(par, model)) for name, model in models.items()}

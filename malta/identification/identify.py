@@ -29,12 +29,15 @@ from malta.identification.response import (
     well_found,
 )
 from malta.identification.spectra import (
+    SIGMA,
     Spectrum,
     between_neighbours,
     readings,
+    require_log,
     spectrum_of,
     straightened,
     whole,
+    windowed_covariances,
 )
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names, twins_of
@@ -47,8 +50,6 @@ if TYPE_CHECKING:
 
     IntArray = NDArray[np.integer[Any]]
 
-WINDOW = 3  # lines to either side whose bins are taken together
-SIGMA = 1.959963984540054  # half of a 95 % interval
 SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
 LOST = 1.0  # of its value: a combination of parameters that is found worse is not found
 LIKELY = 1e-6  # probability below which chi2 refuses the model
@@ -326,22 +327,12 @@ def _plant_with(plant: Plant, values: Mapping[str, float]) -> Plant:
 
 
 def _require_machine(controller: Controller, plant: Plant, log: Log) -> None:
-    """Raise for a log of another machine, of another sample time, or with sensors that failed."""
-    if log.machine and log.machine != plant.name:
-        raise CheckError(
-            f"{log.source}: a log of a {log.machine}, but the gain file's machine is a {plant.name}"
-        )
-    names = [s.name for s in plant.outputs]
-    log.table("y", names)
+    """Raise for a log of another machine, without currents, or whose samples no model fits."""
+    require_log(log, plant.name, controller.sample_time)
+    log.table("y", [s.name for s in plant.outputs])
     if not log.names("i"):
         raise InputError(log.source, "i", "no measured currents", "a column for each axis, as i_dd1 [A]")
-    Ts = controller.sample_time
-    if abs(log.sample_time / Ts - 1) > 1e-3:
-        raise CheckError(f"{log.source}: samples of {log.sample_time:.6g} s, but the law's are {Ts:.6g} s")
-    found = log.survey
-    for what, of in (("stuck", found.stuck), ("clipped", found.clipped)):
-        for name, count in of.items():
-            raise CheckError(f"{log.source}: sensor {name} is {what} in {count} of {log.samples} samples")
+    found, Ts = log.survey, controller.sample_time
     if found.jitter > 0.01 * Ts:
         raise CheckError(
             f"{log.source}: its samples jitter by {found.jitter:.3g} s, more than 1 % of {Ts:g} s"
@@ -378,22 +369,12 @@ def _residuals(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Residual
     return Residuals(lines, between.reshape(*s.between.shape, -1), harmonics)
 
 
-def _covariances(between: ComplexArray) -> tuple[ComplexArray, FloatArray]:
-    """Covariances of e at the lines, from the bins between them, and the number of bins behind each."""
-    each = np.einsum("kma,kmb->kab", between, between.conj())
-    sums = np.concatenate([np.zeros_like(each[:1]), each.cumsum(axis=0)])
-    k = np.arange(len(each))
-    first, last = np.maximum(k - WINDOW, 0), np.minimum(k + WINDOW + 1, len(each))
-    counts = between.shape[1] * (last - first)
-    return (sums[last] - sums[first]) / counts[:, None, None], counts.astype(float)
-
-
 def _weights(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexArray:
     """W at each line, so that W e has unit variance in every entry: the residuals between the lines are noise.
 
     The inverse of a covariance that is estimated from n bins is too large by n / (n - p).
     """
-    C, counts = _covariances(_residuals(model, s, theta).between)
+    C, counts = windowed_covariances(_residuals(model, s, theta).between)
     p = C.shape[1]
     return np.asarray(np.linalg.inv(np.linalg.cholesky(C)) * np.sqrt((counts - p) / counts)[:, None, None])
 
@@ -405,7 +386,7 @@ def _white_residuals(model: ResponseModel, s: Spectrum, theta: FloatArray, W: Co
 
 def _information(model: ResponseModel, s: Spectrum) -> FloatArray:
     """The Fisher information at the start, with the noise that the start leaves between the lines."""
-    C, _ = _covariances(_residuals(model, s, model.start).between)
+    C, _ = windowed_covariances(_residuals(model, s, model.start).between)
     variance = np.einsum("kpp->kp", C).real
     power = (np.abs(s.outputs[s.lines]) ** 2 / variance).max(axis=1)
     if np.median(power) < QUIET:
@@ -541,7 +522,7 @@ def _distortion(model: ResponseModel, s: Spectrum, theta: FloatArray) -> float:
     if not len(s.harmonics):
         return float("nan")
     e = _residuals(model, s, theta)
-    C, _ = _covariances(e.between)
+    C, _ = windowed_covariances(e.between)
     nearest = np.abs(s.lines - s.harmonics[:, None]).argmin(axis=1)
     solved = np.linalg.solve(C[nearest], e.harmonics[..., None])[..., 0]
     return float((e.harmonics.conj() * solved).real.sum() / e.harmonics.size)

@@ -13,16 +13,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.errors import CheckError
+from malta.identification.spectra import (
+    EXCITED,
+    between_neighbours,
+    excited_lines,
+    noise_bins,
+    require_log,
+    whole_periods,
+    windowed_covariances,
+)
 
 if TYPE_CHECKING:
     from malta.identification.log import Log
     from malta.loops.loop import Loop
     from malta.model.plant import ComplexArray, FloatArray
 
-NEIGHBOURS = 16  # bins between lines, nearest to a line, that tell the noise there
-WINDOW = 3  # lines to either side whose bins are taken together
-EXCITED = 1e-6  # of the largest line of an excitation: what is above is a line
-FEWEST = 3  # periods
 LOUD = 4.0  # power at the lines over the noise, of the output that moves most; less is no excitation
 MISSING = 1e-3  # of the samples that may be missing
 
@@ -39,14 +44,11 @@ class Line(NamedTuple):
 
 def lines_of(log: Log, loop: Loop) -> list[Line]:
     """The lines of the last whole periods of a log. Raises CheckError for a log that tells nothing."""
-    plant, each = loop.plant, round(log.period / log.sample_time)
-    _require_log(log, loop)
-    periods = log.samples // each
-    periods -= periods > FEWEST  # the first one, in which the loop settles
-    if periods < FEWEST:
-        found = f"{log.samples * log.sample_time:.4g} s are {periods} periods of {log.period:g} s"
-        raise CheckError(f"{log.source}: too short: {found}, at least {FEWEST} and one to settle are needed")
-    N = each * periods
+    plant = loop.plant
+    require_log(log, plant.name, loop.sample_time)
+    N, periods = whole_periods(
+        log, np.nan_to_num(log.columns.get("excitation", np.zeros((1, 1)))), log.samples
+    )
     commands = (
         log.table("v", [s.name for s in plant.inputs]) if log.names("v") else np.zeros((log.samples, 0))
     )
@@ -56,12 +58,7 @@ def lines_of(log: Log, loop: Loop) -> list[Line]:
         commands,
     )
     D, Y, V = (np.fft.rfft(_filled(table, log)[-N:], axis=0) / N for table in tables)
-    size = np.abs(D[1:])
-    lines = 1 + np.flatnonzero((size > EXCITED * size.max()).any(axis=1))
-    if (lines % periods).any():
-        raise CheckError(
-            f"{log.source}: the excitation has not the period of {log.period:g} s that the log names"
-        )
+    lines = excited_lines(log, D, periods)
     C = _noise(Y, lines, periods)
     power = (np.abs(Y[lines]) ** 2 / np.einsum("kpp->kp", C).real).max(axis=1)
     if np.median(power) < LOUD:
@@ -70,34 +67,13 @@ def lines_of(log: Log, loop: Loop) -> list[Line]:
     return [Line(rate * k, D[k], Y[k], V[k], c) for k, c in zip(lines.tolist(), C, strict=True)]
 
 
-def _require_log(log: Log, loop: Loop) -> None:
-    """Raise CheckError for a log of another machine, of another sample time, or without a periodic excitation."""
-    name, Ts = loop.plant.name, loop.sample_time
-    if log.machine and log.machine != name:
-        raise CheckError(f"{log.source}: a log of a {log.machine}, but the gain file's machine is a {name}")
-    if abs(log.sample_time / Ts - 1) > 1e-3:
-        raise CheckError(f"{log.source}: samples of {log.sample_time:.6g} s, but the law's are {Ts:.6g} s")
-    if not np.nan_to_num(log.columns.get("excitation", np.zeros(1))).any():
-        raise CheckError(f"{log.source}: nothing was excited: its columns exc.* are missing or zero")
-    if not log.period:
-        raise CheckError(
-            f"{log.source}: no period of the excitation is given: a line '# period 1.0 s' in a .csv"
-        )
-    for what in ("stuck", "clipped"):
-        for sensor, count in getattr(log.survey, what).items():
-            raise CheckError(f"{log.source}: sensor {sensor} is {what} in {count} of {log.samples} samples")
-
-
 def _filled(table: FloatArray, log: Log) -> FloatArray:
     """A table with missing samples between their neighbours. Raises CheckError for more than a few of them."""
     bad = ~np.isfinite(table)
     missing = int(bad.any(axis=1).sum()) + log.survey.gaps
     if missing > MISSING * log.samples or log.survey.gaps:
         raise CheckError(f"{log.source}: {missing} samples are missing, at most 0.1 % may be, and no gaps")
-    if not missing:
-        return table
-    k = np.arange(len(table))
-    return np.column_stack([np.interp(k, k[~b], c[~b]) for c, b in zip(table.T, bad.T, strict=True)])
+    return between_neighbours(table)
 
 
 def _noise(Y: ComplexArray, lines: Any, periods: int) -> ComplexArray:
@@ -106,14 +82,7 @@ def _noise(Y: ComplexArray, lines: Any, periods: int) -> ComplexArray:
     Where multiples that were not excited have more power than these bins, as by steps of a sensor or a machine that
     is not linear, the covariance is so many times as large (total variance; Pintelon and Schoukens, ch. 4).
     """
-    top = min(len(Y), int(lines[-1]) + 4 * periods)
-    free = np.setdiff1d(np.arange(1, top), np.arange(0, top, periods))
-    nearest = free[np.argsort(np.abs(free - lines[:, None]), axis=1)[:, :NEIGHBOURS]]
-    each = np.einsum("kna,knb->kab", Y[nearest], Y[nearest].conj()) / NEIGHBOURS
-    sums = np.concatenate([np.zeros_like(each[:1]), each.cumsum(axis=0)])
-    k = np.arange(len(each))
-    first, last = np.maximum(k - WINDOW, 0), np.minimum(k + WINDOW + 1, len(each))
-    C = (sums[last] - sums[first]) / (last - first)[:, None, None]
+    C, _ = windowed_covariances(Y[noise_bins(lines, periods, len(Y))])
     others = np.setdiff1d(np.arange(lines[0], lines[-1], periods), lines)
     if len(others):
         near = np.abs(lines - others[:, None]).argmin(axis=1)

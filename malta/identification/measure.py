@@ -22,7 +22,8 @@ from scipy.stats import norm
 from malta.display import Curves, Description, display
 from malta.errors import InputError
 from malta.identification.excite import LONGEST, ExcitationPlan, excite
-from malta.identification.lines import FEWEST, Columns, Line, columns_of, lines_of
+from malta.identification.lines import Columns, Line, columns_of, lines_of
+from malta.identification.spectra import FEWEST, SIGMA
 from malta.loops.classical import Disk, disk_sizes
 from malta.loops.loop import Loop, loop
 from malta.margins.loop_report import zone
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
     from malta.synthesis.controller import Controller
 
-SIGMA = 1.959963984540054  # half of a 95 % interval
 SAME_LAW = 0.02  # of a command at the lines, by which the law of the gain file may miss it
 SAMPLES = 32  # machines at random in the box, beside its corners
 NARROW = 0.03  # of its width, by which a sampled tube may be too narrow on either side

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import expm, solve_discrete_are
+from scipy.linalg import expm
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize
 from scipy.signal import lfilter
@@ -31,6 +31,7 @@ from malta.model.plant import Plant, symbolic
 from malta.simulation.engine.compiled import library
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.period import runge_kutta
+from malta.synthesis.riccati import dare
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -137,14 +138,10 @@ def _filter(model: ResponseModel, theta: FloatArray, noise: Noise, length: float
     at_positions = (np.linalg.pinv(C[:, :n]) ** 2) @ noise.sensors
     least = (SLOWEST / length) ** 4 * at_positions
     G = np.vstack([Ts**2 / 2 * np.eye(n), Ts * np.eye(n)])
-    # In units of the noise: the Riccati equation is scaled then.
-    unit = np.sqrt(np.concatenate([at_positions, at_positions * 100.0**2]))
-    Q = (G * np.maximum(noise.process, least)) @ G.T / np.outer(unit, unit)
-    own, seen = Ad * unit / unit[:, None], C * unit / np.sqrt(noise.sensors)[:, None]
-    P = solve_discrete_are(own.T, seen.T, Q, np.eye(len(seen)))
-    size = seen @ P @ seen.T + np.eye(len(seen))
-    K = unit[:, None] * np.linalg.solve(size, seen @ P).T / np.sqrt(noise.sensors)
-    return _Linear(Ad, C, K, np.sqrt(np.diag(size) * noise.sensors))
+    Q, R = (G * np.maximum(noise.process, least)) @ G.T, np.diag(noise.sensors)
+    P = dare(Ad.T, C.T, Q, R, what="filter of a log").X
+    size = C @ P @ C.T + R
+    return _Linear(Ad, C, np.linalg.solve(size, C @ P).T, np.sqrt(np.diag(size)))
 
 
 class _Shape(NamedTuple):

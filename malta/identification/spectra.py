@@ -18,9 +18,11 @@ if TYPE_CHECKING:
 
     IntArray = NDArray[np.integer[Any]]
 
+SIGMA = 1.959963984540054  # half of a 95 % interval
 NEIGHBOURS = 16  # bins between lines, nearest to a line, that tell the noise there
 EXCITED = 1e-6  # of the largest line of an excitation: what is above is a line
 FEWEST = 3  # periods
+WINDOW = 3  # lines to either side whose bins are taken together
 WIDER = 2  # times the highest line: up to there motion counts that curvature multiplies
 REPAIRED = 1e-3  # of the currents that may be missing
 FILLED = 0.2  # of the readings that may be missing
@@ -44,9 +46,25 @@ class Spectrum(NamedTuple):
     )
 
 
-def spectrum_of(log: Log, y: FloatArray, i: FloatArray) -> Spectrum:
-    """The spectra of the last whole periods of a log. Raises CheckError for a log that tells nothing."""
-    excitation = whole(log, "excitation")
+def require_log(log: Log, machine: str, sample_time: float) -> None:
+    """Raise CheckError for a log of another machine, of another sample time, or with sensors that failed."""
+    if log.machine and log.machine != machine:
+        raise CheckError(
+            f"{log.source}: a log of a {log.machine}, but the gain file's machine is a {machine}"
+        )
+    if abs(log.sample_time / sample_time - 1) > 1e-3:
+        found = f"samples of {log.sample_time:.6g} s, but the law's are {sample_time:.6g} s"
+        raise CheckError(f"{log.source}: {found}")
+    for what in ("stuck", "clipped"):
+        for sensor, count in getattr(log.survey, what).items():
+            raise CheckError(f"{log.source}: sensor {sensor} is {what} in {count} of {log.samples} samples")
+
+
+def whole_periods(log: Log, excitation: FloatArray, samples: int) -> tuple[int, int]:
+    """How many samples at the end of a log are whole periods of its excitation, and how many periods.
+
+    Raises CheckError for a log that was not excited, names no period, or is too short.
+    """
     if not excitation.size or not np.abs(excitation).max(initial=0.0):
         raise CheckError(f"{log.source}: nothing was excited: its columns exc.* are missing or zero")
     if not log.period:
@@ -54,24 +72,51 @@ def spectrum_of(log: Log, y: FloatArray, i: FloatArray) -> Spectrum:
             f"{log.source}: no period of the excitation is given: a line '# period 1.0 s' in a .csv"
         )
     each = round(log.period / log.sample_time)
-    periods = len(y) // each
+    periods = samples // each
     if periods > FEWEST:
         periods -= 1  # the first one, in which the loop settles
     if periods < FEWEST:
-        found = f"{len(y) * log.sample_time:.4g} s are {periods} periods of {log.period:g} s"
+        found = f"{samples * log.sample_time:.4g} s are {periods} periods of {log.period:g} s"
         raise CheckError(f"{log.source}: too short: {found}, at least {FEWEST} and one to settle are needed")
-    N = each * periods
-    outputs, currents, D = (np.fft.rfft(table[len(y) - N :], axis=0) / N for table in (y, i, excitation))
+    return each * periods, periods
+
+
+def excited_lines(log: Log, D: ComplexArray, periods: int) -> IntArray:
+    """The bins that an excitation D has. Raises CheckError where they are no multiples of 1 / period."""
     size = np.abs(D[1:])
     lines = 1 + np.flatnonzero((size > EXCITED * size.max()).any(axis=1))
     if (lines % periods).any():
         raise CheckError(
             f"{log.source}: the excitation has not the period of {log.period:g} s that the log names"
         )
+    return lines
+
+
+def noise_bins(lines: IntArray, periods: int, count: int) -> IntArray:
+    """Of each line, the NEIGHBOURS nearest of `count` bins that are no multiples of 1 / period: noise alone."""
+    top = min(count, int(lines[-1]) + 4 * periods)
+    free = np.setdiff1d(np.arange(1, top), np.arange(0, top, periods))
+    return np.asarray(free[np.argsort(np.abs(free - lines[:, None]), axis=1)[:, :NEIGHBOURS]])
+
+
+def windowed_covariances(between: ComplexArray) -> tuple[ComplexArray, FloatArray]:
+    """Covariances at the lines of what stands between them, lines x bins x p, and the number of bins behind each."""
+    each = np.einsum("kma,kmb->kab", between, between.conj())
+    sums = np.concatenate([np.zeros_like(each[:1]), each.cumsum(axis=0)])
+    k = np.arange(len(each))
+    first, last = np.maximum(k - WINDOW, 0), np.minimum(k + WINDOW + 1, len(each))
+    counts = between.shape[1] * (last - first)
+    return (sums[last] - sums[first]) / counts[:, None, None], counts.astype(float)
+
+
+def spectrum_of(log: Log, y: FloatArray, i: FloatArray) -> Spectrum:
+    """The spectra of the last whole periods of a log. Raises CheckError for a log that tells nothing."""
+    excitation = whole(log, "excitation")
+    N, periods = whole_periods(log, excitation, len(y))
+    outputs, currents, D = (np.fft.rfft(table[len(y) - N :], axis=0) / N for table in (y, i, excitation))
+    lines = excited_lines(log, D, periods)
     axis = np.abs(D[lines]).argmax(axis=1)  # the input that a line excites most
     pulse = D[lines, axis]
-    free = np.setdiff1d(np.arange(1, lines[-1] + 4 * periods), np.arange(0, len(D), periods))
-    nearest = np.argsort(np.abs(free - lines[:, None]), axis=1)[:, :NEIGHBOURS]
     harmonics = np.setdiff1d(np.arange(lines[0], lines[-1] + 1, periods), lines)
     rate = 2 * np.pi / (N * log.sample_time)
     quiet = np.median(np.abs(outputs[len(outputs) // 2 :]), axis=0)
@@ -82,7 +127,7 @@ def spectrum_of(log: Log, y: FloatArray, i: FloatArray) -> Spectrum:
         lines,
         axis,
         pulse / np.abs(pulse),
-        free[nearest],
+        noise_bins(lines, periods, len(D)),
         harmonics,
         rate,
         periods,

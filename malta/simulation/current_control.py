@@ -13,7 +13,6 @@ from malta.model.data import plant_of
 from malta.model.equations import note
 from malta.model.plant import Actuator
 from malta.model.sensors import Drive
-from malta.simulation import current_control as inverter
 from malta.simulation.layout import Loop, Setup, Signals
 from malta.synthesis.controller import Add
 
@@ -145,10 +144,10 @@ def control_currents(
     integral = add(controller["u_integral"], step)
     u = g["Kp"] * error + Q.T @ integral + believed.drive.emf(estimate)
     note("current_law", "u = Kp epsilon + u_integral + emf, of the axes", u=u)
-    most = inverter.largest_voltage(V, plant.actuator.voltage_limit, g["voltage_limit"])
+    most = largest_voltage(V, plant.actuator.voltage_limit, g["voltage_limit"])
     row: dict[str, Any] = {"link": V, "i": i}
     if s.fidelity == "dq":
-        command, limited = inverter.modulation(drive, u, V, most)
+        command, limited = modulation(drive, u, V, most)
         meaning = "command = u / link_last, scaled with its group where a phase would be beyond its limit"
         note("modulate", meaning, command=command, u_limited=limited)
         command = keep_if_missed(s, signals, command)
@@ -156,7 +155,7 @@ def control_currents(
     else:
         u_phase = believed.drive.to_phases(estimate) @ u
         note("phase_voltages", "u_phase = T_phases u", u_phase=u_phase)
-        command, limits = inverter.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm, most=most)
+        command, limits = duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm, most=most)
         limited = ca.vertcat(*_limited_axes(drive, limits))
         meaning = (
             "command = 1/2 + u_phase / link_last within 1/2 +- sigma; u_limited: its group has one at a limit"

@@ -32,7 +32,7 @@ import numpy as np
 
 from malta.model.data import plant_of
 from malta.model.plant import Plant
-from malta.simulation import current_control as inverter
+from malta.simulation import current_control
 from malta.simulation.current_control import control_currents, keep_if_missed, reading_errors
 from malta.simulation.layout import (
     Layout,
@@ -157,7 +157,7 @@ def _axis_slope(
     u = m * V * (1 - given["sag"] if s.faulty else 1)
     di = (u - actuator.R * i - drive.emf(x)) / actuator.L + drive.coupling(x, i)
     power = ca.dot(ca.DM(list(drive.weight)), u * i)
-    return drive.force(i), ca.vertcat(di, inverter.link_slope(drive, V, power))
+    return drive.force(i), ca.vertcat(di, current_control.link_slope(drive, V, power))
 
 
 def _phase_slope(
@@ -168,7 +168,9 @@ def _phase_slope(
     u = (d - 0.5) * V * (1 - given["sag"] if s.faulty else 1)
     closed = 1 - given["open"] if s.faulty else ca.SX.ones(len(drive.phases))
     flowing = closed * i
-    net = inverter.phase_voltages(drive, u - actuator.R * flowing - drive.to_phases(x) @ drive.emf(x), closed)
+    net = current_control.phase_voltages(
+        drive, u - actuator.R * flowing - drive.to_phases(x) @ drive.emf(x), closed
+    )
     # The arc is short: an open phase loses its current within a sample, and the other phases lose their part of it.
     lost = (1 - closed) * i
     for star in drive.stars if s.faulty else ():
@@ -176,7 +178,9 @@ def _phase_slope(
         lost[phases] += closed[phases] * ca.sum1(flowing[phases]) / ca.fmax(ca.sum1(closed[phases]), 1)
     di = net / actuator.L - lost / OPENING
     power = ca.dot(u, flowing)
-    return drive.force(drive.to_axes(x) @ flowing), ca.vertcat(di, inverter.link_slope(drive, V, power))
+    return drive.force(drive.to_axes(x) @ flowing), ca.vertcat(
+        di, current_control.link_slope(drive, V, power)
+    )
 
 
 class Period(NamedTuple):

@@ -19,8 +19,7 @@ from tomlkit.items import Item
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.model.parameters import describe
-from malta.tuning import groups as corners
-from malta.tuning import lqg, pid
+from malta.tuning import groups, lqg, pid
 from malta.tuning.search import DIGITS, Effort, Journal, apply_trial
 from malta.tuning.verify import judge
 
@@ -109,7 +108,7 @@ def problem_sha256(spec: Spec) -> str:
     asked, searched = dict(spec.specification), (spec.search, spec.delays)
     loads = asdict(spec.loads) if spec.loads else None
     pushes = [asdict(bound) for bound in spec.recovery.values()]
-    settings = (lqg.FRONT, DIGITS, corners.STEP, corners.NEAR)
+    settings = (lqg.FRONT, DIGITS, groups.STEP, groups.NEAR)
     content = [describe(spec.parameters), asked, loads, pushes, searched, spec.sha256, *settings]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

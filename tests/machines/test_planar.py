@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 
 import malta
 from malta.machines.planar import commutation
-from malta.machines.planar import field as coils
 from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
 from malta.machines.planar.field import ODD_X, ODD_Y, Series
@@ -55,7 +54,7 @@ def paper() -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def truth(par: planar.Parameters) -> Series:
     """Every harmonic up to the 16th."""
-    return coils.exact_model(par)
+    return planar_field.exact_model(par)
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +64,8 @@ def exact(par: planar.Parameters, truth: Series) -> Series:
 
 
 @pytest.fixture(scope="module")
-def table(par: planar.Parameters, truth: Series) -> coils.Table:
-    return coils.table(par, truth, 35)
+def table(par: planar.Parameters, truth: Series) -> planar_field.Table:
+    return planar_field.table(par, truth, 35)
 
 
 def quarter(par: planar.Parameters, n: int = 140) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -79,7 +78,7 @@ def largest(values: FloatArray) -> FloatArray:
     return np.asarray(np.abs(values).max(axis=(0, 1)))
 
 
-def single(model: coils.CoilModel, p: FloatArray) -> FloatArray:
+def single(model: planar_field.CoilModel, p: FloatArray) -> FloatArray:
     values: FloatArray = model(*(np.array([v]) for v in p))[0]
     return values
 
@@ -249,7 +248,7 @@ def test_equations_17_to_21_are_the_quadrature(par: planar.Parameters) -> None:
     coil = planar_field.winding(par, rectangles=True, nodes=40)
     for p in np.random.default_rng(5).uniform([-0.05, -0.05, 0], [0.05, 0.05, 5e-3], (4, 3)):
         expected = planar_field.quadrature(par, field, coil, p)
-        found = single(coils.Analytical(plain), p)
+        found = single(planar_field.Analytical(plain), p)
         for part in (slice(0, 3), slice(3, 6)):
             size = np.abs(expected[part]).max()
             np.testing.assert_allclose(found[part], expected[part], rtol=0, atol=1e-9 * size)
@@ -269,7 +268,7 @@ def test_amplitudes_of_the_assumed_magnets_and_coil(
 
 
 def test_the_compensation_factor_is_the_fitted_one(par: planar.Parameters, truth: Series) -> None:
-    assert coils.compensation(par, truth) == pytest.approx(par.C, abs=5e-5)
+    assert planar_field.compensation(par, truth) == pytest.approx(par.C, abs=5e-5)
 
 
 def test_the_fundamental_fits_the_forces(
@@ -278,7 +277,7 @@ def test_the_fundamental_fits_the_forces(
     """0.04 N in F_x, 0.08 N in F_z at 3 A: the paper's 0.83 and 2.38 N are wrong amplitudes, not missing harmonics."""
     x, y, z = quarter(par)
     expected = truth(x, y, z)
-    error = AMPERES * largest(coils.Analytical(par)(x, y, z) - expected)
+    error = AMPERES * largest(planar_field.Analytical(par)(x, y, z) - expected)
     assert error[:3] == pytest.approx([0.043, 0.043, 0.076], abs=2e-3)
     for key, low, high in (("F_x", 0.06, 0.08), ("F_z", 0.08, 0.10)):
         shares = [published_value(paper, f"model.{part}.{key}") for part in ("error_analytical", "amplitude")]
@@ -288,17 +287,17 @@ def test_the_fundamental_fits_the_forces(
 def test_overlapping_rectangles_make_too_much_torque(par: planar.Parameters, truth: Series) -> None:
     """C_1 - C_2 of (20), (21) is 3.8 times what the rounded coil has: 28 mN m at 3 A, where 7 are."""
     p = np.array([par.tau_n / 2, par.tau_n / 2, par.h])
-    paper, ours = single(coils.Analytical(par), p)[3:5], single(truth, p)[3:5]
+    paper, ours = single(planar_field.Analytical(par), p)[3:5], single(truth, p)[3:5]
     assert AMPERES * paper == pytest.approx([-0.0276] * 2, abs=1e-4)
     assert paper / ours == pytest.approx([3.84] * 2, abs=0.01)
 
 
 @pytest.mark.parametrize("kind", ["truth", "analytical", "table"])
-def test_mirror_images(par: planar.Parameters, truth: Series, table: coils.Table, kind: str) -> None:
+def test_mirror_images(par: planar.Parameters, truth: Series, table: planar_field.Table, kind: str) -> None:
     """Mirrored in x: F_x, T_y, T_z turn their signs; in y: F_y, T_x, T_z. And 2 tau_n is a period."""
-    models: dict[str, coils.CoilModel] = {
+    models: dict[str, planar_field.CoilModel] = {
         "truth": truth,
-        "analytical": coils.Analytical(par),
+        "analytical": planar_field.Analytical(par),
         "table": table,
     }
     model = models[kind]
@@ -320,7 +319,7 @@ def test_mirror_images(par: planar.Parameters, truth: Series, table: coils.Table
 def test_bilinear_errors(par: planar.Parameters, truth: Series, n: int, F_x: float, F_z: float) -> None:
     """At 3 A: 0.15 N in F_x with tau_n / 10, 0.0125 N with tau_n / 35, and about the double in F_z, which is a sum."""
     x, y, z = quarter(par, 140)
-    error = AMPERES * largest(coils.table(par, truth, n)(x, y, z) - truth(x, y, z))
+    error = AMPERES * largest(planar_field.table(par, truth, n)(x, y, z) - truth(x, y, z))
     assert error[0] == pytest.approx(F_x, rel=0.01)
     assert error[0] == pytest.approx(error[1], rel=1e-9)
     assert error[2] == pytest.approx(F_z, rel=0.01)
@@ -329,14 +328,14 @@ def test_bilinear_errors(par: planar.Parameters, truth: Series, n: int, F_x: flo
 def test_bilinear_errors_fall_fourfold(par: planar.Parameters, truth: Series) -> None:
     x, y, z = quarter(par, 160)
     expected = truth(x, y, z)
-    errors = [largest(coils.table(par, truth, n)(x, y, z) - expected)[0] for n in (10, 20, 40)]
+    errors = [largest(planar_field.table(par, truth, n)(x, y, z) - expected)[0] for n in (10, 20, 40)]
     assert errors[0] / errors[1] == pytest.approx(4.0, abs=0.05)
     assert errors[1] / errors[2] == pytest.approx(4.0, abs=0.05)
 
 
 def test_equation_27_as_printed(par: planar.Parameters, truth: Series) -> None:
     """With the two weights in each other's place a table of tau_n / 10 errs by 3.8 N instead of 0.15."""
-    printed = coils.table(par, truth, 10)
+    printed = planar_field.table(par, truth, 10)
     printed = replace(printed, cells=printed.cells[:, [0, 2, 1, 3]])
     x, y, z = quarter(par, 140)
     assert AMPERES * largest(printed(x, y, z) - truth(x, y, z))[0] == pytest.approx(3.8, abs=0.1)
@@ -352,7 +351,9 @@ def test_eight_harmonics_beat_the_table(par: planar.Parameters, truth: Series) -
     )
 
 
-def test_height_goes_with_the_fundamental(par: planar.Parameters, truth: Series, table: coils.Table) -> None:
+def test_height_goes_with_the_fundamental(
+    par: planar.Parameters, truth: Series, table: planar_field.Table
+) -> None:
     """e^(-pi z / tau_n) is exact for the fundamental alone: 0.014 N at 2 mm, 0.032 N on the magnets, at the nodes."""
     x, y, _ = quarter(par, 35)
     errors = []
@@ -366,18 +367,18 @@ def test_height_goes_with_the_fundamental(par: planar.Parameters, truth: Series,
 @pytest.mark.parametrize("n", [0, -3])
 def test_a_table_has_cells(par: planar.Parameters, truth: Series, n: int) -> None:
     with pytest.raises(malta.InputError, match="at least one cell"):
-        coils.table(par, truth, n)
+        planar_field.table(par, truth, n)
 
 
 def test_a_table_is_made_of_samples_that_mirror(par: planar.Parameters, truth: Series) -> None:
     """A model without the parities, or with a hole, is refused: three quarters would be wrong without a word."""
     with pytest.raises(malta.InputError, match="mirror"):
-        coils.table(par, lambda x, y, z: truth(x + 1e-3, y, z), 4)
+        planar_field.table(par, lambda x, y, z: truth(x + 1e-3, y, z), 4)
     with pytest.raises(malta.InputError, match="finite"):
-        coils.table(par, lambda x, y, z: truth(x, y, z) * np.nan, 4)
+        planar_field.table(par, lambda x, y, z: truth(x, y, z) * np.nan, 4)
 
 
-def test_the_traced_table_is_the_table(par: planar.Parameters, table: coils.Table) -> None:
+def test_the_traced_table_is_the_table(par: planar.Parameters, table: planar_field.Table) -> None:
     """CasADi's interpolant and numpy's gather, over every quarter and on the edges of cells."""
     p = ca.MX.sym("p", 3)
     traced = ca.Function("traced", [p], [table(p[0], p[1], p[2])])
@@ -484,7 +485,7 @@ def test_limited_currents_keep_the_direction_of_the_wrench(par: planar.Parameter
     ],
 )
 def test_a_position_outside_is_refused(
-    par: planar.Parameters, table: coils.Table, name: str, p: list[float]
+    par: planar.Parameters, table: planar_field.Table, name: str, p: list[float]
 ) -> None:
     """In one sentence that names the coordinate, before any NaN."""
     for use in (commutation.wrench_matrix, commutation.hover):
@@ -634,7 +635,7 @@ def pid(crossover: float) -> tuple[float, float, float]:
 def fly_continuously(
     par: planar.Parameters,
     plant: Series,
-    model: coils.CoilModel,
+    model: planar_field.CoilModel,
     start: tuple[float, float],
     reference: Reference,
 ) -> FloatArray:
@@ -674,7 +675,9 @@ def test_a_symmetric_start_stays_symmetric(
     par: planar.Parameters, paper: dict[str, Any], exact: Series
 ) -> None:
     """From (0, 0) a wrong model never moves x, theta and psi: the paper, which shows them move, started elsewhere."""
-    worst = fly_continuously(par, exact, coils.Analytical(par), (0.0, 0.0), profiled(paper, (0.0, 0.0)))
+    worst = fly_continuously(
+        par, exact, planar_field.Analytical(par), (0.0, 0.0), profiled(paper, (0.0, 0.0))
+    )
     assert worst[[0, 4, 5]].max() < 1e-9  # um and urad
     assert worst[3] > 0.1
 
@@ -686,11 +689,11 @@ def test_what_a_model_error_moves(par: planar.Parameters, paper: dict[str, Any],
     The last is the torque of overlapping rectangles, see above; with the fitted one phi stays below 0.3 urad.
     """
     reference = profiled(paper, START)
-    models: dict[str, coils.CoilModel] = {
+    models: dict[str, planar_field.CoilModel] = {
         "exact": exact,
-        "table": coils.table(par, exact, 35),
-        "fundamental": coils.exact_model(par, order=1),
-        "printed": coils.Analytical(par),
+        "table": planar_field.table(par, exact, 35),
+        "fundamental": planar_field.exact_model(par, order=1),
+        "printed": planar_field.Analytical(par),
     }
     worst = {name: fly_continuously(par, exact, model, START, reference) for name, model in models.items()}
     assert worst["exact"][3:].max() < 1e-9

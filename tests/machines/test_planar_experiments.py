@@ -16,9 +16,8 @@ from scipy.integrate import solve_ivp
 
 import malta
 from malta.machines.planar import claims as claims
-from malta.machines.planar import commutation
+from malta.machines.planar import commutation, field
 from malta.machines.planar import experiments as experiments
-from malta.machines.planar import field as coils
 from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments import models, motions
 from malta.machines.planar.experiments import models as timings
@@ -195,7 +194,7 @@ def test_the_run_by_another_integrator(lqg: Design, flown: dict[str, Experiment]
     The currents of a sample are those for the reading before, limited together, and they are held.
     """
     run, par = flown["step"].run, motions.parameters_of(lqg.plant)
-    model = coils.simulation_model(par)
+    model = field.simulation_model(par)
     f = planar.dynamics(par, model)
     shift = np.array([0, 0, par.h, *np.zeros(9)])
 
@@ -352,7 +351,7 @@ def test_coils_further_apart_have_the_torques_that_the_paper_prints(paper: dict[
     """22/3 tau_n: 1.615, 1.615 and 1.604 N m at 3 A, 4, 5 and 13 % below; the arm of F_z is half the pitch, 65 mm."""
     par: Any = malta.read("data/planar.toml", preset="pitch_22_3")
     x, y = np.meshgrid(*[np.linspace(0, 2 * par.tau_n, 141)] * 2, indexing="ij")
-    found = np.abs(models.coil_wrench(par, coils.exact_model(par), 3.0, x, y)).max(axis=(0, 1))
+    found = np.abs(models.coil_wrench(par, field.exact_model(par), 3.0, x, y)).max(axis=(0, 1))
     assert found[3:] == pytest.approx([1.6152, 1.6152, 1.6041], abs=1e-3)
     printed = [published_value(paper, f"model.amplitude.{name}") for name in ("F_z", "T_x")]
     assert printed[1] / printed[0] == pytest.approx(par.coil_pitch / 2, rel=0.01)
@@ -361,7 +360,7 @@ def test_coils_further_apart_have_the_torques_that_the_paper_prints(paper: dict[
 def test_a_coil_off_the_centre_has_arms(lqg: Design) -> None:
     """T about the centre of gravity is the coil's own and arm x F, as in K(p)."""
     par = motions.parameters_of(lqg.plant)
-    model = coils.exact_model(par)
+    model = field.exact_model(par)
     x, y = np.array([3e-3]), np.array([5e-3])
     centre = np.array([x[0] - par.coil_pitch / 2, y[0] - par.coil_pitch / 2, par.h])
     column = commutation.wrench_matrix(par, model, centre)[
@@ -389,9 +388,9 @@ def test_times_are_those_of_the_numbers(lqg: Design, flown: dict[str, Experiment
     par = motions.parameters_of(lqg.plant)
     p, W = np.array([6e-3, 4e-3, par.h]), np.array([10.0, 200, 400, 1, 2, 3])
     for model in (
-        coils.table(par, coils.simulation_model(par), 35),
-        coils.simulation_model(par),
-        coils.Analytical(par),
+        field.table(par, field.simulation_model(par), 35),
+        field.simulation_model(par),
+        field.Analytical(par),
     ):
         compiled = timings.compile_function(commutation.decoupling(par, model))
         if compiled is None:

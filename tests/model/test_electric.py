@@ -28,7 +28,7 @@ from malta.machines.tubular.drive import (
     to_axes,
     to_phases,
 )
-from malta.simulation import current_control as inverter
+from malta.simulation import current_control
 from malta.synthesis.feedforward import pi_current_loop
 
 if TYPE_CHECKING:
@@ -223,12 +223,12 @@ def test_crossover_and_phase_margin_are_found_on_the_loop(
     """Sec. IV-B: 3000 rad/s and 60 degrees, where |loop| passes 1, of the gains rounded as printed in model.md."""
 
     def size(w: float) -> float:
-        return float(abs(inverter.open_loop_gain(plant.actuator, *gains, delay, np.array([w]))[0])) - 1
+        return float(abs(current_control.open_loop_gain(plant.actuator, *gains, delay, np.array([w]))[0])) - 1
 
     crossover = brentq(size, 1.0, 1e5)
     asked = published["current_controller"]
     assert crossover == pytest.approx(asked["crossover"]["value"], rel=2e-4)
-    phase = np.angle(inverter.open_loop_gain(plant.actuator, *gains, delay, np.array([crossover])))[0]
+    phase = np.angle(current_control.open_loop_gain(plant.actuator, *gains, delay, np.array([crossover])))[0]
     assert 180 + math.degrees(phase) == pytest.approx(asked["phase_margin"]["value"], abs=0.02)
     assert gains == pytest.approx(pi_current_loop(plant.actuator, delay), rel=1e-4)
 
@@ -263,7 +263,7 @@ def test_the_sampled_current_loop_keeps_the_design(plant: Plant) -> None:
 def _link_after(plant: Plant, power: Callable[[float], float], seconds: float) -> float:
     """Link voltage after this course of the power, from the supply's."""
     run = solve_ivp(
-        lambda t, V: [float(inverter.link_slope(plant.drive, V[0], power(t)))],
+        lambda t, V: [float(current_control.link_slope(plant.drive, V[0], power(t)))],
         (0, seconds),
         [plant.drive.link_voltage],
         "Radau",
@@ -280,7 +280,7 @@ def test_braking_from_5_m_per_s_lifts_the_link_by_1_12_volts(
     said = published["dc_link"]
     energy = par.m / 2 * said["speed"]["value"] ** 2
     assert energy == pytest.approx(4.5)
-    rise = inverter.link_voltage(par.V_dc, par.C_dc, energy) - par.V_dc
+    rise = current_control.link_voltage(par.V_dc, par.C_dc, energy) - par.V_dc
     assert rise == pytest.approx(said["rise"]["value"], abs=0.005)
     assert rise / par.V_dc == pytest.approx(0.025, abs=5e-4)  # "around 2.5 %"
 
@@ -291,7 +291,7 @@ def test_the_links_slope_keeps_the_energy(par: tubular.Parameters, plant: Plant)
     def braking(t: float) -> float:
         return -4.5 / 20e-3 * (1 + math.sin(2 * math.pi * t / 20e-3))
 
-    expected = inverter.link_voltage(par.V_dc, par.C_dc, 4.5)
+    expected = current_control.link_voltage(par.V_dc, par.C_dc, 4.5)
     assert _link_after(plant, braking, 20e-3) == pytest.approx(expected, abs=1e-8)
 
 
@@ -299,7 +299,7 @@ def test_the_links_slope_keeps_the_energy(par: tubular.Parameters, plant: Plant)
 def test_the_supply_gives_and_never_takes_back(plant: Plant, V: float, power: float) -> None:
     """C V V' = V (45 V - V) / R_dc - power below 45 V, and -power above."""
     drive = plant.drive
-    stored = drive.link_capacitance * V * float(inverter.link_slope(drive, V, power))
+    stored = drive.link_capacitance * V * float(current_control.link_slope(drive, V, power))
     supplied = V * (drive.link_voltage - V) / drive.supply_resistance if drive.link_voltage > V else 0.0
     assert stored == pytest.approx(supplied - power, rel=1e-9, abs=1e-7)
     assert stored + power >= -1e-7
@@ -319,17 +319,19 @@ def test_the_link_settles_where_the_supply_gives_what_is_drawn(plant: Plant) -> 
 @given(u=EIGHTEEN, V=st.floats(5, 60), limit=st.floats(0.01, 40))
 def test_voltages_keep_the_smaller_limit(plant: Plant, u: list[float], V: float, limit: float) -> None:
     """Of half-bridges, machine and gain file: by axes and by phases."""
-    most = inverter.largest_voltage(V, limit, math.inf)
+    most = current_control.largest_voltage(V, limit, math.inf)
     assert float(most) == min(V / 2, limit)
-    assert inverter.largest_voltage(V, math.inf) == V / 2
+    assert current_control.largest_voltage(V, math.inf) == V / 2
     d, limited = (
         _flat(value)
-        for value in inverter.duty_cycles(plant.drive, ca.DM(u), V, ca.DM(u), real_pwm=False, most=most)
+        for value in current_control.duty_cycles(
+            plant.drive, ca.DM(u), V, ca.DM(u), real_pwm=False, most=most
+        )
     )
     np.testing.assert_allclose((d - 0.5) * V, np.clip(u, -most, most), rtol=0, atol=1e-12)
     assert np.array_equal(limited == 0, d == 0.5 + np.array(u) / V)
     axes = ca.DM(u[: len(plant.drive.axes)])
-    m, _ = inverter.modulation(plant.drive, axes, V, most)
+    m, _ = current_control.modulation(plant.drive, axes, V, most)
     assert float(ca.mmax(plant.drive.peak(ca.DM(m) * V))) <= float(most) * (1 + 1e-12)
 
 
@@ -338,7 +340,8 @@ def test_duty_cycles_are_half_plus_u_over_V_within_0_and_1(
     plant: Plant, u: list[float], i: list[float], V: float
 ) -> None:
     d, limited = (
-        _flat(value) for value in inverter.duty_cycles(plant.drive, ca.DM(u), V, ca.DM(i), real_pwm=False)
+        _flat(value)
+        for value in current_control.duty_cycles(plant.drive, ca.DM(u), V, ca.DM(i), real_pwm=False)
     )
     asked = np.array(u)
     np.testing.assert_allclose((d - 0.5) * V, np.clip(asked, -V / 2, V / 2), rtol=0, atol=1e-12)
@@ -351,8 +354,8 @@ def test_real_duty_cycles_come_in_steps_and_lose_dead_time(
 ) -> None:
     """Steps of 1/1000 (100 kHz of a 100 MHz clock), rounded to the nearest; 20 ns of each 10 us against the current."""
     drive = plant.drive
-    ideal, _ = inverter.duty_cycles(drive, ca.DM(u), V, ca.DM(i), real_pwm=False)
-    d, _ = inverter.duty_cycles(drive, ca.DM(u), V, ca.DM(i), real_pwm=True)
+    ideal, _ = current_control.duty_cycles(drive, ca.DM(u), V, ca.DM(i), real_pwm=False)
+    d, _ = current_control.duty_cycles(drive, ca.DM(u), V, ca.DM(i), real_pwm=True)
     assert (drive.pwm_step, drive.dead_share) == pytest.approx((1e-3, 2e-3))
     counted = _flat(d) + 2e-3 * np.sign(i)
     inside = (_flat(ideal) > 2e-3) & (_flat(ideal) < 1 - 2e-3)
@@ -363,7 +366,7 @@ def test_real_duty_cycles_come_in_steps_and_lose_dead_time(
 @given(u=EIGHTEEN, i=EIGHTEEN)
 def test_a_half_bridge_makes_no_more_than_its_link(plant: Plant, u: list[float], i: list[float]) -> None:
     """A half-bridge that no longer switches has no dead time: its duty cycle stays between 0 and 1."""
-    d, _ = inverter.duty_cycles(plant.drive, ca.DM(u), 45.0, ca.DM(i), real_pwm=True)
+    d, _ = current_control.duty_cycles(plant.drive, ca.DM(u), 45.0, ca.DM(i), real_pwm=True)
     assert _flat(d).min() >= 0
     assert _flat(d).max() <= 1
 
@@ -371,14 +374,14 @@ def test_a_half_bridge_makes_no_more_than_its_link(plant: Plant, u: list[float],
 def test_dead_time_costs_90_millivolts(plant: Plant) -> None:
     """20 ns of 10 us at 45 V, against the current, and nothing without current."""
     u, i = np.zeros(18), np.array([1.0, -1.0, 0.0] * 6)
-    d, _ = inverter.duty_cycles(plant.drive, ca.DM(u), 45.0, ca.DM(i), real_pwm=True)
+    d, _ = current_control.duty_cycles(plant.drive, ca.DM(u), 45.0, ca.DM(i), real_pwm=True)
     assert (_flat(d) - 0.5) * 45 == pytest.approx([-0.09, 0.09, 0.0] * 6, abs=1e-12)
 
 
 @given(u=TWELVE, V=st.floats(5, 60))
 def test_modulation_keeps_the_direction_of_each_module(plant: Plant, u: list[float], V: float) -> None:
     """A module that fits is left alone; one that does not is scaled until its bound is V/2, and says so."""
-    m, limited = (_flat(value) for value in inverter.modulation(plant.drive, ca.DM(u), V))
+    m, limited = (_flat(value) for value in current_control.modulation(plant.drive, ca.DM(u), V))
     asked = np.array(u)
     peaks = _flat(plant.drive.peak(ca.DM(u)))
     for group, peak in zip(plant.drive.groups, peaks, strict=True):
@@ -392,7 +395,7 @@ def test_modulation_keeps_the_direction_of_each_module(plant: Plant, u: list[flo
 def test_no_phase_is_asked_for_more_than_half_the_link(
     plant: Plant, u: list[float], V: float, z: float
 ) -> None:
-    m, _ = inverter.modulation(plant.drive, ca.DM(u), V)
+    m, _ = current_control.modulation(plant.drive, ca.DM(u), V)
     phases = _array(plant.drive.to_phases(_moving(z))) @ _flat(m) * V
     assert np.abs(phases).max() <= V / 2 * (1 + 1e-12)
 
@@ -411,7 +414,7 @@ def test_the_bound_of_a_module_is_reached(plant: Plant) -> None:
 @given(drop=EIGHTEEN)
 def test_star_points_float(plant: Plant, drop: list[float]) -> None:
     """Each star's voltages, less those of its star point, add to zero and differ as they did."""
-    net = _flat(inverter.phase_voltages(plant.drive, ca.DM(drop), ca.DM.ones(18))).reshape(6, 3)
+    net = _flat(current_control.phase_voltages(plant.drive, ca.DM(drop), ca.DM.ones(18))).reshape(6, 3)
     stars = np.reshape(drop, (6, 3))
     assert plant.drive.stars == tuple(tuple(range(k, k + 3)) for k in range(0, 18, 3))
     np.testing.assert_allclose(net.sum(axis=1), 0, atol=1e-12)
@@ -422,12 +425,12 @@ def test_star_points_float(plant: Plant, drop: list[float]) -> None:
 def test_two_phases_of_an_open_star_are_in_series(plant: Plant, drop: list[float], opened: int) -> None:
     closed = np.ones(18)
     closed[opened] = 0
-    net = _flat(inverter.phase_voltages(plant.drive, ca.DM(drop), ca.DM(closed)))
+    net = _flat(current_control.phase_voltages(plant.drive, ca.DM(drop), ca.DM(closed)))
     star = opened // 3
     a, b = (k for k in range(3 * star, 3 * star + 3) if k != opened)
     assert net[opened] == 0
     assert net[[a, b]] == pytest.approx([(drop[a] - drop[b]) / 2, (drop[b] - drop[a]) / 2], abs=1e-12)
-    whole = _flat(inverter.phase_voltages(plant.drive, ca.DM(drop), ca.DM.ones(18)))
+    whole = _flat(current_control.phase_voltages(plant.drive, ca.DM(drop), ca.DM.ones(18)))
     others = [k for k in range(18) if k // 3 != star]
     assert np.array_equal(net[others], whole[others])
 
@@ -437,7 +440,7 @@ def test_a_star_with_less_than_two_phases_carries_nothing(plant: Plant) -> None:
         closed = np.ones(18)
         closed[:3] = 0
         closed[left] = 1
-        net = _flat(inverter.phase_voltages(plant.drive, ca.DM(np.arange(18.0)), ca.DM(closed)))
+        net = _flat(current_control.phase_voltages(plant.drive, ca.DM(np.arange(18.0)), ca.DM(closed)))
         assert not net[:3].any()
 
 

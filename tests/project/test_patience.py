@@ -9,7 +9,7 @@ import pytest
 from conftest import Run, one_sentence
 
 import malta
-from malta.cli import output as patience
+from malta.cli import output
 from malta.cli.output import duration_text, limit_time
 from malta.simulation.scenario import MOST_SUBSTEPS
 from malta.simulation.simulate import integration_error
@@ -28,7 +28,7 @@ class _Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> _Clock:
     made = _Clock()
-    monkeypatch.setattr(patience, "monotonic", made)
+    monkeypatch.setattr(output, "monotonic", made)
     return made
 
 
@@ -53,7 +53,7 @@ def test_long_work_is_refused_in_seconds(clock: _Clock, seconds: float, times: f
         malta.InputError, match=rf"^stroke: found about {said} of work, expected at most 10 min, or"
     ):
         _reports(clock, seconds, times=times)
-    assert clock.now == 1800.0 + patience.ENOUGH
+    assert clock.now == 1800.0 + output.ENOUGH
 
 
 def test_who_agreed_may_wait(clock: _Clock) -> None:
@@ -79,8 +79,8 @@ def test_durations_are_told_as_people_tell_them(seconds: float, text: str) -> No
 def test_the_commands_refuse_and_obey(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
-    monkeypatch.setattr(patience, "ENOUGH", 0.0)
-    monkeypatch.setattr(patience, "LONGEST", 1e-9)
+    monkeypatch.setattr(output, "ENOUGH", 0.0)
+    monkeypatch.setattr(output, "LONGEST", 1e-9)
     monkeypatch.setattr("malta.simulation.engine.batch.LOOK", 1e-3)
     own = {
         "simulate": ("--option", "substeps=500", "--option", "fidelity=force", "--out", tmp_path),

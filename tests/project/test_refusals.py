@@ -14,7 +14,7 @@ import pytest
 from conftest import Run, one_sentence, refusal
 
 import malta
-from malta.campaigns import store as block
+from malta.campaigns import store
 from malta.campaigns.plan import Plan
 from malta.campaigns.run import campaign
 from malta.campaigns.store import block_name, seal
@@ -186,7 +186,7 @@ def test_a_refused_campaign_leaves_what_is_done(tmp_path: Path, monkeypatch: pyt
     controller = malta.gains.read(TABLE2)
     quick = {"fidelity": "force", "duration": 0.01, "rise": 3e-3}
     plan = Plan(controller, spread={"m": 0.1}, samples=16, options=quick)
-    fly = block.fly
+    fly = store.fly
 
     def once(plan: Plan, first: int, *rest: Any) -> Any:
         if first:

@@ -8,20 +8,20 @@ from pathlib import Path
 
 from malta import archives, files, tables, units
 from malta.campaigns import plan
-from malta.cli import output as patience
-from malta.gains import encodings as mat
+from malta.cli import output
+from malta.gains import encodings
 from malta.model import sensors
 from malta.proof.certificate import check, checked_file
 from malta.simulation import inputs, scenario
 from malta.simulation.engine import compiled
-from malta.simulation.experiments import recording as force_log
+from malta.simulation.experiments import recording
 
 TEXT = (Path(__file__).parents[2] / "SECURITY.md").read_text(encoding="utf-8")
 LIMITS = {
     "a file": files.LARGEST,
-    "a log": force_log.LARGEST,
+    "a log": recording.LARGEST,
     "a certificate": checked_file.LARGEST,
-    "elements of a MAT-file, decompressed": mat.LARGEST,
+    "elements of a MAT-file, decompressed": encodings.LARGEST,
     "members of an archive": archives.MANY,
     "tables in tables": tables.DEEPEST,
     "a unit": units.LONGEST,
@@ -41,4 +41,4 @@ def test_the_limits_are_those_of_the_code() -> None:
 
 def test_the_patience_is_that_of_the_code() -> None:
     assert "more than ten minutes" in TEXT
-    assert patience.LONGEST == 600
+    assert output.LONGEST == 600

@@ -21,8 +21,7 @@ from malta.campaigns.plan import fingerprint
 from malta.gains import encodings
 from malta.loops.sampled_loops import machine_loop
 from malta.simulation.experiments.catalogue import jump
-from malta.synthesis import filters as kalman_filter
-from malta.synthesis import lqg, riccati
+from malta.synthesis import filters, lqg, riccati
 
 if TYPE_CHECKING:
     from malta.loops.linear_loops import LoopSystems
@@ -75,7 +74,7 @@ def shipped(request: pytest.FixtureRequest) -> Design:
     with pytest.MonkeyPatch.context() as patch:
         for name in asked:
             patch.setattr(lqg, name, partial(noted, name))
-            patch.setattr(kalman_filter, name, partial(noted, name))
+            patch.setattr(filters, name, partial(noted, name))
         weights = replace(spec.weights, correlation=np.zeros(0))  # which python-control does not know
         lqg.lqr(model, weights)
         lqg.kalman(model, weights)

@@ -25,7 +25,7 @@ from malta.simulation.experiments.catalogue import experiment
 from malta.synthesis.controller import linear_law, linear_law_of
 from malta.synthesis.requirements import requirements_for
 from malta.synthesis.riccati import eigenvalues
-from malta.tuning import lqg as tune_lqg
+from malta.tuning import lqg
 from malta.tuning.groups import figures_of
 from malta.tuning.lqg import _clusters, _search, _worst
 from malta.tuning.search import (
@@ -349,7 +349,7 @@ def test_what_is_found_has_the_figures_that_were_found(small: Spec, tmp_path: Pa
 def test_the_front_trades_margin_for_noise(
     spec: Spec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tune_lqg, "FRONT", (0.65, 0.95))
+    monkeypatch.setattr(lqg, "FRONT", (0.65, 0.95))
     asked = ASKED
     radial = replace(spec, specification=asked, delays=(0,), search=spec.search[:8])
     found = tuned(radial, effort=Effort(generations=0, polish=0, front=20))

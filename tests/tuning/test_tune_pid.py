@@ -22,8 +22,7 @@ from malta.machines.halbach import electronics
 from malta.machines.halbach import plant as halbach
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Pid
-from malta.tuning import pid as tune_pid
-from malta.tuning import verify as outcomes
+from malta.tuning import pid, verify
 from malta.tuning.pid import (
     _goal,
     close_loop,
@@ -340,7 +339,7 @@ def test_a_shared_filter_joins_all_axes(mover: Spec, monkeypatch: pytest.MonkeyP
         seen.append(separate(*given))
         return seen[-1]
 
-    monkeypatch.setattr(tune_pid, "separate", looked_at)
+    monkeypatch.setattr(pid, "separate", looked_at)
     found = tuned(spec, effort=Effort(generations=0, polish=0))
     assert seen == [[((0, 1, 2, 3), tuple(range(count)))] for count in (4, 6)]  # parts, outputs
     assert {name.split()[1] for name in found.trial.figures} == {s.name for s in mover.plant.outputs}
@@ -356,8 +355,8 @@ def test_bandwidth_and_margin_are_judge(motor: Spec, monkeypatch: pytest.MonkeyP
         bound: Any = SimpleNamespace(lower=1.25)
         return replace(linear_report(model, controller), robust=bound)
 
-    linear_report: Callable[..., LoopReport] = vars(outcomes)["linear_report"]
-    monkeypatch.setattr(outcomes, "linear_report", proven)
+    linear_report: Callable[..., LoopReport] = vars(verify)["linear_report"]
+    monkeypatch.setattr(verify, "linear_report", proven)
     rows = {r.name: r for r in judge(spec)}
     assert rows["margin"].ratio == 0.8
     assert rows["bandwidth"].at_least

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.machines.planar import commutation
-from malta.machines.planar import field as coils
 from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments.models import CURRENT, coil_wrench
@@ -86,7 +85,7 @@ def formula_error(e: Evidence) -> float:
     coil = planar_field.winding(par, rectangles=True, nodes=40)
     p = np.array([6e-3, 4e-3, par.h])
     expected = planar_field.quadrature(par, field, coil, p)
-    found = coils.Analytical(par)(*(np.array([v]) for v in p))[0]
+    found = planar_field.Analytical(par)(*(np.array([v]) for v in p))[0]
     return float(
         max(np.abs((found - expected)[k]).max() / np.abs(expected[k]).max() for k in (slice(3), slice(3, 6)))
     )
@@ -102,8 +101,8 @@ def implied_step(name: str, e: Evidence) -> float:
 
 def misprint_error(e: Evidence) -> float:
     """Largest error of F_x, N, of a table of 10 cells with two weights exchanged as (27) prints them."""
-    par, truth = e.parameters, coils.exact_model(e.parameters)
-    table = coils.table(par, truth, 10)
+    par, truth = e.parameters, planar_field.exact_model(e.parameters)
+    table = planar_field.table(par, truth, 10)
     printed = replace(table, cells=table.cells[:, [0, 2, 1, 3]])
     x, y = np.meshgrid(*[np.linspace(0, par.tau_n, 81)] * 2, indexing="ij")
     z = np.full_like(x, par.h)
@@ -113,14 +112,14 @@ def misprint_error(e: Evidence) -> float:
 def condition(ratio: float, e: Evidence) -> float:
     """Worst condition of K(p) for a coil pitch of `ratio` tau_n."""
     par = replace(e.parameters, coil_pitch=ratio * e.parameters.tau_n)
-    return float(commutation.conditioning(par, coils.simulation_model(par)).max())
+    return float(commutation.conditioning(par, planar_field.simulation_model(par)).max())
 
 
 def coil_torque(ratio: float, name: str, e: Evidence) -> float:
     """Amplitude of a torque, N m, of an inner coil at the paper's 3 A for a coil pitch of `ratio` tau_n."""
     par = replace(e.parameters, coil_pitch=ratio * e.parameters.tau_n)
     x, y = np.meshgrid(*[np.linspace(0, 2 * par.tau_n, 141)] * 2, indexing="ij")
-    wrench = coil_wrench(par, coils.exact_model(par), CURRENT, x, y)
+    wrench = coil_wrench(par, planar_field.exact_model(par), CURRENT, x, y)
     return float(np.abs(wrench[..., [s.name for s in e.spec.plant.inputs].index(name)]).max())
 
 
@@ -133,7 +132,7 @@ def coils_width(ratio: float, e: Evidence) -> float:
 def residual(e: Evidence) -> float:
     """Largest relative error of the wrench K i of the computed currents, over a period."""
     par = e.parameters
-    model, W, worst = coils.simulation_model(par), np.array([100.0, 200, 400, 10, 20, 30]), 0.0
+    model, W, worst = planar_field.simulation_model(par), np.array([100.0, 200, 400, 10, 20, 30]), 0.0
     for x in np.arange(6) * par.tau_n / 3:
         for y in np.arange(6) * par.tau_n / 3:
             K = commutation.wrench_matrix(par, model, np.array([x, y, par.h]))

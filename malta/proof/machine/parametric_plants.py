@@ -18,7 +18,7 @@ from malta.model.sensors import LateSensors, with_lags
 from malta.proof.box import without_branches
 from malta.proof.expressions import NotAnalytic, program
 from malta.proof.machine.windings import Windings, with_windings
-from malta.proof.polynomial import rational as compact
+from malta.proof.polynomial import rational
 from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge
 from malta.proof.polynomial.rational import symbolic as rational_functions
 from malta.proof.uncertain import (
@@ -139,14 +139,14 @@ def _exact_command(s: Symbolic, p: Any, acting: Any, wanted: FloatArray, nominal
                     matrix[i, power.index(1)] = c
                 else:
                     right[i] = -c
-        return ca.vertcat(*(compact.expression(r, p) for r in compact.solution(s, matrix, right, m)))
+        return ca.vertcat(*(rational.expression(r, p) for r in rational.solution(s, matrix, right, m)))
     own = [all(not any(e[:i] + e[i + 1 :]) and e[i] <= 2 for e in one) for i, one in enumerate(powers)]
     if not all(own):
         return None
     roots = []
     for i, n in enumerate(polynomials):
         by_power = {power[i]: c for power, c in _coefficients(s, n, first, m).items()}
-        terms = [compact.expression(by_power[k], p) if k in by_power else ca.SX(0) for k in range(3)]
+        terms = [rational.expression(by_power[k], p) if k in by_power else ca.SX(0) for k in range(3)]
         roots.append(_root(terms, p, nominal, float(wanted[i])))
     return ca.vertcat(*roots)
 
@@ -334,34 +334,34 @@ def _expanded_matrices(
         return None
     scales = np.concatenate([nominal, np.array(model(np.r_[nominal, np.zeros(m)])[-1]).ravel()])
     try:
-        s, tables, above = compact.expand_matrices(model, scales)
+        s, tables, above = rational.expand_matrices(model, scales)
     except (TooLarge, NotAnalytic):
         return None
     A, B, C, E, made, ratio, preload = tables
     zero = Ratio(s.context.constant(0))
     acting = {k + i: preload.get((i, 0), zero) for i in range(m)}
-    left = {i: acting[k + i] - compact.substitute(s, made.get((i, 0), zero), acting) for i in range(m)}
-    slope = {at: compact.substitute(s, r, acting) for at, r in ratio.items()}
+    left = {i: acting[k + i] - rational.substitute(s, made.get((i, 0), zero), acting) for i in range(m)}
+    slope = {at: rational.substitute(s, r, acting) for at, r in ratio.items()}
     if not all((slope[at] - r).is_zero() for at, r in ratio.items()):
         return None  # one step finds the command of a chain that is affine in it, and of no other
     ratio = slope
-    moved = compact.solution(
+    moved = rational.solution(
         s, ratio, left, m
     )  # what has to be wanted beyond the preload so that the preload acts
     wanted = {k + i: acting[k + i] + moved[i] for i in range(m)}
-    A, B, C, E = ({at: compact.substitute(s, r, wanted) for at, r in t.items()} for t in (A, B, C, E))
+    A, B, C, E = ({at: rational.substitute(s, r, wanted) for at, r in t.items()} for t in (A, B, C, E))
     n, outputs = of.size1_out(0), of.size1_out(2)
-    rest: compact.Table = {}
+    rest: rational.Table = {}
     if held is not None:
-        carried = compact.product(E, C)
-        A = compact.drop_rounding(s, compact.difference(A, carried), scales, A, carried)
+        carried = rational.product(E, C)
+        A = rational.drop_rounding(s, rational.difference(A, carried), scales, A, carried)
         gains = {(i, j): s.constant(float(x)) for (i, j), x in np.ndenumerate(held) if x}
-        rest = compact.drop_rounding(s, compact.difference(E, compact.product(B, gains)), scales, E)
-    held_above = {(i, 0): compact.substitute(s, r, wanted) for i, r in enumerate(above)}
-    if not compact.is_free_of_functions(s, (A, B, C, rest, held_above)):
+        rest = rational.drop_rounding(s, rational.difference(E, rational.product(B, gains)), scales, E)
+    held_above = {(i, 0): rational.substitute(s, r, wanted) for i, r in enumerate(above)}
+    if not rational.is_free_of_functions(s, (A, B, C, rest, held_above)):
         return None
-    b = compact.matrix_of(B, (n, m), p)
+    b = rational.matrix_of(B, (n, m), p)
     if rest:
-        b = ca.horzcat(b, compact.matrix_of(rest, (n, outputs), p))
-    a, c = compact.matrix_of(A, (n, n), p), compact.matrix_of(C, (outputs, n), p)
-    return a, b, c, ca.vertcat(*(compact.expression(r, p) for r in held_above.values()))
+        b = ca.horzcat(b, rational.matrix_of(rest, (n, outputs), p))
+    a, c = rational.matrix_of(A, (n, n), p), rational.matrix_of(C, (outputs, n), p)
+    return a, b, c, ca.vertcat(*(rational.expression(r, p) for r in held_above.values()))

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from malta.model.signals import FINE
-from malta.report import plots
 from malta.report.figures.drawing import MORE, STYLES, draw_line, finish_axes, micro, new_figure
 from malta.report.page.document import Front, Page, render
 from malta.report.page.sections import Item, Picture, Section, Sheet, distinct_channels, polish
@@ -174,6 +173,8 @@ def report_work(
 
 def overlaid(found: Comparison) -> Iterator[Item]:
     """The figures of a comparison: sensitivities, Nyquist plots, singular values, loads, the main job."""
+    from malta.report import plots
+
     named = dict(zip(found.names, found.designs, strict=True))
     loops = {name: a.curves for name, a in named.items()}
     stable = {name: loops[name] for name, a in named.items() if a.report.stable}

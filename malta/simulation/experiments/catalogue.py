@@ -52,7 +52,6 @@ from malta.simulation.experiments import (
     setting,
     step_wrench,
 )
-from malta.simulation.experiments import catalogue as generic
 from malta.simulation.layout import fidelities
 from malta.simulation.references import Motion, Reference
 from malta.simulation.scenario import Scenario
@@ -276,7 +275,7 @@ OPTIONS = {f.name for f in fields(Scenario)} - MADE | {"engine"}
 
 def experiments_of(plant: Plant) -> Mapping[str, Callable[..., Experiment]]:
     """The experiments of a machine by name, its main job first."""
-    found: Mapping[str, Callable[..., Experiment]] = setting(plant, "EXPERIMENTS", generic.EXPERIMENTS)
+    found: Mapping[str, Callable[..., Experiment]] = setting(plant, "EXPERIMENTS", EXPERIMENTS)
     return found
 
 
@@ -284,7 +283,7 @@ def series_of(plant: Plant) -> Mapping[str, Callable[..., list[PlannedRun]]]:
     """The functions that list the runs of an experiment for campaigns, by the experiment's name."""
     own: Mapping[str, Callable[..., list[PlannedRun]]] | None = setting(plant, "CASES", None)
     if own is None:
-        return {} if experiments_of(plant) is not generic.EXPERIMENTS else generic.CASES
+        return {} if experiments_of(plant) is not EXPERIMENTS else CASES
     return own
 
 

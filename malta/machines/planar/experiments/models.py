@@ -13,8 +13,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.machines.planar import commutation
-from malta.machines.planar import field as coils
+from malta.machines.planar import commutation, field
 from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments.motions import CELLS, FORCES, PLACE, parameters_of, with_coil_model
 from malta.model.plant import Plant
@@ -62,10 +61,10 @@ def errors(
     if len(place) != 2:
         raise InputError("simulate", "errors: place", f"{len(place)} numbers", "x and y")
     commutation.check_position(par, np.array([*place, par.h]))
-    truth = coils.exact_model(par)
-    models: dict[str, coils.CoilModel] = {
-        "analytical": coils.Analytical(par),
-        "table": coils.table(par, truth, cells),
+    truth = field.exact_model(par)
+    models: dict[str, field.CoilModel] = {
+        "analytical": field.Analytical(par),
+        "table": field.table(par, truth, cells),
     }
     x, y = np.meshgrid(*[np.linspace(0, 2 * par.tau_n, 141)] * 2, indexing="ij")
     exact = coil_wrench(par, truth, current, x, y)
@@ -86,7 +85,7 @@ def errors(
             Merit(f"{s.name}, amplitude", float(a), s.unit, f"model.amplitude.{s.name}")
             for s, a in zip(plant.inputs, amplitude, strict=True)
         ),
-        Merit("fitted C of the analytical model", coils.compensation(par, truth), "1", better=""),
+        Merit("fitted C of the analytical model", field.compensation(par, truth), "1", better=""),
         Merit(
             "error of the table, each halving of its step", _error_ratio(curves), "1", key="table_error_ratio"
         ),
@@ -95,7 +94,7 @@ def errors(
 
 
 def coil_wrench(
-    par: planar.Parameters, model: coils.CoilModel, current: float, x: FloatArray, y: FloatArray
+    par: planar.Parameters, model: field.CoilModel, current: float, x: FloatArray, y: FloatArray
 ) -> FloatArray:
     """Wrench of an inner coil, ... x 6, centred at x, y at the working height, about the centre of gravity."""
     own = current * model(x, y, np.full_like(x, par.h))
@@ -104,14 +103,14 @@ def coil_wrench(
     return np.asarray(own)
 
 
-def _by_step(par: planar.Parameters, truth: coils.CoilModel, current: float) -> FloatArray:
+def _by_step(par: planar.Parameters, truth: field.CoilModel, current: float) -> FloatArray:
     """Largest errors of F_x and F_z, N, of a table for each of NODES, at the middles and edges of its cells."""
     found = []
     for n in NODES:
         fine = np.linspace(0, par.tau_n, 2 * n + 1)
         x, y = np.meshgrid(fine, fine, indexing="ij")
         exact = coil_wrench(par, truth, current, x, y)
-        error = np.abs(coil_wrench(par, coils.table(par, truth, n), current, x, y) - exact)
+        error = np.abs(coil_wrench(par, field.table(par, truth, n), current, x, y) - exact)
         found.append(error[..., [0, 2]].max(axis=(0, 1)))
     return np.array(found)
 
@@ -153,10 +152,10 @@ def timing(
     par = parameters_of(plant)
     scenario = scenario_of("timing", 0.01, references.hold, FORCES | options)
     cases, cut = fly(plant, controller, [PlannedRun("hover", scenario, _no_merits)], progress, options)
-    models: dict[str, coils.CoilModel] = {
-        "table": coils.table(par, coils.simulation_model(par), cells),
-        "exact": coils.simulation_model(par),
-        "analytical": coils.Analytical(par),
+    models: dict[str, field.CoilModel] = {
+        "table": field.table(par, field.simulation_model(par), cells),
+        "exact": field.simulation_model(par),
+        "analytical": field.Analytical(par),
     }
     p, W = np.array([*PLACE, par.h]), np.array([10.0, 200, 400, 1, 2, 3])
     plain = numpy_seconds(par, models["table"], p, W)
@@ -200,7 +199,7 @@ def _no_merits(_: Trajectory) -> tuple[Merit, ...]:
 
 
 def numpy_seconds(
-    par: planar.Parameters, model: coils.CoilModel, p: FloatArray, W: FloatArray, calls: int = 20
+    par: planar.Parameters, model: field.CoilModel, p: FloatArray, W: FloatArray, calls: int = 20
 ) -> float:
     """Shortest mean time, s, of `currents(wrench_matrix(...))` by numpy with all checks, over rounds of `calls`."""
     best = math.inf
