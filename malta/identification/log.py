@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 
 from malta.archives import read_npz
 from malta.display import Description, display, quantity
-from malta.errors import InputError
+from malta.errors import CheckError, InputError
 from malta.files import read_file, replace_files
 from malta.gains.encodings import read_mat
 from malta.model.plant import Signal, readonly
@@ -528,3 +528,14 @@ def _from_arrays(arrays: Mapping[str, Any], path: Path) -> Decoded:
             raise InputError(path, group, found, f"numbers, ({len(t)}, {len(names)})")
         tables[group], headings[group] = table, [str(name) for name in names]
     return head, np.asarray(t, dtype=float), tables, headings
+
+
+def require_same_law(log: Log, machine: str, sample_time: float) -> None:
+    """Raise CheckError for a log of another machine than the gain file's, and of another sample time."""
+    if log.machine and log.machine != machine:
+        raise CheckError(
+            f"{log.source}: a log of a {log.machine}, but the gain file's machine is a {machine}"
+        )
+    if abs(log.sample_time / sample_time - 1) > 1e-3:
+        found = f"samples of {log.sample_time:.6g} s, but the law's are {sample_time:.6g} s"
+        raise CheckError(f"{log.source}: {found}")

@@ -13,7 +13,7 @@ from scipy.interpolate import make_interp_spline
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.log import Log
+from malta.identification.log import Log, require_same_law
 from malta.model.data import plant_of
 from malta.simulation.inputs import Inputs, initial_values, sample_inputs
 from malta.simulation.layout import layout_of
@@ -105,14 +105,7 @@ def replay_law(controller: Controller, log: Log) -> LawReplay:
     True
     """
     plant = plant_of(controller.parameters)
-    if log.machine and log.machine != plant.name:
-        raise CheckError(
-            f"{log.source}: a log of a {log.machine}, but the gain file's machine is a {plant.name}"
-        )
-    if abs(log.sample_time / controller.sample_time - 1) > 1e-3:
-        raise CheckError(
-            f"{log.source}: samples of {log.sample_time:g} s, but the law's are {controller.sample_time:g} s"
-        )
+    require_same_law(log, plant.name, controller.sample_time)
     y = log.table("y", [s.name for s in plant.outputs])
     v = log.table("v", [s.name for s in plant.inputs])
     if not (np.isfinite(y).all() and np.isfinite(v).all()) or log.survey.gaps:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.errors import CheckError
-from malta.identification.log import Log
+from malta.identification.log import Log, require_same_law
 from malta.identification.prediction import without_spikes
 from malta.identification.response import ResponseModel
 
@@ -48,13 +48,7 @@ class Spectrum(NamedTuple):
 
 def require_log(log: Log, machine: str, sample_time: float) -> None:
     """Raise CheckError for a log of another machine, of another sample time, or with sensors that failed."""
-    if log.machine and log.machine != machine:
-        raise CheckError(
-            f"{log.source}: a log of a {log.machine}, but the gain file's machine is a {machine}"
-        )
-    if abs(log.sample_time / sample_time - 1) > 1e-3:
-        found = f"samples of {log.sample_time:.6g} s, but the law's are {sample_time:.6g} s"
-        raise CheckError(f"{log.source}: {found}")
+    require_same_law(log, machine, sample_time)
     for what in ("stuck", "clipped"):
         for sensor, count in getattr(log.survey, what).items():
             raise CheckError(f"{log.source}: sensor {sensor} is {what} in {count} of {log.samples} samples")

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rich.text import Text
 
-from malta.display import micro, number
+from malta.display import ceil_to, floor_to, micro, number
 from malta.margins.loop_report import zone
 from malta.report.tables.layout import fold
 
@@ -102,19 +102,13 @@ def _margin(found: LoopReport) -> VerdictLine:
         return VerdictLine("margin", "not proven", "the proof was left out (--no-proof)")
     if margin.lower is None:
         return VerdictLine("margin", "nothing proven", f"{margin.reason}; {of}", "bad", stairs)
-    lost = "no unstable machine found" if margin.exhausted else f"lost at {_up(100 * margin.upper, 1)} %"
+    lost = (
+        "no unstable machine found" if margin.exhausted else f"lost at {ceil_to(100 * margin.upper, 1):.1f} %"
+    )
     state = "good" if margin.lower >= 1 else "bad"
-    return VerdictLine("margin", f"{_down(100 * margin.lower, 1)} % proven", f"{lost} {of}", state, stairs)
-
-
-def _down(value: float, digits: int) -> str:
-    """A proven lower bound with so many decimals, never more than it is."""
-    return f"{math.floor(value * 10**digits) / 10**digits:.{digits}f}"
-
-
-def _up(value: float, digits: int) -> str:
-    """A proven upper bound with so many decimals, never less than it is."""
-    return f"{math.ceil(value * 10**digits) / 10**digits:.{digits}f}"
+    return VerdictLine(
+        "margin", f"{floor_to(100 * margin.lower, 1):.1f} % proven", f"{lost} {of}", state, stairs
+    )
 
 
 def _stairs(found: LoopReport) -> tuple[Stair, ...]:
@@ -148,7 +142,7 @@ def _peak(found: LoopReport) -> VerdictLine:
     bounds = [gain.upper for gain in found.worst.values()]
     if bounds and None not in bounds:
         highest = max(bound for bound in bounds if bound is not None)
-        note += f"; over the uncertainty at most {_up(highest, 2)}, zone {zone(highest)}"
+        note += f"; over the uncertainty at most {ceil_to(highest, 2):.2f}, zone {zone(highest)}"
     return VerdictLine("peak |S|", f"{peaks[name]:.2f}, zone {found_zone}", note, state)
 
 
