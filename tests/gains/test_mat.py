@@ -417,17 +417,17 @@ def test_edited_files_that_are_read_are_read_as_scipy_reads_them(tmp_path: Path)
     program = """
 import sys
 from pathlib import Path
+sys.path[:0] = sys.argv[2:]
 from test_mat import _comparable, _second_opinion
 for path in sorted(Path(sys.argv[1]).glob("*.mat")):
     found = repr(_comparable(_second_opinion(path.read_bytes())))
     assert found == path.with_suffix(".txt").read_text(encoding="utf-8"), path.name
 """
     done = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path)],
+        [sys.executable, "-c", program, str(tmp_path), *sys.path],  # whose folders have this module
         capture_output=True,
         text=True,
         timeout=120,
         check=False,
-        cwd=Path(__file__).parent,  # whose module the program imports
     )
     assert (done.returncode, done.stderr) == (0, "")

@@ -21,6 +21,7 @@ from malta.proof.machine.windings import Windings, with_windings
 from malta.proof.polynomial import rational
 from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge
 from malta.proof.polynomial.rational import symbolic as rational_functions
+from malta.proof.time_limit import check_time
 from malta.proof.uncertain import (
     UncertainSystem,
     describe,
@@ -240,6 +241,7 @@ def of_plant(
     position = position_in(plant, x0)
     own_states = tuple((name, x) for name, x in (at or {}).items() if name != plant.stroke)
     of = model_of(plant, believed or plant, tuple(name for name in names if name != plant.stroke), own_states)
+    check_time()
     p = ca.SX.sym("p", len(names))
     own = [k for k, name in enumerate(names) if name != plant.stroke]
     z = p[names.index(plant.stroke)] if plant.stroke in names else position
@@ -247,6 +249,7 @@ def of_plant(
     short, positive, why = None, None, ""
     if is_commutated(plant) or not program(of).rational:
         short = _expanded_matrices(of, p, z, np.array(nominal, dtype=float), held)
+    check_time()
     if short is not None:
         A, B, C, above = short
         positive = ca.Function("positive", [p], [above]) if above.numel() else None
