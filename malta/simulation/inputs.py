@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
+from scipy import linalg
 from scipy.special import erf
 
 from malta.errors import InputError
@@ -152,11 +152,9 @@ def lagging_references(c: Controller, v_ff: FloatArray) -> FloatArray:
     """The forces behind the lag of the design model while v_ff is commanded, k x m; at rest before the first sample."""
     decay = _decay(c)
     acting = np.vstack([np.repeat(v_ff[:1], c.delay, axis=0), v_ff])[: len(v_ff) - 1]
-    columns = (
-        accumulate(forces.tolist(), lambda lagging, v: (1 - decay) * v + decay * lagging, initial=first)
-        for forces, first in zip(acting.T, v_ff[0].tolist(), strict=True)
-    )
-    return np.column_stack([list(column) for column in columns])
+    given = np.vstack([v_ff[:1], (1 - decay) * acting])
+    rows = np.array([np.ones(len(given)), np.full(len(given), -decay)])  # lagging_k - decay lagging_(k-1) = given_k
+    return np.asarray(linalg.solve_banded((1, 0), rows, given))
 
 
 def _decay(c: Controller) -> float:
