@@ -53,14 +53,26 @@ def linear_table(parameters: Any) -> dict[str, Any]:
         [dict(zip("ABC", (np.array(M) for M in one), strict=True)) for one in several]
         for several in ([s.matrices], [found for _, found in s.terms])
     )
+    later = {
+        "formulas": dict(s.formulas),
+        "parameter_limits": {
+            name: {"above": _finite_or_none(above), "below": _finite_or_none(below)}
+            for name, above, below in s.limits
+        },
+    }
     return {
         **signal_tables(s, "states", "inputs", "outputs"),
         "matrices": matrices[0],
         "terms": dict(zip([name for name, _ in s.terms], terms, strict=True)),
+        **{key: table for key, table in later.items() if table},
         "limit": np.array(s.limit) if np.isfinite(s.limit).all() else None,
         "noise": np.array(s.noise),
         "dead_time": s.dead_time,
     }
+
+
+def _finite_or_none(x: float) -> float | None:
+    return x if math.isfinite(x) else None
 
 
 def linear_parameters(plant: PlantTable, given: LinearTable, path: str | Path) -> Parameters:
@@ -82,6 +94,14 @@ def linear_parameters(plant: PlantTable, given: LinearTable, path: str | Path) -
             name=plant.preset,
             nominal={key: q.value for key, q in parameters.items()},
             terms={key: (M.A, M.B, M.C) for key, M in terms.items()},
+            formulas=given.formulas or {},
+            limits={
+                name: (
+                    -math.inf if one.above is None else one.above,
+                    math.inf if one.below is None else one.below,
+                )
+                for name, one in (given.parameter_limits or {}).items()
+            },
             limit=math.inf if given.limit is None else given.limit,
             noise=given.noise,
             dead_time=given.dead_time,

@@ -60,6 +60,13 @@ class Matrices(Record):
     C: Matrix = entry("output matrix", shape="p x n0")
 
 
+class ParameterLimits(Record):
+    """The limits of a parameter, exclusive."""
+
+    above: Finite | None = entry("lower limit; null: none", "SI")
+    below: Finite | None = entry("upper limit; null: none", "SI")
+
+
 class LinearTable(Record):
     """A machine from plain matrices, as `malta.linear_machine` takes them."""
 
@@ -68,6 +75,10 @@ class LinearTable(Record):
     outputs: Signals = entry("outputs", shape="p")
     matrices: Matrices = entry("matrices of the nominal machine")
     terms: dict[StrictStr, Matrices] | None = entry("matrices by parameter; null without parameters")
+    formulas: dict[StrictStr, StrictStr] | None = entry(
+        'formulas of the parameters, added to entries: "A_2_1" is row 2, column 1 of A', default=None
+    )
+    parameter_limits: dict[StrictStr, ParameterLimits] | None = entry("limits of parameters", default=None)
     limit: Vector | None = entry("limits of the outputs", "m", shape="p")
     noise: Vector = entry("noise of one sample of each output, rms, SI", shape="p")
     dead_time: Finite = entry("from a command to its force", "s")

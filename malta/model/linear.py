@@ -1,6 +1,8 @@
 """A machine from plain matrices: x' = A x + B (u + d), y = C x, with entries that may be uncertain.
 
-    A = A0 + sum of p_i A_i, and B, C likewise      the parameters p by name; none where all entries are known
+    A = A0 + sum of p_i A_i + F(p), and B, C likewise      parameters p by name; none where all entries are known
+
+F has formulas of p, as "-b / J" (formulas.py), for entries that an uncertain system has in its parameters.
 
 Such a machine is designed for, verified, simulated and flown in campaigns as any other. Its currents are its inputs, d
 are its disturbances. Its gain file carries the matrices, so that reading the file back needs no module.
@@ -12,7 +14,7 @@ import keyword
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, make_dataclass
+from dataclasses import dataclass, field, fields, make_dataclass
 from functools import cache
 from numbers import Real
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack, cast
@@ -22,6 +24,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.model.data import plant_of
+from malta.model.formulas import formula, value_of
 from malta.model.machines import machine_names
 from malta.model.parameters import check_parameters, si
 from malta.model.plant import Actuator, Parameters, Plant, Signal
@@ -32,6 +35,8 @@ if TYPE_CHECKING:
 Rows = tuple[tuple[float, ...], ...]
 LETTERS = "ABC"
 CALLER = "linear_machine"
+RESERVED = ("system", "preset")  # fields of the parameters beside their own
+PLACE = re.compile(r"([ABC])_([1-9]\d{0,3})_([1-9]\d{0,3})")  # an entry of a matrix
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,12 @@ class LinearSystem:
     limit: tuple[float, ...]  # m, of each input, its unit; inf: none
     noise: tuple[float, ...]  # p, rms of a sample, the unit of each output
     dead_time: float  # s, from measurement to force
+    formulas: tuple[
+        tuple[str, str], ...
+    ] = ()  # what is added to an entry: ("A_2_1", "-b / J"), row and column from 1
+    limits: tuple[
+        tuple[str, float, float], ...
+    ] = ()  # of parameters: name, above, below, exclusive; inf: none
 
 
 class Details(TypedDict, total=False):
@@ -57,20 +68,22 @@ class Details(TypedDict, total=False):
     outputs: Sequence[str | Signal]
     nominal: Mapping[str, float]
     terms: Mapping[str, Sequence[Any]]
+    formulas: Mapping[str, str]
+    limits: Mapping[str, tuple[float, float]]
     limit: float | Sequence[float]
     noise: float | Sequence[float]
     dead_time: float
 
 
 def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Details]) -> Plant:
-    """Make a machine x' = A x + B (u + d), y = C x from matrices or from a system of python-control.
+    """Make a machine x' = A x + B (u + d), y = C x from matrices, an uncertain system, or one of python-control.
 
     States of positions and then their rates, A = [[0, I], ...], make a machine of second order. An LQG and a margin
     work for other states as well. Their reference is the rest at which the outputs have the wanted values:
     [A B; C 0] (x*, u*) = (0, p*), in the least-squares sense. u* is not fed forward: a machine that needs some stops
     short of the reference without integrals or observed disturbances.
 
-    A : n x n; or a continuous control.StateSpace in place of A, B and C
+    A : n x n; or in place of A, B and C a continuous control.StateSpace, or what `malta.uncertain` makes of a function
     B : n x m
     C : m x n, as many outputs as inputs for a design
     details : by keyword, all optional:
@@ -78,6 +91,8 @@ def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Detai
     states, inputs, outputs : names, "z [m]" with a unit, or Signals; those of a StateSpace, else x1 x2 ..., u1, y1
     nominal : values of the parameters, as {"k": 1.5}
     terms : the factors of each parameter, as {"k": (A1, B1, C1)}; None, or left out at the end: zeros
+    formulas : of the parameters, added to entries, as {"A_2_1": "-b / J"}; row and column from 1
+    limits : of parameters, (above, below), exclusive
     limit : of the inputs, one number for all or one for each; default: infinite
     noise : of the sensors, rms of a sample, one number for all or one for each; default: 0
     dead_time : s, from measurement to force; default: 0
@@ -91,29 +106,39 @@ def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Detai
     >>> cart = malta.linear_machine(A, B, C, name="cart", states=["z [m]", "v [m/s]"])
     >>> malta.linearize(cart, cart.at()).A.tolist()
     [[0.0, 1.0], [0.0, -0.1]]
+    >>> motor = malta.uncertain(
+    ...     lambda J, b: ([[-b / J]], [[1 / J]], [[1]]), {"J": 2e-3, "b": 0.1}
+    ... )
+    >>> malta.linear_machine(motor, name="motor").parameters.system.formulas
+    (('A_1_1', '-(b / J)'), ('B_1_1', '1 / J'))
     """
     for key in details:
         if key not in Details.__annotations__:
             known = " ".join(Details.__annotations__)
             raise InputError(CALLER, key, "an unknown detail", f"one of {known}")
     if B is None and C is None:
-        A, B, C, labels = _of_state_space(A)
-        details = {**labels, **details}
+        is_uncertain = all(hasattr(A, name) for name in ("matrices", "nominal", "limits", "approximate"))
+        A, B, C, own = (_of_uncertain if is_uncertain else _of_state_space)(A)
+        if both := sorted({"nominal", "terms", "formulas", "limits"} & own.keys() & details.keys()):
+            raise InputError(CALLER, both[0], "beside an uncertain system, which has its own", "none")
+        details = {**own, **details}
     matrices = (_matrix("A", A), _matrix("B", B), _matrix("C", C))
     n, m, p = len(matrices[0]), matrices[1].shape[1], len(matrices[2])
     for letter, M, shape in zip(LETTERS, matrices, ((n, n), (n, m), (p, n)), strict=True):
         if M.shape != shape or not M.size:
             raise InputError(CALLER, letter, f"shape {M.shape}", f"{shape}, at least 1 x 1")
-    nominal = details.get("nominal", {})
+    nominal, formulas = details.get("nominal", {}), details.get("formulas", {})
     system = LinearSystem(
         _signals("states", details.get("states"), "x", n),
         _signals("inputs", details.get("inputs"), "u", m),
         _signals("outputs", details.get("outputs"), "y", p),
         _rows(matrices),
-        _terms(nominal, details.get("terms", {}), matrices),
+        _terms(nominal, details.get("terms", {}), matrices, formulas),
         _numbers("limit", details.get("limit", math.inf), m, zero=False),
         _numbers("noise", details.get("noise", 0.0), p),
         _numbers("dead_time", details.get("dead_time", 0.0), 1)[0],
+        _formulas(formulas, nominal, matrices),
+        _limits(details.get("limits", {}), nominal),
     )
     if not math.isfinite(sum(system.noise) + system.dead_time):
         raise InputError(CALLER, "noise, dead_time", "infinity", "finite numbers")
@@ -127,13 +152,17 @@ def record_of(system: LinearSystem, values: Mapping[str, float], name: str) -> P
     if not isinstance(name, str) or not name or name in machine_names():
         raise InputError(CALLER, "name", repr(name), "a name that no other machine has")
     numbers = [float(v) if isinstance(v, Real) and not isinstance(v, bool) else v for v in values.values()]
-    return cast("Parameters", _record(tuple(values))(*numbers, system, name))
+    return cast("Parameters", _record(tuple(values), system.limits)(*numbers, system, name))
 
 
 @cache
-def _record(names: tuple[str, ...]) -> Callable[..., Any]:
-    """The class of parameters with these names, one for all machines with equal names."""
-    entries: list[Any] = [(name, float, si("1")) for name in names]
+def _record(names: tuple[str, ...], limits: tuple[tuple[str, float, float], ...]) -> Callable[..., Any]:
+    """The class of parameters with these names, one for all machines with equal names and limits."""
+    ends = {name: [end if math.isfinite(end) else None for end in own] for name, *own in limits}
+    sides = {name: ends.get(name, (None, None)) for name in names}
+    entries: list[Any] = [
+        (name, float, si("1", above=above, below=below)) for name, (above, below) in sides.items()
+    ]
     entries.append(("system", LinearSystem, field(metadata={"shapes": True})))
     entries.append(("preset", str, "linear"))
     own = {
@@ -146,7 +175,7 @@ def _record(names: tuple[str, ...]) -> Callable[..., Any]:
 
 def _reduce(record: Any) -> tuple[Any, ...]:
     """The arguments with which pickle rebuilds a record, because its class has no name in this module."""
-    values = {name: getattr(record, name) for name, _ in record.system.terms}
+    values = {one.name: getattr(record, one.name) for one in fields(record) if one.name not in RESERVED}
     return record_of, (record.system, values, record.preset)
 
 
@@ -162,6 +191,9 @@ def plant(par: Any) -> Plant:
     for name, terms in s.terms:
         p = getattr(par, name)
         A, B, C = (M + p * ca.sparsify(ca.DM(T)) for M, T in zip((A, B, C), terms, strict=True))
+    if s.formulas:
+        values = {one.name: getattr(par, one.name) for one in fields(par) if one.name not in RESERVED}
+        A, B, C = (_with_formulas(letter, M, s, values) for letter, M in zip(LETTERS, (A, B, C), strict=True))
 
     def position_of(y: Any) -> Any:
         a, b, c = (np.array(ca.DM(M)) for M in (A, B, C))
@@ -191,6 +223,23 @@ def plant(par: Any) -> Plant:
     return made
 
 
+def _with_formulas(letter: str, M: Any, s: LinearSystem, values: Mapping[str, Any]) -> Any:
+    """A matrix and the formulas that are added to its entries, at values of the parameters."""
+    added = {place: value_of(text, values) for place, text in s.formulas if place.startswith(letter)}
+    symbolic = next((type(v) for v in added.values() if isinstance(v, ca.SX | ca.MX)), None)
+    found = M if symbolic is None else symbolic(M)
+    for place, value in added.items():
+        row, column = _place(place)
+        found[row, column] += value
+    return found
+
+
+def _place(place: str) -> tuple[int, int]:
+    """Row and column, from 0."""
+    _, row, column = place.split("_")
+    return int(row) - 1, int(column) - 1
+
+
 def _states_at_rest(A: FloatArray, B: FloatArray, C: FloatArray, coordinates: int) -> FloatArray:
     """The matrix from outputs to states at rest; to the positions q of states (q, q')."""
     n, p, half = len(A), len(C), coordinates
@@ -203,6 +252,9 @@ def _states_at_rest(A: FloatArray, B: FloatArray, C: FloatArray, coordinates: in
 
 def _of_state_space(source: Any) -> tuple[Any, Any, Any, Details]:
     wanted = "matrices A, B, C, or a continuous control.StateSpace"
+    if callable(source) and not hasattr(source, "state_labels"):
+        found = "a function"
+        raise InputError(CALLER, "A", found, "what malta.uncertain(function, nominal values) makes of it")
     if not all(hasattr(source, name) for name in ("A", "B", "C", "D", "dt", "state_labels")):
         raise InputError(CALLER, "A", f"a {type(source).__name__} alone", wanted)
     if source.dt not in (0, None):
@@ -221,6 +273,45 @@ def _of_state_space(source: Any) -> tuple[Any, Any, Any, Details]:
     return source.A, source.B, source.C, labels
 
 
+def _of_uncertain(system: Any) -> tuple[Any, Any, Any, Details]:
+    """What `malta.uncertain` made: constant entries as they are, the others as formulas of the parameters."""
+    if system.sample_time is not None:
+        raise InputError(CALLER, "A", "an uncertain system in discrete time", "one in continuous time")
+    if system.approximate:
+        raise InputError(
+            CALLER, "A", f"an uncertain system that is not exact: {system.approximate}", "an exact one"
+        )
+    p = ca.SX.sym("p", len(system.names))
+    A, B, C, *more = system.matrices.call([p])
+    if more and ca.sparsify(more[0]).nnz():
+        raise InputError(CALLER, "D", "inputs that the outputs follow at once", "zeros")
+    if len(more) > 1:
+        E = ca.sparsify(more[1])
+        if not E.sparsity().is_diag():
+            raise InputError(
+                CALLER, "E", "an E(p) that is not diagonal", "a diagonal one, or A and B divided by it"
+            )
+        A, B = (ca.diag(1 / ca.diag(E)) @ M for M in (A, B))
+    base, formulas = [], {}
+    for letter, M in zip(LETTERS, (A, B, C), strict=True):
+        constant = np.zeros(M.shape)
+        for row, column in zip(*M.sparsity().get_triplet(), strict=True):
+            entry, place = ca.simplify(M[row, column]), f"{letter}_{row + 1}_{column + 1}"
+            if entry.is_constant():
+                constant[row, column] = float(entry)
+                continue
+            try:
+                formulas[place] = formula(entry, p, system.names)
+            except ValueError as error:
+                wanted = "a shorter one, or a machine of its own (malta new)"
+                raise InputError(CALLER, place, str(error), wanted) from error
+        base.append(constant)
+    nominal = dict(zip(system.names, system.nominal.tolist(), strict=True))
+    limits = dict(zip(system.names, system.limits, strict=False))
+    own: Details = {"nominal": nominal, "formulas": formulas, "limits": limits}
+    return base[0], base[1], base[2], own
+
+
 def _matrix(name: str, value: Any) -> FloatArray:
     try:
         found = np.array(value, dtype=float)
@@ -237,21 +328,57 @@ def _rows(matrices: Sequence[FloatArray]) -> tuple[Rows, Rows, Rows]:
     return A, B, C
 
 
+def _formulas(
+    given: Mapping[str, str], nominal: Mapping[str, float], matrices: Sequence[FloatArray]
+) -> tuple[tuple[str, str], ...]:
+    """The formulas, whose places and values at the nominal parameters are checked. Raises InputError."""
+    for place, text in given.items():
+        field = f"formulas.{place}"
+        known = PLACE.fullmatch(str(place))
+        shape = matrices[LETTERS.index(known[1])].shape if known else (0, 0)
+        if not known or int(known[2]) > shape[0] or int(known[3]) > shape[1]:
+            raise InputError(CALLER, field, "no entry of A, B or C", "A_2_1 for row 2 and column 1 of A")
+        if not isinstance(text, str):
+            raise InputError(CALLER, field, f"a {type(text).__name__}", 'a formula, as "-b / J"')
+        try:
+            value_of(text, {name: float(value) for name, value in nominal.items()})
+        except (TypeError, ValueError) as error:
+            raise InputError(CALLER, field, str(error), 'a formula of the parameters, as "-b / J"') from error
+    return tuple(sorted(given.items()))
+
+
+def _limits(given: Any, nominal: Mapping[str, float]) -> tuple[tuple[str, float, float], ...]:
+    """Limits by parameter, without those that are infinite on both sides. Raises InputError."""
+    found = []
+    for name, ends in (given if isinstance(given, Mapping) else {"": given}).items():
+        if name not in nominal:
+            raise InputError(CALLER, f"limits.{name}", "an unknown parameter", " ".join(nominal) or "none")
+        try:
+            above, below = map(float, ends)
+        except (TypeError, ValueError) as error:
+            raise InputError(CALLER, f"limits.{name}", repr(ends), "(above, below), two numbers") from error
+        if not above < below:
+            raise InputError(CALLER, f"limits.{name}", repr(ends), "(above, below), the lower one first")
+        if math.isfinite(above) or math.isfinite(below):
+            found.append((name, above, below))
+    return tuple(found)
+
+
 def _terms(
-    nominal: Any, terms: Any, base: Sequence[FloatArray]
+    nominal: Any, terms: Any, base: Sequence[FloatArray], formulas: Any
 ) -> tuple[tuple[str, tuple[Rows, Rows, Rows]], ...]:
     """The terms in the order of the nominal values. Raises InputError for names and shapes that do not fit."""
-    for what, given in (("nominal", nominal), ("terms", terms)):
+    for what, given in (("nominal", nominal), ("terms", terms), ("formulas", formulas)):
         if not isinstance(given, Mapping):
             raise InputError(CALLER, what, f"a {type(given).__name__}", "a table by parameter")
     for name in {**nominal, **terms}:
-        if name not in nominal or name not in terms:
+        if name not in nominal or (name not in terms and not formulas):
             where = "nominal" if name not in nominal else "terms"
             raise InputError(CALLER, f"{where}.{name}", "nothing", "a nominal value and its terms")
-        if not str(name).isidentifier() or keyword.iskeyword(name) or name in ("system", "preset"):
+        if not str(name).isidentifier() or keyword.iskeyword(name) or name in RESERVED:
             raise InputError(CALLER, f"nominal.{name}", "this name", "a name as Python has them")
     found = []
-    for name in nominal:
+    for name in [one for one in nominal if one in terms]:
         parts = (
             list(terms[name]) if isinstance(terms[name], tuple | list) else [terms[name], None, None, None]
         )

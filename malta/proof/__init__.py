@@ -4,6 +4,7 @@ A proof is read in this order: groups (the closed loop, split into groups of sta
 polynomial (their characteristic polynomials over a box) -> exclusion (no zero at any frequency) -> robust (the margin).
 
 uncertain, systems, box   what a user asks about: systems, compensators, ranges
+connections               uncertain systems in series, in parallel, in feedback
 robust, search            the margin: witness, proof, certificate
 machine                   a machine's model in its parameters
 polynomial                characteristic polynomials over boxes
@@ -23,6 +24,11 @@ from malta.contents import contents
 if TYPE_CHECKING:
     from malta.proof.blocks.blocks import Dynamic as Dynamic
     from malta.proof.blocks.gain import Gain as Gain
+    from malta.proof.connections import append as append
+    from malta.proof.connections import feedback as feedback
+    from malta.proof.connections import parallel as parallel
+    from malta.proof.connections import random_systems as random_systems
+    from malta.proof.connections import series as series
     from malta.proof.margin import Margin as Margin
     from malta.proof.robust import margin_of_polynomial as margin_of_polynomial
     from malta.proof.uncertain import Compensator as Compensator

@@ -87,6 +87,35 @@ class UncertainSystem:
             made.append(matrix)
         return made
 
+    def state_space(self, **values: float) -> Any:
+        """The known system at given values of parameters, SI, and nominal ones of the others: a control.StateSpace.
+
+        Raises InputError for unknown parameters, values that are no numbers, and a system without a value there.
+
+        >>> import malta
+        >>> motor = malta.uncertain(lambda J: ([[-0.1 / J]], [[1 / J]], [[1]]), {"J": 2e-3})
+        >>> motor.state_space(J=1e-3).poles().real.tolist()
+        [-100.0]
+        """
+        import control
+
+        p = self.nominal.copy()
+        for name, value in values.items():
+            if name not in self.names:
+                raise InputError(
+                    "state_space", name, "an unknown parameter", "one of " + " ".join(self.names)
+                )
+            p[self.names.index(name)] = number("state_space", name, value)
+        A, B, C, *more = (M[0] for M in self.every(p))
+        D = more[0] if more else np.zeros((len(C), B.shape[1]))
+        if not all(np.isfinite(M).all() for M in (A, B, C, D, *more)) or (
+            len(more) > 1 and np.linalg.det(more[1]) == 0
+        ):
+            raise InputError("state_space", "matrices", "no value there", "parameters within their limits")
+        if len(more) > 1:
+            A, B = np.linalg.solve(more[1], A), np.linalg.solve(more[1], B)
+        return control.ss(A, B, C, D, 0 if self.sample_time is None else self.sample_time)
+
 
 @dataclass(frozen=True, eq=False)
 class Compensator:

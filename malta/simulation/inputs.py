@@ -153,7 +153,8 @@ def lagging_references(c: Controller, v_ff: FloatArray) -> FloatArray:
     decay = _decay(c)
     acting = np.vstack([np.repeat(v_ff[:1], c.delay, axis=0), v_ff])[: len(v_ff) - 1]
     given = np.vstack([v_ff[:1], (1 - decay) * acting])
-    rows = np.array([np.ones(len(given)), np.full(len(given), -decay)])  # lagging_k - decay lagging_(k-1) = given_k
+    # lagging_k - decay lagging_(k-1) = given_k
+    rows = np.array([np.ones(len(given)), np.full(len(given), -decay)])
     return np.asarray(linalg.solve_banded((1, 0), rows, given))
 
 

@@ -19,6 +19,7 @@ from conftest import refusal
 import malta
 from malta.gains import encodings
 from malta.loops.sampled_loops import machine_system
+from malta.model.formulas import formula, value_of
 from malta.model.plant import Plant, Signal
 from malta.simulation.experiments.catalogue import jump
 from malta.synthesis.pid import pid as design_pid
@@ -249,7 +250,7 @@ def test_labels_come_from_the_system() -> None:
     assert [s.name for s in numbered.states] == ["x1", "x2", "x3"]
 
 
-ONE = {"A": [[1.0]], "B": [[1.0]], "C": [[1.0]]}
+ONE: dict[str, Any] = {"A": [[1.0]], "B": [[1.0]], "C": [[1.0]]}
 
 
 @pytest.mark.parametrize(
@@ -284,7 +285,7 @@ ONE = {"A": [[1.0]], "B": [[1.0]], "C": [[1.0]]}
         (
             {"nose": 1},
             "nose: found an unknown detail, expected one of "
-            "name states inputs outputs nominal terms limit noise dead_time (did you mean 'noise'?)",
+            "name states inputs outputs nominal terms formulas limits limit noise dead_time (did you mean 'noise'?)",
         ),
     ],
 )
@@ -295,8 +296,135 @@ def test_bad_matrices_get_one_sentence(given: dict[str, Any], sentence: str) -> 
 
 
 @pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        (
+            {"formulas": {"A_2_1": "k"}},
+            "formulas.A_2_1: found no entry of A, B or C, expected A_2_1 for row 2",
+        ),
+        ({"formulas": {"A_1_1": 2}}, "formulas.A_1_1: found a int, expected a formula"),
+        ({"formulas": {"A_1_1": "q / 2"}}, "formulas.A_1_1: found 'q', which is none of the parameters k"),
+        ({"formulas": {"A_1_1": "__import__('os')"}}, "found \"__import__('os')\", which no formula has"),
+        ({"formulas": {"A_1_1": "1 / (k - 1)"}}, "found no value (float division by zero)"),
+        ({"formulas": {"A_1_1": "(" * 300 + "k" + ")" * 300}}, "found no formula"),
+        ({"formulas": {"A_1_1": "-" * 3000 + "k"}}, "found too many brackets in brackets"),
+        ({"formulas": {"A_1_1": "k" * 4001}}, "found 4001 characters, of at most 4000"),
+        ({"formulas": {"A_1_1": "9**9**9**9"}}, "found no value"),
+        ({"formulas": {"A_1_1": "(-k)**0.5"}}, "not a finite number"),
+        ({"limits": {"q": (0, 1)}}, "limits.q: found an unknown parameter, expected k"),
+        ({"limits": {"k": (2, 0)}}, "limits.k: found (2, 0), expected (above, below), the lower one first"),
+        ({"limits": {"k": 1}}, "limits.k: found 1, expected (above, below), two numbers"),
+        ({"limits": {"k": (1, 2)}}, "k: found 1"),
+    ],
+)
+def test_bad_formulas_get_one_sentence(given: dict[str, Any], sentence: str) -> None:
+    details = {**ONE, "nominal": {"k": 1}, "formulas": {"A_1_1": "k"}, **given}
+    with pytest.raises(malta.InputError) as caught:
+        malta.linear_machine(**details)
+    assert sentence in str(caught.value)
+
+
+k, m = ca.SX.sym("k"), ca.SX.sym("m")
+EXPRESSIONS = [
+    -2 * k / (m + 1) ** 2, k - (m - k), -(k * m), -(k**2), k**-1.5, 1 / (k * m), 2 * (k + m), k / (m / k), k * -m,
+    ca.sqrt(k) * ca.sin(-m), ca.exp(-k / m), m**k, (m**k) ** k, m ** (k**m), k + (m + k), 0.1 + k, ca.tanh(k) - 1e-30,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
+def test_a_formula_gives_back_its_expression_to_the_bit(expression: Any) -> None:
+    text = formula(expression, ca.vertcat(k, m), ["k", "m"])
+    back = ca.Function("both", [k, m], [expression, value_of(text, {"k": k, "m": m})])
+    rng = np.random.default_rng(1)
+    for one in rng.uniform(0.2, 3, (5, 2)).tolist():
+        wanted, found = map(float, back(*one))
+        assert wanted == found
+        assert value_of(text, dict(zip("km", one, strict=True))) == pytest.approx(wanted, rel=1e-14)
+
+
+def geared(J: Any, b: Any, k: Any) -> Any:
+    """A motor on a negative spring: every entry depends on J, and not linearly."""
+    return [[0, 1], [k / J, -b / J]], [[0], [1 / J]], [[1, 0]]
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_an_uncertain_system_is_a_machine(suffix: str, tmp_path: Path) -> None:
+    """It is designed, proven, simulated and stored, with the poles and the margin of the uncertain system."""
+    system = malta.uncertain(geared, {"J": 2e-3, "b": 0.1, "k": 5.0}, limits={"J": (0, np.inf)})
+    machine = malta.linear_machine(system, name="geared", states=["q [rad]", "w [rad/s]"])
+    model = malta.linearize(machine, machine.at())
+    (A,), (B,), _ = system.at(system.nominal)
+    assert np.array_equal(model.A, A)
+    assert np.array_equal(model.B, B)
+    law = malta.lqg(model, malta.weights([1e6, 0], [1], [1e-2], [1e-12]), Ts=1e-3, name="geared")
+    report = malta.verify(model, law, {"J": 0.2, "b": 0.2, "k": 0.3})
+    assert report.robust is not None
+    malta.gains.write(law, report, tmp_path / f"geared{suffix}")
+    found = malta.gains.read(tmp_path / f"geared{suffix}")
+    assert found.parameters == law.parameters
+    assert pickle.loads(pickle.dumps(found.parameters)) == law.parameters
+    again = malta.uncertain(malta.plant_of(found.parameters), ["J", "b", "k"])
+    assert again.limits[0] == (0, np.inf)
+    for row in np.random.default_rng(2).uniform(0.5, 2, (4, 3)) * system.nominal:
+        for one, other in zip(again.at(row), system.at(row), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-15)
+    assert report.robust.witness is not None
+    lost = malta.linear_machine(
+        malta.uncertain(geared, dict(report.robust.witness), limits={"J": (0, np.inf)}),
+        name="geared", states=["q [rad]", "w [rad/s]"],
+    )  # fmt: skip
+    radius = malta.verify(malta.linearize(lost, lost.at()), law).stages[-1].spectral_radius
+    assert radius == pytest.approx(1, abs=1e-7)
+
+
+def test_a_campaign_varies_what_formulas_have() -> None:
+    machine = malta.linear_machine(malta.uncertain(geared, {"J": 2e-3, "b": 0.1, "k": 5.0}), name="geared")
+    model = malta.linearize(machine, machine.at())
+    law = malta.lqg(model, malta.weights([1e6, 0], [1], [1e-2], [1e-12]), Ts=1e-3)
+    found = malta.campaign(malta.campaigns.Plan(law, "step", {"J": 0.2}, samples=12, options={"time": 0.05}))
+    values = dict(zip(found.names, found.values[3], strict=True))
+    other = malta.linear_machine(malta.uncertain(geared, {"b": 0.1, "k": 5.0} | values), name="geared")
+    alone = malta.experiment("step", other, law, time=0.05, noise=0.0).cases[0].run
+    rms = float(np.sqrt(((alone.p - alone.reference) ** 2).mean()))
+    assert rms == pytest.approx(found.batch.rms[3, 0], rel=1e-6)
+    assert np.ptp(found.batch.rms[:, 0]) > 1e-3 * rms
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "sentence"),
+    [
+        (lambda k: ([[k]], [[1]], [[1]], [[1]]), {}, "D: found inputs that the outputs follow at once"),
+        (
+            lambda k: ([[k]], [[1]], [[1]]),
+            {"sample_time": 0.1},
+            "A: found an uncertain system in discrete time",
+        ),
+        (
+            lambda k: (np.eye(2) * k, np.eye(2), np.eye(2), np.zeros((2, 2)), [[1, k], [0, 1]]),
+            {},
+            "E: found an E",
+        ),
+        (lambda k: ([[ca.fabs(k)]], [[1]], [[1]]), {}, "A_1_1: found operation"),
+    ],
+)
+def test_uncertain_systems_that_are_no_machine_get_one_sentence(
+    source: Any, options: Any, sentence: str
+) -> None:
+    with pytest.raises(malta.InputError, match=sentence):
+        malta.linear_machine(malta.uncertain(source, {"k": 1.0}, **options))
+
+
+def test_a_mass_in_E_divides_its_row() -> None:
+    machine = malta.linear_machine(
+        malta.uncertain(lambda k: ([[3.0]], [[2.0]], [[1]], [[0]], [[k]]), {"k": 4.0}), name="divided"
+    )
+    assert malta.linearize(machine, machine.at()).A.item() == 0.75
+
+
+@pytest.mark.parametrize(
     ("source", "field"),
     [
+        (lambda k: k, "A: found a function, expected what malta.uncertain"),
         (control.ss([[0.5]], [[1]], [[1]], 0, 0.1), "A: found a discrete system, dt = 0.1"),
         (control.ss([[0.5]], [[1]], [[1]], 1), "D: found inputs that the outputs follow at once"),
         (np.eye(2), "A: found a ndarray alone"),

@@ -1,0 +1,304 @@
+"""Uncertain systems in series, side by side, in parallel and in feedback, with each other and with known systems.
+
+    series      y = G2 G1 u         parallel    y = (G1 + G2) u
+    side by side  y = diag(G1, G2) u    feedback    y = G (u + sign K y)
+
+Parameters of the same name are one parameter. What is known may be a control.StateSpace or TransferFunction, or a
+matrix of gains. The result is an uncertain system of its own: its margin, gains over the box and samples are asked as
+of any other, and `malta.linear_machine` makes a machine of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import InputError
+from malta.model.plant import readonly
+from malta.proof.box import box_of
+from malta.proof.systems import compensator_of
+from malta.proof.uncertain import UncertainSystem, describe, plural
+
+if TYPE_CHECKING:
+    from malta.proof.margin import Ranges
+
+MOST_SYSTEMS = 100_000
+LARGEST_LOOP = 4  # signals of an algebraic loop, whose matrix is inverted by minors
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """Matrices in the symbols of all parameters."""
+
+    A: Any
+    B: Any
+    C: Any
+    D: Any
+    E: Any
+
+
+def series(*systems: Any) -> UncertainSystem:
+    """Connect systems one after the other: the first takes u, the last gives y.
+
+    systems : UncertainSystems, control.StateSpaces, TransferFunctions or matrices of gains; at least one uncertain
+
+    Returns an UncertainSystem.
+
+    Raises InputError for shapes, sample times and nominal values that do not fit.
+
+    >>> import control, malta
+    >>> mass = malta.uncertain(
+    ...     lambda m: ([[0, 1], [0, 0]], [[0], [1 / m]], [[1, 0]]), {"m": 0.1}
+    ... )
+    >>> lagging = malta.proof.series(
+    ...     control.tf([500], [1, 500]), mass
+    ... )  # a drive of 500 rad/s
+    >>> print(malta.robust_margin(lagging, control.tf([-40, -800], [1, 80]), {"m": 0.5}))
+    proven 197.57 %, lost at 197.57 % at 168.5 rad/s
+    """
+    caller = "series"
+    whole = _Connection.of(systems, caller)
+    found = whole.parts[0]
+    for k, after in enumerate(whole.parts[1:], 2):
+        if after.B.shape[1] != found.C.shape[0]:
+            before = plural(found.C.shape[0], "output")
+            raise InputError(
+                caller, f"system {k}", plural(after.B.shape[1], "input"), f"as many as the {before} before"
+            )
+        found = _Parts(
+            ca.vertcat(
+                ca.horzcat(found.A, ca.SX(found.A.shape[0], after.A.shape[0])),
+                ca.horzcat(after.B @ found.C, after.A),
+            ),
+            ca.vertcat(found.B, after.B @ found.D),
+            ca.horzcat(after.D @ found.C, after.C),
+            after.D @ found.D,
+            ca.diagcat(found.E, after.E),
+        )  # fmt: skip
+    return whole.system(found)
+
+
+def append(*systems: Any) -> UncertainSystem:
+    """Put systems side by side, each with inputs and outputs of its own: y = diag(G1, G2, ...) u.
+
+    The arguments, the result and the errors are those of `series`.
+
+    >>> import malta
+    >>> one = malta.uncertain(lambda k: ([[-k]], [[1]], [[1]]), {"k": 2.0})
+    >>> both = malta.proof.append(one, [[3.0]])
+    >>> both.state_space(k=5).D.tolist()
+    [[0.0, 0.0], [0.0, 3.0]]
+    """
+    whole = _Connection.of(systems, "append")
+    return whole.system(whole.side_by_side())
+
+
+def parallel(*systems: Any) -> UncertainSystem:
+    """Add the outputs of systems with the same inputs: y = (G1 + G2 + ...) u.
+
+    The arguments, the result and the errors are those of `series`.
+
+    >>> import malta
+    >>> one = malta.uncertain(lambda k: ([[-k]], [[1]], [[1]]), {"k": 2.0})
+    >>> malta.proof.parallel(one, one).state_space(k=4).dcgain().item()
+    0.5
+    """
+    whole = _Connection.of(systems, "parallel")
+    first = whole.parts[0].D.shape
+    for k, part in enumerate(whole.parts, 1):
+        if part.D.shape != first:
+            raise InputError("parallel", f"system {k}", f"shape {part.D.shape}", f"{first}, as the first")
+    both, count = whole.side_by_side(), len(systems)
+    into, out = ca.repmat(ca.DM.eye(first[1]), count, 1), ca.repmat(ca.DM.eye(first[0]), 1, count)
+    return whole.system(_Parts(both.A, both.B @ into, out @ both.C, out @ both.D @ into, both.E))
+
+
+def feedback(system: Any, law: Any, sign: int = -1) -> UncertainSystem:
+    """Close a loop: y = G (u + sign K y), as control.feedback does for known systems.
+
+    law : K, from y to what is added to u
+    sign : -1, or +1, which the laws of malta take
+
+    The other arguments, the result and the errors are those of `series`. Raises InputError too where I - sign D_K D_G
+    is singular, or an algebraic loop has more than LARGEST_LOOP signals.
+
+    >>> import control, malta
+    >>> mass = malta.uncertain(
+    ...     lambda m: ([[0, 1], [0, 0]], [[0], [1 / m]], [[1, 0]]), {"m": 0.1}
+    ... )
+    >>> closed = malta.proof.feedback(mass, control.tf([40, 800], [1, 80]))
+    >>> for known in malta.proof.random_systems(closed, 2, {"m": 0.5}, seed=1):
+    ...     print(f"{control.damp(known, doprint=False)[1].min():.2f}")
+    0.19
+    0.16
+    """
+    caller = "feedback"
+    whole = _Connection.of((system, law), caller)
+    if sign not in (-1, 1):
+        raise InputError(caller, "sign", describe(sign), "-1 or 1")
+    G, K = whole.parts
+    if K.D.shape != G.D.shape[::-1]:
+        raise InputError(caller, "law", f"shape {K.D.shape}", f"{G.D.shape[::-1]}, from y to u")
+    # e = u + sign (C_K x_K + D_K y), y = C_G x_G + D_G e, so that Q e = u + sign (C_K x_K + D_K C_G x_G)
+    Q = ca.SX.eye(G.D.shape[1]) - sign * K.D @ G.D
+    e_from_x = _solve(Q, sign * ca.horzcat(K.D @ G.C, K.C), caller)
+    e_from_u = _solve(Q, ca.SX.eye(G.D.shape[1]), caller)
+    n, k = G.A.shape[0], K.A.shape[0]
+    y_from_x = ca.horzcat(G.C, ca.SX(G.C.shape[0], k)) + G.D @ e_from_x
+    y_from_u = G.D @ e_from_u
+    return whole.system(
+        _Parts(
+            ca.vertcat(
+                ca.horzcat(G.A, ca.SX(n, k)) + G.B @ e_from_x,
+                ca.horzcat(ca.SX(k, n), K.A) + K.B @ y_from_x,
+            ),
+            ca.vertcat(G.B @ e_from_u, K.B @ y_from_u),
+            y_from_x,
+            y_from_u,
+            ca.diagcat(G.E, K.E),
+        )
+    )
+
+
+def random_systems(system: UncertainSystem, count: int, ranges: Ranges, seed: int = 0) -> list[Any]:
+    """Draw known systems from a box, each parameter uniformly in its range: for plots beside what is proven of all.
+
+    ranges : by parameter: 0.2 is +-20 % of the nominal value, (low, high) an interval in SI; others stay nominal
+
+    Returns `count` control.StateSpaces; the same for the same seed.
+
+    Raises InputError for unknown parameters, ranges beyond their limits, and a count that is no whole number.
+
+    >>> import malta
+    >>> motor = malta.uncertain(lambda J: ([[-0.1 / J]], [[1 / J]], [[1]]), {"J": 2e-3})
+    >>> [
+    ...     f"{known.poles().real.item():.1f}"
+    ...     for known in malta.proof.random_systems(motor, 3, {"J": 0.2})
+    ... ]
+    ['-47.4', '-55.1', '-61.2']
+    """
+    caller = "random_systems"
+    if not isinstance(system, UncertainSystem):
+        raise InputError(caller, "system", describe(system), "what malta.uncertain makes")
+    if isinstance(count, bool) or not isinstance(count, int) or not 0 < count <= MOST_SYSTEMS:
+        raise InputError(caller, "count", describe(count), f"a whole number from 1 to {MOST_SYSTEMS}")
+    box = box_of(system.names, system.nominal, system.limits, ranges, {}, caller=caller)
+    if box.most <= 1:
+        raise InputError(caller, "ranges", f"a box in which {box.ends}", "ranges within the limits")
+    rows = np.random.default_rng(seed).uniform(-1, 1, (count, len(system.names)))
+    drawn = system.nominal + np.where(rows < 0, rows * box.down, rows * box.up)
+    return [system.state_space(**dict(zip(system.names, row, strict=True))) for row in drawn.tolist()]
+
+
+def _solve(Q: Any, right: Any, caller: str) -> Any:
+    """Q^-1 times a matrix, of symbols; Q of a loop without direct paths is 1."""
+    if ca.sparsify(Q - ca.SX.eye(Q.shape[0])).nnz() == 0:
+        return right
+    if Q.shape[0] > LARGEST_LOOP:
+        found = f"an algebraic loop of {Q.shape[0]} signals"
+        raise InputError(caller, "D", found, f"at most {LARGEST_LOOP}, or a system without a direct path")
+    if ca.sparsify(ca.simplify(ca.det(Q))).nnz() == 0:
+        raise InputError(
+            caller, "D", "an algebraic loop without a solution", "I - sign D_K D_G that is not singular"
+        )
+    return ca.inv_minor(Q) @ right
+
+
+@dataclass(frozen=True, eq=False)
+class _Connection:
+    """Systems in the symbols of their common parameters."""
+
+    p: Any
+    names: tuple[str, ...]
+    nominal: tuple[float, ...]
+    limits: tuple[tuple[float, float], ...]
+    sample_time: float | None
+    approximate: str
+    positive: tuple[Any, ...]
+    parts: tuple[_Parts, ...]
+
+    @classmethod
+    def of(cls, systems: Sequence[Any], caller: str) -> _Connection:
+        """Read the systems, of which at least one is uncertain, and their parameters. Raises InputError."""
+        uncertain = [one for one in systems if isinstance(one, UncertainSystem)]
+        if not uncertain:
+            raise InputError(caller, "systems", "no uncertain system", "at least one, of malta.uncertain")
+        nominal: dict[str, float] = {}
+        limits: dict[str, tuple[float, float]] = {}
+        for one in uncertain:
+            ends = one.limits or ((-np.inf, np.inf),) * len(one.names)
+            for name, value, (above, below) in zip(one.names, one.nominal.tolist(), ends, strict=True):
+                if nominal.setdefault(name, value) != value:
+                    raise InputError(
+                        caller, name, f"nominal values {nominal[name]:g} and {value:g}", "one value"
+                    )
+                low, high = limits.get(name, (-np.inf, np.inf))
+                limits[name] = max(low, above), min(high, below)
+        symbols = {name: ca.SX.sym(name) for name in nominal}
+        times = {_sample_time(one, caller) for one in systems} - {_ANY}
+        if len(times) > 1:
+            found = ", ".join(sorted("continuous" if T is None else f"{T:g} s" for T in times))
+            raise InputError(
+                caller, "sample_time", found, "one for all systems; control.c2d samples a continuous one"
+            )
+        return cls(
+            ca.vertcat(*symbols.values()), tuple(nominal), tuple(nominal.values()), tuple(limits.values()),
+            times.pop(),
+            "; ".join(dict.fromkeys(one.approximate for one in uncertain if one.approximate)),
+            tuple(one.positive(_own(one, symbols)) for one in uncertain if one.positive is not None),
+            tuple(_parts(one, symbols) for one in systems),
+        )  # fmt: skip
+
+    def side_by_side(self) -> _Parts:
+        return _Parts(*(ca.diagcat(*(getattr(part, letter) for part in self.parts)) for letter in "ABCDE"))
+
+    def system(self, found: _Parts) -> UncertainSystem:
+        """The uncertain system of matrices in the common symbols; E and D only where there are any."""
+        A, B, C, D, E = (ca.sparsify(M) for M in (found.A, found.B, found.C, found.D, found.E))
+        plain_E = ca.sparsify(E - ca.SX.eye(E.shape[0])).nnz() == 0
+        matrices = [A, B, C] if plain_E and not D.nnz() else [A, B, C, D] if plain_E else [A, B, C, D, E]
+        positive = ca.Function("positive", [self.p], [ca.vertcat(*self.positive)]) if self.positive else None
+        return UncertainSystem(
+            self.names,
+            readonly(np.array(self.nominal)),
+            ca.Function("matrices", [self.p], matrices),
+            self.limits,
+            self.sample_time,
+            self.approximate,
+            positive,
+        )
+
+
+_ANY = -1.0  # the sample time of gains, which fit every system
+
+
+def _sample_time(one: Any, caller: str) -> float | None:
+    if isinstance(one, UncertainSystem):
+        return one.sample_time
+    if not hasattr(one, "dt"):
+        return _ANY
+    if one.dt is True:
+        raise InputError(caller, "dt", "True", "0, or a sample time in seconds")
+    return float(one.dt) if one.dt else None
+
+
+def _own(one: UncertainSystem, symbols: dict[str, Any]) -> Any:
+    return ca.vertcat(*(symbols[name] for name in one.names))
+
+
+def _parts(one: Any, symbols: dict[str, Any]) -> _Parts:
+    """The matrices of one system; those of a known one are constant."""
+    if isinstance(one, UncertainSystem):
+        A, B, C, *more = one.matrices.call([_own(one, symbols)])
+        D = more[0] if more else ca.SX(C.shape[0], B.shape[1])
+        return _Parts(A, B, C, D, more[1] if len(more) > 1 else ca.SX.eye(A.shape[0]))
+    shape = np.shape(one) if not hasattr(one, "ninputs") else (one.noutputs, one.ninputs)
+    outputs, inputs = shape if len(shape) == 2 else (1, 1)
+    law = compensator_of(one, inputs, outputs)
+    n = len(law.A)
+    A, B, C, D = (ca.SX(ca.sparsify(ca.DM(M))) for M in (law.A, law.B, law.C, law.D))
+    return _Parts(A, B.reshape((n, inputs)), C.reshape((outputs, n)), D, ca.SX.eye(n))
