@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
+    from malta.model.coils import Allocation as Allocation
+    from malta.model.coils import allocation as allocation
     from malta.model.data import published as published
     from malta.model.linearize import InverseCheck as InverseCheck
     from malta.model.linearize import LinearModel as LinearModel

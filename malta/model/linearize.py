@@ -179,8 +179,10 @@ def jacobians(
     kind = type(x)
     y, i = kind.sym("y", C.shape[0]), kind.sym("i", len(plant.actuator.coils))
     made, wanted = plant.forces(x, i), (believed or plant).currents(y, v)
-    here = plant.h(x, u)
-    (carried,) = ca.substitute([wanted], [y], [here])
+    here = ca.densify(
+        plant.h(x, u)
+    )  # a sensor or coil may be zero always: substitute asks for equal patterns
+    carried = ca.densify(ca.substitute([wanted], [y], [here])[0])
 
     def at(expression: Any) -> Any:
         return ca.substitute([expression], [y, i], [here, carried])[0]

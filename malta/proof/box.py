@@ -137,7 +137,11 @@ def box_of(
         down[i], up[i] = (-below(-away) for away in rates_of(nominal, value))
         for limit, rate in ((low, down[i]), (high, up[i])):
             if rate > 0 and abs(limit - nominal) / rate < most:
-                most, ends = abs(limit - nominal) / rate, f"{name} reaches its limit {limit:g}"
+                # the limit of what may be zero is the double below
+                most, ends = (
+                    abs(limit - nominal) / rate,
+                    f"{name} reaches its limit {round(limit, 300) + 0.0:g}",
+                )
     if not (down + up).any() and not empty:
         raise InputError(caller, "ranges", "no parameters", "at least one uncertain parameter")
     return Box(names, at, down, up, fixed, most, ends=ends)
