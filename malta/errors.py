@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 LONGEST = 300  # characters of a sentence
@@ -38,6 +39,7 @@ class InputError(ValueError):
     field : the entry or the argument
     found : what stands there
     expected : what should
+    among : names of which one was meant, where `expected` does not list them as "one of ..."
 
     >>> import malta
     >>> try:
@@ -47,11 +49,13 @@ class InputError(ValueError):
     presets: no preset 'table9'
     """
 
-    def __init__(self, where: str | Path, field: str, found: str, expected: str) -> None:
+    def __init__(
+        self, where: str | Path, field: str, found: str, expected: str, among: Iterable[str] = ()
+    ) -> None:
         self.where, self.field = str(where), field
         file = shorten(self.where, MOST_OF_FILE, head=0.25)
         subject = ": ".join(filter(None, (file, shorten(field, MOST_OF_FIELD))))
-        hint = _suggestion(field, found, expected)
+        hint = _suggestion(field, found, list(among) or _names_in(expected))
         room = LONGEST - len(f"{subject}: found , expected {hint}")
         whole = len(on_one_line(expected))
         self.found = shorten(found, max(room // 2, room - whole))
@@ -59,23 +63,30 @@ class InputError(ValueError):
         super().__init__(f"{subject}: found {self.found}, expected {self.expected}{hint}")
 
 
-def _suggestion(field: str, found: str, expected: str) -> str:
-    """The question that ends a refusal, where the expected names have one that is like the one that was typed."""
+def _names_in(expected: str) -> list[str]:
+    """The names that a sentence lists: "c or fmu", "all, or one of x y", "one of bases.state: x y, or a number"."""
     if re.fullmatch(r"[\w-]+( or [\w-]+)+", expected):
-        names = expected.replace(" or ", ", ")
-    elif expected.startswith("one of "):
-        names = expected.removeprefix("one of ").partition(", or ")[0].replace("'", "")
-    else:
-        return ""
-    from difflib import get_close_matches  # where something is wrong already
+        return expected.split(" or ")
+    listed = re.search(r"\b(?:one|some) of (?:[\w.]+: )?(.*)", " ".join(expected.split()))
+    if listed is None:
+        return re.findall(r"'([^']+)'", expected) if expected.startswith("'") else []
+    names = listed[1].partition(", or ")[0].replace("'", "").replace(" or ", ", ")
+    return names.split(", ") if ", " in names else names.split()
 
-    known = {name.lower(): name for name in (names.split(", ") if ", " in names else names.split())}
-    quoted = re.findall(r"'([^']+)'", found)
-    for typed in [*quoted, *([] if quoted else [re.split(r"[.:] ?", field)[-1]])]:
-        close = get_close_matches(typed.lower(), known, n=1)
-        if close and known[close[0]] != typed:
-            return f" (did you mean {known[close[0]]!r}?)"
-    return ""
+
+def _suggestion(field: str, found: str, names: Sequence[str]) -> str:
+    """The question that ends a refusal, where one of the expected names is like the one that was typed."""
+    if not names:
+        return ""
+    from difflib import SequenceMatcher, get_close_matches  # where something is wrong already
+
+    known = {name.lower(): name for name in reversed(names)}  # the first of those that differ in case alone
+    likely: dict[str, float] = {}
+    for whole in re.findall(r"'([^']+)'", found) or [field]:
+        for typed in {whole, *(re.split(mark, whole)[-1] for mark in (r"[.:] ?", r"[.:]? "))} - set(names):
+            for name in get_close_matches(typed.lower(), known, n=1):
+                likely[known[name]] = SequenceMatcher(None, name, typed.lower()).ratio()
+    return f" (did you mean {max(likely, key=lambda name: likely[name])!r}?)" if likely else ""
 
 
 class CheckError(ArithmeticError):

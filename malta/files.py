@@ -289,15 +289,25 @@ def read_file(
 
 
 def _neighbour(path: Path) -> str:
-    """The question that ends a refusal, where a file of nearly that name stands beside it."""
+    """The question that ends a refusal, where a file of nearly that name stands, or a folder of nearly its folder's."""
+    here = path.parent if path.parent.is_dir() else _most_like(path.parent)
+    other = here and (here / path.name if file_exists(here / path.name) else _most_like(here / path.name))
+    return f" (did you mean {other}?)" if other else ""
+
+
+def _most_like(path: Path) -> Path | None:
+    """The file or folder beside a path whose name is most like its own, those of its kind first; None: none is."""
     from difflib import get_close_matches  # where something is wrong already
 
     try:
-        names = [entry.name for entry in islice(path.parent.iterdir(), MANY) if entry.suffix == path.suffix]
-    except OSError:
-        return ""
-    close = get_close_matches(path.name, names, n=1, cutoff=0.8)
-    return f" (did you mean {path.with_name(close[0])}?)" if close else ""
+        names = [entry.name for entry in islice(path.parent.iterdir(), MANY)]
+    except (OSError, ValueError):
+        return None
+    for some in ([name for name in names if Path(name).suffix == path.suffix], names):
+        close = get_close_matches(path.name, some, n=1, cutoff=0.8)
+        if close:
+            return path.with_name(close[0])
+    return None
 
 
 def _refused(path: Path, error: OSError | ValueError) -> InputError:

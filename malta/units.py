@@ -162,6 +162,29 @@ def _quoted(unit: str) -> str:
     return repr(unit if len(unit) <= 40 else f"{unit[:37]}...")
 
 
+def units_like(unit: str, si_unit: str) -> list[str]:
+    """Units of the dimension of another, each with one name in the place of one that is like it; for a refusal."""
+    from difflib import get_close_matches  # where something is wrong already
+
+    known, others = [], [si_unit]
+    columns = [line.split(" = ") for line in UNITS.strip().splitlines()]
+    for names in ([column[0] for column in columns], [column[min(2, len(column) - 1)] for column in columns]):
+        prefixes = ["", *(name[:-1] for name in names if name.endswith("-"))]
+        known += [prefix + name for name in names if name.isalpha() for prefix in prefixes]
+    for token in set(re.findall(r"[^\W\d_]+", unit[:LONGEST])):
+        near = get_close_matches(token, known, n=20, cutoff=0.4)
+        others += [re.sub(rf"(?<![^\W\d_]){token}(?![^\W\d_])", name, unit) for name in near]
+    return [other for other in others if is_unit_of(other, si_unit)]
+
+
+def is_unit_of(unit: str, si_unit: str) -> bool:
+    """Whether a text is a unit of the dimension of another, as "um" of "m"."""
+    try:
+        return _root_units(unit)[1] == _root_units(si_unit)[1]
+    except Exception:  # pint raises many kinds, tokenizer errors among them
+        return False
+
+
 def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -> float:
     """Convert a value to `si_unit` ("kg", "m/s", "N m", ...).
 
@@ -177,10 +200,10 @@ def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -
     try:
         factor, found_root = _root_units(unit)
     except Exception as error:  # pint raises many kinds, tokenizer errors among them
-        raise InputError(where, f"{name}.unit", _quoted(unit), expected) from error
+        raise InputError(where, f"{name}.unit", _quoted(unit), expected, units_like(unit, si_unit)) from error
     si_factor, si_root = _root_units(si_unit)
     if found_root != si_root:
-        raise InputError(where, f"{name}.unit", _quoted(unit), expected)
+        raise InputError(where, f"{name}.unit", _quoted(unit), expected, units_like(unit, si_unit))
     ratio: float = factor / si_factor
     whole = round(1 / ratio) if ratio < 1 else 0
     # Dividing by a power of ten is exact where multiplying is not: 50 us is 5e-05, not 4.9999...e-05.

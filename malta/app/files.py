@@ -119,7 +119,7 @@ class DesignFiles:
         checked: dict[str, Value] = {}
         for key, value in values.items():
             if key not in self.fields:
-                raise InputError(where, str(key), "an unknown entry", "a field of the page")
+                raise InputError(where, str(key), "an unknown entry", "a field of the page", self.fields)
             found = check_value(self.fields[key], value, where)
             if found != self.fields[key].value:
                 checked[key] = found

@@ -117,7 +117,7 @@ def _update(file: Path, designs: Sequence[Path]) -> None:
     for place in find_tables(text, str(file)):
         for name in place.designs:
             if name not in known:
-                raise InputError(file, place.machine, name, "one of " + " ".join(sorted(known)))
+                raise InputError(file, place.machine, repr(name), "one of " + " ".join(sorted(known)))
         specs.append([read_design(known[name]) for name in place.designs])
     with progress_bar("claims") as progress:
         ledgers = _compute_each(specs, progress)

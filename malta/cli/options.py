@@ -479,7 +479,8 @@ def read_changed_design(file: Path, changes: list[str] | None) -> Spec:
             raise InputError("--set", name, "a change of it", "another design file")
         if name.partition(".")[0] not in DesignFile.model_fields:
             expected = f"one of {' '.join(units)}, or an entry of the design file"
-            raise InputError("--set", name, "an unknown parameter", expected)
+            known = [*units, *DesignFile.model_fields]
+            raise InputError("--set", name, "an unknown parameter", expected, known)
     values = read_assignments("--set", of_machine, units)
     change_machine(spec.parameters, of_machine)  # which says what is wrong with a value
     changed = read_design(file, values, others)

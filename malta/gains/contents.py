@@ -374,7 +374,9 @@ def _parameters(plant: PlantTable, path: str | Path) -> Parameters:
     needed = set(units) - set(later_parameters(record))
     odd = sorted(set(given) - set(units) | needed - set(given))
     if odd:
-        raise InputError(path, "plant.parameters", f"{odd[0]} missing or unknown", " ".join(units))
+        raise InputError(
+            path, "plant.parameters", f"{odd[0]!r} missing or unknown", "one of " + " ".join(units)
+        )
     for key, q in given.items():
         if q.unit != units[key]:
             raise InputError(path, f"plant.parameters.{key}.unit", repr(q.unit), repr(units[key]))

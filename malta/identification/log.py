@@ -25,7 +25,7 @@ from malta.simulation.current_control import reading_errors
 from malta.simulation.excitation import Multisine
 from malta.simulation.layout import Loop
 from malta.simulation.simulate import prepare
-from malta.units import to_si
+from malta.units import is_unit_of, to_si
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -100,7 +100,7 @@ class Log:
         for name in names:
             if name not in known:
                 raise InputError(
-                    self.source, GROUPS[group] + name, "no such column", f"one of {group}: {known}"
+                    self.source, GROUPS[group] + name, "no such column", f"one of {group}: {' '.join(known)}"
                 )
         return np.asarray(self.columns[group][:, [known.index(name) for name in names]])
 
@@ -451,14 +451,13 @@ def _group_of(heading: str, path: Path) -> str:
     for group, prefix in GROUPS.items():
         if prefix and heading.startswith(prefix):
             return group
-    name, unit = _parts(heading, path)
+    unit = _parts(heading, path)[1]
     for si_unit, group in (("m", "y"), ("rad", "y"), ("N", "v"), ("N m", "v"), ("A", "i"), ("V", "u")):
-        try:
-            to_si(1.0, unit, si_unit, path, name)
-        except InputError:
-            continue
-        return group
-    raise InputError(path, heading, f"unit {unit!r}", "m, rad, N, N m, A or V, or a prefix as ref. or flag.")
+        if is_unit_of(unit, si_unit):
+            return group
+    raise InputError(
+        path, heading, f"unit {unit!r}", "one of m, rad, N, N m, A, V, or a prefix as ref. or flag."
+    )
 
 
 def _parts(heading: str, path: Path) -> tuple[str, str]:
@@ -477,16 +476,11 @@ def _in_si(table: FloatArray, headings: list[str], path: Path) -> tuple[FloatArr
     table, signals = np.array(table, dtype=float), []
     for k, heading in enumerate(headings):
         name, unit = _parts(heading, path)
-        for si_unit in SI_UNITS:
-            try:
-                factor = to_si(1.0, unit, si_unit, path, name)
-            except InputError:
-                continue
-            table[:, k] *= factor
-            signals.append(Signal(name, si_unit))
-            break
-        else:
+        si_unit = next((one for one in SI_UNITS if is_unit_of(unit, one)), None)
+        if si_unit is None:
             raise InputError(path, heading, f"unit {unit!r}", "one of " + ", ".join(SI_UNITS))
+        table[:, k] *= to_si(1.0, unit, si_unit, path, name)
+        signals.append(Signal(name, si_unit))
     return table, tuple(signals)
 
 

@@ -28,6 +28,7 @@ from malta.loops.classical import Disk, disk_sizes
 from malta.loops.loop import Loop, loop
 from malta.margins.loop_report import zone
 from malta.model.data import plant_of
+from malta.model.parameters import units_of
 
 if TYPE_CHECKING:
     from malta.identification.log import Log
@@ -225,13 +226,14 @@ def measure(
         raise InputError("measure", "logs", "none", "at least one log")
     plant = plant_of(controller.parameters if parameters is None else parameters)
     predicted = loop(plant, controller)
+    box = dict(uncertainty or {})
+    loops = _machines(predicted, box, seed)
     lines = [found for log in logs for found in lines_of(log, predicted)]
     w = np.unique(np.array([line.w for line in lines]))
     cut = cut_loop(predicted, w)
     columns = columns_of(lines, w, cut.G)
     names = tuple(s.name for s in plant.outputs), tuple(s.name for s in plant.inputs)
-    box = dict(uncertainty or {})
-    machines = [cut_loop(one, w) for one in _machines(predicted, box, seed)]
+    machines = [cut_loop(one, w) for one in loops]
     (S, T, L, SP, largest), deviation = _curves(columns, cut, machines)
     source = ", ".join(log.source for log in logs)
     law = _law_misses(lines, cut, w)
@@ -403,8 +405,9 @@ def _machines(predicted: Loop, box: Mapping[str, float], seed: int) -> list[Loop
     par = predicted.plant.parameters
     names, shares = list(box), np.array(list(box.values()))
     for name in names:
-        if not hasattr(par, name):
-            raise InputError("measure", f"uncertainty.{name}", "an unknown parameter", "one of the machine's")
+        if name not in units_of(par):
+            expected = "one of " + " ".join(units_of(par))
+            raise InputError("measure", f"uncertainty.{name}", "an unknown parameter", expected)
     if not names:
         return [predicted]
     corners = list(product((-1.0, 1.0), repeat=len(names))) if len(names) <= CORNERS else []

@@ -163,7 +163,7 @@ def load_vector(plant: Plant, name: str, load: Mapping[str, float]) -> FloatArra
     known = [s.name for s in plant.disturbances]
     for disturbance in load:
         if disturbance not in known:
-            raise InputError("recovery", name, disturbance, "one of " + (" ".join(known) or "none"))
+            raise InputError("recovery", name, repr(disturbance), "one of " + (" ".join(known) or "none"))
     return np.array([load.get(disturbance, 0.0) for disturbance in known])
 
 

@@ -153,7 +153,7 @@ def require_part(part: Part, name: str) -> ModuleType:
     module = part_of(part, name)
     if module is None:
         known = ", ".join(other for other in machine_names() if part_of(part, other) is not None)
-        raise InputError(part, "machine", repr(name), f"one that malta has {part} of: {known}")
+        raise InputError(part, "machine", repr(name), f"one of {known}, or another that has {part}")
     return module
 
 

@@ -193,7 +193,7 @@ def _trace(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: s
         own = inspect.signature(source).parameters.values()
     except (TypeError, ValueError) as error:
         found = "a function whose parameters cannot be read"
-        raise InputError(caller, "source", found, "one of the parameters " + " ".join(names)) from error
+        raise InputError(caller, "source", found, "a function of " + " ".join(names)) from error
     named = [q for q in own if q.kind in (q.POSITIONAL_OR_KEYWORD, q.KEYWORD_ONLY)]
     # An argument with a default that is no parameter here keeps it.
     wanted = [q.name for q in named if q.default is q.empty or q.name in names]
@@ -207,7 +207,7 @@ def _trace(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: s
         found = f"a function that cannot be traced ({first})"
         raise InputError(caller, "source", found, "numpy and CasADi operations") from error
     found = "a function of " + " ".join(wanted) if wanted else "a function without named parameters"
-    raise InputError(caller, "source", found, "the parameters " + " ".join(names))
+    raise InputError(caller, "source", found, "the parameters " + " ".join(names), names)
 
 
 def _affine_matrices(source: Any, p: Any, names: tuple[str, ...], terms: Mapping[str, Any]) -> list[Any]:

@@ -125,8 +125,9 @@ def stages_of(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Pl
         known = units_of(plant.parameters)
         for name in values:
             if name not in known:
+                expected = "one of " + " ".join(known)
                 raise InputError(
-                    f"scenario {scenario.name}", f"changes.{name}", "an unknown parameter", " ".join(known)
+                    f"scenario {scenario.name}", f"changes.{name}", "an unknown parameter", expected
                 )
             if name in shape_parameters(plant.parameters):
                 found = "a parameter that shapes the machine's functions"

@@ -351,7 +351,9 @@ def _specification(content: DesignFile, spec: Spec) -> dict[str, Any]:
             other = " or ".join(f"an {one}" if one == "LQG" else f"a {one}" for one in known[name].laws)
             raise InputError(path, f"specification.{name}", f"a requirement of {other}", " ".join(able))
         if name not in known:
-            raise InputError(path, f"specification.{name}", "an unknown requirement", " ".join(able))
+            raise InputError(
+                path, f"specification.{name}", "an unknown requirement", "one of " + " ".join(able)
+            )
     given = specification_table(able.values(), table, path)
     asked: dict[str, float] = {}
     recovery: dict[str, RecoveryBound] = {}

@@ -214,10 +214,12 @@ def with_published(
     if isinstance(node, dict):
         if set(node) == {"published"}:
             found: Any = printed()
+            tables = {name: table for name, table in found.items() if isinstance(table, dict)}
+            known = [*found, *(f"{name}.{key}" for name, table in tables.items() for key in table)]
             for key in str(node["published"]).split("."):
                 if not isinstance(found, dict) or key not in found:
                     source = machine_file.parent / "published" / machine_file.name
-                    raise InputError(where, field, repr(node["published"]), f"a table of {source}")
+                    raise InputError(where, field, repr(node["published"]), f"a table of {source}", known)
                 found = found[key]
             if not _is_numeric(found):
                 expected = "the name of a number, a quantity or a table of them"

@@ -29,7 +29,7 @@ from pydantic import Field, StrictStr
 from malta.errors import CheckError, InputError
 from malta.model.plant import Signal, readonly
 from malta.tables import Quantity, Record, entry
-from malta.units import to_si
+from malta.units import is_unit_of, to_si, units_like
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant
@@ -138,7 +138,12 @@ def ordered(
 ) -> list[Any]:
     """The entries in the order of the signals, one for each."""
     names = [s.name for s in signals]
-    if set(entries) != set(names):
+    for name in entries:
+        if name not in names:
+            raise InputError(
+                where, f"{field}.{name}", f"none of the {len(names)} {what}", "one of " + " ".join(names)
+            )
+    if len(entries) < len(names):
         raise InputError(
             where,
             field,
@@ -188,19 +193,16 @@ def variances(
     variances = []
     for q, s in zip(ordered(entries, signals, where, field, what), signals, strict=True):
         name = f"{field}.{s.name}"
-        try:
+        squared = f"({s.unit})^2"
+        if is_unit_of(q.unit, s.unit):
             deviation = positive(to_si(q.value, q.unit, s.unit, where, name), where, name, s.unit)
-            variances.append(positive(deviation * deviation, where, name, f"({s.unit})^2"))
-        except InputError as error:
-            if not error.field.endswith(".unit"):
-                raise
-            squared = f"({s.unit})^2"
-            try:
-                variance = to_si(q.value, q.unit, squared, where, name)
-            except InputError:
-                expected = f"a unit of {s.unit} (standard deviation) or {s.unit}^2 (variance)"
-                raise InputError(where, f"{name}.unit", repr(q.unit), expected) from None
-            variances.append(positive(variance, where, name, squared))
+            variance = deviation * deviation
+        elif is_unit_of(q.unit, squared):
+            variance = to_si(q.value, q.unit, squared, where, name)
+        else:
+            expected = f"a unit of {s.unit} (standard deviation) or {s.unit}^2 (variance)"
+            raise InputError(where, f"{name}.unit", repr(q.unit), expected, units_like(q.unit, s.unit))
+        variances.append(positive(variance, where, name, squared))
     return np.array(variances)
 
 
@@ -319,7 +321,8 @@ def _load(
         return load, slope
     if name not in units:
         known = " ".join(units) or "none"
-        raise InputError(path, f"{field}.load", "nothing", f"a load, or the name of a disturbance: {known}")
+        expected = f"a load, or the name of a disturbance: {known}"
+        raise InputError(path, f"{field}.load", f"nothing, and {name!r}", expected, units)
     return tuple(float(disturbance == name) for disturbance in units), slope
 
 
@@ -341,18 +344,13 @@ def _outputs(table: RecoveryTable, plant: Plant, path: Path, field: str) -> Sequ
     known = {s.name: s for s in plant.outputs}
     for name in table.outputs or ():
         if name not in known:
-            raise InputError(path, f"{field}.outputs", repr(name), "outputs: " + " ".join(known))
+            raise InputError(path, f"{field}.outputs", repr(name), "one of " + " ".join(known))
     return [known[name] for name in table.outputs or known]
 
 
 def _unit(quantity: Quantity, signals: Sequence[Signal], path: Path, field: str) -> str:
     """The SI unit of the outputs that a bound is of: the one that its own unit converts to."""
     units = list(dict.fromkeys(s.unit for s in signals))
-    for unit in units[:-1]:
-        try:
-            to_si(1.0, quantity.unit, unit, path, field)
-        except InputError:
-            continue
-        return unit
-    to_si(1.0, quantity.unit, units[-1], path, field)
-    return units[-1]
+    unit = next((one for one in units if is_unit_of(quantity.unit, one)), units[-1])
+    to_si(1.0, quantity.unit, unit, path, field)
+    return unit

@@ -447,7 +447,9 @@ def place_of(
         return "filter", (), "s", False
     table, _, name = entry.rpartition(".")
     if table not in tables:
-        raise InputError(where, field, repr(entry), "an entry as bases.state.x: " + " ".join(tables))
+        raise InputError(
+            where, field, repr(entry), "an entry as bases.state.x, in one of " + " ".join(tables)
+        )
     weight, signals, squared = tables[table]
     names = [s.name for s in signals]
     if name not in names:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 import subprocess
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,13 +32,15 @@ from malta.firmware.supervisor import (
     MONITORS,
     STATES,
     TIMES,
+    TOUCH,
     TRANSITIONS,
     State,
     bounds_of,
     monitors_of,
     reference_limits,
+    touch_bounds,
 )
-from malta.firmware.supervisor_text import monitor_lines, supervisor_members, supervisor_sources
+from malta.firmware.supervisor_text import _NUMBERS, monitor_lines, supervisor_members, supervisor_sources
 from malta.machines.tubular.experiments.faults import SOFT
 from malta.simulation.engine.compiled import compiler
 
@@ -891,3 +894,21 @@ def test_faults_are_chosen_by_a_word_and_fly_with_their_own_engine() -> None:
             malta.experiment("commissioning", malta.plant_of(c.parameters), c, engine=engine)
     with pytest.raises(InputError, match="only"):
         malta.experiment("supervised-faults", malta.plant_of(c.parameters), c, only="lunch")
+
+
+def test_a_cushioned_clearance_is_used_up_at_a_share_of_it() -> None:
+    """Contact is linear in a reading: radial ones are at TOUCH of where they would be without a touchdown bearing."""
+    plant = malta.plant_of(TARGETS["robust"].controller.parameters)
+    hard = touch_bounds(replace(plant, cushioned=(False,) * len(plant.contacts)))
+    assert touch_bounds(plant) / hard == pytest.approx([TOUCH, TOUCH, TOUCH, TOUCH, 1], rel=1e-6)
+
+
+def test_fades_bound_the_derivatives_of_their_polynomials() -> None:
+    """Moves are quintic, with 3/4 of speed and acceleration; a rate ends with (1 - u)^3 (u + 3 u^2)."""
+    u = np.linspace(0, 1, 10001)
+    quintic = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
+    ending = np.polynomial.Polynomial([1, -1]) ** 3 * np.polynomial.Polynomial([0, 1, 3])
+    assert _NUMBERS["fade_speed"] == pytest.approx(abs(quintic.deriv()(u)).max() / 0.75, rel=1e-6)
+    assert _NUMBERS["fade_acceleration"] == pytest.approx(abs(quintic.deriv(2)(u)).max() / 0.75, rel=1e-6)
+    largest = abs(ending.deriv(2)(u)).max()
+    assert largest <= _NUMBERS["fade_rate"] < 1.01 * largest

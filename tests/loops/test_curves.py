@@ -20,6 +20,7 @@ from malta.loops.linear_loops import linear_loop
 from malta.loops.locus import _changes, root_locus
 from malta.loops.time_domain import loop_steps, step_figures
 from malta.simulation.references import Motion
+from malta.synthesis.recovery import StepResponse
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant
@@ -290,8 +291,9 @@ def test_a_pair_of_systems_is_a_plant_and_its_controller() -> None:
         ((control.tf([1], [1, 1]), control.tf([1], [1, 1], 0.1)), "dt"),
         ((control.ss(-np.eye(2), np.eye(2), [[1.0, 0.0]], np.zeros((1, 2))),), "2 inputs and 1 outputs"),
         ((s,), "a TransferFunction"),
+        ((malta.linear_machine([[0]], [[1]], [[1]]),), "a Plant"),
     ],
-    ids=["number", "sample times", "not square", "improper"],
+    ids=["number", "sample times", "not square", "improper", "plant alone"],
 )
 def test_what_is_no_loop_is_refused(arguments: tuple[Any, ...], message: str) -> None:
     with pytest.raises(malta.InputError, match=message):
@@ -312,6 +314,14 @@ def test_steps_are_those_of_python_control(name: str) -> None:
     assert 100 * found.overshoot == pytest.approx(info["Overshoot"], abs=0.5)
     assert found.rise == pytest.approx(info["RiseTime"], rel=0.05)
     assert found.settling == pytest.approx(info["SettlingTime"], rel=0.05)
+
+
+def test_a_rise_is_read_between_samples() -> None:
+    """10 % at 1 + 0.05/0.45 s, 90 % at 2 + 0.4/0.5 s."""
+    y = np.array([0.0, 0.05, 0.5, 1.0, 1.0]).reshape(-1, 1, 1)
+    assert step_figures(StepResponse(np.arange(5.0), y, np.ones((1, 1))), 0, 0).rise == pytest.approx(
+        2.8 - 1 - 1 / 9
+    )
 
 
 def test_loads_are_those_of_recovery(machine: Machine) -> None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
@@ -147,26 +146,6 @@ def test_names_that_are_typed_wrong_are_asked_for() -> None:
     assert str(malta.InputError("--to", "", "'fmuu'", "c or fmu")).endswith("(did you mean 'fmu'?)")
     with pytest.raises(malta.InputError, match=r"no such file.*\(did you mean data/tubular\.toml\?\)"):
         malta.read("data/tubuler.toml")
-
-
-@pytest.mark.parametrize(
-    ("line", "says"),
-    [
-        ("simulate TABLE2 --option fidelty=force", "(did you mean 'fidelity'?)"),
-        ("simulate TABLE2 --option distanc=3mm", "(did you mean 'distance'?)"),
-        ("simulate TABLE2 --sensor offest_x1=2um", "(did you mean 'offset_x1'?)"),
-        ("simulate TABLE2 --engine compild", "(did you mean 'compiled'?)"),
-        ("campaign TABLE2 --study rare --limit deviation-y11=3um", "(did you mean 'deviation-y1'?)"),
-        ("campaign TABLE2 --spread K_a=2%", "(did you mean 'K_A'?)"),
-        ("plot TABLE2 bode --at sensor", "(did you mean 'sensors'?)"),
-        ("plot TABLE2 bodee", "(did you mean 'bode'?)"),
-        ("export TABLE2 --part controler --to fmu", "(did you mean 'controller'?)"),
-    ],
-)
-def test_a_typed_name_is_asked_for(run: Run, line: str, says: str) -> None:
-    code, _, err = run(*line.replace("TABLE2", "design/gains/table2.json").split())
-    assert code == 2
-    assert says in err, err
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ from test_many_parameters import asked, chain, ranges
 
 import malta
 from malta.proof.certificate.checked_multipliers import refusal
-from malta.proof.multipliers.structured import Proof, Shown
+from malta.proof.multipliers.multipliers import Blocks, Multiplier
+from malta.proof.multipliers.structured import Proof, Shown, worst
 
 
 @cache
@@ -92,3 +93,10 @@ def test_a_box_with_an_unstable_loop_is_refused() -> None:
     sides = proof.box.sides(t)
     whole = with_cells(proof, lambda cells: [c._replace(cell=replace(c.cell, sides=sides)) for c in cells])
     assert "a cell from" in refusal(replace(whole, layers=(whole.layers[-1]._replace(t=t),)))
+
+
+def test_no_parameter_is_worst_where_none_has_an_effect() -> None:
+    N, D = np.diag([2.0, 1.0]) + 0j, np.eye(2) + 0j
+    m = Multiplier(D, np.zeros((2, 2), dtype=complex), Blocks((1, 1)))
+    assert worst(N, m, np.array([1, 0]), 2, 7) == 1  # the direction of the larger gain
+    assert worst(N, m, np.array([-1, -1]), 2, 7) == 7

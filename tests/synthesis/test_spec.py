@@ -222,16 +222,16 @@ FAULTS = {  # old text, new text; field, found, expected
         "each of the 5 inputs (fx_B1 fy_B1 fx_B2 fy_B2 f_D)",
     ),
     "too many weights": (
-        INPUT, INPUT_WEIGHTS.replace(" }", ", f_E = 1 }"), "weights.input",
-        "6 entries (fx_B1 fy_B1 fx_B2 fy_B2 f_D f_E)", "5 inputs",
+        INPUT, INPUT_WEIGHTS.replace(" }", ", f_E = 1 }"), "weights.input.f_E",
+        "none of the 5 inputs", "one of fx_B1 fy_B1 fx_B2 fy_B2 f_D",
     ),
     "weights of other signals": (
-        STATE, 'state = { published = "table_II.input" }', "weights.state", "5 entries (fx_B1",
-        "10 states (x y z alpha beta x_dot y_dot z_dot alpha_dot beta_dot)",
+        STATE, 'state = { published = "table_II.input" }', "weights.state.fx_B1", "none of the 10 states",
+        "one of x y z alpha beta x_dot y_dot z_dot alpha_dot beta_dot",
     ),
     "integral weights of other signals": (
-        INTEGRAL, 'integral = { published = "table_II.input" }', "weights.integral", "(fx_B1",
-        "5 measured signals (x1 y1 x2 y2 z)",
+        INTEGRAL, 'integral = { published = "table_II.input" }', "weights.integral.fx_B1",
+        "none of the 5 measured signals", "one of x1 y1 x2 y2 z",
     ),
     "negative": (INPUT, INPUT_WEIGHTS.replace("0.1", "-0.1"), "weights.input.f_D", "-0.1", "above 0"),
     "zero input weight": (INPUT, INPUT_WEIGHTS.replace("0.1", "0"), "weights.input.f_D", "0", "above 0"),
@@ -250,8 +250,8 @@ FAULTS = {  # old text, new text; field, found, expected
     "bases of no kind": ('input = "SI"', 'input = "metric"', "bases.input", "'metric'", '"SI"'),
     "no bases": ('input = "SI"', "", "bases.input", "nothing", "key"),
     "noise of other signals": (
-        SENSOR, 'sensor = { published = "table_II.process_noise" }', "noise.sensor", "(fx_B1",
-        "(x1 y1 x2 y2 z)",
+        SENSOR, 'sensor = { published = "table_II.process_noise" }', "noise.sensor.fx_B1",
+        "none of the 5 measured signals", "one of x1 y1 x2 y2 z",
     ),
     "unit of a noise": (
         PROCESS, "process = " + quantities(dict.fromkeys(FORCES, 1.0), "m"),
