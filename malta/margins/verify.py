@@ -128,15 +128,20 @@ def linear_report(
 
 
 def _nominal_report(model: LinearModel, controller: Controller, current_loops: CurrentLoops) -> LoopReport:
-    whole = loop_of_model(model, controller)
-    machine = whole.sampled
     loops = {
         "sampled": sampled_loop(model, controller, delay=controller.delay),
         "+ current loops": sampled_loop(model, controller, delay=controller.delay, current_loops="lag"),
-        "machine": machine,
     }
     names = [s.name for s in controller.measurements]
     stages = tuple(stage_of(name, stage, names) for name, stage in loops.items())
+    found = machine_report(model, controller)
+    return replace(found, stages=(*stages, *found.stages), current_loops=current_loops)
+
+
+def machine_report(model: LinearModel, controller: Controller) -> LoopReport:
+    """The report of the machine's loop alone, without the stages before it: what a page shows at each move."""
+    whole = loop_of_model(model, controller)
+    stage = stage_of("machine", whole.sampled, [s.name for s in controller.measurements])
     empty = np.zeros(0, dtype=complex)
     regulator, observer = (empty, empty) if controller.cost is None else controller_poles(controller)
     poles = Poles(
@@ -145,11 +150,8 @@ def _nominal_report(model: LinearModel, controller: Controller, current_loops: C
         filter=continuous_poles(observer, controller.sample_time),
         closed_loop=whole.poles,
     )
-    bandwidths = bandwidths_of(model, controller, machine, stable=stages[-1].stable)
-    extent = extent_of(model.plant)
-    return LoopReport(
-        model, controller, poles, stages, bandwidths, extent=extent, current_loops=current_loops
-    )
+    bandwidths = bandwidths_of(model, controller, whole.sampled, stable=stage.stable)
+    return LoopReport(model, controller, poles, (stage,), bandwidths, extent=extent_of(model.plant))
 
 
 def _grid(Ts: float) -> FloatArray:

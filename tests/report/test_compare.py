@@ -18,8 +18,8 @@ from rich.console import Console
 from test_report_page import HOSTILE, STRANGE, cart_controller
 
 from malta.cli.documents.loops import compare_output
-from malta.margins.loop_report import MEANINGS, LoopFigure, best_of, four_digits
 from malta.margins.verify import linear_report
+from malta.merits import MEANINGS, Merit, best_of, figure, four_digits
 from malta.report.page.analysis import Subject
 from malta.report.page.comparison import Comparison, Row, compare, comparison_tables, names_of
 from malta.report.page.report import comparison_page
@@ -120,8 +120,8 @@ def test_names_stay_distinguishable() -> None:
     assert found[1:3] == ("b/one.json (1)", "b/one.json (2)")
 
 
-def score(value: float, kind: str = "peak_s") -> LoopFigure:
-    return LoopFigure(kind, "key", "label", value, "1", 1.0)
+def score(value: float, kind: str = "peak_s") -> Merit:
+    return figure(kind, "key", "label", value, "1")
 
 
 def test_the_best_is_better_in_digits_that_are_shown() -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from malta.margins.loop_report import zone
+from malta.model.parameters import box_words
 from malta.model.signals import axis_units
 from malta.proof.margin import NOT_PROVEN, unproven
 from malta.report.tables.design import bandwidth_table, loop_poles_table, recovery_table, sensitivity_table
@@ -64,8 +65,7 @@ def loop_tables(
 
 def _margin_tables(found: LoopReport) -> Iterator[Table | Paragraph]:
     """The margins of the stages, over the travel and of each parameter, and what they leave open."""
-    box = "  ".join(f"{name} +-{100 * share:g} %" for name, share in found.uncertainty.items())
-    yield Paragraph(f"Uncertainty: {box}\n")
+    yield Paragraph(f"Uncertainty: {box_words(found.uncertainty, found.plant.parameters)}\n")
     yield chain_table(found)
     if missing := found.left_out:
         yield Paragraph(f"Not in the last stage: {missing}\n")
