@@ -443,7 +443,7 @@ def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:
     classical: list[Classical | None] = []
     for positions in places_along(q.plant, q.controller, q.names, q.current_loops):
         proven_at = positions if q.whole else positions[:1]  # else a place takes as long as the whole travel
-        margin = _smallest([q.margin_at(z) for z in proven_at]) if q.proof else NOT_PROVEN
+        margin = smallest_margin([q.margin_at(z) for z in proven_at]) if q.proof else NOT_PROVEN
         loops = [q.loaded_loop_at(z) for z in positions]
         peak = float(np.max([peak_sensitivity(loop, "sensors") for loop in loops]))
         sides = [classical_margins(loop, sensors) if loop.stable else None for loop in loops]
@@ -455,7 +455,7 @@ def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:
     return tuple(places), worst_of(classical)
 
 
-def _smallest(margins: Sequence[Margin]) -> Margin:
+def smallest_margin(margins: Sequence[Margin]) -> Margin:
     """One margin that holds at several places: the smallest lower and the smallest upper bound."""
     lower = None if any(m.lower is None for m in margins) else min(m.lower or 0.0 for m in margins)
     reason = "; ".join(dict.fromkeys(m.reason for m in margins if m.reason))

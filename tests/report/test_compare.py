@@ -23,7 +23,7 @@ from malta.merits import MEANINGS, Merit, best_of, figure, four_digits
 from malta.report.page.analysis import Subject
 from malta.report.page.comparison import Comparison, Row, compare, comparison_tables, names_of
 from malta.report.page.report import comparison_page
-from malta.report.tables.margins import _position_text
+from malta.report.tables.margins import position_text
 
 if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
@@ -198,4 +198,4 @@ def test_an_unstable_design_is_compared_and_ends_with_exit_code_1(run: Run) -> N
 def test_places_along_a_travel_are_in_millimetres_and_others_as_they_are() -> None:
     travel: Any = SimpleNamespace(stroke=0.01, course="z")
     speed: Any = SimpleNamespace(stroke=0.0, course="Omega")
-    assert [_position_text(one, 1.5e-3) for one in (travel, speed)] == ["1.5", "0.0015"]
+    assert [position_text(one, 1.5e-3) for one in (travel, speed)] == ["1.5", "0.0015"]

@@ -170,7 +170,7 @@ def open_bounds(found: LoopReport) -> list[str]:
     margins = [(link.name, link.margin) for link in found.chain]
     margins += [(_coverage_text(found), found.travel)] if found.extent.intervals else []
     unit = " mm" if found.extent.stroke else ""
-    margins += [(f"at {_position_text(found.extent, p.position)}{unit}", p.margin) for p in found.places]
+    margins += [(f"at {position_text(found.extent, p.position)}{unit}", p.margin) for p in found.places]
     alone = [
         (f"{name} {way}", m)
         for name, both in found.tolerance.items()
@@ -448,7 +448,7 @@ def places_table(found: LoopReport) -> Table:
         unstable = math.isnan(place.peak)
         add_row(
             table,
-            _position_text(extent, place.position),
+            position_text(extent, place.position),
             *(_margin_cells(place.margin) if proven else ()),
             "unstable" if unstable else f"{place.peak:.2f}",
             "" if unstable else zone(place.peak),
@@ -458,7 +458,7 @@ def places_table(found: LoopReport) -> Table:
     return table
 
 
-def _position_text(extent: Extent, position: float) -> str:
+def position_text(extent: Extent, position: float) -> str:
     """A place along the travel, mm, or along a parameter."""
     if extent.stroke:
         return f"{round(position * 1e3, 6):.4g}"
