@@ -19,11 +19,10 @@ from malta.app.files import Edited
 from malta.errors import CheckError, InputError
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.loop import Loop, loop_of_model
-from malta.loops.sampled_loops import continuous_poles
-from malta.loops.time_domain import noise_of
-from malta.margins.loop_report import BANDWIDTHS, MEANINGS, Stage, zone
+from malta.margins.loop_report import BANDWIDTHS, LoopReport, pole_figures, zone
 from malta.margins.travel import travel_loops
-from malta.margins.verify import bandwidths_of, controller_poles, stage_of
+from malta.margins.verify import machine_report
+from malta.merits import Merit, figure
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.proof.loss import RayBound, ray_bound
@@ -32,11 +31,11 @@ from malta.simulation.experiments.catalogue import cases_of, main_job, series_of
 from malta.simulation.inputs import feedforward, motion_of, past_forces
 from malta.simulation.period import state_reference
 from malta.synthesis.lqg import synthesize
-from malta.synthesis.riccati import eigenvalues
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from malta.loops.sampled_loops import SampledLoop
-    from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.model.plant import FloatArray, Plant, Signal
     from malta.simulation.experiments import PlannedRun
     from malta.simulation.references import Motion
     from malta.simulation.scenario import Scenario
@@ -185,19 +184,14 @@ class Problem:
         return loop_of_model(self.model, self.controller)
 
     @cached_property
-    def stage(self) -> Stage:
-        """Its peak sensitivities, as `malta.verify` has them."""
-        return stage_of("machine", self.loop.sampled, [s.name for s in self.controller.measurements])
+    def report(self) -> LoopReport:
+        """What is known of it without a proof, the record of `malta.verify`."""
+        return machine_report(self.model, self.controller)
 
     @cached_property
     def curves(self) -> LoopCurves:
         """Its frequency responses and the margins of its channels."""
         return loop_curves(self.loop)
-
-    @cached_property
-    def poles(self) -> ComplexArray:
-        """Poles of the closed loop, rad/s, as `malta.verify` has them."""
-        return self.loop.poles
 
 
 def solve(edited: Edited) -> Problem:
@@ -229,7 +223,7 @@ def picture(problem: Problem, view: View, first: int | None = None, *, margin: b
 
     Raises CheckError where no input holds the machine.
     """
-    stage = problem.stage
+    stage = problem.report.stages[-1]
     with np.errstate(all="ignore"):  # an unstable loop runs away
         return {
             "stable": stage.stable,
@@ -245,12 +239,14 @@ def picture(problem: Problem, view: View, first: int | None = None, *, margin: b
 
 def _poles(problem: Problem) -> dict[str, list[list[float]]]:
     """The poles of the continuous machine, of regulator, filter and closed loop, rad/s, as rows [re, im]."""
-    c, Ts = problem.controller, problem.controller.sample_time
-    sets = {"machine": eigenvalues(problem.model.A), "closed loop": problem.poles}
-    if c.cost is not None:
-        regulator, observer = controller_poles(c)
-        sets |= {"regulator": continuous_poles(regulator, Ts), "filter": continuous_poles(observer, Ts)}
-    return {name: [[float(s.real), float(s.imag)] for s in found] for name, found in sets.items()}
+    poles = problem.report.poles.pairs
+    sets = {
+        "machine": "open_loop",
+        "closed loop": "closed_loop",
+        "regulator": "regulator",
+        "filter": "filter",
+    }
+    return {name: poles[key] for name, key in sets.items() if poles[key]}
 
 
 def _frequency(curves: LoopCurves) -> dict[str, Any]:
@@ -289,7 +285,7 @@ def curves(name: str, t: FloatArray, reference: FloatArray, p: FloatArray, v: Fl
 def _load(problem: Problem, view: View) -> dict[str, Any] | None:
     """The outputs under a unit of one disturbance, until little of it is left; None without disturbances."""
     names = [s.name for s in problem.plant.disturbances]
-    if not names or not problem.stage.stable:
+    if not names or not problem.report.stable:
         return None
     k = names.index(view.load) if view.load in names else 0
     answer = problem.loop.sampled.answer()
@@ -326,58 +322,59 @@ def margin_document(bound: RayBound) -> dict[str, Any]:
     return {"upper": upper, "at": dict(bound.at), "frequency": bound.frequency, "ray": bound.ray}
 
 
-class Merit(NamedTuple):
-    """A figure of the comparison, of a kind of MEANINGS."""
+# The figures that pinned designs are compared by: those of the report, with the words of a narrow column, and of the
+# run and the load that are drawn. Numbers are SI but for angles.
 
-    label: str
-    value: float
-    unit: str
-    kind: str
-    note: str = ""
 
-    @property
-    def document(self) -> dict[str, Any]:
-        """The figure for the page: which side is better is +1 (larger), -1 (smaller) or 0."""
-        shown = {"label": self.label, "value": self.value, "unit": self.unit, "note": self.note}
-        better = {"high": 1, "low": -1, "": 0}[MEANINGS[self.kind].better]
-        return shown | {"value": self.value if math.isfinite(self.value) else None, "better": better}
+SHORT = {
+    "peak_sensitivity": "peak |S|",
+    "bandwidth_sigma_max_T": "bandwidth, T",
+    "bandwidth_crossover_max": "bandwidth, L",
+    "smallest_damping": "least damping",
+    "slowest_pole": "slowest pole",
+}
+SIDES = {"high": 1, "low": -1, "": 0}  # of the better values
 
 
 def _figures(
     problem: Problem, run: Mapping[str, Any] | None, load: Mapping[str, Any] | None
 ) -> list[dict[str, Any]]:
-    """The figures that pinned designs are compared by."""
-    poles = problem.poles
-    damping = float((-poles.real / np.maximum(np.abs(poles), 1e-300)).min(initial=1.0))
-    merits = [
-        Merit("least damping", damping, "1", "damping"),
-        Merit("slowest pole", float(-poles.real.max(initial=-math.inf)), "rad/s", "slowest_pole"),
+    """The figures of the picture: numbers without a value are null."""
+    merits = [*reversed([*pole_figures(problem.report.poles.closed_loop)])]
+    if problem.report.stable:
+        merits = [*_loop_merits(problem), *_time_merits(problem, run, load), *merits]
+    return [
+        {
+            "label": SHORT.get(one.key, one.label),
+            "value": in_unit(one.value, one.unit) if math.isfinite(one.value) else None,
+            "unit": one.unit,
+            "note": one.note,
+            "better": SIDES[one.better],
+        }
+        for one in merits
     ]
-    if problem.stage.stable:
-        merits = [*_stable_merits(problem), *_time_merits(problem, run, load), *merits]
-    return [merit.document for merit in merits]
 
 
-def _stable_merits(problem: Problem) -> list[Merit]:
+def _loop_merits(problem: Problem) -> list[Merit]:
     """Of the machine's loop: sensitivity, bandwidths, margins of the channels, noise."""
-    stage, loop = problem.stage, problem.loop.sampled
-    sensors = {k: v for k, v in stage.peak_sensitivity.items() if k != "sigma_max"}
-    worst = max(sensors, key=lambda name: sensors[name])
-    bandwidths = bandwidths_of(problem.model, problem.controller, loop, stable=True)
+    found = problem.report.quick_figures
+    known = {one.key: one for one in found}
+    peak, sensors = known["peak_sensitivity"], [one for one in found if one.kind == "peak_s_of"]
+    worst = max(sensors, key=lambda one: one.value)
     delay = min(problem.curves.margins, key=lambda m: m.delay)
     phase = min(problem.curves.margins, key=lambda m: m.phase)
-    noise, inputs = noise_of(loop, problem.plant), problem.plant.inputs
     alone = "smallest of the sensors, the others closed"
+    noise = {kind: [one.value for one in found if one.kind == kind] for kind in ("motion", "command")}
     return [
-        Merit("peak |S|", sensors[worst], "1", "peak_s", f"at {worst}, zone {zone(sensors[worst])}"),
+        peak._replace(note=f"at {worst.signal}, zone {zone(peak.value)}"),
         *(
-            Merit(f"bandwidth, {short}", bandwidths[key], "rad/s", "bandwidth", BANDWIDTHS[key])
-            for key, short in (("sigma_max_T", "T"), ("crossover_max", "L"))
+            known[f"bandwidth_{key}"]._replace(note=BANDWIDTHS[key])
+            for key in ("sigma_max_T", "crossover_max")
         ),
-        Merit("phase margin", math.degrees(phase.phase), "deg", "phase_margin", f"{phase.channel}, {alone}"),
-        Merit("delay margin", delay.delay, "s", "delay_margin", f"{delay.channel}, {alone}"),
-        *_worst_by_unit("motion", "motion at rest, rms", noise.motion, problem.plant.outputs),
-        *_worst_by_unit("command", "command noise, rms", noise.force[: len(inputs)], inputs),
+        figure("phase_margin", "", "phase margin", phase.phase, note=f"{phase.channel}, {alone}"),
+        figure("delay_margin", "", "delay margin", delay.delay, "s", note=f"{delay.channel}, {alone}"),
+        *_worst_by_unit("motion", "motion at rest, rms", noise["motion"], problem.plant.outputs),
+        *_worst_by_unit("command", "command noise, rms", noise["command"], problem.plant.inputs),
     ]
 
 
@@ -388,19 +385,26 @@ def _time_merits(
     outputs, merits = problem.plant.outputs, []
     if run is not None:
         error = np.abs(np.array(run["p"]) - np.array(run["reference"])).max(axis=1)
-        merits += _worst_by_unit("job_lower", f"error, {run['name']}", error, outputs)
+        merits += _worst_by_unit("job", f"error, {run['name']}", error.tolist(), outputs)
     if load is not None:
-        merits += _worst_by_unit("load_moves", f"moved by {load['name']}", np.array(load["largest"]), outputs)
+        merits += _worst_by_unit("load_moves", f"moved by {load['name']}", load["largest"], outputs)
     return merits
 
 
-def _worst_by_unit(kind: str, label: str, values: FloatArray, signals: Sequence[Any]) -> list[Merit]:
+def _worst_by_unit(kind: str, label: str, values: Sequence[float], signals: Sequence[Signal]) -> list[Merit]:
     """The largest of the values of each unit."""
     worst: dict[str, tuple[float, str]] = {}
-    for value, s in zip(values.tolist(), signals, strict=True):
+    for value, s in zip(values, signals, strict=True):
         worst[s.unit] = max(worst.get(s.unit, (0.0, s.name)), (value, s.name))
     return [
-        Merit(label if len(worst) == 1 else f"{label} [{unit}]", value, unit, kind, f"largest at {name}")
+        figure(
+            kind,
+            "",
+            label if len(worst) == 1 else f"{label} [{unit}]",
+            value,
+            unit,
+            note=f"largest at {name}",
+        )
         for unit, (value, name) in worst.items()
         if value > 0
     ]

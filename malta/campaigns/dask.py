@@ -59,15 +59,15 @@ def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[
         try:
             if left:
                 require_malta(client, version("malta"))
-            yield from _collect(dask, client, address, plan, left)
+            yield from collect_blocks(dask, client, address, plan, left)
         finally:
             client.close(timeout=2)
 
 
-def _collect(
+def collect_blocks(
     dask: Any, client: Any, address: str, plan: Plan, left: Mapping[int, int]
 ) -> Iterator[tuple[int, Block]]:
-    task = _task(plan, version("malta"))
+    task = task_of(plan, version("malta"))
     parts, alone = deque(left.items()), 0.0  # s
     waiting: dict[Any, int] = {}
     while waiting or parts:
@@ -75,7 +75,7 @@ def _collect(
         try:
             # Few at a time: a block that is done stays in the memory of its worker until it is fetched.
             for part in [parts.popleft() for _ in range(min(len(parts), room))]:
-                waiting[client.submit(_at_worker, task, *part, pure=False)] = part[0]
+                waiting[client.submit(simulate_at_worker, task, *part, pure=False)] = part[0]
             with client.as_current():
                 done = dask.wait(list(waiting), timeout=1.0, return_when="FIRST_COMPLETED").done
         except TimeoutError:
@@ -88,10 +88,10 @@ def _collect(
                 "--cluster", address, f"the connection lost ({type(error).__name__})", AGAIN
             ) from error
         for future in done:
-            yield waiting.pop(future), _result(address, future)
+            yield waiting.pop(future), block_of(address, future)
 
 
-def _task(plan: Plan, malta: str) -> _Task:
+def task_of(plan: Plan, malta: str) -> _Task:
     name = plan.plant.name
     return _Task(plan.identity, malta, name, sources_of(name), pickle.dumps(plan))
 
@@ -175,7 +175,7 @@ def _threads(client: Any) -> int:
         return 0
 
 
-def _result(address: str, future: Any) -> Block:
+def block_of(address: str, future: Any) -> Block:
     if future.status != "finished":
         error = future.exception() if future.status == "error" else None
         found = "the connection lost" if error is None else f"a worker that fails ({_describe(error)})"
@@ -191,13 +191,13 @@ def _describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
-def _at_worker(task: _Task, first: int, count: int) -> Block | tuple[str, str, str, str]:
+def simulate_at_worker(task: _Task, first: int, count: int) -> Block | tuple[str, str, str, str]:
     """Simulate a block on a worker: the block, or the arguments of an InputError, which does not pickle."""
     here = version("malta")
     if here != task.version:
         return "--cluster", "a worker", f"malta {here}", f"malta {task.version}"
     try:
-        plan = _unpickle_plan(task)
+        plan = unpickle_plan(task)
         if plan.identity != task.identity:
             return "--cluster", "a worker", "another revision of malta or of the machine", "the same as here"
         return fly(plan, first, count, workers=1)
@@ -206,7 +206,7 @@ def _at_worker(task: _Task, first: int, count: int) -> Block | tuple[str, str, s
 
 
 @lru_cache(maxsize=4)
-def _unpickle_plan(task: _Task) -> Plan:
+def unpickle_plan(task: _Task) -> Plan:
     """The plan of a task, unpickled once: results for its machines and its scenario are cached by the object's id."""
     if task.sources:
         load_sources(task.machine, task.sources)

@@ -107,7 +107,7 @@ def limit_of(plan: Plan, name: str, bound: float | None = None, bounds: Bounds =
 
 def merits_of(plan: Plan) -> dict[str, tuple[str, str]]:
     """The figures of merit that may be bounded: label and unit by name, as "deviation-y1": ("deviation y1", "um")."""
-    return {slug(f.label): (f.label, f.unit) for f in findings_of(plan, middle_run(plan))}
+    return {slug(f.label): (f.label, f.merit.unit) for f in findings_of(plan, middle_run(plan))}
 
 
 def slug(text: str) -> str:
@@ -149,13 +149,15 @@ def _touchdown(plan: Plan, _: Bounds) -> Callable[[Batch], FloatArray]:
 def _published(plan: Plan, bounds: Bounds) -> Callable[[Batch], FloatArray]:
     def bounded(batch: Batch) -> list[Finding]:
         listed = figures_of(_campaign(plan, batch), bounds.published)
-        return [f for f in listed if f.relation == "at most" and math.isfinite(f.published)]
+        return [f for f in listed if f.bounded]
 
     if not bounded(middle_run(plan)):
         raise InputError(
             "campaign", "limit published", "no published bounds", "a scenario for which they are"
         )
-    return lambda batch: np.max([_ratio(f.values, f.published, batch) for f in bounded(batch)], axis=0)
+    return lambda batch: np.max(
+        [_ratio(f.values, f.merit.bound or 0.0, batch) for f in bounded(batch)], axis=0
+    )
 
 
 def _specification(plan: Plan, bounds: Bounds) -> Callable[[Batch], FloatArray]:

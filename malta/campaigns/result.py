@@ -14,6 +14,7 @@ from scipy.stats import binomtest
 from malta.campaigns.plan import Plan, half_width, varied_names
 from malta.campaigns.store import Block, figure_shapes
 from malta.display import Description, display
+from malta.merits import Merit
 from malta.model.data import published_value
 from malta.model.parameters import differences, units_of
 from malta.model.plant import readonly
@@ -160,17 +161,24 @@ def rate(count: int, runs: int) -> Rate:
 class Finding(NamedTuple):
     """A figure of merit over all completed runs, SI."""
 
-    label: str
+    merit: Merit  # what the values are of, without one of its own; its bound is the published one
     kind: str  # figures of one kind share a diagram
-    unit: str  # for display
     values: FloatArray  # a row for each run of the campaign; NaN where it has none
-    published: float = math.nan  # SI; NaN where the paper has none
-    relation: str = "at most"  # of ours to the published: "about" or "at most"
+
+    @property
+    def label(self) -> str:
+        """The words of the figure."""
+        return self.merit.label
+
+    @property
+    def bounded(self) -> bool:
+        """Whether the paper prints an upper bound."""
+        return self.merit.bound is not None and self.merit.relation == "at most"
 
     @property
     def within(self) -> NDArray[np.bool_]:
         """True for runs that were completed within the published bound."""
-        return np.asarray(self.values <= self.published)
+        return np.asarray(self.values <= (math.nan if self.merit.bound is None else self.merit.bound))
 
 
 CLEARANCE = "clearance:"  # kind of the figures that tell how close a run came to each contact
@@ -195,7 +203,10 @@ def every_figure(found: Campaign, published: Mapping[str, Any] | None = None) ->
     ) -> Finding:
         bound = published_value(published or {}, keys[key]) if key in keys else math.nan
         label = f"{kind} {name}" if name else kind
-        return Finding(label, kind, unit, readonly(np.where(done, values, np.nan)), bound, relation)
+        merit = Merit(label, math.nan, unit, relation=relation, kind="runs", signal=name)
+        if math.isfinite(bound):
+            merit = merit._replace(bound=bound)
+        return Finding(merit, kind, readonly(np.where(done, values, np.nan)))
 
     first = 1 if plant.has_stroke else 0  # of the groups: the stroke and the thrust
     strokes, others = outputs_of(plant)[:first], outputs_of(plant)[first:]
@@ -239,9 +250,7 @@ def runs_within_bounds(
     found: Campaign, published: Mapping[str, Any] | None = None
 ) -> NDArray[np.bool_] | None:
     """True for runs that were completed within every published bound; None where the paper has no bounds."""
-    bounds = [
-        f for f in every_figure(found, published) if f.relation == "at most" and math.isfinite(f.published)
-    ]
+    bounds = [f for f in every_figure(found, published) if f.bounded]
     return np.all([f.within for f in bounds], axis=0) if bounds else None
 
 

@@ -130,7 +130,7 @@ def sensitivity(
     if size < LEAST:
         expected = f"at least {LEAST * (len(factors) + 2)} for {len(factors)} factors"
         raise InputError("campaign", "samples", str(plan.samples), expected)
-    points = _points(len(factors), size, plan.seed)
+    points = sobol_points(len(factors), size, plan.seed)
     machines = machines_in_box(plan, points[:, : len(names)])
     draws = (points[:, -1] * DRAWS).astype(np.int64) if noisy else np.zeros(len(points), np.int64)
     batch = simulate_machines(plan, machines, noise=draws[:, None], workers=workers, progress=progress)
@@ -143,12 +143,12 @@ def sensitivity(
         factors,
         len(points),
         rate(int(independent.sum()), independent.size),
-        _indices(within.astype(float), size, plan.seed),
-        {f.label: _indices(f.values, size, plan.seed) for f in findings_of(plan, batch)},
+        indices_of(within.astype(float), size, plan.seed),
+        {f.label: indices_of(f.values, size, plan.seed) for f in findings_of(plan, batch)},
     )
 
 
-def _points(factors: int, size: int, seed: int) -> FloatArray:
+def sobol_points(factors: int, size: int, seed: int) -> FloatArray:
     """Saltelli's design in the unit box: samples A and B, then A with each column from B in turn."""
     both = qmc.Sobol(2 * factors, rng=np.random.default_rng(seed)).random(size)
     A, B = both[:, :factors], both[:, factors:]
@@ -156,7 +156,7 @@ def _points(factors: int, size: int, seed: int) -> FloatArray:
     return np.concatenate([A, B, *mixed])
 
 
-def _indices(values: FloatArray, size: int, seed: int) -> tuple[Index, ...]:
+def indices_of(values: FloatArray, size: int, seed: int) -> tuple[Index, ...]:
     """The indices of each factor, with half 95 % intervals by resampling; none where the values have no variance."""
     if not np.isfinite(values).all() or np.ptp(values) == 0:
         return ()
@@ -290,7 +290,7 @@ def tolerances(
                 return None
 
         part = progress_of_part(progress, len(found), len(searches))
-        found.append(_largest(name, keeps, min(_widest(plan, names[k]) for k in chosen), part))
+        found.append(largest_spread(name, keeps, min(_widest(plan, names[k]) for k in chosen), part))
     return Tolerances(plan, limit, wanted, today, tuple(found))
 
 
@@ -300,7 +300,7 @@ def _widest(plan: Plan, name: str) -> float:
     return FARTHEST / plan.spread[name] if relative else WIDEST
 
 
-def _largest(
+def largest_spread(
     name: str, keeps: Callable[[float], Rate | None], widest: float, progress: Progress | None
 ) -> Spread:
     """The largest factor that keeps the yield, by bisection before the first that loses it.

@@ -30,6 +30,7 @@ from malta.campaigns.result import (
 )
 from malta.campaigns.run import Yields, runs_within_specification
 from malta.display import Description, display
+from malta.merits import Merit, figure
 from malta.simulation.engine.digest import LARGEST_FIGURE, Batch, verdicts
 from malta.units import in_unit
 
@@ -203,18 +204,20 @@ class Runs:
 
 
 @dataclass(frozen=True, eq=False)
-class Merit:
+class Distribution:
     """The distribution of a figure of merit over the completed runs, SI."""
 
-    label: str
+    merit: Merit  # without a value; its bound is the published one
     kind: str  # figures of one kind share a diagram
-    unit: str  # for display
-    published: float  # NaN where the paper has none
-    relation: str  # of ours to the published: "about" or "at most"
     sketch: Sketch
     within: int  # runs that were completed within the published bound
     total: Fraction  # of the values
     squares: Fraction  # of the values
+
+    @property
+    def label(self) -> str:
+        """The words of the figure."""
+        return self.merit.label
 
     @property
     def mean(self) -> float:
@@ -229,6 +232,10 @@ class Merit:
     def percentiles(self, marks: Iterable[float]) -> FloatArray:
         """Percentiles, exact or to `sketch.ACCURACY`: see `Summary.exact`."""
         return quantiles(self.sketch, [mark / 100 for mark in marks])
+
+    def figures(self, marks: Iterable[float]) -> list[Merit]:
+        """The same as figures of merit."""
+        return [self.merit._replace(value=float(value)) for value in self.percentiles(marks)]
 
 
 @display
@@ -268,7 +275,7 @@ class Summary:
     within: int | None
     specified: int | None
     engines: tuple[str, ...]
-    listed: tuple[Merit, ...]
+    listed: tuple[Distribution, ...]
     bands: NDArray[np.int64]
     kept: Runs
     interrupted: bool = False
@@ -276,8 +283,8 @@ class Summary:
     folder: Path | None = None
 
     @property
-    def merits(self) -> tuple[Merit, ...]:
-        """The figures of merit of the scenario."""
+    def merits(self) -> tuple[Distribution, ...]:
+        """The distributions of the figures of merit of the scenario."""
         rose = any(m.kind == RISE[0] and m.sketch.count for m in self.listed)
         return tuple(m for m in self.listed if rose or m.kind not in RISE)
 
@@ -306,15 +313,28 @@ class Summary:
         return Yields(self.rate, published, specified)
 
     @property
+    def figures(self) -> tuple[Merit, ...]:
+        """Figures of merit: the shares of its yields, then of each distribution the median and the 95 % percentile."""
+        words = ("completed", "completed within the published bounds", "completed within the [specification]")
+        rates = zip(words, self.yields, strict=True)
+        found = [figure("yield", name, name, one.share) for name, one in rates if one is not None]
+        for one in self.merits:
+            middle, high = one.figures((50, 95))
+            found += [
+                middle._replace(label=f"{one.label}, median"),
+                high._replace(label=f"{one.label}, 95 % of the runs"),
+            ]
+        return tuple(found)
+
+    @property
     def description(self) -> Description:
         """Its plan, its ends, its yields and its figures of merit."""
         ends = ", ".join(f"{name} {count}" for name, count in self.ends.items())
         rows = [("ends", ends or "none"), ("completed", str(self.rate))]
-        for merit in self.merits:
-            low, middle, high = (in_unit(float(x), merit.unit) for x in merit.percentiles((5, 50, 95)))
-            rows.append(
-                (merit.label, f"{middle:.3g} {merit.unit}, 90 % of the runs in {low:.3g} .. {high:.3g}")
-            )
+        for one in self.merits:
+            low, middle, high = (in_unit(x.value, x.unit) for x in one.figures((5, 50, 95)))
+            shown = f"{middle:.3g} {one.merit.unit}, 90 % of the runs in {low:.3g} .. {high:.3g}"
+            rows.append((one.label, shown))
         title = f"Summary of {self.plan.controller.name!r} in {self.plan.scenario!r}"
         return Description(f"{title}: {self.runs} of {self.plan.samples} machines", tuple(rows))
 
@@ -335,7 +355,7 @@ def summary_of(found: Campaign, bounds: Bounds = UNBOUNDED) -> Summary:
         None if within is None else int(within.sum()),
         None if specified is None else int(specified.sum()),
         found.engines,
-        tuple(_merit(figure) for figure in every_figure(found, bounds.published)),
+        tuple(_distribution(one) for one in every_figure(found, bounds.published)),
         _bands(found, within),
         _keep(Runs(found.index, found.values, found.batch)),
         found.interrupted,
@@ -368,22 +388,13 @@ def join(one: Summary, other: Summary) -> Summary:
     )
 
 
-def _merit(figure: Finding) -> Merit:
-    values = figure.values[np.isfinite(figure.values)]
-    return Merit(
-        figure.label,
-        figure.kind,
-        figure.unit,
-        figure.published,
-        figure.relation,
-        sketch_of(values),
-        int(figure.within.sum()),
-        Fraction(float(values.sum())),
-        Fraction(float((values**2).sum())),
-    )
+def _distribution(found: Finding) -> Distribution:
+    values = found.values[np.isfinite(found.values)]
+    sums = Fraction(float(values.sum())), Fraction(float((values**2).sum()))
+    return Distribution(found.merit, found.kind, sketch_of(values), int(found.within.sum()), *sums)
 
 
-def _join_merits(one: Merit, other: Merit) -> Merit:
+def _join_merits(one: Distribution, other: Distribution) -> Distribution:
     return replace(
         one,
         sketch=merge(one.sketch, other.sketch),

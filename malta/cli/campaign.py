@@ -485,7 +485,7 @@ def _report(gains: Path, found: Summary, worst: int, *, as_json: bool) -> None:
 
     for file in found.damaged:
         print_note(f"{file}: a damaged block, flown again")
-    files = _draw(found)
+    files = draw_figures(found)
     if as_json:
         from malta.cli.documents.campaigns import CampaignOutput, runs_fields
 
@@ -505,7 +505,7 @@ def _report(gains: Path, found: Summary, worst: int, *, as_json: bool) -> None:
         raise typer.Exit(130)
 
 
-def _draw(found: Summary) -> list[Path]:
+def draw_figures(found: Summary) -> list[Path]:
     """Draw the figures of a campaign into its folder; none without runs."""
     if found.folder is None or not found.runs:
         return []

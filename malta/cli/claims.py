@@ -61,7 +61,7 @@ def claims(
     if not designs:
         specs = [spec for spec in specs if _is_meant(spec)] or specs
     with progress_bar("claims") as progress:
-        ledgers = _compute_ledgers(specs, progress)
+        ledgers = compute_ledgers(specs, progress)
     if as_json:
         from malta.cli.documents.others import claims_output
 
@@ -82,7 +82,7 @@ def _is_meant(spec: Spec) -> bool:
     return spec.name in getattr(require_part("claims", spec.plant.name), "REPRODUCING", (spec.name,))
 
 
-def _compute_ledgers(specs: Sequence[Spec], progress: Callable[[float], None] | None) -> list[Ledger]:
+def compute_ledgers(specs: Sequence[Spec], progress: Callable[[float], None] | None) -> list[Ledger]:
     """Compute the ledger of each machine, in the order in which the designs name the machines."""
     machines = dict.fromkeys(spec.plant.name for spec in specs)
     return _compute_each([[spec for spec in specs if spec.plant.name == name] for name in machines], progress)

@@ -9,13 +9,14 @@ import gc
 import io
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
 
 from malta.cli.app import app as live_page
 from malta.cli.campaign import campaign
@@ -125,8 +126,40 @@ UsageError: Any = (
 )  # of click, or of the copy of click that newer versions of typer have
 
 
+class Commands(Mapping[str, Any]):
+    """The commands by name. Each is made of its function when it is asked for: the others are not, which takes long."""
+
+    def __init__(self) -> None:
+        self._functions = {run.__name__: run for run in chain.from_iterable(GROUPS.values())}
+        self._made: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        """The command of a name. Raises KeyError for an unknown one."""
+        if name not in self._made:
+            alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+            alone.command(cls=Command)(self._functions[name])
+            self._made[name] = get_command(alone)
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Their names, in the order of the help."""
+        return iter(self._functions)
+
+    def __len__(self) -> int:
+        """Their number."""
+        return len(self._functions)
+
+
 class Grouped(TyperGroup):
     """The group of all commands: its help lists them under the headings of GROUPS, with their whole first lines."""
+
+    def __init__(self, **known: Any) -> None:
+        super().__init__(**known)
+        self.commands = Commands()  # type: ignore[assignment]  # only read
+
+    def list_commands(self, _: Any) -> list[str]:
+        """Their names."""
+        return [*self.commands]
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command; Ctrl-C says which files it has written."""
@@ -141,9 +174,8 @@ class Grouped(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the sections of the commands."""
         for heading, commands in GROUPS.items():
-            known = [(c.__name__, _first_line(c)) for c in commands if self.get_command(ctx, c.__name__)]
             with formatter.section(heading):
-                formatter.write_dl(known)
+                formatter.write_dl([(c.__name__, _first_line(c)) for c in commands])
 
 
 def _files_text(written: Sequence[Path]) -> str:
@@ -177,8 +209,6 @@ app = typer.Typer(
 
     Exit codes: 0 fine; 1 a check failed (unstable, touched down), old gain files stand; 2 bad input; 130 Ctrl-C.""",
 )
-for command in chain.from_iterable(GROUPS.values()):
-    app.command(cls=Command)(command)
 
 
 def _print_version(asked: bool) -> None:

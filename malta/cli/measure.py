@@ -138,13 +138,14 @@ def _measured(
 
 def _print(found: Measurement, files: list[Path]) -> None:
     """The tables, and in words what was compared with what."""
+    from malta.model.parameters import box_words
     from malta.report.tables.experiments import measured_tables
 
     console = make_console()
     for table in measured_tables(found):
         console.print(table)
     how = "each line in each input" if found.experiments > 1 else "columns interpolated between their lines"
-    box = ", ".join(f"{name} +-{100 * share:.3g} %" for name, share in found.box.items()) or "no uncertainty"
+    box = box_words(found.box) or "no uncertainty"
     print_text(
         console, f"{len(found.w)} lines, {how}; predicted: {found.machines} machines, sampled, of {box}"
     )

@@ -15,7 +15,6 @@ import typer
 from malta.cli.output import make_console, print_note
 from malta.errors import CheckError, InputError
 from malta.files import locate, shipped_path
-from malta.tables import load_toml
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
@@ -398,6 +397,8 @@ def design_files(
 def _is_machine_data(file: Path) -> bool:
     """Whether a file has what data of machines have and designs have not; a file that cannot be read is no data."""
     try:
+        from malta.tables import load_toml  # loads pydantic, which no help needs
+
         content = load_toml(file)
     except InputError:
         return False
@@ -485,11 +486,13 @@ def read_changed_design(file: Path, changes: list[str] | None) -> Spec:
     change_machine(spec.parameters, of_machine)  # which says what is wrong with a value
     changed = read_design(file, values, others)
     return replace(
-        changed, name=f"{spec.name}_{_name_of(changes)}", summary=f"{spec.summary}; with {', '.join(changes)}"
+        changed,
+        name=f"{spec.name}_{name_of_changes(changes)}",
+        summary=f"{spec.summary}; with {', '.join(changes)}",
     )
 
 
-def _name_of(changes: list[str]) -> str:
+def name_of_changes(changes: list[str]) -> str:
     """The changes as a part of a file's name: `m=.4` is m_0_4, `m=4` is m_4 and `m=4%` m_4percent."""
     words = re.sub(r"(?<!\d)\.(?=\d)", "0.", " ".join(changes)).replace("%", "percent")
     words = re.sub(r"[\u00b5\u03bc]", "u", words)  # micro

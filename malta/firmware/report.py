@@ -25,6 +25,7 @@ from malta.firmware.export import comment, render
 from malta.firmware.period_functions import LINK_RANGE
 from malta.firmware.signals import Target, reading_ranges
 from malta.firmware.supervisor import AWAKE, STATES, ReferenceLimits, State, monitors_of, reference_limits
+from malta.model.parameters import box_words
 
 # MISRA C:2012 of the exported C: the rules that it deviates from, each with its reason.
 #
@@ -250,7 +251,7 @@ def _margin_text(t: Target, uncertainty: dict[str, float], *, proof: bool) -> st
         )
     margin = rounded_margin(t.controller, uncertainty)
     assert margin is not None
-    box = ", ".join(f"{name} +-{100 * share:g} %" for name, share in uncertainty.items())
+    box = box_words(uncertainty, t.controller.parameters)
     proven = (
         f"nothing is proven ({margin.reason})"
         if margin.lower is None

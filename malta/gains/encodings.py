@@ -309,7 +309,7 @@ def _from_json(data: bytes) -> Any:
 def _to_npz(content: Mapping[str, Any]) -> bytes:
     archived = io.BytesIO()
     with zipfile.ZipFile(archived, "w") as archive:  # stored: compressors differ in their bytes
-        for name, value in _flat(_columns(content)).items():
+        for name, value in flat_entries(columns_of(content)).items():
             entry = io.BytesIO()
             array = np.zeros(0) if value is None else np.array(value)
             np.lib.format.write_array(entry, array, allow_pickle=False)
@@ -328,11 +328,11 @@ def _from_npz(data: bytes) -> dict[str, Any]:
     return tree
 
 
-def _to_mat(content: Mapping[str, Any]) -> bytes:
+def to_mat(content: Mapping[str, Any]) -> bytes:
     from scipy.io import savemat
 
     buffer: Any = io.BytesIO()  # any: scipy's stubs know only file names
-    savemat(buffer, _cells(_columns(content)), long_field_names=True, oned_as="row")
+    savemat(buffer, cells_of(columns_of(content)), long_field_names=True, oned_as="row")
     body = bytes(buffer.getvalue())[MAT_HEADER:]
     return mat_header(body) + body
 
@@ -350,27 +350,31 @@ def _from_mat(data: bytes) -> dict[str, Any]:
     return {name: _without_shape(value, name) for name, value in read_mat(data).items()}
 
 
-def _columns(content: Any) -> Any:
+def columns_of(content: Any) -> Any:
     """Signals as two lists, name and unit."""
     if isinstance(content, list) and content and isinstance(content[0], Mapping):
         return {column: [row[column] for row in content] for column in ("name", "unit")}
     if isinstance(content, Mapping):
-        return {key: _columns(entry) for key, entry in content.items()}
+        return {key: columns_of(entry) for key, entry in content.items()}
     return content
 
 
-def _flat(tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat_entries(tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested tables as one, names joined by dots."""
     flat: dict[str, Any] = {}
     for key, value in tables.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+        flat |= (
+            flat_entries(value, f"{prefix}{key}.")
+            if isinstance(value, Mapping)
+            else {f"{prefix}{key}": value}
+        )
     return flat
 
 
-def _cells(value: Any) -> Any:
+def cells_of(value: Any) -> Any:
     """Lists of text as MATLAB cell arrays, lists of numbers as arrays."""
     if isinstance(value, Mapping):
-        return {key: _cells(entry) for key, entry in value.items()}
+        return {key: cells_of(entry) for key, entry in value.items()}
     if isinstance(value, list):
         return np.array(value, dtype=object if isinstance(value[0], str) else float)
     return np.zeros((0, 0)) if value is None else value
@@ -394,7 +398,7 @@ def _without_shape(value: Any, name: str) -> Any:
 _FORMS: dict[str, _Form] = {
     ".json": (_to_json, _from_json),
     ".npz": (_to_npz, _from_npz),
-    ".mat": (_to_mat, _from_mat),
+    ".mat": (to_mat, _from_mat),
 }
 SUFFIXES = tuple(_FORMS)
 """The suffixes of gain files, one for each encoding.

@@ -121,11 +121,13 @@ def columns_of(lines: Sequence[Line], w: FloatArray, predicted: ComplexArray) ->
         if known[:, j].sum() < 2:
             raise CheckError("measure: an input is excited at fewer than two lines")
         scale = predicted[:, :, j][:, np.abs(predicted[:, :, j]).mean(axis=0).argmax()]
-        _interpolate(np.log(w), known[:, j], scale, off[:, j], C[:, j])
+        interpolate_columns(np.log(w), known[:, j], scale, off[:, j], C[:, j])
     return Columns(predicted + off.transpose(0, 2, 1), C)
 
 
-def _interpolate(x: FloatArray, known: Any, scale: ComplexArray, off: ComplexArray, C: ComplexArray) -> None:
+def interpolate_columns(
+    x: FloatArray, known: Any, scale: ComplexArray, off: ComplexArray, C: ComplexArray
+) -> None:
     """Fill the rows of `off` (k x p) that are not known, and what that may miss into the covariances C, k x p x p.
 
     Between its lines a column's difference over `scale` is linear in x. A line that is interpolated from its two

@@ -28,7 +28,7 @@ from malta.loops.classical import Disk, disk_sizes
 from malta.loops.loop import Loop, loop
 from malta.margins.loop_report import zone
 from malta.model.data import plant_of
-from malta.model.parameters import units_of
+from malta.model.parameters import box_words, units_of
 
 if TYPE_CHECKING:
     from malta.identification.log import Log
@@ -169,15 +169,11 @@ class Measurement:
             ("verdict", self.refusal or "as predicted"),
             ("largest |S|", peaks),
             ("disk margin", f"{all_at_once.size:.3g} of all sensors, at least {low:.3g} with 95 %"),
-            ("predicted", f"{self.machines} machines, sampled: {_box_text(self.box)}"),
+            ("predicted", f"{self.machines} machines, sampled: {box_words(self.box) or 'no uncertainty'}"),
         )
         tops = {"measured": self.largest.size[:, 0], "predicted": np.abs(self.largest.predicted[:, 0])}
         curves = Curves(self.w, "frequency [rad/s]", tops, "sigma_max(S) [1]", logarithmic=True)
         return Description(f"Loop as measured in {self.source!r}", rows, curves)
-
-
-def _box_text(box: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} ±{100 * share:.3g} %" for name, share in box.items()) or "no uncertainty"
 
 
 def measure(

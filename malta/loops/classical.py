@@ -141,7 +141,7 @@ def disk_margin(loop: Nominal, kind: Literal["forces", "sensors", "forces and se
         else:
             zero = np.zeros((len(w), P.shape[1], P.shape[1])), np.zeros((len(w), F.shape[1], F.shape[1]))
             Q = np.block([[zero[0], P], [F, zero[1]]])
-        return np.asarray(_balanced_norm(_disk_matrix(Q))[:, None])
+        return np.asarray(balanced_norm(_disk_matrix(Q))[:, None])
 
     (mu,), (at,) = find_peaks(sizes, loop.frequencies)
     return Disk(kind, float(1 / mu), float(at))
@@ -162,7 +162,7 @@ def disk_margins_alone(loop: Nominal, sensors: Sequence[str]) -> list[Disk]:
 
 def disk_sizes(S: ComplexArray) -> FloatArray:
     """The disk margin of all channels at once at each frequency, from sensitivities S, k x p x p: a lower bound."""
-    return np.asarray(1 / _balanced_norm(S - np.eye(S.shape[-1]) / 2))
+    return np.asarray(1 / balanced_norm(S - np.eye(S.shape[-1]) / 2))
 
 
 def _disk_matrix(Q: ComplexArray) -> ComplexArray:
@@ -170,7 +170,7 @@ def _disk_matrix(Q: ComplexArray) -> ComplexArray:
     return np.asarray(np.linalg.inv(eye - Q) - eye / 2)
 
 
-def _balanced_norm(M: ComplexArray) -> FloatArray:
+def balanced_norm(M: ComplexArray) -> FloatArray:
     """sigma_max of D M D^-1, D diagonal so that norms of rows and columns agree (Osborne): an upper bound of mu."""
     size = np.abs(M)
     d = np.ones((*size.shape[:2], 1))

@@ -107,7 +107,7 @@ def root_locus(
         _in_rates(found, loop.sample_time),
         nominal,
         loop.closed_poles,
-        _changes(matrix, values, found, loop.sample_time),
+        stability_changes(matrix, values, found, loop.sample_time),
         loop.sample_time,
     )
 
@@ -270,7 +270,9 @@ def _growth(found: ComplexArray, T: float | None) -> float:
     return float((found.real + 0.5 * (T or 0.0) * np.abs(found) ** 2).max(initial=-math.inf))
 
 
-def _changes(matrix: Matrix, values: FloatArray, found: ComplexArray, T: float | None) -> tuple[float, ...]:
+def stability_changes(
+    matrix: Matrix, values: FloatArray, found: ComplexArray, T: float | None
+) -> tuple[float, ...]:
     """The values at which the worst pole crosses the boundary of stability; rounding on it is no crossing."""
     least = ROUNDING * (float(np.abs(found).max(initial=0.0)) + (0.0 if T is None else 1 / T))
     worst = [_growth(row, T) for row in found]

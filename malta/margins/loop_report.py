@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from malta.display import Curves, Description, display, micro, number
+from malta.display import Curves, Description, display
 from malta.errors import CheckError
 from malta.loops.loop import Loop, loop_of_model
 from malta.loops.sampled_loops import LAST
 from malta.loops.time_domain import Recovery, furthest, noise_of, recovery
 from malta.margins.travel import NOT_BETWEEN, NOWHERE, Extent
+from malta.merits import ROOTS, Merit, figure, in_groups
+from malta.model.parameters import box_words
 from malta.model.signals import FINE
 from malta.proof.machine.windings import left_out
 from malta.proof.margin import NOT_PROVEN
 from malta.synthesis.requirements import Figure, judge_figure, ratio_of
-from malta.units import distinct, identifier, in_unit
 
 if TYPE_CHECKING:
     from malta.loops.classical import Classical, Disk
@@ -33,17 +34,6 @@ if TYPE_CHECKING:
     from malta.synthesis.requirements import Noise, Verdict
 
 
-# Figures of merit of a loop: identifiers with units, words, and which way is better. One table of meanings.
-#
-# Headlines of reports, columns of comparisons, the live page and JSON documents take their figures from here.
-
-
-Better = Literal["high", "low", ""]  # "": neither
-Scope = Literal[
-    "loop", "box", "machine"
-]  # what two designs share for a comparison of the figure to make sense
-PLAIN = (1e-2, 1e6)  # sizes of numbers that are written without a power of ten
-ROOTS = {"m s^0.5": (1e6, "um s^0.5"), "rad s^0.5": (1e6, "urad s^0.5")}  # no products of whole powers
 # ISO 14839-3: upper limits of the peak sensitivity
 ZONES = ((3.0, "A"), (4.0, "B"), (5.0, "C"), (np.inf, "D"))
 BANDWIDTHS = {
@@ -53,123 +43,6 @@ BANDWIDTHS = {
     "w_n_max": "regulator's fastest natural frequency",
     "w_n_min": "regulator's slowest natural frequency",
 }
-
-
-class Meaning(NamedTuple):
-    """What a kind of figures is."""
-
-    group: str
-    better: Better
-    scope: Scope
-    unit: str = "1"  # for display
-
-
-MEANINGS: dict[str, Meaning] = {
-    "stable": Meaning("stability and margins", "high", "loop"),
-    "margin_proven": Meaning("stability and margins", "high", "box", "percent"),
-    "margin_lost_at": Meaning("stability and margins", "high", "box", "percent"),
-    "disk": Meaning("stability and margins", "high", "loop"),
-    "disk_of": Meaning("stability and margins", "high", "machine"),
-    "phase_margin": Meaning("stability and margins", "high", "loop", "deg"),
-    "delay_margin": Meaning("stability and margins", "high", "loop", "us"),
-    "mass_margin": Meaning("stability and margins", "high", "machine", "kg"),
-    "payload": Meaning("stability and margins", "high", "machine", "kg"),
-    "peak_s": Meaning("sensitivity", "low", "loop"),
-    "peak_s_of": Meaning("sensitivity", "low", "machine"),
-    "peak_t": Meaning("sensitivity", "low", "loop"),
-    "bandwidth": Meaning("bandwidth and poles", "high", "loop", "rad/s"),
-    "natural": Meaning("bandwidth and poles", "", "loop", "rad/s"),
-    "slowest_pole": Meaning("bandwidth and poles", "high", "loop", "rad/s"),
-    "damping": Meaning("bandwidth and poles", "high", "loop"),
-    "motion": Meaning("noise at rest", "low", "machine"),
-    "command": Meaning("noise at rest", "low", "machine"),
-    "load_moves": Meaning("a constant load from outside", "low", "machine"),
-    "load_settles": Meaning("a constant load from outside", "low", "machine", "s"),
-    "compliance": Meaning("a constant load from outside", "low", "machine"),
-    "job_lower": Meaning("main job", "low", "machine"),
-    "job_higher": Meaning("main job", "high", "machine"),
-    "job": Meaning("main job", "", "machine"),
-    "requirements": Meaning("requirements", "high", "machine"),
-    "undecided": Meaning("requirements", "", "machine"),
-    "at_most": Meaning("requirements", "low", "machine"),
-    "at_least": Meaning("requirements", "high", "machine"),
-}
-GROUPS = tuple(dict.fromkeys(meaning.group for meaning in MEANINGS.values()))
-
-
-class LoopFigure(NamedTuple):
-    """A figure of merit of a design."""
-
-    kind: str  # of MEANINGS
-    key: str  # identifier with its unit
-    label: str
-    value: float  # SI
-    unit: str  # for display
-    factor: float  # from SI to it
-    signal: str = ""  # in the label, of a figure that each signal has
-    bound: float | None = None  # that the design file asks for, SI
-
-    @property
-    def meaning(self) -> Meaning:
-        """What figures of this kind are."""
-        return MEANINGS[self.kind]
-
-    @property
-    def text(self) -> str:
-        """The value in its unit, with four digits."""
-        if self.kind == "stable":
-            return "yes" if self.value else "NO"
-        if math.isnan(self.value):
-            return "none"
-        if math.isinf(self.value):
-            return "any"
-        return four_digits(self.factor * self.value)
-
-    @property
-    def heading(self) -> str:
-        """The label with the unit in brackets."""
-        shown = {"percent": "%", "1": ""}.get(self.unit, micro(self.unit))
-        return f"{self.label} [{shown}]" if shown else self.label
-
-
-def figure(
-    kind: str,
-    name: str,
-    label: str,
-    value: float,
-    unit: str = "",
-    signal: str = "",
-    bound: float | None = None,
-) -> LoopFigure:
-    """The figure of a kind: `name` is its key without a unit; `unit` for display, if not that of its kind."""
-    unit = unit or MEANINGS[kind].unit
-    factor, shown = ROOTS[unit] if unit in ROOTS else (in_unit(1.0, unit), unit)
-    return LoopFigure(kind, identifier(name, unit), label, float(value), shown, factor, signal, bound)
-
-
-def four_digits(value: float) -> str:
-    """A number with four digits; far from one with its power of ten.
-
-    >>> four_digits(0.5), four_digits(4.7e-7)
-    ('0.5000', '4.7e-07')
-    """
-    rounded = float(f"{value:.4g}")
-    return number(rounded) if PLAIN[0] <= abs(value) < PLAIN[1] or not value else f"{rounded:g}"
-
-
-def best_of(figures: Sequence[LoopFigure | None]) -> tuple[bool, ...]:
-    """Which designs are better than some other: those that share the best value, none where all are as good.
-
-    Values that are written with the same digits are as good as each other.
-    """
-    known = [one for one in figures if one is not None and not math.isnan(one.value)]
-    if len(known) < 2 or not known[0].meaning.better:
-        return tuple(False for _ in figures)
-    pick = max if known[0].meaning.better == "high" else min
-    best = pick(known, key=lambda one: one.value).text
-    if all(one.text == best for one in known):
-        return tuple(False for _ in figures)
-    return tuple(one is not None and one.text == best for one in figures)
 
 
 def zone(peak: float) -> str:
@@ -366,7 +239,7 @@ class LoopReport:
     >>> f"{found.peak_sensitivity['y']:.2f}, {found.robust.lower:.2f}"
     '1.57, 3.91'
     >>> peak = next(one for one in found.figures if one.key == "peak_sensitivity")
-    >>> peak.heading, f"{peak.value:.2f}", peak.meaning.better
+    >>> peak.heading, f"{peak.value:.2f}", peak.better
     ('peak |S| of the worst sensor', '1.57', 'low')
     """
 
@@ -442,10 +315,16 @@ class LoopReport:
         return noise_of(self.loop.sampled, self.plant) if self.stable else None
 
     @cached_property
-    def figures(self) -> tuple[LoopFigure, ...]:
+    def figures(self) -> tuple[Merit, ...]:
         """The figures of merit, in the order of their groups."""
-        parts = (_margins, _sensitivities, _bandwidths, _noise, _loads, _requirements)
-        return in_groups([found for part in parts for found in part(self)])
+        slow = (_margins, _complementary, _loads, _requirements)
+        return in_groups([*self.quick_figures, *(found for part in slow for found in part(self))])
+
+    @cached_property
+    def quick_figures(self) -> tuple[Merit, ...]:
+        """Those of them that need no frequency response and no proof: what a page shows at each move."""
+        parts = (_sensitivities, _bandwidths, _noise)
+        return tuple(found for part in parts for found in part(self))
 
     def __str__(self) -> str:
         lines = [f"{'stable' if self.stable else 'UNSTABLE'} with hold, delay and current loops"]
@@ -459,9 +338,11 @@ class LoopReport:
         for key, value in self.bandwidth.items():
             lines.append(f"bandwidth, {BANDWIDTHS[key]}: {value / (2 * np.pi):.2f} Hz ({value:.1f} rad/s)")
         if self.uncertainty:
-            box = "  ".join(f"{name} +-{share * 100:g} %" for name, share in self.uncertainty.items())
             where = str(self.extent) if self.covers_travel else "in the middle and at the end of the travel"
-            lines += [f"uncertainty: {box}", f"{f'robust {where}'.rstrip()}: {self.robust}"]
+            lines += [
+                f"uncertainty: {box_words(self.uncertainty, self.plant.parameters)}",
+                f"{f'robust {where}'.rstrip()}: {self.robust}",
+            ]
         return "\n".join(lines)
 
     @property
@@ -469,7 +350,7 @@ class LoopReport:
         """What a reader looks for first, then every figure of merit."""
         state = "stable" if self.stable else "UNSTABLE"
         at = f"{self.controller.name!r} on {self.plant.name!r}"
-        box = ", ".join(f"{name} ±{share * 100:g} %" for name, share in self.uncertainty.items())
+        box = box_words(self.uncertainty, self.plant.parameters)
         rows = [("margin", f"{self.robust} of {box}")] if self.robust is not None else []
         shown = sorted(self.figures[1:], key=lambda one: one.kind not in FIRST)
         rows += [(one.heading, one.text) for one in shown]
@@ -490,13 +371,6 @@ class LoopReport:
         return Curves(w, "frequency [rad/s]", sizes, "largest singular value [1]", logarithmic=True)
 
 
-def in_groups(figures: Sequence[LoopFigure]) -> tuple[LoopFigure, ...]:
-    """Figures in the order of their groups, with keys of which none comes twice."""
-    found = sorted(figures, key=lambda one: GROUPS.index(one.meaning.group))
-    keys = distinct(one.key for one in found)
-    return tuple(one._replace(key=key) for one, key in zip(found, keys, strict=True))
-
-
 def require_stable(found: LoopReport, name: str) -> None:
     """Raise CheckError when a stage is unstable: such gains are not written to files."""
     for stage in found.stages:
@@ -506,7 +380,7 @@ def require_stable(found: LoopReport, name: str) -> None:
             )
 
 
-def _margins(a: LoopReport) -> Iterator[LoopFigure]:
+def _margins(a: LoopReport) -> Iterator[Merit]:
     yield figure("stable", "stable", "stable on the machine", float(a.stable))
     if a.robust is not None:
         where = f", {a.extent}" if str(a.extent) else ""
@@ -530,7 +404,7 @@ def _margins(a: LoopReport) -> Iterator[LoopFigure]:
             yield figure("payload", "payload_carried", "payload in flight", a.payload.carried)
 
 
-def _sensitivities(a: LoopReport) -> Iterator[LoopFigure]:
+def _sensitivities(a: LoopReport) -> Iterator[Merit]:
     peaks = a.peak_sensitivity
     sensors = {name: peak for name, peak in peaks.items() if name != "sigma_max"}
     worst = max(sensors.values()) if a.stable else math.nan
@@ -538,12 +412,15 @@ def _sensitivities(a: LoopReport) -> Iterator[LoopFigure]:
     yield figure("peak_s", "peak_sensitivity_sigma_max", "peak sigma_max(S)", peaks["sigma_max"])
     for name, peak in sensors.items():
         yield figure("peak_s_of", f"peak_sensitivity {name}", f"peak |S| at {name}", peak, signal=name)
+
+
+def _complementary(a: LoopReport) -> Iterator[Merit]:
     if a.classical is not None:
         largest = max(gang[1] for gang in a.classical.gang.values())
         yield figure("peak_t", "peak_complementary", "peak |T| of the worst sensor", largest)
 
 
-def _bandwidths(a: LoopReport) -> Iterator[LoopFigure]:
+def _bandwidths(a: LoopReport) -> Iterator[Merit]:
     for key, value in a.bandwidth.items():
         kind = "natural" if key.startswith("w_n") else "bandwidth"
         yield figure(kind, f"bandwidth_{key}", BANDWIDTHS[key], value)
@@ -551,14 +428,14 @@ def _bandwidths(a: LoopReport) -> Iterator[LoopFigure]:
         yield from pole_figures(a.poles.closed_loop)
 
 
-def pole_figures(poles: ComplexArray) -> Iterator[LoopFigure]:
+def pole_figures(poles: ComplexArray) -> Iterator[Merit]:
     """The slowest decay and the smallest damping of a closed loop's poles, rad/s."""
     yield figure("slowest_pole", "slowest_pole", "decay of the slowest pole", -poles.real.max())
     damping = -poles.real / np.maximum(np.abs(poles), 1e-300)
     yield figure("damping", "smallest_damping", "smallest damping ratio", damping.min())
 
 
-def _noise(a: LoopReport) -> Iterator[LoopFigure]:
+def _noise(a: LoopReport) -> Iterator[Merit]:
     if a.noise is None:
         return
     for signal, value in zip(a.plant.outputs, a.noise.motion, strict=True):
@@ -569,7 +446,7 @@ def _noise(a: LoopReport) -> Iterator[LoopFigure]:
         yield figure("command", f"command {signal.name} rms", words, value, signal.unit, signal.name)
 
 
-def _loads(a: LoopReport) -> Iterator[LoopFigure]:
+def _loads(a: LoopReport) -> Iterator[Merit]:
     units = {s.name: s.unit for s in a.plant.disturbances}
     for load, output in furthest(a.recovery):
         fine, name = FINE.get(output.unit, output.unit), f"load {load.name}"
@@ -582,7 +459,7 @@ def _loads(a: LoopReport) -> Iterator[LoopFigure]:
         yield figure("compliance", f"{name} compliance", peak, output.compliance, fine, load.name)
 
 
-def _requirements(a: LoopReport) -> Iterator[LoopFigure]:
+def _requirements(a: LoopReport) -> Iterator[Merit]:
     asked = [one for one in a.requirements if one.asked is not None]
     if asked:
         kept = sum(one.holds for one in asked) / len(asked)

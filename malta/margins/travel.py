@@ -176,7 +176,7 @@ def travel_margin(
         with time_limit(end):
             along, over = travel_loops(plant, controller, names, current_loops)
             if plant.has_stroke and not over:  # places of the travel, and no other interval
-                problem = _anywhere(plant, controller, names, current_loops)
+                problem = margin_anywhere(plant, controller, names, current_loops)
     except TimeUp:
         spent, why = clock.monotonic() - begun, "time was up before the model was written out"
         return Margin(None, math.inf, None, None, {}, {}, (), spent, why)
@@ -197,12 +197,12 @@ def travel_loops(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
 ) -> tuple[list[tuple[UncertainSystem, Compensator]], dict[str, tuple[float, float]]]:
     """The loops whose common margin travel_margin proves, and the intervals that do not grow with the margin."""
-    along, extent = _along(plant, controller, names, current_loops), extent_of(plant, names)
+    along, extent = margin_along(plant, controller, names, current_loops), extent_of(plant, names)
     return along, extent.intervals if len(along) == 1 else dict(extent.over)
 
 
 @lru_cache(maxsize=8)  # several margins need the same loops; records compare by identity
-def _along(
+def margin_along(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops
 ) -> list[tuple[UncertainSystem, Compensator]]:
     """The machine's loop with its position as a parameter; where that is too long, its loops at ENDS of the travel."""
@@ -225,7 +225,7 @@ def _is_long(plant: Plant, controller: Controller, names: tuple[str, ...]) -> bo
 
 
 @lru_cache(maxsize=8)
-def _anywhere(
+def margin_anywhere(
     plant: Plant,
     controller: Controller,
     names: tuple[str, ...],
@@ -240,13 +240,13 @@ def _anywhere(
         return None
     if off_stroke(plant, plant.point(controller.operating_point[0]).x):
         return None
-    along = _along(plant, controller, names, current_loops)
+    along = margin_along(plant, controller, names, current_loops)
     try:
         if position is None:
             travel = (-plant.travel, plant.travel)
             machine = held_machine(plant, plant_of(controller.parameters), names, travel)
         else:
-            whole = _anywhere(plant, controller, names, current_loops)
+            whole = margin_anywhere(plant, controller, names, current_loops)
             if whole is None:
                 return None
             machine = whole.machine.at(position)
@@ -283,7 +283,7 @@ def place_margin(
     if plant.stroke in over:
         return margin_at(*along[0], ranges, {plant.stroke: position}, tolerance=TOLERANCE, wider=travel)
     loop = loop_at(plant, controller, names, position, current_loops)
-    if (problem := _anywhere(plant, controller, names, current_loops, position)) is not None:
+    if (problem := margin_anywhere(plant, controller, names, current_loops, position)) is not None:
         found = margin_of(problem, _box(loop[0], ranges), Effort(time=EACH))
         if found.lower is not None:
             return found
@@ -329,14 +329,14 @@ def covers_travel(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
 ) -> bool:
     """Whether one proof covers the whole travel."""
-    return len(_along(plant, controller, names, current_loops)) == 1
+    return len(margin_along(plant, controller, names, current_loops)) == 1
 
 
 def depends_on_course(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
 ) -> bool:
     """Whether the machine's loop depends on the position along its course."""
-    along, course = _along(plant, controller, names, current_loops), extent_of(plant, names).course
+    along, course = margin_along(plant, controller, names, current_loops), extent_of(plant, names).course
     if len(along) > 1:
         return True
     if not course:

@@ -128,15 +128,20 @@ def linear_report(
 
 
 def _nominal_report(model: LinearModel, controller: Controller, current_loops: CurrentLoops) -> LoopReport:
-    whole = loop_of_model(model, controller)
-    machine = whole.sampled
     loops = {
         "sampled": sampled_loop(model, controller, delay=controller.delay),
         "+ current loops": sampled_loop(model, controller, delay=controller.delay, current_loops="lag"),
-        "machine": machine,
     }
     names = [s.name for s in controller.measurements]
     stages = tuple(stage_of(name, stage, names) for name, stage in loops.items())
+    found = machine_report(model, controller)
+    return replace(found, stages=(*stages, *found.stages), current_loops=current_loops)
+
+
+def machine_report(model: LinearModel, controller: Controller) -> LoopReport:
+    """The report of the machine's loop alone, without the stages before it: what a page shows at each move."""
+    whole = loop_of_model(model, controller)
+    stage = stage_of("machine", whole.sampled, [s.name for s in controller.measurements])
     empty = np.zeros(0, dtype=complex)
     regulator, observer = (empty, empty) if controller.cost is None else controller_poles(controller)
     poles = Poles(
@@ -145,11 +150,8 @@ def _nominal_report(model: LinearModel, controller: Controller, current_loops: C
         filter=continuous_poles(observer, controller.sample_time),
         closed_loop=whole.poles,
     )
-    bandwidths = bandwidths_of(model, controller, machine, stable=stages[-1].stable)
-    extent = extent_of(model.plant)
-    return LoopReport(
-        model, controller, poles, stages, bandwidths, extent=extent, current_loops=current_loops
-    )
+    bandwidths = bandwidths_of(model, controller, whole.sampled, stable=stage.stable)
+    return LoopReport(model, controller, poles, (stage,), bandwidths, extent=extent_of(model.plant))
 
 
 def _grid(Ts: float) -> FloatArray:
@@ -441,7 +443,7 @@ def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:
     classical: list[Classical | None] = []
     for positions in places_along(q.plant, q.controller, q.names, q.current_loops):
         proven_at = positions if q.whole else positions[:1]  # else a place takes as long as the whole travel
-        margin = _smallest([q.margin_at(z) for z in proven_at]) if q.proof else NOT_PROVEN
+        margin = smallest_margin([q.margin_at(z) for z in proven_at]) if q.proof else NOT_PROVEN
         loops = [q.loaded_loop_at(z) for z in positions]
         peak = float(np.max([peak_sensitivity(loop, "sensors") for loop in loops]))
         sides = [classical_margins(loop, sensors) if loop.stable else None for loop in loops]
@@ -453,7 +455,7 @@ def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:
     return tuple(places), worst_of(classical)
 
 
-def _smallest(margins: Sequence[Margin]) -> Margin:
+def smallest_margin(margins: Sequence[Margin]) -> Margin:
     """One margin that holds at several places: the smallest lower and the smallest upper bound."""
     lower = None if any(m.lower is None for m in margins) else min(m.lower or 0.0 for m in margins)
     reason = "; ".join(dict.fromkeys(m.reason for m in margins if m.reason))

@@ -8,9 +8,12 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from malta.display import quantity
 from malta.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from malta.model.plant import Parameters
 
 
@@ -118,6 +121,23 @@ def differences(record: type[Parameters] | Parameters) -> dict[str, str]:
             if all(limit is None or limit < 0 for limit in (above, least)):
                 units[f.name] = f.metadata["unit"]
     return units
+
+
+def box_words(box: Mapping[str, float], parameters: Parameters | None = None) -> str:
+    """An uncertainty in words: parameters with their half ranges, those of one half range together; "" of none.
+
+    box : shares of the parameters; of differences and offsets half ranges in SI
+    parameters : of the machine, which tell the two apart; None: all are shares
+
+    >>> box_words({"m": 0.2, "K_A": 0.2, "R": 0.05})
+    'm K_A ±20 %, R ±5 %'
+    """
+    units = {} if parameters is None else differences(parameters)
+    together: dict[str, list[str]] = {}
+    for name, half in box.items():
+        size = quantity(half, units[name]) if name in units else f"{100 * half:.4g} %"
+        together.setdefault(size, []).append(name)
+    return ", ".join(f"{' '.join(names)} ±{size}" for size, names in together.items())
 
 
 def check_parameters(record: Parameters, where: str | Path = "parameters") -> None:

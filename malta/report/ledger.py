@@ -204,11 +204,11 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
     ]
     names = tuple(e.spec.name for e in found)
     meant = tuple(name for name in names if name in getattr(paper, "REPRODUCING", names))
-    claims = [_claim(row, found, published, meant) for row in paper.rows()]
+    claims = [claim_of(row, found, published, meant) for row in paper.rows()]
     return Ledger(machine, paper.SOURCE, names, tuple(claims), meant)
 
 
-def _claim(
+def claim_of(
     row: Row, found: Sequence[Evidence], published: Mapping[str, Any], reproducing: Sequence[str]
 ) -> Claim:
     """The line of the ledger for a row and the evidence of all designs.
@@ -237,8 +237,10 @@ def _claim(
         return Claim(subject, mark + printed, ours, (OTHER if shown else LQG_ONLY) + note, "other")
     own = [value for value, e in zip(values, found, strict=True) if e in judged]
     built = [row.by_construction(e) if callable(row.by_construction) else row.by_construction for e in judged]
-    words = [_word(row, target, value, by_construction=one) for value, one in zip(own, built, strict=True)]
-    verdict = _verdict(row, words, [e.spec.name for e in judged])
+    words = [
+        verdict_word(row, target, value, by_construction=one) for value, one in zip(own, built, strict=True)
+    ]
+    verdict = verdict_of(row, words, [e.spec.name for e in judged])
     return Claim(subject, mark + printed, ours, verdict, word_of(words))
 
 
@@ -268,7 +270,7 @@ def word_of(verdicts: Sequence[str]) -> Word:
     return "partly" if "differs" in words and len(words) > 1 else next(w for w in WORDS if w in words)
 
 
-def _verdict(row: Row, words: Sequence[str], names: Sequence[str]) -> str:
+def verdict_of(row: Row, words: Sequence[str], names: Sequence[str]) -> str:
     """The verdict on the figures of all designs that are judged, from that on each, with notes and reasons."""
     note = f"; {row.note}" if row.note else ""
     kinds = {word.partition(FACTOR)[0] for word in words}
@@ -281,7 +283,7 @@ def _verdict(row: Row, words: Sequence[str], names: Sequence[str]) -> str:
     return text + (f"; {row.why}" if row.why and "not reproduced" in text else "")
 
 
-def _word(row: Row, target: float, value: float, *, by_construction: bool = False) -> str:
+def verdict_word(row: Row, target: float, value: float, *, by_construction: bool = False) -> str:
     """The verdict on the figure of one design."""
     word = _comparison(row, target, value)
     if not by_construction or word.startswith("not"):

@@ -11,6 +11,7 @@ from rich.console import Group
 from malta.loops.time_domain import recovery
 from malta.margins.loop_report import LoopReport
 from malta.model.linearize import LinearModel
+from malta.model.parameters import box_words
 from malta.report.figures import (
     distributions_figure,
     experiment_figure,
@@ -88,12 +89,12 @@ def design_page(
 
 
 def _margin_text(margins: LoopReport) -> Paragraph:
-    box_text = " ".join(f"{name} +-{100 * share:g} %" for name, share in margins.uncertainty.items())
+    box = box_words(margins.uncertainty, margins.plant.parameters)
     assert margins.robust is not None
     where = str(margins.extent).replace("the travel", "the whole travel")
     if not margins.covers_travel:
         where = "in the middle and at the end of the travel"
-    return Paragraph(f"{f'Parametric margin {where}'.rstrip()} ({box_text}): {margins.robust}\n")
+    return Paragraph(f"{f'Parametric margin {where}'.rstrip()} ({box}): {margins.robust}\n")
 
 
 def _rate_text(Ts: float) -> str:

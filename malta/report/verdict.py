@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,6 +19,7 @@ from rich.text import Text
 
 from malta.display import ceil_to, floor_to, micro, number
 from malta.margins.loop_report import zone
+from malta.model.parameters import box_words
 from malta.report.tables.layout import fold
 
 if TYPE_CHECKING:
@@ -94,7 +95,9 @@ def _margin(found: LoopReport) -> VerdictLine:
         return VerdictLine("margin", "not proven", "no uncertain parameters, or the proof was left out")
     if not found.stable:
         return VerdictLine("margin", "none", "the loop is unstable already", "bad")
-    of = " ".join(filter(None, (f"of {box_words(found.uncertainty)}", str(found.extent))))
+    of = " ".join(
+        filter(None, (f"of {box_words(found.uncertainty, found.plant.parameters)}", str(found.extent)))
+    )
     if not found.covers_travel:
         of += " (only in its middle and at its end)"
     stairs = _stairs(found)
@@ -117,18 +120,6 @@ def _stairs(found: LoopReport) -> tuple[Stair, ...]:
     if found.extent.intervals and stages and found.robust is not None:
         stages.append(("travel" if found.extent.stroke else found.extent.course, found.robust))
     return tuple(Stair(name, margin.lower or 0.0) for name, margin in stages)
-
-
-def box_words(box: Mapping[str, float]) -> str:
-    """Parameters with their shares, those of one share together.
-
-    >>> box_words({"m": 0.2, "K_A": 0.2, "R": 0.05})
-    'm K_A ±20 %, R ±5 %'
-    """
-    together: dict[float, list[str]] = {}
-    for name, share in box.items():
-        together.setdefault(share, []).append(name)
-    return ", ".join(f"{' '.join(names)} ±{100 * share:g} %" for share, names in together.items())
 
 
 def _peak(found: LoopReport) -> VerdictLine:

@@ -14,7 +14,9 @@ import numpy as np
 
 from malta.display import Curves, Description, display, quantity
 from malta.files import replace_files
+from malta.merits import Merit, reported, reported_merits
 from malta.model.plant import Plant, Signal, readonly
+from malta.model.signals import FINE
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.inputs import Inputs
 from malta.simulation.layout import columns_of_row, electronics_of
@@ -197,22 +199,37 @@ class Trajectory:
         return evaluate(axes.map(len(self.force)), self.force / constants)[0]
 
     @property
+    def figures(self) -> tuple[Merit, ...]:
+        """Figures of merit of any run: deviations of each output, largest and rms, forces, the nearest contact."""
+        off, found = self.p - self.reference, []
+        for k, s in enumerate(self.plant.outputs):
+            largest = float(np.abs(off[:, k]).max(initial=0.0))
+            rms = math.sqrt((off[:, k] ** 2).mean()) if len(off) else 0.0
+            unit = FINE.get(s.unit, s.unit)
+            found += [
+                Merit(f"largest deviation {s.name}", largest, unit, signal=s.name),
+                Merit(f"deviation {s.name}, rms", rms, unit, signal=s.name),
+            ]
+        for s, column in zip(self.plant.inputs, self.v.T, strict=False):
+            largest = float(np.abs(column).max(initial=0.0))
+            found.append(Merit(f"largest command {s.name}", largest, s.unit, signal=s.name))
+        if self.plant.contacts:
+            closest = float(self.contact.max(initial=0.0))
+            found.append(Merit("nearest contact", closest, "percent", relation="at most", bound=1.0))
+        return tuple(found)
+
+    @property
     def description(self) -> Description:
         """How it ended, the largest deviations, forces and shares of clearances."""
-        plant, Ts = self.plant, self.controller.sample_time
-        off = self.p - self.reference
+        plant, Ts, figures = self.plant, self.controller.sample_time, self.figures
         rows = [("ended", f"{self.verdict.name} at {quantity(self.verdict.time, 's')}, {self.engine}")]
-        for k, signal in enumerate(plant.outputs):
-            sizes = (
-                np.abs(off[:, k]).max(initial=0.0),
-                math.sqrt((off[:, k] ** 2).mean()) if len(off) else 0.0,
-            )
-            largest, rms = (quantity(float(size), signal.unit) for size in sizes)
-            rows.append((f"p - p* of {signal.name}", f"{largest} at most, {rms} rms"))
-        closest = float(self.contact.max(initial=0.0))
-        rows += [("nearest contact", f"{100 * closest:.3g} % of a clearance")] if plant.contacts else []
+        for signal, largest, rms in zip(plant.outputs, figures[::2], figures[1::2], strict=False):
+            sizes = (quantity(one.value, signal.unit) for one in (largest, rms))
+            rows.append((f"p - p* of {signal.name}", "{} at most, {} rms".format(*sizes)))
+        if plant.contacts:
+            rows.append((figures[-1].label, f"{figures[-1].phrase()} of a clearance"))
         rows.append(("limits reached", ", ".join(self.limits) or "none"))
-        size = np.abs(off).max(axis=0, initial=0.0)
+        off, size = self.p - self.reference, [one.value for one in figures[::2]]
         shown = {s.name: off[:, k] / (size[k] or 1.0) for k, s in enumerate(plant.outputs)}
         curves = Curves(self.t, "time [s]", shown, "(p - p*) / its largest [1]")
         title = f"Trajectory of {self.controller.name!r} in {self.scenario.name!r}: {len(self.t)} samples"
@@ -262,12 +279,19 @@ def label_rows(
 class StrokeFigures:
     """Figures of a stroke, as papers publish them. SI."""
 
-    rise: float  # s, 10 to 90 % of the true position; NaN when it was not reached
-    overshoot: float  # beyond the end, as a share of the stroke; NaN when the run ended early
-    axial_error: float  # m, largest |z* - z|
-    radial: Mapping[str, float]  # m, largest deviation of each radial output
-    force: float  # N, largest commanded thrust
-    current: float  # A, largest commanded current of any axis
+    rise: float = reported("rise, 10-90 %", "ms")  # s, of the true position; NaN when it was not reached
+    overshoot: float = reported(
+        "overshoot", "percent", "at most"
+    )  # of the stroke; NaN when the run ended early
+    axial_error: float = reported("axial error", "mm", "at most")  # m, largest |z* - z|
+    radial: Mapping[str, float] = reported("deviation {}", "um", "at most")  # m, largest, by radial output
+    force: float = reported("largest thrust", "N")  # N, commanded
+    current: float = reported("largest commanded current", "A")  # A, of any axis
+
+    @property
+    def figures(self) -> tuple[Merit, ...]:
+        """Its figures of merit, with what each means and which way is better."""
+        return tuple(reported_merits(self).values())
 
 
 def stroke_figures(run: Trajectory) -> StrokeFigures:

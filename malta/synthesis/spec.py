@@ -21,6 +21,7 @@ import numpy as np
 from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.model.data import plant_of
+from malta.model.parameters import box_words
 from malta.model.plant import Plant, Signal, readonly
 from malta.units import to_si
 
@@ -370,8 +371,7 @@ class Spec:
         rows = [("machine", f"{self.plant.name}, preset {self.parameters.preset!r}")]
         kind = "PID" if self.pid else f"LQG, {self.discretization}"
         rows.append(("law", f"{kind}, every {quantity(self.sample_time, 's')}, delay {self.delay}"))
-        box = ", ".join(f"{name} +-{100 * share:g} %" for name, share in self.uncertainty.items())
-        rows.append(("uncertainty", box or "none"))
+        rows.append(("uncertainty", box_words(self.uncertainty, self.parameters) or "none"))
         asked = ", ".join(f"{name} {value:g}" for name, value in self.specification.items())
         rows += [("specification", asked or "none"), ("sha256", self.sha256[:12])]
         return Description(f"Spec {self.name!r} of {self.path.name}", tuple(rows))

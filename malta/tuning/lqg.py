@@ -176,7 +176,7 @@ class _Cluster(NamedTuple):
     groups: tuple[Group, ...]
 
 
-def _clusters(spec: Spec) -> list[_Cluster]:
+def clusters_of(spec: Spec) -> list[_Cluster]:
     """What can be searched by itself: groups that share no variable. Mirror images are left out."""
     groups = groups_of(spec)
     base = spec.weights
@@ -214,7 +214,7 @@ def _differ(a: Weights, b: Weights) -> bool:
     return any((getattr(a, name) != getattr(b, name)).any() for name in names)
 
 
-def _search(spec: Spec, cluster: _Cluster, delay: int, journal: Journal) -> Search:
+def cluster_search(spec: Spec, cluster: _Cluster, delay: int, journal: Journal) -> Search:
     """The trials of one cluster with one delay."""
     at_least = at_least_of(spec.plant)
 
@@ -224,7 +224,7 @@ def _search(spec: Spec, cluster: _Cluster, delay: int, journal: Journal) -> Sear
     return Search(spec, cluster.variables, delay, journal, compute)
 
 
-def _worst(search: Search, u: FloatArray) -> float:
+def worst_ratio(search: Search, u: FloatArray) -> float:
     """What is minimized: the worst ratio, and a little of all of them."""
     ratios = _ratios(search.spec, search.figures(u), search.spec.specification)
     return (max(ratios) + 0.01 * sum(ratios) / len(ratios) if ratios else UNSTABLE) + distance_outside(u)
@@ -289,17 +289,17 @@ def search_weights(
 
     Raises InputError for a machine whose groups no LQG can be searched for, and for a variable without effect.
     """
-    clusters = _clusters(spec)
+    clusters = clusters_of(spec)
     journal.expect(_expected(clusters, spec, effort), progress)
     found: dict[int, list[tuple[Search, FloatArray]]] = {}
     for delay in spec.delays:
         found[delay] = []
-        for search in (_search(spec, cluster, delay, journal) for cluster in clusters):
-            goal = partial(_worst, search)
+        for search in (cluster_search(spec, cluster, delay, journal) for cluster in clusters):
+            goal = partial(worst_ratio, search)
             u = search.evolve(goal, effort.generations)
             look = partial(_look_worst, search)
             found[delay].append((search, descend(look, u, Merit(), effort.polish * len(search.low))))
-    worst = {delay: max(_worst(s, u) for s, u in places) for delay, places in found.items()}
+    worst = {delay: max(worst_ratio(s, u) for s, u in places) for delay, places in found.items()}
     # More states are worth it only where they help.
     delay = min(d for d, ratio in worst.items() if ratio <= 1.01 * min(worst.values()))
     trial = combine(spec, found[delay])

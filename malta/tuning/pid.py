@@ -324,7 +324,7 @@ def _load_error(figures: Mapping[str, float]) -> float:
     return math.hypot(*(value for name, value in figures.items() if name.startswith("load_error")))
 
 
-def _goal(search: Search, u: FloatArray, outputs: Collection[str]) -> float:
+def goal_value(search: Search, u: FloatArray, outputs: Collection[str]) -> float:
     """The logarithm of these outputs' load error; beyond a bound it costs more than it can gain."""
     figures = _of(search.figures(u), outputs)
     if not figures:
@@ -364,7 +364,7 @@ def _polish(search: Search, u: FloatArray, trials: int, outputs: Collection[str]
             constraints=optimize.NonlinearConstraint(bounds, -np.inf, -2 * ROOM),
             options={"maxfev": trials, "initial_tr_radius": first, "final_tr_radius": last},
         )  # fmt: skip
-        u = min(tried, key=partial(_goal, search, outputs=outputs))
+        u = min(tried, key=partial(goal_value, search, outputs=outputs))
     return u
 
 
@@ -411,7 +411,7 @@ def search_gains(
         for some, chosen, generations in rounds:
             names = [spec.plant.outputs[o].name for o in chosen]
             search = Search(there, some, spec.delay, journal, compute, among=variables)
-            u = search.evolve(partial(_goal, search, outputs=names), generations)
+            u = search.evolve(partial(goal_value, search, outputs=names), generations)
             u = _polish(search, u, 3 * effort.polish * len(some), names)
             there = apply_trial(there, combine(there, [(search, u)]))
         search = Search(there, variables, spec.delay, journal, compute)

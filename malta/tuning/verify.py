@@ -233,7 +233,7 @@ def verify(
     bandwidth, last 0 dB of sigma_max(L): 46.29 Hz (290.8 rad/s)
     bandwidth, regulator's fastest natural frequency: 39.37 Hz (247.4 rad/s)
     bandwidth, regulator's slowest natural frequency: 39.37 Hz (247.4 rad/s)
-    uncertainty: m +-20 %  C +-20 %
+    uncertainty: m C ±20 %
     robust: proven 320... %, lost at 320.61 % at 1047 rad/s
     >>> found = malta.verify(model, controller, {"m": 0.2}, stages=True)
     >>> down, up = found.tolerance["m"]

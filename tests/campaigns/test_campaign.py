@@ -405,15 +405,15 @@ def test_figures_count_completed_runs_and_bounds_of_the_published_stroke(
     plan = Plan(shaky, "stroke", dict.fromkeys(BOX, 0.6), samples=64)
     found = campaign(plan)
     listed = {figure.label: figure for figure in figures_of(found, published)}
-    assert listed["deviation y1"].published == pytest.approx(20e-6)
-    assert listed["rise, 10-90 %"].relation == "about"
+    assert listed["deviation y1"].merit.bound == pytest.approx(20e-6)
+    assert listed["rise, 10-90 %"].merit.relation == "about"
     for figure in listed.values():
         assert np.isnan(figure.values[~found.completed]).all()
     within = runs_within_bounds(found, published)
     assert within is not None
     for row in range(64):
-        bounded = [f for f in listed.values() if f.relation == "at most" and math.isfinite(f.published)]
-        assert within[row] == all(f.values[row] <= f.published for f in bounded)
+        limits = [(f, f.merit.bound) for f in listed.values() if f.merit.relation == "at most"]
+        assert within[row] == all(f.values[row] <= bound for f, bound in limits if bound is not None)
     assert runs_within_bounds(found) is None
     other = campaign(Plan(shaky, "stroke", {"m": 0.0}, samples=8, options={"distance": 2e-3}))
     assert runs_within_bounds(other, published) is None

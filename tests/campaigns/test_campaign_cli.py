@@ -28,7 +28,7 @@ QUICK = ("--option", "fidelity=force", "--option", "rise=3ms")
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without figures, which take longer than so few runs."""
-    monkeypatch.setattr("malta.cli.campaign._draw", lambda *_: [])
+    monkeypatch.setattr("malta.cli.campaign.draw_figures", lambda *_: [])
 
 
 def _sentence(err: str) -> str:

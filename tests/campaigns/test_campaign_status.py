@@ -32,7 +32,7 @@ COMMON = ("--samples", "40", "--option", "fidelity=force", "--option", "rise=3ms
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without figures, which take longer than so few runs; four blocks and eight runs."""
-    monkeypatch.setattr("malta.cli.campaign._draw", lambda *_: [])
+    monkeypatch.setattr("malta.cli.campaign.draw_figures", lambda *_: [])
     monkeypatch.setattr("malta.campaigns.run.BLOCK", 8)
 
 

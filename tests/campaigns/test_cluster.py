@@ -22,12 +22,12 @@ from conftest import one_sentence, without_progress
 import malta
 from malta.campaigns import dask as cluster
 from malta.campaigns.dask import (
-    _at_worker,
-    _collect,
-    _result,
-    _task,
+    block_of,
     blocks,
+    collect_blocks,
     require_malta,
+    simulate_at_worker,
+    task_of,
 )
 from malta.campaigns.plan import Plan
 from malta.campaigns.run import campaign
@@ -173,14 +173,14 @@ def test_without_the_extra_it_says_how_to_get_it(plan: Plan, monkeypatch: pytest
 
 
 def test_what_a_worker_does_is_what_is_done_here(plan: Plan) -> None:
-    task = _task(plan, malta_version())
-    block = _at_worker(task, 8, 8)
+    task = task_of(plan, malta_version())
+    block = simulate_at_worker(task, 8, 8)
     assert not isinstance(block, str)
     here = fly(plan, 8, 8)
     for name in Batch.__dataclass_fields__:
         assert np.array_equal(getattr(block[1], name), getattr(here.batch, name), equal_nan=True)
-    again = _task(replace(plan), malta_version())  # as it comes with the next block
-    assert cluster._unpickle_plan(again) is cluster._unpickle_plan(task)
+    again = task_of(replace(plan), malta_version())  # as it comes with the next block
+    assert cluster.unpickle_plan(again) is cluster.unpickle_plan(task)
 
 
 def malta_version() -> str:
@@ -190,17 +190,17 @@ def malta_version() -> str:
 
 
 def test_what_a_worker_refuses_comes_back_as_a_sentence(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
-    refused = _at_worker(_task(plan, "9"), 0, 8)
+    refused = simulate_at_worker(task_of(plan, "9"), 0, 8)
     with pytest.raises(malta.InputError, match=f"a worker: found malta {malta_version()}, expected malta 9"):
-        _result(NOBODY, _future(refused))
+        block_of(NOBODY, _future(refused))
 
     def none(*_: Any, **__: Any) -> Any:
         raise malta.InputError("campaign", "m", "lead", "iron")
 
     monkeypatch.setattr(cluster, "fly", none)
-    refused = _at_worker(_task(plan, malta_version()), 0, 8)
+    refused = simulate_at_worker(task_of(plan, malta_version()), 0, 8)
     with pytest.raises(malta.InputError, match="campaign: m: found lead, expected iron"):
-        _result(NOBODY, _future(refused))
+        block_of(NOBODY, _future(refused))
 
 
 def _clients_answers(worker: Any, scheduler: Any) -> Any:
@@ -267,9 +267,9 @@ def _future(result: Any, status: str = "finished") -> Any:
 
 def test_a_worker_that_fails_is_one_sentence() -> None:
     with pytest.raises(malta.InputError, match="found a worker that fails \\(ModuleNotFoundError: No module"):
-        _result(NOBODY, _future(ModuleNotFoundError("No module named 'malta'"), "error"))
+        block_of(NOBODY, _future(ModuleNotFoundError("No module named 'malta'"), "error"))
     with pytest.raises(malta.InputError, match="found the connection lost"):
-        _result(NOBODY, _future(None, "cancelled"))
+        block_of(NOBODY, _future(None, "cancelled"))
 
 
 class _Idle:
@@ -293,7 +293,7 @@ def test_a_scheduler_without_workers_is_not_waited_for_forever(
 
     monkeypatch.setattr(cluster, "WAIT", 3.0)
     with pytest.raises(malta.InputError, match="found no workers, expected a scheduler with some"):
-        list(_collect(SimpleNamespace(wait=wait), _Idle(), NOBODY, plan, {0: 8}))
+        list(collect_blocks(SimpleNamespace(wait=wait), _Idle(), NOBODY, plan, {0: 8}))
 
 
 def test_nothing_left_asks_nobody(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,9 +23,9 @@ from malta.campaigns.studies import (
     Index,
     Sensitivity,
     Tolerances,
-    _indices,
-    _points,
+    indices_of,
     sensitivity,
+    sobol_points,
     spread_of,
     tolerances,
 )
@@ -81,7 +81,7 @@ def test_a_yield_that_comes_back_is_reported(gap: tuple[float, float], monotone:
     def keeps(factor: float) -> Rate | None:
         return None if gap[0] < factor < gap[1] else rate(99, 100)
 
-    spread = tolerance._largest("m", keeps, 6.0, None)
+    spread = tolerance.largest_spread("m", keeps, 6.0, None)
     assert spread.factor == pytest.approx(2.0, abs=6 / 6 / 2**7)
     assert spread.factor <= 2.0
     assert spread.monotone is monotone
@@ -115,14 +115,14 @@ def test_indices_are_shares(indices: Sensitivity) -> None:
 
 def test_indices_of_the_ishigami_function() -> None:
     """sin x1 + 7 sin^2 x2 + 0.1 x3^4 sin x1 over -pi .. pi, about a mean of 1e6: its indices in closed form."""
-    x = 2 * math.pi * _points(3, 2**13, 1) - math.pi
+    x = 2 * math.pi * sobol_points(3, 2**13, 1) - math.pi
     values = 1e6 + np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
-    found = _indices(values, 2**13, 1)
+    found = indices_of(values, 2**13, 1)
     for index, first, total in zip(found, (0.3139, 0.4424, 0.0), (0.5576, 0.4424, 0.2437), strict=True):
         assert index.first == pytest.approx(first, abs=0.02)
         assert index.total == pytest.approx(total, abs=0.01)
         assert 0 < index.first_half < 0.06
-    assert _indices(np.ones_like(values), 2**13, 1) == ()
+    assert indices_of(np.ones_like(values), 2**13, 1) == ()
 
 
 def test_indices_of_the_g_function() -> None:
@@ -133,9 +133,9 @@ def test_indices_of_the_g_function() -> None:
     total = np.array([share[k] * np.prod(1 + np.delete(share, k)) for k in range(4)]) / variance
     inside = []
     for seed in range(10):
-        x = _points(4, 2**10, seed)
+        x = sobol_points(4, 2**10, seed)
         values = np.prod((np.abs(4 * x - 2) + weight) / (1 + weight), axis=1)
-        for k, index in enumerate(_indices(values, 2**10, seed)):
+        for k, index in enumerate(indices_of(values, 2**10, seed)):
             inside.append(abs(index.first - share[k] / variance) < index.first_half)
             inside.append(abs(index.total - total[k]) < index.total_half)
             assert index.first == pytest.approx(share[k] / variance, abs=0.06)

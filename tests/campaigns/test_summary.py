@@ -131,6 +131,11 @@ def test_a_summary_by_hand(flown: Campaign, bounds: Bounds) -> None:
         assert merit.mean == pytest.approx(values.mean(), rel=1e-13)
         assert merit.standard_deviation == pytest.approx(values.std(), rel=1e-9, abs=1e-15)
         assert merit.within == figure.within.sum()
+        assert [one.value for one in merit.figures((50,))] == [np.median(values)]
+    shares = {one.label: one for one in found.figures}
+    assert (shares["completed"].value, shares["completed"].better) == (found.rate.share, "high")
+    rise = shares["rise, 10-90 %, median"]
+    assert (rise.better, rise.relation, rise.meaning.group) == ("low", "about", "campaign")
     names, limited = verdicts(flown.plan.plant), flown.batch.saturated.max(axis=1) > 0
     ways = dict(zip(summary.ways_to_end(flown.plan), found.bands[0], strict=True))  # over m
     assert ways[summary.WITHIN].sum() == found.within

@@ -60,7 +60,7 @@ def _gain_npz(document: Any, case: Case) -> bytes:
     """Cuts change the members before their checksums are made."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        entries = list(encodings._flat(encodings._columns(document)).items())
+        entries = list(encodings.flat_entries(encodings.columns_of(document)).items())
         chosen = int(case.cuts[0].at * len(entries)) if case.cuts and case.sealed else -1
         for k, (name, value) in enumerate(entries):
             member = io.BytesIO()
@@ -71,7 +71,7 @@ def _gain_npz(document: Any, case: Case) -> bytes:
 
 
 def _gain_mat(document: Any, case: Case) -> bytes:
-    body = cut(encodings._to_mat(document)[encodings.MAT_HEADER :], case.cuts)
+    body = cut(encodings.to_mat(document)[encodings.MAT_HEADER :], case.cuts)
     return encodings.mat_header(body) + body
 
 

@@ -83,12 +83,12 @@ def test_every_gain_file_is_read_as_scipy_reads_it(
     """As committed, and saved anew by scipy with other options: the same document as in the .json."""
     _assert_same(path.read_bytes())
     content = encodings.decode(path.with_suffix(".json"))
-    cells = encodings._cells(encodings._columns(content))
+    cells = encodings.cells_of(encodings.columns_of(content))
     data = _signed(_saved(cells, **options))
     _assert_same(data)
     again = tmp_path / path.name
     again.write_bytes(data)
-    assert encodings.decode(again) == encodings.decode(path) == encodings._columns(content)
+    assert encodings.decode(again) == encodings.decode(path) == encodings.columns_of(content)
 
 
 NAMES = st.from_regex(r"[a-zA-Z][a-zA-Z0-9_]{0,30}", fullmatch=True)
@@ -362,7 +362,7 @@ EDITS: dict[str, Callable[[bytes, int], Iterator[bytes]]] = {
 
 def _compressed_copy() -> bytes:
     content = encodings.decode(SMALL.with_suffix(".json"))
-    return _saved(encodings._cells(encodings._columns(content)), do_compression=True)
+    return _saved(encodings.cells_of(encodings.columns_of(content)), do_compression=True)
 
 
 def _given(data: bytes, *_: Any) -> bytes:

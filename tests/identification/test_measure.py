@@ -16,7 +16,7 @@ from figure_checks import defects
 import malta
 from malta.identification import ExcitationPlan, Log, Measurement
 from malta.identification import measure as measuring
-from malta.identification.lines import _interpolate
+from malta.identification.lines import interpolate_columns
 from malta.identification.measure import cut_loop
 from malta.report.figures.runs import measured_figure
 
@@ -138,7 +138,7 @@ def test_interpolation_says_what_it_may_miss() -> None:
     off, C = (0.01 * x**2)[:, None].astype(complex), np.zeros((9, 1, 1), dtype=complex)
     truth = off.copy()
     off[~known] = 0
-    _interpolate(x, known, scale, off, C)
+    interpolate_columns(x, known, scale, off, C)
     error = np.abs(off - truth)[:, 0]
     assert error[~known] == pytest.approx(np.sqrt(C[~known, 0, 0].real / 2))
     assert error[known].max() == 0

@@ -21,7 +21,7 @@ from malta import gains
 from malta.cli.main import app, main
 from malta.errors import InputError
 from malta.loops.classical import (
-    _balanced_norm,
+    balanced_norm,
     classical_margins,
     delay_margins,
     disk_margins_alone,
@@ -212,11 +212,11 @@ def test_a_balanced_matrix_bounds_mu() -> None:
     M *= 10.0 ** rng.uniform(-3, 3, (20, 4, 1)) * 10.0 ** rng.uniform(-3, 3, (20, 1, 4))
     U = np.exp(2j * np.pi * rng.uniform(size=(500, 1, 4, 1)))
     below = np.abs(np.linalg.eigvals(U * M)).max(axis=(0, 2))
-    above = _balanced_norm(M)
+    above = balanced_norm(M)
     assert (below <= above * (1 + 1e-9)).all()
     assert np.median(above / below) < 1.3
     a, b = rng.normal(size=(5, 4)) + 1j, rng.normal(size=(5, 4)) - 1j
-    assert _balanced_norm(a[:, :, None] * b[:, None, :]) == pytest.approx(np.abs(a * b).sum(axis=1), rel=1e-3)
+    assert balanced_norm(a[:, :, None] * b[:, None, :]) == pytest.approx(np.abs(a * b).sum(axis=1), rel=1e-3)
 
 
 @pytest.mark.parametrize("name", DESIGNS)

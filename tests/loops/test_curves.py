@@ -17,7 +17,7 @@ import malta
 from malta.loops.classical import delay_margins, find_tops
 from malta.loops.curves import LoopCurves, loop_curves, respond
 from malta.loops.linear_loops import linear_loop
-from malta.loops.locus import _changes, root_locus
+from malta.loops.locus import root_locus, stability_changes
 from malta.loops.time_domain import loop_steps, step_figures
 from malta.simulation.references import Motion
 from malta.synthesis.recovery import StepResponse
@@ -426,7 +426,7 @@ def test_stability_that_changes_from_sample_to_sample() -> None:
         return np.array([math.cos(math.pi * value) + 0j])
 
     values = np.arange(4.0)
-    found = _changes(poles, values, np.array([poles(v) for v in values]), None)
+    found = stability_changes(poles, values, np.array([poles(v) for v in values]), None)
     assert found == pytest.approx((0.5, 1.5, 2.5), abs=1e-6)
 
 

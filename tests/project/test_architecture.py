@@ -26,6 +26,7 @@ GROUND = (
     "tables",
     "processes",
     "display",
+    "merits",
 )
 ORDER = (*GROUND, *PACKAGES[1:])
 MACHINES = {"tubular", "halbach", "planar"}

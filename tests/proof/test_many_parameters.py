@@ -16,7 +16,7 @@ from scipy import linalg
 import malta
 from malta.proof.box import Box, box_of
 from malta.proof.multipliers.multipliers import Blocks, Multiplier, multiplier
-from malta.proof.multipliers.pencil import LEVELS, _gains
+from malta.proof.multipliers.pencil import LEVELS, gains_of_level
 from malta.proof.multipliers.pencil_response import Branch, excludes_zero, response
 from malta.proof.multipliers.structured import Structured, rows_of
 from malta.proof.problem import OfLoop
@@ -121,12 +121,12 @@ def _matrix(system: UncertainSystem, law: Compensator, p: Any) -> Any:
 
 def test_fractions_come_close_to_a_hold() -> None:
     """Y / 2 coth(Y / 2) - 1 is the fraction of a level and a remainder, whose terms are no larger than the whole's."""
-    whole, y = np.array(_gains(0)), 1.7
+    whole, y = np.array(gains_of_level(0)), 1.7
     for level in range(LEVELS + 1):
         z, held = y / 2, 0.0
         for k in range(level, 0, -1):
             held = z * z / (2 * k + 1 + held)
-        left = np.array(_gains(level))
+        left = np.array(gains_of_level(level))
         beyond = float(left @ y ** (2.0 * np.arange(1, len(left) + 1)))
         assert held + beyond == pytest.approx(z / math.tanh(z) - 1, rel=1e-14)
         assert (left[:level] == 0).all()

@@ -16,7 +16,7 @@ from flint import arb
 from scipy import linalg
 
 from malta import gains
-from malta.margins.travel import NOT_BETWEEN, _anywhere, loop_at, travel_margin
+from malta.margins.travel import NOT_BETWEEN, loop_at, margin_anywhere, travel_margin
 from malta.model.data import plant_of
 from malta.proof.box import box_of
 from malta.proof.expressions import NotAnalytic, program
@@ -35,7 +35,7 @@ BOX = {"m": 0.05, "I_x": 0.1, "I_z": 0.1, "B_r": 0.05, "r_z": 0.2}
 def machine(name: str = "planar") -> tuple[Any, Any, HeldLoop]:
     controller = gains.read(f"design/gains/{name}.json")
     plant = plant_of(controller.parameters)
-    found = _anywhere(plant, controller, NAMES, "lag")
+    found = margin_anywhere(plant, controller, NAMES, "lag")
     assert found is not None
     return plant, controller, found
 

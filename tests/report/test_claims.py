@@ -192,13 +192,13 @@ def _row(relation: str = "about", form: str = "{:.2f}", note: str = "", why: str
 def test_about_is_5_percent_or_says_how_far(off: float, word: str) -> None:
     for target in (1.0, 400.0, 1e-6, -3.0):
         for sign in (1, -1):
-            assert claims._word(_row(), target, target * (1 + sign * off)) == word
+            assert claims.verdict_word(_row(), target, target * (1 + sign * off)) == word
 
 
 @given(value=st.floats(-1e3, 1e3), target=st.floats(-1e3, 1e3))
 def test_at_most_is_at_most(value: float, target: float) -> None:
     for relation, sign in (("at most", 1), ("at least", -1)):
-        word = claims._word(_row(relation), sign * target, sign * value)
+        word = claims.verdict_word(_row(relation), sign * target, sign * value)
         assert word.startswith("not reproduced") == (value > target)
         if word == "reproduced":
             assert value == pytest.approx(target, rel=0.0501, abs=0)
@@ -221,7 +221,7 @@ def test_at_most_is_at_most(value: float, target: float) -> None:
     ],
 )
 def test_a_bound_says_how_far_it_is(relation: str, bound: float, value: float, word: str) -> None:
-    assert claims._word(_row(relation), bound, value) == word
+    assert claims.verdict_word(_row(relation), bound, value) == word
 
 
 @pytest.mark.parametrize(
@@ -238,34 +238,36 @@ def test_a_bound_says_how_far_it_is(relation: str, bound: float, value: float, w
     ],
 )
 def test_what_is_so_by_construction_still_has_to_agree(relation: str, value: float, word: str) -> None:
-    assert claims._word(_row(relation), 1.0, value, by_construction=True) == word
+    assert claims.verdict_word(_row(relation), 1.0, value, by_construction=True) == word
 
 
 def test_what_is_beside_is_not_compared() -> None:
     for value in (1e-9, 1.0, 1e9):
-        assert claims._word(_row("beside"), 1.0, value, by_construction=True) == "not compared"
+        assert claims.verdict_word(_row("beside"), 1.0, value, by_construction=True) == "not compared"
 
 
 @given(digits=st.integers(0, 4), value=st.floats(0, 1e4), target=st.floats(0, 1e4))
 def test_equal_is_every_printed_digit(digits: int, value: float, target: float) -> None:
     row = _row("equal", f"{{:.{digits}f}}")
     same = f"{value:.{digits}f}" == f"{target:.{digits}f}"
-    assert (claims._word(row, target, value) == "reproduced") == same
-    assert claims._word(row, target, target) == "reproduced"
+    assert (claims.verdict_word(row, target, value) == "reproduced") == same
+    assert claims.verdict_word(row, target, target) == "reproduced"
     if abs(value - target) > 1.01 * 10**-digits:
-        assert claims._word(row, target, value) == "not reproduced"
+        assert claims.verdict_word(row, target, value) == "not reproduced"
 
 
 @pytest.mark.parametrize("relation", ["about", "at most", "equal"])
 def test_what_was_not_reached_is_not_reproduced(relation: str) -> None:
     """NaN: the stroke of a run that touched down has no rise."""
-    assert claims._word(_row(relation), 1.0, math.nan) == "not reproduced"
+    assert claims.verdict_word(_row(relation), 1.0, math.nan) == "not reproduced"
 
 
 def _judge(row: Row, values: Sequence[float], built: Sequence[bool] = (False,) * 3) -> str:
     """The verdict on figures of designs a, b, c, whose published value is 1."""
-    words = [claims._word(row, 1.0, v, by_construction=one) for v, one in zip(values, built, strict=False)]
-    return claims._verdict(row, words, "abc"[: len(values)])
+    words = [
+        claims.verdict_word(row, 1.0, v, by_construction=one) for v, one in zip(values, built, strict=False)
+    ]
+    return claims.verdict_of(row, words, "abc"[: len(values)])
 
 
 def test_the_verdict_of_several_designs() -> None:
@@ -309,7 +311,7 @@ def test_the_verdict_of_several_designs() -> None:
     ],
 )
 def test_a_claim_has_one_word(verdicts: list[str], word: str) -> None:
-    assert claims.word_of(verdicts) == word
+    assert claims.verdict_word(verdicts) == word
 
 
 def test_only_designs_that_are_meant_to_reproduce_a_paper_are_judged(published: dict[str, Any]) -> None:
@@ -320,7 +322,7 @@ def test_only_designs_that_are_meant_to_reproduce_a_paper_are_judged(published: 
 
     def claim(names: Sequence[str], meant: Sequence[str] = ("table2",), **changes: Any) -> tuple[str, str]:
         chosen = [e for e in found if e.spec.name in names]
-        line = claims._claim(row._replace(**changes), chosen, published, meant)
+        line = claims.claim_of(row._replace(**changes), chosen, published, meant)
         assert line.ours == tuple(f"{1e3 * values[name]:.1f}" for name in names)
         return line.verdict, line.word
 
@@ -339,7 +341,7 @@ def test_a_claim_shows_its_figures(found: Found, published: dict[str, Any]) -> N
 
     def claim(**changes: Any) -> Claim:
         row = Row("rise", "ms", "{:.2f}", lambda _: next(values), "figure_12.rise_time")
-        return claims._claim(row._replace(**changes), found.evidence, published, NAMES)
+        return claims.claim_of(row._replace(**changes), found.evidence, published, NAMES)
 
     assert claim() == Claim(
         "rise [ms]", "16.2", ("16.20", "–"), "table2: reproduced; calibrated: not reproduced", "partly"
@@ -361,7 +363,7 @@ def test_a_claim_shows_its_figures(found: Found, published: dict[str, Any]) -> N
 def test_a_figure_that_is_not_published_is_missed(found: Found) -> None:
     row = next(r for r in tubular.rows() if r.published == "figure_12.rise_time")
     with pytest.raises(malta.InputError) as caught:
-        claims._claim(row, found.evidence, {"figure_12": {}}, NAMES)
+        claims.claim_of(row, found.evidence, {"figure_12": {}}, NAMES)
     assert (caught.value.where, caught.value.field) == ("data/published", "figure_12.rise_time")
 
 

@@ -18,12 +18,12 @@ from rich.console import Console
 from test_report_page import HOSTILE, STRANGE, cart_controller
 
 from malta.cli.documents.loops import compare_output
-from malta.margins.loop_report import MEANINGS, LoopFigure, best_of, four_digits
 from malta.margins.verify import linear_report
+from malta.merits import MEANINGS, Merit, best_of, figure, four_digits
 from malta.report.page.analysis import Subject
 from malta.report.page.comparison import Comparison, Row, compare, comparison_tables, names_of
 from malta.report.page.report import comparison_page
-from malta.report.tables.margins import _position_text
+from malta.report.tables.margins import position_text
 
 if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
@@ -120,8 +120,8 @@ def test_names_stay_distinguishable() -> None:
     assert found[1:3] == ("b/one.json (1)", "b/one.json (2)")
 
 
-def score(value: float, kind: str = "peak_s") -> LoopFigure:
-    return LoopFigure(kind, "key", "label", value, "1", 1.0)
+def score(value: float, kind: str = "peak_s") -> Merit:
+    return figure(kind, "key", "label", value, "1")
 
 
 def test_the_best_is_better_in_digits_that_are_shown() -> None:
@@ -198,4 +198,4 @@ def test_an_unstable_design_is_compared_and_ends_with_exit_code_1(run: Run) -> N
 def test_places_along_a_travel_are_in_millimetres_and_others_as_they_are() -> None:
     travel: Any = SimpleNamespace(stroke=0.01, course="z")
     speed: Any = SimpleNamespace(stroke=0.0, course="Omega")
-    assert [_position_text(one, 1.5e-3) for one in (travel, speed)] == ["1.5", "0.0015"]
+    assert [position_text(one, 1.5e-3) for one in (travel, speed)] == ["1.5", "0.0015"]

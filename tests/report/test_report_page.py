@@ -89,7 +89,7 @@ def test_the_key_figures_are_those_of_verify(cart: Analysis, page: Page) -> None
     assert shown["Bandwidth"] == f"{margins.bandwidth['sigma_max_T'] / (2 * np.pi):.1f} Hz"
     for value in shown.values():
         assert f'<dd class="value">{value}</dd>' in page.html
-    found = {score.key: score.value for score in cart.figures}
+    found = {score.identifier: score.value for score in cart.figures}
     assert found["peak_sensitivity"] == peak
     assert found["bandwidth_sigma_max_T_rad_per_s"] == margins.bandwidth["sigma_max_T"]
     assert found["stable"] == 1.0

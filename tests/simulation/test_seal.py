@@ -17,7 +17,7 @@ from conftest import Run, refusal
 
 import malta
 from malta.campaigns import plan as identity
-from malta.campaigns.dask import _at_worker, _task
+from malta.campaigns.dask import simulate_at_worker, task_of
 from malta.campaigns.plan import Plan, fingerprint, planned_run, revision_of
 from malta.campaigns.result import Campaign
 from malta.campaigns.run import campaign
@@ -173,7 +173,7 @@ def test_changed_outcomes_are_named_and_not_reported(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`completed` zeroed, with and without a verdict that no run has: the yield stays, without a traceback."""
-    monkeypatch.setattr("malta.cli.campaign._draw", lambda *_: [])
+    monkeypatch.setattr("malta.cli.campaign.draw_figures", lambda *_: [])
     command = (
         "campaign",
         GAINS,
@@ -305,8 +305,8 @@ def test_model_and_experiments_are_in_the_revision(plan: Plan, monkeypatch: pyte
 def test_a_worker_of_another_revision_is_refused(plan: Plan) -> None:
     from importlib.metadata import version
 
-    task = replace(_task(plan, version("malta")), identity="0" * 64)
-    assert _at_worker(task, 0, 8) == (
+    task = replace(task_of(plan, version("malta")), identity="0" * 64)
+    assert simulate_at_worker(task, 0, 8) == (
         *("--cluster", "a worker", "another revision of malta or of the machine"),
         "the same as here",
     )

@@ -20,7 +20,7 @@ from tampering import claiming
 
 import malta
 from malta.margins.loop_report import Stage
-from malta.margins.verify import _smallest
+from malta.margins.verify import smallest_margin
 from malta.proof.box import below
 from malta.proof.certificate import certificate, check, checked_file, checked_loop
 from malta.proof.exclusion import exclusion
@@ -88,7 +88,7 @@ def test_the_remainder_of_an_interpolation_is_bounded(degree_of: float) -> None:
     radius = 4.0
     a = 1.01 * radius
     disc = enclosure.Disc(radius, 0.0, [(1 / (a - radius), 0)])
-    side = enclosure._interpolation_side("x", 0, [disc], min(degree_of, 1e-5))
+    side = enclosure.interpolation_side("x", 0, [disc], min(degree_of, 1e-5))
     if degree_of > 1e-5:
         side = replace(side, degree=1, tails=((3.5 / radius / (radius - 1) / (a - radius), 0),))
     d = side.degree
@@ -109,10 +109,10 @@ def test_the_remainder_of_an_interpolation_is_bounded(degree_of: float) -> None:
 
 def test_bounds_add_up() -> None:
     one, two = [(1.0, 3), (2.0, -1)], [(3.0, 0), (1.0, 2)]
-    assert enclosure._add_bounds(one, None) == one
-    assert enclosure._add_bounds(None, two) == two
-    assert enclosure._add_bounds(None, None) is None
-    both = enclosure._add_bounds(one, two)
+    assert enclosure.add_bounds(one, None) == one
+    assert enclosure.add_bounds(None, two) == two
+    assert enclosure.add_bounds(None, None) is None
+    both = enclosure.add_bounds(one, two)
     assert both is not None
     assert [math.ldexp(m, e) for m, e in both] == [11.0, 5.0]
 
@@ -145,7 +145,7 @@ def test_an_enclosure_ends_in_time_where_later_places_take_longer(monkeypatch: p
     clock = iter([0.0, 0.0, 0.0])
     monkeypatch.setattr(time, "monotonic", lambda: next(clock, 1e9))
     with pytest.raises(enclosure.Unproven, match="time was up before the coefficients were found"):
-        enclosure._values(f, [(fmpq(1), fmpq(4))] * 3, until=1.0)
+        enclosure.values_within(f, [(fmpq(1), fmpq(4))] * 3, until=1.0)
 
 
 # Exclusion of zero
@@ -361,12 +361,12 @@ def _margin(lower: float | None, upper: float, reason: str = "") -> Margin:
 
 
 def test_the_margin_of_several_places_is_the_smallest() -> None:
-    found = _smallest([_margin(1.0, 2.0), _margin(0.5, 3.0)])
+    found = smallest_margin([_margin(1.0, 2.0), _margin(0.5, 3.0)])
     assert (found.lower, found.upper) == (0.5, 2.0)
 
 
 def test_a_place_without_a_proof_leaves_nothing_proven() -> None:
-    found = _smallest([_margin(1.0, 2.0), _margin(None, 3.0, "too wide"), _margin(0.5, 4.0)])
+    found = smallest_margin([_margin(1.0, 2.0), _margin(None, 3.0, "too wide"), _margin(0.5, 4.0)])
     assert (found.lower, found.upper, found.reason) == (None, 2.0, "too wide")
 
 

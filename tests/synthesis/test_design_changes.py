@@ -11,7 +11,7 @@ import pytest
 from conftest import Run, one_sentence
 
 import malta
-from malta.cli.options import _name_of, read_changed_design
+from malta.cli.options import name_of_changes, read_changed_design
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -99,8 +99,8 @@ def test_the_gain_files_of_the_unchanged_design_stand(run: Run, tmp_path: Path) 
 )
 def test_designs_of_other_changes_have_other_names(one: str, other: str) -> None:
     """Else the gain files of one would take the place of those of the other."""
-    assert _name_of([one]) != _name_of([other])
-    assert _name_of(["m=.4"]) == _name_of(["m=0.4"])
+    assert name_of_changes([one]) != name_of_changes([other])
+    assert name_of_changes(["m=.4"]) == name_of_changes(["m=0.4"])
 
 
 @pytest.mark.parametrize("name", ["m", "weights.state.z"])

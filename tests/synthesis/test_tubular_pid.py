@@ -325,7 +325,7 @@ def test_a_number_of_the_search_is_written_to_its_own_axis(spec: Spec) -> None:
 
 @pytest.mark.slow
 def test_a_pid_has_no_verdict_on_figures_of_an_lqg(found: Evidence, published: dict[str, Any]) -> None:
-    lines = {row.subject: claims._claim(row, [found], published, ["tubular_pid"]) for row in tubular.rows()}
+    lines = {row.subject: claims.claim_of(row, [found], published, ["tubular_pid"]) for row in tubular.rows()}
     only = {subject for subject, line in lines.items() if line.verdict == "of an LQG only"}
     assert only == {"LQR: stiffness over attraction, K1/k", "LQR: share of the 20 % box"}
     dashes = {subject for subject, line in lines.items() if line.ours == ("–",)}
@@ -333,7 +333,7 @@ def test_a_pid_has_no_verdict_on_figures_of_an_lqg(found: Evidence, published: d
     assert not any("nan" in line.ours[0] for line in lines.values())
     row = Row("a gain", "1", "{:.1f}", lambda e: e.K[0, 0], 4.0, of_lqg=True)
     lqg = replace(found, spec=malta.read_design(ROOT / "design" / "table2.toml"), K=np.array([[4.0]]))
-    line = claims._claim(row, [lqg, found], published, ["table2"])
+    line = claims.claim_of(row, [lqg, found], published, ["table2"])
     assert (line.ours, line.verdict, line.word) == (("4.0", "–"), "reproduced", "reproduced")
 
 

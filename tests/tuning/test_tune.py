@@ -27,7 +27,7 @@ from malta.synthesis.requirements import requirements_for
 from malta.synthesis.riccati import eigenvalues
 from malta.tuning import lqg
 from malta.tuning.groups import figures_of
-from malta.tuning.lqg import _clusters, _search, _worst
+from malta.tuning.lqg import cluster_search, clusters_of, worst_ratio
 from malta.tuning.search import (
     Effort,
     Journal,
@@ -215,7 +215,7 @@ def test_the_law_of_gains_is_the_controllers(
 def test_quick_figures_are_those_of_verify(
     spec: Spec, flagship: tuple[LinearModel, Controller, LoopReport], requirements: Any
 ) -> None:
-    clusters = _clusters(spec)
+    clusters = clusters_of(spec)
     assert [len(c.variables) for c in clusters] == [8, 5]
     assert [len(c.groups) for c in clusters] == [
         2,
@@ -242,12 +242,12 @@ def requirements_of(requirements: dict[tuple[str, str], Outcome], name: str) -> 
 
 
 def test_an_unstable_trial_has_no_figures(spec: Spec) -> None:
-    cluster = _clusters(spec)[0]
+    cluster = clusters_of(spec)[0]
     hasty = replace(spec.weights, process_variance=spec.weights.process_variance * 1e10)
     assert figures_of(spec, cluster.groups[0], replace(hasty, q_base=spec.weights.q_base / 1000), 0) == {}
-    search = _search(spec, cluster, 0, Journal(None, problem_sha256(spec), restart=False))
+    search = cluster_search(spec, cluster, 0, Journal(None, problem_sha256(spec), restart=False))
     search.journal.known = {f"{cluster.variables} 0 {search.values(search.start)}": {}}
-    assert _worst(search, search.start) == 1e3
+    assert worst_ratio(search, search.start) == 1e3
 
 
 def test_ratios_count_from_either_side() -> None:
@@ -325,8 +325,8 @@ def test_the_journal_of_another_search_is_refused(small: Spec, tmp_path: Path) -
 @pytest.mark.slow
 def test_what_is_found_has_the_figures_that_were_found(small: Spec, tmp_path: Path) -> None:
     """Through the written file: the same bits of weights, comments kept, the machine found from another folder."""
-    clusters = _clusters(small)
-    search = _search(small, clusters[-1], 0, Journal(None, problem_sha256(small), restart=False))
+    clusters = clusters_of(small)
+    search = cluster_search(small, clusters[-1], 0, Journal(None, problem_sha256(small), restart=False))
     found = tuned(small, effort=Effort(generations=0, polish=2, front=0))
     assert found.front == ()
     target = tmp_path / "deep" / "robust.toml"
@@ -485,7 +485,7 @@ def test_a_variable_without_effect_is_refused(tmp_path: Path) -> None:
     path = edited(tmp_path, (STROKE, other))
     spec = malta.read_design(path)
     assert spec.search[8].entries == ("bases.state.x_dot",)
-    assert refusal(lambda: _clusters(spec), path).field == "search.numbers.stroke"
+    assert refusal(lambda: clusters_of(spec), path).field == "search.numbers.stroke"
 
 
 # --- the command ---

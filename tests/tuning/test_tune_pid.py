@@ -24,8 +24,8 @@ from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Pid
 from malta.tuning import pid, verify
 from malta.tuning.pid import (
-    _goal,
     close_loop,
+    goal_value,
     loads_of,
     loop_figures,
     parts_of,
@@ -171,7 +171,7 @@ def search_of(spec: Spec) -> Search:
 
 
 def goal(search: Search, u: Any) -> float:
-    return _goal(search, u, ["x"])
+    return goal_value(search, u, ["x"])
 
 
 # --- figures ---

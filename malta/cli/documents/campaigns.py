@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from malta.campaigns.rare import RareEvent
     from malta.campaigns.studies import Index, Sensitivity, Tolerances
-    from malta.campaigns.summary import Merit, Runs, Summary
+    from malta.campaigns.summary import Distribution, Runs, Summary
     from malta.campaigns.survey import Status
     from malta.firmware.flight import Difference
     from malta.firmware.program import Precision
@@ -55,7 +55,7 @@ class PercentilesPart(Part):
 class DistributionPart(Part):
     """A figure of merit over the completed runs, SI."""
 
-    READS: ClassVar = {"smallest": "sketch.smallest"}
+    READS: ClassVar = {"smallest": "sketch.smallest", "published": "merit.bound"}
 
     p5: Number
     p50: Number
@@ -233,7 +233,7 @@ def runs_fields(found: Summary, worst: int) -> dict[str, Any]:
 
     completed, within, specified = found.yields
     runs = worst_runs(found, worst)
-    names = distinct(identifier(merit.label, merit.unit) for merit in found.merits)
+    names = distinct(one.merit.identifier for one in found.merits)
     error = 0.0 if found.exact else ACCURACY
     return {
         "manifest": found.plan.manifest,
@@ -309,9 +309,9 @@ def tolerance_fields(found: Tolerances) -> dict[str, Any]:
     }
 
 
-def _distribution(merit: Merit) -> DistributionPart:
-    marks = merit.percentiles((5, 50, 95, 99, 100)).tolist()
-    return DistributionPart.of(merit, **dict(zip(("p5", "p50", "p95", "p99", "largest"), marks, strict=True)))
+def _distribution(found: Distribution) -> DistributionPart:
+    marks = found.percentiles((5, 50, 95, 99, 100)).tolist()
+    return DistributionPart.of(found, **dict(zip(("p5", "p50", "p95", "p99", "largest"), marks, strict=True)))
 
 
 def _run_part(found: Summary, runs: Runs, row: int) -> RunPart:

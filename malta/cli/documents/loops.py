@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from operator import attrgetter
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from malta.merits import by_identifier
 from malta.units import distinct
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
     from malta.loops.time_domain import Deviation, Recovery
     from malta.margins.loop_report import LoopReport
+    from malta.merits import Merit
     from malta.report.page.analysis import Analysis
     from malta.report.page.comparison import Comparison
 
@@ -25,7 +27,12 @@ if TYPE_CHECKING:
 
 
 Number = Annotated[float | None, Field(description="null where it is not finite, or where there is none")]
-Files = Annotated[list[str], Field(description="files that the command wrote")]
+Files = Annotated[
+    list[str],
+    BeforeValidator(lambda paths: [str(path) for path in paths]),
+    Field(description="files that the command wrote"),
+]
+Name = Annotated[str, BeforeValidator(str)]  # of a file too
 Shares = Annotated[
     dict[str, float],
     Field(
@@ -34,7 +41,7 @@ Shares = Annotated[
 ]
 
 
-UNIT = re.compile(r"_(?:rad_per_s|rad|share|kg|s|N|A)$")  # at the end of a key
+UNIT = re.compile(r"_(?:rad_per_s|rad|share|kg|s|N|A|si|per_s)$")  # at the end of a key
 
 
 class Part(BaseModel):
@@ -84,23 +91,9 @@ class ShareOfRuns(Part):
     high: Number
 
 
-class Labelled(Protocol):
-    """A figure of merit."""
-
-    @property
-    def identifier(self) -> str:
-        """Its key."""
-
-    @property
-    def value(self) -> float:
-        """SI."""
-
-
-def merits_of(merits: Iterable[Labelled]) -> dict[str, Number]:
+def merits_of(merits: Iterable[Merit]) -> dict[str, Number]:
     """Figures of merit by their identifiers."""
-    listed = list(merits)
-    names = distinct(merit.identifier for merit in listed)
-    return {name: merit.value for name, merit in zip(names, listed, strict=True)}
+    return {name: merit.value for name, merit in by_identifier(merits).items()}
 
 
 def words_of(label: str) -> str:
@@ -298,7 +291,7 @@ class VerifyOutput(LoopPart):
 
     kind: Literal["malta-verify-output"] = Field(default="malta-verify-output", alias="schema")
     version: Literal[1] = 1
-    gains: str
+    gains: Name
     design: str
     files: Files
     recovery: list[RecoveryPart]
@@ -328,7 +321,7 @@ def verify_output(gains: Path, found: LoopReport, files: Sequence[Path]) -> Veri
         tolerance={name: {"down": down, "up": up} for name, (down, up) in found.tolerance.items()},
         places=[PlacePart.of(place, unit=unit) for place in found.places],
     )
-    own = {"gains": str(gains), "files": [str(file) for file in files], "robust": robust}
+    own = {"gains": gains, "files": files, "robust": robust}
     return VerifyOutput.of(found, **loop_fields(found) | own, recovery=[_recovery(r) for r in found.recovery])
 
 
@@ -350,9 +343,11 @@ def _recovery(found: Recovery) -> RecoveryPart:
 class ReportOutput(Part):
     """What `malta report --json` prints."""
 
+    READS: ClassVar = {"design": "subject.controller.name"}
+
     kind: Literal["malta-report-output"] = Field(default="malta-report-output", alias="schema")
     version: Literal[1] = 1
-    gains: str
+    gains: Name
     design: str
     figures: dict[str, Number] = Field(description="the figures of merit of the page, SI")
     files: Files
@@ -360,6 +355,8 @@ class ReportOutput(Part):
 
 class ComparedDesign(Part):
     """A design of a comparison."""
+
+    READS: ClassVar = {"gains": "subject.source", "machine": "plant.name", "stable": "report.stable"}
 
     name: str = Field(description="the design's, or with a number where two have one name")
     gains: str
@@ -391,22 +388,16 @@ class CompareOutput(Part):
 
 def report_output(gains: Path, analysis: Analysis, files: Iterable[Path]) -> ReportOutput:
     """The document of a report."""
-    figures: dict[str, float | None] = {score.key: score.value for score in analysis.figures}
-    name = analysis.subject.controller.name
-    return ReportOutput(gains=str(gains), design=name, figures=figures, files=list(map(str, files)))
+    return ReportOutput.of(analysis, gains=gains, figures=merits_of(analysis.figures), files=files)
 
 
 def compare_output(found: Comparison, files: Iterable[Path]) -> CompareOutput:
     """The document of a comparison."""
-    designs = [
-        ComparedDesign(name=name, gains=a.subject.source, machine=a.plant.name, stable=a.report.stable)
-        for name, a in zip(found.names, found.designs, strict=True)
-    ]
+    designs = [ComparedDesign.of(a, name=name) for name, a in zip(found.names, found.designs, strict=True)]
     figures = [
-        ComparedFigure(
-            key=row.key,
-            group=row.group,
-            better=next(s for s in row.scores if s is not None).meaning.better or None,
+        ComparedFigure.of(
+            row,
+            better=next(s for s in row.scores if s is not None).better or None,
             values=[None if score is None else score.value for score in row.scores],
             best=[name for name, best in zip(found.names, row.best, strict=True) if best],
         )
@@ -416,10 +407,4 @@ def compare_output(found: Comparison, files: Iterable[Path]) -> CompareOutput:
         row.key: [None if entry is None else entry.value for entry in row.entries]
         for row in found.differences
     }
-    return CompareOutput(
-        designs=designs,
-        differences=differences,
-        figures=figures,
-        remarks=list(found.remarks),
-        files=list(map(str, files)),
-    )
+    return CompareOutput.of(found, designs=designs, differences=differences, figures=figures, files=files)

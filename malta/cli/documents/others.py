@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
-from malta.cli.documents.loops import Files, Number, Part, RequirementPart
+from malta.cli.documents.loops import Files, Name, Number, Part, RequirementPart
 from malta.identification.response import units_of_model
 from malta.report.ledger import Word
 from malta.units import identifier
@@ -86,12 +86,8 @@ def certified_part(claim: Claim) -> CertifiedPart:
         sample_time_s=None if T is None else double(T),
         places=None if places is None else [double(x) for x in places.at],
         parameters=[
-            ClaimedParameter(
-                name=p.name,
-                unit=p.unit,
-                nominal=double(p.nominal),
-                low=double(p.interval[0]),
-                high=double(p.interval[1]),
+            ClaimedParameter.of(
+                p, nominal=double(p.nominal), low=double(p.interval[0]), high=double(p.interval[1])
             )
             for p in claim.parameters
         ],
@@ -187,8 +183,8 @@ def tune_output(spec: Spec, tuned: Tuned, files: Sequence[Path]) -> TuneOutput:
     from malta.synthesis.requirements import requirements_for
 
     units = {name: one.unit for name, one in requirements_for(spec.plant).items()}
-    search = SearchPart(
-        trials=tuned.trials,
+    search = SearchPart.of(
+        tuned,
         values=dict(zip((v.name for v in spec.search), tuned.trial.values, strict=True)),
         delay_samples=tuned.trial.delay,
         front=[
@@ -196,37 +192,12 @@ def tune_output(spec: Spec, tuned: Tuned, files: Sequence[Path]) -> TuneOutput:
             for point in tuned.front
         ],
     )
-    return TuneOutput(
-        design=spec.name,
-        files=[str(path) for path in files],
-        requirements=[RequirementPart.of(r) for r in tuned.requirements],
-        search=search,
-    )
+    return TuneOutput.of(tuned, design=spec.name, files=files, search=search)
 
 
 def claims_output(ledgers: Sequence[Ledger]) -> ClaimsOutput:
     """The document of ledgers."""
-    return ClaimsOutput(
-        ledgers=[
-            LedgerPart(
-                machine=one.machine,
-                source=one.source,
-                designs=list(one.designs),
-                reproducing=list(one.reproducing),
-                claims=[
-                    ClaimPart(
-                        subject=c.subject,
-                        published=c.published,
-                        ours=list(c.ours),
-                        verdict=c.verdict,
-                        word=c.word,
-                    )
-                    for c in one.claims
-                ],
-            )
-            for one in ledgers
-        ]
-    )
+    return ClaimsOutput(ledgers=[LedgerPart.of(one) for one in ledgers])
 
 
 # The documents of `malta excite`, `log`, `identify`, `learn`, `replay`, `measure` and `commission`.
@@ -235,9 +206,11 @@ def claims_output(ledgers: Sequence[Ledger]) -> ClaimsOutput:
 class ExciteOutput(Part):
     """What `malta excite --json` prints."""
 
+    READS: ClassVar = {"lines_Hz": "signal.frequencies", "crest_factor": "signal.crest_factor"}
+
     kind: Literal["malta-excite-output"] = Field(default="malta-excite-output", alias="schema")
     version: Literal[1] = 1
-    gains: str
+    gains: Name
     duration_s: float
     lines_Hz: list[float]
     crest_factor: list[Number] = Field(description="of each input")
@@ -260,6 +233,8 @@ class SignalStatistics(Part):
 
 class LogOutput(Part):
     """What `malta log --json` prints."""
+
+    READS: ClassVar = {"log": "source", "jitter_s": "survey.jitter", "findings": "survey.findings"}
 
     kind: Literal["malta-log-output"] = Field(default="malta-log-output", alias="schema")
     version: Literal[1] = 1
@@ -312,8 +287,8 @@ class LearnOutput(Part):
 
     kind: Literal["malta-learn-output"] = Field(default="malta-learn-output", alias="schema")
     version: Literal[1] = 1
-    gains: str
-    log: str
+    gains: Name
+    log: Name
     factor: float
     deviation: float = Field(description="standard deviation of the factor")
     parameter: str
@@ -325,10 +300,12 @@ class LearnOutput(Part):
 class ReplayOutput(Part):
     """What `malta replay --json` prints."""
 
+    READS: ClassVar = {"difference_at_once": "at_once", "innovation_rms": "rms", "sensor_noise": "expected"}
+
     kind: Literal["malta-replay-output"] = Field(default="malta-replay-output", alias="schema")
     version: Literal[1] = 1
-    gains: str
-    log: str
+    gains: Name
+    log: Name
     same: bool
     difference: dict[str, float] = Field(description="largest of each command in the second half, SI")
     difference_at_once: dict[str, float] = Field(description="the same from the first sample on")
@@ -441,39 +418,17 @@ class CommissionOutput(Part):
 
 def excite_output(gains: Path, plan: ExcitationPlan, files: Iterable[Path]) -> ExciteOutput:
     """The document of an excitation."""
-    return ExciteOutput(
-        gains=str(gains),
-        duration_s=plan.duration,
-        lines_Hz=plan.signal.frequencies.tolist(),
-        crest_factor=plan.signal.crest_factor.tolist(),
-        motion=dict(plan.motion),
-        current_A=dict(plan.current),
-        command_share=dict(plan.command),
-        accuracy_share=dict(plan.accuracy),
-        files=list(map(str, files)),
-    )
+    return ExciteOutput.of(plan, gains=gains, files=files)
 
 
 def log_output(log: Log, files: Iterable[Path]) -> LogOutput:
     """The document of a log."""
-    found, signals = log.survey, {}
-    for heading, numbers in found.statistics.items():
+    signals = {}
+    for heading, numbers in log.survey.statistics.items():
         name, _, unit = heading.partition(" [")
         fields = dict(zip(("least", "mean", "largest", "deviation"), numbers, strict=True))
         signals[name.replace(".", "_")] = SignalStatistics(unit=unit[:-1], **fields)
-    return LogOutput(
-        log=log.source,
-        sha256=log.sha256,
-        machine=log.machine,
-        controller=log.controller,
-        samples=log.samples,
-        sample_time_s=log.sample_time,
-        period_s=log.period,
-        signals=signals,
-        jitter_s=found.jitter,
-        findings=list(found.findings),
-        files=list(map(str, files)),
-    )
+    return LogOutput.of(log, signals=signals, files=files)
 
 
 def identify_output(gains: Path, found: Identified, files: Iterable[Path]) -> IdentifyOutput:
@@ -512,30 +467,12 @@ def identify_output(gains: Path, found: Identified, files: Iterable[Path]) -> Id
 
 def learn_output(gains: Path, log: Path, found: Learned, files: Iterable[Path]) -> LearnOutput:
     """The document of what a stroke taught."""
-    return LearnOutput(
-        gains=str(gains),
-        log=str(log),
-        factor=found.factor,
-        deviation=found.deviation,
-        parameter=found.parameter,
-        before=found.before,
-        after=found.after,
-        files=list(map(str, files)),
-    )
+    return LearnOutput.of(found, gains=gains, log=log, files=files)
 
 
 def replay_output(gains: Path, log: Path, found: LawReplay) -> ReplayOutput:
     """The document of a replay."""
-    return ReplayOutput(
-        gains=str(gains),
-        log=str(log),
-        same=found.same,
-        difference=dict(found.difference),
-        difference_at_once=dict(found.at_once),
-        innovation_rms=dict(found.rms),
-        sensor_noise=dict(found.expected),
-        whiteness=dict(found.whiteness),
-    )
+    return ReplayOutput.of(found, gains=gains, log=log)
 
 
 def measure_output(gains: Path, found: Measurement, files: Iterable[Path]) -> MeasureOutput:

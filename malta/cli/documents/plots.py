@@ -158,8 +158,6 @@ class LocusPart(Part):
 class MapPart(Part):
     """A margin map: growth of the worst pole over two parameters, and the proven box."""
 
-    READS: ClassVar = {"x_values_si": "x_values", "y_values_si": "y_values", "growth_per_s": "growth"}
-
     name: str
     x: str
     y: str
@@ -198,24 +196,8 @@ def plot_output(
         at=at,
         loops=[_loop_part(curves, kinds, channels, at) for curves in loops],
         root_loci=[_locus_part(found) for found in planes[0]],
-        margin_maps=[_map_part(found) for found in planes[1]],
+        margin_maps=[MapPart.of(found) for found in planes[1]],
         files=list(map(str, files)),
-    )
-
-
-def _map_part(found: MarginMap) -> MapPart:
-    return MapPart(
-        name=found.name,
-        x=found.x,
-        y=found.y,
-        units=list(found.units),
-        nominal=list(found.nominal),
-        half=list(found.half),
-        proven=found.proven,
-        witness=None if found.witness is None else list(found.witness),
-        x_values_si=found.x_values.tolist(),
-        y_values_si=found.y_values.tolist(),
-        growth_per_s=found.growth.tolist(),
     )
 
 

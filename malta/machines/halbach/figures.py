@@ -30,7 +30,6 @@ from malta.report.figures.drawing import (
     draw_noisy,
     ending_text,
     finish_axes,
-    merit_phrase,
     merits_phrase,
     micro,
     new_page,
@@ -55,7 +54,7 @@ EACH: dict[str, Any] = {"color": "#b5b5b5", "linewidth": 0.7}
 def step_figure(e: Experiment, _: Published | None = None) -> Figure:
     """All steps on top of each other with their mean, the position at rest, and the vertical force. Fig. 9."""
     run = e.run
-    merits = "; ".join(f"{m.label} {merit_phrase(m)}" for m in e.cases[0].merits[:4])
+    merits = "; ".join(f"{m.label} {m.phrase()}" for m in e.cases[0].merits[:4])
     figure = new_page([run], f"steps{ending_text(run)}", f"{e.cases[0].label}: {micro(merits)}", hspace=0.4)
     grid = figure.add_gridspec(2, 2)
     if len(e.cases) > 1:
@@ -103,7 +102,7 @@ def stairs_figure(e: Experiment, published: Published | None = None) -> Figure:
     """Every law with either PWM: reference and position. Fig. 7."""
     text = merits_phrase(e.cases[:2], 2)
     if len(e.merits) > 1:
-        zones = "; ".join(f"{m.label} {merit_phrase(m)}" for m in e.merits)
+        zones = "; ".join(f"{m.label} {m.phrase()}" for m in e.merits)
         text = zones if published is None else f"{zones} (published: {_published_text(e, published)})"
     figure = new_page(runs_of(e), "stairs", micro(text), top=0.83, hspace=0.28)
     panels = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
@@ -221,7 +220,7 @@ def _on_two_lines(text: str) -> str:
 def budget_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The error at rest by source, and current noise along half a pitch. Sec. 5.1."""
     values = [in_unit(case.merits[0].value, "um") for case in e.cases]
-    found = f"position, rms, of all sources together: {merit_phrase(e.cases[-1].merits[0])}"
+    found = f"position, rms, of all sources together: {e.cases[-1].merits[0].phrase()}"
     figure = new_page(runs_of(e), "error of the position at rest, by source", found, left=0.15, wspace=0.26)
     sources, along = figure.subplots(1, 2, width_ratios=(1.2, 1))
     floor = 1e-3  # um: the resolution of the laser is 1 nm
@@ -238,7 +237,7 @@ def budget_figure(e: Experiment, _: Published | None = None) -> Figure:
 def identify_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The motor's step beside the linear servo's, printed and fitted, and their differences. Sec. 2.3."""
     run, linear = e.run, e.curves["linear"]
-    text = ", ".join(f"{m.label.replace(', ', ' ')} {merit_phrase(m)}" for m in e.merits[:4])
+    text = ", ".join(f"{m.label.replace(', ', ' ')} {m.phrase()}" for m in e.merits[:4])
     figure = new_page([run], f"a step of the open loop{ending_text(run)}", micro(text), hspace=0.2)
     position, difference = figure.subplots(2, 1, sharex=True)
     draw_line(position, run.t, 1e3 * run.p[:, 0], label="motor", **STYLES[0])

@@ -21,7 +21,6 @@ from malta.report.figures.drawing import (
     finish_axes,
     label_upright,
     mark_end,
-    merit_phrase,
     new_page,
     number,
     published_in_unit,
@@ -40,7 +39,7 @@ def step_figure(e: Experiment, published: Published | None = None) -> Figure:
     """Figs 9 to 12: motion, forces, and deviations of the other outputs, from the place without symmetry."""
     cases = [case for case in e.cases if case.label.endswith(e.cases[0].label.split(", ", 1)[1])]
     run, inputs = e.run, [s.name for s in e.run.plant.inputs]
-    merits = {merit.label: merit_phrase(merit) for merit in e.merits}
+    merits = {merit.label: merit.phrase() for merit in e.merits}
     names = {"table moves phi by": "table", "analytical moves phi by": "analytical"}
     told = [f"{short} {merits[label]}" for label, short in names.items() if label in merits]
     figure = new_page(
@@ -115,7 +114,7 @@ def errors_figure(e: Experiment, published: Published | None = None) -> Figure:
     c, models = e.curves, [case.label for case in e.cases]
     mm = c["x"] * 1e3
     row = len(mm) // 8  # a quarter of a pole pitch
-    largest = (f"{case.label} {merit_phrase(case.merits[2])}" for case in e.cases)
+    largest = (f"{case.label} {case.merits[2].phrase()}" for case in e.cases)
     figure = new_page(
         runs_of(e),
         "one inner coil, coil models against its exact wrench",
@@ -187,7 +186,7 @@ def delay_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The largest of the three angles over time, by speed of the controller."""
     speeds = list(dict.fromkeys(case.label.split(", ")[1] for case in e.cases))
     left = (
-        f"{merit_phrase(case.merits[1])} {case.label.split(',')[0]} the delay"
+        f"{case.merits[1].phrase()} {case.label.split(',')[0]} the delay"
         for case in e.cases
         if case.label.endswith(speeds[-1])
     )

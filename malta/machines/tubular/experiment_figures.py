@@ -29,7 +29,6 @@ from malta.report.figures.drawing import (
     ended_early,
     finish_axes,
     mark_end,
-    merit_phrase,
     micro,
     new_page,
     number,
@@ -51,7 +50,7 @@ def commissioning_figure(e: Experiment, _: Published | None = None) -> Figure:
     flying = (state >= list(STATES).index("LIFT")) & (state <= list(STATES).index("LANDING"))
     followed = np.where(flying[:, None], e.curves["followed"], np.nan)
     shown = (e.merits[1], e.merits[3], e.merits[5])
-    found = ", ".join(f"{merit.label} {merit_phrase(merit)}" for merit in shown)
+    found = ", ".join(f"{merit.label} {merit.phrase()}" for merit in shown)
     places = {"size": (9.0, 9.6), "hspace": 0.28, "top": 0.885}
     figure = new_page([run], "commissioning by the supervisor", found, **places)
     (height, error), (stroke, thrust), *others = figure.subplots(4, 2, sharex=True)
@@ -143,9 +142,7 @@ def _draw_speeds(axes: Axes, e: Experiment) -> None:
 def _moments_figure(e: Experiment) -> Figure:
     """Contact speeds, currents and times until it is off of each class of faults, a mark for each moment."""
     merits = {merit.label: merit for merit in e.merits}
-    alone, supervised = (
-        merit_phrase(merits[f"fastest contact {who}"]) for who in ("alone", "with supervisor")
-    )
+    alone, supervised = (merits[f"fastest contact {who}"].phrase() for who in ("alone", "with supervisor"))
     found = (
         f"{merits['moments'].value:.0f} moments; fastest contact alone {alone}, with supervisor {supervised}"
     )
@@ -236,7 +233,7 @@ def recording_figure(e: Experiment, _: Published | None = None) -> Figure:
     found = "no v0 recorded"
     if e.merits:
         thrust = next(merit for merit in e.merits if merit.label.endswith(e.run.plant.thrust))
-        found = f"{thrust.label}: {merit_phrase(thrust)}; {e.merits[-1].label}: {merit_phrase(e.merits[-1])}"
+        found = f"{thrust.label}: {thrust.phrase()}; {e.merits[-1].label}: {e.merits[-1].phrase()}"
     figure = new_page(runs_of(e), "v0(z) recorded by a slow stroke", found, hspace=0.34, top=0.83, left=0.1)
     (table, difference), (own, recorded) = figure.subplots(2, 2)
     _draw_tables(table, difference, e)
@@ -308,8 +305,8 @@ def capture_figure(e: Experiment, _: Published | None = None) -> Figure:
     clearance as built; the largest displacement over time of some releases."""
     ratio = next(merit for merit in e.merits if merit.label == "x: their ratio")
     inside = e.merits[-1]
-    found = f"along x it returns from {merit_phrase(ratio)} of what the force limit allows; "
-    found += f"{inside.label}: {merit_phrase(inside)}"
+    found = f"along x it returns from {ratio.phrase()} of what the force limit allows; "
+    found += f"{inside.label}: {inside.phrase()}"
     figure = new_page(runs_of(e), "released at rest, without touchdown bearings", found, hspace=0.42)
     *maps, traces = figure.subplots(2, 2).ravel()
     for axes, plane in zip(maps, PLANES, strict=True):
@@ -357,7 +354,7 @@ SMOOTHED = 50  # samples of a mean of the noisy force
 def carrier_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The carrier's acceleration, the force of a bearing, and the radial deviation at rest and during a stroke."""
     rest = [case for case in e.cases if case.label.startswith("rest")]
-    told = ", ".join(f"{case.label.partition(', ')[2]} {merit_phrase(case.merits[0])}" for case in rest)
+    told = ", ".join(f"{case.label.partition(', ')[2]} {case.merits[0].phrase()}" for case in rest)
     figure = new_page(runs_of(e), "the carrier accelerates sideways", f"radial deviation at rest: {told}")
     (moved, force), (still, stroke) = figure.subplots(2, 2, sharex=True)
     moved.plot(e.curves["t"] * 1e3, e.curves["acceleration"], color="#000000", linewidth=1.4)

@@ -45,7 +45,6 @@ from malta.report.figures.drawing import (
     finish_axes,
     label_upright,
     mark_end,
-    merit_phrase,
     merits_phrase,
     micro,
     new_page,
@@ -270,7 +269,7 @@ def _half_way(run: Trajectory) -> float:
 
 def thermal_figure(e: Experiment, published: Published | None = None) -> Figure:
     """The drift of the support, and the mover's position in space with and without the outer loop. Fig. 15."""
-    _, now, true = (merit_phrase(merit) for merit in e.merits)
+    _, now, true = (merit.phrase() for merit in e.merits)
     found = f"{merits_phrase(e.cases, 0)}; lag {now}, at true speed {true}"
     figure = new_page(runs_of(e), "support drifts by thermal expansion", found, hspace=0.18)
     space, blow_up = figure.subplots(2, 1, sharex=True)
@@ -294,7 +293,7 @@ def thermal_figure(e: Experiment, published: Published | None = None) -> Figure:
 def disturbance_figure(e: Experiment, _: Published | None = None) -> Figure:
     """Compliance over frequency with simulated points, and the responses to steps and to vibration."""
     plant, c = e.run.plant, e.curves
-    worst, at, stiffness = (merit_phrase(merit) for merit in e.merits)
+    worst, at, stiffness = (merit.phrase() for merit in e.merits)
     found = f"largest compliance {worst} at {at}, smallest dynamic stiffness {stiffness}"
     figure = new_page(runs_of(e), "forces and torques on the mover", found, hspace=0.44)
     (compliance, radial), (axial, vibration) = figure.subplots(2, 2)
@@ -364,7 +363,7 @@ def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
 
 def _touchdown_text(after: Merit) -> str:
     """When a fault led to a touchdown."""
-    return f"touchdown after {merit_phrase(after)}" if after.value >= 0 else "touchdown before it"
+    return f"touchdown after {after.phrase()}" if after.value >= 0 else "touchdown before it"
 
 
 def drive_limits_figure(e: Experiment, _: Published | None = None) -> Figure:

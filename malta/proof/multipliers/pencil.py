@@ -149,7 +149,7 @@ STEEPEST = 16.0  # norm of Y up to which e^Y is
 
 
 @lru_cache(maxsize=LEVELS + 1)
-def _gains(level: int) -> tuple[float, ...]:
+def gains_of_level(level: int) -> tuple[float, ...]:
     """Coefficients of c(Y), B_2k / (2 k)!, less those of its fraction, by powers of Y^2 from the first."""
     from flint import fmpq
 
@@ -192,7 +192,7 @@ def square_hold_series(A: Expansion, dens: Expansion, T: float, *, level: int = 
     own = quotient(A, dens)
     if own is None:
         return None
-    c = _function(own.times(T), _gains(level), LARGEST, even=True)
+    c = _function(own.times(T), gains_of_level(level), LARGEST, even=True)
     if c is None:
         return None
     if level:
@@ -244,7 +244,7 @@ def _function(Y: Expansion, b: Sequence[float], largest: float, *, even: bool) -
     whole, _ = _sum(size + extra, np.zeros((0, *size.shape)), np.abs(b).tolist(), even)
     power = norm ** (2 if even else 1)
     ratio = power / (39.0 if even else len(b) + 1)
-    last = _gains(0)[-1] if even else b[-1]  # no smaller than with a level
+    last = gains_of_level(0)[-1] if even else b[-1]  # no smaller than with a level
     tail = abs(last) * power ** len(b) * ratio / (1 - ratio)
     rounding = 4 * len(b) * len(size) * EPS * whole
     tails = 2 * tail * weights[:, None] / weights

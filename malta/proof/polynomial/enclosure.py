@@ -91,8 +91,8 @@ def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until:
         [low[i] + (high[i] - low[i]) * _share(side, k) for k in range(side.degree + 1)]
         for i, side in enumerate(plan)
     ]
-    points = _values(f, list(itertools.product(*grid)), until)
-    tails = _add_bounds(_sum_tails(plan), f.coupling_bounds(moves, _real(sides)))
+    points = values_within(f, list(itertools.product(*grid)), until)
+    tails = add_bounds(_sum_tails(plan), f.coupling_bounds(moves, _real(sides)))
     return family([s.degree + 1 for s in plan], [s.chebyshev for s in plan], points, tails)
 
 
@@ -100,7 +100,7 @@ def _real(sides: FloatArray) -> list[tuple[Any, Any]]:
     return [(arb(a), arb(b)) for a, b in sides.tolist()]
 
 
-def _add_bounds(
+def add_bounds(
     one: list[tuple[float, int]] | None, two: list[tuple[float, int]] | None
 ) -> list[tuple[float, int]] | None:
     """The sums of two lists of bounds."""
@@ -131,7 +131,7 @@ def _share(side: Side, k: int) -> Any:
     return exact(nodes(side.degree, chebyshev=True)[k]) if side.chebyshev else fmpq(k, side.degree)
 
 
-def _values(f: Polynomial, places: list[tuple[Any, ...]], until: float = math.inf) -> list[list[Any]]:
+def values_within(f: Polynomial, places: list[tuple[Any, ...]], until: float = math.inf) -> list[list[Any]]:
     """The coefficients at the places, as balls accurate to 60 bits."""
 
     def evaluate(place: tuple[Any, ...]) -> list[Any]:
@@ -165,13 +165,13 @@ def _plan(f: Polynomial, low: list[Any], high: list[Any], known: tuple[int | Non
     discs: dict[int, list[Disc]] = {}
     if free:
         middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
-        (nominal,) = _values(f, [tuple(middle)])
+        (nominal,) = values_within(f, [tuple(middle)])
         size = [pair(c if hasattr(c, "abs_upper") else arb(c)) for c in nominal]
         discs = {i: discs_of(f, i, low, high, size) for i in free}
     plan: list[Side] = []
     for tail in TAILS:
         plan = [
-            _interpolation_side(f.names[i], i, discs[i], tail) if i in discs
+            interpolation_side(f.names[i], i, discs[i], tail) if i in discs
             else Side(0 if low[i] == high[i] else d or 0, False, None)
             for i, d in enumerate(known)
         ]  # fmt: skip
@@ -245,7 +245,7 @@ def _wanted_degree(disc: Disc, tail: float) -> float:
     return (disc.share + 3 - math.log2(disc.radius - 1) - math.log2(tail)) / math.log2(disc.radius)
 
 
-def _interpolation_side(name: str, axis: int, discs: list[Disc], tail: float) -> Side:
+def interpolation_side(name: str, axis: int, discs: list[Disc], tail: float) -> Side:
     """The sampling of the lowest degree with an error of at most `tail` by any disc; else the one of least error."""
     best, best_rank = None, (True, 0, math.inf)
     for disc in discs:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from malta.campaigns.plan import Plan
     from malta.campaigns.result import Campaign
     from malta.campaigns.studies import Index, Sensitivity
-    from malta.campaigns.summary import Merit, Summary
+    from malta.campaigns.summary import Distribution, Summary
 
 
 FINE: Mapping[
@@ -81,10 +81,10 @@ def distributions_figure(found: Campaign | Summary, published: Published | None 
 
     summary = as_summary(found, Bounds(published))
     told = {m.label: text for m in summary.merits if (text := _without_spread(summary, m))}
-    panels: dict[tuple[str, str], list[Merit]] = {}  # one panel for each kind and unit
+    panels: dict[tuple[str, str], list[Distribution]] = {}  # one panel for each kind and unit
     for listed in summary.merits:
         if listed.label not in told and listed.sketch.count:
-            panels.setdefault((listed.kind, listed.unit), []).append(listed)
+            panels.setdefault((listed.kind, listed.merit.unit), []).append(listed)
     rows, columns = rows_and_columns(len(panels))
     height = 1.2 + 2.4 * rows
     places = {"size": (9.0, height), "top": 1 - 1.05 / height, "hspace": 0.7, "wspace": 0.28}
@@ -102,18 +102,18 @@ def distributions_figure(found: Campaign | Summary, published: Published | None 
     return figure
 
 
-def _without_spread(found: Summary, merit: Merit) -> str:
+def _without_spread(found: Summary, one: Distribution) -> str:
     """What is to say of a figure of merit that needs no distribution; nothing of one that has one."""
-    if not merit.sketch.count:
+    if not one.sketch.count:
         return ""
-    unit = "%" if merit.unit == "percent" else micro(merit.unit)
-    least, most = (in_unit(value, merit.unit) for value in (merit.sketch.smallest, merit.sketch.largest))
-    label = merit.label.replace("clearance:", "clearance used up,")
+    unit = "%" if one.merit.unit == "percent" else micro(one.merit.unit)
+    least, most = (in_unit(value, one.merit.unit) for value in (one.sketch.smallest, one.sketch.largest))
+    label = one.label.replace("clearance:", "clearance used up,")
     if found.runs > 1 and most - least <= 1e-9 * abs(most):
         return f"{label}: {number(most, 3)} {unit} in every run"
-    output = merit.label.removeprefix("deviation ").removeprefix("of ")
-    jump = in_unit(_jumps(found.plan).get(output, 0.0), merit.unit)
-    if merit.kind.startswith("deviation") and jump and 0.9 * jump < least and most < 1.5 * jump:
+    output = one.label.removeprefix("deviation ").removeprefix("of ")
+    jump = in_unit(_jumps(found.plan).get(output, 0.0), one.merit.unit)
+    if one.kind.startswith("deviation") and jump and 0.9 * jump < least and most < 1.5 * jump:
         return f"{label}: the jump of the reference itself, {number(jump, 3)} {unit}"
     return ""
 
@@ -128,14 +128,15 @@ def _jumps(plan: Plan) -> dict[str, float]:
     return {signal.name: float(step) for signal, step in zip(plant.outputs, steps, strict=True)}
 
 
-def _draw_distribution(axes: Axes, kind: str, listed: Sequence[Merit]) -> None:
+def _draw_distribution(axes: Axes, kind: str, listed: Sequence[Distribution]) -> None:
     """Histograms of figures of one kind, on a logarithmic axis where they reach over decades."""
     from matplotlib.ticker import MaxNLocator
 
     from malta.campaigns.summary import histogram
 
-    unit = listed[0].unit
-    bound, scale = in_unit(listed[0].published, unit), in_unit(1.0, unit)
+    merit = listed[0].merit
+    unit, scale = merit.unit, in_unit(1.0, merit.unit)
+    bound = math.nan if merit.bound is None else in_unit(merit.bound, unit)
     told = "%" if unit == "percent" else micro(unit)
     name = kind if len(listed) > 1 else listed[0].label
     name = name.replace("clearance:", "clearance used up,").removesuffix(",")
@@ -166,7 +167,7 @@ def _draw_distribution(axes: Axes, kind: str, listed: Sequence[Merit]) -> None:
     axes.set_ylim(0, None)
     if math.isfinite(bound):
         axes.axvline(bound, **BOUND)
-        text = "published" if listed[0].relation == "about" else "published bound"
+        text = "published" if merit.relation == "about" else "published bound"
         axes.annotate(
             text, (bound, 1.01), xycoords=("data", "axes fraction"), ha="center", va="bottom", **NOTE
         )

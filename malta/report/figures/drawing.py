@@ -12,7 +12,7 @@ import numpy as np
 
 from malta.display import micro as micro
 from malta.display import number as number
-from malta.margins.loop_report import ROOTS
+from malta.merits import ROOTS
 from malta.model.data import published_value
 from malta.model.plant import Plant
 from malta.simulation.trajectory import Trajectory
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
     from malta.model.plant import FloatArray
-    from malta.simulation.experiments import Case, Experiment, Merit
+    from malta.simulation.experiments import Case, Experiment
 
 
 Published = Mapping[str, Any]  # a file of data/published/
@@ -348,15 +348,9 @@ def published_in_unit(published: Published, key: str, unit: str) -> float:
     return in_unit(published_value(published, key), unit)
 
 
-def merit_phrase(merit: Merit, digits: int = 3) -> str:
-    """The value of a figure of merit with its unit, for a sentence."""
-    unit = {"percent": " %", "1": ""}.get(merit.unit, f" {micro(merit.unit)}")
-    return number(in_unit(merit.value, merit.unit), digits) + unit
-
-
 def merits_phrase(cases: Sequence[Case], which: int) -> str:
     """One figure of merit of all cases, in a line."""
-    found = ", ".join(f"{case.label} {merit_phrase(case.merits[which])}" for case in cases)
+    found = ", ".join(f"{case.label} {case.merits[which].phrase()}" for case in cases)
     return micro(f"{cases[0].merits[which].label.replace(': ', ', ')}: {found}")
 
 

@@ -14,6 +14,7 @@ from malta.loops.loop import loop_along
 from malta.loops.sampled_loops import SampledLoop
 from malta.loops.time_domain import furthest, load_vector
 from malta.margins.loop_report import ZONES
+from malta.model.parameters import box_words
 from malta.report.figures.drawing import (
     BOUND,
     DOT,
@@ -74,7 +75,7 @@ def chain_figure(found: LoopReport) -> Figure:
     """
     if not found.chain:
         raise InputError(found.controller.name, "stages", "none", "a report of malta.verify with stages=True")
-    box = ", ".join(f"{key} ±{100 * share:g} %" for key, share in found.uncertainty.items())
+    box = box_words(found.uncertainty, found.plant.parameters)
     figure = new_figure(
         f"{found.controller.name}: where the margin goes",
         f"100 %: {box}, all at once",

@@ -14,13 +14,14 @@ import numpy as np
 from malta.errors import CheckError, InputError
 from malta.loops.curves import loop_curves
 from malta.loops.sampled_loops import LAST
-from malta.margins.loop_report import BANDWIDTHS, figure, in_groups
+from malta.margins.loop_report import BANDWIDTHS
+from malta.merits import in_groups
 from malta.model.data import plant_of
 from malta.model.linear import is_linear
 from malta.model.parameters import units_of
 from malta.model.plant import Signal
 from malta.model.signals import FINE
-from malta.report.figures.drawing import merit_phrase, micro, number
+from malta.report.figures.drawing import micro, number
 from malta.simulation.experiments import progress_of_part
 from malta.simulation.experiments.catalogue import experiment, main_job
 from malta.synthesis.spec import Pid, Weights, integral_signals, pid_signals, process_signals
@@ -30,7 +31,8 @@ from malta.units import identifier, in_unit
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
     from malta.loops.curves import LoopCurves
-    from malta.margins.loop_report import LoopFigure, LoopReport
+    from malta.margins.loop_report import LoopReport
+    from malta.merits import Merit
     from malta.model.plant import FloatArray, Parameters, Plant
     from malta.proof.machine.windings import CurrentLoops
     from malta.simulation.experiments import Experiment
@@ -39,7 +41,6 @@ if TYPE_CHECKING:
 
 
 Share = Callable[[float], None]  # takes the share of the work that is done, 0 to 1
-JOBS = {"low": "job_lower", "high": "job_higher", "": "job"}  # kinds of figures by which way is better
 
 
 class Subject(NamedTuple):
@@ -91,9 +92,9 @@ class Analysis:
         return loop_curves(self.report.loop)
 
     @cached_property
-    def figures(self) -> tuple[LoopFigure, ...]:
+    def figures(self) -> tuple[Merit, ...]:
         """The figures of merit of the loop and of the main job, in the order of their groups."""
-        return in_groups([*self.report.figures, *_job_figures(self.job)])
+        return in_groups([*self.report.figures, *(() if self.job is None else self.job.figures)])
 
 
 def analyse(
@@ -135,21 +136,6 @@ def _main_job(subject: Subject, notes: list[str], progress: Share | None) -> Exp
     if found.interrupted or any(case.run.verdict.name == "interrupted" for case in found.cases):
         raise KeyboardInterrupt
     return found
-
-
-def _job_figures(job: Experiment | None) -> Iterator[LoopFigure]:
-    if job is None:
-        return
-    several = len(job.cases) > 1
-    rows = [("", merit) for merit in job.merits]
-    if several and [m.label for m in job.merits] == [m.label for m in job.cases[0].merits]:
-        rows = [(case.label, merit) for case in job.cases for merit in case.merits]
-    completed = float(np.mean([case.run.verdict.completed for case in job.cases]))
-    yield figure("job_higher", f"{job.name} completed", f"{job.name}: runs completed", completed, "percent")
-    for case, merit in rows:
-        label = f"{case}: {merit.label}" if case else merit.label
-        name = f"{job.name} {case} {merit.key or merit.label}"
-        yield figure(JOBS[merit.better], name, label, merit.value, merit.unit)
 
 
 # What a design is, entry by entry: machine, law, weights, noise, gains. Reports list it, comparisons seek changes.
@@ -398,7 +384,7 @@ def _job(a: Analysis) -> Iterator[KeyFigure]:
     yield KeyFigure(label, short, outcome if short != outcome and a.job.failed else fidelity, state)
     for merit in a.job.merits[:MERITS]:
         if math.isfinite(merit.value) and not a.job.failed:
-            yield KeyFigure(merit.label.capitalize(), merit_phrase(merit), label.lower())
+            yield KeyFigure(merit.label.capitalize(), merit.phrase(), label.lower())
 
 
 def summary_sentences(a: Analysis) -> list[str]:

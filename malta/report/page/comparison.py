@@ -13,7 +13,7 @@ from rich.console import Group
 from rich.text import Text
 
 from malta.errors import InputError
-from malta.margins.loop_report import LoopFigure, best_of
+from malta.merits import Merit, best_of, by_identifier
 from malta.report.page.analysis import GROUPS, Entry, design_entries, display_unit
 from malta.report.tables.layout import Paragraph, new_table
 from malta.report.verdict import verdict_lines
@@ -58,7 +58,7 @@ class Row(NamedTuple):
     group: str
     key: str
     heading: str
-    scores: tuple[LoopFigure | None, ...]
+    scores: tuple[Merit | None, ...]
     best: tuple[bool, ...]  # better than some other design
 
     @property
@@ -130,7 +130,7 @@ class Comparison:
     @cached_property
     def rows(self) -> tuple[Row, ...]:
         """The figures of merit that make sense beside each other."""
-        found = [{score.key: score for score in a.figures} for a in self.designs]
+        found = [by_identifier(a.figures) for a in self.designs]
         rows = []
         for key in dict.fromkeys(key for scores in found for key in scores):
             scores = tuple(of.get(key) for of in found)
@@ -214,11 +214,11 @@ class Comparison:
                 found.append(f"{name}: the loop is UNSTABLE on its machine.")
         return tuple(found)
 
-    def _is_shown(self, score: LoopFigure) -> bool:
+    def _is_shown(self, score: Merit) -> bool:
         """Whether a figure means the same in all designs, or at least something beside the others."""
         return self.one_machine or score.meaning.scope != "machine"
 
-    def _is_judged(self, score: LoopFigure) -> bool:
+    def _is_judged(self, score: Merit) -> bool:
         """Whether one of the designs can be better by this figure."""
         return score.meaning.scope != "box" or self.one_box
 

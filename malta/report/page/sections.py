@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from malta.loops.time_domain import budget_of
-from malta.margins.loop_report import four_digits
+from malta.merits import four_digits
 from malta.model.data import published_figures
 from malta.model.plant import Signal
 from malta.model.signals import FINE

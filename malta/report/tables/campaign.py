@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -141,7 +140,7 @@ def _ends_table(found: Summary) -> Table:
 def _findings_table(found: Summary) -> Table:
     from malta.campaigns.summary import ACCURACY
 
-    bounds = any(math.isfinite(m.published) for m in found.merits)
+    bounds = any(m.merit.bound is not None for m in found.merits)
     heads = [*(f"{p} %" for p in PERCENTILES), "largest", *(["published", "kept [%]"] if bounds else [])]
     accuracy = "" if found.exact else f", within {100 * ACCURACY:.1g} % of their values"
     table = new_table(
@@ -152,17 +151,16 @@ def _findings_table(found: Summary) -> Table:
     for m in found.merits:
         if not m.sketch.count:
             continue
-        unit = in_unit(1.0, m.unit)
+        unit = in_unit(1.0, m.merit.unit)
         cells = [number(float(v) * unit, 3) for v in (*m.percentiles(PERCENTILES), m.sketch.largest)]
-        if bounds and math.isfinite(m.published):
-            bound = f"{in_unit(m.published, m.unit):.6g}"
-            at_most = m.relation == "at most"
+        if m.merit.bound is not None:
+            bound = f"{in_unit(m.merit.bound, m.merit.unit):.6g}"
+            at_most = m.merit.relation == "at most"
             cells += [
                 f"<= {bound}" if at_most else bound,
                 number(100 * m.within / found.runs) if at_most else "",
             ]
-        shown = "%" if m.unit == "percent" else m.unit
-        add_row(table, f"{m.label} [{shown}]", *cells, *([""] * (len(heads) - len(cells))))
+        add_row(table, m.merit.heading, *cells, *([""] * (len(heads) - len(cells))))
     return table
 
 

@@ -20,7 +20,6 @@ from malta.report.tables.layout import (
     Paragraph,
     add_row,
     fold,
-    merit_heading,
     merit_text,
     new_sheet,
     new_table,
@@ -39,9 +38,10 @@ if TYPE_CHECKING:
     from malta.identification.measure import Measurement, MeasurementPlan
     from malta.identification.prediction import Predicted
     from malta.identification.replay import LawReplay
+    from malta.merits import Merit
     from malta.model.plant import Plant
     from malta.report.ledger import Claim, Ledger
-    from malta.simulation.experiments import Experiment, Merit
+    from malta.simulation.experiments import Experiment
 
 
 def limits_text(e: Experiment) -> list[str]:
@@ -107,11 +107,11 @@ def _merits_table(title: str, merits: Sequence[Merit], published: Published | No
     if published is None or not any(merit.published for merit in merits):
         table = new_table(title, "figure", "ours")
         for merit in merits:
-            add_row(table, merit_heading(merit), merit_text(merit))
+            add_row(table, merit.heading, merit_text(merit))
         return table
     table = new_table(title, "figure", "ours", "published")
     for merit in merits:
-        add_row(table, merit_heading(merit), merit_text(merit), published_text(merit, published))
+        add_row(table, merit.heading, merit_text(merit), published_text(merit, published))
     return table
 
 
@@ -128,7 +128,7 @@ def _cases_table(e: Experiment, published: Published | None) -> Table:
         return _transposed(e, fullest)
     ended = any(not case.run.verdict.completed for case in e.cases)
     heads = ["verdict", "at [ms]"] if ended else []
-    table = new_table(e.question, "case", *heads, *map(merit_heading, fullest))
+    table = new_table(e.question, "case", *heads, *(merit.heading for merit in fullest))
     if ended:
         table.columns[1].justify = "left"
     for case in e.cases:
@@ -154,7 +154,7 @@ def _transposed(e: Experiment, fullest: Sequence[Merit]) -> Table:
     add_row(table, "verdict", *(end.name for end in ends))
     add_row(table, "at [ms]", *(f"{end.time * 1e3:.1f}" for end in ends))
     for merit in fullest:
-        add_row(table, merit_heading(merit), *(values.get(merit.label, "-") for values in found))
+        add_row(table, merit.heading, *(values.get(merit.label, "-") for values in found))
     return table
 
 
@@ -166,7 +166,7 @@ def _list_of_merits(e: Experiment) -> Table:
         end = case.run.verdict
         add_row(table, case.label, "verdict", f"{end.name} at {end.time * 1e3:.1f} ms")
         for merit in case.merits:
-            add_row(table, "", merit_heading(merit), merit_text(merit))
+            add_row(table, "", merit.heading, merit_text(merit))
     return table
 
 

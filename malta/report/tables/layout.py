@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rich.style import Style
     from rich.table import Column
 
-    from malta.simulation.experiments import Merit
+    from malta.merits import Merit
 
 
 EDGES = 2  # columns of a terminal, left and right of a table
@@ -232,12 +232,6 @@ class Paragraph:
 
 
 # Rows, cells and headings that several tables share.
-
-
-def merit_heading(merit: Merit) -> str:
-    """The name of a figure of merit with its unit in brackets."""
-    unit = {"percent": "%", "1": ""}.get(merit.unit, merit.unit)
-    return f"{merit.label} [{unit}]" if unit else merit.label
 
 
 def merit_text(merit: Merit) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from malta.margins.loop_report import zone
+from malta.model.parameters import box_words
 from malta.model.signals import axis_units
 from malta.proof.margin import NOT_PROVEN, unproven
 from malta.report.tables.design import bandwidth_table, loop_poles_table, recovery_table, sensitivity_table
@@ -64,8 +65,7 @@ def loop_tables(
 
 def _margin_tables(found: LoopReport) -> Iterator[Table | Paragraph]:
     """The margins of the stages, over the travel and of each parameter, and what they leave open."""
-    box = "  ".join(f"{name} +-{100 * share:g} %" for name, share in found.uncertainty.items())
-    yield Paragraph(f"Uncertainty: {box}\n")
+    yield Paragraph(f"Uncertainty: {box_words(found.uncertainty, found.plant.parameters)}\n")
     yield chain_table(found)
     if missing := found.left_out:
         yield Paragraph(f"Not in the last stage: {missing}\n")
@@ -170,7 +170,7 @@ def open_bounds(found: LoopReport) -> list[str]:
     margins = [(link.name, link.margin) for link in found.chain]
     margins += [(_coverage_text(found), found.travel)] if found.extent.intervals else []
     unit = " mm" if found.extent.stroke else ""
-    margins += [(f"at {_position_text(found.extent, p.position)}{unit}", p.margin) for p in found.places]
+    margins += [(f"at {position_text(found.extent, p.position)}{unit}", p.margin) for p in found.places]
     alone = [
         (f"{name} {way}", m)
         for name, both in found.tolerance.items()
@@ -448,7 +448,7 @@ def places_table(found: LoopReport) -> Table:
         unstable = math.isnan(place.peak)
         add_row(
             table,
-            _position_text(extent, place.position),
+            position_text(extent, place.position),
             *(_margin_cells(place.margin) if proven else ()),
             "unstable" if unstable else f"{place.peak:.2f}",
             "" if unstable else zone(place.peak),
@@ -458,7 +458,7 @@ def places_table(found: LoopReport) -> Table:
     return table
 
 
-def _position_text(extent: Extent, position: float) -> str:
+def position_text(extent: Extent, position: float) -> str:
     """A place along the travel, mm, or along a parameter."""
     if extent.stroke:
         return f"{round(position * 1e3, 6):.4g}"

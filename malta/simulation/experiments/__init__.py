@@ -19,7 +19,8 @@ import numpy as np
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.loops.loop import loop_along
-from malta.margins.loop_report import Better
+from malta.merits import Merit as Merit
+from malta.merits import figure
 from malta.model.linearize import linearize
 from malta.model.machines import attribute_of
 from malta.model.plant import Plant
@@ -29,7 +30,6 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-from malta.units import identifier, in_unit
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -40,27 +40,6 @@ Progress = Callable[[float], None]
 # Sensors as built, without systematic errors; and exact sensors.
 REAL: dict[str, Any] = {"noise": 1.0, "quantize": True, "sensor_errors": {}}
 QUIET: dict[str, Any] = {"noise": 0.0, "quantize": False, "sensor_errors": None}
-
-
-class Merit(NamedTuple):
-    """A figure of merit: value in SI, unit for display, the key of the paper's value, and which way is better."""
-
-    label: str
-    value: float
-    unit: str
-    published: str = ""  # key of data/published/
-    relation: str = "about"  # of ours to the published: "about" or "at most"
-    key: str = ""  # its name in documents, without a unit; "": the words of the label
-    better: Better = "low"  # "high", or "" where neither is
-
-    @property
-    def identifier(self) -> str:
-        """The key of the figure in JSON documents, with its SI unit: `rise_s`."""
-        return identifier(self.key or self.label, self.unit)
-
-    def __str__(self) -> str:
-        unit = "%" if self.unit == "percent" else self.unit
-        return f"{self.label} {in_unit(self.value, self.unit):.3g} {unit}"
 
 
 class Case(NamedTuple):
@@ -144,6 +123,20 @@ class Experiment:
         if len(self.cases) == 1:
             return verdicts[0]
         return f"{len(ends)} of {len(self.cases)} runs not completed ({ends[0].label}: {verdicts[0]})"
+
+    @property
+    def figures(self) -> tuple[Merit, ...]:
+        """The share of the runs that were completed, then the figures of merit: of the whole, or else of each run."""
+        rows = [("", merit) for merit in self.merits]
+        if len(self.cases) > 1 and [m.label for m in self.merits] == [m.label for m in self.cases[0].merits]:
+            rows = [(case.label, merit) for case in self.cases for merit in case.merits]
+        completed = float(np.mean([case.run.verdict.completed for case in self.cases]))
+        ended = figure("job", f"{self.name} completed", f"{self.name}: runs completed", completed, "percent")
+        found = [ended._replace(better="high")]
+        for case, merit in rows:
+            label = f"{case}: {merit.label}" if case else merit.label
+            found.append(merit._replace(label=label, key=f"{self.name} {case} {merit.key or merit.label}"))
+        return tuple(found)
 
     @property
     def description(self) -> Description:

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError
+from malta.merits import reported_merits
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
@@ -82,17 +83,15 @@ def stroke_merits(run: Trajectory, *, published: bool = True) -> tuple[Merit, ..
 
     published : the stroke is that of Figs 12 and 13, so published figures stand beside ours
     """
-    f = stroke_figures(run)
-    merits = [
-        Merit("rise, 10-90 %", f.rise, "ms", "figure_12.rise_time"),
-        Merit("overshoot", f.overshoot, "percent", "figure_12.overshoot", "at most"),
-        Merit("axial error", f.axial_error, "mm", "figure_12.axial_error", "at most"),
-    ]
-    bound = "figure_13.radial_deviation"
-    merits += [Merit(f"deviation {name}", value, "um", bound, "at most") for name, value in f.radial.items()]
+    printed = {
+        "rise": "figure_12.rise_time",
+        "overshoot": "figure_12.overshoot",
+        "axial_error": "figure_12.axial_error",
+        "radial": "figure_13.radial_deviation",
+    }  # by fields of StrokeFigures
+    found = reported_merits(stroke_figures(run)).items()
+    merits = [merit._replace(published=printed.get(name.partition(".")[0], "")) for name, merit in found]
     merits += [
-        Merit("largest thrust", f.force, "N"),
-        Merit("largest commanded current", f.current, "A"),
         Merit(
             "drive constant per module, f / i",
             drive_constant(run),
