@@ -3,8 +3,8 @@
     v = K(s) (p* - y),    K = sum of L_k E_k(s) R_k        E_k: an element; R_k: what of the errors it takes,
                                                            L_k: the forces that it acts with
 
-A law of errors is sampled by Tustin's rule, as malta.synthesis.controller_of recommends: with z = (1 + s T/2) / (1 - s T/2) it
-has the same matrices in s as the continuous law.
+A law of errors is sampled by Tustin's rule, as malta.synthesis.controller_of recommends: with
+z = (1 + s T/2) / (1 - s T/2) it has the same matrices in s as the continuous law.
 """
 
 from __future__ import annotations
@@ -52,16 +52,14 @@ class Parameter:
     @property
     def bounds(self) -> tuple[float, float]:
         """The bounds of x."""
-        ends = []
+        ends: list[float | None] = []
         for end in (self.low, self.high):
             if self.scale:
                 ends.append((end - self.start) / self.scale)
             else:
                 share = end / self.start
                 ends.append(math.log(share) if share > 0 and math.isfinite(share) else None)
-        if self.scale:
-            return ends[0], ends[1]
-        low, high = ends if self.start > 0 else ends[::-1]
+        low, high = ends if self.scale or self.start > 0 else ends[::-1]
         return (-math.inf if low is None else low), (math.inf if high is None else high)
 
 
@@ -130,7 +128,9 @@ class Element:
         return Element(f"{self.name} {other.name}", tuple(named), matrices)
 
 
-def _positive(element: str, bounds: Mapping[str, tuple[float, float]] | None, **starts: float) -> list[Parameter]:
+def _positive(
+    element: str, bounds: Mapping[str, tuple[float, float]] | None, **starts: float
+) -> list[Parameter]:
     """Parameters that keep their sign. Raises InputError for zeros, and for bounds of others."""
     given = dict(bounds or {})
     found = []
@@ -170,7 +170,7 @@ def pid(
     Kp: float,
     Ki: float = 0.0,
     Kd: float = 0.0,
-    filter: float = 0.0,  # noqa: A002: what the project calls it
+    filter: float = 0.0,
     *,
     bounds: Bounds | None = None,
 ) -> Element:
@@ -187,7 +187,9 @@ def pid(
     2
     """
     if Kd and not filter > 0:
-        raise InputError(CALLER, f"{name}.filter", f"{filter} s", "a time above 0 s: no sampled law has a plain rate")
+        raise InputError(
+            CALLER, f"{name}.filter", f"{filter} s", "a time above 0 s: no sampled law has a plain rate"
+        )
     terms = {"Kp": Kp} | ({"Ki": Ki} if Ki else {}) | ({"Kd": Kd, "filter": filter} if Kd else {})
 
     def matrices(v: Sequence[Any]) -> Matrices:
@@ -316,7 +318,11 @@ def states(name: str, start: Any, pattern: Any = None) -> Element:
     (n, _), (m, r) = shapes[0], shapes[3]
     if shapes != [(n, n), (n, r), (m, n), (m, r)] or not all(np.isfinite(M).all() for M in parts):
         raise InputError(CALLER, name, f"matrices of shapes {shapes}", "A, B, C and D that fit, of numbers")
-    masks = [np.ones(s, dtype=bool) for s in shapes] if pattern is None else [np.asarray(M, dtype=bool) for M in pattern]
+    masks = (
+        [np.ones(s, dtype=bool) for s in shapes]
+        if pattern is None
+        else [np.asarray(M, dtype=bool) for M in pattern]
+    )
     if [M.shape for M in masks] != shapes:
         raise InputError(CALLER, f"{name}.pattern", "other shapes", f"those of A, B, C and D: {shapes}")
     parameters, places = [], []
@@ -352,8 +358,8 @@ Layout = Mapping[str, Element] | Element | Sequence[Place]
 def places_of(layout: Any, inputs: Sequence[str], outputs: Sequence[str]) -> tuple[Place, ...]:
     """The places of a layout.
 
-    layout : elements by the outputs whose errors they take, for the input of the same index; one element from all errors
-        to all forces; or places, as of the coordinates of the centre of gravity
+    layout : elements by the outputs whose errors they take, for the input of the same index; one element from all
+        errors to all forces; or places, as of the coordinates of the centre of gravity
 
     Raises InputError for outputs that the machine does not have, for other shapes, and for two elements of one name.
     """
@@ -363,8 +369,14 @@ def places_of(layout: Any, inputs: Sequence[str], outputs: Sequence[str]) -> tup
     elif isinstance(layout, Mapping):
         unknown = next((name for name in layout if name not in outputs), None)
         if unknown is not None or m != p:
-            expected = "one of " + " ".join(outputs) if m == p else "an element or places, where inputs are no outputs"
-            raise InputError(CALLER, "law", f"an element of {unknown}" if unknown else "elements by output", expected)
+            expected = (
+                "one of " + " ".join(outputs)
+                if m == p
+                else "an element or places, where inputs are no outputs"
+            )
+            raise InputError(
+                CALLER, "law", f"an element of {unknown}" if unknown else "elements by output", expected
+            )
         one = np.eye(p)
         found = tuple(
             Place(one[:, [k]], layout[name], one[[k]]) for k, name in enumerate(outputs) if name in layout
@@ -423,7 +435,7 @@ class Structure:
             made[e.name] = [ca.SX(M) for M in e.matrices(values)]
             first += len(values)
         (m, _), (_, p) = self.places[0].left.shape, self.places[0].right.shape
-        D, A, B, C = ca.SX(m, p), [], [], []
+        D, A, B, C = ca.SX(m, p), list[Any](), list[Any](), list[Any]()
         for left, element, right in self.places:
             a, b, c, d = made[element.name]
             D = D + left @ d @ right
@@ -444,10 +456,13 @@ class Structure:
 
     def at(self, x: FloatArray) -> Structure:
         """The same structure with the values at x as its present ones."""
-        values, first = {}, 0
+        values: dict[str, float] = {}
+        first = 0
         for e in self.elements:
             k = len(e.parameters)
-            numbers = (float(ca.DM(p.value(v))) for p, v in zip(e.parameters, x[first : first + k], strict=True))
+            numbers = (
+                float(ca.DM(p.value(v))) for p, v in zip(e.parameters, x[first : first + k], strict=True)
+            )
             values |= dict(zip(e.values, numbers, strict=True))
             first += k
         new = {e.name: e.at(values) for e in self.elements}

@@ -104,14 +104,20 @@ def disk_margin(least: float, *, at: At = "sensors", channels: Sequence[str] | N
 
 
 def gain_limit(
-    inputs: str | Sequence[str], outputs: str | Sequence[str], limit: float, *, weight: Any = None, name: str = ""
+    inputs: str | Sequence[str],
+    outputs: str | Sequence[str],
+    limit: float,
+    *,
+    weight: Any = None,
+    name: str = "",
 ) -> Goal:
     """The largest singular value between signals at most a limit, at all frequencies.
 
     inputs : "reference x1", "load fx_B1" (on a force), "disturbance F_x"; "load" alone for all of them
     outputs : "error x1", "output x1", "force fx_B1" (of the law), "acting fx_B1" (with the load)
     limit : in units of the outputs over those of the inputs
-    weight : W of W G: a stable proper control system with one input; None: 1. Of a sampled loop it is sampled by Tustin's rule
+    weight : W of W G: a stable proper control system with one input; None: 1. Of a sampled loop it is sampled by
+        Tustin's rule
 
     Raises InputError for a limit that is not above 0, and for other weights.
 
@@ -142,16 +148,20 @@ def tracking(
     for one in (time, peak, steady):
         _require_positive("tracking", one)
     w = 2 / time
-    W = System(*(np.array([[v]]) for v in (-w * steady / peak, 1.0, w / peak - w * steady / peak**2, 1 / peak)))
+    W = System(
+        *(np.array([[v]]) for v in (-w * steady / peak, 1.0, w / peak - w * steady / peak**2, 1 / peak))
+    )
     made = partial(_each_channel, name := f"tracking {time:g} s", "sensors", channels, 1.0, 0.0, W=W)
     return Goal(name, made, unit=f"2 / w = {time:g} s")
 
 
-def noise_limit(levels: Mapping[str, float], outputs: str | Sequence[str], limit: float, *, name: str = "") -> Goal:
+def noise_limit(
+    levels: Mapping[str, float], outputs: str | Sequence[str], limit: float, *, name: str = ""
+) -> Goal:
     """The rms of outputs under white noise at most a limit; of several outputs the root of the sum of squares.
 
-    levels : of inputs, as {"reference x1": 1e-7, "load": 0.5}: standard deviations of a sample of a sampled loop, the roots
-        of spectral densities of a continuous one. Noise of a sensor enters as a reference does
+    levels : of inputs, as {"reference x1": 1e-7, "load": 0.5}: standard deviations of a sample of a sampled loop, the
+        roots of spectral densities of a continuous one. Noise of a sensor enters as a reference does
     outputs : as in `gain_limit`
     limit : in their unit
 
@@ -178,9 +188,15 @@ def poles(decay: float = 0.0, damping: float = 0.0, fastest: float = math.inf) -
     >>> poles(decay=10.0).name
     'poles'
     """
-    if not (decay >= 0 and 0 <= damping < 1 and fastest > decay) or (decay, damping, fastest) == (0, 0, math.inf):
+    if not (decay >= 0 and 0 <= damping < 1 and fastest > decay) or (decay, damping, fastest) == (
+        0,
+        0,
+        math.inf,
+    ):
         found = f"decay {decay}, damping {damping}, fastest {fastest}"
-        raise InputError(CALLER, "poles", found, "a decay above 0, a damping below 1, or poles faster than the decay")
+        raise InputError(
+            CALLER, "poles", found, "a decay above 0, a damping below 1, or poles faster than the decay"
+        )
     parts = [f"decay {decay:g} 1/s"] * (decay > 0) + [f"damping {damping:g}"] * (damping > 0)
     unit = ", ".join(parts + [f"up to {fastest:g} rad/s"] * math.isfinite(fastest))
     return Goal("poles", partial(_poles, decay, damping, fastest), unit=unit)
@@ -202,7 +218,9 @@ def _weight_of(weight: Any) -> System:
         wanted = "a proper control system with one input and one output"
         raise InputError(CALLER, "weight", f"a {type(weight).__name__}", wanted) from error
     if found.D.shape != (1, 1) or (len(found.A) and np.linalg.eigvals(found.A).real.max() >= 0):
-        raise InputError(CALLER, "weight", "an unstable one or one of several signals", "a stable one of one signal")
+        raise InputError(
+            CALLER, "weight", "an unstable one or one of several signals", "a stable one of one signal"
+        )
     return found
 
 
@@ -217,7 +235,12 @@ def _weighted(system: System, W: System) -> System:
 
 
 def _figures_of(
-    loop: ClosedLoop, found: tuple[System, Channels], factor: float, shift: float, W: System | None, of: tuple[str, str]
+    loop: ClosedLoop,
+    found: tuple[System, Channels],
+    factor: float,
+    shift: float,
+    W: System | None,
+    of: tuple[str, str],
 ) -> list[Figure]:
     """The peaks of factor W (G - shift)."""
     system, by = found
@@ -240,17 +263,26 @@ def _each_channel(
         figure
         for name in names
         for figure in _figures_of(
-            loop, loop.part(loop.rows(f"{out} {name}"), loop.columns(f"{into} {name}")), factor, shift, W, (goal, name)
+            loop,
+            loop.part(loop.rows(f"{out} {name}"), loop.columns(f"{into} {name}")),
+            factor,
+            shift,
+            W,
+            (goal, name),
         )
     ]
 
 
-def _gain(goal: str, inputs: Any, outputs: Any, factor: float, W: System | None, loop: ClosedLoop) -> list[Figure]:
+def _gain(
+    goal: str, inputs: Any, outputs: Any, factor: float, W: System | None, loop: ClosedLoop
+) -> list[Figure]:
     part = loop.part(loop.rows(outputs), loop.columns(inputs))
     return _figures_of(loop, part, factor, 0.0, W, (goal, ""))
 
 
-def _noise(goal: str, levels: Mapping[str, float], outputs: Any, limit: float, loop: ClosedLoop) -> list[Figure]:
+def _noise(
+    goal: str, levels: Mapping[str, float], outputs: Any, limit: float, loop: ClosedLoop
+) -> list[Figure]:
     """Of a sampled loop the sum over samples is the integral over w of |G|^2 T / (1 + (w T/2)^2)."""
     columns = [(k, level) for signal, level in levels.items() for k in loop.columns(signal)]
     size = np.array([level for _, level in columns])
@@ -289,13 +321,16 @@ def _poles(decay: float, damping: float, fastest: float, loop: ClosedLoop) -> li
             found.append(("damping", s, 1 + damping - ratio, -by))
         if math.isfinite(fastest):
             found.append(("fastest", s, size / fastest, grown / fastest))
-    near = [f for f in found if f[2] > 0.5]
+    top = max((f[2] for f in found), default=0.0)
+    near = [f for f in found if f[2] >= min(top, 0.5)]
     return [Figure("poles", kind, abs(s), value, loop.slope(slope)) for kind, s, value, slope in near]
 
 
 def stability(loop: ClosedLoop, rate: float) -> list[Figure]:
     """1 + Re(pole) / rate of the slowest poles: below 1 where the loop is stable."""
     return [
-        Figure("stability", "", abs(pole.value), 1 + pole.value.real / rate, loop.slope(pole.slope.real / rate))
+        Figure(
+            "stability", "", abs(pole.value), 1 + pole.value.real / rate, loop.slope(pole.slope.real / rate)
+        )
         for pole in loop.poles(SLOWEST)
     ]

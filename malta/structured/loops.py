@@ -2,8 +2,8 @@
 
     x' = A x + B u + B_w w,  y = C x + D u + D_w w,  u = K (p* - y) + d
 
-Of a sampled plant s is that of z = (1 + s T/2) / (1 - s T/2). In it a law sampled by Tustin's rule is the continuous law,
-and peaks and stability are those of the sampled loop, exactly; the frequency w stands for tan(w T/2) / (T/2).
+Of a sampled plant s is that of z = (1 + s T/2) / (1 - s T/2). In it a law sampled by Tustin's rule is the continuous
+law, and peaks and stability are those of the sampled loop, exactly; the frequency w stands for tan(w T/2) / (T/2).
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from malta.structured.norms import Channels, Pole, poles_of
 from malta.synthesis.state_space import balanced_units
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from malta.model.plant import FloatArray
 
 JOINS = 1e-12  # of the largest entries of its row and column: smaller ones are rounding
@@ -96,11 +98,17 @@ def models_of_systems(plants: Any) -> list[Model]:
         matrices = System(*(np.array(M, dtype=float) for M in (ss.A, ss.B, ss.C, ss.D)))
         name = f"{ss.name}" if len(given) == 1 else f"model {k + 1}"
         found.append(
-            model_of(name, matrices, ss.input_labels, ss.output_labels, sample_time=float(ss.dt or 0.0) or None)
+            model_of(
+                name, matrices, ss.input_labels, ss.output_labels, sample_time=float(ss.dt or 0.0) or None
+            )
         )
     first = found[0]
     for other in found[1:]:
-        if (other.inputs, other.outputs, other.sample_time) != (first.inputs, first.outputs, first.sample_time):
+        if (other.inputs, other.outputs, other.sample_time) != (
+            first.inputs,
+            first.outputs,
+            first.sample_time,
+        ):
             expected = "the same signals and sample time in all of them"
             raise InputError(CALLER, "plant", f"{other.name} beside {first.name}", expected)
     return found
@@ -176,13 +184,13 @@ class ClosedLoop:
         return System(A[np.ix_(x, x)], B[x], C[:, x], D), channels
 
     @cached_property
-    def _joined(self) -> np.ndarray:
+    def _joined(self) -> NDArray[np.bool_]:
         size = np.abs(self.whole[0].A)
         least = JOINS * np.sqrt(np.outer(size.max(axis=1, initial=0.0), size.max(axis=0, initial=0.0)))
-        return np.asarray(size > least)
+        return size > least
 
     @cached_property
-    def groups(self) -> list[FloatArray]:
+    def groups(self) -> list[NDArray[np.int_]]:
         """States that nothing joins to each other."""
         count, label = sparse.csgraph.connected_components(self._joined, directed=False)
         return [np.flatnonzero(label == k) for k in range(count)]
@@ -191,21 +199,21 @@ class ClosedLoop:
     def growth(self) -> float:
         """The largest Re of a pole; below 0 where the loop is stable."""
         A = self.whole[0].A
-        return max((float(np.linalg.eigvals(A[np.ix_(x, x)]).real.max()) for x in self.groups), default=-math.inf)
+        return max(
+            (float(np.linalg.eigvals(A[np.ix_(x, x)]).real.max()) for x in self.groups), default=-math.inf
+        )
 
     def poles(self, count: int = 0) -> list[Pole]:
         """The poles with their derivatives by M, each group by itself; count of each, the slowest first, 0: all."""
         (A, _, _, _), by = self.whole
-        return [
-            pole
-            for x in self.groups
-            for pole in poles_of(A[np.ix_(x, x)], by.B2[x], by.C2[:, x], count)
-        ]
+        return [pole for x in self.groups for pole in poles_of(A[np.ix_(x, x)], by.B2[x], by.C2[:, x], count)]
 
     def rows(self, signals: Any) -> list[int]:
         """The outputs of these names. Raises InputError for unknown ones."""
         m = self.model
-        return _picked(signals, dict(zip(OF_OUTPUTS, (m.outputs, m.outputs, m.inputs, m.inputs), strict=True)))
+        return _picked(
+            signals, dict(zip(OF_OUTPUTS, (m.outputs, m.outputs, m.inputs, m.inputs), strict=True))
+        )
 
     def columns(self, signals: Any) -> list[int]:
         """The inputs of these names. Raises InputError for unknown ones."""
@@ -213,7 +221,7 @@ class ClosedLoop:
         return _picked(signals, dict(zip(OF_INPUTS, (m.outputs, m.inputs, m.disturbances), strict=True)))
 
 
-def _reach(joined: np.ndarray, start: np.ndarray) -> np.ndarray:
+def _reach(joined: Any, start: Any) -> Any:
     """The states that others drive, from some: joined[i, j] where state j drives state i."""
     found = start.copy()
     while True:

@@ -2,10 +2,11 @@
 
     min over x  max of soft figures   where hard figures <= 1,  low <= x <= high
 
-Figures are maxima over frequencies, channels and models: not smooth where two are as large. Each program knows all local
-peaks that come near, not only the largest, so that it steps along their edge (as the bundle methods of Apkarian and Noll):
+Figures are maxima over frequencies, channels and models: not smooth where two are as large. Each program knows all
+local peaks that come near, not only the largest, so that it steps along their edge, as the bundle methods of Apkarian
+and Noll do:
 
-    min over d, t, q   t + PENALTY q + d' H d / 2,    f_i + g_i d <= t,    h_j + g_j d <= 1 + q,    |d| <= radius,  q >= 0
+    min over d, t, q   t + PENALTY q + d' H d / 2,   f_i + g_i d <= t,   h_j + g_j d <= 1 + q,   |d| <= radius,   q >= 0
 
 H follows the curvature of the figures weighted by their multipliers (Powell's damped BFGS).
 """
@@ -82,7 +83,7 @@ Looker = Callable[["FloatArray"], "Look | None"]  # None: no figures, as of an u
 def minimize(look: Looker, start: Look, bounds: FloatArray, effort: Effort) -> Look:
     """Search from a place with figures to a local minimum of the largest soft one."""
     here, radius, still = start, RADIUS, 0
-    H = FIRST_CURVATURE * np.eye(len(start.x))
+    H: FloatArray = FIRST_CURVATURE * np.eye(len(start.x))
     for _ in range(effort.steps):
         if here.merit <= effort.enough or radius < 1e-7:
             break
@@ -115,7 +116,9 @@ def minimize(look: Looker, start: Look, bounds: FloatArray, effort: Effort) -> L
     return here
 
 
-def _program(here: Look, H: FloatArray, bounds: FloatArray, radius: float) -> tuple[FloatArray, float, FloatArray] | None:
+def _program(
+    here: Look, H: FloatArray, bounds: FloatArray, radius: float
+) -> tuple[FloatArray, float, FloatArray] | None:
     """The step of a quadratic program, the decrease that it expects, and the multipliers of all figures."""
     n = len(here.x)
     soft_top, hard_top = here.soft, max(here.hard, 1.0)
@@ -196,5 +199,6 @@ def _near(a: float, b: float) -> bool:
 def by_x(figures: Sequence[Figure], slope: FloatArray, model: str, *, hard: bool) -> list[Slope]:
     """Figures with their derivatives by x. slope: of [D C; B A], column by column, by x."""
     return [
-        Slope((model, f.goal, f.channel), f.w, f.value, f.slope.ravel(order="F") @ slope, hard) for f in figures
+        Slope((model, f.goal, f.channel), f.w, f.value, f.slope.ravel(order="F") @ slope, hard)
+        for f in figures
     ]

@@ -11,7 +11,7 @@ All are differentiated by a matrix M that acts as A + B2 M C2 does: the output o
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy import linalg
@@ -204,7 +204,8 @@ class Pole(NamedTuple):
 
 def poles_of(A: FloatArray, B2: FloatArray, C2: FloatArray, count: int = 0) -> list[Pole]:
     """The eigenvalues of A + B2 M C2 with their derivatives, those that decay slowest first; count: 0 for all."""
-    values, left, right = linalg.eig(A, left=True, right=True)
+    found_eig: Any = linalg.eig(A, left=True, right=True)
+    values, left, right = found_eig
     order = [k for k in np.argsort(-values.real) if values[k].imag >= 0]
     found = []
     for k in order[:count] if count else order:

@@ -1,7 +1,7 @@
 """What a law is tuned for: systems, an uncertain system, or a machine; its models at parameters, and what proves a law.
 
-A machine's models for goals are its loops under load, as `malta verify` measures them; those for stability are the loops
-without loads that the proof of the margin is of.
+A machine's models for goals are its loops under load, as `malta verify` measures them; those for stability are the
+loops without loads that the proof of the margin is of.
 """
 
 from __future__ import annotations
@@ -110,7 +110,8 @@ class Uncertain:
         c, at = self.compensator(law), goal.peak[1]
         names = self.nominal[0].outputs if at == "sensors" else self.nominal[0].inputs
         return {
-            name: worst_case_gain(self.system, c, ranges, at=at, channel=k, time=time) for k, name in enumerate(names)
+            name: worst_case_gain(self.system, c, ranges, at=at, channel=k, time=time)
+            for k, name in enumerate(names)
         }
 
 
@@ -121,7 +122,9 @@ class Machine:
     plant: Plant
     sample_time: float
     places: tuple[Values, ...]
-    zero: Controller = field(repr=False)  # a law of errors that does nothing, with the machine's current loops
+    zero: Controller = field(
+        repr=False
+    )  # a law of errors that does nothing, with the machine's current loops
 
     @property
     def nominal(self) -> list[Model]:
@@ -132,7 +135,8 @@ class Machine:
         parameters = {name: v for name, v in values.items() if name in known}
         states = {name: v for name, v in values.items() if name not in known}
         if goals:
-            found = loop(self.plant, self.zero, parameters=parameters, **states).sampled_forces
+            at: dict[str, Any] = dict(states)
+            found = loop(self.plant, self.zero, parameters=parameters, **at).sampled_forces
         else:
             found = self._unloaded(parameters, states)
         m, extra = len(self.plant.inputs), found.control.D_y
@@ -142,14 +146,18 @@ class Machine:
             found.Ad + found.Bd @ extra @ found.Cd,
             np.hstack([into, pushed]), found.Cd, np.zeros((len(found.Cd), m + pushed.shape[1])),
         )  # fmt: skip
-        names = [[s.name for s in signals] for signals in (self.plant.inputs, self.plant.outputs, self.plant.disturbances)]
+        names = [
+            [s.name for s in signals]
+            for signals in (self.plant.inputs, self.plant.outputs, self.plant.disturbances)
+        ]
         return model_of(
             _name(values), system, names[0], names[1],
             disturbances=names[2] if pushed.shape[1] else (), sample_time=self.sample_time, goals=goals,
         )  # fmt: skip
 
     def _unloaded(self, parameters: Values, states: Values) -> SampledLoop:
-        changed: Any = replace(self.plant.parameters, **parameters)  # type: ignore[type-var]
+        own: Any = self.plant.parameters
+        changed = replace(own, **parameters)
         machine = self.plant.variant(changed) if parameters else self.plant
         return sampled_loop(
             linearize(machine, machine.at(**states)), self.zero,
@@ -196,7 +204,9 @@ def target_of(
             raise InputError(CALLER, "delay", f"{delay} samples", "none without a sample time")
         return Uncertain(plant, T, delay, lag)
     if delay or lag is not None:
-        raise InputError(CALLER, "delay, lag", "some", "those of an uncertain system alone: other plants have their own")
+        raise InputError(
+            CALLER, "delay, lag", "some", "those of an uncertain system alone: other plants have their own"
+        )
     if isinstance(plant, Plant):
         if sample_time is None:
             raise InputError(CALLER, "sample_time", "none", "the sample time of the machine's law, s")
@@ -204,11 +214,15 @@ def target_of(
 
         m, p = len(plant.inputs), len(plant.outputs)
         nothing = control.ss([[0.0]], np.zeros((1, p)), np.zeros((m, 1)), np.zeros((m, p)), sample_time)
-        own = [{plant.stroke: share * plant.travel} for share in (0.0, 1.0, -1.0)] if plant.has_stroke else [{}]
+        own = (
+            [{plant.stroke: share * plant.travel} for share in (0.0, 1.0, -1.0)] if plant.has_stroke else [{}]
+        )
         zero = controller_of(nothing, plant, name="nothing")
         return Machine(plant, sample_time, tuple(own if places is None else places), zero)
     if sample_time is not None:
-        raise InputError(CALLER, "sample_time", f"{sample_time} s", "none: systems of python-control have their own")
+        raise InputError(
+            CALLER, "sample_time", f"{sample_time} s", "none: systems of python-control have their own"
+        )
     return Systems(tuple(models_of_systems(plant)))
 
 

@@ -6,9 +6,9 @@ A stabilizing K with |T_zw| < gamma exists exactly when X >= 0 and Y >= 0 solve
 
     A'X + XA + Q - (X B + S) R^-1 (B'X + S') = 0    and its dual,    and    rho(X Y) < gamma^2
 
-with R = D1'D1 - diag(gamma^2, 0), D1 = [D11 D12], S = C1'D1 (Glover and Doyle, Systems & Control Letters 11 (1988); Zhou,
-Doyle and Glover, Robust and Optimal Control, theorem 17.1, whose letters these are). R is indefinite, which the equations
-of a regulator are not; so they are solved here, by an ordered Schur form of their Hamiltonian matrices.
+with R = D1'D1 - diag(gamma^2, 0), D1 = [D11 D12], S = C1'D1 (Glover and Doyle, Systems & Control Letters 11 (1988);
+Zhou, Doyle and Glover, Robust and Optimal Control, theorem 17.1, whose letters these are). R is indefinite, which that
+of a regulator is not; so they are solved here, by an ordered Schur form of their Hamiltonian matrices.
 """
 
 from __future__ import annotations
@@ -111,10 +111,11 @@ def h_infinity(plant: Any, outputs: int, inputs: int) -> Synthesized:
     plant : continuous control.StateSpace, or A, B, C and D, whose last inputs are u and whose last outputs are y
     outputs, inputs : numbers of y and of u
 
-    Returns a Synthesized: `gamma` to six digits, and a law that reaches it to a thousandth, checked by the norm of its loop.
+    Returns a Synthesized: `gamma` to six digits, and a law that reaches it to a thousandth, checked by the norm of its
+    loop.
 
-    Raises InputError for shapes that do not fit, inputs u that z does not weigh, outputs y without noise, and plants that no
-    law stabilizes; CheckError where the closed loop does not keep what the equations promise.
+    Raises InputError for shapes that do not fit, inputs u that z does not weigh, outputs y without noise, and plants
+    that no law stabilizes; CheckError where the closed loop does not keep what the equations promise.
 
     >>> from malta import structured
     >>> P = [[0.0]], [[1.0, 0.0, 1.0]], [[1.0], [0.0], [1.0]], [[0, 0, 0], [0, 0, 1], [0, 1, 0]]
@@ -146,7 +147,10 @@ def _system_of(plant: Any) -> System:
     given = (plant.A, plant.B, plant.C, plant.D) if hasattr(plant, "A") else plant
     try:
         found = System(*(np.atleast_2d(np.asarray(M, dtype=float)) for M in given))
-        fits = found.B.shape == (len(found.A), found.D.shape[1]) and found.C.shape == (len(found.D), len(found.A))
+        fits = found.B.shape == (len(found.A), found.D.shape[1]) and found.C.shape == (
+            len(found.D),
+            len(found.A),
+        )
     except (TypeError, ValueError):
         fits = False
     if not fits or not all(np.isfinite(M).all() for M in found):
@@ -164,13 +168,19 @@ def _normal(whole: System, p2: int, m2: int) -> tuple[_Problem, Callable[[System
     D12, D21, D22 = D[:p1, m1:], D[p1:, :m1], D[p1:, m1:]
     U, s, V = np.linalg.svd(D12)
     if p1 < m2 or not s.min() > RANK * max(s.max(), 1e-300):
-        raise InputError(CALLER, "D12", "an input u that z does not weigh at once", "a weight of every input u")
+        raise InputError(
+            CALLER, "D12", "an input u that z does not weigh at once", "a weight of every input u"
+        )
     of_z, of_u = np.roll(U, -m2, axis=1).T, V.T / s  # of_z D12 of_u = [0; 1]
     U, s, V = np.linalg.svd(D21)
     if m1 < p2 or not s.min() > RANK * max(s.max(), 1e-300):
-        raise InputError(CALLER, "D21", "an output y that w does not reach at once", "noise of every output y")
+        raise InputError(
+            CALLER, "D21", "an output y that w does not reach at once", "noise of every output y"
+        )
     of_w, of_y = np.roll(V.T, -p2, axis=1), (U / s).T  # of_y D21 of_w = [0 1]
-    problem = _Problem(A, B[:, :m1] @ of_w, B[:, m1:] @ of_u, of_z @ C[:p1], of_y @ C[p1:], of_z @ D[:p1, :m1] @ of_w)
+    problem = _Problem(
+        A, B[:, :m1] @ of_w, B[:, m1:] @ of_u, of_z @ C[:p1], of_y @ C[p1:], of_z @ D[:p1, :m1] @ of_w
+    )
 
     def back(K: System) -> System:
         B_K, C_K, D_K = K.B @ of_y, of_u @ K.C, of_u @ K.D @ of_y
@@ -181,8 +191,10 @@ def _normal(whole: System, p2: int, m2: int) -> tuple[_Problem, Callable[[System
     return problem, back
 
 
-def _riccati(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray) -> tuple[FloatArray, float] | None:
-    """The stabilizing X >= 0 of A'X + XA + Q - (XB + S) R^-1 (B'X + S') = 0, R indefinite, and its residual; or None."""
+def _riccati(
+    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray
+) -> tuple[FloatArray, float] | None:
+    """The stabilizing X >= 0 of A'X + XA + Q - (XB + S) R^-1 (B'X + S') = 0, R indefinite, and its residual."""
     n = len(A)
     if not n:
         return np.zeros((0, 0)), 0.0
@@ -205,7 +217,7 @@ def _riccati(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: Floa
     terms = [A.T @ X, X @ A, Q, -(X @ B + S) @ np.linalg.solve(R, B.T @ X + S.T)]
     residual = float(np.linalg.norm(sum(terms)) / max(sum(np.linalg.norm(term) for term in terms), 1e-300))
     unit = X * np.outer(t, t)
-    if residual > RESIDUAL or np.linalg.eigvalsh(unit).min() < -1e-8 * max(np.abs(unit).max(), 1e-300):
+    if residual > RESIDUAL or np.linalg.eigvalsh(unit).min() < -1e-8 * max(np.abs(unit).max(), 1.0):
         return None
     return X, residual
 
@@ -323,7 +335,7 @@ def mixed_sensitivity(plant: Any, of_error: Any, of_input: Any = None, of_output
     G = control.ss(plant)
     p, m = G.noutputs, G.ninputs
     given = [("of_error", of_error, p), ("of_input", of_input, m), ("of_output", of_output, p)]
-    sides = []
+    sides: list[System | None] = []
     for name, weight, size in given:
         if weight is None:
             sides.append(None)
@@ -365,20 +377,20 @@ def _augmented(G: System, sides: list[System | None]) -> System:
 
 @on_one_thread
 def shape_loop(plant: Any, before: Any = 1.0, after: Any = 1.0) -> Synthesized:
-    """Find the law that stands the largest uncertainty of normalized coprime factors of a shaped plant (Glover, McFarlane).
+    """Find the law that stands the largest uncertainty of normalized coprime factors of a shaped plant.
 
-    The shaped plant is G_s = W2 G W1, K = W1 K_s W2. gamma is sqrt(1 + rho(X Z)) in closed form, without a search; 1 / gamma is
-    the margin: the largest |[dN dM]| of G_s = (M + dM)^-1 (N + dN) that K stabilizes.
+    The shaped plant is G_s = W2 G W1, K = W1 K_s W2. gamma is sqrt(1 + rho(X Z)) in closed form, without a search, and
+    1 / gamma the margin: K holds (M + dM)^-1 (N + dN) for every |[dN dM]| below it, with G_s = M^-1 N.
 
     plant : continuous, strictly proper control system
     before, after : W1 and W2, control systems or numbers
 
-    Returns a Synthesized, whose law takes the errors r - y: negative feedback; its norm is that of the four transfer functions
-    [K; 1] (1 + G K)^-1 [1 G] of the shaped plant.
+    Returns a Synthesized, whose law takes the errors r - y: negative feedback; its norm is that of the four transfer
+    functions [K; 1] (1 + G K)^-1 [1 G] of the shaped plant.
 
     Raises InputError for a plant with D, and for equations without a solution.
 
-    Source: McFarlane and Glover, IEEE TAC 37 (1992).
+    Source: McFarlane and Glover, A loop-shaping design procedure, IEEE TAC 37 (1992).
 
     >>> import control
     >>> from malta import structured
@@ -399,27 +411,24 @@ def shape_loop(plant: Any, before: Any = 1.0, after: Any = 1.0) -> Synthesized:
     x = _riccati(A, B, C.T @ C, np.eye(m), np.zeros((n, m)))
     z = _riccati(A.T, C.T, B @ B.T, np.eye(p), np.zeros((n, p)))
     if x is None or z is None:
-        raise InputError("shape_loop", "plant", "one that no law stabilizes", "a plant that u stabilizes and y shows")
+        raise InputError(
+            "shape_loop", "plant", "one that no law stabilizes", "a plant that u stabilizes and y shows"
+        )
     X, Z = x[0], z[0]
     best = math.sqrt(1 + float(np.linalg.eigvals(X @ Z).real.max(initial=0.0)))
     gamma = best * (1 + ABOVE)
     inner = (1 - gamma**2) * np.eye(n) + X @ Z
     back = np.linalg.inv(inner.T)
     F = -B.T @ X
-    own = System(A + B @ F + gamma**2 * back @ Z @ C.T @ C, gamma**2 * back @ Z @ C.T, B.T @ X, np.zeros((m, p)))
+    own = System(A + B @ F + gamma**2 * back @ Z @ C.T @ C, gamma**2 * back @ Z @ C.T, F, np.zeros((m, p)))
     eye = np.eye(p)  # w = (r, d): y = r - G (u + d); z = (u, y)
     four = System(
         A, np.hstack([np.zeros((n, p)), B, B]), np.vstack([np.zeros((m, n)), -C, -C]),
         np.block([[np.zeros((m, p + m)), np.eye(m)], [eye, np.zeros((p, 2 * m))], [eye, np.zeros((p, 2 * m))]]),
     )  # fmt: skip
-    law = System(own.A, -own.B, own.C, own.D) if _grows(four, own, p, m) else own
-    norm, w = _checked(four, law, p, m, gamma)
-    whole = control.ss(*law)
+    norm, w = _checked(four, own, p, m, gamma)
+    whole = control.ss(*own)
     whole = control.ss(system(before) * whole * system(after))
     made = System(*(np.array(M, dtype=float) for M in (whole.A, whole.B, whole.C, whole.D)))
     coupling = float(np.abs(np.linalg.eigvals(X @ Z)).max(initial=0.0)) / (gamma**2 - 1)
     return Synthesized(made, best, norm, w, coupling, max(x[1], z[1]))
-
-
-def _grows(P: System, K: System, p2: int, m2: int) -> bool:
-    return bool(np.linalg.eigvals(lower_loop(P, K, p2, m2).A).real.max() >= 0)

@@ -1,9 +1,9 @@
 """A law of a given structure whose goals hold, proven over the parameters: tune, prove, add what refutes it, repeat.
 
-    1. The law is searched for all models so far, at first those at nominal parameters.
-    2. The margin of the loop is proven, and the peaks of |S| over the box. Where a bound is above what is asked for, the witness
-       is a plant that refutes the law: it becomes a model, as far out as the margin asks.
-    3. This ends when the proofs hold what is asked for, or when they cannot, which the certificate says then.
+1. The law is searched for all models so far, at first those at nominal parameters.
+2. The margin of the loop is proven, and the peaks of |S| over the box. Where a bound is above what is asked for, the witness
+   is a plant that refutes the law: it becomes a model, as far out as the margin asks.
+3. This ends when the proofs hold what is asked for, or when they cannot, which the certificate says then.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from malta.proof.margin import Margin, Ranges
 from malta.structured.elements import CALLER, Structure, places_of, sample_law
 from malta.structured.goals import Goal
 from malta.structured.loops import ClosedLoop, Model
-from malta.structured.minimax import Effort, Look
+from malta.structured.minimax import Look
 from malta.structured.plants import Machine, Systems, Uncertain, Values, target_of
 from malta.structured.search import ROOM, Task, contradiction, random_starts, rate_of, search
 
@@ -79,7 +79,9 @@ class Tuned:
     def certificate(self) -> str:
         """What is proven and what is not, in one sentence each."""
         if self.margin is None:
-            return "Nothing is proven: the plant has no ranges of parameters; figures are those of its models."
+            return (
+                "Nothing is proven: the plant has no ranges of parameters; figures are those of its models."
+            )
         low = self.margin.lower
         found = [
             f"Proven: the loop is stable for all parameters within {low:.4g} times their ranges."
@@ -90,7 +92,9 @@ class Tuned:
             found.append(f"Asked for were {self.asked:g} times: the proof does not close.")
         for (goal, channel), gain in self.peaks.items():
             if gain.upper is None:
-                found.append(f"Not proven: {goal} of {channel} over the ranges ({gain.reason}); {gain.lower:.4g} is reached.")
+                found.append(
+                    f"Not proven: {goal} of {channel} over the ranges ({gain.reason}); {gain.lower:.4g} is reached."
+                )
             else:
                 found.append(f"Proven: |S| of {channel} is below {gain.upper:.4g} over the ranges ({goal}).")
         return "\n".join(found)
@@ -103,7 +107,9 @@ class Tuned:
         rows += [(name, f"{value:.4f} of its bound") for name, value in self.reached.items()]
         rows.append(("searched in", quantity(self.seconds, "s")))
         rows += [("certificate", line) for line in self.certificate.split("\n")]
-        return Description("Structured law: " + ("the proof closes" if self.closed else "not proven"), tuple(rows))
+        return Description(
+            "Structured law: " + ("the proof closes" if self.closed else "not proven"), tuple(rows)
+        )
 
 
 @on_one_thread
@@ -126,13 +132,13 @@ def tune(
     """Find the parameters of a law's elements that meet goals, and prove what they promise over ranges of parameters.
 
     plant : a control system, or several that one law shall hold; an uncertain system, from `malta.uncertain`; or a Plant
-    law : elements by the outputs whose errors they take, for the input of the same index; one element from all errors to all
-        inputs; or places (left, element, right), as for the coordinates of a centre of gravity
+    law : elements by the outputs whose errors they take, for the input of the same index; one element from all errors
+        to all inputs; or places (left, element, right), as for the coordinates of a centre of gravity
     goals : of malta.structured; hard ones hold, the largest soft one is made small
-    ranges : of parameters, as in `malta.robust_margin`: what is proven over, and where worst parameters are searched
+    ranges : of parameters, as in `malta.robust_margin`, over which stability is proven, and worst ones are searched
     margin : multiples of the ranges within which the loop is proven stable; None: 1
-    over_box : whether goals hold for every plant within the ranges that the proof finds, not at nominal parameters alone;
-        peaks of |S| are proven over them
+    over_box : whether goals hold for the worst plants within the ranges, not at nominal parameters alone; peaks of |S|
+        are proven over them
     sample_time : s, of the law, for an uncertain system that is continuous and for a machine
     delay, lag : of an uncertain system, as in malta.proof.Compensator
     places : of a machine: states at which goals hold; None: the middle and the ends of its travel
@@ -142,11 +148,11 @@ def tune(
 
     Returns a Tuned. Its `closed` and its `certificate` say whether the proofs hold what was asked for.
 
-    Raises InputError for elements that do not fit, for a structure that stabilizes no model; CheckError where no law was
-    found that meets all hard goals, with two that hold each other.
+    Raises InputError for elements that do not fit, and for a structure that was not found to stabilize the models;
+    CheckError where no law was found that meets all hard goals, with two that hold each other.
 
-    Source: Apkarian and Noll, Nonsmooth H-infinity synthesis, IEEE TAC 51 (2006), for the kind of the search; the proofs are
-    those of malta.proof.
+    Source: Apkarian and Noll, Nonsmooth H-infinity synthesis, IEEE TAC 51 (2006), for the kind of the search; the
+    proofs are those of malta.proof.
 
     >>> import malta
     >>> from malta import structured
@@ -163,8 +169,13 @@ def tune(
     structure = Structure(places_of(law, first.inputs, first.outputs))
     if isinstance(target, Systems):
         if ranges is not None:
-            raise InputError(CALLER, "ranges", "ranges", "none for systems of python-control: malta.uncertain has some")
-        look = _search(Task(structure, tuple(goals), tuple(models), rate_of(first)), random_starts(structure, starts, seed))
+            raise InputError(
+                CALLER, "ranges", "ranges", "none for systems of python-control: malta.uncertain has some"
+            )
+        look = _search(
+            Task(structure, tuple(goals), tuple(models), rate_of(first)),
+            random_starts(structure, starts, seed),
+        )
         proof, rounds = Proof(None, {}, closed=False), 1
     else:
         asked = _Asked(target, tuple(goals), ranges, 1.0 if margin is None else margin, over_box)

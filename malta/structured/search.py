@@ -53,7 +53,9 @@ class Task:
             found += by_x(self._stable(loop), slope, model.name, hard=True)
             for goal in self.goals if model.goals else ():
                 factor = 1 + ROOM if goal.hard else 1.0
-                figures = [f._replace(value=factor * f.value, slope=factor * f.slope) for f in goal.figures(loop)]
+                figures = [
+                    f._replace(value=factor * f.value, slope=factor * f.slope) for f in goal.figures(loop)
+                ]
                 found += by_x(figures, slope, model.name, hard=goal.hard)
         return Look(x, tuple(found)) if all(math.isfinite(f.value) for f in found) else None
 
@@ -82,10 +84,10 @@ def rate_of(model: Model) -> float:
     return 0.03 * float(np.exp(np.log(size).mean())) if len(size) else 1.0
 
 
-def search(task: Task, starts: Sequence[FloatArray], effort: Effort = Effort()) -> Look:  # noqa: B008: a frozen record
+def search(task: Task, starts: Sequence[FloatArray]) -> Look:
     """The best law of several starts.
 
-    Raises InputError for a structure that stabilizes no model at a start and beside it, with a pole that no law of it moves
+    Raises InputError for a structure that stabilizes the models from none of them, with a pole that no law of it moves
     where there is one.
     """
     bounds, best, slowest = task.structure.bounds, None, math.inf
@@ -99,10 +101,7 @@ def search(task: Task, starts: Sequence[FloatArray], effort: Effort = Effort()) 
         here = task.look(stable.x)
         if here is None:
             continue
-        if not wanted:  # hard goals alone are made as small as bounds ask for
-            found = minimize(task.look, here, bounds, Effort(effort.steps, 1e-12))
-        else:
-            found = minimize(task.look, here, bounds, effort)
+        found = minimize(task.look, here, bounds, Effort(enough=0.0 if wanted else 1e-12))
         if best is None or found.merit < best.merit:
             best = found
         if not wanted and best.hard <= 1:
@@ -143,10 +142,12 @@ def random_starts(structure: Structure, count: int, seed: int) -> list[FloatArra
 
 
 def contradiction(look: Look) -> tuple[str, str] | None:
-    """Two goals that hold each other: the largest hard figures with slopes of opposite directions; None: no bound is broken."""
+    """Two hard goals that hold each other, by the directions of their slopes; None where no bound is broken."""
     if look.hard <= 1:
         return None
-    active = sorted((f for f in look.figures if f.hard and f.value > look.hard * 0.98), key=lambda f: -f.value)
+    active = sorted(
+        (f for f in look.figures if f.hard and f.value > look.hard * 0.98), key=lambda f: -f.value
+    )
     first = active[0]
     against = min(active, key=lambda f: float(f.slope @ first.slope) / (np.linalg.norm(f.slope) or 1.0))
 
