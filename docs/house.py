@@ -31,7 +31,7 @@ ORDER = (
         "simulation",
         "firmware",
     ),
-    *("campaigns", "tuning", "identification", "report", "app", "machines", "cli"),
+    *("campaigns", "tuning", "structured", "identification", "report", "app", "machines", "cli"),
 )
 
 

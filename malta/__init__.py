@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta import report as report
     from malta import schemas as schemas
     from malta import simulation as simulation
+    from malta import structured as structured
     from malta import synthesis as synthesis
     from malta.app.server import app_widget as app_widget
     from malta.campaigns.run import campaign as campaign
@@ -84,7 +85,7 @@ _OLD = {
     "Margins": "malta.margins.LoopReport",
     "Robustness": "malta.margins.LoopReport",
 }
-_MODULES = (*_NOW_OF, "gains", "references", "report", "schemas")
+_MODULES = (*_NOW_OF, "gains", "references", "report", "schemas", "structured")
 
 __all__, _load, __dir__ = contents(__name__, __file__, _MODULES, _OLD)
 

@@ -29,6 +29,7 @@ LISTS = (
     "campaigns",
     "identification",
     "simulation",
+    "structured",
 )
 
 

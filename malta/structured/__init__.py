@@ -1,0 +1,39 @@
+"""Laws of a given structure, tuned on figures with exact derivatives and proven; H-infinity laws of full order.
+
+elements   what is tuned: gains, PIDs, leads, notches, transfer functions, state spaces, and where they stand
+goals      what is asked for: sensitivity, disks, gains, noise, tracking, poles
+tune       from a start to a proof: goals on models, worst parameters from proofs, until they close
+h_infinity from a generalized plant to the best law of its order, by two Riccati equations
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from malta.contents import contents
+
+if TYPE_CHECKING:
+    from malta.structured.elements import Element as Element
+    from malta.structured.elements import Place as Place
+    from malta.structured.elements import gain as gain
+    from malta.structured.elements import lead as lead
+    from malta.structured.elements import notch as notch
+    from malta.structured.elements import pid as pid
+    from malta.structured.elements import states as states
+    from malta.structured.elements import transfer as transfer
+    from malta.structured.goals import Goal as Goal
+    from malta.structured.goals import disk_margin as disk_margin
+    from malta.structured.goals import gain_limit as gain_limit
+    from malta.structured.goals import noise_limit as noise_limit
+    from malta.structured.goals import poles as poles
+    from malta.structured.goals import sensitivity as sensitivity
+    from malta.structured.goals import soft as soft
+    from malta.structured.goals import tracking as tracking
+    from malta.structured.riccati import Synthesized as Synthesized
+    from malta.structured.riccati import h_infinity as h_infinity
+    from malta.structured.riccati import mixed_sensitivity as mixed_sensitivity
+    from malta.structured.riccati import shape_loop as shape_loop
+    from malta.structured.rounds import Tuned as Tuned
+    from malta.structured.rounds import tune as tune
+
+__all__, __getattr__, __dir__ = contents(__name__, __file__)

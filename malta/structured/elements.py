@@ -1,0 +1,483 @@
+"""The tunable parts of a control law: named elements with parameters, and where they stand between errors and forces.
+
+    v = K(s) (p* - y),    K = sum of L_k E_k(s) R_k        E_k: an element; R_k: what of the errors it takes,
+                                                           L_k: the forces that it acts with
+
+A law of errors is sampled by Tustin's rule, as malta.synthesis.controller_of recommends: with
+z = (1 + s T/2) / (1 - s T/2) it has the same matrices in s as the continuous law.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+from scipy import linalg
+
+from malta.errors import InputError
+from malta.loops.linear_loops import System
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+CALLER = "structured"
+Matrices = tuple[Any, Any, Any, Any]  # A, B, C and D in CasADi
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number that is searched: value = start e^x where it keeps its sign, else start + scale x.
+
+    name : within its element
+    start : its first value
+    scale : of x where the number may change its sign; 0: it keeps its sign
+    low, high : bounds of the value
+    """
+
+    name: str
+    start: float
+    scale: float = 0.0
+    low: float = -math.inf
+    high: float = math.inf
+
+    def value(self, x: Any) -> Any:
+        """The value at x, of numbers or CasADi symbols."""
+        return self.start + self.scale * x if self.scale else self.start * ca.exp(x)
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The bounds of x."""
+        ends: list[float | None] = []
+        for end in (self.low, self.high):
+            if self.scale:
+                ends.append((end - self.start) / self.scale)
+            else:
+                share = end / self.start
+                ends.append(math.log(share) if share > 0 and math.isfinite(share) else None)
+        low, high = ends if self.scale or self.start > 0 else ends[::-1]
+        return (-math.inf if low is None else low), (math.inf if high is None else high)
+
+
+@dataclass(frozen=True, eq=False)
+class Element:
+    """A tunable part of a law. `a * b` is one behind the other, b first.
+
+    name : of the element; parameters are called "name.parameter"
+    parameters : what is searched, with the values at which a search starts
+    matrices : CasADi values of the parameters, in their order -> A, B, C and D
+
+    >>> from malta.structured import lead, pid
+    >>> law = pid("axial", Kp=2e3, Ki=1e4, Kd=5.0, filter=1e-4) * lead("roll_off", zero=5e3, pole=2e4)
+    >>> law.order, [name for name, _ in law.values.items()][:2]
+    (3, ['axial.Kp', 'axial.Ki'])
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    matrices: Callable[[Sequence[Any]], Matrices] = field(repr=False)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The parameters by name: "element.parameter"."""
+        return {p.name if "." in p.name else f"{self.name}.{p.name}": p.start for p in self.parameters}
+
+    @cached_property
+    def system(self) -> System:
+        """The element with its present values."""
+        made = self.matrices([ca.DM(p.start) for p in self.parameters])
+        return System(*(np.atleast_2d(np.array(ca.DM(M), dtype=float)) for M in made))
+
+    @property
+    def order(self) -> int:
+        """The number of states."""
+        return len(self.system.A)
+
+    def at(self, values: Mapping[str, float]) -> Element:
+        """The same element with other values: by their names, as in `values`."""
+        names = list(self.values)
+        own = (
+            replace(p, start=float(values.get(n, p.start)))
+            for n, p in zip(names, self.parameters, strict=True)
+        )
+        return replace(self, parameters=tuple(own))
+
+    def __mul__(self, other: Element) -> Element:
+        """This element behind another."""
+        k = len(self.parameters)
+
+        def matrices(values: Sequence[Any]) -> Matrices:
+            A1, B1, C1, D1 = other.matrices(values[k:])
+            A2, B2, C2, D2 = self.matrices(values[:k])
+            A = ca.blockcat([[A2, B2 @ C1], [ca.DM(A1.shape[0], A2.shape[0]), A1]])
+            return A, ca.vertcat(B2 @ D1, B1), ca.horzcat(C2, D2 @ C1), D2 @ D1
+
+        named = [
+            replace(p, name=name)
+            for e in (self, other)
+            for p, name in zip(e.parameters, e.values, strict=True)
+        ]
+        names = [p.name for p in named]
+        twice = next((n for n in names if names.count(n) > 1), None)
+        if twice is not None:
+            raise InputError(CALLER, twice, "one parameter twice", "elements of different names in a series")
+        return Element(f"{self.name} {other.name}", tuple(named), matrices)
+
+
+def _positive(
+    element: str, bounds: Mapping[str, tuple[float, float]] | None, **starts: float
+) -> list[Parameter]:
+    """Parameters that keep their sign. Raises InputError for zeros, and for bounds of others."""
+    given = dict(bounds or {})
+    found = []
+    for name, start in starts.items():
+        low, high = given.pop(name, (-math.inf, math.inf))
+        if not (math.isfinite(start) and start != 0):
+            raise InputError(CALLER, f"{element}.{name}", f"{start}", "a first value that is not 0")
+        if not low <= start <= high:
+            raise InputError(CALLER, f"{element}.{name}", f"{start}", f"a first value within {low} .. {high}")
+        found.append(Parameter(name, float(start), 0.0, low, high))
+    if given:
+        raise InputError(CALLER, f"{element}.bounds", " ".join(given), "some of " + " ".join(starts))
+    return found
+
+
+Bounds = Mapping[str, tuple[float, float]]
+
+
+def gain(name: str, value: float, *, bounds: Bounds | None = None) -> Element:
+    """A gain, which keeps its sign.
+
+    name : of the element
+    value : at which a search starts
+    bounds : (low, high) of "value"
+
+    Raises InputError for a gain of 0.
+
+    >>> gain("stiffness", 2e3).order
+    0
+    """
+    none = ca.DM(0, 0), ca.DM(0, 1), ca.DM(1, 0)
+    return Element(name, tuple(_positive(name, bounds, value=value)), lambda v: (*none, v[0]))
+
+
+def pid(
+    name: str,
+    Kp: float,
+    Ki: float = 0.0,
+    Kd: float = 0.0,
+    filter: float = 0.0,
+    *,
+    bounds: Bounds | None = None,
+) -> Element:
+    """Kp + Ki / s + Kd s / (1 + filter s); without the terms that are 0.
+
+    name : of the element
+    Kp, Ki, Kd : force per error, its integral, its rate
+    filter : s, of the rate
+    bounds : (low, high) of some of them
+
+    Raises InputError for a Kd without a filter: no sampled law differentiates at once.
+
+    >>> pid("axial", Kp=2e3, Ki=1e4, Kd=5.0, filter=1e-4).order
+    2
+    """
+    if Kd and not filter > 0:
+        raise InputError(
+            CALLER, f"{name}.filter", f"{filter} s", "a time above 0 s: no sampled law has a plain rate"
+        )
+    terms = {"Kp": Kp} | ({"Ki": Ki} if Ki else {}) | ({"Kd": Kd, "filter": filter} if Kd else {})
+
+    def matrices(v: Sequence[Any]) -> Matrices:
+        term = dict(zip(terms, v, strict=True))
+        A, B, C, D = [], [], [], term["Kp"]
+        if Ki:
+            A, B, C = [0], [1], [term["Ki"]]
+        if Kd:
+            rate = 1 / term["filter"]
+            A, B, C, D = [*A, -rate], [*B, rate], [*C, -term["Kd"] * rate], D + term["Kd"] * rate
+        n = len(A)
+        return (
+            ca.diag(ca.vertcat(*A)) if n else ca.DM(0, 0),
+            ca.vertcat(*B) if n else ca.DM(0, 1),
+            ca.horzcat(*C) if n else ca.DM(1, 0),
+            D,
+        )
+
+    return Element(name, tuple(_positive(name, bounds, **terms)), matrices)
+
+
+def lead(name: str, zero: float, pole: float, *, bounds: Bounds | None = None) -> Element:
+    """(1 + s / zero) / (1 + s / pole), a lag where the pole is the slower one.
+
+    name : of the element
+    zero, pole : rad/s
+    bounds : (low, high) of some of them
+
+    Raises InputError for frequencies that are not above 0.
+
+    >>> lead("phase", 100.0, 1000.0).system.D.item()
+    10.0
+    """
+    _require_above_zero(name, zero=zero, pole=pole)
+
+    def matrices(v: Sequence[Any]) -> Matrices:
+        share = v[1] / v[0]
+        return -v[1], v[1], 1 - share, share
+
+    return Element(name, tuple(_positive(name, bounds, zero=zero, pole=pole)), matrices)
+
+
+def notch(
+    name: str, frequency: float, depth: float, damping: float, *, bounds: Bounds | None = None
+) -> Element:
+    """(s^2 + 2 depth w s + w^2) / (s^2 + 2 damping w s + w^2).
+
+    name : of the element
+    frequency : w, rad/s
+    depth, damping : of its zeros and of its poles
+    bounds : (low, high) of some of them
+
+    Raises InputError for numbers that are not above 0.
+
+    >>> notch("bending", 300.0, 0.1, 1.0).order
+    2
+    """
+    _require_above_zero(name, frequency=frequency, depth=depth, damping=damping)
+
+    def matrices(v: Sequence[Any]) -> Matrices:
+        w, zeta, damped = v
+        A = ca.blockcat([[0, w], [-w, -2 * damped * w]])
+        return A, ca.vertcat(0, 1), ca.horzcat(0, 2 * (zeta - damped) * w), ca.DM(1)
+
+    terms = {"frequency": frequency, "depth": depth, "damping": damping}
+    return Element(name, tuple(_positive(name, bounds, **terms)), matrices)
+
+
+def _require_above_zero(element: str, **values: float) -> None:
+    for name, value in values.items():
+        if not (math.isfinite(value) and value > 0):
+            raise InputError(CALLER, f"{element}.{name}", f"{value}", "a number above 0")
+
+
+def transfer(name: str, numerator: Sequence[float], denominator: Sequence[float]) -> Element:
+    """A proper transfer function of order n with free coefficients, the highest power first.
+
+    name : of the element
+    numerator, denominator : at which a search starts, with as many coefficients; each may change its sign
+
+    Raises InputError for an improper one.
+
+    >>> transfer("shape", [2.0, 100.0], [1.0, 50.0]).values
+    {'shape.b1': 2.0, 'shape.b0': 100.0, 'shape.a0': 50.0}
+    """
+    a, b = np.asarray(denominator, dtype=float), np.asarray(numerator, dtype=float)
+    n = len(a) - 1
+    if n < 0 or not a[0] or len(b) > n + 1:
+        found = f"{len(b)} over {len(a)} coefficients"
+        raise InputError(CALLER, name, found, "a numerator of at most the denominator's order")
+    b, a = np.append(np.zeros(n + 1 - len(b)), b) / a[0], a[1:] / a[0]
+    k = np.arange(1, n + 1)
+    rate = float((np.abs(a) ** (1 / k)).max(initial=0.0)) or 1.0
+    size = float((np.abs(b) / rate ** np.arange(n + 1.0)).max()) or 1.0
+    parameters = [Parameter(f"b{n - i}", float(b[i]), size * rate**i) for i in range(n + 1)]
+    parameters += [Parameter(f"a{n - 1 - i}", float(a[i]), rate ** (i + 1.0)) for i in range(n)]
+
+    def matrices(v: Sequence[Any]) -> Matrices:
+        if not n:
+            return ca.DM(0, 0), ca.DM(0, 1), ca.DM(1, 0), v[0]
+        own = ca.horzcat(*(v[n + 1 + i] / rate ** (i + 0.0) for i in range(n)))
+        A = ca.vertcat(-own, rate * ca.DM(np.eye(n - 1, n))) if n > 1 else -own
+        out = [(v[1 + i] - v[0] * v[n + 1 + i]) / rate ** (i + 0.0) for i in range(n)]
+        return A, ca.DM(np.eye(n, 1)), ca.horzcat(*out), v[0]
+
+    return Element(name, tuple(parameters), matrices)
+
+
+def states(name: str, start: Any, pattern: Any = None) -> Element:
+    """A state-space system of the order of its start, from several errors to several forces.
+
+    name : of the element
+    start : continuous control.StateSpace, or A, B, C and D, at which a search starts
+    pattern : four arrays of truth values, of entries of A, B, C and D that are searched; None: all
+
+    Raises InputError for matrices that do not fit.
+
+    >>> import numpy as np
+    >>> element = states("law", ([[-10.0]], [[1.0]], [[5.0]], [[2.0]]))
+    >>> element.order, len(element.parameters)
+    (1, 4)
+    """
+    given = (start.A, start.B, start.C, start.D) if hasattr(start, "A") else start
+    parts = [np.atleast_2d(np.asarray(M, dtype=float)) for M in given]
+    shapes = [M.shape for M in parts]
+    (n, _), (m, r) = shapes[0], shapes[3]
+    if shapes != [(n, n), (n, r), (m, n), (m, r)] or not all(np.isfinite(M).all() for M in parts):
+        raise InputError(CALLER, name, f"matrices of shapes {shapes}", "A, B, C and D that fit, of numbers")
+    masks = (
+        [np.ones(s, dtype=bool) for s in shapes]
+        if pattern is None
+        else [np.asarray(M, dtype=bool) for M in pattern]
+    )
+    if [M.shape for M in masks] != shapes:
+        raise InputError(CALLER, f"{name}.pattern", "other shapes", f"those of A, B, C and D: {shapes}")
+    parameters, places = [], []
+    for letter, M, mask in zip("ABCD", parts, masks, strict=True):
+        scale = float(np.abs(M).max(initial=0.0)) or 1.0
+        for i, j in np.argwhere(mask).tolist():
+            parameters.append(Parameter(f"{letter}{i}{j}", float(M[i, j]), scale))
+            places.append(("ABCD".index(letter), i, j))
+    if not parameters:
+        raise InputError(CALLER, f"{name}.pattern", "nothing to search", "an entry at least")
+
+    def matrices(v: Sequence[Any]) -> Matrices:
+        made = [ca.SX(ca.DM(M)) for M in parts]
+        for value, (which, i, j) in zip(v, places, strict=True):
+            made[which][i, j] = value
+        A, B, C, D = made
+        return A, B, C, D
+
+    return Element(name, tuple(parameters), matrices)
+
+
+class Place(NamedTuple):
+    """Where an element stands: forces = left E (right errors)."""
+
+    left: FloatArray  # m x outputs of the element
+    element: Element
+    right: FloatArray  # inputs of the element x p
+
+
+Layout = Mapping[str, Element] | Element | Sequence[Place]
+
+
+def places_of(layout: Any, inputs: Sequence[str], outputs: Sequence[str]) -> tuple[Place, ...]:
+    """The places of a layout.
+
+    layout : elements by the outputs whose errors they take, for the input of the same index; one element from all
+        errors to all forces; or places, as of the coordinates of the centre of gravity
+
+    Raises InputError for outputs that the machine does not have, for other shapes, and for two elements of one name.
+    """
+    m, p = len(inputs), len(outputs)
+    if isinstance(layout, Element):
+        found: tuple[Place, ...] = (Place(np.eye(m), layout, np.eye(p)),)
+    elif isinstance(layout, Mapping):
+        unknown = next((name for name in layout if name not in outputs), None)
+        if unknown is not None or m != p:
+            expected = (
+                "one of " + " ".join(outputs)
+                if m == p
+                else "an element or places, where inputs are no outputs"
+            )
+            raise InputError(
+                CALLER, "law", f"an element of {unknown}" if unknown else "elements by output", expected
+            )
+        one = np.eye(p)
+        found = tuple(
+            Place(one[:, [k]], layout[name], one[[k]]) for k, name in enumerate(outputs) if name in layout
+        )
+    else:
+        found = tuple(Place(np.asarray(a, dtype=float), e, np.asarray(b, dtype=float)) for a, e, b in layout)
+    known: dict[str, Element] = {}
+    for left, element, right in found:
+        if known.setdefault(element.name, element) is not element:
+            raise InputError(CALLER, element.name, "two elements of one name", "names that tell them apart")
+        rows, columns = element.system.D.shape
+        if left.shape != (m, rows) or right.shape != (columns, p):
+            shape = f"{left.shape}, {rows} x {columns}, {right.shape}"
+            raise InputError(CALLER, element.name, shape, f"a product of {m} forces x {p} errors")
+    if not found:
+        raise InputError(CALLER, "law", "no element", "one at least")
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """A law of elements in their places, as a function of the numbers x of its parameters.
+
+    x : parameters of all elements, an element in several places once; 0 is where the search starts
+    """
+
+    places: tuple[Place, ...]
+
+    @cached_property
+    def elements(self) -> tuple[Element, ...]:
+        """Each element once, in the order of its first place."""
+        return tuple({place.element.name: place.element for place in self.places}.values())
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameters of all elements."""
+        return tuple(p for e in self.elements for p in e.parameters)
+
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """The bounds of x, parameters x 2."""
+        return np.array([p.bounds for p in self.parameters]).reshape(-1, 2)
+
+    @cached_property
+    def order(self) -> int:
+        """The number of states of the whole law."""
+        return sum(place.element.order for place in self.places)
+
+    @cached_property
+    def _theta(self) -> ca.Function:
+        """x -> [D C; B A], and its derivative by x."""
+        x = ca.SX.sym("x", len(self.parameters))
+        first, made = 0, {}
+        for e in self.elements:
+            values = [p.value(x[first + k]) for k, p in enumerate(e.parameters)]
+            made[e.name] = [ca.SX(M) for M in e.matrices(values)]
+            first += len(values)
+        (m, _), (_, p) = self.places[0].left.shape, self.places[0].right.shape
+        D, A, B, C = ca.SX(m, p), list[Any](), list[Any](), list[Any]()
+        for left, element, right in self.places:
+            a, b, c, d = made[element.name]
+            D = D + left @ d @ right
+            A, B, C = [*A, a], [*B, b @ right], [*C, left @ c]
+        theta = ca.densify(ca.blockcat([[D, ca.horzcat(*C)], [ca.vertcat(*B), ca.diagcat(*A)]]))
+        return ca.Function("theta", [x], [theta, ca.jacobian(theta, x)])
+
+    def theta(self, x: FloatArray) -> tuple[FloatArray, Any]:
+        """[D C; B A] of the continuous law at x, and its derivative by x: entries, column by column, x parameters."""
+        theta, slope = self._theta(x)
+        return np.array(theta), slope.sparse() if hasattr(slope, "sparse") else np.array(slope)
+
+    def system(self, x: FloatArray) -> System:
+        """The continuous law at x."""
+        theta, _ = self.theta(x)
+        (m, _), (_, p) = self.places[0].left.shape, self.places[0].right.shape
+        return System(theta[m:, p:], theta[m:, :p], theta[:m, p:], theta[:m, :p])
+
+    def at(self, x: FloatArray) -> Structure:
+        """The same structure with the values at x as its present ones."""
+        values: dict[str, float] = {}
+        first = 0
+        for e in self.elements:
+            k = len(e.parameters)
+            numbers = (
+                float(ca.DM(p.value(v))) for p, v in zip(e.parameters, x[first : first + k], strict=True)
+            )
+            values |= dict(zip(e.values, numbers, strict=True))
+            first += k
+        new = {e.name: e.at(values) for e in self.elements}
+        return Structure(tuple(Place(p.left, new[p.element.name], p.right) for p in self.places))
+
+
+def sample_law(law: System, Ts: float) -> System:
+    """Sample a continuous law by Tustin's rule: s+ = A s + B e, v = C s + D e.
+
+    Raises InputError for a law with a pole at 2 / Ts.
+    """
+    one, half = np.eye(len(law.A)), law.A * Ts / 2
+    if not len(one):
+        return law
+    if np.abs(np.linalg.eigvals(one - half)).min() < 1e-12:
+        raise InputError(CALLER, "law", "a pole at 2 / Ts", "poles that a sampled law can have")
+    back = linalg.inv(one - half)
+    return System(back @ (one + half), back @ law.B * Ts, law.C @ back, law.D + law.C @ back @ law.B * Ts / 2)

@@ -1,0 +1,248 @@
+"""The loops that a law is tuned on: a plant, continuous or sampled, closed by a structure, between named signals.
+
+    x' = A x + B u + B_w w,  y = C x + D u + D_w w,  u = K (p* - y) + d
+
+Of a sampled plant s is that of z = (1 + s T/2) / (1 - s T/2). In it a law sampled by Tustin's rule is the continuous
+law, and peaks and stability are those of the sampled loop, exactly; the frequency w stands for tan(w T/2) / (T/2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import sparse
+
+from malta.errors import CheckError, InputError
+from malta.loops.linear_loops import System
+from malta.structured.elements import CALLER, Structure
+from malta.structured.norms import Channels, Pole, poles_of
+from malta.synthesis.state_space import balanced_units
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from malta.model.plant import FloatArray
+
+JOINS = 1e-12  # of the largest entries of its row and column: smaller ones are rounding
+OF_INPUTS = ("reference", "load", "disturbance")
+OF_OUTPUTS = ("error", "output", "force", "acting")
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A linear plant that a law is tuned on.
+
+    name : of the model, as "nominal" or its parameters in words
+    plane : inputs u, then disturbances w; outputs y; of a sampled plant in the s of Tustin's rule
+    inputs, outputs, disturbances : names
+    sample_time : s; None: continuous
+    goals : whether all goals hold here; else stability alone
+    """
+
+    name: str
+    plane: System
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    disturbances: tuple[str, ...] = ()
+    sample_time: float | None = None
+    goals: bool = True
+
+
+def model_of(
+    name: str,
+    system: System,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    *,
+    disturbances: Sequence[str] = (),
+    sample_time: float | None = None,
+    goals: bool = True,
+) -> Model:
+    """Make a model of matrices, of x+ where there is a sample time. Raises InputError for an eigenvalue -1 of those."""
+    plane = system if sample_time is None else to_plane(system, sample_time)
+    t = balanced_units(plane.A, plane.B, plane.C) if len(plane.A) else np.ones(0)
+    plane = System(plane.A * t / t[:, None], plane.B / t[:, None], plane.C * t, plane.D)
+    return Model(name, plane, tuple(inputs), tuple(outputs), tuple(disturbances), sample_time, goals)
+
+
+def to_plane(system: System, Ts: float) -> System:
+    """x+ = A x + B u in the s of z = (1 + s Ts/2) / (1 - s Ts/2). Raises InputError for an eigenvalue -1."""
+    A, B, C, D = system
+    one = np.eye(len(A))
+    try:
+        back = np.linalg.inv(one + A)
+    except np.linalg.LinAlgError as error:
+        raise InputError(CALLER, "plant", "a pole z = -1", "a sampled plant without one") from error
+    return System(2 / Ts * back @ (A - one), 4 / Ts * back @ back @ B, C, D - C @ back @ B)
+
+
+def models_of_systems(plants: Any) -> list[Model]:
+    """The models of one control system or of several with the same signals. Raises InputError for others."""
+    import control  # imports matplotlib and takes a second: only where it is used
+
+    given = list(plants) if isinstance(plants, list | tuple) else [plants]
+    found: list[Model] = []
+    for k, plant in enumerate(given):
+        try:
+            ss = control.ss(plant)
+        except Exception as error:  # many kinds: an improper function, a frequency response without states
+            wanted = "a system of python-control with states, or several"
+            raise InputError(CALLER, "plant", f"a {type(plant).__name__}", wanted) from error
+        if ss.dt is True:
+            raise InputError(CALLER, "plant.dt", "True", "a sample time in s, or 0")
+        matrices = System(*(np.array(M, dtype=float) for M in (ss.A, ss.B, ss.C, ss.D)))
+        name = f"{ss.name}" if len(given) == 1 else f"model {k + 1}"
+        found.append(
+            model_of(
+                name, matrices, ss.input_labels, ss.output_labels, sample_time=float(ss.dt or 0.0) or None
+            )
+        )
+    first = found[0]
+    for other in found[1:]:
+        if (other.inputs, other.outputs, other.sample_time) != (
+            first.inputs,
+            first.outputs,
+            first.sample_time,
+        ):
+            expected = "the same signals and sample time in all of them"
+            raise InputError(CALLER, "plant", f"{other.name} beside {first.name}", expected)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """A model closed by a law: everything between all signals, and how the law's matrices act on it.
+
+    Inputs: references, loads on the forces, disturbances. Outputs: errors, outputs, the law's forces, acting forces.
+    """
+
+    model: Model
+    theta: FloatArray  # [D C; B A] of the law
+
+    @cached_property
+    def _open(self) -> tuple[System, Channels, FloatArray]:
+        A, B_all, C, D_all = self.model.plane
+        p, m = len(self.model.outputs), len(self.model.inputs)
+        n, k = len(A), len(self.theta) - m
+        B, D, w = B_all[:, :m], D_all[:, :m], B_all.shape[1] - m
+        B1 = np.hstack([np.zeros((n, p)), B_all])
+        y = np.hstack([np.zeros((p, p)), D_all])
+        e = np.hstack([np.eye(p), -D_all])
+        load = np.hstack([np.zeros((m, p)), np.eye(m), np.zeros((m, w))])
+        direct = np.vstack([e, y, np.zeros_like(load), load])
+        out = np.vstack([-C, C, np.zeros((2 * m, n))])
+        through = np.vstack([-D, D, np.eye(m), np.eye(m)])
+
+        def wide(M: FloatArray, rows: int, columns: int) -> FloatArray:
+            whole = np.zeros((M.shape[0] + rows, M.shape[1] + columns))
+            whole[: M.shape[0], : M.shape[1]] = M
+            return whole
+
+        B2, C2 = wide(B, k, k), wide(-C, k, k)
+        B2[n:, m:], C2[p:, n:] = np.eye(k), np.eye(k)
+        by = Channels(B2, C2, wide(through, 0, k), wide(e, k, 0))
+        return System(wide(A, k, k), wide(B1, k, 0), wide(out, 0, k), direct), by, wide(-D, k, k)
+
+    @cached_property
+    def _acting(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """M = (1 - theta D22)^-1 theta and the factors of dM = left dtheta right. Raises CheckError without one."""
+        _, _, D22 = self._open
+        try:
+            left = np.linalg.inv(np.eye(len(self.theta)) - self.theta @ D22)
+        except np.linalg.LinAlgError as error:
+            raise CheckError(f"{self.model.name}: 1 + L is singular at infinite frequency") from error
+        right = np.eye(self.theta.shape[1]) + D22 @ left @ self.theta
+        return left @ self.theta, left, right
+
+    @cached_property
+    def whole(self) -> tuple[System, Channels]:
+        """The closed loop between all signals, and its channels for derivatives."""
+        (A, B1, C1, D11), by, _ = self._open
+        M, _, _ = self._acting
+        closed = System(
+            A + by.B2 @ M @ by.C2, B1 + by.B2 @ M @ by.D21, C1 + by.D12 @ M @ by.C2, D11 + by.D12 @ M @ by.D21
+        )
+        return closed, Channels(by.B2, by.C2, by.D12, by.D21)
+
+    def slope(self, by_M: FloatArray) -> FloatArray:
+        """The derivative by theta, from that by M."""
+        _, left, right = self._acting
+        return np.asarray(left.T @ by_M @ right.T)
+
+    def part(self, rows: Sequence[int], columns: Sequence[int]) -> tuple[System, Channels]:
+        """The loop between some signals: only states that the inputs reach and that the outputs see."""
+        (A, B, C, D), by = self.whole
+        B, C, D = B[:, list(columns)], C[list(rows)], D[np.ix_(rows, columns)]
+        joined = self._joined
+        x = np.flatnonzero(_reach(joined, B.any(axis=1)) & _reach(joined.T, C.any(axis=0)))
+        channels = Channels(by.B2[x], by.C2[:, x], by.D12[list(rows)], by.D21[:, list(columns)])
+        return System(A[np.ix_(x, x)], B[x], C[:, x], D), channels
+
+    @cached_property
+    def _joined(self) -> NDArray[np.bool_]:
+        size = np.abs(self.whole[0].A)
+        least = JOINS * np.sqrt(np.outer(size.max(axis=1, initial=0.0), size.max(axis=0, initial=0.0)))
+        return size > least
+
+    @cached_property
+    def groups(self) -> list[NDArray[np.int_]]:
+        """States that nothing joins to each other."""
+        count, label = sparse.csgraph.connected_components(self._joined, directed=False)
+        return [np.flatnonzero(label == k) for k in range(count)]
+
+    @cached_property
+    def growth(self) -> float:
+        """The largest Re of a pole; below 0 where the loop is stable."""
+        A = self.whole[0].A
+        return max(
+            (float(np.linalg.eigvals(A[np.ix_(x, x)]).real.max()) for x in self.groups), default=-math.inf
+        )
+
+    def poles(self, count: int = 0) -> list[Pole]:
+        """The poles with their derivatives by M, each group by itself; count of each, the slowest first, 0: all."""
+        (A, _, _, _), by = self.whole
+        return [pole for x in self.groups for pole in poles_of(A[np.ix_(x, x)], by.B2[x], by.C2[:, x], count)]
+
+    def rows(self, signals: Any) -> list[int]:
+        """The outputs of these names. Raises InputError for unknown ones."""
+        m = self.model
+        return _picked(
+            signals, dict(zip(OF_OUTPUTS, (m.outputs, m.outputs, m.inputs, m.inputs), strict=True))
+        )
+
+    def columns(self, signals: Any) -> list[int]:
+        """The inputs of these names. Raises InputError for unknown ones."""
+        m = self.model
+        return _picked(signals, dict(zip(OF_INPUTS, (m.outputs, m.inputs, m.disturbances), strict=True)))
+
+
+def _reach(joined: Any, start: Any) -> Any:
+    """The states that others drive, from some: joined[i, j] where state j drives state i."""
+    found = start.copy()
+    while True:
+        more = found | joined[:, found].any(axis=1)
+        if (more == found).all():
+            return found
+        found = more
+
+
+def _picked(signals: Any, known: dict[str, tuple[str, ...]]) -> list[int]:
+    """Numbers of the signals "kind" or "kind name"."""
+    every = [f"{kind} {name}" for kind, names in known.items() for name in names]
+    found = []
+    for signal in [signals] if isinstance(signals, str) else list(signals):
+        own = [k for k, name in enumerate(every) if name == signal or name.partition(" ")[0] == signal]
+        if not own:
+            raise InputError(CALLER, "signal", repr(signal), "one of " + ", ".join([*known, *every]))
+        found += own
+    return found
+
+
+def close(model: Model, structure: Structure, x: FloatArray) -> ClosedLoop:
+    """Close a model by a structure at x."""
+    return ClosedLoop(model, structure.theta(x)[0])

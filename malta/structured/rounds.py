@@ -1,0 +1,289 @@
+"""A law of a given structure whose goals hold, proven over the parameters: tune, prove, add what refutes it, repeat.
+
+1. The law is searched for all models so far, at first those at nominal parameters.
+2. The margin of the loop is proven, and the peaks of |S| over the box. Where a bound is above what is asked for, the witness
+   is a plant that refutes the law: it becomes a model, as far out as the margin asks.
+3. This ends when the proofs hold what is asked for, or when they cannot, which the certificate says then.
+"""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.display import Description, display, quantity
+from malta.errors import CheckError, InputError
+from malta.loops.linear_loops import System
+from malta.processes import on_one_thread
+from malta.proof.margin import Margin, Ranges
+from malta.structured.elements import CALLER, Structure, places_of, sample_law
+from malta.structured.goals import Goal
+from malta.structured.loops import ClosedLoop, Model
+from malta.structured.minimax import Look
+from malta.structured.plants import Machine, Systems, Uncertain, Values, target_of
+from malta.structured.search import ROOM, Task, contradiction, random_starts, rate_of, search
+
+if TYPE_CHECKING:
+    from malta.proof.blocks.gain import Gain
+    from malta.synthesis.controller import Controller
+
+ROUNDS = 12
+PROOF_TIME = 60.0  # s, of each proof
+
+
+@display
+@dataclass(frozen=True, eq=False)
+class Tuned:
+    """A law of a given structure, with what it reaches and what is proven of it.
+
+    values : of its parameters, by "element.parameter"
+    order : states of the whole law
+    law : the continuous law of the errors p* - y: A, B, C and D
+    sample_time : s, at which it is sampled by Tustin's rule; None: continuous
+    reached : by goal the largest figure of all models; at most 1 where the goal holds
+    models : that it was tuned on, in words
+    margin : proven over the ranges; None without ranges
+    peaks : proven peaks of |S| by goal and channel
+    asked : what was asked of the margin, in multiples of the ranges
+    closed : whether the proofs hold all that was asked to be proven
+    rounds : of tuning and proving
+    seconds : s
+    controller : of a machine, for gain files, verification, simulation and export
+    """
+
+    values: Mapping[str, float]
+    order: int
+    law: System
+    sample_time: float | None
+    reached: Mapping[str, float]
+    models: tuple[str, ...]
+    margin: Margin | None
+    peaks: Mapping[tuple[str, str], Gain]
+    asked: float | None
+    closed: bool
+    rounds: int
+    seconds: float
+    controller: Controller | None
+
+    @property
+    def sampled(self) -> System:
+        """The law as it runs: s+ = A s + B e, v = C s + D e; of a continuous loop `law`."""
+        return self.law if self.sample_time is None else sample_law(self.law, self.sample_time)
+
+    @property
+    def certificate(self) -> str:
+        """What is proven and what is not, in one sentence each."""
+        if self.margin is None:
+            return (
+                "Nothing is proven: the plant has no ranges of parameters; figures are those of its models."
+            )
+        low = self.margin.lower
+        found = [
+            f"Proven: the loop is stable for all parameters within {low:.4g} times their ranges."
+            if low
+            else f"Not proven: stability over the ranges ({self.margin.reason or 'the nominal loop is lost'})."
+        ]
+        if self.asked is not None and (low or 0.0) < self.asked:
+            found.append(f"Asked for were {self.asked:g} times: the proof does not close.")
+        for (goal, channel), gain in self.peaks.items():
+            if gain.upper is None:
+                found.append(
+                    f"Not proven: {goal} of {channel} over the ranges ({gain.reason}); {gain.lower:.4g} is reached."
+                )
+            else:
+                found.append(f"Proven: |S| of {channel} is below {gain.upper:.4g} over the ranges ({goal}).")
+        return "\n".join(found)
+
+    @property
+    def description(self) -> Description:
+        """Its parameters, goals and proofs."""
+        rows = [("order", f"{self.order} states"), ("models", f"{len(self.models)}, in {self.rounds} rounds")]
+        rows += [(name, f"{value:.5g}") for name, value in self.values.items()]
+        rows += [(name, f"{value:.4f} of its bound") for name, value in self.reached.items()]
+        rows.append(("searched in", quantity(self.seconds, "s")))
+        rows += [("certificate", line) for line in self.certificate.split("\n")]
+        return Description(
+            "Structured law: " + ("the proof closes" if self.closed else "not proven"), tuple(rows)
+        )
+
+
+@on_one_thread
+def tune(
+    plant: Any,
+    law: Any,
+    goals: Sequence[Goal],
+    *,
+    ranges: Ranges | None = None,
+    margin: float | None = None,
+    over_box: bool = False,
+    sample_time: float | None = None,
+    delay: int = 0,
+    lag: float | None = None,
+    places: Sequence[Values] | None = None,
+    starts: int = 3,
+    seed: int = 0,
+    name: str = "structured",
+) -> Tuned:
+    """Find the parameters of a law's elements that meet goals, and prove what they promise over ranges of parameters.
+
+    plant : a control system, or several that one law shall hold; an uncertain system, from `malta.uncertain`; or a Plant
+    law : elements by the outputs whose errors they take, for the input of the same index; one element from all errors
+        to all inputs; or places (left, element, right), as for the coordinates of a centre of gravity
+    goals : of malta.structured; hard ones hold, the largest soft one is made small
+    ranges : of parameters, as in `malta.robust_margin`, over which stability is proven, and worst ones are searched
+    margin : multiples of the ranges within which the loop is proven stable; None: 1
+    over_box : whether goals hold for the worst plants within the ranges, not at nominal parameters alone; peaks of |S|
+        are proven over them
+    sample_time : s, of the law, for an uncertain system that is continuous and for a machine
+    delay, lag : of an uncertain system, as in malta.proof.Compensator
+    places : of a machine: states at which goals hold; None: the middle and the ends of its travel
+    starts : of the search, the first from the elements' own values
+    seed : of the further ones
+    name : of the controller
+
+    Returns a Tuned. Its `closed` and its `certificate` say whether the proofs hold what was asked for.
+
+    Raises InputError for elements that do not fit, and for a structure that was not found to stabilize the models;
+    CheckError where no law was found that meets all hard goals, with two that hold each other.
+
+    Source: Apkarian and Noll, Nonsmooth H-infinity synthesis, IEEE TAC 51 (2006), for the kind of the search; the
+    proofs are those of malta.proof.
+
+    >>> import malta
+    >>> from malta import structured
+    >>> mass = malta.uncertain(lambda m: ([[0, 1], [0, 0]], [[0], [1 / m]], [[1, 0]]), {"m": 1.0})
+    >>> law = structured.pid("axis", Kp=50.0, Kd=10.0, filter=0.01)
+    >>> found = structured.tune(mass, law, [structured.sensitivity(1.5)], ranges={"m": 0.2}, margin=2.0)
+    >>> found.closed, found.margin.lower >= 2
+    (True, True)
+    """
+    begun = clock.monotonic()
+    target = target_of(plant, sample_time, delay, lag, places)
+    models = target.nominal
+    first = models[0]
+    structure = Structure(places_of(law, first.inputs, first.outputs))
+    if isinstance(target, Systems):
+        if ranges is not None:
+            raise InputError(
+                CALLER, "ranges", "ranges", "none for systems of python-control: malta.uncertain has some"
+            )
+        look = _search(
+            Task(structure, tuple(goals), tuple(models), rate_of(first)),
+            random_starts(structure, starts, seed),
+        )
+        proof, rounds = Proof(None, {}, closed=False), 1
+    else:
+        asked = _Asked(target, tuple(goals), ranges, 1.0 if margin is None else margin, over_box)
+        task = Task(structure, tuple(goals), tuple(models), rate_of(first))
+        task, look, proof, rounds = _rounds(asked, task, random_starts(structure, starts, seed))
+        models = list(task.models)
+    found = structure.at(look.x)
+    values = {key: value for e in found.elements for key, value in e.values.items()}
+    system = structure.system(look.x)
+    controller = target.controller(system, name) if isinstance(target, Machine) else None
+    return Tuned(
+        values, structure.order, system, first.sample_time, _reached(look, goals), tuple(m.name for m in models),
+        proof.margin, proof.peaks, None if ranges is None else (1.0 if margin is None else margin), proof.closed,
+        rounds, clock.monotonic() - begun, controller,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Proof:
+    """The proofs of a law, and the models that refute it."""
+
+    margin: Margin | None
+    peaks: Mapping[tuple[str, str], Gain]
+    closed: bool
+    refuting: tuple[Model, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """What shall be proven."""
+
+    target: Uncertain | Machine
+    goals: tuple[Goal, ...]
+    ranges: Ranges | None
+    margin: float
+    over_box: bool
+
+    def prove(self, law: System) -> Proof:
+        """Prove a law."""
+        if self.ranges is None:
+            return Proof(None, {}, closed=False)
+        found = self.target.margin(law, self.ranges, PROOF_TIME)
+        holds = found.lower is not None and found.lower >= self.margin
+        refuting = []
+        if not holds and found.witness is not None and found.upper < self.margin * (1 + ROOM):
+            refuting.append(self.target.at(self._far(found), goals=False))
+        peaks: dict[tuple[str, str], Gain] = {}
+        stable = found.lower is not None and found.lower >= 1
+        for goal in self.goals if self.over_box and stable else ():
+            if goal.peak is None:
+                continue
+            for channel, gain in self.target.gains(law, goal, self.ranges, PROOF_TIME).items():
+                peaks[goal.name, channel] = gain
+                if gain.upper is None or gain.upper > goal.peak[0]:
+                    holds = holds and not goal.hard
+                    if gain.lower > goal.peak[0] * (1 - ROOM):
+                        refuting.append(self.target.at(gain.witness, goals=True))
+        return Proof(found, peaks, closed=holds and (stable or not self.over_box), refuting=tuple(refuting))
+
+    def _far(self, margin: Margin) -> dict[str, float]:
+        """The witness of a margin, as far out as is asked for."""
+        assert margin.witness is not None
+        further = self.margin * (1 + ROOM) / margin.upper
+        nominal = {name: margin.witness[name] - moved for name, moved in margin.moved.items()}
+        return {name: nominal.get(name, 0.0) + further * margin.moved[name] if name in (self.ranges or {}) else value
+                for name, value in margin.witness.items()}  # fmt: skip
+
+
+def _search(task: Task, starts: Sequence[Any]) -> Look:
+    """The best law. Raises CheckError where it breaks hard goals."""
+    look = search(task, starts)
+    both = contradiction(look) if look.hard > 1 + ROOM else None
+    if both is not None:
+        one, other = both
+        against = f"{one} against {other}" if one != other else one
+        raise CheckError(f"{CALLER}: no law of this structure was found that meets the hard goals: {against}")
+    return look
+
+
+def _rounds(asked: _Asked, task: Task, starts: Sequence[Any]) -> tuple[Task, Look, Proof, int]:
+    """Tune and prove until the proof closes, or cannot."""
+    look = _search(task, starts)
+    for count in range(1, ROUNDS + 1):
+        proof = asked.prove(task.structure.system(look.x))
+        known = {(model.name, model.goals) for model in task.models}
+        new = tuple(m for m in proof.refuting if (m.name, m.goals) not in known)
+        if proof.closed or asked.ranges is None or not new or count == ROUNDS:
+            return task, look, proof, count
+        task = replace(task, models=(*task.models, *new))
+        try:
+            look = _search(task, [look.x])
+        except (CheckError, InputError):
+            look = _search(task, [look.x, *starts])
+    raise AssertionError("unreachable")
+
+
+def _reached(look: Look, goals: Sequence[Goal]) -> dict[str, float]:
+    """The largest figure of each goal, without the room of hard ones."""
+    found = {}
+    for goal in goals:
+        own = [f.value for f in look.figures if f.key[1] == goal.name]
+        found[goal.name] = max(own, default=0.0) / (1 + ROOM if goal.hard else 1.0)
+    return found
+
+
+def figures_of(model: Model, structure: Structure, goals: Sequence[Goal]) -> dict[str, float]:
+    """The largest figure of each goal on a model at the structure's present values; infinite where it is unstable."""
+    loop = ClosedLoop(model, structure.theta(np.zeros(len(structure.parameters)))[0])
+    if not loop.growth < 0:
+        return {goal.name: math.inf for goal in goals}
+    return {goal.name: max((f.value for f in goal.figures(loop)), default=0.0) for goal in goals}
