@@ -232,6 +232,12 @@ def plot(
             metavar="FILE|FOLDER", help="A .png, .svg or .pdf file, or a folder. [build/NAME_KIND.png]"
         ),
     ] = None,
+    dark: Annotated[
+        bool,
+        typer.Option(
+            "--dark", help="Light lines on a dark page. [.svg: as the reader's screen has it; else light]"
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Draw the loop of a gain file: one channel at a time with the others closed, margins where they are read.
@@ -261,7 +267,7 @@ def plot(
     names = [*dict.fromkeys(kinds)]
     shown, note = _distinct(loops, names, place) if channels is None else (channels, "")
     pictures = _draw(loops, names, shown, place, (*loci, *maps), named=channels is not None)
-    files = _save(pictures, out)
+    files = _save(pictures, out, dark=dark)
     if note:
         print_note(note)
     if as_json:
@@ -466,7 +472,7 @@ def _draw(
     return pictures
 
 
-def _save(pictures: Sequence[Picture], out: Path | None) -> list[Path]:
+def _save(pictures: Sequence[Picture], out: Path | None, *, dark: bool) -> list[Path]:
     """Write the pictures to the file that was named, or to a folder as NAME_KIND.png, all or none."""
     from malta.files import replace_files
     from malta.report import encode_figure
@@ -476,7 +482,9 @@ def _save(pictures: Sequence[Picture], out: Path | None) -> list[Path]:
         raise InputError("--out", "", f"one file for {len(pictures)} pictures", "a folder")
     folder = Path("build") if out is None else out
     paths = [cast("Path", out)] if one else [folder / f"{_file_name(p.name)}.png" for p in pictures]
-    contents = {path: encode_figure(p.figure, path) for path, p in zip(paths, pictures, strict=True)}
+    contents = {
+        path: encode_figure(p.figure, path, dark=dark) for path, p in zip(paths, pictures, strict=True)
+    }
     replace_files(contents)
     return list(contents)
 
