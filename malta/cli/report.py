@@ -92,7 +92,7 @@ def report(
     page_file = require_suffix(out or Path("build") / f"{controller.name}_report.html", *SUFFIXES)
     subject = read_subject(gains, controller, change, uncertain, design)
     with unwritten_progress("report") as progress:
-        flown = _campaigns_of(campaign, controller, subject.spec)
+        flown = campaigns_of(campaign, controller, subject.spec, changed=bool(change))
         analysis, page = report_work(subject, proof=not no_proof, campaigns=flown, progress=progress)
         contents = {page_file: page.content}
         if pdf:
@@ -142,18 +142,25 @@ def read_subject(
     return subject._replace(box=box)
 
 
-def _campaigns_of(folders: Sequence[Path] | None, controller: Controller, spec: Spec | None) -> list[Summary]:
+def campaigns_of(
+    folders: Sequence[Path] | None, controller: Controller, spec: Spec | None, *, changed: bool = False
+) -> list[Summary]:
     """Summarize the campaigns in some folders; without any, those in build/campaigns that are of this controller.
+
+    changed : whether the machine is changed by --set, so that no campaign which is not named is of it
 
     Raises InputError for a named folder without a campaign, or with one of another controller.
     """
+    kept = [] if changed else sorted(path.parent for path in CAMPAIGNS.glob("*/campaign.json"))
+    if not folders and not kept:
+        return []
     from malta.campaigns.summary import Bounds
     from malta.campaigns.survey import status
     from malta.model.data import plant_of, published_figures
 
     bounds = Bounds(published_figures(plant_of(controller.parameters).name), spec)
     found = []
-    for folder in folders or sorted(path.parent for path in CAMPAIGNS.glob("*/campaign.json")):
+    for folder in folders or kept:
         try:
             found.append(status(folder, controller, bounds).summary)
         except InputError:
@@ -529,8 +536,9 @@ def compare(
     page_file = None if out is None else require_suffix(out, *SUFFIXES)
     files = [locate(file) for file in gains]
     subjects = [read_subject(file, read_controller(file, machine), change, uncertain, None) for file in files]
+    flown = [campaigns_of(None, one.controller, one.spec, changed=bool(change)) for one in subjects]
     with unwritten_progress("compare") as progress:
-        found = compare_subjects(subjects, proof=not no_proof, progress=progress)
+        found = compare_subjects(subjects, proof=not no_proof, campaigns=flown, progress=progress)
         written = []
         if page_file is not None:
             from malta.report.page.report import comparison_page
