@@ -92,7 +92,7 @@ def report(
     page_file = require_suffix(out or Path("build") / f"{controller.name}_report.html", *SUFFIXES)
     subject = read_subject(gains, controller, change, uncertain, design)
     with unwritten_progress("report") as progress:
-        flown = _campaigns_of(campaign, controller, subject.spec)
+        flown = campaigns_of(campaign, controller, subject.spec, changed=bool(change))
         analysis, page = report_work(subject, proof=not no_proof, campaigns=flown, progress=progress)
         contents = {page_file: page.content}
         if pdf:
@@ -142,18 +142,25 @@ def read_subject(
     return subject._replace(box=box)
 
 
-def _campaigns_of(folders: Sequence[Path] | None, controller: Controller, spec: Spec | None) -> list[Summary]:
+def campaigns_of(
+    folders: Sequence[Path] | None, controller: Controller, spec: Spec | None, *, changed: bool = False
+) -> list[Summary]:
     """Summarize the campaigns in some folders; without any, those in build/campaigns that are of this controller.
+
+    changed : whether the machine is changed by --set, so that no campaign which is not named is of it
 
     Raises InputError for a named folder without a campaign, or with one of another controller.
     """
+    kept = [] if changed else sorted(path.parent for path in CAMPAIGNS.glob("*/campaign.json"))
+    if not folders and not kept:
+        return []
     from malta.campaigns.summary import Bounds
     from malta.campaigns.survey import status
     from malta.model.data import plant_of, published_figures
 
     bounds = Bounds(published_figures(plant_of(controller.parameters).name), spec)
     found = []
-    for folder in folders or sorted(path.parent for path in CAMPAIGNS.glob("*/campaign.json")):
+    for folder in folders or kept:
         try:
             found.append(status(folder, controller, bounds).summary)
         except InputError:
@@ -232,6 +239,12 @@ def plot(
             metavar="FILE|FOLDER", help="A .png, .svg or .pdf file, or a folder. [build/NAME_KIND.png]"
         ),
     ] = None,
+    dark: Annotated[
+        bool,
+        typer.Option(
+            "--dark", help="Light lines on a dark page. [.svg: as the reader's screen has it; else light]"
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Draw the loop of a gain file: one channel at a time with the others closed, margins where they are read.
@@ -261,7 +274,7 @@ def plot(
     names = [*dict.fromkeys(kinds)]
     shown, note = _distinct(loops, names, place) if channels is None else (channels, "")
     pictures = _draw(loops, names, shown, place, (*loci, *maps), named=channels is not None)
-    files = _save(pictures, out)
+    files = _save(pictures, out, dark=dark)
     if note:
         print_note(note)
     if as_json:
@@ -466,7 +479,7 @@ def _draw(
     return pictures
 
 
-def _save(pictures: Sequence[Picture], out: Path | None) -> list[Path]:
+def _save(pictures: Sequence[Picture], out: Path | None, *, dark: bool) -> list[Path]:
     """Write the pictures to the file that was named, or to a folder as NAME_KIND.png, all or none."""
     from malta.files import replace_files
     from malta.report import encode_figure
@@ -476,7 +489,9 @@ def _save(pictures: Sequence[Picture], out: Path | None) -> list[Path]:
         raise InputError("--out", "", f"one file for {len(pictures)} pictures", "a folder")
     folder = Path("build") if out is None else out
     paths = [cast("Path", out)] if one else [folder / f"{_file_name(p.name)}.png" for p in pictures]
-    contents = {path: encode_figure(p.figure, path) for path, p in zip(paths, pictures, strict=True)}
+    contents = {
+        path: encode_figure(p.figure, path, dark=dark) for path, p in zip(paths, pictures, strict=True)
+    }
     replace_files(contents)
     return list(contents)
 
@@ -521,8 +536,9 @@ def compare(
     page_file = None if out is None else require_suffix(out, *SUFFIXES)
     files = [locate(file) for file in gains]
     subjects = [read_subject(file, read_controller(file, machine), change, uncertain, None) for file in files]
+    flown = [campaigns_of(None, one.controller, one.spec, changed=bool(change)) for one in subjects]
     with unwritten_progress("compare") as progress:
-        found = compare_subjects(subjects, proof=not no_proof, progress=progress)
+        found = compare_subjects(subjects, proof=not no_proof, campaigns=flown, progress=progress)
         written = []
         if page_file is not None:
             from malta.report.page.report import comparison_page

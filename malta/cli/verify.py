@@ -34,6 +34,7 @@ from malta.cli.output import (
 from malta.errors import CheckError, InputError, shorten
 
 if TYPE_CHECKING:
+    from malta.campaigns.summary import Summary
     from malta.cli.documents.others import CheckOutput
     from malta.identification.data_file import IdentifiedData
     from malta.margins.loop_report import LoopReport
@@ -92,6 +93,7 @@ def verify(
     \b
     Example:  malta verify design/gains/calibrated.json --set m=0.56
     """
+    from malta.cli.report import campaigns_of
     from malta.margins.loop_report import require_stable
     from malta.model.data import plant_of, published_figures
     from malta.tuning.verify import verify as verify_loop
@@ -128,7 +130,8 @@ def verify(
 
         print_document(verify_output(gains, found, files))
     else:
-        _print_tables(gains, found, spec, published, change or ())
+        flown = campaigns_of(None, controller, spec, changed=bool(change or measured))
+        _print_tables(gains, found, spec, published, change or (), campaigns=flown)
         print_written(make_console(), files)
     require_stable(found, str(gains))
     if refusal is not None:
@@ -194,13 +197,15 @@ def _print_tables(
     spec: Spec | None,
     published: Mapping[str, Any] | None,
     changes: Sequence[str],
+    *,
+    campaigns: Sequence[Summary],
 ) -> None:
     """Print the tables of a verification; poles of a changed machine stand beside no published ones."""
     from malta import report
 
     controller, console = found.controller, make_console()
     preset = f"{controller.parameters.preset} {' '.join(changes)}".rstrip()
-    verdict = report.verdict_text(found)
+    verdict = report.verdict_text(found, campaigns)
     print_text(console, f"{gains}: {controller.name}, {found.plant.name}, preset {preset}")
     console.print(verdict, "\n")
     console.print(report.poles_table(found.model, None if changes else published))

@@ -249,13 +249,13 @@ def verdict_html(lines: Sequence[VerdictLine]) -> str:
         note = f" {html.escape(micro(line.note))}" if line.note else ""
         value = html.escape(micro(f"{SIGNS[line.state]} {line.value}"))
         state = f' class="{line.state}"' if line.state else ""
-        bars = _stairs_html(line.stairs)
+        bars = stairs_html(line.stairs)
         rows.append(f"<div{state}><dt>{line.label}</dt><dd><b>{value}</b>{note}{bars}</dd></div>")
     return f'<dl class="verdict">{"".join(rows)}</dl>'
 
 
-def _stairs_html(stairs: Sequence[Stair]) -> str:
-    """The staircase as bars, each with its name and its share."""
+def stairs_html(stairs: Sequence[Stair]) -> str:
+    """Proven margins as bars of their heights, each with its name and its share; "" for a single one."""
     largest = max((stair.proven for stair in stairs), default=0.0)
     if len(stairs) < 2 or not largest > 0:
         return ""

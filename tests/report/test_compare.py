@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 from browsing import browser as browser
 from browsing import open_page
@@ -71,6 +73,19 @@ def test_figures_are_those_of_verify_and_the_better_is_marked(carts: Comparison)
     noise = next(row for row in carts.rows if row.scores[0] and row.scores[0].kind == "command")
     assert noise.best == (True, False)
     assert row_of(carts, "stable").best == (False, False)  # a tie
+
+
+def test_margins_stand_as_bars_where_they_count_in_one_box(carts: Comparison) -> None:
+    """As high as the proven margin, in the terminal and on the page; no bars of different uncertainties."""
+    proven = [stair.proven for stair in carts.margins]
+    assert proven == [a.report.robust.lower for a in carts.designs if a.report.robust is not None]
+    line = next(line for line in text_of(carts, 80).splitlines() if line.startswith(" margin"))
+    assert re.findall("[▁-█]", line)[int(np.argmax(proven))] == "█"
+    html = comparison_page(carts).html
+    heights = [float(height) for height in re.findall(r'<i style="height:([\d.]+)rem"', html)]
+    assert np.divide(heights, max(heights)) == pytest.approx(np.divide(proven, max(proven)), abs=0.01)
+    wide = replace(carts.designs[1], subject=carts.designs[1].subject._replace(box={"k": 0.1}))
+    assert Comparison(carts.names, (carts.designs[0], wide)).margins == ()
 
 
 def test_only_what_differs_is_listed(carts: Comparison) -> None:

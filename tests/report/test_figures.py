@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -15,8 +17,10 @@ from figure_checks import defects, texts_of
 import malta
 from malta import report
 from malta.cli.options import read_shares
+from malta.errors import InputError
 from malta.model.signals import outputs_of
-from malta.report import encode_figure, new_figure
+from malta.report import encode_figure, figures, new_figure
+from malta.report.page import document
 from malta.simulation.experiments import Case, Experiment
 from malta.simulation.experiments.catalogue import experiments_of
 
@@ -222,3 +226,62 @@ def test_a_dollar_in_a_name_begins_no_formula(end: str) -> None:
     if end == "svg":
         assert "a$x_{$ and $\\frac$" in content.decode()
         assert ">$\\mathdefault" not in content.decode()  # ticks are drawn as powers
+
+
+def _rows(*names: str) -> Any:
+    """Colours of six hexadecimal digits as rows of red, green, blue from 0 to 1."""
+    return np.array([[int(name.lstrip("#")[k : k + 2], 16) for k in (0, 2, 4)] for name in names]) / 255
+
+
+def _contrast(rows: Any, paper: str) -> Any:
+    """Contrast of colours with a page, 1 to 21, as WCAG 2 has it."""
+    low, high = np.sort(
+        [document.luminance(rows), np.full(len(rows), document.luminance(_rows(paper))[0])], axis=0
+    )
+    return (high + 0.05) / (low + 0.05)
+
+
+def test_lines_are_told_apart_without_colour() -> None:
+    """By dash, or by steps of lightness, on a light page and on a dark one; a light grid or fill is no line."""
+    styles = (*figures.STYLES, *figures.MORE)
+    assert len({(style["color"], style["linestyle"]) for style in styles}) == len(styles)
+    light = _rows(*dict.fromkeys(style["color"] for style in styles))
+    for rows, paper, least in ((light, "ffffff", 13.0), (document.dark_colours(light), "1a1a1a", 11.0)):
+        assert np.abs(np.diff(np.sort(document.lightness(rows)))).min() > least
+        assert _contrast(rows, paper).min() > 3  # of graphical objects
+    assert document.lightness(_rows("777777"))[0] == pytest.approx(
+        50.03, abs=0.01
+    )  # CIE 1976, published sRGB table
+
+
+def test_lines_of_the_live_page_are_told_apart_without_colour() -> None:
+    """Lines of one dash, the first and the fifth and so on, by lightness."""
+    css = (ROOT / "malta" / "app" / "static" / "app.css").read_text(encoding="utf-8")
+    for theme in re.findall(r"--card: (#\w+);.*?(--c0:.*?) color-scheme", css, re.DOTALL):
+        card = theme[0] if len(theme[0]) == 7 else "#" + "".join(2 * letter for letter in theme[0][1:])
+        rows = _rows(*re.findall(r"--c\d: #(\w{6});", theme[1]))
+        assert len(rows) == 8
+        assert _contrast(rows, card).min() > 3
+        bright = document.lightness(rows)
+        assert np.abs(bright[:4] - bright[4:]).min() > 15
+
+
+def test_a_dark_figure_is_one_in_each_form(tmp_path: Path) -> None:
+    """Paper and ink change places in a picture and in vectors; on paper nothing is dark."""
+    figure = report.new_figure("dark", size=(3.0, 2.0))
+    figure.subplots().plot([0, 1], [0, 1], **figures.STYLES[1])
+    light, dark = (_pixels(report.encode_figure(figure, Path("a.png"), dark=dark)) for dark in (False, True))
+    for picture, page in ((light, 255), (dark, 0x1A)):
+        assert (picture == page).all(axis=2).mean() > 0.8
+    assert len(np.unique(dark.reshape(-1, 3), axis=0)) > 20  # smooth edges stay
+    svg = report.encode_figure(figure, Path("a.svg"), dark=True).decode()
+    assert "prefers-color-scheme" not in svg
+    assert f"stroke:{document.dark_colour('7d2906')}" in svg
+    with pytest.raises(InputError, match="dark figure on paper"):
+        report.save(figure, tmp_path / "a.pdf", dark=True)
+
+
+def _pixels(png: bytes) -> Any:
+    from PIL import Image
+
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))

@@ -356,16 +356,6 @@ def test_an_interrupted_run_has_touched_nothing(flown: Flown, tmp_path: Path) ->
     assert not any(line.get_marker() == "X" for axes in figure.axes for line in axes.lines)
 
 
-def test_lines_are_told_apart_without_colour() -> None:
-    """By dash, or by darkness."""
-    seen = set()
-    for style in (*figures.STYLES, *figures.MORE):
-        red, green, blue = (int(style["color"][k : k + 2], 16) for k in (1, 3, 5))
-        dark = round((0.3 * red + 0.59 * green + 0.11 * blue) / 80)
-        seen.add((style["linestyle"], dark))
-    assert len(seen) == len(figures.STYLES) + len(figures.MORE)
-
-
 @pytest.mark.slow
 def test_one_case_is_an_experiment_too(flown: Flown, published: dict[str, Any], tmp_path: Path) -> None:
     """As after Ctrl-C, or where an option leaves one choice."""

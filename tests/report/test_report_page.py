@@ -18,7 +18,7 @@ from conftest import ROOT, Run
 from page_checks import cells_of, read_page
 
 import malta
-from malta.cli.report import read_subject
+from malta.cli.report import campaigns_of, read_subject
 from malta.margins.verify import linear_report
 from malta.report.figures.drawing import printable
 from malta.report.page.analysis import Subject, analyse, key_figures
@@ -214,6 +214,23 @@ def test_a_campaign_and_the_requirements_stand_in_the_page(tmp_path: Path, run: 
     before = out.read_bytes()
     assert run(*report).code == 0
     assert out.read_bytes() == before
+
+
+@pytest.mark.slow
+def test_a_known_yield_stands_in_the_verdict_of_the_same_machine(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of campaigns in build/campaigns; a changed machine has none, and what is damaged there disturbs nobody."""
+    monkeypatch.chdir(tmp_path)
+    gains = ROOT / "design" / "gains" / "calibrated.json"
+    assert run("campaign", gains, "--samples", "16").code == 0
+    assert run("verify", gains, "--no-proof").out.count("of 16 machines") == 2  # first and last
+    controller = malta.gains.read(gains)
+    assert [one.runs for one in campaigns_of(None, controller, None)] == [16]
+    assert campaigns_of(None, controller, None, changed=True) == []
+    (manifest,) = Path("build", "campaigns").glob("*/campaign.json")
+    manifest.write_text("{}")
+    assert campaigns_of(None, controller, None) == []
 
 
 def test_the_command_refuses_what_is_no_page(tmp_path: Path, run: Run) -> None:

@@ -31,23 +31,23 @@ if TYPE_CHECKING:
 
 Published = Mapping[str, Any]  # a file of data/published/
 
-STYLES: Sequence[dict[str, Any]] = (  # distinct without colour: by darkness and dashes
+STYLES: Sequence[dict[str, Any]] = (  # distinct without colour: by steps of lightness and by dashes
     {"color": "#000000", "linestyle": "-", "linewidth": 1.6},
-    {"color": "#c1440e", "linestyle": "-", "linewidth": 1.4},
-    {"color": "#1f77b4", "linestyle": (0, (5, 2)), "linewidth": 1.4},
-    {"color": "#8a8a8a", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
+    {"color": "#7d2906", "linestyle": "-", "linewidth": 1.4},
+    {"color": "#176aa8", "linestyle": (0, (5, 2)), "linewidth": 1.4},
+    {"color": "#8e8e8e", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
 )
-"""Styles of lines that are distinct without colour, by darkness and dashes: keywords of Axes.plot.
+"""Styles of lines that are distinct without colour, by lightness and dashes: keywords of Axes.plot.
 
 >>> import malta
 >>> [style["color"] for style in malta.report.STYLES]
-['#000000', '#c1440e', '#1f77b4', '#8a8a8a']
+['#000000', '#7d2906', '#176aa8', '#8e8e8e']
 """
 MORE: Sequence[dict[str, Any]] = (  # used after STYLES
     {"color": "#000000", "linestyle": (0, (7, 2, 1.5, 2)), "linewidth": 1.4},
-    {"color": "#c1440e", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
-    {"color": "#1f77b4", "linestyle": (0, (9, 2, 1.5, 2, 1.5, 2)), "linewidth": 1.4},
-    {"color": "#8a8a8a", "linestyle": "-", "linewidth": 1.2},
+    {"color": "#7d2906", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
+    {"color": "#176aa8", "linestyle": (0, (9, 2, 1.5, 2, 1.5, 2)), "linewidth": 1.4},
+    {"color": "#8e8e8e", "linestyle": "-", "linewidth": 1.2},
 )
 BOUND: dict[str, Any] = {"color": "#9a9a9a", "linestyle": (0, (8, 3)), "linewidth": 0.9}
 BOUND_LINE = "bound"  # marks what is no data

@@ -16,12 +16,13 @@ from malta.errors import InputError
 from malta.merits import Merit, best_of, by_identifier
 from malta.report.page.analysis import GROUPS, Entry, design_entries, display_unit
 from malta.report.tables.layout import Paragraph, new_table
-from malta.report.verdict import verdict_lines
+from malta.report.verdict import Stair, staircase, verdict_lines
 from malta.simulation.experiments import progress_of_part
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from malta.campaigns.summary import Summary
     from malta.report.page.analysis import Analysis, Subject
     from malta.report.verdict import VerdictLine
 
@@ -148,6 +149,15 @@ class Comparison:
         """The verdict on each design."""
         return tuple(verdict_lines(a.report, a.campaigns) for a in self.designs)
 
+    @cached_property
+    def margins(self) -> tuple[Stair, ...]:
+        """The proven margin of each design; none where they count in different uncertainties, or one is not proven."""
+        robust = [a.report.robust for a in self.designs]
+        known = [margin.lower for margin in robust if margin is not None and margin.lower is not None]
+        if len(known) < len(robust) or not self.one_box:
+            return ()
+        return tuple(Stair(name, lower) for name, lower in zip(self.names, known, strict=True))
+
     @property
     def judged_text(self) -> str:
         """In how many of the figures that the design files bound each design is better; other figures are no score."""
@@ -227,11 +237,13 @@ def compare(
     subjects: Sequence[Subject],
     *,
     proof: bool = True,
+    campaigns: Sequence[Sequence[Summary]] = (),
     progress: Callable[[float], None] | None = None,
 ) -> Comparison:
     """Analyse designs and put them beside each other.
 
     proof : whether the margin of the parameters is proven for each
+    campaigns : summaries of the campaigns of each; (): none of any
     progress : takes the share of the work that is done
 
     Raises InputError for fewer than LEAST or more than MOST designs, CheckError as `analyse`.
@@ -244,9 +256,10 @@ def compare(
             subject,
             proof=proof,
             stages=False,
+            campaigns=flown,
             progress=progress_of_part(progress, n, len(subjects)),
         )
-        for n, subject in enumerate(subjects)
+        for n, (subject, flown) in enumerate(zip(subjects, campaigns or [()] * len(subjects), strict=True))
     ]
     return Comparison(names_of(subjects), tuple(designs))
 
@@ -296,7 +309,7 @@ def comparison_tables(found: Comparison, width: int = 80) -> Group:
     """What differs in the designs, and their figures of merit, in blocks of designs that fit in `width` columns."""
     parts: list[Any] = []
     verdict = [
-        Line("", lines[0].label, tuple(line.value for line in lines), tuple(False for _ in lines))
+        Line("", lines[0].label, _with_bars(lines, found.margins), tuple(False for _ in lines))
         for lines in zip(*found.verdicts, strict=True)
     ]
     parts += [
@@ -313,6 +326,14 @@ def comparison_tables(found: Comparison, width: int = 80) -> Group:
         parts.append(Text("The designs do not differ.\n"))
     parts += [Text(remark) for remark in found.remarks]
     return Group(*parts)
+
+
+def _with_bars(lines: Sequence[VerdictLine], margins: Sequence[Stair]) -> tuple[str, ...]:
+    """The values of a line of all verdicts; margins behind bars of their heights, the largest a whole one."""
+    bars = staircase(margins) if lines[0].label == "margin" else ""
+    return tuple(
+        f"{bar} {line.value}".lstrip() for bar, line in zip(bars or [""] * len(lines), lines, strict=True)
+    )
 
 
 def _blocks(names: Sequence[str], lines: Sequence[Line], width: int) -> Iterator[list[int]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
 import html
 import io
 import re
@@ -13,6 +12,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
+
+import numpy as np
 
 from malta.errors import InputError
 from malta.files import replace_files
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.figure import Figure
 
+    from malta.model.plant import FloatArray
     from malta.report.page.analysis import KeyFigure
     from malta.report.page.sections import Sheet
 
@@ -126,10 +128,38 @@ def dark_colour(name: str) -> str:
     >>> dark_colour("000000"), dark_colour("ffffff")
     ('#ededed', '#1a1a1a')
     """
-    red, green, blue = (int(name[k : k + 2], 16) / 255 for k in (0, 2, 4))
-    hue, light, strength = colorsys.rgb_to_hls(red, green, blue)
-    turned = colorsys.hls_to_rgb(hue, 0.93 - 0.83 * light, strength)
-    return "#" + "".join(f"{round(255 * part):02x}" for part in turned)
+    rgb = np.array([[int(name[k : k + 2], 16) for k in (0, 2, 4)]]) / 255
+    return "#" + "".join(f"{round(255 * part):02x}" for part in dark_colours(rgb)[0])
+
+
+def dark_colours(rgb: FloatArray) -> FloatArray:
+    """Colours of a dark page in place of those of a light one: rows of red, green, blue from 0 to 1.
+
+    Lightness is the eye's, so that lines which differ in grey on a light page do so on a dark one.
+    """
+    middle = (rgb.min(axis=1) + rgb.max(axis=1))[:, None] / 2
+    tint = (rgb - middle) / np.maximum(np.minimum(middle, 1 - middle), 1e-9)
+    black, white = lightness(np.array([[0xED] * 3, [0x1A] * 3]) / 255)
+    wanted = black + (white - black) * lightness(rgb) / 100
+    low, high = np.zeros_like(middle), np.ones_like(middle)
+    for _ in range(20):  # halves the interval of the colour's middle
+        middle = (low + high) / 2
+        turned = middle + np.minimum(middle, 1 - middle) * tint
+        darker = (lightness(turned) < wanted)[:, None]
+        low, high = np.where(darker, middle, low), np.where(darker, high, middle)
+    return np.asarray(np.clip(turned, 0.0, 1.0))
+
+
+def lightness(rgb: FloatArray) -> FloatArray:
+    """CIE lightness of colours, 0 (black) to 100 (white): rows of red, green, blue from 0 to 1, of sRGB."""
+    Y = luminance(rgb)
+    return np.asarray(np.where(Y > (6 / 29) ** 3, 116 * np.cbrt(Y) - 16, Y * (29 / 3) ** 3))
+
+
+def luminance(rgb: FloatArray) -> FloatArray:
+    """Relative luminance of colours, 0 to 1: rows of red, green, blue from 0 to 1, of sRGB (IEC 61966-2-1)."""
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return np.asarray(linear @ [0.2126, 0.7152, 0.0722])
 
 
 # The figures of a page as a PDF for a paper: one on each sheet, with its caption, in vectors with embedded fonts.

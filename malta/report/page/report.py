@@ -12,7 +12,7 @@ from malta.model.signals import FINE
 from malta.report.figures.drawing import MORE, STYLES, draw_line, finish_axes, micro, new_figure
 from malta.report.page.document import Front, Page, render
 from malta.report.page.sections import Item, Picture, Section, Sheet, distinct_channels, polish
-from malta.report.verdict import SIGNS
+from malta.report.verdict import SIGNS, stairs_html
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -277,6 +277,7 @@ def comparison_page(found: Comparison, progress: Callable[[float], None] | None 
         " · ".join(found.names),
         f"Machine {machines}",
         foot="malta compare",
+        verdict=_margin_bars(found),
     )
     sections = (
         Section("verdict", "Verdict", tuple(_verdicts(found))),
@@ -285,6 +286,12 @@ def comparison_page(found: Comparison, progress: Callable[[float], None] | None 
         Section("differences", "What differs in the designs", tuple(_differences(found))),
     )
     return render(front, [section for section in sections if section.items], progress)
+
+
+def _margin_bars(found: Comparison) -> str:
+    """The proven margins of the designs as bars beside each other; "" where they cannot be compared."""
+    bars = stairs_html(found.margins)
+    return bars and f'<dl class="verdict"><div><dt>proven margin</dt><dd>{bars}</dd></div></dl>'
 
 
 def _verdicts(found: Comparison) -> Iterator[Item]:
