@@ -322,8 +322,9 @@ def learn(
 def replay(gains: GainFile, log: LogFile, machine: MachineFile = None, as_json: AsJson = False) -> None:
     """Run a law on logged readings: does it command what was logged, and how large are its innovations?
 
-    Commands that differ give exit code 1: another gain file flew, or another law. Innovations larger than the sensors'
-    noise, or far from white, say that the machine is not the one that the filter believes in.
+    Commands that differ give exit code 1: another gain file flew, or another law. So do innovations that are larger, or
+    less white, than those of the gain file's own machine on the same reference and excitation; the parameter that
+    explains them is named.
 
     \b
     Example:  malta replay design/gains/robust.json build/stroke.npz
@@ -345,4 +346,5 @@ def replay(gains: GainFile, log: LogFile, machine: MachineFile = None, as_json: 
         console.print(replay_table(found, plant_of(controller.parameters)))
         same = "as logged, but for rounding" if found.same else "not those of the log"
         print_text(console, f"{log}: the commands of {controller.name} are {same}")
-    raise typer.Exit(0 if found.same else 1)
+    if found.refusal:
+        raise CheckError(f"{log}: {found.refusal}")

@@ -33,6 +33,7 @@ from malta.identification.spectra import (
     Spectrum,
     between_neighbours,
     readings,
+    require_closed_loop,
     require_log,
     spectrum_of,
     straightened,
@@ -227,7 +228,8 @@ def identify(
     Returns an Identified, also where its `refusal` says that the model does not explain the log.
 
     Raises InputError for unknown parameters and another machine's signals; CheckError for a log that tells nothing:
-    too short, without excitation, another sample time, a stuck or clipped sensor, parameters that only act together.
+    too short, without excitation or with one that is not independent, an open loop, another sample time, a stuck or
+    clipped sensor, parameters that only act together.
 
     >>> import dataclasses, malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -257,6 +259,7 @@ def identify(
         spectrum.currents[0].real,
         log.sample_time,
     )
+    require_closed_loop(log, float(np.linalg.eigvals(model.matrices(model.start)[0]).real.max()))
     dropped: dict[str, float] = {}
     F = _information(model, straightened(model, spectrum, model.start))
     if not parameters:

@@ -26,6 +26,8 @@ WINDOW = 3  # lines to either side whose bins are taken together
 WIDER = 2  # times the highest line: up to there motion counts that curvature multiplies
 REPAIRED = 1e-3  # of the currents that may be missing
 FILLED = 0.2  # of the readings that may be missing
+INDEPENDENT = 0.05  # smallest eigenvalue of the correlation of the excited inputs; 1 where none share a line
+FEEDBACK = 1e-3  # of an excitation: commands that move by less beside it do not depend on readings
 
 
 class Spectrum(NamedTuple):
@@ -86,6 +88,46 @@ def excited_lines(log: Log, D: ComplexArray, periods: int) -> IntArray:
     return lines
 
 
+def require_independent(log: Log, D: ComplexArray) -> None:
+    """Raise CheckError for inputs that are not excited independently of each other, as with lines that collide.
+
+    D : lines x inputs, Fourier coefficients of the excitation
+    """
+    size = np.linalg.norm(D, axis=0)
+    used = np.flatnonzero(size > EXCITED * size.max())
+    unit = D[:, used] / size[used]
+    R = unit.conj().T @ unit
+    least = float(np.linalg.eigvalsh(R)[0])
+    if least < INDEPENDENT:
+        between = np.abs(R - np.eye(len(used)))
+        a, b = np.unravel_index(int(between.argmax()), between.shape)
+        one, other = (log.names("excitation")[used[k]] for k in (a, b))
+        raise CheckError(
+            f"{log.source}: the excitation of the inputs is not independent: their lines collide, and {one} and {other} "
+            f"are correlated by {between[a, b]:.3f}; the smallest eigenvalue of all correlations is {least:.2g}, at "
+            f"least {INDEPENDENT:g} is needed"
+        )
+
+
+def require_closed_loop(log: Log, pole: float) -> None:
+    """Raise CheckError where commands do not depend on readings, and the machine's model is unstable: it lay on its
+    touchdown bearings, or another law held it.
+
+    pole : the largest real part of the model's poles, rad/s
+    """
+    if pole <= 0 or not log.names("v"):
+        return
+    sent = log.columns["excitation"]
+    own = log.columns["v"] - sent
+    moved, size = np.nanstd(own, axis=0), np.nanstd(sent, axis=0)
+    share = moved[size > 0] / size[size > 0]
+    if len(share) and share.max() < FEEDBACK:
+        raise CheckError(
+            f"{log.source}: an open loop: beside the excitation commands move by {share.max():.2g} of it, a law's move "
+            f"by {FEEDBACK:g} at least, and the machine is unstable (pole at {pole:.4g} rad/s)"
+        )
+
+
 def noise_bins(lines: IntArray, periods: int, count: int) -> IntArray:
     """Of each line, the NEIGHBOURS nearest of `count` bins that are no multiples of 1 / period: noise alone."""
     top = min(count, int(lines[-1]) + 4 * periods)
@@ -109,6 +151,7 @@ def spectrum_of(log: Log, y: FloatArray, i: FloatArray) -> Spectrum:
     N, periods = whole_periods(log, excitation, len(y))
     outputs, currents, D = (np.fft.rfft(table[len(y) - N :], axis=0) / N for table in (y, i, excitation))
     lines = excited_lines(log, D, periods)
+    require_independent(log, D[lines])
     axis = np.abs(D[lines]).argmax(axis=1)  # the input that a line excites most
     pulse = D[lines, axis]
     harmonics = np.setdiff1d(np.arange(lines[0], lines[-1] + 1, periods), lines)

@@ -112,6 +112,7 @@ def test_commands_write_and_show_a_log(run: Run, tmp_path: Path) -> None:
     assert found["signals"]["z"]["unit"] == "m"
     learned = run("learn", ROBUST, file, "--json")
     assert json.loads(learned.out)["after"] == pytest.approx(4.68, rel=0.01)
-    assert run("replay", ROBUST, file).code == 0
+    said = run("replay", ROBUST, file)
+    assert (said.code, "as logged" in said.out, "K_D -11 %" in said.err) == (1, True, True)
     other = run("replay", "design/gains/calibrated.json", file, "--json")
     assert (other.code, json.loads(other.out)["same"]) == (1, False)

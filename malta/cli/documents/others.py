@@ -322,6 +322,13 @@ class LearnOutput(Part):
     files: Files
 
 
+class Explained(Part):
+    """What a change of a parameter would explain of the innovations."""
+
+    change: float = Field(description="as a share of the parameter's value")
+    share: float = Field(description="of the power beyond that of the gain file's own machine")
+
+
 class ReplayOutput(Part):
     """What `malta replay --json` prints."""
 
@@ -335,6 +342,9 @@ class ReplayOutput(Part):
     innovation_rms: dict[str, float] = Field(description="of each output, SI")
     sensor_noise: dict[str, float] = Field(description="noise and steps of each sensor, SI")
     whiteness: dict[str, float] = Field(description="largest autocorrelation, in standard deviations")
+    own_machine_rms: dict[str, float] = Field(description="of innovations of the gain file's own machine, SI")
+    explained: dict[str, Explained] = Field(description="by parameter, where the innovations are refused")
+    refusal: str = Field(description="why the log is not of this law on its machine; empty: it is")
 
 
 class MeasuredCurve(Part):
@@ -535,6 +545,9 @@ def replay_output(gains: Path, log: Path, found: LawReplay) -> ReplayOutput:
         innovation_rms=dict(found.rms),
         sensor_noise=dict(found.expected),
         whiteness=dict(found.whiteness),
+        own_machine_rms=dict(found.own) if found.same else {},
+        explained={name: Explained(change=a, share=b) for name, (a, b) in found.explained.items()},
+        refusal=found.refusal,
     )
 
 
