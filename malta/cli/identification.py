@@ -54,6 +54,16 @@ def identify(
     robust: Annotated[
         bool, typer.Option("--robust", help="Take outliers for missing (Student's likelihood in time).")
     ] = False,
+    loaded: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="LOG", help="A second log, with a known mass on the machine: the mass comes out."
+        ),
+    ] = None,
+    added: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="What it adds to a parameter, as m=100g. Repeatable."),
+    ] = None,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -62,12 +72,14 @@ def identify(
     Maximum likelihood at the excited lines, from measured currents to measured outputs; feedback does not bias it. Then
     prediction errors in time, on the machine without linearization: both have to agree.
     A log that the machine's model does not explain is refused with exit code 1, and no file is written.
+    Of one log masses are known, as forces and stiffness scale with them; with --loaded and --added they come out.
 
     \b
     Example:  malta identify design/gains/robust.json log.npz -o found.toml
     """
     from malta.identification.data_file import write_data
     from malta.identification.identify import identify as identify_parameters
+    from malta.identification.identify import weigh
     from malta.identification.log import read_log
     from malta.identification.response import units_of_model
     from malta.model.data import plant_of
@@ -75,10 +87,21 @@ def identify(
 
     controller = read_controller(gains, machine)
     values = read_assignments("--known", known, units_of_model(plant_of(controller.parameters)))
-    with working(f"identifying from {log}"):
-        found = identify_parameters(
-            controller, read_log(log), parameters=parameters or (), known=values, robust=robust
+    more = read_assignments("--added", added, units_of_model(plant_of(controller.parameters)))
+    if (loaded is None) != (not more):
+        raise InputError(
+            "--loaded", "", "--loaded or --added alone", "both, as --loaded log2.npz --added m=100g"
         )
+    if loaded is not None and robust:
+        raise InputError("--robust", "", "two logs", "one log: two are estimated at the lines alone")
+    with working(f"identifying from {log}"):
+        if loaded is not None:
+            logs = read_log(log), read_log(loaded)
+            found = weigh(controller, *logs, more, parameters=parameters or (), known=values)
+        else:
+            found = identify_parameters(
+                controller, read_log(log), parameters=parameters or (), known=values, robust=robust
+            )
     files = []
     if out is not None and not found.refusal:
         files.append(write_data(found, out, gains=str(gains), known=values))

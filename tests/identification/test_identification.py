@@ -125,6 +125,18 @@ def test_only_ratios_are_found_without_a_mass(log: Log) -> None:
     assert (np.abs(heavier.values - 1.25 * lighter.values) < 0.5 * heavier.half_widths).all()
 
 
+@pytest.mark.slow
+def test_a_known_mass_on_a_second_flight_gives_the_mass(plan: ExcitationPlan) -> None:
+    logs = [malta.identification.log_of(excited(plan, {**TRUE, "m": m})) for m in (0.38, 0.48)]
+    asked = ["K_A", "K_B", "m", "I_xx"]
+    found = malta.identification.weigh(CONTROLLER, *logs, {"m": 0.1}, parameters=asked, known={"K_D": 5.5})
+    assert found.refusal == ""
+    assert (np.abs(found.values - [9000.0, 5.0, 0.38, 1.3805e-3]) < 2 * found.half_widths).all()
+    assert (found.half_widths / found.values < 5e-3).all()
+    with pytest.raises(malta.InputError, match="what the second log's machine has more"):
+        malta.identification.weigh(CONTROLLER, *logs, {"m": 0.0})
+
+
 @pytest.mark.parametrize("known", [{"I_xx": 1.45e-3, "I_yy": 1.45e-3}, {"l_S": 0.09}, {"K_D": 5.2}])
 def test_a_wrong_model_is_refused(log: Log, known: dict[str, float]) -> None:
     found = malta.identify(CONTROLLER, log, parameters=["K_A", "K_B"], known=known)
@@ -151,7 +163,7 @@ def test_logs_that_tell_nothing_are_refused(log: Log) -> None:
             log, excitation=colliding
         ),
         r"an open loop: .* unstable \(pole at 2[12]\d.\d rad/s": with_columns(
-            log, v=sent + [0, 3.5, 0, 3.5, 0]
+            log, v=sent + np.array([0, 3.5, 0, 3.5, 0])
         ),
         "y1 is stuck": with_columns(log, y=stuck),
         "x1 is clipped": with_columns(log, y=clipped),
