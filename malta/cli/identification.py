@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
 
 
-LogFile = Annotated[Path, typer.Argument(metavar="LOG", help="A log: .csv, .npz or .mat.")]
+LogFile = Annotated[Path, typer.Argument(metavar="LOG", help="A log: .csv, .npz, .mat or .parquet.")]
 
 
 def identify(
@@ -153,7 +153,9 @@ def excite(
     ] = None,
     log: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Fly it on the simulated machine: its log, .csv, .npz or .mat."),
+        typer.Option(
+            metavar="FILE", help="Fly it on the simulated machine: its log: .csv, .npz, .mat, .parquet."
+        ),
     ] = None,
     machine: MachineFile = None,
     as_json: AsJson = False,
@@ -257,7 +259,7 @@ def _fly(plan: ExcitationPlan, plant: Plant, controller: Controller, path: Path,
 
 
 def log(
-    file: Annotated[Path, typer.Argument(metavar="LOG", help="A log: .csv, .npz or .mat.")],
+    file: Annotated[Path, typer.Argument(metavar="LOG", help="A log: .csv, .npz, .mat or .parquet.")],
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw it: a .png, .svg or .pdf file.")
     ] = None,
