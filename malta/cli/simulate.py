@@ -140,7 +140,7 @@ def simulate(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Write what a bench would log of the first run: .csv, .npz or .mat.",
+            help="Write what a bench would log of the first run: .csv, .npz, .mat, .parquet.",
         ),
     ] = None,
     replay: Annotated[

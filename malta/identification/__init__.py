@@ -9,6 +9,7 @@ from malta.contents import contents
 if TYPE_CHECKING:
     from malta.identification.excite import ExcitationPlan as ExcitationPlan
     from malta.identification.identify import Identified as Identified
+    from malta.identification.identify import weigh as weigh
     from malta.identification.learn import Learned as Learned
     from malta.identification.log import Log as Log
     from malta.identification.log import log_of as log_of

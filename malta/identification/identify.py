@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from malta.identification.response import (
     candidates,
     deviations,
     information,
+    plant_with,
     require_parameters,
     units_of_model,
     well_found,
@@ -32,15 +34,20 @@ from malta.identification.spectra import (
     SIGMA,
     Spectrum,
     between_neighbours,
+    distortion_of,
     readings,
+    require_closed_loop,
     require_log,
+    residuals_of,
     spectrum_of,
     straightened,
+    weights_of,
+    white_residuals,
+    whiteness_of,
     whole,
     windowed_covariances,
 )
 from malta.model.data import plant_of
-from malta.model.parameters import symbolic_names, twins_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -227,7 +234,8 @@ def identify(
     Returns an Identified, also where its `refusal` says that the model does not explain the log.
 
     Raises InputError for unknown parameters and another machine's signals; CheckError for a log that tells nothing:
-    too short, without excitation, another sample time, a stuck or clipped sensor, parameters that only act together.
+    too short, without excitation or with one that is not independent, an open loop, another sample time, a stuck or
+    clipped sensor, parameters that only act together.
 
     >>> import dataclasses, malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -246,27 +254,11 @@ def identify(
     plant = _known_plant(plant_of(controller.parameters), known or {}, start or {})
     _require_machine(controller, plant, log)
     y, i = readings(log, robust=robust), whole(log, "i")
-    spectrum = spectrum_of(log, between_neighbours(y), i)
     names = require_parameters(plant, parameters) or candidates(plant)
     names = tuple(name for name in names if name not in (known or {}))
-    model = ResponseModel(
-        plant,
-        names,
-        tuple(log.names("i")),
-        spectrum.outputs[0].real,
-        spectrum.currents[0].real,
-        log.sample_time,
-    )
-    dropped: dict[str, float] = {}
-    F = _information(model, straightened(model, spectrum, model.start))
-    if not parameters:
-        left = well_found(F, names, SHARE / SIGMA)
-        sigma = deviations(F)
-        dropped = {n: float(sigma[k]) for k, n in enumerate(names) if k not in left and np.isfinite(sigma[k])}
-        model = replace(model, names=tuple(names[k] for k in left))
-        F = F[np.ix_(left, left)]
-    _require_identifiable(model, F, log.source)
-    found = _estimate_straightened(model, spectrum, log, dropped)
+    records, dropped = _chosen([_record(plant, names, log, y, i)], log.source, named=bool(parameters))
+    model, spectrum, _ = records[0]
+    found = _estimate_straightened(records, log, dropped)
     filled = robust or bool(np.isnan(y).any())
     wanted = filled or (in_time and not found.refusal)
     if not wanted or plant.sensors is not None or not plant.second_order:
@@ -274,26 +266,117 @@ def identify(
     predicted = _predicted(model, spectrum, found, i, y, robust=robust)
     if filled:  # once more, with predictions in their place
         spectrum = spectrum_of(log, predicted.readings, i)
-        found = _estimate_straightened(model, spectrum, log, dropped)
+        found = _estimate_straightened([records[0]._replace(spectrum=spectrum)], log, dropped)
         told = float(np.isfinite(y).mean())  # what was filled in tells nothing
         found = replace(found, covariance=found.covariance / told)
         predicted = _predicted(model, spectrum, found, i, y, robust=robust)
     return replace(found, in_time=predicted)
 
 
-def _estimate_straightened(
-    model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str, float]
+def weigh(
+    controller: Controller,
+    log: Log,
+    loaded: Log,
+    added: Mapping[str, float],
+    *,
+    parameters: Sequence[str] = (),
+    known: Mapping[str, float] | None = None,
 ) -> Identified:
+    """Identify parameters from two logs of a machine, with and without a known mass on it: so its own mass comes out.
+
+    One log tells ratios such as K_A / m. With a mass d the second one tells K_A / (m + d), and both together K_A and m.
+    The likelihood at the lines is that of both logs together, as `identify` has it for one; nothing is estimated in
+    time.
+
+    controller : the gain file that flew both
+    log : without the added mass
+    loaded : with it
+    added : what it adds to parameters, SI, as {"m": 0.1}; on the centre of gravity it adds no inertia
+    parameters : as for `identify`; (): those that both logs tell to 50 %, and those of `added`
+    known : parameters with values that were weighed or measured otherwise, SI
+
+    Returns an Identified of the machine without the added mass, also where its `refusal` says that the model does not
+    explain the logs; its log is the first one.
+
+    Raises InputError and CheckError as `identify` does, and InputError where nothing is added.
+
+    >>> import malta
+    >>> malta.identification.weigh.__annotations__["return"]
+    'Identified'
+    """
+    plant = _known_plant(plant_of(controller.parameters), known or {}, {})
+    require_parameters(plant, list(added))
+    if not any(added.values()):
+        raise InputError("weigh", "added", "nothing", "what the second log's machine has more, as m=100g")
+    names = require_parameters(plant, parameters) or (*candidates(plant), *added)
+    names = tuple(name for name in dict.fromkeys(names) if name not in (known or {}))
+    par = plant.parameters
+    heavier = plant_with(plant, {name: float(getattr(par, name)) + more for name, more in added.items()})
+    records = []
+    for flown, machine in ((log, plant), (loaded, heavier)):
+        _require_machine(controller, machine, flown)
+        records.append(_record(machine, names, flown, readings(flown, robust=False), whole(flown, "i")))
+    records[1] = records[1]._replace(added=added)
+    source = f"{log.source} and {loaded.source}"
+    records, dropped = _chosen(records, source, named=bool(parameters))
+    return _estimate_straightened(records, log, dropped)
+
+
+class _Record(NamedTuple):
+    """A log as it is estimated from: the machine where it was made, its spectrum, and what that machine has more than
+    the one that is asked for, SI."""
+
+    model: ResponseModel
+    spectrum: Spectrum
+    added: Mapping[str, float] = MappingProxyType({})
+
+    def at(self, theta: FloatArray) -> FloatArray:
+        """The parameters of this log's machine."""
+        return np.array([x + self.added.get(n, 0.0) for n, x in zip(self.model.names, theta, strict=True)])
+
+
+def _record(plant: Plant, names: tuple[str, ...], log: Log, y: FloatArray, i: FloatArray) -> _Record:
+    """The record of a log. Raises CheckError for a log that tells nothing."""
+    s = spectrum_of(log, between_neighbours(y), i)
+    mean = s.outputs[0].real, s.currents[0].real
+    model = ResponseModel(plant, names, tuple(log.names("i")), *mean, log.sample_time)
+    require_closed_loop(log, float(np.linalg.eigvals(model.matrices(model.start)[0]).real.max()))
+    return _Record(model, s)
+
+
+def _chosen(records: list[_Record], source: str, *, named: bool) -> tuple[list[_Record], dict[str, float]]:
+    """The records with the parameters that are told, and the deviations of those that are not, as shares.
+
+    Where they were named, all have to be told; else those that are not are left out.
+    """
+    model, dropped = records[0].model, {}
+    told = [
+        _information(r.model, straightened(r.model, r.spectrum, r.model.start), model.scale) for r in records
+    ]
+    F = np.sum(told, axis=0)
+    if not named:
+        left, sigma = well_found(F, model.names, SHARE / SIGMA), deviations(F)
+        dropped = {
+            n: float(sigma[k]) for k, n in enumerate(model.names) if k not in left and np.isfinite(sigma[k])
+        }
+        names = tuple(model.names[k] for k in left)
+        records = [r._replace(model=replace(r.model, names=names)) for r in records]
+        F = F[np.ix_(left, left)]
+    _require_identifiable(records[0].model, F, source)
+    return records, dropped
+
+
+def _estimate_straightened(records: Sequence[_Record], log: Log, dropped: Mapping[str, float]) -> Identified:
     """The estimate at the lines, with the machine's curvature at what was found, until that moves no more."""
-    theta = model.start
+    theta = records[0].model.start
     for _ in range(STRAIGHTENED):
-        straight = straightened(model, s, theta)
-        found = _search(model, straight, theta)
+        straight = [r._replace(spectrum=straightened(r.model, r.spectrum, r.at(theta))) for r in records]
+        found = _search(straight, theta)
         moved = np.abs(found.theta - theta) / np.sqrt(np.diag(found.covariance))
         theta = found.theta
         if (moved < SETTLED).all():
             break
-    return _estimate(model, straight, log, dropped, found)
+    return _estimate(straight, log, dropped, found)
 
 
 def _predicted(
@@ -301,7 +384,7 @@ def _predicted(
 ) -> Predicted:
     """The estimate in time, from that at the lines on."""
     bins, places = np.unique(s.between.ravel(), return_index=True)
-    e = _residuals(model, straightened(model, s, found.values), found.values).between
+    e = residuals_of(model, straightened(model, s, found.values), found.values).between
     samples = round(2 * np.pi / (s.rate * model.sample_time))
     noise = noise_between_lines(
         model, found.values, s.rate * bins, e.reshape(-1, e.shape[2])[places], samples
@@ -315,15 +398,7 @@ def _known_plant(plant: Plant, known: Mapping[str, float], start: Mapping[str, f
     require_parameters(plant, list(values))
     if not values:
         return plant
-    return _plant_with(plant, values)
-
-
-def _plant_with(plant: Plant, values: Mapping[str, float]) -> Plant:
-    """The machine with these parameters; those that are alike by declaration stay alike. Errors of sensors are none."""
-    par: Any = plant.parameters
-    own = {name: float(value) for name, value in values.items() if name in symbolic_names(par)}
-    alike = {name: own[twin] for name, twin in twins_of(par).items() if twin in own}
-    return plant_of(replace(par, **alike | own))
+    return plant_with(plant, values)
 
 
 def _require_machine(controller: Controller, plant: Plant, log: Log) -> None:
@@ -339,54 +414,9 @@ def _require_machine(controller: Controller, plant: Plant, log: Log) -> None:
         )
 
 
-class Residuals(NamedTuple):
-    """e = Y - G I - T c at some bins, with the c of least squares at lines and between them: bins x p each."""
-
-    lines: ComplexArray
-    between: ComplexArray  # lines x NEIGHBOURS x p
-    harmonics: ComplexArray
-
-
-def _residuals(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Residuals:
-    """The residuals of parameters theta.
-
-    What noise leaves in the states from the begin of the record to its end acts at all bins alike. It is fitted and
-    taken off, as it would correlate the residuals of all lines.
-    """
-    kinds = (s.lines, s.between.ravel(), s.harmonics)
-    bins = np.concatenate(kinds)
-    G, T = model.responses(theta, s.rate * bins)
-    e = s.outputs[bins] - np.einsum("kpm,km->kp", G, s.currents[bins])
-    fitted = len(bins) - len(s.harmonics)
-    rows = (T[:fitted] * s.weight[:, None]).reshape(-1, T.shape[2])
-    size = np.linalg.norm(rows, axis=0)
-    rows = rows / np.where(size > 0, size, 1.0)
-    right = (e[:fitted] * s.weight).ravel()
-    normal, moments = (rows.conj().T @ rows).real, (rows.conj().T @ right).real
-    c = np.linalg.lstsq(normal, moments, rcond=1e-12)[0] / np.where(size > 0, size, 1.0)
-    e = e - T @ c
-    lines, between, harmonics = np.split(e, np.cumsum([len(kind) for kind in kinds])[:2])
-    return Residuals(lines, between.reshape(*s.between.shape, -1), harmonics)
-
-
-def _weights(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexArray:
-    """W at each line, so that W e has unit variance in every entry: the residuals between the lines are noise.
-
-    The inverse of a covariance that is estimated from n bins is too large by n / (n - p).
-    """
-    C, counts = windowed_covariances(_residuals(model, s, theta).between)
-    p = C.shape[1]
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(C)) * np.sqrt((counts - p) / counts)[:, None, None])
-
-
-def _white_residuals(model: ResponseModel, s: Spectrum, theta: FloatArray, W: ComplexArray) -> ComplexArray:
-    """Residuals at the lines in standard deviations, lines x p; squares sum up to chi2 with twice as many entries."""
-    return np.asarray(np.einsum("kab,kb->ka", W, _residuals(model, s, theta).lines))
-
-
-def _information(model: ResponseModel, s: Spectrum) -> FloatArray:
-    """The Fisher information at the start, with the noise that the start leaves between the lines."""
-    C, _ = windowed_covariances(_residuals(model, s, model.start).between)
+def _information(model: ResponseModel, s: Spectrum, scale: FloatArray) -> FloatArray:
+    """The Fisher information at the start, in units of `scale`, with the noise that is left between the lines."""
+    C, _ = windowed_covariances(residuals_of(model, s, model.start).between)
     variance = np.einsum("kpp->kp", C).real
     power = (np.abs(s.outputs[s.lines]) ** 2 / variance).max(axis=1)
     if np.median(power) < QUIET:
@@ -394,7 +424,7 @@ def _information(model: ResponseModel, s: Spectrum) -> FloatArray:
             f"{s.source}: the excitation does not rise above the noise: at half of the lines the outputs move by "
             f"less than {np.sqrt(np.median(power)):.2g} standard deviations"
         )
-    slopes = model.slopes(model.start, s.rate * s.lines)
+    slopes = model.slopes(model.start, s.rate * s.lines) * (scale / model.scale)[:, None, None, None]
     return information(slopes, s.currents[s.lines], variance)
 
 
@@ -430,51 +460,56 @@ def _starting(model: ResponseModel, name: str) -> float:
 
 
 class Found(NamedTuple):
-    """What a search ends with: parameters, their covariance, residuals in standard deviations, chi2 / dof, dof."""
+    """What a search ends with: parameters, their covariance, residuals of each record in standard deviations,
+    chi2 / dof, dof."""
 
     theta: FloatArray
     covariance: FloatArray
-    white: ComplexArray
+    white: list[ComplexArray]
     chi2: float
     dof: int
 
 
-def _search(model: ResponseModel, s: Spectrum, begin: FloatArray) -> Found:
+def _search(records: Sequence[_Record], begin: FloatArray) -> Found:
     """The most likely parameters from `begin` on.
 
     The weights stay those of `begin` while the parameters move: with their own, parameters that make more of noise
     between the lines would look more likely.
     """
-    scale, start, W = model.scale, model.start, _weights(model, s, begin)
+    scale, start = records[0].model.scale, records[0].model.start
+    weights = [weights_of(r.model, r.spectrum, r.at(begin)) for r in records]
+    size = 2 * sum(r.spectrum.lines.size * r.spectrum.outputs.shape[1] for r in records)
+
+    def white(theta: FloatArray) -> list[ComplexArray]:
+        pairs = zip(records, weights, strict=True)
+        return [white_residuals(r.model, r.spectrum, r.at(theta), W) for r, W in pairs]
 
     def residuals(moved: FloatArray) -> FloatArray:
         try:
-            e = np.sqrt(2) * _white_residuals(model, s, start + scale * moved, W).ravel()
+            e = np.sqrt(2) * np.concatenate([part.ravel() for part in white(start + scale * moved)])
         except (np.linalg.LinAlgError, ValueError):
-            return np.full(2 * s.lines.size * s.outputs.shape[1], 1e6)
+            return np.full(size, 1e6)
         return np.concatenate([e.real, e.imag])
 
     found = least_squares(residuals, (begin - start) / scale, method="lm", x_scale="jac", xtol=1e-9)
     theta = start + scale * found.x
-    white = _white_residuals(model, s, theta, W)
-    dof = 2 * white.size - len(scale)
-    chi2 = float(2 * (np.abs(white) ** 2).sum() / dof)
+    parts, dof = white(theta), size - len(scale)
+    chi2 = 2 * sum(float((np.abs(part) ** 2).sum()) for part in parts) / dof
     covariance = _covariance(np.asarray(found.jac), np.asarray(found.fun), max(1.0, chi2))
-    return Found(theta, covariance * np.outer(scale, scale), white, chi2, dof)
+    return Found(theta, covariance * np.outer(scale, scale), parts, chi2, dof)
 
 
-def _estimate(
-    model: ResponseModel, s: Spectrum, log: Log, dropped: Mapping[str, float], found: Found
-) -> Identified:
+def _estimate(records: Sequence[_Record], log: Log, dropped: Mapping[str, float], found: Found) -> Identified:
     """The machine that was found, and how white the residuals are. Raises CheckError where it is none."""
     theta, covariance, white, chi2, dof = found
-    outputs = (np.abs(white) ** 2).mean(axis=0).tolist()
+    model, s, _ = records[0]
+    outputs = (np.abs(np.concatenate(white)) ** 2).mean(axis=0).tolist()
     par, plant = model.plant.parameters, model.plant
     others = replace(model, names=tuple(n for n in acting(plant) if n not in model.names))
     slopes = others.slopes(others.start, s.rate * s.lines)
     held = {n: float(getattr(par, n)) for n, slope in zip(others.names, slopes, strict=True) if slope.any()}
     try:
-        most_likely = _plant_with(plant, dict(zip(model.names, theta.tolist(), strict=True)))
+        most_likely = plant_with(plant, dict(zip(model.names, theta.tolist(), strict=True)))
     except InputError as error:
         raise CheckError(f"{s.source}: what explains the log best is no machine ({error})") from error
     return Identified(
@@ -488,8 +523,8 @@ def _estimate(
         chi2=chi2,
         limit=float(SLACK * chi2_distribution.isf(LIKELY, dof) / dof),
         dof=dof,
-        whiteness=_whiteness(white, s),
-        distortion=_distortion(model, s, theta),
+        whiteness=whiteness_of(white, [r.spectrum for r in records]),
+        distortion=float(np.mean([distortion_of(r.model, r.spectrum, r.at(theta)) for r in records])),
         by_output=dict(zip([o.name for o in plant.outputs], outputs, strict=True)),
         dropped=dropped,
     )
@@ -505,24 +540,3 @@ def _covariance(slopes: FloatArray, e: FloatArray, spread: float) -> FloatArray:
     own = inverse @ (slopes.T * e**2) @ slopes @ inverse * len(e) / (len(e) - len(inverse))
     grown = np.sqrt(np.maximum(np.diag(own) / (spread * np.diag(inverse)), 1.0))
     return np.asarray(spread * inverse * np.outer(grown, grown))
-
-
-def _whiteness(white: ComplexArray, s: Spectrum) -> float:
-    """The correlation of neighbouring lines of one axis, over its standard deviation where they are independent."""
-    total, count = 0.0, 0
-    for axis in np.unique(s.axis):
-        own = white[s.axis == axis] / s.turn[s.axis == axis][:, None]
-        total += float((own[1:].conj() * own[:-1]).real.sum())
-        count += own[1:].size
-    return total / float(np.sqrt(max(count, 1) / 2))
-
-
-def _distortion(model: ResponseModel, s: Spectrum, theta: FloatArray) -> float:
-    """The mean power of e at harmonics that were not excited, over that of the noise; NaN where there are none."""
-    if not len(s.harmonics):
-        return float("nan")
-    e = _residuals(model, s, theta)
-    C, _ = windowed_covariances(e.between)
-    nearest = np.abs(s.lines - s.harmonics[:, None]).argmin(axis=1)
-    solved = np.linalg.solve(C[nearest], e.harmonics[..., None])[..., 0]
-    return float((e.harmonics.conj() * solved).real.sum() / e.harmonics.size)

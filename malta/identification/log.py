@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 VERSION = 1
 LARGEST = 2_000_000_000  # bytes of a log
-SUFFIXES = (".csv", ".npz", ".mat")
+SUFFIXES = (".csv", ".npz", ".mat", ".parquet")
 GROUPS = {"y": "", "v": "", "i": "", "u": "", "reference": "ref.", "excitation": "exc.", "flags": "flag."}
 """The groups of columns, and what stands before the signal's name in a heading."""
 TEXTS = ("machine", "controller")  # of a file's head; sample_time and period are numbers, s
@@ -293,12 +294,12 @@ def without_idle(log: Log) -> Log:
 
 
 def write_log(log: Log, path: str | Path) -> Path:
-    """Write a log as .csv, .npz or .mat; docs/formats/log.md describes the files.
+    """Write a log as .csv, .npz, .mat or .parquet; docs/formats/log.md describes the files.
 
     log : what to write
-    path : the suffix chooses the encoding
+    path : the suffix chooses the encoding; .parquet needs pyarrow
 
-    Returns the path. Raises InputError for another suffix, and for a file that cannot be written.
+    Returns the path. Raises InputError for another suffix, without pyarrow, and for a file that cannot be written.
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -312,7 +313,8 @@ def write_log(log: Log, path: str | Path) -> Path:
     path = Path(path)
     _require_suffix(path)
     log = without_idle(log)
-    encode: Callable[[Log], bytes] = {".csv": _to_csv, ".npz": _to_npz, ".mat": _to_mat}[path.suffix]
+    encoders: dict[str, Callable[[Log], bytes]] = {".csv": _to_csv, ".npz": _to_npz, ".mat": _to_mat}
+    encode = encoders.get(path.suffix, _to_parquet)
     replace_files({path: encode(log)})
     return path
 
@@ -326,15 +328,68 @@ def _headings(log: Log, group: str) -> list[str]:
     return [f"{s.name} [{s.unit}]" for s in log.signals.get(group, ())]
 
 
+def _head(log: Log) -> dict[str, str]:
+    """What a text says of a log beside its columns."""
+    names = {"machine": log.machine, "controller": log.controller}
+    return names | {"sample_time": f"{log.sample_time!r} s", "period": f"{log.period!r} s"}
+
+
+def _one_table(log: Log) -> tuple[list[str], FloatArray]:
+    """Headings with prefixes, and all columns beside t."""
+    present = [group for group in GROUPS if log.names(group)]
+    headings = ["t [s]", *(GROUPS[g] + name for g in present for name in _headings(log, g))]
+    return headings, np.column_stack([log.t, *(log.columns[group] for group in present)])
+
+
+def _arrow(path: Path | str) -> tuple[Any, Any]:
+    """pyarrow and its module of Parquet files. Raises InputError where it is not installed."""
+    try:
+        return import_module("pyarrow"), import_module("pyarrow.parquet")
+    except ImportError:
+        expected = "pyarrow, as by pip install pyarrow; or .csv, .npz, .mat"
+        raise InputError(path, "", "a .parquet file without pyarrow", expected) from None
+
+
+def _to_parquet(log: Log) -> bytes:
+    """A column of doubles for each heading, and the head as metadata of the schema."""
+    arrow, parquet = _arrow("log")
+    headings, table = _one_table(log)
+    head = {"malta log": str(VERSION)} | _head(log)
+    buffer = io.BytesIO()
+    parquet.write_table(arrow.table(list(table.T.copy()), names=headings, metadata=head), buffer)
+    return buffer.getvalue()
+
+
+def _from_parquet(content: bytes, path: Path) -> Decoded:
+    arrow, parquet = _arrow(path)
+    try:
+        read = parquet.read_table(io.BytesIO(content), use_threads=False)
+        columns = [
+            np.asarray(column.cast(arrow.float64()).to_numpy(), dtype=float) for column in read.columns
+        ]
+    except (arrow.ArrowException, OSError, ValueError) as error:
+        raise InputError(
+            path, "", f"a damaged file ({str(error)[:80]})", "a Parquet file of numbers"
+        ) from error
+    stored = read.schema.metadata or {}
+    words = {
+        name.decode(errors="replace"): value.decode(errors="replace").split()
+        for name, value in stored.items()
+    }
+    head = {name: text[0] for name, text in words.items() if text}
+    if not columns:
+        raise InputError(path, "", "no columns", "t [s], x1 [m], ...")
+    return _tabulated(head, [name.strip() for name in read.column_names], np.column_stack(columns), path)
+
+
 def _to_csv(log: Log) -> bytes:
     """A head of comments, a line of headings, and a line a sample."""
     present = [group for group in GROUPS if log.names(group)]
-    head = [f"# malta log {VERSION}", f"# machine {log.machine}", f"# controller {log.controller}"]
-    head += [f"# sample_time {log.sample_time!r} s", f"# period {log.period!r} s"]
-    head.append(",".join(["t [s]", *(GROUPS[g] + name for g in present for name in _headings(log, g))]))
+    head = [f"# malta log {VERSION}", *(f"# {name} {value}" for name, value in _head(log).items())]
+    headings, table = _one_table(log)
+    head.append(",".join(headings))
     buffer = io.StringIO()
     buffer.write("\n".join(head) + "\n")
-    table = np.column_stack([log.t, *(log.columns[group] for group in present)])
     sent = ("reference", "excitation")  # with all digits: they are differentiated
     formats = ["%.12g", *("%.17g" if g in sent else "%.9g" for g in present for _ in log.names(g))]
     np.savetxt(buffer, table, fmt=formats, delimiter=",")
@@ -368,7 +423,7 @@ def _to_mat(log: Log) -> bytes:
 
 
 def read_log(path: str | Path) -> Log:
-    """Read a log: a .csv, .npz or .mat of malta, or a .csv of another program with headings "name [unit]".
+    """Read a log: a .csv, .npz, .mat or .parquet of malta, or a .csv of another program with headings "name [unit]".
 
     path : the file. Units are converted to SI; a cell that is empty or nan is a missing reading.
 
@@ -390,7 +445,7 @@ def read_log(path: str | Path) -> Log:
     path = Path(path)
     _require_suffix(path)
     content = read_file(path, "log", Path.read_bytes, LARGEST)
-    decode = {".csv": _from_csv, ".npz": _from_npz, ".mat": _from_mat}[path.suffix]
+    decode = {".csv": _from_csv, ".npz": _from_npz, ".mat": _from_mat}.get(path.suffix, _from_parquet)
     head, t, tables, headings = decode(content, path)
     if len(t) < 2 or not (np.diff(t) > 0).all():
         raise InputError(path, "t", "times that do not rise", "the times of the samples, in order")
@@ -432,7 +487,12 @@ def _from_csv(content: bytes, path: Path) -> Decoded:
         raise InputError(path, "", f"a line that cannot be read ({str(error)[:80]})", "numbers") from error
     if values.ndim != 2 or values.shape[1] != len(names):
         raise InputError(path, "", f"{values.shape[-1]} cells in a line", f"{len(names)}, as headings")
-    if names[0].split()[0] != "t":
+    return _tabulated(head, names, values, path)
+
+
+def _tabulated(head: dict[str, Any], names: list[str], values: FloatArray, path: Path) -> Decoded:
+    """The tables of a file that is one table, whose first column is t."""
+    if not names[0].startswith("t ") and names[0] != "t":
         raise InputError(path, names[0], "the first column", "t [s]")
     places: dict[str, list[int]] = {}
     for k, name in enumerate(names[1:], start=1):

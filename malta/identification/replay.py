@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +14,15 @@ from scipy.interpolate import make_interp_spline
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.identification.log import Log, require_same_law
+from malta.identification.response import acting
 from malta.model.data import plant_of
+from malta.model.parameters import twins_of
 from malta.simulation.inputs import Inputs, initial_values, sample_inputs
 from malta.simulation.layout import layout_of
 from malta.simulation.period import law_reference
 from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario, Simulation, simulation_of
+from malta.simulation.simulate import simulate
 from malta.synthesis.controller import (
     Controller,
     commanded,
@@ -32,12 +35,17 @@ from malta.synthesis.controller import (
 )
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.model.plant import FloatArray, Plant
 
 SAME = 1e-6  # of a force's limit: commands that differ by less are the same, in files of nine digits too
 SETTLED = 0.5  # of a log, after which the start of the filter is forgotten
 LAGS = 20  # samples, over which innovations are tested
 BLOCK = 1000  # samples in one call
+LARGER = 1.2  # times the innovations of the gain file's own machine, beyond which the log's are refused
+ALIKE = 0.1  # by which autocorrelations of both may differ, and 6 standard deviations where that is more
+STEP = 0.01  # of a parameter, by which the machine is moved to see what that changes
+FARTHEST = 0.5  # of its value: a parameter that had to change by more explains nothing
+SEED = 1  # of the noise of the gain file's own machine: not that of a simulated log
 
 
 @display
@@ -53,6 +61,11 @@ class LawReplay:
     expected : by output: noise and steps of the machine's sensors, SI
     whiteness : by output: the largest autocorrelation of the innovation over 20 samples, in standard deviations
     same : whether all commands are the logged ones, but for rounding
+    own : by output: rms of the innovation of the gain file's own machine on this reference and excitation, SI
+    unlike : by output: by how much an autocorrelation of the innovation differs from that one's, at most
+    allowed : of `unlike`, from the number of samples
+    explained : where the innovations are refused, by parameter: its change as a share of its value, and the share of
+        their power beyond the own machine's that this explains
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -73,6 +86,46 @@ class LawReplay:
     expected: Mapping[str, float]
     whiteness: Mapping[str, float]
     same: bool
+    own: Mapping[str, float]
+    unlike: Mapping[str, float]
+    allowed: float
+    explained: Mapping[str, tuple[float, float]]
+
+    @property
+    def refusal(self) -> str:
+        """Why the log is not one of this law on the machine that its filter knows; "": it is."""
+        if not self.same:
+            name = max(self.difference, key=lambda n: self.difference[n])
+            return (
+                f"{name} differs by {self.difference[name]:.2g} from the log: another law or other gains flew"
+            )
+        return self.doubt + self._explanation
+
+    @property
+    def doubt(self) -> str:
+        """What is wrong with the innovations, with numbers; "": nothing."""
+        name = max(self.own, key=lambda n: self.rms[n] / self.own[n])
+        if self.rms[name] > LARGER * self.own[name]:
+            return (
+                f"the innovation of {name} has {self.rms[name]:.3g} rms, {self.rms[name] / self.own[name]:.3g} times "
+                f"that of the gain file's machine, at most {LARGER:g} is noise"
+            )
+        name = max(self.unlike, key=lambda n: self.unlike[n])
+        if self.unlike[name] > self.allowed:
+            return (
+                f"the innovation of {name} is not as white as that of the gain file's machine: autocorrelations differ "
+                f"by {self.unlike[name]:.2g}, at most {self.allowed:.2g} is noise"
+            )
+        return ""
+
+    @property
+    def _explanation(self) -> str:
+        """The parameters that explain most of the innovations, in words."""
+        best = max((share for _, share in self.explained.values()), default=0.0)
+        parts = [f"{n} {100 * c:+.2g} %" for n, (c, share) in self.explained.items() if share > 0.9 * best]
+        if best < 0.5:
+            return "; no parameter by itself explains half of it" if self.explained else ""
+        return f"; {' or '.join(parts)} would explain {100 * best:.0f} % of it"
 
     @property
     def description(self) -> Description:
@@ -89,10 +142,15 @@ def replay_law(controller: Controller, log: Log) -> LawReplay:
     agrees once that start is forgotten, which the second half of the log shows. Derivatives of the reference are taken
     from its samples.
 
+    Where the commands are the log's, the gain file's own machine flies the same reference and excitation, with noise
+    and steps of its sensors. Innovations of the log that are larger than its, or correlated otherwise, are of another
+    machine: `refusal` says so, and which parameter would explain them. Filters that are weighted for robustness have
+    no white innovations on any machine; so these are what the log's are compared with, not white noise.
+
     controller : the gain file
     log : with measured outputs, commands and reference
 
-    Returns a LawReplay.
+    Returns a LawReplay, also where its `refusal` says what is wrong.
 
     Raises InputError for a log without these columns, CheckError for another machine, another sample time or missing
     samples.
@@ -118,42 +176,126 @@ def replay_law(controller: Controller, log: Log) -> LawReplay:
     names, forces = [s.name for s in plant.outputs], [s.name for s in plant.inputs]
     noise = np.sqrt(np.array(plant.noise) ** 2 + np.array(plant.resolution) ** 2 / 12)
     largest = off[half:].max(axis=0)
-    return LawReplay(
+    same = bool((largest <= SAME * controller.limits.force).all())
+    rms = np.sqrt((late**2).mean(axis=0))
+    twin = _Twin(controller, log) if same else None
+    own = late if twin is None else twin.innovation(plant, noise=1.0)[half:]
+    unlike = np.abs(_autocorrelations(late) - _autocorrelations(own)).max(axis=1)
+    found = LawReplay(
         commands,
         innovation,
         difference=dict(zip(forces, largest.tolist(), strict=True)),
         at_once=dict(zip(forces, off.max(axis=0).tolist(), strict=True)),
-        rms=dict(zip(names, np.sqrt((late**2).mean(axis=0)).tolist(), strict=True)),
+        rms=dict(zip(names, rms.tolist(), strict=True)),
         expected=dict(zip(names, noise.tolist(), strict=True)),
         whiteness={name: whiteness(column) for name, column in zip(names, late.T, strict=True)},
-        same=bool((largest <= SAME * controller.limits.force).all()),
+        same=same,
+        own=dict(zip(names, np.maximum(np.sqrt((own**2).mean(axis=0)), 1e-300).tolist(), strict=True)),
+        unlike=dict(zip(names, unlike.tolist(), strict=True)),
+        allowed=max(ALIKE, 6 * float(np.sqrt(2 / len(late)))),
+        explained={},
     )
+    if twin is None or not found.doubt:
+        return found
+    return replace(found, explained=_explained(plant, twin, late, noise, half))
 
 
 def whiteness(values: FloatArray) -> float:
     """The largest autocorrelation of a series over LAGS samples, in standard deviations of a white one."""
-    centred = values - values.mean()
-    power = float(centred @ centred)
-    if power == 0 or len(centred) <= LAGS + 1:
-        return 0.0
-    lags = [abs(float(centred[k:] @ centred[:-k])) / power for k in range(1, LAGS + 1)]
-    return max(lags) * float(np.sqrt(len(centred)))
+    return float(np.abs(_autocorrelations(values[:, None])).max() * np.sqrt(len(values)))
+
+
+def _autocorrelations(table: FloatArray) -> FloatArray:
+    """The autocorrelations of each column over 1 to LAGS samples, columns x LAGS; 0 of a series that is constant."""
+    centred = table - table.mean(axis=0)
+    power = (centred**2).sum(axis=0)
+    if len(centred) <= LAGS + 1:
+        return np.zeros((table.shape[1], LAGS))
+    lags = [(centred[k:] * centred[:-k]).sum(axis=0) for k in range(1, LAGS + 1)]
+    return np.asarray((np.array(lags) / np.where(power > 0, power, 1.0)).T)
+
+
+class _Twin:
+    """The machine of a gain file, or one near it, on the reference and the excitation of a log."""
+
+    def __init__(self, controller: Controller, log: Log) -> None:
+        self.controller, self.log = controller, log
+
+    def innovation(self, plant: Plant, noise: float) -> FloatArray:
+        """Innovations of the law on this machine, k x p. Raises CheckError where it does not fly to the end."""
+        motion, forces = _sent(self.controller, self.log)
+        fidelity: Any = "force" if plant.windings is None else "dq"
+        scenario = Scenario(
+            "replay", self.log.samples * self.controller.sample_time, lambda _: motion,
+            excitation=forces, noise=noise, quantize=noise > 0, fidelity=fidelity,
+            seed=SEED,
+        )  # fmt: skip
+        run = simulate(plant, self.controller, scenario)
+        if not run.verdict.completed:
+            end = f"{run.verdict.name} at {run.verdict.time:.4g} s"
+            raise CheckError(f"{self.log.source}: the gain file's machine does not fly this reference: {end}")
+        return _run(*_inputs(self.controller, self.log), run.y)[1]
+
+
+def _explained(
+    plant: Plant, twin: _Twin, late: FloatArray, noise: FloatArray, half: int
+) -> dict[str, tuple[float, float]]:
+    """By parameter: the change of it that explains most of the innovations, as a share of its value, and how much.
+
+    The innovations move by a D with the change a, D from a machine that is 1 % off without noise. The power of what is
+    left is compared with that beyond the own machine's noise.
+    """
+    still = twin.innovation(plant, noise=0.0)[half:]
+    off = (late - still) / noise
+    beyond = float(
+        (off**2).sum() - ((twin.innovation(plant, noise=1.0)[half:] - still) ** 2 / noise**2).sum()
+    )
+    found: dict[str, tuple[float, float]] = {}
+    alike = twins_of(plant.parameters)
+    for name in acting(plant):
+        value = float(getattr(plant.parameters, name))
+        own = dict.fromkeys([name, *(n for n, other in alike.items() if other == name)], (1 + STEP) * value)
+        par: Any = plant.parameters
+        try:
+            moved = twin.innovation(plant.variant(replace(par, **own)), noise=0.0)[half:]
+        except (CheckError, InputError):
+            continue
+        D = (moved - still) / (STEP * noise)
+        power = float((D**2).sum())
+        if power > 0 and beyond > 0:
+            a = float((off * D).sum()) / power
+            if abs(a) < FARTHEST:
+                found[name] = (a, min(1.0, a**2 * power / beyond))
+    return found
+
+
+def _sent(
+    controller: Controller, log: Log
+) -> tuple[Callable[[Any], Motion], Callable[[Any], FloatArray] | None]:
+    """The reference of a log as a function of time, and its excitation; None where nothing was excited."""
+    plant, Ts = plant_of(controller.parameters), controller.sample_time
+    p = log.table("reference", [s.name for s in plant.outputs])
+    spline = make_interp_spline(Ts * np.arange(log.samples), p, k=5)
+    sent = log.columns.get("excitation", np.zeros((log.samples, 0)))
+
+    def motion(t: Any) -> Motion:
+        return Motion(spline(t), spline(t, 1), spline(t, 2))
+
+    def forces(t: Any) -> FloatArray:
+        return np.asarray(sent[np.clip(np.round(np.asarray(t) / Ts).astype(int), 0, log.samples - 1)])
+
+    return motion, forces if sent.any() else None
 
 
 def _inputs(controller: Controller, log: Log) -> tuple[Simulation, Inputs]:
     """What the law was given at every sample, from the reference and the excitation of a log."""
     plant, Ts = plant_of(controller.parameters), controller.sample_time
-    p = log.table("reference", [s.name for s in plant.outputs])
+    function, excitation = _sent(controller, log)
     t = Ts * np.arange(log.samples)
-    spline = make_interp_spline(t, p, k=5)
-    motion = Motion(p, spline(t, 1), spline(t, 2))
-    sent = log.columns.get("excitation", np.zeros((log.samples, 0)))
-    excitation = (lambda _: sent) if sent.any() else None
-
-    def reference(_: Any) -> Any:
-        return lambda _: motion
-
-    scenario = Scenario("replay", log.samples * Ts, reference, fidelity="force", excitation=excitation)
+    motion = function(t)._replace(p=log.table("reference", [s.name for s in plant.outputs]))
+    scenario = Scenario(
+        "replay", log.samples * Ts, lambda _: function, fidelity="force", excitation=excitation
+    )
     simulation = simulation_of(plant, controller, scenario)
     return simulation, Inputs(t, motion, sample_inputs(simulation, motion, t))
 

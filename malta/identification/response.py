@@ -9,8 +9,8 @@ delay, current loops and law drop out, whatever they are, and what is left is th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from malta.errors import InputError
+from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names, twins_of
 from malta.model.plant import Plant, symbolic
 from malta.model.sensors import with_lags
@@ -272,6 +273,14 @@ def units_of_model(plant: Plant) -> dict[str, str]:
     fields: dict[str, Any] = plant.parameters.__dataclass_fields__
     units = {name: str(fields[name].metadata["unit"]) for name in symbolic_names(plant.parameters)}
     return units | {s.name: s.unit for s in plant.sensor_errors}
+
+
+def plant_with(plant: Plant, values: Mapping[str, float]) -> Plant:
+    """The machine with these parameters; those that are alike by declaration stay alike. Sensors' errors are none."""
+    par: Any = plant.parameters
+    own = {name: float(value) for name, value in values.items() if name in symbolic_names(par)}
+    alike = {name: own[twin] for name, twin in twins_of(par).items() if twin in own}
+    return plant_of(replace(par, **alike | own))
 
 
 def require_parameters(plant: Plant, names: Sequence[str]) -> tuple[str, ...]:

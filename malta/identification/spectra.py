@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -26,6 +27,8 @@ WINDOW = 3  # lines to either side whose bins are taken together
 WIDER = 2  # times the highest line: up to there motion counts that curvature multiplies
 REPAIRED = 1e-3  # of the currents that may be missing
 FILLED = 0.2  # of the readings that may be missing
+INDEPENDENT = 0.05  # smallest eigenvalue of the correlation of the excited inputs; 1 where none share a line
+FEEDBACK = 1e-3  # of an excitation: commands that move by less beside it do not depend on readings
 
 
 class Spectrum(NamedTuple):
@@ -86,6 +89,46 @@ def excited_lines(log: Log, D: ComplexArray, periods: int) -> IntArray:
     return lines
 
 
+def require_independent(log: Log, D: ComplexArray) -> None:
+    """Raise CheckError for inputs that are not excited independently of each other, as with lines that collide.
+
+    D : lines x inputs, Fourier coefficients of the excitation
+    """
+    size = np.linalg.norm(D, axis=0)
+    used = np.flatnonzero(size > EXCITED * size.max())
+    unit = D[:, used] / size[used]
+    R = unit.conj().T @ unit
+    least = float(np.linalg.eigvalsh(R)[0])
+    if least < INDEPENDENT:
+        between = np.abs(R - np.eye(len(used)))
+        a, b = np.unravel_index(int(between.argmax()), between.shape)
+        one, other = (log.names("excitation")[used[k]] for k in (a, b))
+        raise CheckError(
+            f"{log.source}: the excitation of the inputs is not independent: their lines collide, and {one} and "
+            f"{other} are correlated by {between[a, b]:.3f}; the smallest eigenvalue is {least:.2g}, "
+            f"at least {INDEPENDENT:g} is needed"
+        )
+
+
+def require_closed_loop(log: Log, pole: float) -> None:
+    """Raise CheckError where commands do not depend on readings, and the machine's model is unstable: it lay on its
+    touchdown bearings, or another law held it.
+
+    pole : the largest real part of the model's poles, rad/s
+    """
+    if pole <= 0 or not log.names("v"):
+        return
+    sent = log.columns["excitation"]
+    own = log.columns["v"] - sent
+    moved, size = np.nanstd(own, axis=0), np.nanstd(sent, axis=0)
+    share = moved[size > 0] / size[size > 0]
+    if len(share) and share.max() < FEEDBACK:
+        raise CheckError(
+            f"{log.source}: an open loop: beside the excitation commands move by {share.max():.2g} of it, a law's move "
+            f"by {FEEDBACK:g} at least, and the machine is unstable (pole at {pole:.4g} rad/s)"
+        )
+
+
 def noise_bins(lines: IntArray, periods: int, count: int) -> IntArray:
     """Of each line, the NEIGHBOURS nearest of `count` bins that are no multiples of 1 / period: noise alone."""
     top = min(count, int(lines[-1]) + 4 * periods)
@@ -109,6 +152,7 @@ def spectrum_of(log: Log, y: FloatArray, i: FloatArray) -> Spectrum:
     N, periods = whole_periods(log, excitation, len(y))
     outputs, currents, D = (np.fft.rfft(table[len(y) - N :], axis=0) / N for table in (y, i, excitation))
     lines = excited_lines(log, D, periods)
+    require_independent(log, D[lines])
     axis = np.abs(D[lines]).argmax(axis=1)  # the input that a line excites most
     pulse = D[lines, axis]
     harmonics = np.setdiff1d(np.arange(lines[0], lines[-1] + 1, periods), lines)
@@ -183,3 +227,70 @@ def whole(log: Log, group: str) -> FloatArray:
             f"{log.source}: {100 * missing:.3g} % of the samples of {group} are missing, at most 0.1 % may be"
         )
     return between_neighbours(table)
+
+
+class Residuals(NamedTuple):
+    """e = Y - G I - T c at some bins, with the c of least squares at lines and between them: bins x p each."""
+
+    lines: ComplexArray
+    between: ComplexArray  # lines x NEIGHBOURS x p
+    harmonics: ComplexArray
+
+
+def residuals_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Residuals:
+    """The residuals of parameters theta.
+
+    What noise leaves in the states from the begin of the record to its end acts at all bins alike. It is fitted and
+    taken off, as it would correlate the residuals of all lines.
+    """
+    kinds = (s.lines, s.between.ravel(), s.harmonics)
+    bins = np.concatenate(kinds)
+    G, T = model.responses(theta, s.rate * bins)
+    e = s.outputs[bins] - np.einsum("kpm,km->kp", G, s.currents[bins])
+    fitted = len(bins) - len(s.harmonics)
+    rows = (T[:fitted] * s.weight[:, None]).reshape(-1, T.shape[2])
+    size = np.linalg.norm(rows, axis=0)
+    rows = rows / np.where(size > 0, size, 1.0)
+    right = (e[:fitted] * s.weight).ravel()
+    normal, moments = (rows.conj().T @ rows).real, (rows.conj().T @ right).real
+    c = np.linalg.lstsq(normal, moments, rcond=1e-12)[0] / np.where(size > 0, size, 1.0)
+    e = e - T @ c
+    lines, between, harmonics = np.split(e, np.cumsum([len(kind) for kind in kinds])[:2])
+    return Residuals(lines, between.reshape(*s.between.shape, -1), harmonics)
+
+
+def weights_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexArray:
+    """W at each line, so that W e has unit variance in every entry: the residuals between the lines are noise.
+
+    The inverse of a covariance that is estimated from n bins is too large by n / (n - p).
+    """
+    C, counts = windowed_covariances(residuals_of(model, s, theta).between)
+    p = C.shape[1]
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(C)) * np.sqrt((counts - p) / counts)[:, None, None])
+
+
+def white_residuals(model: ResponseModel, s: Spectrum, theta: FloatArray, W: ComplexArray) -> ComplexArray:
+    """Residuals at the lines in standard deviations, lines x p; squares sum up to chi2 with twice as many entries."""
+    return np.asarray(np.einsum("kab,kb->ka", W, residuals_of(model, s, theta).lines))
+
+
+def distortion_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> float:
+    """The mean power of e at harmonics that were not excited, over that of the noise; NaN where there are none."""
+    if not len(s.harmonics):
+        return float("nan")
+    e = residuals_of(model, s, theta)
+    C, _ = windowed_covariances(e.between)
+    nearest = np.abs(s.lines - s.harmonics[:, None]).argmin(axis=1)
+    solved = np.linalg.solve(C[nearest], e.harmonics[..., None])[..., 0]
+    return float((e.harmonics.conj() * solved).real.sum() / e.harmonics.size)
+
+
+def whiteness_of(parts: Sequence[ComplexArray], spectra: Sequence[Spectrum]) -> float:
+    """The correlation of neighbouring lines of one axis, over its standard deviation where they are independent."""
+    total, count = 0.0, 0
+    for white, s in zip(parts, spectra, strict=True):
+        for axis in np.unique(s.axis):
+            own = white[s.axis == axis] / s.turn[s.axis == axis][:, None]
+            total += float((own[1:].conj() * own[:-1]).real.sum())
+            count += own[1:].size
+    return total / float(np.sqrt(max(count, 1) / 2))

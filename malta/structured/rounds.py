@@ -1,8 +1,8 @@
 """A law of a given structure whose goals hold, proven over the parameters: tune, prove, add what refutes it, repeat.
 
 1. The law is searched for all models so far, at first those at nominal parameters.
-2. The margin of the loop is proven, and the peaks of |S| over the box. Where a bound is above what is asked for, the witness
-   is a plant that refutes the law: it becomes a model, as far out as the margin asks.
+2. The margin of the loop is proven, and the peaks of |S| over the box. Where a bound is above what is asked for, the
+   witness is a plant that refutes the law: it becomes a model, as far out as the margin asks.
 3. This ends when the proofs hold what is asked for, or when they cannot, which the certificate says then.
 """
 
@@ -131,7 +131,7 @@ def tune(
 ) -> Tuned:
     """Find the parameters of a law's elements that meet goals, and prove what they promise over ranges of parameters.
 
-    plant : a control system, or several that one law shall hold; an uncertain system, from `malta.uncertain`; or a Plant
+    plant : a control system, or several that one law shall hold; what `malta.uncertain` makes; or a Plant
     law : elements by the outputs whose errors they take, for the input of the same index; one element from all errors
         to all inputs; or places (left, element, right), as for the coordinates of a centre of gravity
     goals : of malta.structured; hard ones hold, the largest soft one is made small

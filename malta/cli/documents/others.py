@@ -297,6 +297,13 @@ class LearnOutput(Part):
     files: Files
 
 
+class Explained(Part):
+    """What a change of a parameter would explain of the innovations."""
+
+    change: float = Field(description="as a share of the parameter's value")
+    share: float = Field(description="of the power beyond that of the gain file's own machine")
+
+
 class ReplayOutput(Part):
     """What `malta replay --json` prints."""
 
@@ -312,6 +319,9 @@ class ReplayOutput(Part):
     innovation_rms: dict[str, float] = Field(description="of each output, SI")
     sensor_noise: dict[str, float] = Field(description="noise and steps of each sensor, SI")
     whiteness: dict[str, float] = Field(description="largest autocorrelation, in standard deviations")
+    own_machine_rms: dict[str, float] = Field(description="of innovations of the gain file's own machine, SI")
+    explained: dict[str, Explained] = Field(description="by parameter, where the innovations are refused")
+    refusal: str = Field(description="why the log is not of this law on its machine; empty: it is")
 
 
 class MeasuredCurve(Part):
@@ -472,7 +482,13 @@ def learn_output(gains: Path, log: Path, found: Learned, files: Iterable[Path]) 
 
 def replay_output(gains: Path, log: Path, found: LawReplay) -> ReplayOutput:
     """The document of a replay."""
-    return ReplayOutput.of(found, gains=gains, log=log)
+    return ReplayOutput.of(
+        found,
+        gains=gains,
+        log=log,
+        own_machine_rms=found.own if found.same else {},
+        explained={name: Explained(change=a, share=b) for name, (a, b) in found.explained.items()},
+    )
 
 
 def measure_output(gains: Path, found: Measurement, files: Iterable[Path]) -> MeasureOutput:

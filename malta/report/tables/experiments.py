@@ -284,13 +284,15 @@ def quality_table(found: Identified) -> Table:
 
 def replay_table(found: LawReplay, plant: Plant) -> Table:
     """Commands and innovations of a law on a log."""
-    table = new_table("The law on the log", "signal", "from the start", "second half", "sensor", "whiteness")
+    columns = ("signal", "from the start", "second half", "own machine", "sensor", "whiteness")
+    table = new_table("The law on the log", *columns)
     for signal in plant.inputs:
         off = f"{found.at_once[signal.name]:.2g}", f"{found.difference[signal.name]:.2g}"
-        add_row(table, f"{signal.name} differs by [{signal.unit}]", *off, "", "")
+        add_row(table, f"{signal.name} differs by [{signal.unit}]", *off, "", "", "")
     for signal in plant.outputs:
         name = signal.name
-        cells = f"{found.rms[name]:.3g}", f"{found.expected[name]:.3g}", f"{found.whiteness[name]:.2g}"
+        own = f"{found.own[name]:.3g}" if found.same else ""
+        cells = f"{found.rms[name]:.3g}", own, f"{found.expected[name]:.3g}", f"{found.whiteness[name]:.2g}"
         add_row(table, f"innovation of {name}, rms [{signal.unit}]", "", *cells)
     return table
 
