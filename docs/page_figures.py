@@ -371,6 +371,34 @@ def bode() -> Figure:
     return malta.report.bode(spec.plant, malta.synthesize(spec, model))
 
 
+def positioning() -> Figure:
+    """|S| of the positioning system of docs/howto/structured.md at the corners of its box, with two laws."""
+    from malta import structured
+
+    inertia, load = 1e-6, 1.15e-7  # kg m^2
+    laws = {"tuned at nominal parameters": (8.0426e-5, 1.7952, 860.61, 358.41, 0.042484, 0.61949),
+            "tuned until the proof closes": (6.907e-5, 1.6407, 260.03, 377.74, 0.0078568, 0.71245)}  # fmt: skip
+    w = np.unique(
+        np.concatenate([np.geomspace(10, 1000, 150), np.linspace(285, 305, 80), np.linspace(380, 405, 100)])
+    )
+    s = 1j * w
+    figure, panels = new_figure(2)
+    for axes, (title, (k0, zero, pole, *notch)) in zip(panels, laws.items(), strict=True):
+        law = (
+            structured.gain("k", k0) * structured.lead("lead", zero, pole) * structured.notch("notch", *notch)
+        )
+        K = law.system.response(s)[:, 0, 0]
+        for share in product((0.5, 1.5), (0.5, 1.5), (0.5, 1.5), (0.75, 1.0, 1.25)):
+            b1, b2, b12, k = np.array([1e-6, 1e-6, 5e-7, 0.013]) * share
+            shaft = b12 * s + k
+            P = shaft / ((inertia * s**2 + b1 * s + shaft) * (load * s**2 + b2 * s + shaft) - shaft**2)
+            axes.loglog(w, np.abs(1 / (1 + P * K)), color="#3b6ea5", linewidth=0.7)
+        axes.axhline(1.3, color="#b5432a", linewidth=1, linestyle="--", label="1.3")
+        axes.set_ylim(0.1, 12)
+        finish(axes, "w [rad/s]", "|S|", title)
+    return figure
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "value_sets": value_sets,
     "cell": cell,
@@ -382,6 +410,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "frames": frames,
     "current_noise": current_noise,
     "bode": bode,
+    "positioning": positioning,
 }
 
 

@@ -72,7 +72,7 @@ class Effort:
     least : relative decrease of the merit below which steps count as none
     """
 
-    steps: int = 60
+    steps: int = 80
     enough: float = 0.0
     least: float = 1e-5
 

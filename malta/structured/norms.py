@@ -27,6 +27,7 @@ RISE = 1e-7  # relative, above the largest gain that was found, at which a searc
 NEAR = 1e-6  # |Re| of an eigenvalue over its size, up to which it may lie on the imaginary axis
 ROUNDS = 9  # of the refinement of a peak
 POINTS = 9  # in each of them
+SHARES = (0.7, 0.85, 0.95, 0.99)  # of the largest gain: maxima are looked for between their crossings
 LEVELS = 30  # at most
 
 
@@ -107,21 +108,27 @@ def peak_gain(system: System) -> tuple[float, float]:
     return best, where
 
 
-def peaks_of(system: System, share: float = 0.7) -> list[Peak]:
-    """The largest gain of a stable system between each two frequencies at which it crosses a share of its peak."""
+def peaks_of(system: System) -> list[Peak]:
+    """The local maxima of a stable system's gain that come near the largest one.
+
+    One that rises above a share of the largest, between places where the gain is below it, is found for certain: these
+    places are eigenvalues of a Hamiltonian matrix.
+    """
     system = balanced(system)
     best, where = peak_gain(system)
     if not math.isfinite(best) or best == 0.0:
         return []
     scale = where if 0 < where < math.inf else _middle_of(system)
-    ends = _crossings(system, share * best) if len(system.A) else np.zeros(0)
-    angle = np.concatenate([[0.0], 2 * np.arctan(ends / scale), [math.pi]])
-    low, high = angle[:-1], angle[1:]
-    keep = high - low > 1e-9
-    low, high = low[keep], high[keep]
-    inside = _sizes(system, _frequency((low + high) / 2, scale)) > share * best * (1 - 1e-9)
-    low, high = low[inside], high[inside]
-    found = [_refined(system, a, b, scale) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
+    poles = np.linalg.eigvals(system.A) if len(system.A) else np.zeros(0)
+    levels = [_crossings(system, share * best) for share in SHARES] if len(poles) else []
+    w = np.concatenate([np.abs(poles), [where], *levels])
+    at = np.unique(np.concatenate([[0.0, math.pi], 2 * np.arctan(w / scale)]))
+    angle = np.unique(np.concatenate([at, (at[1:] + at[:-1]) / 2]))
+    sizes = _sizes(system, _frequency(angle, scale))
+    before, after = np.append(-np.inf, sizes[:-1]), np.append(sizes[1:], -np.inf)
+    tops = np.flatnonzero((sizes >= before) & (sizes > after) & (sizes > SHARES[0] * best))
+    low, high = angle[np.maximum(tops - 1, 0)], angle[np.minimum(tops + 1, len(angle) - 1)]
+    found = [_peak_at(system, w) for w in _refined(system, low, high, scale).tolist()]
     if not found or max(peak.value for peak in found) < best * (1 - 1e-6):
         found.append(_peak_at(system, where))
     return found
@@ -140,17 +147,17 @@ def _frequency(angle: FloatArray, scale: float) -> FloatArray:
     return np.where(angle >= math.pi - 1e-12, np.inf, w)
 
 
-def _refined(system: System, low: float, high: float, scale: float) -> Peak:
-    """The largest gain between two angles."""
+def _refined(system: System, low: FloatArray, high: FloatArray, scale: float) -> FloatArray:
+    """The frequency of the largest gain between each two angles."""
+    rows = np.arange(len(low))
     where = high
     for _ in range(ROUNDS):
-        angle = np.linspace(low, high, POINTS)
-        sizes = _sizes(system, _frequency(angle, scale))
-        k = int(sizes.argmax())
-        low, high, where = float(angle[max(k - 1, 0)]), float(angle[min(k + 1, POINTS - 1)]), float(angle[k])
-        if high - low < 1e-9:
-            break
-    return _peak_at(system, float(_frequency(np.array([where]), scale)[0]))
+        angle = np.linspace(low, high, POINTS, axis=1)
+        sizes = _sizes(system, _frequency(angle.ravel(), scale)).reshape(angle.shape)
+        k = sizes.argmax(axis=1)
+        where = angle[rows, k]
+        low, high = angle[rows, np.maximum(k - 1, 0)], angle[rows, np.minimum(k + 1, POINTS - 1)]
+    return _frequency(where, scale)
 
 
 def _peak_at(system: System, w: float) -> Peak:

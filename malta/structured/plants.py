@@ -6,10 +6,9 @@ loops without loads that the proof of the margin is of.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,23 +35,6 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
 
 Values = Mapping[str, float]
-
-
-class Target(Protocol):
-    """What a law is tuned for."""
-
-    @property
-    def nominal(self) -> list[Model]:
-        """Its models at nominal parameters."""
-
-    def at(self, values: Values, *, goals: bool) -> Model:
-        """Its model at parameters, and at states as the stroke."""
-
-    def margin(self, law: System, ranges: Ranges, time: float | None) -> Margin:
-        """The proven margin of a continuous law."""
-
-    def gains(self, law: System, goal: Goal, ranges: Ranges, time: float | None) -> dict[str, Gain]:
-        """The proven peaks of a goal's |S| over the ranges, by channel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,10 +206,3 @@ def target_of(
             CALLER, "sample_time", f"{sample_time} s", "none: systems of python-control have their own"
         )
     return Systems(tuple(models_of_systems(plant)))
-
-
-def corner_names(ranges: Ranges) -> list[str]:
-    """Names of ranges in their order. Raises InputError for none."""
-    if not ranges:
-        raise InputError(CALLER, "ranges", "no parameter", 'some, as {"m": 0.2}')
-    return list(itertools.chain(ranges))

@@ -1,20 +1,18 @@
 """A law of a given structure whose goals hold, proven over the parameters: tune, prove, add what refutes it, repeat.
 
 1. The law is searched for all models so far, at first those at nominal parameters.
-2. The margin of the loop is proven, and the peaks of |S| over the box. Where a bound is above what is asked for, the
+2. The margin of the loop is proven, and the peaks of |S| over the box. Where one is worse than what is asked for, its
    witness is a plant that refutes the law: it becomes a model, as far out as the margin asks.
 3. This ends when the proofs hold what is asked for, or when they cannot, which the certificate says then.
 """
 
 from __future__ import annotations
 
-import math
+import itertools
 import time as clock
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
@@ -23,7 +21,7 @@ from malta.processes import on_one_thread
 from malta.proof.margin import Margin, Ranges
 from malta.structured.elements import CALLER, Structure, places_of, sample_law
 from malta.structured.goals import Goal
-from malta.structured.loops import ClosedLoop, Model
+from malta.structured.loops import Model
 from malta.structured.minimax import Look
 from malta.structured.plants import Machine, Systems, Uncertain, Values, target_of
 from malta.structured.search import ROOM, Task, contradiction, random_starts, rate_of, search
@@ -131,7 +129,7 @@ def tune(
 ) -> Tuned:
     """Find the parameters of a law's elements that meet goals, and prove what they promise over ranges of parameters.
 
-    plant : a control system, or several that one law shall hold; what `malta.uncertain` makes; or a Plant
+    plant : a control system, or several that one law shall hold; an uncertain system, from `malta.uncertain`; a Plant
     law : elements by the outputs whose errors they take, for the input of the same index; one element from all errors
         to all inputs; or places (left, element, right), as for the coordinates of a centre of gravity
     goals : of malta.structured; hard ones hold, the largest soft one is made small
@@ -256,20 +254,24 @@ def _search(task: Task, starts: Sequence[Any]) -> Look:
 
 
 def _rounds(asked: _Asked, task: Task, starts: Sequence[Any]) -> tuple[Task, Look, Proof, int]:
-    """Tune and prove until the proof closes, or cannot."""
+    """Tune and prove until the proof closes, or cannot: then the last law that meets the goals stands."""
     look = _search(task, starts)
-    for count in range(1, ROUNDS + 1):
+    for count in itertools.count(1):
         proof = asked.prove(task.structure.system(look.x))
         known = {(model.name, model.goals) for model in task.models}
         new = tuple(m for m in proof.refuting if (m.name, m.goals) not in known)
-        if proof.closed or asked.ranges is None or not new or count == ROUNDS:
-            return task, look, proof, count
-        task = replace(task, models=(*task.models, *new))
+        if proof.closed or not new or count == ROUNDS:
+            break
+        more = replace(task, models=(*task.models, *new))
         try:
-            look = _search(task, [look.x])
+            look = _search(more, [look.x])
         except (CheckError, InputError):
-            look = _search(task, [look.x, *starts])
-    raise AssertionError("unreachable")
+            try:
+                look = _search(more, [look.x, *starts])
+            except (CheckError, InputError):
+                break
+        task = more
+    return task, look, proof, count
 
 
 def _reached(look: Look, goals: Sequence[Goal]) -> dict[str, float]:
@@ -279,11 +281,3 @@ def _reached(look: Look, goals: Sequence[Goal]) -> dict[str, float]:
         own = [f.value for f in look.figures if f.key[1] == goal.name]
         found[goal.name] = max(own, default=0.0) / (1 + ROOM if goal.hard else 1.0)
     return found
-
-
-def figures_of(model: Model, structure: Structure, goals: Sequence[Goal]) -> dict[str, float]:
-    """The largest figure of each goal on a model at the structure's present values; infinite where it is unstable."""
-    loop = ClosedLoop(model, structure.theta(np.zeros(len(structure.parameters)))[0])
-    if not loop.growth < 0:
-        return {goal.name: math.inf for goal in goals}
-    return {goal.name: max((f.value for f in goal.figures(loop)), default=0.0) for goal in goals}
