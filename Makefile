@@ -76,12 +76,15 @@ links: $(VENV)/docs  # needs a network
 bench: $(VENV)/dev  # with PAGE=docs/benchmarks.md it writes that page
 	$(BIN)/python bench/run.py $(if $(PAGE),--page $(PAGE))
 
-figures: $(VENV)/runtime  # the pictures of the README and of the theory pages
+figures: $(VENV)/dev  # the pictures of the README, of the theory pages and of the gallery
 	$(BIN)/python docs/page_figures.py
 	$(BIN)/python -c "import malta; c = malta.gains.read('design/gains/calibrated.json'); \
 	  run = malta.simulate(malta.plant_of(c.parameters), c, malta.Scenario.stroke()); \
 	  malta.report.stroke(run, 'design/figures/stroke.svg', malta.published('data/tubular.toml'))"
 	$(BIN)/malta plot design/gains/calibrated.json marginmap --x K_A --y K_B --out design/figures/margin_map.svg
+	$(BIN)/malta simulate design/gains/calibrated.json --scenario stroke --out build
+	$(BIN)/malta motion design/gains/calibrated.json build/calibrated_stroke.npz --out design/figures/stroke.gif
+	$(BIN)/python docs/gallery.py
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \

@@ -28,7 +28,7 @@ from malta.cli.identification import excite, identify, learn, log, replay
 from malta.cli.measure import measure
 from malta.cli.output import interruption, print_error, print_note, silence
 from malta.cli.report import compare, plot, report
-from malta.cli.simulate import simulate
+from malta.cli.simulate import motion, simulate
 from malta.cli.verify import check, verify
 from malta.errors import CheckError, InputError, shorten
 from malta.files import is_interrupt, noting_files
@@ -195,7 +195,7 @@ def _first_line(command: Callable[..., None]) -> str:
 GROUPS: dict[str, tuple[Callable[..., None], ...]] = {  # the order of the help
     "Commands": (design, verify, check, simulate, campaign, tune),
     "From the bench": (excite, log, identify, learn, replay, measure, commission),
-    "Pages and pictures": (plot, report, compare, live_page, claims),
+    "Pages and pictures": (plot, report, compare, motion, live_page, claims),
     "For other programs": (export, pil, schema),
     "A machine of your own": (new,),
 }

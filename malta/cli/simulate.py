@@ -325,3 +325,41 @@ def _conclude(gains: Path, simulation: Simulation, engine: str) -> None:
         raise typer.Exit(130)
     if result.failed:
         raise CheckError(f"{gains}: {simulation.scenario}: {result.outcome}")
+
+
+# `malta motion`: the bodies of a machine as they move in a run, from the run's file.
+
+
+def motion(
+    gains: GainFile,
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A .npz file of malta simulate --out.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="A page (.html) or an animated picture (.gif). [build/RUN_motion.html]"
+        ),
+    ] = None,
+    machine: MachineFile = None,
+) -> None:
+    """Show the machine in motion: its bodies in three dimensions, as they move in a run.
+
+    The page needs no network: drag the machine to turn it, go through time with the scrubber, magnify small motion.
+    Bodies are those that the machine's module describes: Plant(bodies=...).
+
+    \b
+    Example:  malta motion design/gains/calibrated.json build/calibrated_stroke.npz
+    """
+    from malta.files import replace_files
+    from malta.model.data import plant_of
+    from malta.report.page.motion import motion_gif, motion_page, read_motion
+
+    controller = read_controller(gains, machine)
+    file = out or Path("build") / f"{run.stem}_motion.html"
+    if file.suffix not in (".html", ".gif"):
+        raise InputError("--out", "", f"suffix {file.suffix!r}", ".html or .gif")
+    plant = plant_of(controller.parameters)
+    found = read_motion(run, plant)
+    about = f"Design {controller.name}, machine {plant.name}"
+    content = motion_gif(found) if file.suffix == ".gif" else motion_page(found, about).content
+    replace_files({file: content})
+    print_written(make_console(), [file])

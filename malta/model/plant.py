@@ -8,7 +8,7 @@ machine moves by f(x, u, w + load(x)), and the controller is designed for f(x, u
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from malta.model.linearize import InverseCheck
+    from malta.model.rigidbody import Body
 
     FloatArray = NDArray[np.floating[Any]]
     ComplexArray = NDArray[np.complexfloating[Any, Any]]
@@ -161,6 +162,7 @@ class Plant:
     stroke : the output that the stroke moves; "": the machine has no stroke, travel, thrust and mass
     travel : of the stroke, either way, m
     over : intervals of parameters that proofs cover, SI, as any speed of a rotor: {"Omega": (0, 2094)}
+    bodies : () -> what pictures of the machine in motion show, see `malta motion`; None: no pictures
 
     >>> import malta
     >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
@@ -204,6 +206,7 @@ class Plant:
     stroke: str = ""
     travel: float = 0.0
     over: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    bodies: Callable[[], Sequence[Body]] | None = None
 
     def __post_init__(self) -> None:
         for name, value in defaults(self).items():

@@ -14,9 +14,31 @@ NOTE: eq. (4) writes the Cardan rates as components of an angular velocity in fr
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
+
+
+class Body(NamedTuple):
+    """A body of a machine as pictures show it; nothing is computed of it.
+
+    name : as "mover"
+    form : "box", or "cylinder", whose axis is z
+    size : along x, y and z, m
+    place : of its middle, m, beside what it moves by
+    moves : states that move it along x, y, z and turn it by Cardan angles about them, "" for none; (): it stands still
+
+    >>> import malta
+    >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
+    >>> [(body.name, body.moves[:3]) for body in plant.bodies()]
+    [('module 1', ()), ('module 2', ()), ('mover', ('x', 'y', 'z'))]
+    """
+
+    name: str
+    form: Literal["box", "cylinder"]
+    size: tuple[float, float, float]
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    moves: tuple[str, ...] = ()
 
 
 class Trig(NamedTuple):

@@ -14,7 +14,9 @@ from typing import Any
 import pytest
 from conftest import ROOT
 from docstrings import to_rest
+from gallery import FOLDER, cards, few_colours
 from links import broken_links
+from PIL import Image
 from public import all_names, docstring_of, names_of
 from typer.main import get_command
 
@@ -137,3 +139,26 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     known = {found for text in pages.values() for found in re.findall(r'id="(malta\.[\w.]+)"', text)}
     assert set(all_names()) <= known
     assert json.loads((tmp_path / "site" / "schemas" / "gain.json").read_text())["title"] == "malta gain file"
+
+
+def test_every_card_of_the_gallery_has_a_command_and_small_pictures() -> None:
+    """Light and dark, made of commands that exist; all of them together stay small."""
+    page = (DOCS / "index.md").read_text(encoding="utf-8")
+    found = cards(page)
+    assert len(found) == page.count(":::{grid-item-card}") >= 20
+    program: Any = get_command(app)
+    for line in "\n".join(found.values()).replace(" && ", "\n").splitlines():
+        name, *arguments = shlex.split(line)[1:]
+        command = program.commands[name]
+        command.make_parser(command.context_class(command, info_name=name)).parse_args(arguments)
+    files = {f"{name}{suffix}.png" for name in found for suffix in ("", "_dark")}
+    assert {file.name for file in FOLDER.iterdir()} == files
+    assert sum(file.stat().st_size for file in FOLDER.iterdir()) < 600_000
+
+
+def test_a_picture_of_few_colours_keeps_its_paper() -> None:
+    picture = Image.new("RGB", (90, 60), (26, 26, 26))
+    for k in range(60):
+        picture.putpixel((k, k), (4 * k, 200, 255 - 4 * k))
+    small = few_colours(picture).convert("RGB")
+    assert small.getpixel((80, 5)) == (26, 26, 26)

@@ -43,6 +43,7 @@ from malta.model.plant import (
     Plant,
     Signal,
 )
+from malta.model.rigidbody import Body
 
 
 @dataclass(frozen=True)
@@ -145,4 +146,14 @@ def plant(par: Parameters) -> Plant:
         stroke="x",
         travel=par.travel,
         variant=plant,
+        bodies=partial(_bodies, par),
+    )
+
+
+def _bodies(par: Parameters) -> tuple[Body, ...]:
+    """A slider above the magnets; the source prints no sizes but those of the travel and the gap."""
+    size = par.travel
+    return (
+        Body("magnets", "box", (4 * size, size, 0.3 * size), (0.0, 0.0, -0.3 * size - par.z_0)),
+        Body("slider", "box", (1.5 * size, size, 0.3 * size), moves=("x",)),
     )

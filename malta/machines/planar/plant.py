@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import partial
 from numbers import Real
 from typing import Any
 
@@ -42,6 +43,7 @@ from malta.model.plant import (
     trace,
 )
 from malta.model.rigidbody import (
+    Body,
     acceleration,
     principal_angles,
     rotate,
@@ -179,6 +181,19 @@ def plant(par: Parameters) -> Plant:
         stroke="y",
         travel=par.xy_max,
         variant=plant,
+        bodies=partial(_bodies, par),
+    )
+
+
+def _bodies(par: Parameters) -> tuple[Body, ...]:
+    """As the mover the plate of even density with its mass and moments of inertia; the magnets lie under its travel."""
+    side = math.sqrt(6 * par.I_z / par.m)
+    height = math.sqrt(max(12 * par.I_x / par.m - side**2, (0.05 * side) ** 2))
+    wide, thick = side + 2 * par.xy_max, 0.05 * side
+    moves = tuple(s.name for s in POSITIONS)
+    return (
+        Body("magnets", "box", (wide, wide, thick), (0.0, 0.0, -(thick + height) / 2)),
+        Body("mover", "box", (side, side, height), moves=moves),
     )
 
 

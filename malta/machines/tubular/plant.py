@@ -35,6 +35,7 @@ from malta.model.plant import (
 from malta.model.rigidbody import (
     EXACT,
     SMALL_ANGLE,
+    Body,
     Trig,
     acceleration,
     principal_angles,
@@ -190,8 +191,22 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
         mass=par.m,
         thrust="f_D",
         stroke="z",
+        bodies=partial(_bodies, par),
         variant=partial(plant, small_angle=small_angle),
     )
+
+
+def _bodies(par: Parameters) -> tuple[Body, ...]:
+    """The modules, whose bore is drawn wide for magnified motion; the mover as a cylinder of its mass and inertia."""
+    radius = math.sqrt(2 * par.I_zz / par.m)
+    length = math.sqrt(max(12 * par.I_xx / par.m - 3 * radius**2, radius**2))
+    bore = 2.6 * radius
+    modules = (
+        Body(f"module {k + 1}", "cylinder", (bore, bore, 1.8 * par.l_B), (0.0, 0.0, sign * par.l_B))
+        for k, sign in enumerate((-1, 1))
+    )
+    moves = tuple(s.name for s in POSITIONS)
+    return (*modules, Body("mover", "cylinder", (2 * radius, 2 * radius, length), moves=moves))
 
 
 def _actuator(par: Parameters, constants: tuple[float, ...]) -> Actuator:

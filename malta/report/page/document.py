@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import html
 import io
 import re
@@ -275,10 +277,10 @@ def render(
         for section in sections
     ]
     title = f"{front.heading}: {front.kind.lower()}"
-    text = _environment().get_template("page.html.jinja").render(
-        title=title, kind=front.kind, heading=front.heading, about=front.about, figures=front.figures,
-        foot=front.foot, verdict=Markup(front.verdict),
-        sections=parts, style=Markup(_style()), inks=Markup(f"{_inks([rules])}\n{rules}"),
+    text = render_template(
+        "page.html.jinja", title=title, kind=front.kind, heading=front.heading, about=front.about,
+        figures=front.figures, foot=front.foot, verdict=Markup(front.verdict),
+        sections=parts, style=Markup(page_style()), inks=Markup(f"{_inks([rules])}\n{rules}"),
     )  # fmt: skip
     return Page(title, text, tuple((picture.caption, picture) for picture in pictures))
 
@@ -305,6 +307,11 @@ def _inks(texts: Any) -> str:
     return f":root{{{light}}}\n@media screen and (prefers-color-scheme: dark){{:root{{{dark}}}}}"
 
 
+def render_template(name: str, **values: Any) -> str:
+    """A page of a template beside this module; texts are escaped but for those of the class Markup."""
+    return str(_environment().get_template(name).render(**values))
+
+
 @cache
 def _environment() -> jinja2.Environment:
     import jinja2
@@ -321,6 +328,14 @@ def _environment() -> jinja2.Environment:
     return environment
 
 
+def script_of(text: str) -> tuple[str, str]:
+    """The policy of a page that runs this script and asks no network, and the element of the script."""
+    digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    policy = f"default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src 'sha256-{digest}'"
+    return policy, f"<script>{text}</script>"
+
+
 @cache
-def _style() -> str:
+def page_style() -> str:
+    """The style of all pages."""
     return Path(__file__).with_name("style.css").read_text(encoding="utf-8")

@@ -1,0 +1,321 @@
+"""A machine in motion: its bodies as they move in a run, as a page with a scrubber or as an animated picture.
+
+A coordinate that moves little beside the size of the machine is magnified, so that one sees what sensors see. Bodies
+are those of `Plant.bodies`; nothing is computed of them.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from malta.archives import read_npz
+from malta.errors import InputError
+from malta.files import read_file
+from malta.model.rigidbody import Body, rotation
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+    from malta.model.plant import FloatArray, Plant
+    from malta.report.page.document import Page
+
+FRAMES = 240  # of a page
+SIDES = 28  # of a cylinder
+SMALL = 0.01  # of the largest body: what moves less is magnified
+SHOWN = 0.12  # of the smallest side of a moving body: the largest magnified motion
+VIEW = (math.radians(-38), math.radians(24))  # turn about the upright axis, and height of the eye
+INKS: Mapping[str, tuple[int, int, int]] = {
+    "paper": (255, 255, 255), "mover": (86, 143, 196), "still": (150, 150, 150), "text": (40, 44, 48),
+    "trace": (125, 41, 6),
+}  # fmt: skip
+
+
+class Mesh(NamedTuple):
+    """A body as flat faces: points in its own frame, m, and the points of each face in order."""
+
+    points: FloatArray  # n x 3
+    faces: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The bodies of a machine, and how they move in a run.
+
+    title : of the run
+    t : s, of each frame
+    bodies : of the machine
+    poses : of each body, frames x 6: place (m) and Cardan angles (rad)
+    up : the axis that points up, 0 to 2
+    small : the coordinates that are magnified, of each body
+    factor : by which, as a first choice
+    signals : series of numbers beside the picture, by their names with units, frames each
+    """
+
+    title: str
+    t: FloatArray
+    bodies: tuple[Body, ...]
+    poses: FloatArray
+    up: int
+    small: FloatArray
+    factor: float
+    signals: Mapping[str, FloatArray]
+
+
+def mesh_of(body: Body) -> Mesh:
+    """The faces of a box or of a cylinder about z.
+
+    >>> from malta.model.rigidbody import Body
+    >>> len(mesh_of(Body("plate", "box", (1.0, 1.0, 0.1))).faces)
+    6
+    """
+    half = np.array(body.size) / 2
+    if body.form == "box":
+        signs = np.array([[x, y, z] for z in (-1, 1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+        around = tuple((k, (k + 1) % 4, 4 + (k + 1) % 4, 4 + k) for k in range(4))
+        return Mesh(signs * half, ((3, 2, 1, 0), (4, 5, 6, 7), *around))
+    turn = 2 * np.pi * np.arange(SIDES) / SIDES
+    ring = np.column_stack([half[0] * np.cos(turn), half[1] * np.sin(turn)])
+    points = np.vstack([np.column_stack([ring, np.full(SIDES, side * half[2])]) for side in (-1, 1)])
+    next_of = [(k + 1) % SIDES for k in range(SIDES)]
+    around = tuple((k, next_of[k], SIDES + next_of[k], SIDES + k) for k in range(SIDES))
+    return Mesh(points, (tuple(range(SIDES - 1, -1, -1)), tuple(range(SIDES, 2 * SIDES)), *around))
+
+
+def read_motion(file: str | Path, plant: Plant, *, frames: int = FRAMES) -> Motion:
+    """Read how a machine moves from the file of a run, as `malta simulate --out` writes them.
+
+    file : a .npz file
+    plant : the machine
+    frames : at most so many
+
+    Raises InputError for a machine without bodies, and a file that is none of a run of it.
+    """
+    if plant.bodies is None:
+        raise InputError(plant.name, "bodies", "none", "bodies of the machine: Plant(bodies=...)")
+    arrays = _series(Path(file), plant)
+    kept = np.unique(np.linspace(0, len(arrays["t"]) - 1, frames).astype(int))
+    states = dict(zip((s.name for s in plant.states), arrays["x"][kept].T, strict=True))
+    bodies = tuple(plant.bodies())
+    poses = np.stack([_poses(body, states, len(kept)) for body in bodies])
+    small, factor = _magnified(bodies, poses)
+    signals = {
+        str(name): np.asarray(arrays[key][kept, k])
+        for key in ("p", "v")
+        for k, name in enumerate(arrays[f"{key}_columns"])
+    }
+    return Motion(Path(file).stem, arrays["t"][kept], bodies, poses, _upright(plant), small, factor, signals)
+
+
+def _series(file: Path, plant: Plant) -> Mapping[str, Any]:
+    """Times, states, outputs and commands of a run. Raises InputError for another file, and another machine's."""
+    kind = "run, a .npz file of malta simulate"
+    content = read_file(file, kind, Path.read_bytes)
+    try:
+        arrays = read_npz(content)
+    except ValueError as error:
+        raise InputError(file, "", str(error), f"a {kind}") from error
+    t = arrays.get("t", np.zeros((0, 0)))
+    if t.ndim != 1 or not len(t):
+        raise InputError(file, "t", "no times", f"a {kind}")
+    for key, signals in (("x", plant.states), ("p", plant.outputs), ("v", plant.inputs)):
+        names = [f"{s.name} [{s.unit}]" for s in signals]
+        columns = [str(name) for name in np.ravel(arrays.get(f"{key}_columns", []))]
+        if columns != names:
+            raise InputError(
+                file, f"{key}_columns", " ".join(columns[:4]) or "none", f"those of {plant.name}"
+            )
+        values = arrays.get(key)
+        if values is None or values.shape != (len(t), len(names)) or not np.isfinite(values).all():
+            raise InputError(file, key, "no numbers of every time", f"{len(t)} x {len(names)} finite numbers")
+    return arrays
+
+
+def _poses(body: Body, states: Mapping[str, FloatArray], count: int) -> FloatArray:
+    """Place and Cardan angles of a body in every frame."""
+    columns = [states.get(name, np.zeros(count)) for name in (*body.moves, *[""] * (6 - len(body.moves)))]
+    return np.asarray(np.column_stack(columns) + np.append(body.place, np.zeros(3)))
+
+
+def _upright(plant: Plant) -> int:
+    """The axis against which the weight of the mover acts; z where none is told."""
+    names = [s.name for s in plant.disturbances]
+    if not {"F_x", "F_y", "F_z"} <= {*names}:
+        return 2
+    load = np.abs(np.array(ca.DM(plant.load(ca.DM.zeros(len(plant.states))))).ravel())
+    size = [load[names.index(f"F_{axis}")] for axis in "xyz"]
+    return int(np.argmax(size)) if max(size) > 0 else 2
+
+
+def _magnified(bodies: Sequence[Body], poses: FloatArray) -> tuple[FloatArray, float]:
+    """Which coordinates of each body are magnified, and a factor of 1, 2 or 5 times a power of ten that shows them."""
+    largest = max(max(body.size) for body in bodies)
+    arm = np.array([[1, 1, 1, *[max(body.size) / 2] * 3] for body in bodies])
+    reach = arm * np.abs(poses - poses.mean(axis=1, keepdims=True)).max(axis=1)
+    moving = np.array([[bool(body.moves)] * 6 for body in bodies])
+    small = moving & (reach < SMALL * largest)
+    most = float((reach * small).max(initial=0.0))
+    if most <= 0:
+        return small, 1.0
+    shown = SHOWN * min(min(body.size) for body in bodies if body.moves) / most
+    power = 10.0 ** math.floor(math.log10(max(shown, 1.0)))
+    return small, max(step * power for step in (1, 2, 5) if step * power <= max(shown, 1.0))
+
+
+def placed(mesh: Mesh, pose: FloatArray) -> FloatArray:
+    """The points of a body in the frame of the stator, n x 3."""
+    return np.asarray(mesh.points @ np.array(ca.DM(rotation(pose[3:]))) + pose[:3])
+
+
+def camera(up: int, turn: float, height: float) -> FloatArray:
+    """Rows: to the right, up and towards the eye, for the upright axis `up`."""
+    upright, across, along = (np.eye(3)[(up + k) % 3] for k in range(3))
+    eye = math.cos(height) * (math.cos(turn) * across + math.sin(turn) * along) + math.sin(height) * upright
+    right = np.cross(upright, eye)
+    right /= np.linalg.norm(right)
+    return np.vstack([right, np.cross(eye, right), eye])
+
+
+def magnify(found: Motion, k: int, body: int, factor: float) -> FloatArray:
+    """The pose of a body in a frame, small motion about its mean times a factor."""
+    pose, rest = found.poses[body, k], found.poses[body].mean(axis=0)
+    return np.asarray(np.where(found.small[body], rest + factor * (pose - rest), pose))
+
+
+def motion_gif(found: Motion, *, size: tuple[int, int] = (520, 320), frames: int = 60) -> bytes:
+    """Draw the motion as an animated picture, which repeats.
+
+    size : pixels
+    frames : so many, evenly over the run
+    """
+    from PIL import Image
+
+    meshes = [mesh_of(body) for body in found.bodies]
+    view = camera(found.up, *VIEW)
+    ends = np.vstack([placed(mesh, magnify(found, k, n, found.factor)) @ view.T
+                      for n, mesh in enumerate(meshes) for k in (0, len(found.t) // 2, len(found.t) - 1)])  # fmt: skip
+    shown = np.unique(np.linspace(0, len(found.t) - 1, frames).astype(int))
+    pictures = [_draw_frame(found, int(k), meshes, view, ends, size) for k in shown]
+    palette = pictures[len(pictures) // 2].quantize(32, Image.Quantize.MAXCOVERAGE)
+    drawn = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    buffer = io.BytesIO()
+    drawn[0].save(buffer, "GIF", save_all=True, append_images=drawn[1:], duration=66, loop=0, optimize=True)
+    return buffer.getvalue()
+
+
+def motion_page(found: Motion, about: str = "") -> Page:
+    """Write the motion as one page in HTML that needs no network: turned by dragging, with a scrubber.
+
+    about : a line below the title
+    """
+    from markupsafe import Markup
+
+    from malta.report.page.document import Page, page_style, render_template, script_of
+
+    meshes = [mesh_of(body) for body in found.bodies]
+    upright = camera(found.up, 0.0, 0.0)
+    data = {
+        "t": _rounded(found.t), "view": VIEW, "factor": found.factor, "up": np.eye(3)[found.up].tolist(),
+        "across": upright[2].tolist(), "along": upright[0].tolist(),
+        "reach": max(float(np.linalg.norm(body.size)) for body in found.bodies),
+        "bodies": [
+            {"points": _rounded(mesh.points), "faces": mesh.faces, "poses": _rounded(poses), "moves": bool(body.moves),
+             "mean": _rounded(poses.mean(axis=0)), "small": small.tolist()}
+            for body, mesh, poses, small in zip(found.bodies, meshes, found.poses, found.small, strict=True)
+        ],
+        "signals": [
+            {"name": name.partition(" ")[0], "k": k, **_in_fine_unit(name, values)}
+            for k, (name, values) in enumerate(found.signals.items())
+        ],
+    }  # fmt: skip
+    policy, script = script_of(Path(__file__).with_name("motion.js").read_text(encoding="utf-8"))
+    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
+    page = render_template(
+        "motion.html.jinja", title=found.title, about=about, style=Markup(page_style()), script=Markup(script),
+        policy=policy, data=Markup(text),
+    )  # fmt: skip
+    return Page(f"{found.title}: in motion", page)
+
+
+def _in_fine_unit(name: str, values: FloatArray) -> dict[str, Any]:
+    """A series in a unit in which its numbers are short: micrometres, or millimetres beyond a tenth of one."""
+    unit, largest = name.partition("[")[2].rstrip("]"), float(np.abs(values).max(initial=0.0))
+    factor, prefix = (1.0, "") if unit not in ("m", "rad") else (1e6, "µ") if largest < 1e-4 else (1e3, "m")
+    return {"unit": prefix + unit, "values": _rounded(factor * values)}
+
+
+def _rounded(values: FloatArray) -> Any:
+    """Numbers with six digits, as lists."""
+    flat = [float(f"{value:.6g}") for value in np.ravel(values)]
+    return np.reshape(flat, np.shape(values)).tolist()
+
+
+def _draw_frame(
+    found: Motion, k: int, meshes: Sequence[Mesh], view: FloatArray, ends: FloatArray, size: tuple[int, int]
+) -> Image.Image:
+    """A frame at twice the size, made smaller: still bodies as edges, moving ones as faces, the time and a trace."""
+    from matplotlib import get_data_path
+    from PIL import Image, ImageDraw, ImageFont
+
+    big = (2 * size[0], 2 * size[1])
+    picture = Image.new("RGB", big, INKS["paper"])
+    pen = ImageDraw.Draw(picture)
+    low, high = ends.min(axis=0), ends.max(axis=0)
+    scale = 0.9 * min(big[0] / (high[0] - low[0]), 0.74 * big[1] / (high[1] - low[1]))
+    middle = np.array([big[0] / 2, 0.47 * big[1]])
+    polygons = []
+    for n, (body, mesh) in enumerate(zip(found.bodies, meshes, strict=True)):
+        points = placed(mesh, magnify(found, k, n, found.factor)) @ view.T
+        flat = middle + scale * (points[:, :2] - (low + high)[:2] / 2) * [1, -1]
+        for face in mesh.faces:
+            a, b, c = points[list(face[:3])]
+            normal = np.cross(b - a, c - a)
+            normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
+            outline = [(float(x), float(y)) for x, y in flat[list(face)]]
+            polygons.append((float(points[list(face), 2].mean()), bool(body.moves), normal, outline))
+    # From the back to the front: backs of still bodies, moving bodies, fronts of still ones.
+    for _, moves, normal, outline in sorted(polygons, key=lambda one: (_layer(one[1], one[2]), one[0])):
+        if moves and normal[2] > 0:
+            light = 0.62 + 0.38 * max(0.0, float(normal @ [0.25, 0.6, 0.75]))
+            pen.polygon(outline, fill=tuple(round(light * part) for part in INKS["mover"]))
+        elif not moves:
+            pen.line(
+                [*outline, outline[0]], fill=INKS["still"] if normal[2] > 0 else (205, 205, 205), width=2
+            )
+    font = ImageFont.truetype(str(Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), 26)
+    names = list(found.signals)
+    chosen = max(
+        (name for name in names if name.endswith("[m]")),
+        key=lambda name: float(np.ptp(found.signals[name])),
+        default=names[0],
+    )
+    y = found.signals[chosen]
+    left, right, top, bottom = 40, big[0] - 40, 0.86 * big[1], 0.96 * big[1]
+    along = left + (right - left) * (found.t - found.t[0]) / max(found.t[-1] - found.t[0], 1e-12)
+    across = bottom - (bottom - top) * (y - y.min()) / max(float(np.ptp(y)), 1e-300)
+    trace = [(float(a), float(b)) for a, b in zip(along, across, strict=True)]
+    pen.line(trace, fill=(200, 200, 200), width=3)
+    pen.line(trace[: k + 1], fill=INKS["trace"], width=4)
+    pen.ellipse([trace[k][0] - 8, trace[k][1] - 8, trace[k][0] + 8, trace[k][1] + 8], fill=INKS["trace"])
+    pen.text((left, 16), f"{1e3 * found.t[k]:6.1f} ms", fill=INKS["text"], font=font)
+    pen.text((right, 16), f"small motion × {found.factor:g}", fill=INKS["text"], font=font, anchor="ra")
+    pen.text(
+        (left, int(top) - 36),
+        f"{chosen.partition(' ')[0]}: {1e3 * y[k]:.2f} mm",
+        fill=INKS["trace"],
+        font=font,
+    )
+    return picture.resize(size, Image.Resampling.LANCZOS)
+
+
+def _layer(moves: bool, normal: FloatArray) -> int:
+    """The order in which faces are drawn: 0 first."""
+    return 1 if moves else 2 if normal[2] > 0 else 0

@@ -1,0 +1,160 @@
+"""A machine in motion: bodies where the states say, small motion magnified, one file without a network."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from browsing import browser as browser
+from browsing import open_page
+from conftest import ROOT, Run
+from PIL import Image
+
+import malta
+from malta.machines.tubular.plant import measured
+from malta.model.rigidbody import Body
+from malta.report.page.motion import (
+    VIEW,
+    camera,
+    magnify,
+    mesh_of,
+    motion_gif,
+    motion_page,
+    placed,
+    read_motion,
+)
+from malta.simulation.trajectory import save
+
+if TYPE_CHECKING:
+    from malta.report.page.motion import Motion
+
+GAINS = ROOT / "design" / "gains" / "calibrated.json"
+MACHINES = ("tubular", pytest.param("planar", marks=pytest.mark.slow), "halbach")
+
+
+@pytest.fixture(scope="module")
+def run_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of a stroke of 10 mm."""
+    controller = malta.gains.read(GAINS)
+    run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(10e-3))
+    return save(run, tmp_path_factory.mktemp("run") / "stroke.npz")
+
+
+@pytest.fixture(scope="module")
+def stroke(run_file: Path) -> Motion:
+    return read_motion(run_file, malta.plant_of(malta.gains.read(GAINS).parameters))
+
+
+@pytest.mark.parametrize("form", ["box", "cylinder"])
+def test_a_body_is_closed_and_its_faces_look_outwards(form: Any) -> None:
+    """Every edge belongs to two faces, which go through it in opposite directions; the volume is that of the body."""
+    mesh = mesh_of(Body("one", form, (0.2, 0.3, 0.5)))
+    edges = [(face[k], face[(k + 1) % len(face)]) for face in mesh.faces for k in range(len(face))]
+    assert len({*edges}) == len(edges)
+    assert {(b, a) for a, b in edges} == {*edges}
+    fans = [
+        (mesh.points[f[0]], mesh.points[f[k]], mesh.points[f[k + 1]])
+        for f in mesh.faces
+        for k in range(1, len(f) - 1)
+    ]
+    volume = sum(np.dot(a, np.cross(b, c)) for a, b, c in fans) / 6
+    whole = 0.2 * 0.3 * 0.5
+    assert volume == pytest.approx(whole if form == "box" else np.pi / 4 * whole, rel=0.01)
+
+
+def test_points_of_the_mover_are_where_the_sensors_see_them(stroke: Motion) -> None:
+    """The axis at a sensor plane, by the picture's rotation and by the machine's own h(x)."""
+    par: Any = malta.gains.read(GAINS).parameters
+    pose = np.array([2e-4, -1e-4, 0.0, 1e-3, -2e-3, 0.3])
+    ends = mesh_of(stroke.bodies[-1])._replace(points=np.array([[0, 0, -par.l_S], [0, 0, par.l_S]]))
+    seen = np.array(measured(par, np.append(pose, np.zeros(6)))).ravel()
+    found = placed(ends, pose)
+    assert found[:, :2].ravel().tolist() == pytest.approx(seen[:4].tolist(), abs=2e-8)
+
+
+@pytest.mark.parametrize("up", [0, 1, 2])
+def test_a_camera_keeps_lengths_and_what_is_up(up: int) -> None:
+    view = camera(up, *VIEW)
+    assert view @ view.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(view) == pytest.approx(1)
+    assert view[0] @ np.eye(3)[up] == pytest.approx(0, abs=1e-12)
+    assert view[1] @ np.eye(3)[up] > 0.5
+
+
+def test_small_motion_is_magnified_and_the_stroke_is_not(stroke: Motion) -> None:
+    mover = len(stroke.bodies) - 1
+    assert stroke.up == 1
+    assert stroke.small[mover].tolist() == [True, True, False, True, True, True]
+    assert not stroke.small[:mover].any()
+    mesh, frames = mesh_of(stroke.bodies[mover]), range(0, len(stroke.t), 4)
+    seen = np.array([placed(mesh, magnify(stroke, k, mover, stroke.factor))[:, :2] for k in frames])
+    narrow = min(stroke.bodies[mover].size)
+    assert 0.02 * narrow < np.abs(seen - seen.mean(axis=0)).max() <= 0.25 * narrow
+    axial = [magnify(stroke, k, mover, stroke.factor)[2] for k in (0, -1)]
+    assert np.diff(axial) == pytest.approx(10e-3, rel=0.01)
+
+
+def test_the_page_has_the_run_and_runs_no_other_script(stroke: Motion) -> None:
+    html = motion_page(stroke, "<b>about</b>").html
+    assert "<b>about" not in html
+    assert not re.search(r"(src|href)=\"(?!data:)", html)
+    assert re.search(r"script-src 'sha256-[\w+/]{43}='", html)
+    data = json.loads(re.findall(r"id=\"motion-data\">(.*?)</script>", html, re.DOTALL)[0])
+    assert data["bodies"][-1]["poses"][-1][2] == pytest.approx(5e-3, rel=0.02)
+    z = next(one for one in data["signals"] if one["name"] == "z")
+    assert (z["unit"], z["values"][0]) == ("mm", pytest.approx(-5, rel=1e-3))
+
+
+def test_the_picture_moves_and_is_small(stroke: Motion) -> None:
+    content = motion_gif(stroke, frames=6)
+    assert len(content) < 600_000
+    with Image.open(io.BytesIO(content)) as picture:
+        assert getattr(picture, "n_frames", 1) == 6
+        first = np.asarray(picture.convert("RGB")).astype(int)
+        picture.seek(5)
+        assert np.abs(np.asarray(picture.convert("RGB")).astype(int) - first).max() > 100
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_every_machine_shows_a_body_that_its_states_move(name: str) -> None:
+    plant = malta.plant_of(malta.read(f"data/{name}.toml"))
+    assert plant.bodies is not None
+    moves = [state for body in plant.bodies() for state in body.moves if state]
+    assert moves
+    assert {*moves} <= {s.name for s in plant.states}
+    assert all(min(body.size) > 0 for body in plant.bodies())
+
+
+def test_the_command_writes_and_refuses(run_file: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "m.html"
+    assert run("motion", GAINS, run_file, "--out", out).out.startswith("wrote ")
+    assert out.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    cut = tmp_path / "cut.npz"
+    cut.write_bytes(run_file.read_bytes()[:-300])
+    for arguments, words in (
+        ((GAINS, cut), "expected a run"),
+        ((GAINS, run_file, "--out", tmp_path / "m.pdf"), ".html or .gif"),
+        ((ROOT / "design" / "gains" / "halbach.json", run_file), "expected those of halbach"),
+    ):
+        said = run("motion", *arguments)
+        assert said.code == 2
+        assert words in said.err
+
+
+@pytest.mark.slow
+def test_the_page_runs_in_a_browser(stroke: Motion, tmp_path: Path, browser: Any) -> None:
+    """Without an error, no wider than a telephone; the scrubber moves the mover."""
+    page = motion_page(stroke).save(tmp_path / "m.html")
+    open_page(browser, page, width=390, scheme="dark")
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
+    picture = "return document.getElementById('view').toDataURL()"
+    first = browser.execute_script(picture)
+    move = "const t = document.getElementById('time'); t.value = t.max; t.dispatchEvent(new Event('input'));"
+    browser.execute_script(move)
+    assert browser.execute_script(picture) != first
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
