@@ -231,7 +231,7 @@ def measure(
     columns = columns_of(lines, w, cut.G)
     names = tuple(s.name for s in plant.outputs), tuple(s.name for s in plant.inputs)
     box = dict(uncertainty or {})
-    machines = [cut_loop(one, w) for one in _machines(predicted, box, seed)]
+    machines = [cut_loop(one, w) for one in machines_of(predicted, box, seed)]
     (S, T, L, SP, largest), deviation = _curves(columns, cut, machines)
     source = ", ".join(log.source for log in logs)
     law = _law_misses(lines, cut, w)
@@ -398,7 +398,7 @@ def cut_loop(loop: Loop, w: FloatArray) -> Cut:
     return Cut(np.asarray(P, dtype=complex), F[..., :p], F[..., p:])
 
 
-def _machines(predicted: Loop, box: Mapping[str, float], seed: int) -> list[Loop]:
+def machines_of(predicted: Loop, box: Mapping[str, float], seed: int, samples: int = SAMPLES) -> list[Loop]:
     """The machine, and those at the corners and at random places of the box, all under the same law."""
     par = predicted.plant.parameters
     names, shares = list(box), np.array(list(box.values()))
@@ -408,7 +408,7 @@ def _machines(predicted: Loop, box: Mapping[str, float], seed: int) -> list[Loop
     if not names:
         return [predicted]
     corners = list(product((-1.0, 1.0), repeat=len(names))) if len(names) <= CORNERS else []
-    random = np.random.default_rng(seed).uniform(-1, 1, (SAMPLES, len(names)))
+    random = np.random.default_rng(seed).uniform(-1, 1, (samples, len(names)))
     places = np.vstack([np.array(corners).reshape(-1, len(names)), random])
     found, at = [predicted], dict[str, Any](predicted.at)
     for place in places:
