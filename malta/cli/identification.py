@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,9 +14,11 @@ from malta.cli.options import (
     GainFile,
     MachineFile,
     Seed,
+    Uncertain,
     change_machine,
     read_assignments,
     read_controller,
+    read_uncertainty,
     verify_and_write,
 )
 from malta.cli.output import make_console, print_document, print_text, print_written, progress_bar, working
@@ -23,7 +26,7 @@ from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
     from malta.identification.excite import ExcitationPlan
-    from malta.model.plant import Plant
+    from malta.model.plant import FloatArray, Plant, Signal
     from malta.synthesis.controller import Controller
 
 
@@ -191,7 +194,11 @@ def excite(
     )  # fmt: skip
     console, files = make_console(), []
     if out is not None:
-        files.append(_write_period(out, plan, plant, controller.sample_time))
+        import numpy as np
+
+        t = controller.sample_time * np.arange(round(plan.signal.period / controller.sample_time))
+        forces = plan.signal(t)
+        files.append(_write_forces(out, controller.sample_time, plant.inputs, forces))
     if not as_json:
         f, crest = plan.signal.frequencies, plan.signal.crest_factor
         print_text(
@@ -222,19 +229,17 @@ def read_band(text: str) -> tuple[float, float]:
         raise InputError("--band", "", repr(text if dots else low), "LOW..HIGH in Hz, as 2..400") from None
 
 
-def _write_period(path: Path, plan: ExcitationPlan, plant: Plant, Ts: float) -> Path:
-    """Write one period of the excitation at the samples of the law."""
+def _write_forces(path: Path, Ts: float, signals: Sequence[Signal], forces: FloatArray) -> Path:
+    """Write forces beside the law's at its samples, a column for each name."""
     import numpy as np
 
     from malta.files import replace_files
 
     if path.suffix != ".csv":
         raise InputError(path, "", f"suffix {path.suffix!r}", ".csv")
-    t = Ts * np.arange(round(plan.signal.period / Ts))
-    heading = ",".join(["t [s]", *(f"exc.{s.name} [{s.unit}]" for s in plant.inputs)])
-    rows = "\n".join(
-        ",".join(f"{x:.9g}" for x in row) for row in np.column_stack([t, plan.signal(t)]).tolist()
-    )
+    heading = ",".join(["t [s]", *(f"exc.{s.name} [{s.unit}]" for s in signals)])
+    table = np.column_stack([Ts * np.arange(len(forces)), forces])
+    rows = "\n".join(",".join(f"{x:.9g}" for x in row) for row in table.tolist())
     replace_files({path: f"{heading}\n{rows}\n".encode()})
     return path
 
@@ -306,10 +311,26 @@ def log(
 
 def learn(
     gains: GainFile,
-    log: LogFile,
+    log: Annotated[
+        Path | None, typer.Argument(metavar="[LOG]", help="A log of a stroke: .csv, .npz, .mat or .parquet.")
+    ] = None,
     parameter: Annotated[
         str, typer.Option(metavar="NAME", help="The force constant of the thrust. [found by its effect]")
     ] = "",
+    following: Annotated[
+        Path | None,
+        typer.Option(
+            "--next", metavar="FILE", help="Write the thrust that the next stroke is sent too (.csv)."
+        ),
+    ] = None,
+    strokes: Annotated[
+        int,
+        typer.Option(
+            metavar="N", help="Fly so many strokes of the simulated machine, each taught by the last."
+        ),
+    ] = 0,
+    change: Changes = None,
+    uncertain: Uncertain = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Write NAME_learned as .json, .npz and .mat.")
     ] = None,
@@ -319,16 +340,46 @@ def learn(
     """Learn the thrust of the drive from the log of one stroke, and write it into what the law believes.
 
     The new gain file commutates with the learned force constant, and its filter predicts with it: the next stroke needs
-    no feedback to correct the thrust.
+    no feedback to correct the thrust. With --next the thrust over time that was missing is written, which the next
+    stroke is sent beside the law's. --strokes does both on the simulated machine, with --set as another one, and
+    computes by how much errors shrink over the box of the gain file.
 
     \b
     Example:  malta learn design/gains/robust.json build/stroke.npz --out build
+              malta learn design/gains/robust.json --strokes 6 --set K_D=4.68
     """
-    from malta.identification.learn import learn as learn_thrust
-    from malta.identification.log import read_log
+    controller = read_controller(gains, machine)
+    if (log is None) == (strokes == 0):
+        raise InputError("learn", "LOG", "a log and --strokes" if log else "nothing", "a log, or --strokes N")
+    if strokes:
+        _learn_strokes(gains, controller, strokes, change, uncertain, out, as_json=as_json)
+    elif log is not None:
+        _learn_from(gains, controller, log, parameter, following, out, as_json=as_json)
 
-    found = learn_thrust(read_controller(gains, machine), read_log(log), parameter=parameter)
+
+def _learn_from(
+    gains: Path,
+    controller: Controller,
+    log: Path,
+    parameter: str,
+    following: Path | None,
+    out: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Learn from the log of one stroke."""
+    from malta.identification.learn import learn as learn_thrust
+    from malta.identification.learn import next_stroke
+    from malta.identification.log import read_log
+    from malta.model.data import plant_of
+
+    read = read_log(log)
+    found = learn_thrust(controller, read, parameter=parameter)
     files = [] if out is None else verify_and_write(found.controller, gains, out)
+    if following is not None:
+        plant, after = plant_of(controller.parameters), next_stroke(controller, read)
+        sent = plant.inputs[plant.thrust_input :][:1], after.thrust[:, None]
+        files.append(_write_forces(following, controller.sample_time, *sent))
     if as_json:
         from malta.cli.documents.others import learn_output
 
@@ -338,6 +389,50 @@ def learn(
     half = 1.96 * found.deviation
     print_text(console, f"{log}: the stroke took {found.factor:.4f} +- {half:.4f} times the thrust expected")
     print_text(console, f"{found.parameter}: {found.before:.5g} -> {found.after:.5g}, as the law believes it")
+    if following is not None:
+        print_text(
+            console,
+            f"the error, {1e6 * after.error:.3g} um rms, has {after.patterns} patterns above the noise of "
+            f"{1e6 * after.noise:.3g} um: the next stroke is sent up to {abs(after.thrust).max():.3g} N too",
+        )
+    print_written(console, files)
+
+
+def _learn_strokes(
+    gains: Path,
+    controller: Controller,
+    strokes: int,
+    change: list[str] | None,
+    uncertain: list[str] | None,
+    out: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Fly strokes on the simulated machine, each taught by those before."""
+    from malta.identification.learn import contraction, learn_strokes
+    from malta.model.data import plant_of, published_figures
+    from malta.report.tables.experiments import strokes_table
+
+    plant = plant_of(change_machine(controller.parameters, change))
+    with working(f"{strokes} strokes"):
+        found = learn_strokes(plant, controller, strokes=strokes)
+        box = read_uncertainty(gains, uncertain, controller.parameters, published_figures(plant.name))
+        shrinks = contraction(controller, box) if box else None
+    files = [] if out is None else verify_and_write(found.controller, gains, out)
+    if as_json:
+        from malta.cli.documents.others import learned_strokes_output
+
+        print_document(learned_strokes_output(gains, found, shrinks, files))
+        return
+    console = make_console()
+    console.print(strokes_table(found))
+    if shrinks is not None:
+        print_text(
+            console,
+            f"the next stroke would be sent up to {abs(found.thrust).max():.3g} N beside the law's thrust; at the "
+            f"corners of the box what it can move of the error shrinks to {100 * shrinks:.3g} % at most "
+            "from stroke to stroke (computed, not proven)",
+        )
     print_written(console, files)
 
 

@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from malta.identification.identify import Identified as Identified
     from malta.identification.identify import weigh as weigh
     from malta.identification.learn import Learned as Learned
+    from malta.identification.learn import LearnedStrokes as LearnedStrokes
+    from malta.identification.learn import contraction as contraction
+    from malta.identification.learn import learn_strokes as learn_strokes
+    from malta.identification.learn import next_stroke as next_stroke
     from malta.identification.log import Log as Log
     from malta.identification.log import log_of as log_of
     from malta.identification.log import write_log as write_log

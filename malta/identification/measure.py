@@ -223,7 +223,7 @@ def measure(
     plant = plant_of(controller.parameters if parameters is None else parameters)
     predicted = loop(plant, controller)
     box = dict(uncertainty or {})
-    loops = _machines(predicted, box, seed)
+    loops = machines_of(predicted, box, seed)
     lines = [found for log in logs for found in lines_of(log, predicted)]
     w = np.unique(np.array([line.w for line in lines]))
     cut = cut_loop(predicted, w)
@@ -396,7 +396,7 @@ def cut_loop(loop: Loop, w: FloatArray) -> Cut:
     return Cut(np.asarray(P, dtype=complex), F[..., :p], F[..., p:])
 
 
-def _machines(predicted: Loop, box: Mapping[str, float], seed: int) -> list[Loop]:
+def machines_of(predicted: Loop, box: Mapping[str, float], seed: int, samples: int = SAMPLES) -> list[Loop]:
     """The machine, and those at the corners and at random places of the box, all under the same law."""
     par = predicted.plant.parameters
     names, shares = list(box), np.array(list(box.values()))
@@ -407,7 +407,7 @@ def _machines(predicted: Loop, box: Mapping[str, float], seed: int) -> list[Loop
     if not names:
         return [predicted]
     corners = list(product((-1.0, 1.0), repeat=len(names))) if len(names) <= CORNERS else []
-    random = np.random.default_rng(seed).uniform(-1, 1, (SAMPLES, len(names)))
+    random = np.random.default_rng(seed).uniform(-1, 1, (samples, len(names)))
     places = np.vstack([np.array(corners).reshape(-1, len(names)), random])
     found, at = [predicted], dict[str, Any](predicted.at)
     for place in places:

@@ -165,7 +165,9 @@ class Machine:
         found = {}
         for k, signal in enumerate(signals):
             each = [worst_case_gain(*one, ranges, over, at=at, channel=k, time=time) for one in loops]
-            found[signal.name] = max(each, key=lambda g: (g.upper is None, g.lower))
+            proven = [gain.upper for gain in each if gain.upper is not None]
+            worst = max(each, key=lambda gain: gain.lower)
+            found[signal.name] = replace(worst, upper=max(proven) if len(proven) == len(each) else None)
         return found
 
 

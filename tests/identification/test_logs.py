@@ -112,7 +112,9 @@ def test_commands_write_and_show_a_log(run: Run, tmp_path: Path) -> None:
     assert picture.stat().st_size > 10_000
     found = json.loads(run("log", file, "--json").out)
     assert found["signals"]["z"]["unit"] == "m"
-    learned = run("learn", ROBUST, file, "--json")
+    learned = run("learn", ROBUST, file, "--next", tmp_path / "next.csv", "--json")
+    assert (tmp_path / "next.csv").read_text().startswith("t [s],exc.f_D [N]\n0,")
+    assert run("learn", ROBUST).code == 2
     assert json.loads(learned.out)["after"] == pytest.approx(4.68, rel=0.01)
     said = run("replay", ROBUST, file)
     assert (said.code, "as logged" in said.out, "K_D -11 %" in said.err) == (1, True, True)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from malta.identification.commission import Commissioning
     from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
-    from malta.identification.learn import Learned
+    from malta.identification.learn import Learned, LearnedStrokes
     from malta.identification.log import Log
     from malta.identification.measure import Curve, Measurement, MeasurementPlan
     from malta.identification.replay import LawReplay
@@ -297,6 +297,23 @@ class LearnOutput(Part):
     files: Files
 
 
+class LearnedStrokesOutput(Part):
+    """What `malta learn --strokes --json` prints."""
+
+    kind: Literal["malta-learned-strokes-output"] = Field(
+        default="malta-learned-strokes-output", alias="schema"
+    )
+    version: Literal[1] = 1
+    gains: str
+    axial_error_m: list[float] = Field(description="the largest true error of each stroke")
+    patterns: list[int] = Field(description="of each stroke: patterns of its error that rose above the noise")
+    largest_thrust_N: float = Field(description="that the next stroke would be sent beside the law's")
+    contraction: float | None = Field(
+        description="of the error over the corners of the box, computed; null: no box"
+    )
+    files: Files
+
+
 class Explained(Part):
     """What a change of a parameter would explain of the innovations."""
 
@@ -478,6 +495,20 @@ def identify_output(gains: Path, found: Identified, files: Iterable[Path]) -> Id
 def learn_output(gains: Path, log: Path, found: Learned, files: Iterable[Path]) -> LearnOutput:
     """The document of what a stroke taught."""
     return LearnOutput.of(found, gains=gains, log=log, files=files)
+
+
+def learned_strokes_output(
+    gains: Path, found: LearnedStrokes, shrinks: float | None, files: Iterable[Path]
+) -> LearnedStrokesOutput:
+    """The document of strokes that learned."""
+    return LearnedStrokesOutput(
+        gains=str(gains),
+        axial_error_m=list(found.axial_error),
+        patterns=list(found.patterns),
+        largest_thrust_N=float(abs(found.thrust).max()),
+        contraction=shrinks,
+        files=list(map(str, files)),
+    )
 
 
 def replay_output(gains: Path, log: Path, found: LawReplay) -> ReplayOutput:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from malta.identification.commission import Commissioning, Finding, Step
     from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
+    from malta.identification.learn import LearnedStrokes
     from malta.identification.log import Log
     from malta.identification.measure import Measurement, MeasurementPlan
     from malta.identification.prediction import Predicted
@@ -279,6 +280,15 @@ def quality_table(found: Identified) -> Table:
         add_row(table, f"of {name}", f"{value:.3g}", "1")
     add_row(table, "correlation of neighbouring lines [sigma]", f"{found.whiteness:.2g}", "-2 .. 2")
     add_row(table, "power where nothing was excited", f"{found.distortion:.3g}", "1")
+    return table
+
+
+def strokes_table(found: LearnedStrokes) -> Table:
+    """The error of each stroke, and what it taught."""
+    table = new_table("Stroke by stroke", "stroke", "largest axial error [um]", "patterns above the noise")
+    for k, (error, count) in enumerate(zip(found.axial_error, found.patterns, strict=True)):
+        taught = "the force constant" if k == 0 else str(count)
+        add_row(table, str(k + 1), f"{1e6 * error:.3g}", taught)
     return table
 
 
