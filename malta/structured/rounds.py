@@ -80,9 +80,9 @@ class Tuned:
             return (
                 "Nothing is proven: the plant has no ranges of parameters; figures are those of its models."
             )
-        low = self.margin.lower
+        low, but = self.margin.lower, f" ({self.margin.reason})" if self.margin.reason else ""
         found = [
-            f"Proven: the loop is stable for all parameters within {low:.4g} times their ranges."
+            f"Proven: the loop is stable for all parameters within {low:.4g} times their ranges{but}."
             if low
             else f"Not proven: stability over the ranges ({self.margin.reason or 'the nominal loop is lost'})."
         ]
