@@ -11,7 +11,7 @@ from scipy.interpolate import make_interp_spline
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.log import Log
+from malta.identification.log import Log, reference_spline
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names
 from malta.simulation.engine.engines import evaluate
@@ -151,8 +151,7 @@ def _stroke(
     if not (np.isfinite(z).all() and np.isfinite(f).all()) or log.survey.gaps:
         raise CheckError(f"{log.source}: samples are missing")
     t = Ts * np.arange(len(z_ref))
-    spline = make_interp_spline(t, z_ref, k=5)
-    a = spline(t, 2)
+    a = reference_spline(log, [stroke], Ts)(t, 2)[:, 0]
     largest = float(np.abs(a).max())
     if believed.mass * largest < SMALLEST * controller.limits.force[thrust]:
         found = f"{largest:.3g} m/s2 at most in ref.{stroke}"

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.log import Log, require_same_law
+from malta.identification.log import Log, reference_spline, require_same_law
 from malta.model.data import plant_of
 from malta.simulation.inputs import Inputs, initial_values, sample_inputs
 from malta.simulation.layout import layout_of
@@ -145,7 +144,7 @@ def _inputs(controller: Controller, log: Log) -> tuple[Simulation, Inputs]:
     plant, Ts = plant_of(controller.parameters), controller.sample_time
     p = log.table("reference", [s.name for s in plant.outputs])
     t = Ts * np.arange(log.samples)
-    spline = make_interp_spline(t, p, k=5)
+    spline = reference_spline(log, [s.name for s in plant.outputs], Ts)
     motion = Motion(p, spline(t, 1), spline(t, 2))
     sent = log.columns.get("excitation", np.zeros((log.samples, 0)))
     excitation = (lambda _: sent) if sent.any() else None
