@@ -36,6 +36,7 @@ from malta.synthesis.requirements import requirements_for
 from malta.tuning.search import base_of
 
 if TYPE_CHECKING:
+    from malta.model.plant import Parameters
     from malta.synthesis.spec import Spec
 
 
@@ -208,7 +209,8 @@ class Session:
         self._news: list[Document] = []
         self._count = 0
         self._ray: int | None = None
-        self._slow_margin, self._machines = False, set[Any]()
+        self._slow_margin = False
+        self._traced: Parameters | None = None  # of the machine whose margin was traced last
         self._timer: threading.Timer | None = None
         self._serial, self._due = 0, set[str]()  # tasks that the workers are asked for when the page rests
         self._workers = {task: Worker(self._tell) for task in ("check", "prove")}
@@ -352,15 +354,14 @@ class Session:
     def _picture(self, edit: Edit, view: View) -> tuple[Document, Problem]:
         """The picture of an edit; the eigenvalue margin is left to the background where tracing a machine is slow."""
         problem = solve(self.files.apply(edit))
-        new = problem.plant.parameters not in self._machines
+        new = problem.plant.parameters != self._traced
         wanted = not (new and self._slow_margin)
         began = time.perf_counter()
         document = picture(problem, view, self._ray, margin=wanted)
         if new and wanted:
-            self._machines.add(problem.plant.parameters)
-            self._slow_margin = self._slow_margin or (
-                len(self._machines) > 1 and time.perf_counter() - began > 4 * SLOW
-            )
+            first = self._traced is None
+            self._traced = problem.plant.parameters
+            self._slow_margin |= not first and time.perf_counter() - began > 4 * SLOW
         if document["margin"] is not None:
             self._ray = document["margin"].get("ray", self._ray)
         return document, problem

@@ -13,7 +13,7 @@ from scipy.signal import fftconvolve
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.log import Log, log_of, require_same_law
+from malta.identification.log import Log, log_of, reference_spline, require_same_law
 from malta.identification.measure import cut_loop, machines_of
 from malta.loops.loop import Loop, loop
 from malta.model.data import plant_of
@@ -164,8 +164,7 @@ def _stroke(
     if not (np.isfinite(z).all() and np.isfinite(f).all()) or log.survey.gaps:
         raise CheckError(f"{log.source}: samples are missing")
     t = Ts * np.arange(len(z_ref))
-    spline = make_interp_spline(t, z_ref, k=5)
-    a = spline(t, 2)
+    a = reference_spline(log, [stroke], Ts)(t, 2)[:, 0]
     largest = float(np.abs(a).max())
     if believed.mass * largest < SMALLEST * controller.limits.force[thrust]:
         found = f"{largest:.3g} m/s2 at most in ref.{stroke}"

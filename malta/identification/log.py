@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import math
 import re
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 
 VERSION = 1
 LARGEST = 2_000_000_000  # bytes of a log
+MOST = 1e30  # SI: no reading is beyond it, and squares and sums of those within are numbers
 SUFFIXES = (".csv", ".npz", ".mat", ".parquet")
 GROUPS = {"y": "", "v": "", "i": "", "u": "", "reference": "ref.", "excitation": "exc.", "flags": "flag."}
 """The groups of columns, and what stands before the signal's name in a heading."""
@@ -447,17 +450,29 @@ def read_log(path: str | Path) -> Log:
     content = read_file(path, "log", Path.read_bytes, LARGEST)
     decode = {".csv": _from_csv, ".npz": _from_npz, ".mat": _from_mat}.get(path.suffix, _from_parquet)
     head, t, tables, headings = decode(content, path)
-    if len(t) < 2 or not (np.diff(t) > 0).all():
+    if len(t) < 2 or not ((np.diff(t) > 0).all() and np.abs(t).max() < MOST):
         raise InputError(path, "t", "times that do not rise", "the times of the samples, in order")
     columns, signals = {}, {}
     for group in tables:
         columns[group], signals[group] = _in_si(tables[group], headings[group], path)
     if "y" not in columns:
         raise InputError(path, "y", "no measured outputs", "columns of positions, as x1 [m]")
-    Ts = float(head.get("sample_time") or np.median(np.diff(t)))
+    Ts = _seconds(head, "sample_time", path) or float(np.median(np.diff(t)))
     names = (str(head.get("machine", "")), str(head.get("controller", "")))
-    period = float(head.get("period") or 0.0)
+    period = _seconds(head, "period", path)
     return Log(str(path), *names, Ts, period, t, columns, signals, sha256(content).hexdigest())
+
+
+def _seconds(head: Mapping[str, Any], name: str, path: Path) -> float:
+    """A time of a file's head; 0 where it has none."""
+    found = head.get(name, 0.0)
+    try:
+        seconds = float(found)
+    except (TypeError, ValueError):
+        seconds = math.nan
+    if not 0 <= seconds < MOST:
+        raise InputError(path, name, repr(found), "a number of seconds")
+    return seconds
 
 
 Decoded = tuple[dict[str, Any], "FloatArray", dict[str, "FloatArray"], dict[str, list[str]]]
@@ -479,13 +494,17 @@ def _from_csv(content: bytes, path: Path) -> Decoded:
     names = [name.strip() for name in lines[first].split(",")]
     try:
         rows = io.StringIO(text)
-        if re.search(r",\s*(,|$)", text, re.M):  # empty cells: missing readings
-            values = np.genfromtxt(rows, delimiter=",", skip_header=first + 1)
-        else:
-            values = np.loadtxt(rows, delimiter=",", skiprows=first + 1, comments=None, ndmin=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a file without rows, which is refused below
+            if re.search(r",\s*(,|$)", text, re.M):  # empty cells: missing readings
+                values = np.genfromtxt(rows, delimiter=",", skip_header=first + 1, ndmin=2)
+            else:
+                values = np.loadtxt(rows, delimiter=",", skiprows=first + 1, comments=None, ndmin=2)
     except ValueError as error:
         raise InputError(path, "", f"a line that cannot be read ({str(error)[:80]})", "numbers") from error
-    if values.ndim != 2 or values.shape[1] != len(names):
+    if not values.size:
+        raise InputError(path, "", "headings alone", "a line of numbers for each sample")
+    if values.shape[1] != len(names):
         raise InputError(path, "", f"{values.shape[-1]} cells in a line", f"{len(names)}, as headings")
     return _tabulated(head, names, values, path)
 
@@ -540,6 +559,10 @@ def _in_si(table: FloatArray, headings: list[str], path: Path) -> tuple[FloatArr
         if si_unit is None:
             raise InputError(path, heading, f"unit {unit!r}", "one of " + ", ".join(SI_UNITS))
         table[:, k] *= to_si(1.0, unit, si_unit, path, name)
+        far = np.flatnonzero(np.abs(table[:, k]) >= MOST)
+        if len(far):
+            found = f"{table[far[0], k]:g} in sample {far[0] + 1}"
+            raise InputError(path, heading, found, "a reading, or nothing where it is missing")
         signals.append(Signal(name, si_unit))
     return table, tuple(signals)
 
@@ -568,8 +591,13 @@ def _from_mat(content: bytes, path: Path) -> Decoded:
 
 def _from_arrays(arrays: Mapping[str, Any], path: Path) -> Decoded:
     """Head, times, tables and headings of the arrays of a file; also those of a run of `malta simulate --out`."""
-    head = {name: np.ravel(arrays[name])[0] for name in (*TEXTS, "sample_time", "period") if name in arrays}
+    head = {
+        name: arrays[name].ravel()[0] for name in (*TEXTS, "sample_time", "period")
+        if name in arrays and arrays[name].size
+    }  # fmt: skip
     t = arrays.get("t", np.zeros(0))
+    if t.dtype.kind not in "fiu" or t.ndim != 1:
+        raise InputError(path, "t", f"an array of {t.dtype}, {t.shape}", "the times of the samples, in order")
     tables, headings = {}, {}
     for group in GROUPS:
         if group not in arrays:
@@ -582,6 +610,19 @@ def _from_arrays(arrays: Mapping[str, Any], path: Path) -> Decoded:
             raise InputError(path, group, found, f"numbers, ({len(t)}, {len(names)})")
         tables[group], headings[group] = table, [str(name) for name in names]
     return head, np.asarray(t, dtype=float), tables, headings
+
+
+def reference_spline(log: Log, names: list[str], sample_time: float) -> Any:
+    """The reference of outputs by a spline of fifth degree in t, s, which has its derivatives.
+
+    Raises InputError for an output without one, and CheckError for a log of fewer samples than it takes.
+    """
+    from scipy.interpolate import make_interp_spline
+
+    p = log.table("reference", names)
+    if len(p) < 6 or not np.isfinite(p).all():
+        raise CheckError(f"{log.source}: {len(p)} samples of a reference, or some that are missing")
+    return make_interp_spline(sample_time * np.arange(len(p)), p, k=5)
 
 
 def require_same_law(log: Log, machine: str, sample_time: float) -> None:

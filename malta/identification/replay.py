@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.log import Log, require_same_law
+from malta.identification.log import Log, reference_spline, require_same_law
 from malta.identification.response import acting
 from malta.model.data import plant_of
 from malta.model.parameters import twins_of
@@ -274,8 +273,7 @@ def _sent(
 ) -> tuple[Callable[[Any], Motion], Callable[[Any], FloatArray] | None]:
     """The reference of a log as a function of time, and its excitation; None where nothing was excited."""
     plant, Ts = plant_of(controller.parameters), controller.sample_time
-    p = log.table("reference", [s.name for s in plant.outputs])
-    spline = make_interp_spline(Ts * np.arange(log.samples), p, k=5)
+    spline = reference_spline(log, [s.name for s in plant.outputs], Ts)
     sent = log.columns.get("excitation", np.zeros((log.samples, 0)))
 
     def motion(t: Any) -> Motion:

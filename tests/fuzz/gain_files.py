@@ -9,14 +9,15 @@ import zipfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from hypothesis import strategies as st
 from pydantic import ValidationError
 
 import malta
 from fuzz.cases import ROOT, Case, require_finite
-from fuzz.edits import cut, edited
+from fuzz.edits import NAMES, cut, edited
 from fuzz.oracle import Defect, Ended, line, observe
 from malta.campaigns.plan import box_of
 from malta.gains import encodings
@@ -30,15 +31,20 @@ def gain_document(name: str) -> dict[str, Any]:
     """The document of a gain file; "linear": of a loop of plain matrices."""
     if name != "linear":
         return encodings.decode(ROOT / "design" / "gains" / f"{name}.json")
+    model, controller = cart()
+    return malta.gains.document(controller, malta.verify(model, controller))
+
+
+def cart(z: str = "z", v: str = "v", u: str = "u", name: str = "cart") -> tuple[Any, Any]:
+    """The model of a machine of plain matrices with these signals, and a controller of this name."""
     plant = malta.linear_machine(
         [[0, 1], [100, -1]], [[0], [2]], [[1, 0]],
-        name="cart", states=["z [m]", "v [m/s]"], inputs=["u [N]"], outputs=["z [m]"],
+        name="cart", states=[f"{z} [m]", f"{v} [m/s]"], inputs=[f"{u} [N]"], outputs=[f"{z} [m]"],
         nominal={"k": 1.0}, terms={"k": [[[0, 0], [1, 0]]]}, noise=1e-6, limit=10.0,
     )  # fmt: skip
     model = malta.linearize(plant, plant.at())
     weights = malta.weights([10, 1], [1], [1e-2], [1e-8], q_i=[10])
-    controller = malta.lqg(model, weights, 1e-3, name="cart")
-    return malta.gains.document(controller, malta.verify(model, controller))
+    return model, malta.lqg(model, weights, 1e-3, name=name)
 
 
 def signed(document: Any) -> Any:
@@ -118,7 +124,12 @@ def export_as_c(case: Case, folder: Path) -> Ended | None:
     path, out = folder / "mine.json", folder / "c"
     document = edited(gain_document(case.base), case.edits)
     path.write_bytes(_gain_json(signed(document), case))
-    ended = observe(line("export", str(path), "--out", str(out)), folder, [str(path)], writes=True)
+    return _exported(path, out)
+
+
+def _exported(path: Path, out: Path) -> Ended:
+    """Export a gain file as C; Defect where the compiler finds that it is none."""
+    ended = observe(line("export", str(path), "--out", str(out)), path.parent, [str(path)], writes=True)
     sources, cc = [str(file) for file in out.rglob("*.c")], compiler()
     if ended.code == 0 and sources and cc is not None:
         command = [*cc, "-std=c99", "-fsyntax-only", "-Wcomment", "-Werror", f"-I{out}", *sources]
@@ -135,6 +146,49 @@ def draw_figures(case: Case, folder: Path) -> Ended | None:
     path.write_bytes(_gain_json(signed(document), case))
     drawn = line("plot", str(path), "step", "--out", str(folder / "step.png"))
     return observe(drawn, folder, [str(path)], writes=True)
+
+
+class Named(NamedTuple):
+    """What is done with a gain file whose signals and whose controller have these names."""
+
+    does: str  # a key of _NAMED
+    names: tuple[str, ...]
+
+
+def use_names(case: Named, folder: Path) -> Ended | None:
+    """Write a gain file, and a log of its loop at rest; then run a command on them."""
+    path, log = folder / "mine.json", folder / "mine.csv"
+
+    def written() -> None:
+        model, controller = cart(*case.names)
+        malta.gains.write(controller, malta.verify(model, controller), path)
+        still = malta.Scenario("still", 0.02, malta.references.hold, noise=1.0)
+        run = malta.simulate(model.plant, controller, still)
+        malta.identification.write_log(malta.identification.log_of(run), log)
+
+    ended = observe(written)
+    if ended.code:
+        return ended
+    if case.does == "export":
+        return _exported(path, folder / "c")
+    arguments = [text.replace("OUT", str(folder / "out")) for text in _NAMED[case.does]]
+    return observe(
+        line(arguments[0], str(log if case.does == "log" else path), *arguments[1:]), folder, writes=True
+    )
+
+
+_NAMED = {
+    "export": ("export",),
+    "fmu": ("export", "--to", "fmu", "--out", "OUT"),
+    "plot": ("plot", "step", "bode", "load", "--out", "OUT"),
+    "report": ("report", "--out", "OUT.html"),
+    "log": ("log",),
+    "simulate": ("simulate", "--json"),
+    "verify": ("verify", "--certificate", "OUT.json"),
+}
+NAMED = st.builds(
+    Named, st.sampled_from(tuple(_NAMED)), st.lists(st.sampled_from(NAMES), min_size=4, max_size=4).map(tuple)
+)
 
 
 def show_scenarios(case: Case, folder: Path) -> Ended | None:

@@ -10,10 +10,25 @@ from hypothesis import strategies as st
 
 from fuzz.cases import Case, cases
 from fuzz.designs import EXAMPLES, read_data_file, read_design_file
-from fuzz.gain_files import draw_figures, export_as_c, read_gain_file, read_shares_of, show_scenarios
+from fuzz.gain_files import (
+    NAMED,
+    draw_figures,
+    export_as_c,
+    read_gain_file,
+    read_shares_of,
+    show_scenarios,
+    use_names,
+)
 from fuzz.lines import LINES, run_line
 from fuzz.oracle import Ended
-from fuzz.records import check_certificate, read_campaign, read_log_file, read_rare_event, read_trials
+from fuzz.records import (
+    check_certificate,
+    read_campaign,
+    read_day,
+    read_log_file,
+    read_rare_event,
+    read_trials,
+)
 
 GAINS = ("table2", "robust", "tubular_pid", "halbach", "planar", "linear")
 DESIGNS = ("table2", "robust", "robust_observer", "tubular_pid", "halbach", "halbach_pid", "planar")
@@ -39,12 +54,12 @@ def _of_form(suffix: str) -> Read:
 
 
 KINDS: dict[str, Kind] = {
-    "gains.json": Kind(cases(GAINS), _of_form(".json"), 260),
+    "gains.json": Kind(cases(GAINS), _of_form(".json"), 220),
     "gains.npz": Kind(cases(GAINS), _of_form(".npz"), 200),
     "gains.mat": Kind(cases(GAINS), _of_form(".mat"), 200),
     "design": Kind(cases((*DESIGNS, *EXAMPLES)), read_design_file, 260),
     "data": Kind(cases((*DATA, *EXAMPLES)), read_data_file, 220),
-    "campaign": Kind(cases(("manifest", "block")), read_campaign, 180),
+    "campaign": Kind(cases(("manifest", "block")), read_campaign, 150),
     "certificate": Kind(cases(("continuous", "sampled")), check_certificate, 180),
     "log": Kind(cases(("csv", "npz")), read_log_file, 160),
     "rare": Kind(cases(("record", "repetition")), read_rare_event, 40),
@@ -52,6 +67,8 @@ KINDS: dict[str, Kind] = {
     "plot": Kind(cases(("linear",)), draw_figures, 20),
     "trials": Kind(cases(("trials",)), read_trials, 60),
     "shares": Kind(cases(("table2", "linear")), read_shares_of, 40),
-    "lines": Kind(LINES, run_line, 120),
-    "commands": Kind(cases(("table2", "halbach", "linear")), show_scenarios, 40),
+    "lines": Kind(LINES, run_line, 90),
+    "commands": Kind(cases(("table2", "halbach", "linear")), show_scenarios, 20),
+    "names": Kind(NAMED, use_names, 40),
+    "journal": Kind(cases(("day",)), read_day, 80),
 }

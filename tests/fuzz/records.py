@@ -15,16 +15,20 @@ import numpy as np
 import malta
 from fuzz.cases import ROOT, Case
 from fuzz.edits import cut, edited
-from fuzz.oracle import Defect, Ended, observe
+from fuzz.oracle import Defect, Ended, line, observe
 from malta.campaigns.limits import limit_of
 from malta.campaigns.plan import Plan
 from malta.campaigns.rare import rare_event, read_design_point, write_event
 from malta.campaigns.run import campaign
 from malta.campaigns.store import MANIFEST, block_name, read_plan, seal
+from malta.identification.calibration import Estimate
+from malta.identification.commission import Commissioning, Entry, Finding, read_journal
 from malta.proof.certificate import certificate, checked_file
 from malta.proof.certificate.check import check
 from malta.proof.uncertain import Compensator
 from malta.report import campaign_tables
+from malta.report.page.binder import binder_page, binder_text
+from malta.report.tables.experiments import findings_table
 from malta.simulation.experiments.recording import columns_of_log, read_log, record
 from malta.tuning.search import Journal
 
@@ -210,7 +214,8 @@ def read_log_file(case: Case, folder: Path) -> Ended | None:
     def recorded() -> Any:
         return record(read_log(path, plant), plant)
 
-    ended = observe(recorded, folder, [str(path)])
+    shown = observe(line("log", str(path)), folder, [str(path)])
+    ended = observe(recorded, folder, [str(path)]) if shown.code == 0 else shown
     if ended.code == 0 and not np.isfinite(ended.value.v0).all():
         raise Defect(f"v0 was recorded as {ended.value.v0}")
     return ended
@@ -228,6 +233,32 @@ def _log_npz(tree: Any, case: Case) -> bytes:
     arrays: dict[str, Any] = {"t": rows[:, 0], "y": rows[:, 1:2], "y_columns": headings[1:2]}
     np.savez(buffer, **arrays, v=rows[:, 2:], v_columns=headings[2:])
     return cut(buffer.getvalue(), case.cuts)
+
+
+@cache
+def _journal() -> dict[str, Any]:
+    """A day's journal of two steps, the second of which failed."""
+    estimate = Estimate(0.4e-6, 0.01e-6, "m")
+    findings = (Finding("noise of x1", estimate, 0.0, 1e-6), Finding("disk margin", Estimate(0.3, 0.02), 0.2))
+    entries = (
+        Entry("still", "Is it quiet?", "still.npz", "0" * 64, findings),
+        Entry("loop", "Is it as predicted?", "", "", (), "too loud"),
+    )
+    done = Commissioning("mine.json", "1" * 64, "tubular", "", entries, ("still", "loop", "stroke"))
+    return done.document | {"signature": done.signature}
+
+
+def read_day(case: Case, folder: Path) -> Ended | None:
+    """Read the edited journal of a day of commissioning, and write its page."""
+    path = folder / "mine.json"
+    path.write_bytes(
+        cut(json.dumps(edited(_journal(), case.edits)).encode(errors="surrogatepass"), case.cuts)
+    )
+    ended = observe(lambda: read_journal(path), folder, [str(path)])
+    if ended.code:
+        return ended
+    done = ended.value[0]
+    return observe(lambda: (binder_page(done).content, binder_text(done), findings_table(done)), folder)
 
 
 def read_trials(case: Case, folder: Path) -> Ended | None:

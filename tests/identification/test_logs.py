@@ -11,6 +11,7 @@ import pytest
 from conftest import Run
 
 import malta
+from malta.report.figures.runs import log_figure
 
 ROBUST = "design/gains/robust.json"
 CONTROLLER = malta.gains.read(ROBUST)
@@ -74,6 +75,11 @@ def test_csv_of_other_programs(tmp_path: Path) -> None:
         ("t [s],x1 [m]\n0,1\n1,a\n", "cannot be read"),
         ("t [s],fx [N]\n0,1\n1,2\n", "no measured outputs"),
         ("x1 [m],t [s]\n0,1\n1,2\n", "the first column"),
+        ("t [s],x1 [m]\n", "headings alone"),
+        ("t [s],x1 [m]\n0,1\n1,1e308\n", r"1e\+308 in sample 2"),
+        ("t [s],x1 [m]\n0,1\n1e40,2\n", "times that do not rise"),
+        ("# sample_time fast\nt [s],x1 [m]\n0,1\n1,2\n", "sample_time: found 'fast'"),
+        ("# period nan s\nt [s],x1 [m]\n0,1\n1,2\n", "period: found 'nan'"),
     ],
 )
 def test_what_is_no_log_is_refused(text: str, found: str, tmp_path: Path) -> None:
@@ -84,6 +90,26 @@ def test_what_is_no_log_is_refused(text: str, found: str, tmp_path: Path) -> Non
         (tmp_path / f"bad{suffix}").write_bytes(b"no archive")
         with pytest.raises(malta.InputError):
             malta.read_log(tmp_path / f"bad{suffix}")
+
+
+def test_arrays_that_are_no_log_are_refused(tmp_path: Path) -> None:
+    path, good = tmp_path / "bad.npz", {"y": np.zeros((2, 1)), "y_columns": np.array(["x1 [m]"])}
+    for t in (np.arange(2) * 1j, np.zeros((2, 1)), np.array(["0", "1"])):
+        np.savez(path, t=t, **good)
+        with pytest.raises(malta.InputError, match="t: found an array of"):
+            malta.read_log(path)
+    np.savez(path, t=np.arange(2.0), period=np.zeros(0), **good)
+    assert malta.read_log(path).period == 0
+
+
+def test_a_log_of_few_samples_or_of_zeros_is_answered(log: malta.identification.Log) -> None:
+    controller = malta.gains.read(ROBUST)
+    few = {group: table[:5] for group, table in log.columns.items()}
+    for ask in (malta.learn, malta.identification.replay_law):
+        with pytest.raises(malta.CheckError, match="5 samples of a reference"):
+            ask(controller, replace(log, t=log.t[:5], columns=few))
+    zeros = {group: 0 * table for group, table in log.columns.items()}
+    assert len(log_figure(replace(log, columns=zeros)).axes) == 1
 
 
 def test_gaps_stuck_and_clipped_sensors_are_seen(log: malta.identification.Log) -> None:

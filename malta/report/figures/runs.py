@@ -289,7 +289,7 @@ POINTS = 2000  # of a line: intervals, each drawn from its least to its largest 
 
 def log_figure(log: Log) -> Figure:
     """Draw a log: measured outputs, reference, commands, excitation and currents over time."""
-    groups = [group for group in PANELS if log.names(group) and np.nan_to_num(log.columns[group]).any()]
+    groups = [g for g in PANELS if log.names(g) and (g == "y" or np.nan_to_num(log.columns[g]).any())]
     figure = new_figure(log.source, "; ".join(log.survey.findings), size=(9.0, 1.2 + 1.9 * len(groups)))
     for axes, group in zip(
         figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0], groups, strict=True
