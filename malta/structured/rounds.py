@@ -52,6 +52,15 @@ class Tuned:
     rounds : of tuning and proving
     seconds : s
     controller : of a machine, for gain files, verification, simulation and export
+
+    >>> import control
+    >>> from malta import structured
+    >>> law = structured.gain("k", 3.0)
+    >>> found = structured.tune(control.tf([1], [1, 1]), law, [], starts=1)
+    >>> found.order, found.closed
+    (0, False)
+    >>> print(found.certificate)
+    Nothing is proven: the plant has no ranges of parameters; figures are those of its models.
     """
 
     values: Mapping[str, float]
@@ -154,9 +163,12 @@ def tune(
 
     >>> import malta
     >>> from malta import structured
-    >>> mass = malta.uncertain(lambda m: ([[0, 1], [0, 0]], [[0], [1 / m]], [[1, 0]]), {"m": 1.0})
+    >>> def body(m):
+    ...     return [[0, 1], [0, 0]], [[0], [1 / m]], [[1, 0]]
+    >>> mass = malta.uncertain(body, {"m": 1.0})
     >>> law = structured.pid("axis", Kp=50.0, Kd=10.0, filter=0.01)
-    >>> found = structured.tune(mass, law, [structured.sensitivity(1.5)], ranges={"m": 0.2}, margin=2.0)
+    >>> goals = [structured.sensitivity(1.5)]
+    >>> found = structured.tune(mass, law, goals, ranges={"m": 0.2}, margin=2.0)
     >>> found.closed, found.margin.lower >= 2
     (True, True)
     """
