@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from malta.display import Description, display, quantity
+from malta.display import Description, ceil_to, display, floor_to, quantity
 from malta.errors import CheckError, InputError
 from malta.loops.linear_loops import System
 from malta.processes import on_one_thread
@@ -91,7 +91,7 @@ class Tuned:
             )
         low = self.margin.lower
         found = [
-            f"Proven: the loop is stable for all parameters within {low:.4g} times their ranges."
+            f"Proven: the loop is stable for all parameters within {floor_to(low, 3):g} times their ranges."
             if low
             else f"Not proven: stability over the ranges ({self.margin.reason or 'the nominal loop is lost'})."
         ]
@@ -103,7 +103,9 @@ class Tuned:
                     f"Not proven: {goal} of {channel} over the ranges ({gain.reason}); {gain.lower:.4g} is reached."
                 )
             else:
-                found.append(f"Proven: |S| of {channel} is below {gain.upper:.4g} over the ranges ({goal}).")
+                found.append(
+                    f"Proven: |S| of {channel} is below {ceil_to(gain.upper, 3):g} over the ranges ({goal})."
+                )
         return "\n".join(found)
 
     @property
