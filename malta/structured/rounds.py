@@ -175,6 +175,10 @@ def tune(
     (True, True)
     """
     begun = clock.monotonic()
+    if ranges is None and (margin is not None or over_box):
+        raise InputError(
+            CALLER, "ranges", "none beside a margin or over_box", "ranges of parameters to prove it over"
+        )
     target = target_of(plant, sample_time, delay, lag, places)
     models = target.nominal
     first = models[0]

@@ -193,6 +193,7 @@ LAW = structured.gain("k", 1.0)
         (lambda: structured.tune(PLAIN, LAW, [], ranges={"k": 0.2}), "malta.uncertain"),
         (lambda: structured.tune(PLAIN, LAW, [structured.gain_limit("load x", "output", 1.0)]), "one of reference"),
         (lambda: structured.tune(PLAIN, {"z": LAW}, []), "an element of z"),
+        (lambda: structured.tune(PLAIN, LAW, [], margin=2.0), "ranges of parameters to prove"),
         (lambda: structured.tune(PLAIN, LAW, [], delay=1), "uncertain system alone"),
         (lambda: structured.tune(object(), LAW, []), "a system of python-control"),
         (lambda: structured.pid("a", 1.0, Kd=1.0), "no sampled law has a plain rate"),
