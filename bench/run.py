@@ -34,6 +34,7 @@ from peer_problem import Workload
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from structured import structured
 from timing import Result, medians, optional
 
 import malta
@@ -397,6 +398,7 @@ WORKLOADS: dict[str, Callable[[int], list[Result]]] = {
     "halbach": halbach,
     "firmware": firmware,
     "live": live_page,
+    "structured": structured,
 }
 
 

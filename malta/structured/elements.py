@@ -71,9 +71,10 @@ class Element:
     parameters : what is searched, with the values at which a search starts
     matrices : CasADi values of the parameters, in their order -> A, B, C and D
 
-    >>> from malta.structured import lead, pid
-    >>> law = pid("axial", Kp=2e3, Ki=1e4, Kd=5.0, filter=1e-4) * lead("roll_off", zero=5e3, pole=2e4)
-    >>> law.order, [name for name, _ in law.values.items()][:2]
+    >>> from malta import structured
+    >>> law = structured.pid("axial", Kp=2e3, Ki=1e4, Kd=5.0, filter=1e-4)
+    >>> law = law * structured.lead("roll_off", zero=5e3, pole=2e4)
+    >>> law.order, list(law.values)[:2]
     (3, ['axial.Kp', 'axial.Ki'])
     """
 
@@ -98,7 +99,10 @@ class Element:
         return len(self.system.A)
 
     def at(self, values: Mapping[str, float]) -> Element:
-        """The same element with other values: by their names, as in `values`."""
+        """The same element with other values.
+
+        values : by the names of `Element.values`; others stay
+        """
         names = list(self.values)
         own = (
             replace(p, start=float(values.get(n, p.start)))
@@ -158,7 +162,8 @@ def gain(name: str, value: float, *, bounds: Bounds | None = None) -> Element:
 
     Raises InputError for a gain of 0.
 
-    >>> gain("stiffness", 2e3).order
+    >>> from malta import structured
+    >>> structured.gain("stiffness", 2e3).order
     0
     """
     none = ca.DM(0, 0), ca.DM(0, 1), ca.DM(1, 0)
@@ -174,7 +179,7 @@ def pid(
     *,
     bounds: Bounds | None = None,
 ) -> Element:
-    """Kp + Ki / s + Kd s / (1 + filter s); without the terms that are 0.
+    """A PID, Kp + Ki / s + Kd s / (1 + filter s), without the terms that are 0.
 
     name : of the element
     Kp, Ki, Kd : force per error, its integral, its rate
@@ -183,7 +188,8 @@ def pid(
 
     Raises InputError for a Kd without a filter: no sampled law differentiates at once.
 
-    >>> pid("axial", Kp=2e3, Ki=1e4, Kd=5.0, filter=1e-4).order
+    >>> from malta import structured
+    >>> structured.pid("axial", Kp=2e3, Ki=1e4, Kd=5.0, filter=1e-4).order
     2
     """
     if Kd and not filter > 0:
@@ -212,7 +218,7 @@ def pid(
 
 
 def lead(name: str, zero: float, pole: float, *, bounds: Bounds | None = None) -> Element:
-    """(1 + s / zero) / (1 + s / pole), a lag where the pole is the slower one.
+    """A lead, (1 + s / zero) / (1 + s / pole), a lag where the pole is the slower one.
 
     name : of the element
     zero, pole : rad/s
@@ -220,7 +226,8 @@ def lead(name: str, zero: float, pole: float, *, bounds: Bounds | None = None) -
 
     Raises InputError for frequencies that are not above 0.
 
-    >>> lead("phase", 100.0, 1000.0).system.D.item()
+    >>> from malta import structured
+    >>> structured.lead("phase", 100.0, 1000.0).system.D.item()
     10.0
     """
     _require_above_zero(name, zero=zero, pole=pole)
@@ -235,7 +242,7 @@ def lead(name: str, zero: float, pole: float, *, bounds: Bounds | None = None) -
 def notch(
     name: str, frequency: float, depth: float, damping: float, *, bounds: Bounds | None = None
 ) -> Element:
-    """(s^2 + 2 depth w s + w^2) / (s^2 + 2 damping w s + w^2).
+    """A notch, (s^2 + 2 depth w s + w^2) / (s^2 + 2 damping w s + w^2).
 
     name : of the element
     frequency : w, rad/s
@@ -244,7 +251,8 @@ def notch(
 
     Raises InputError for numbers that are not above 0.
 
-    >>> notch("bending", 300.0, 0.1, 1.0).order
+    >>> from malta import structured
+    >>> structured.notch("bending", 300.0, 0.1, 1.0).order
     2
     """
     _require_above_zero(name, frequency=frequency, depth=depth, damping=damping)
@@ -272,7 +280,8 @@ def transfer(name: str, numerator: Sequence[float], denominator: Sequence[float]
 
     Raises InputError for an improper one.
 
-    >>> transfer("shape", [2.0, 100.0], [1.0, 50.0]).values
+    >>> from malta import structured
+    >>> structured.transfer("shape", [2.0, 100.0], [1.0, 50.0]).values
     {'shape.b1': 2.0, 'shape.b0': 100.0, 'shape.a0': 50.0}
     """
     a, b = np.asarray(denominator, dtype=float), np.asarray(numerator, dtype=float)
@@ -307,8 +316,8 @@ def states(name: str, start: Any, pattern: Any = None) -> Element:
 
     Raises InputError for matrices that do not fit.
 
-    >>> import numpy as np
-    >>> element = states("law", ([[-10.0]], [[1.0]], [[5.0]], [[2.0]]))
+    >>> from malta import structured
+    >>> element = structured.states("law", ([[-10.0]], [[1.0]], [[5.0]], [[2.0]]))
     >>> element.order, len(element.parameters)
     (1, 4)
     """
@@ -345,11 +354,21 @@ def states(name: str, start: Any, pattern: Any = None) -> Element:
 
 
 class Place(NamedTuple):
-    """Where an element stands: forces = left E (right errors)."""
+    """Where an element stands: forces = left E (right errors).
 
-    left: FloatArray  # m x outputs of the element
+    left : m x outputs of the element
+    element : E
+    right : inputs of the element x p
+
+    >>> from malta import structured
+    >>> axis = structured.gain("axis", 2e3)
+    >>> structured.Place([[1.0], [1.0]], axis, [[0.5, 0.5]]).element.order  # of two
+    0
+    """
+
+    left: FloatArray
     element: Element
-    right: FloatArray  # inputs of the element x p
+    right: FloatArray
 
 
 Layout = Mapping[str, Element] | Element | Sequence[Place]

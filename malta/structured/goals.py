@@ -50,6 +50,11 @@ class Goal:
     hard : whether it bounds the search; else it is made small
     unit : what the figure 1 stands for, in words
     peak : of a sensitivity: its bound, and where it is measured
+
+    >>> from malta import structured
+    >>> goal = structured.sensitivity(2.0)
+    >>> goal.name, goal.hard, goal.peak
+    ('sensitivity 2', True, (2.0, 'sensors'))
     """
 
     name: str
@@ -62,14 +67,17 @@ class Goal:
 def soft(goal: Goal) -> Goal:
     """The same goal, which is made as small as hard ones allow.
 
-    >>> soft(sensitivity(2.0)).hard
+    goal : a hard one
+
+    >>> from malta import structured
+    >>> structured.soft(structured.sensitivity(2.0)).hard
     False
     """
     return replace(goal, hard=False)
 
 
 def sensitivity(peak: float, *, at: At = "sensors", channels: Sequence[str] | None = None) -> Goal:
-    """|S| of each channel by itself, the others closed, at all frequencies at most a peak.
+    """Bound |S| of each channel by itself, the others closed, at all frequencies.
 
     peak : above 1, since the mean of log |S| is not negative
     at : "sensors" or "forces"
@@ -77,7 +85,8 @@ def sensitivity(peak: float, *, at: At = "sensors", channels: Sequence[str] | No
 
     Raises InputError for a peak that no loop has.
 
-    >>> sensitivity(2.0).name
+    >>> from malta import structured
+    >>> structured.sensitivity(2.0).name
     'sensitivity 2'
     """
     if not peak > 1:
@@ -94,7 +103,8 @@ def disk_margin(least: float, *, at: At = "sensors", channels: Sequence[str] | N
 
     Raises InputError for a margin that no loop has.
 
-    >>> disk_margin(0.8).unit
+    >>> from malta import structured
+    >>> structured.disk_margin(0.8).unit
     'alpha = 0.8'
     """
     if not 0 < least < 2:
@@ -118,10 +128,12 @@ def gain_limit(
     limit : in units of the outputs over those of the inputs
     weight : W of W G: a stable proper control system with one input; None: 1. Of a sampled loop it is sampled by
         Tustin's rule
+    name : of the goal; "": of its signals
 
     Raises InputError for a limit that is not above 0, and for other weights.
 
-    >>> gain_limit("load", "output", 1e-4, name="stiffness").name
+    >>> from malta import structured
+    >>> structured.gain_limit("load", "output", 1e-4, name="stiffness").name
     'stiffness'
     """
     _require_positive("gain_limit", limit)
@@ -133,7 +145,7 @@ def gain_limit(
 def tracking(
     time: float, *, peak: float = 1.5, steady: float = 1e-3, channels: Sequence[str] | None = None
 ) -> Goal:
-    """|S| of each channel at most (peak s + w steady) / (s + w) at s = jw: slow references are followed.
+    """Bound |S| of each channel by (peak s + w steady) / (s + w) at s = jw, so that slow references are followed.
 
     time : s, of the answer, 2 / w
     peak : of |S| far above w
@@ -142,7 +154,8 @@ def tracking(
 
     Raises InputError for numbers that are not above 0.
 
-    >>> tracking(0.05).unit
+    >>> from malta import structured
+    >>> structured.tracking(0.05).unit
     '2 / w = 0.05 s'
     """
     for one in (time, peak, steady):
@@ -164,10 +177,12 @@ def noise_limit(
         roots of spectral densities of a continuous one. Noise of a sensor enters as a reference does
     outputs : as in `gain_limit`
     limit : in their unit
+    name : of the goal; "": of its signals
 
     Raises InputError for levels and limits that are not above 0.
 
-    >>> noise_limit({"reference": 1e-7}, "force", 0.5).unit
+    >>> from malta import structured
+    >>> structured.noise_limit({"reference": 1e-7}, "force", 0.5).unit
     'rms 0.5'
     """
     for value in (limit, *levels.values()):
@@ -185,7 +200,8 @@ def poles(decay: float = 0.0, damping: float = 0.0, fastest: float = math.inf) -
 
     Raises InputError for numbers out of these, and for none.
 
-    >>> poles(decay=10.0).name
+    >>> from malta import structured
+    >>> structured.poles(decay=10.0).name
     'poles'
     """
     if not (decay >= 0 and 0 <= damping < 1 and fastest > decay) or (decay, damping, fastest) == (

@@ -52,7 +52,8 @@ class Synthesized:
     residual : the larger relative one of the equations
 
     >>> from malta import structured
-    >>> P = [[0.0]], [[1.0, 0.0, 1.0]], [[1.0], [0.0], [1.0]], [[0, 0, 0], [0, 0, 1], [0, 1, 0]]
+    >>> D = [[0, 0, 0], [0, 0, 1], [0, 1, 0]]
+    >>> P = [[0.0]], [[1.0, 0.0, 1.0]], [[1.0], [0.0], [1.0]], D
     >>> f"{structured.h_infinity(P, 1, 1).gamma:.4f}"  # sqrt 2
     '1.4142'
     """
@@ -118,7 +119,8 @@ def h_infinity(plant: Any, outputs: int, inputs: int) -> Synthesized:
     that no law stabilizes; CheckError where the closed loop does not keep what the equations promise.
 
     >>> from malta import structured
-    >>> P = [[0.0]], [[1.0, 0.0, 1.0]], [[1.0], [0.0], [1.0]], [[0, 0, 0], [0, 0, 1], [0, 1, 0]]
+    >>> D = [[0, 0, 0], [0, 0, 1], [0, 1, 0]]
+    >>> P = [[0.0]], [[1.0, 0.0, 1.0]], [[1.0], [0.0], [1.0]], D
     >>> found = structured.h_infinity(P, 1, 1)
     >>> found.gamma < found.norm < 1.001 * found.gamma
     True
@@ -326,8 +328,9 @@ def mixed_sensitivity(plant: Any, of_error: Any, of_input: Any = None, of_output
     >>> import control
     >>> from malta import structured
     >>> G = control.tf([200], [0.025, 1.0025, 10.1, 1])
-    >>> found = structured.mixed_sensitivity(G, control.tf([1 / 1.5, 10], [1, 1e-3]), 1.0)
-    >>> f"{found.gamma:.2f}"  # Skogestad and Postlethwaite, example 2.17, print 1.37
+    >>> W = control.tf([1 / 1.5, 10], [1, 1e-3])
+    >>> found = structured.mixed_sensitivity(G, W, 1.0)
+    >>> f"{found.gamma:.2f}"  # Skogestad and Postlethwaite, example 2.17: 1.37
     '1.37'
     """
     import control  # imports matplotlib and takes a second: only where it is used

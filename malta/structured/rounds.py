@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from malta.display import Description, display, quantity
+from malta.display import Description, ceil_to, display, floor_to, quantity
 from malta.errors import CheckError, InputError
 from malta.loops.linear_loops import System
 from malta.processes import on_one_thread
@@ -52,6 +52,15 @@ class Tuned:
     rounds : of tuning and proving
     seconds : s
     controller : of a machine, for gain files, verification, simulation and export
+
+    >>> import control
+    >>> from malta import structured
+    >>> law = structured.gain("k", 3.0)
+    >>> found = structured.tune(control.tf([1], [1, 1]), law, [], starts=1)
+    >>> found.order, found.closed
+    (0, False)
+    >>> print(found.certificate)
+    Nothing is proven: the plant has no ranges of parameters; figures are those of its models.
     """
 
     values: Mapping[str, float]
@@ -82,7 +91,7 @@ class Tuned:
             )
         low, but = self.margin.lower, f" ({self.margin.reason})" if self.margin.reason else ""
         found = [
-            f"Proven: the loop is stable for all parameters within {low:.4g} times their ranges{but}."
+            f"Proven: the loop is stable for all parameters within {floor_to(low, 3):g} times their ranges{but}."
             if low
             else f"Not proven: stability over the ranges ({self.margin.reason or 'the nominal loop is lost'})."
         ]
@@ -94,7 +103,9 @@ class Tuned:
                     f"Not proven: {goal} of {channel} over the ranges ({gain.reason}); {gain.lower:.4g} is reached."
                 )
             else:
-                found.append(f"Proven: |S| of {channel} is below {gain.upper:.4g} over the ranges ({goal}).")
+                found.append(
+                    f"Proven: |S| of {channel} is below {ceil_to(gain.upper, 3):g} over the ranges ({goal})."
+                )
         return "\n".join(found)
 
     @property
@@ -154,13 +165,20 @@ def tune(
 
     >>> import malta
     >>> from malta import structured
-    >>> mass = malta.uncertain(lambda m: ([[0, 1], [0, 0]], [[0], [1 / m]], [[1, 0]]), {"m": 1.0})
+    >>> def body(m):
+    ...     return [[0, 1], [0, 0]], [[0], [1 / m]], [[1, 0]]
+    >>> mass = malta.uncertain(body, {"m": 1.0})
     >>> law = structured.pid("axis", Kp=50.0, Kd=10.0, filter=0.01)
-    >>> found = structured.tune(mass, law, [structured.sensitivity(1.5)], ranges={"m": 0.2}, margin=2.0)
+    >>> goals = [structured.sensitivity(1.5)]
+    >>> found = structured.tune(mass, law, goals, ranges={"m": 0.2}, margin=2.0)
     >>> found.closed, found.margin.lower >= 2
     (True, True)
     """
     begun = clock.monotonic()
+    if ranges is None and (margin is not None or over_box):
+        raise InputError(
+            CALLER, "ranges", "none beside a margin or over_box", "ranges of parameters to prove it over"
+        )
     target = target_of(plant, sample_time, delay, lag, places)
     models = target.nominal
     first = models[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import control
@@ -149,7 +150,7 @@ def test_the_positioning_system_of_mathworks_is_proven_over_its_box() -> None:
     assert malta.worst_case_gain(positioning(), malta.proof.Compensator(A, -B, C, -D), RANGES).lower > 8
 
 
-def test_a_machine_has_its_own_loop() -> None:
+def test_a_machine_has_its_own_loop(tmp_path: Path) -> None:
     """The models of a machine under load are the loop of `malta verify`, to the digits of its peaks."""
     controller = malta.gains.read(ROOT / "design" / "gains" / "tubular_pid.json")
     plant = malta.plant_of(controller.parameters)
@@ -163,6 +164,20 @@ def test_a_machine_has_its_own_loop() -> None:
     peak = max(float(np.abs(S[:, k, k]).max()) for k in (0, 2, 4))
     assert peak == pytest.approx(2.3 * found.reached["sensitivity 2.3"], rel=1e-3)
     assert found.order == 10
+    margins = malta.verify(plant, found.controller)
+    malta.gains.write(found.controller, margins, tmp_path / "law.json")
+    again = malta.gains.read(tmp_path / "law.json")
+    assert np.array_equal(
+        malta.loop(plant, again, z=5e-3).matrix, malta.loop(plant, found.controller, z=5e-3).matrix
+    )
+
+
+def test_a_certificate_rounds_to_its_safe_side(body: UncertainSystem) -> None:
+    law = structured.gain("stiffness", 1.0) * structured.pid("axis", Kp=1389.97, Kd=20.0, filter=1e-3)
+    found = structured.tune(body, law, [], ranges={"k": 0.2}, margin=1.9, starts=1)
+    assert found.margin is not None
+    assert found.margin.lower == pytest.approx(389.97 / 200, rel=1e-4)
+    assert "within 1.949 times" in found.certificate
 
 
 FIXED = control.ss([[1, 0], [0, -1]], [[0], [1]], [[1, 1]], 0)  # no input moves the pole at 1
@@ -178,6 +193,7 @@ LAW = structured.gain("k", 1.0)
         (lambda: structured.tune(PLAIN, LAW, [], ranges={"k": 0.2}), "malta.uncertain"),
         (lambda: structured.tune(PLAIN, LAW, [structured.gain_limit("load x", "output", 1.0)]), "one of reference"),
         (lambda: structured.tune(PLAIN, {"z": LAW}, []), "an element of z"),
+        (lambda: structured.tune(PLAIN, LAW, [], margin=2.0), "ranges of parameters to prove"),
         (lambda: structured.tune(PLAIN, LAW, [], delay=1), "uncertain system alone"),
         (lambda: structured.tune(object(), LAW, []), "a system of python-control"),
         (lambda: structured.pid("a", 1.0, Kd=1.0), "no sampled law has a plain rate"),
