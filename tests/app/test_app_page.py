@@ -106,6 +106,18 @@ def test_a_slider_moves_the_design_and_its_proof_follows(page: Any) -> None:
     assert "pid.Kp.F_x" in text(page, ".tables")
 
 
+def test_the_margin_map_shows_the_proven_box_and_the_poles_where_it_is_clicked(page: Any) -> None:
+    find(page, ".card.poles .tabs button[data-value=map]").click()
+    wait(lambda: "proven 288.7" in text(page, ".card.poles .note").replace("blue: ", "").replace(",", ""))
+    assert len(page.find_elements("css selector", ".card.poles .proven-box")) == 1
+    find(page, ".card.poles .chart").click()  # its middle, where the machine of the file is
+    wait(lambda: "there stable" in text(page, ".card.poles .note"))
+    slider, _ = row(page, "stiffness")
+    slider.send_keys("\ue014")  # an arrow to the right: another design, of which nothing is proven yet
+    wait(lambda: not page.find_elements("css selector", ".card.poles .proven-box"))
+    wait(lambda: page.find_elements("css selector", ".card.poles .proven-box"))
+
+
 def test_undo_redo_and_reset_by_keys(page: Any) -> None:
     from selenium.webdriver.common.keys import Keys
 

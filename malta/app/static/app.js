@@ -3,7 +3,7 @@
 
 import { createChart } from "./chart.js";
 import { createPanel, element } from "./controls.js";
-import { color, loadView, nyquistView, poleView, runView, sensitivityView, timeGroups } from "./figures.js";
+import { color, loadView, mapView, nyquistView, poleView, runView, sensitivityView, timeGroups } from "./figures.js";
 import { digits, floored, percent } from "./numbers.js";
 import { countLights, differenceTable, figureTable, requirementRows } from "./tables.js";
 
@@ -28,7 +28,7 @@ export async function mount(root, transport) {
     description, values: {}, redesign: true, undo: [], redo: [], pins: [], pinned: 0,
     picture: null, simulated: null, requirements: {}, proof: null, version: 0, number: 0, failed: "",
     run: description.runs[0], load: description.loads[0]?.name ?? "", runGroup: "", loadGroup: "",
-    sens: "S", reach: NEAR, allPoles: false, table: "requirements", hidden: new Set(), hiddenPoles: new Set(), ties: false,
+    sens: "S", reach: NEAR, poles: "slow", map: null, there: null, mapX: "", mapY: "", table: "requirements", hidden: new Set(), hiddenPoles: new Set(), ties: false,
   };
   const fresh = () => Object.fromEntries(state.description.fields.map((field) => [field.key, field.value]));
   state.values = { ...fresh(), ...description.edit.values };
@@ -77,14 +77,16 @@ export async function mount(root, transport) {
   };
   const sensTabs = tabs([["S", "S"], ["T", "T"]], () => state.sens, (value) => { state.sens = value; });
   const reachTabs = tabs([[NEAR, "near −1"], [WIDE, "wide"]], () => state.reach, (value) => { state.reach = Number(value); });
-  const poleTabs = tabs([["slow", "slow"], ["all", "all"]], () => (state.allPoles ? "all" : "slow"), (value) => { state.allPoles = value === "all"; });
+  const poleTabs = tabs([["slow", "slow"], ["all", "all"], ["map", "margin map"]], () => state.poles, (value) => { state.poles = value; if (value === "map") askMap(); });
+  const mapXs = pick("parameter along x", () => state.mapX, (value) => { state.mapX = value; askMap(); });
+  const mapYs = pick("parameter along y", () => state.mapY, (value) => { state.mapY = value; askMap(); });
   const runList = pick("run", () => state.run, (value) => { state.run = value; state.simulated = null; ask(); });
   const runGroups = pick("signals of the run", () => state.runGroup, (value) => { state.runGroup = value; draw(); });
   const loadList = pick("load", () => state.load, (value) => { state.load = value; ask(); });
   const loadGroups = pick("outputs under the load", () => state.loadGroup, (value) => { state.loadGroup = value; draw(); });
   card("sensitivity", "Sensitivity", sensTabs);
   card("nyquist", "Nyquist", reachTabs);
-  card("poles", "Poles", poleTabs);
+  card("poles", "Poles", mapXs, mapYs, poleTabs);
   card("run", "Run", runList, runGroups);
   card("load", "Load", loadList, loadGroups);
   const tableTabs = tabs([["requirements", "Requirements"], ["figures", "Figures"], ["changes", "Changes"]], () => state.table, (value) => { state.table = value; });
@@ -190,7 +192,7 @@ export async function mount(root, transport) {
   function take(answer, milliseconds) {
     state.failed = answer.error ?? "";
     if (answer.version !== undefined && answer.version !== state.version) {
-      Object.assign(state, { version: answer.version, requirements: {}, proof: null, simulated: null });
+      Object.assign(state, { version: answer.version, requirements: {}, proof: null, simulated: null, there: null });
     } else if (state.moving && answer.version === last.version) Object.assign(state, last);
     if (!answer.error) {
       state.picture = answer;
@@ -212,12 +214,32 @@ export async function mount(root, transport) {
     if (item.version < state.version || !state.picture) return;
     if (item.kind === "requirement") state.requirements[item.name] = item;
     if (item.kind === "proof") state.proof = item;
+    if (item.kind === "map") state.map = item;
     if (item.kind === "run") state.simulated = item;
     if (item.kind === "margin") state.picture.margin = item;
     if (item.kind === "failed") say(item.error, "error");
     if (item.kind === "notice") say(item.text);
-    if (item.kind === "run") draw();
+    if (item.kind === "run" || state.poles === "map") draw();
     else { drawHeader(); drawTables(); }
+  }
+
+  // --- the margin map: the plane of two parameters, and the poles at a point of it ---
+  async function askMap() {
+    const known = Object.keys(state.description.parameters);
+    if (known.length < 2) return;
+    if (!known.includes(state.mapX)) state.mapX = known[0];
+    if (!known.includes(state.mapY) || state.mapY === state.mapX) state.mapY = known.find((name) => name !== state.mapX);
+    for (const list of [mapXs, mapYs]) list.fill(known.map((name) => [name, name]));
+    Object.assign(state, { map: null, there: null });
+    draw();
+    const answer = await transport.ask({ ask: "map", x: state.mapX, y: state.mapY }).catch(() => ({ error: GONE }));
+    if (answer.error) say(answer.error, "error");
+  }
+
+  async function pickPoint(x, y) {
+    const answer = await transport.ask({ ask: "map", x: state.mapX, y: state.mapY, at: [x, y] }).catch(() => ({ error: GONE }));
+    if (answer.error) say(answer.error, "error");
+    else if (answer.version === state.version) { state.there = answer; draw(); }
   }
 
   function say(text, kind = "note") {
@@ -251,10 +273,14 @@ export async function mount(root, transport) {
     const names = picture.frequency.sensors;
     show(charts.sensitivity, sensitivityView(picture, state.pins, state.sens, state.hidden));
     show(charts.nyquist, nyquistView(picture, state.pins, state.reach, state.hidden));
-    show(charts.poles, poleView(picture, state.pins, state.allPoles, state.hiddenPoles));
+    const mapped = state.poles === "map", uncertain = Object.keys(state.description.parameters);
+    mapXs.hidden = mapYs.hidden = !mapped || uncertain.length < 2;
+    poleTabs.lastChild.hidden = uncertain.length < 2;
+    show(charts.poles, mapped ? mapView(state, pickPoint) : poleView(picture, state.pins, state.poles === "all", state.hiddenPoles, state.there), state.map?.error ?? "The map follows.");
     legendOf(charts.sensitivity, names, state.hidden);
     legendOf(charts.nyquist, names, state.hidden);
-    legendOf(charts.poles, Object.keys(picture.poles).filter((name) => picture.poles[name].length), state.hiddenPoles, { machine: "○", "closed loop": "×", regulator: "+", filter: "□" });
+    if (mapped) charts.poles.legend.replaceChildren();
+    else legendOf(charts.poles, Object.keys(picture.poles).filter((name) => picture.poles[name].length), state.hiddenPoles, { machine: "○", "closed loop": "×", regulator: "+", filter: "□" });
     drawTimes();
     drawTables();
   }
