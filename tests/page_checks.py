@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import json
 import re
 from html.parser import HTMLParser
 
@@ -48,7 +51,7 @@ class Reader(HTMLParser):
             self.faults.append(f"</{tag}> closes another element")
 
     def handle_data(self, data: str) -> None:
-        if self.open and self.open[-1] != "style":
+        if self.open and self.open[-1] not in ("style", "script"):
             self.text.append(data)
 
     def _look(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -78,8 +81,17 @@ def read_page(html: str) -> Reader:
     assert reader.open == []
     assert [name for name in reader.named if name[1] not in reader.ids] == []
     assert reader.count["h1"] == 1
-    assert "script" not in reader.count
-    assert not re.search(r"https?://", html)
+    policy = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', html)
+    for kind, text in re.findall(r"<script([^>]*)>(.*?)</script>", html, re.DOTALL):
+        if "application/json" in kind:
+            json.loads(text)
+        else:  # the page's own, and no other runs
+            digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+            assert policy == [
+                f"default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src 'sha256-{digest}'"
+            ]
+    assert reader.count.get("script", 0) == 2
+    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", html)
     assert reader.count["figcaption"] == reader.count["figure"] == reader.count["svg"]
     return reader
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
@@ -20,6 +21,7 @@ from malta.errors import CheckError, InputError
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.loop import Loop, loop_of_model
 from malta.margins.loop_report import BANDWIDTHS, LoopReport, pole_figures, zone
+from malta.margins.margin_map import margin_map_of
 from malta.margins.travel import travel_loops
 from malta.margins.verify import machine_report
 from malta.merits import Merit, figure
@@ -320,6 +322,54 @@ def margin_document(bound: RayBound) -> dict[str, Any]:
     """An eigenvalue margin for the page; no upper bound is null."""
     upper = bound.upper if math.isfinite(bound.upper) else None
     return {"upper": upper, "at": dict(bound.at), "frequency": bound.frequency, "ray": bound.ray}
+
+
+def map_document(problem: Problem, names: tuple[str, str], lost: float) -> dict[str, Any]:
+    """The plane of two uncertain parameters: where eigenvalues are unstable on a grid, which proves nothing.
+
+    names : of the parameters along x and y
+    lost : where about stability is lost, in multiples of the box
+
+    Raises InputError for parameters that are not uncertain.
+    """
+    from contourpy import FillType, contour_generator  # with matplotlib, which draws the same map elsewhere
+
+    box = problem.spec.uncertainty
+    found = margin_map_of(problem.plant, problem.controller, names, box, proof=False, lost=lost)
+    lines: Any = contour_generator(
+        found.x_values, found.y_values, found.growth, fill_type=FillType.OuterOffset
+    )
+    rings, offsets = lines.filled(0.0, math.inf)
+    areas = [
+        [round_values(ring[a:b].T) for a, b in pairwise(at)] for ring, at in zip(rings, offsets, strict=True)
+    ]
+    boundary = [round_values(line.T) for line in lines.lines(0.0)] if found.growth.min() < 0 else []
+    return {
+        "x": found.x, "y": found.y, "units": found.units, "nominal": found.nominal, "half": found.half,
+        "reach": [round_values(values[[0, -1]]) for values in (found.x_values, found.y_values)],
+        "unstable": areas, "boundary": boundary, "others": len(box) > 2,
+    }  # fmt: skip
+
+
+def poles_document(problem: Problem, at: Mapping[str, float]) -> dict[str, Any]:
+    """Poles of the closed loop of a machine with other parameters, rad/s, under the same controller.
+
+    Raises InputError for values that are none of a machine.
+    """
+    plant = problem.plant
+    try:
+        other = plant_of(replace(plant.parameters, **at))
+    except CheckError as error:
+        raise InputError("malta app", "map", str(error), "a machine") from error
+    place = dict(problem.spec.operating_point)
+    poles = loop_of_model(linearize(other, other.at(**place)), problem.controller).poles
+    worst = poles[np.argmax(poles.real)]
+    return {
+        "at": dict(at),
+        "poles": [[float(s.real), float(s.imag)] for s in poles],
+        "worst": [float(worst.real), float(worst.imag)],
+        "stable": bool(worst.real < 0),
+    }
 
 
 # The figures that pinned designs are compared by: those of the report, with the words of a narrow column, and of the

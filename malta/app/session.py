@@ -18,6 +18,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from malta.app.fields import HUGE
 from malta.app.files import (
     DesignFiles,
     Edit,
@@ -29,7 +30,15 @@ from malta.app.files import (
     save_design,
     save_gains,
 )
-from malta.app.picture import Problem, View, describe_error, picture, run_names, solve
+from malta.app.picture import (
+    Problem,
+    View,
+    describe_error,
+    picture,
+    poles_document,
+    run_names,
+    solve,
+)
 from malta.errors import InputError, shorten
 from malta.processes import environment, python_module
 from malta.synthesis.requirements import requirements_for
@@ -154,7 +163,9 @@ def _start() -> subprocess.Popen[str]:
 
 def _obituary(asked: Mapping[str, Any], reason: str, *, again: bool) -> dict[str, Any]:
     """What is heard of a process that ended at a document. again : it was started again and asked once more"""
-    does = "proves the margin" if asked["task"] == "prove" else "simulates and judges the requirements"
+    does = {"prove": "proves the margin", "map": "draws the margin map"}.get(
+        asked["task"], "simulates and judges the requirements"
+    )
     sentence = f"the process that {does} ended by itself ({reason})"
     mark = {"version": asked["version"], "serial": asked["serial"]}
     if again:
@@ -162,7 +173,7 @@ def _obituary(asked: Mapping[str, Any], reason: str, *, again: bool) -> dict[str
     sentence += ", and so did the one that was started in its place"
     if asked["task"] == "prove":
         return mark | {"kind": "proof", "lower": None, "upper": None, "frequency": None, "reason": sentence}
-    return mark | {"kind": "failed", "error": sentence}
+    return mark | {"kind": "map" if asked["task"] == "map" else "failed", "error": sentence}
 
 
 def _describe_end(code: int) -> str:
@@ -213,7 +224,10 @@ class Session:
         self._traced: Parameters | None = None  # of the machine whose margin was traced last
         self._timer: threading.Timer | None = None
         self._serial, self._due = 0, set[str]()  # tasks that the workers are asked for when the page rests
-        self._workers = {task: Worker(self._tell) for task in ("check", "prove")}
+        self._workers = {task: Worker(self._tell) for task in ("check", "prove", "map")}
+        self._plane: tuple[str, str] | None = None  # of the map that the page shows
+        self._lost = 1.0  # the last eigenvalue margin, which says how wide a map is
+        self._message: Document | None = None  # of the design that the workers follow
 
     # --- the door ---
 
@@ -223,6 +237,7 @@ class Session:
             "open": self.open,
             "evaluate": self.evaluate,
             "news": self.news,
+            "map": self.map,
             "save": self.save,
             "gains": self.gains,
         }
@@ -282,12 +297,31 @@ class Session:
             except Exception as error:
                 return {"number": number, "version": version, "error": shorten(describe_error(error))}
             margin = document["margin"] is None and bool(problem.spec.uncertainty)
-            tasks = {"check"} if same else {"check", "prove"}
+            tasks = {"check"} if same else {"check", "prove", *(["map"] if self._plane else [])}
             self._follow_later(
                 edit, view, tasks, fingerprint(problem.spec, problem.plant.parameters), margin=margin
             )
             spent = {"wall": time.perf_counter() - began, "cpu": time.thread_time() - cpu}
             return {"number": number, "version": version, **document, "seconds": spent}
+
+    def map(self, body: Mapping[str, Any]) -> Document:
+        """Ask for the plane of two parameters, which follows as news; of body["at"], a point of it, the poles there."""
+        names, at = (body.get("x"), body.get("y")), body.get("at")
+        known = list(self.files.spec.uncertainty)
+        if names[0] not in known or names[1] not in known or names[0] == names[1]:
+            raise InputError("malta app", "map", repr(names), "two of " + " ".join(known))
+        if at is None:
+            with self._state:
+                self._plane, message = (str(names[0]), str(names[1])), self._message
+            if message is not None:
+                self._workers["map"].ask(message | {"task": "map", "plane": [*self._plane, self._lost]})
+            return {"version": self._version}
+        if not (isinstance(at, list) and len(at) == 2 and all(map(_is_finite, at))):
+            raise InputError("malta app", "at", repr(at), "two numbers")
+        with self._busy:
+            problem = solve(self.files.apply(self.edit))
+            point = {str(name): float(value) for name, value in zip(names, at, strict=True)}
+            return {"version": self._version, **poles_document(problem, point)}
 
     def news(self, body: Mapping[str, Any]) -> Document:
         """News that are newer than body["after"], as soon as there are some; none after LONGEST_WAIT."""
@@ -364,6 +398,7 @@ class Session:
             self._slow_margin |= not first and time.perf_counter() - began > 4 * SLOW
         if document["margin"] is not None:
             self._ray = document["margin"].get("ray", self._ray)
+            self._lost = document["margin"].get("upper") or self._lost
         return document, problem
 
     def _supersede(self) -> int:
@@ -390,7 +425,9 @@ class Session:
             "design": design,
             "run": view.run,
             "margin": margin,
+            "plane": [*(self._plane or ()), self._lost],
         }
+        self._message = message
 
         def ask() -> None:
             with self._state:
@@ -417,6 +454,11 @@ class Session:
             self._state.notify_all()
         if self._hear is not None:
             self._hear(reply)
+
+
+def _is_finite(value: object) -> bool:
+    """Whether a value is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < HUGE
 
 
 def requirement_list(spec: Spec) -> list[Document]:

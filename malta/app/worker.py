@@ -18,7 +18,16 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from malta.app.files import DesignFiles, Edited, fingerprint, open_design
-from malta.app.picture import Problem, View, curves, describe_error, margin_document, planned_run, solve
+from malta.app.picture import (
+    Problem,
+    View,
+    curves,
+    describe_error,
+    map_document,
+    margin_document,
+    planned_run,
+    solve,
+)
 from malta.errors import CheckError, InputError, shorten
 from malta.margins.loop_report import Outcome
 from malta.margins.travel import travel_loops, travel_margin
@@ -38,9 +47,13 @@ class SupersededError(Exception):
 
 
 def replies(problem: Problem, truth: Edited, message: Message, newer: Newer) -> Iterator[dict[str, Any]]:
-    """What follows a design, one document after the other: message["task"] is "check" or "prove"."""
+    """What follows a design, one document after the other: message["task"] is "check", "prove" or "map"."""
     if message["task"] == "prove":
         yield from _proof(problem, newer)
+        return
+    if message["task"] == "map":
+        x, y, lost = message["plane"]
+        yield {"kind": "map"} | map_document(problem, (x, y), lost)
         return
     if message["margin"] and problem.spec.uncertainty:
         loops, over = travel_loops(problem.plant, problem.controller, tuple(problem.spec.uncertainty))
@@ -137,7 +150,7 @@ def failure(message: Message, error: Exception) -> dict[str, Any]:
     sentence = shorten(describe_error(error))
     if message["task"] == "prove":
         return {"kind": "proof", "lower": None, "upper": None, "frequency": None, "reason": sentence}
-    return {"kind": "failed", "error": sentence}
+    return {"kind": "map" if message["task"] == "map" else "failed", "error": sentence}
 
 
 class _Inbox:

@@ -84,6 +84,7 @@ def margin_map_of(
     *,
     margin: Margin | None = None,
     proof: bool = True,
+    lost: float = LEAST,
 ) -> MarginMap:
     """Map the stability of a machine's loop over two of its parameters.
 
@@ -91,6 +92,7 @@ def margin_map_of(
     uncertainty : relative half range of each parameter; that of x and of y is the box of the map
     margin : of all of `uncertainty`, from `malta.verify`; None: that of x and y alone is proven here
     proof : False: without a margin, where none is given
+    lost : of a map without a margin: where about stability is lost, in multiples of the box, which sets its width
 
     Raises InputError for a parameter that is not uncertain, and for one with itself.
 
@@ -108,7 +110,8 @@ def margin_map_of(
         margin = travel_margin(plant, controller, box)
     nominal = np.array([float(getattr(plant.parameters, name)) for name in names])
     half = np.abs(nominal) * np.array([box[x], box[y]])
-    lost = margin.upper if margin is not None and math.isfinite(margin.upper) else LEAST
+    if margin is not None:
+        lost = margin.upper if math.isfinite(margin.upper) else LEAST
     reach = min(max(BEYOND * lost, LEAST), WIDEST)
     loops, over = travel_loops(plant, controller, names)
     limits = np.array(loops[0][0].limits or [(-math.inf, math.inf)] * len(loops[0][0].names))[:2]

@@ -21,7 +21,7 @@ import pytest
 import malta
 from malta.app import session as follow
 from malta.app.files import Edit, TakenError, fingerprint, inside, open_design, save_design
-from malta.app.picture import View, picture, solve
+from malta.app.picture import View, map_document, picture, solve
 from malta.app.server import LARGEST, PAGES, Server
 from malta.app.session import Session
 from malta.app.worker import work
@@ -111,6 +111,47 @@ def test_eigenvalue_margin_lies_just_above_the_proven_one(design: Path) -> None:
     assert proven.lower <= bound.upper <= 1.001 * proven.lower + 1e-3
     again = ray_bound(loops, spec.uncertainty, over, bound.ray)
     assert again.upper == pytest.approx(bound.upper, rel=2e-3)
+
+
+def test_the_margin_map_and_the_poles_at_its_points_agree(tmp_path: Path) -> None:
+    """Eigenvalues of the sampled loop on a grid, and the machine's own loop at a point: two routes to the boundary."""
+    page = Client(copied(tmp_path), tmp_path)
+    page.ask("evaluate", number=1, values={})
+    names = list(page.ask("open")["parameters"])[:2]
+    x, y = names
+    assert page.ask("map", x=x, y=y) == {"version": 1}
+    problem = solve(page.session.files.apply(page.session.edit))
+    found = map_document(problem, (x, y), 3.0)
+    assert found["half"][0] == pytest.approx(found["nominal"][0] * problem.spec.uncertainty[x])
+    for row, worst in ((found["nominal"], -1.0), (np.array(found["boundary"][0])[:, 10], 0.0)):
+        there = page.ask("map", x=x, y=y, at=[float(value) for value in row])
+        assert there["at"] == pytest.approx(dict(zip(names, row, strict=True)))
+        if worst < 0:
+            assert there["stable"]
+            assert there["poles"] == pytest.approx(
+                np.array(picture(problem, View())["poles"]["closed loop"]), rel=1e-6
+            )
+        else:
+            scale = abs(complex(*there["worst"]))
+            assert abs(there["worst"][0]) < 0.02 * scale
+    far = np.array(found["unstable"][0][0])  # a ring whose points are unstable, or on the boundary
+    furthest = far[:, np.argmax(np.abs(far / np.array(found["nominal"])[:, None] - 1).sum(axis=0))]
+    assert not page.ask("map", x=x, y=y, at=furthest.tolist())["stable"]
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        ({"x": "m", "y": "m"}, "two of m"),
+        ({"x": [], "y": 1}, "two of m"),
+        ({"x": "m", "y": "A", "at": [1]}, "two numbers"),
+        ({"x": "m", "y": "A", "at": [1, float("nan")]}, "two numbers"),
+        ({"x": "m", "y": "A", "at": [-1, 1]}, "m: found -1"),
+    ],
+)
+def test_a_map_of_other_things_is_refused(tmp_path: Path, body: dict[str, Any], says: str) -> None:
+    page = Client(copied(tmp_path), tmp_path)
+    assert says in page.ask("map", **body)["error"]
 
 
 def test_a_machine_that_differs_keeps_its_controller(tmp_path: Path) -> None:

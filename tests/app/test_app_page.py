@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import threading
 import time
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browsing import browser as browser
+from browsing import printed
 from test_app import copied
 
 import malta
@@ -104,6 +106,64 @@ def test_a_slider_moves_the_design_and_its_proof_follows(page: Any) -> None:
     assert row(page, "stiffness")[1].get_attribute("value") == moved
     page.find_elements("css selector", ".card.table .tabs button")[2].click()
     assert "pid.Kp.F_x" in text(page, ".tables")
+
+
+def test_the_margin_map_shows_the_proven_box_and_the_poles_where_it_is_clicked(page: Any) -> None:
+    find(page, ".card.poles .tabs button[data-value=map]").click()
+    wait(lambda: "proven 288.7" in text(page, ".card.poles .note").replace("blue: ", "").replace(",", ""))
+    assert len(page.find_elements("css selector", ".card.poles .proven-box")) == 1
+    find(page, ".card.poles .chart").click()  # its middle, where the machine of the file is
+    wait(lambda: "there stable" in text(page, ".card.poles .note"))
+    slider, _ = row(page, "stiffness")
+    slider.send_keys("\ue014")  # an arrow to the right: another design, of which nothing is proven yet
+    wait(lambda: not page.find_elements("css selector", ".card.poles .proven-box"))
+    wait(lambda: page.find_elements("css selector", ".card.poles .proven-box"))
+
+
+def test_while_a_slider_is_dragged_axes_stand_still_and_old_values_are_grey(page: Any) -> None:
+    """Between input events and the change that ends them; the design of the beginning is a thin line."""
+    ticks = "return [...document.querySelectorAll('.card.load .tick')].map((one) => one.textContent).join()"
+    wait(lambda: page.find_elements("css selector", ".requirements .light.true"))
+    slider, _ = row(page, "stiffness")
+    place = round(0.9 * float(slider.get_attribute("value")))
+    began, version = (
+        page.execute_script(ticks),
+        page.execute_script("return document.querySelector('#page').dataset.version"),
+    )
+    move = "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event(arguments[2], {bubbles: true}));"
+    page.execute_script(move, slider, place, "input")
+    wait(lambda: page.execute_script("return document.querySelector('#page').dataset.version") != version)
+    assert page.find_elements("css selector", ".card.load .line.faint")
+    assert page.execute_script(ticks) == began
+    old = page.find_elements("css selector", ".requirements .light.old")
+    assert old
+    assert not any(
+        one.get_attribute("aria-label") == "met"
+        for one in page.find_elements("css selector", ".light.old .sign")
+    )
+    page.execute_script(move, slider, place, "change")
+    wait(lambda: page.execute_script(ticks) != began)
+    assert not page.find_elements("css selector", ".card.load .line.faint")
+    wait(lambda: page.find_elements("css selector", ".requirements .light.false"))
+    signs = [
+        one.get_attribute("class").split()[1]
+        for one in page.find_elements("css selector", ".requirements .light")
+    ]
+    assert signs[0] == "false"  # failures first
+
+
+def test_the_page_fits_a_small_screen_and_paper(page: Any) -> None:
+    for width in (768, 390):
+        screen = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
+        page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+        wide = "const a = document.querySelector('.cards'); return [a.scrollWidth - a.clientWidth, "
+        wide += "document.documentElement.scrollWidth]"
+        assert page.execute_script(wide) == [0, width]
+    page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    pypdf = pytest.importorskip("pypdf")
+    text = " ".join(sheet.extract_text() for sheet in pypdf.PdfReader(io.BytesIO(printed(page))).pages)
+    assert "Sensitivity" in text
+    assert "peak sensitivity" in text
 
 
 def test_undo_redo_and_reset_by_keys(page: Any) -> None:

@@ -20,10 +20,11 @@ from page_checks import cells_of, read_page
 import malta
 from malta.cli.report import campaigns_of, read_subject
 from malta.margins.verify import linear_report
-from malta.report.figures.drawing import printable
+from malta.report.figures.drawing import STYLES, new_figure, printable
 from malta.report.page.analysis import Subject, analyse, key_figures
-from malta.report.page.document import Page, dark_colour, pdf_of
+from malta.report.page.document import Front, Page, dark_colour, pdf_of, render
 from malta.report.page.report import page_of
+from malta.report.page.sections import Picture, Section, Sheet
 from malta.report.verdict import SIGNS, verdict_lines
 
 if TYPE_CHECKING:
@@ -99,6 +100,81 @@ def test_the_gains_stand_in_the_page_to_six_digits(cart: Analysis, page: Page) -
     K = cart.subject.controller.K
     (row,) = cells_of(page.html, "K<")[1:]
     assert [float(cell.replace("−", "-")) for cell in row[1:]] == pytest.approx(K[0], rel=1e-5)
+
+
+X = np.geomspace(1.0, 1000.0, 400)
+
+
+def curves_page() -> Page:
+    """A page with a figure of two panels over one axis: logarithmic above, and of three decades either way below."""
+
+    def draw() -> Any:
+        figure = new_figure("curves", size=(7.0, 5.0))
+        upper, lower = figure.subplots(2, 1, sharex=True)
+        upper.loglog(X, X**2, label="square", **STYLES[0])
+        upper.loglog(X, X**0.5, label="<root>", **STYLES[2])
+        lower.plot(X, X - 100, **STYLES[0])
+        lower.set_yscale("symlog", linthresh=10.0)
+        lower.set_xlabel("frequency [rad/s]")
+        upper.legend()
+        return figure
+
+    rows = Sheet("Numbers", ("a", "b"), (("1", "2"),), (False, True))
+    return render(Front("Test", "Curves", "about"), [Section("one", "One", (Picture(draw, "Curves."), rows))])
+
+
+def test_a_figure_says_what_its_panels_lines_and_legends_are() -> None:
+    html = curves_page().html
+    read_page(html)
+    assert "<root>" not in html
+    (told,) = json.loads(re.findall(r'id="figures">(.*?)</script>', html, re.DOTALL)[0])
+    assert [line["label"] for line in told["lines"]] == ["square", "<root>", "square"]  # the last by its look
+    assert [entry["label"] for entry in told["legend"]] == ["square", "<root>"]
+    for line, y in zip(told["lines"], (X**2, X**0.5), strict=False):
+        path = re.findall(rf'id="{line["id"]}".*?d="(.*?)"', html, re.DOTALL)[0]
+        (px, py), panel = map(float, re.findall(r"M ?(\S+) (\S+)", path)[0]), told["axes"][0]
+        for at, ends, side, value in ((px, ("left", "right"), "x", X[0]), (py, ("bottom", "top"), "y", y[0])):
+            share = (at - panel[ends[0]]) / (panel[ends[1]] - panel[ends[0]])
+            low, high = (np.log10(panel[side][end]) for end in ("low", "high"))
+            assert low + share * (high - low) == pytest.approx(np.log10(value), abs=0.01)
+
+
+POINT = """
+const [n, share, kind, down] = arguments, svg = document.querySelector("figure svg");
+const a = JSON.parse(document.getElementById("figures").textContent)[0].axes[n], m = svg.getScreenCTM();
+const p = new DOMPoint(a.left + share * (a.right - a.left), (a.top + a.bottom) / 2).matrixTransform(m);
+svg.dispatchEvent(new PointerEvent(kind, {clientX: p.x, clientY: p.y + down, bubbles: true}));
+return document.querySelector(".readout").innerText.replaceAll("−", "-").split("\\n");
+"""
+
+
+@pytest.mark.slow
+def test_a_figure_answers_under_the_pointer(tmp_path: Path, browser: Any) -> None:
+    """Values of all lines, a cursor in both panels, lines that are hidden by the legend, zoom, folded tables, paper."""
+    open_page(browser, curves_page().save(tmp_path / "page.html"))
+    head, *rows = browser.execute_script(POINT, 0, 0.5, "pointermove", 0)
+    x = float(head.split()[1])
+    assert head.startswith("frequency ")
+    assert [float(row.partition(": ")[2]) for row in rows[:2]] == pytest.approx([x**2, x**0.5], rel=0.02)
+    assert browser.execute_script("return document.querySelectorAll('figure .hair').length") == 2
+    _, below, *_ = browser.execute_script(POINT, 1, 0.9, "pointermove", 0)
+    x = float(browser.execute_script("return document.querySelector('.readout').innerText").split()[1])
+    assert float(below.partition(": ")[2]) == pytest.approx(x - 100, rel=0.02)
+    browser.execute_script("document.querySelectorAll('.channel')[1].dispatchEvent(new Event('click'))")
+    assert len(browser.execute_script(POINT, 0, 0.5, "pointermove", 0)) == len([head, *rows]) - 1
+    box = "return document.querySelector('figure svg').getAttribute('viewBox')"
+    whole = browser.execute_script(box)
+    browser.execute_script(POINT, 0, 0.2, "pointerdown", -40)
+    browser.execute_script(POINT, 0, 0.6, "pointerup", 40)
+    assert browser.execute_script(box) != whole
+    browser.execute_script("dispatchEvent(new Event('beforeprint')); document.querySelector('.fold').click()")
+    assert browser.execute_script(box) == whole
+    assert browser.execute_script("return document.querySelector('table').offsetHeight") == 0
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+    pypdf = pytest.importorskip("pypdf")
+    text = pypdf.PdfReader(io.BytesIO(printed(browser))).pages[0].extract_text()
+    assert "Numbers" in text
+    assert "1 2" in " ".join(text.split())  # on paper no table is folded
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 
 import { createChart } from "./chart.js";
 import { createPanel, element } from "./controls.js";
-import { color, loadView, nyquistView, poleView, runView, sensitivityView, timeGroups } from "./figures.js";
+import { color, loadView, mapView, nyquistView, poleView, runView, sensitivityView, timeGroups } from "./figures.js";
 import { digits, floored, percent } from "./numbers.js";
 import { countLights, differenceTable, figureTable, requirementRows } from "./tables.js";
 
@@ -28,7 +28,7 @@ export async function mount(root, transport) {
     description, values: {}, redesign: true, undo: [], redo: [], pins: [], pinned: 0,
     picture: null, simulated: null, requirements: {}, proof: null, version: 0, number: 0, failed: "",
     run: description.runs[0], load: description.loads[0]?.name ?? "", runGroup: "", loadGroup: "",
-    sens: "S", reach: NEAR, allPoles: false, table: "requirements", hidden: new Set(), hiddenPoles: new Set(), ties: false,
+    sens: "S", reach: NEAR, poles: "slow", map: null, there: null, mapX: "", mapY: "", table: "requirements", hidden: new Set(), hiddenPoles: new Set(), ties: false,
   };
   const fresh = () => Object.fromEntries(state.description.fields.map((field) => [field.key, field.value]));
   state.values = { ...fresh(), ...description.edit.values };
@@ -37,7 +37,7 @@ export async function mount(root, transport) {
   // --- parts of the page ---
   const button = (text, title, press, attributes = {}) => element("button", { type: "button", title, onclick: press, ...attributes }, text);
   const badge = element("div", { class: "badge", role: "status", "aria-live": "polite" });
-  const lights = element("button", { type: "button", class: "lights", title: "requirements", onclick: () => { state.table = "requirements"; drawTables(); } });
+  const lights = element("button", { type: "button", class: "lights", title: "requirements", onclick: () => { state.table = "requirements"; drawTables(); tables.scrollTop = 0; tables.scrollIntoView({ block: "nearest" }); } });
   const speed = element("span", { class: "speed", "aria-hidden": "true" });
   const title = element("h1", {}), subtitle = element("span", { class: "soft" });
   const undo = button("↶ Undo", "Ctrl Z", () => step("undo", "redo")), redo = button("↷ Redo", "Ctrl Y", () => step("redo", "undo"));
@@ -77,14 +77,16 @@ export async function mount(root, transport) {
   };
   const sensTabs = tabs([["S", "S"], ["T", "T"]], () => state.sens, (value) => { state.sens = value; });
   const reachTabs = tabs([[NEAR, "near −1"], [WIDE, "wide"]], () => state.reach, (value) => { state.reach = Number(value); });
-  const poleTabs = tabs([["slow", "slow"], ["all", "all"]], () => (state.allPoles ? "all" : "slow"), (value) => { state.allPoles = value === "all"; });
+  const poleTabs = tabs([["slow", "slow"], ["all", "all"], ["map", "margin map"]], () => state.poles, (value) => { state.poles = value; if (value === "map") askMap(); });
+  const mapXs = pick("parameter along x", () => state.mapX, (value) => { state.mapX = value; askMap(); });
+  const mapYs = pick("parameter along y", () => state.mapY, (value) => { state.mapY = value; askMap(); });
   const runList = pick("run", () => state.run, (value) => { state.run = value; state.simulated = null; ask(); });
   const runGroups = pick("signals of the run", () => state.runGroup, (value) => { state.runGroup = value; draw(); });
   const loadList = pick("load", () => state.load, (value) => { state.load = value; ask(); });
   const loadGroups = pick("outputs under the load", () => state.loadGroup, (value) => { state.loadGroup = value; draw(); });
   card("sensitivity", "Sensitivity", sensTabs);
   card("nyquist", "Nyquist", reachTabs);
-  card("poles", "Poles", poleTabs);
+  card("poles", "Poles", mapXs, mapYs, poleTabs);
   card("run", "Run", runList, runGroups);
   card("load", "Load", loadList, loadGroups);
   const tableTabs = tabs([["requirements", "Requirements"], ["figures", "Figures"], ["changes", "Changes"]], () => state.table, (value) => { state.table = value; });
@@ -110,6 +112,7 @@ export async function mount(root, transport) {
   function change(field, value, done) {
     if (!before) {
       before = snapshot();
+      state.ghost = state.failed ? null : state.picture;
       tied = field.linked.length ? [...field.linked] : [field.key];
       if (state.ties) {
         for (const other of state.description.fields) {
@@ -119,6 +122,7 @@ export async function mount(root, transport) {
     }
     for (const key of tied) state.values[key] = inUnitOf(key, value, field);
     if (done) {
+      state.ghost = null;
       if (tied.some((key) => before.values[key] !== state.values[key])) remember(before);
       before = null;
     }
@@ -147,7 +151,7 @@ export async function mount(root, transport) {
     if (!next) return;
     state[to].push(snapshot());
     Object.assign(state, { values: { ...next.values }, redesign: next.redesign });
-    before = null;
+    before = state.ghost = null;
     refresh();
   }
 
@@ -155,6 +159,7 @@ export async function mount(root, transport) {
 
   function refresh() {
     // Nothing that was proven or measured of the last design is shown beside the numbers of the next.
+    state.past = { ...state.past, ...state.requirements, ...(state.proof?.lower ? { margin: { found: state.proof.lower } } : {}) };
     if (!state.moving) last = { version: state.version, proof: state.proof, requirements: state.requirements, simulated: state.simulated };
     Object.assign(state, { moving: true, proof: null, requirements: {}, simulated: null });
     panel.show(state.values);
@@ -190,7 +195,8 @@ export async function mount(root, transport) {
   function take(answer, milliseconds) {
     state.failed = answer.error ?? "";
     if (answer.version !== undefined && answer.version !== state.version) {
-      Object.assign(state, { version: answer.version, requirements: {}, proof: null, simulated: null });
+      state.past = { ...state.past, ...state.requirements };
+      Object.assign(state, { version: answer.version, requirements: {}, proof: null, simulated: null, there: null });
     } else if (state.moving && answer.version === last.version) Object.assign(state, last);
     if (!answer.error) {
       state.picture = answer;
@@ -212,12 +218,32 @@ export async function mount(root, transport) {
     if (item.version < state.version || !state.picture) return;
     if (item.kind === "requirement") state.requirements[item.name] = item;
     if (item.kind === "proof") state.proof = item;
+    if (item.kind === "map") state.map = item;
     if (item.kind === "run") state.simulated = item;
     if (item.kind === "margin") state.picture.margin = item;
     if (item.kind === "failed") say(item.error, "error");
     if (item.kind === "notice") say(item.text);
-    if (item.kind === "run") draw();
+    if (item.kind === "run" || state.poles === "map") draw();
     else { drawHeader(); drawTables(); }
+  }
+
+  // --- the margin map: the plane of two parameters, and the poles at a point of it ---
+  async function askMap() {
+    const known = Object.keys(state.description.parameters);
+    if (known.length < 2) return;
+    if (!known.includes(state.mapX)) state.mapX = known[0];
+    if (!known.includes(state.mapY) || state.mapY === state.mapX) state.mapY = known.find((name) => name !== state.mapX);
+    for (const list of [mapXs, mapYs]) list.fill(known.map((name) => [name, name]));
+    Object.assign(state, { map: null, there: null });
+    draw();
+    const answer = await transport.ask({ ask: "map", x: state.mapX, y: state.mapY }).catch(() => ({ error: GONE }));
+    if (answer.error) say(answer.error, "error");
+  }
+
+  async function pickPoint(x, y) {
+    const answer = await transport.ask({ ask: "map", x: state.mapX, y: state.mapY, at: [x, y] }).catch(() => ({ error: GONE }));
+    if (answer.error) say(answer.error, "error");
+    else if (answer.version === state.version) { state.there = answer; draw(); }
   }
 
   function say(text, kind = "note") {
@@ -235,6 +261,8 @@ export async function mount(root, transport) {
   }
 
   function show(chart, view, empty) {
+    if (view && before && chart.held?.words === view.y.label) Object.assign(view, { x: chart.held.x, y: chart.held.y });
+    else if (view) chart.held = { x: view.x, y: view.y, words: view.y.label };
     const missing = view ? view.empty : empty;
     chart.node.classList.toggle("empty", Boolean(missing));
     chart.node.dataset.missing = missing ?? "";
@@ -245,26 +273,30 @@ export async function mount(root, transport) {
 
   function draw() {
     drawHeader();
-    const { picture } = state;
+    const { picture } = state, pins = state.ghost ? [...state.pins, { picture: state.ghost }] : state.pins;
     if (!picture) return;
     for (const group of [sensTabs, reachTabs, poleTabs]) group.mark();
     const names = picture.frequency.sensors;
-    show(charts.sensitivity, sensitivityView(picture, state.pins, state.sens, state.hidden));
-    show(charts.nyquist, nyquistView(picture, state.pins, state.reach, state.hidden));
-    show(charts.poles, poleView(picture, state.pins, state.allPoles, state.hiddenPoles));
+    show(charts.sensitivity, sensitivityView(picture, pins, state.sens, state.hidden));
+    show(charts.nyquist, nyquistView(picture, pins, state.reach, state.hidden));
+    const mapped = state.poles === "map", uncertain = Object.keys(state.description.parameters);
+    mapXs.hidden = mapYs.hidden = !mapped || uncertain.length < 2;
+    poleTabs.lastChild.hidden = uncertain.length < 2;
+    show(charts.poles, mapped ? mapView(state, pickPoint) : poleView(picture, pins, state.poles === "all", state.hiddenPoles, state.there), state.map?.error ?? "The map follows.");
     legendOf(charts.sensitivity, names, state.hidden);
     legendOf(charts.nyquist, names, state.hidden);
-    legendOf(charts.poles, Object.keys(picture.poles).filter((name) => picture.poles[name].length), state.hiddenPoles, { machine: "○", "closed loop": "×", regulator: "+", filter: "□" });
-    drawTimes();
+    if (mapped) charts.poles.legend.replaceChildren();
+    else legendOf(charts.poles, Object.keys(picture.poles).filter((name) => picture.poles[name].length), state.hiddenPoles, { machine: "○", "closed loop": "×", regulator: "+", filter: "□" });
+    drawTimes({ ...state, pins });
     drawTables();
   }
 
-  function drawTimes() {
+  function drawTimes(seen) {
     const groups = timeGroups(state.description, true), short = timeGroups(state.description, false);
     const group = groups.find((one) => one.id === state.runGroup) ?? groups[0];
     const under = short.find((one) => one.id === state.loadGroup) ?? short[0];
-    show(charts.run, runView(state, group, state.hidden), "Too many samples for the linear loop, or no such run.");
-    show(charts.load, loadView(state, under, state.hidden), state.description.loads.length ? "An unstable loop carries no load." : "No force acts on this machine from outside.");
+    show(charts.run, runView(seen, group, state.hidden), "Too many samples for the linear loop, or no such run.");
+    show(charts.load, loadView(seen, under, state.hidden), state.description.loads.length ? "An unstable loop carries no load." : "No force acts on this machine from outside.");
     const signals = group.of === "v" ? state.description.inputs : state.description.outputs;
     const named = (of, indices) => indices.map((k) => of[k].name);
     legendOf(charts.run, named(signals, group.indices), state.hidden);
@@ -285,7 +317,7 @@ export async function mount(root, transport) {
     const { table } = state;
     if (table === "requirements") {
       tables.replaceChildren(state.description.requirements.length ? element("table", { class: "requirements" }, element("tbody", {}, ...requirementRows(state.description, state)))
-        : element("p", { class: "soft" }, "The design file asks for nothing: it has no [specification]."), figureTable(state));
+        : element("p", { class: "soft" }, "The design file asks for nothing. Lines like margin = 1.5 or peak_sensitivity = 2.5 below [specification] are judged here at every move, and malta tune reaches for them."), figureTable(state));
     } else tables.replaceChildren(table === "figures" ? figureTable(state) : differenceTable(state.description, state));
     const counts = countLights(state.description, state);
     lights.hidden = !state.description.requirements.length;

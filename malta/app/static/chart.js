@@ -52,7 +52,7 @@ const MARKS = {
 // A chart that fills its node. draw(view) draws
 //   x, y: {label, min, max, log}; equal: one scale for both
 //   lines: {name, xs, ys, color, dash, width, faint}; points: {name, xs, ys, mark, color, faint}
-//   shapes: {kind: "circle" | "band" | "line" | "ray" | "text", ...}
+//   shapes: {kind: "circle" | "band" | "line" | "ray" | "text" | "area", ...}; pick(x, y): what a click does
 //   read(line, k): rows of the readout; nearest: "x" along the axis, "xy" the nearest point
 export function createChart(label) {
   const node = document.createElement("div");
@@ -99,6 +99,11 @@ export function createChart(label) {
 
   function drawShape(group, shape, s) {
     const { toX, toY, right, bottom, x, y } = s;
+    if (shape.kind === "area") { // rings of points, the first outside, others holes
+      const d = shape.rings.map(([xs, ys]) => `${pathOf(xs, ys, toX, toY)}Z`).join("");
+      group.append(svg("path", { class: shape.class, d, "fill-rule": "evenodd" }));
+      return;
+    }
     if (shape.kind === "circle") {
       const rx = Math.abs(toX(shape.x + shape.r) - toX(shape.x)), ry = Math.abs(toY(shape.y + shape.r) - toY(shape.y));
       group.append(svg("ellipse", { class: shape.class, cx: toX(shape.x), cy: toY(shape.y), rx, ry }));
@@ -203,6 +208,13 @@ export function createChart(label) {
     if (view) point({ left: event.clientX - box.left, top: event.clientY - box.top });
   });
   node.addEventListener("pointerleave", () => point(null));
+  node.addEventListener("click", (event) => {
+    if (!view?.pick || !shown) return;
+    const box = node.getBoundingClientRect(), back = (axis, to, place) => axis.min + ((place - to(axis.min)) * (axis.max - axis.min)) / (to(axis.max) - to(axis.min));
+    const left = event.clientX - box.left, top = event.clientY - box.top;
+    if (left < MARGIN.left || left > shown.right || top < MARGIN.top || top > shown.bottom) return;
+    view.pick(back(shown.x, shown.toX, left), back(shown.y, shown.toY, top));
+  });
   node.addEventListener("blur", () => point(null));
   node.addEventListener("keydown", (event) => {
     const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];

@@ -1,7 +1,7 @@
 // What the charts show: documents of the session as views of chart.js.
 
 import { rangeOf } from "./chart.js";
-import { decibels, digits, printedUnit, quantity, scaleFor } from "./numbers.js";
+import { decibels, digits, floored, percent, printedUnit, quantity, scaleFor } from "./numbers.js";
 
 const DASHES = ["", "7 3", "2 3", "8 3 2 3", "", "7 3", "2 3", "8 3 2 3"];
 export const color = (k) => `var(--c${k % 8})`;
@@ -72,7 +72,7 @@ export function nyquistView(picture, pins, reach, hidden) {
 const POLES = { machine: ["o", 7], "closed loop": ["x", 0], regulator: ["+", 2], filter: ["s", 4] };
 
 // Poles in the s plane, ln z / Ts of sampled ones; rays of damping 0.1, 0.3 and 0.7.
-export function poleView(picture, pins, all, hidden) {
+export function poleView(picture, pins, all, hidden, there = null) {
   const sizes = picture.poles["closed loop"].map(([re, im]) => Math.hypot(re, im)).sort((a, b) => a - b);
   const wanted = 1.25 * (all ? sizes[sizes.length - 1] : sizes[Math.floor(0.6 * (sizes.length - 1))] ?? 1);
   const power = 10 ** Math.floor(Math.log10(wanted));
@@ -92,7 +92,7 @@ export function poleView(picture, pins, all, hidden) {
     x: { label: "Re s [rad/s]", min: -reach, max: 0.35 * reach },
     y: { label: "Im s [rad/s]", min: -reach, max: reach },
     shapes: [{ kind: "line", x: 0, class: "limit" }, { kind: "line", y: 0 }, ...rays, ...labels],
-    points: [...pins.flatMap((pin) => sets(pin.picture.poles, true)), ...sets(picture.poles, false)],
+    points: [...pins.flatMap((pin) => sets(pin.picture.poles, true)), ...sets(picture.poles, false), ...(there ? [{ name: "at the picked point of the map", mark: "x", color: "var(--accent)", size: 3, xs: there.poles.map((p) => p[0]), ys: there.poles.map((p) => p[1]) }] : [])],
     note: hiddenPoles ? `${hiddenPoles} faster ${hiddenPoles > 1 ? "poles" : "pole"} outside` : "",
     summary: `${sizes.length} poles of the closed loop, spectral radius ${digits(picture.radius, 6)}`,
     read: (set, k) => {
@@ -178,5 +178,28 @@ function timeView(lines, { unit, words }, times, title) {
       { text: `${digits(line.xs[k], 4)} ${time.unit}`, strong: true },
       ...scaled.filter((one) => !one.silent && one.xs === line.xs || (!one.silent && one.xs.length === line.xs.length)).map((one) => ({ color: one.color, text: `${one.name}: ${digits(one.ys[k], 4)} ${value.unit}` })),
     ],
+  };
+}
+
+// The plane of two parameters: the proven box, the boundary by eigenvalues, the witness; a click asks for the poles there.
+export function mapView(state, pick) {
+  const { map, proof, there, picture } = state;
+  if (!map || map.error) return null;
+  const [cx, cy] = map.nominal, [hx, hy] = map.half, lower = proof?.lower ?? 0;
+  const box = (share) => [[[cx - share * hx, cx + share * hx, cx + share * hx, cx - share * hx], [cy - share * hy, cy - share * hy, cy + share * hy, cy + share * hy]]];
+  const unit = (k) => (map.units[k] === "1" ? "" : ` [${printedUnit(map.units[k])}]`);
+  const points = [{ name: "nominal", xs: [cx], ys: [cy], mark: "+", size: 6, color: "var(--ink)" }];
+  const witness = proof?.at ?? {};
+  if (witness[map.x] !== undefined && witness[map.y] !== undefined) points.push({ name: map.others ? "witness, other parameters moved too" : "witness", xs: [witness[map.x]], ys: [witness[map.y]], mark: "x", size: 6, color: "var(--bad)" });
+  if (there) points.push({ name: `picked: ${there.stable ? "stable" : "unstable"}`, xs: [there.at[map.x]], ys: [there.at[map.y]], mark: "o", size: 6, color: "var(--accent)" });
+  const told = there ? `there ${there.stable ? "stable" : "UNSTABLE"}, slowest pole ${digits(there.worst[0], 4)}${there.worst[1] ? ` ± ${digits(Math.abs(there.worst[1]), 4)} j` : ""} rad/s` : "click for the poles there";
+  return {
+    nearest: "xy", pick,
+    x: { label: `${map.x}${unit(0)}`, min: map.reach[0][0], max: map.reach[0][1] }, y: { label: `${map.y}${unit(1)}`, min: map.reach[1][0], max: map.reach[1][1] },
+    shapes: [...map.unstable.map((rings) => ({ kind: "area", rings, class: "forbidden" })), ...(lower > 0 ? [{ kind: "area", rings: box(lower), class: "proven-box" }] : []), { kind: "area", rings: box(1), class: "asked-box" }],
+    lines: map.boundary.map(([xs, ys]) => ({ name: "boundary", xs, ys, color: "var(--ink)", silent: true })), points,
+    note: `${map.version !== state.version ? "of the last design" : lower > 0 ? `blue: proven, ${percent(floored(lower))} of the dashed box` : picture.margin ? "not proven (yet)" : ""}; ${told}`,
+    summary: `${map.x} and ${map.y}; ${told}`,
+    read: (set, k) => [{ text: set.name, strong: true, color: set.color }, { text: `${map.x} ${digits(set.xs[k], 4)}` }, { text: `${map.y} ${digits(set.ys[k], 4)}` }],
   };
 }

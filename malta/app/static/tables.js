@@ -19,13 +19,19 @@ const wordsOf = (name) => [name.split(" ")[0].replaceAll("_", " "), ...name.spli
 
 const boundText = (asked, value) => (asked.switch ? (value ? "yes" : "no") : asked.name === "margin" ? percent(value) : quantity(value, asked.unit, 3));
 
+// Failures first, then what is not known yet. A value of the last design stays, grey and without a verdict, until the new one comes.
 export function requirementRows(description, state) {
-  return description.requirements.map((asked) => {
-    const found = asked.name === "margin" ? marginLight(asked.asked, state) : state.requirements[asked.name] ?? { holds: null, found: null, how: "" };
+  const past = (asked) => ({ holds: null, found: state.past?.[asked.name]?.found ?? null, how: "of the last design", old: true });
+  const judged = description.requirements.map((asked) => {
+    const found = asked.name === "margin" ? marginLight(asked.asked, state) : state.requirements[asked.name];
+    return { asked, found: found && (found.found !== null || found.holds !== null) ? found : past(asked) };
+  });
+  const rank = ({ found }) => (found.holds === false ? 0 : 1);
+  return judged.sort((one, other) => rank(one) - rank(other)).map(({ asked, found }) => {
     const [sign, words] = SIGNS[found.holds ?? null];
     const value = found.found === null || found.found === undefined ? (found.holds === false ? "none" : "") : boundText(asked, found.found);
     const bound = asked.switch ? "" : `${asked.at_least ? "≥" : "≤"} ${boundText(asked, asked.asked)}`;
-    return element("tr", { class: `light ${found.holds ?? "open"}`, title: found.how ?? "" },
+    return element("tr", { class: `light ${found.holds ?? "open"}${found.old ? " old" : ""}`, title: found.how ?? "" },
       element("td", { class: "sign", role: "img", "aria-label": words }, sign),
       element("td", {}, wordsOf(asked.name)), element("td", { class: "number" }, value), element("td", { class: "number soft" }, bound));
   });

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import html
 import io
+import json
 import re
 import warnings
 from collections.abc import Callable, Sequence
@@ -19,13 +20,14 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.files import replace_files
-from malta.report.figures.drawing import printable
+from malta.report.figures.drawing import BOUND_LINE, printable
 from malta.report.page.sections import Folded, Item, Picture, Section, polish
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     import jinja2
+    from matplotlib.axes import Axes
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.figure import Figure
 
@@ -41,19 +43,22 @@ NAMESPACE = re.compile(r"^\{[^}]*\}")
 COLOUR = re.compile(r"#[0-9a-f]{6}\b")
 REFERENCE = re.compile(r"url\(#([^)]+)\)")
 NUMBER = re.compile(r"-?\d+\.\d{3,}")
+ALONG = ("time", "frequency")  # labels of axes along which one looks at curves
+MOST_OF_A_MARK = 8  # points: what has fewer is no curve
 FONT = re.compile(r"font-family: [^;]*;? ?")
 
 
-def inline_svg(figure: Figure, prefix: str, label: str, styles: dict[str, str]) -> str:
-    """Draw a figure as an <svg> element for a page.
+def inline_svg(figure: Figure, prefix: str, label: str, styles: dict[str, str]) -> tuple[str, dict[str, Any]]:
+    """Draw a figure as an <svg> element for a page, and say what its panels, lines and legends are.
 
     prefix : of the identifiers in it, which no other figure of the page may have
     label : what the figure shows, for readers who do not see it
     styles : style -> class, of all figures of the page so far; those of this figure are added
     """
+    lines, entries = _mark_lines(figure)
     root = ElementTree.fromstring(_svg_bytes(figure))
     named = dict.fromkeys(found for node in root.iter() for found in _references(node))
-    names = {name: f"{prefix}-{number}" for number, name in enumerate(named)}
+    names = {name: f"{prefix}-{number}" for number, name in enumerate([*named, *lines, *entries])}
     for node in root.iter():
         _simplify(node, names, styles)
     for parent in list(root.iter()):
@@ -64,7 +69,77 @@ def inline_svg(figure: Figure, prefix: str, label: str, styles: dict[str, str]) 
     least = f"min-width:{float(box.split()[2]):.0f}px"  # of a narrow screen, which scrolls
     root.attrib.clear()
     root.attrib.update({"viewBox": box, "role": "img", "aria-label": printable(label), "style": least})
-    return ElementTree.tostring(root, encoding="unicode")
+    told = {
+        "axes": [_panel(axes, 72 * figure.get_size_inches()) for axes in figure.axes],
+        "lines": [{"id": names[key], "axes": k, "label": label} for key, (k, label) in lines.items()],
+        "legend": [{"id": names[key], "label": label} for key, label in entries.items()],
+    }
+    return ElementTree.tostring(root, encoding="unicode"), told
+
+
+def _mark_lines(figure: Figure) -> tuple[dict[str, tuple[int, str]], dict[str, str]]:
+    """Name the lines of a figure that are data, and the texts of its legends, so that its SVG has these names.
+
+    A line without a name of its own has that of the legend's line in its look.
+
+    Returns name -> (panel, label) of lines, and name -> label of legends.
+    """
+    legends = [legend for legend in (*figure.legends, *(a.get_legend() for a in figure.axes)) if legend]
+    looks: dict[str, str] = {}
+    entries: dict[str, str] = {}
+    for legend in legends:
+        for handle, text in zip(legend.legend_handles, legend.get_texts(), strict=False):
+            name = f"legend-{len(entries)}"
+            text.set_gid(name)
+            entries[name] = text.get_text()
+            if handle is not None and hasattr(handle, "get_linestyle"):
+                looks[_look_of(handle)] = text.get_text()
+    lines: dict[str, tuple[int, str]] = {}
+    for k, axes in enumerate(figure.axes):
+        for line in axes.lines:
+            if line.get_gid() == BOUND_LINE or np.size(line.get_xdata()) < MOST_OF_A_MARK:
+                continue
+            name, label = f"line-{len(lines)}", str(line.get_label())
+            line.set_gid(name)
+            lines[name] = k, looks.get(_look_of(line), "") if label.startswith("_") else label
+    return lines, entries
+
+
+def _look_of(line: Any) -> str:
+    """Colour and dashes of a line; matplotlib keeps the dashes of a style to itself."""
+    return (
+        f"{line.get_color()} {getattr(line, '_unscaled_dash_pattern', line.get_linestyle())}"
+        if hasattr(line, "get_color")
+        else ""
+    )
+
+
+def _panel(axes: Axes, size: FloatArray) -> dict[str, Any]:
+    """Where a panel is in its SVG, points, and its axes; `along`: whether one looks at it along x."""
+    wide, tall = size.tolist()
+    place = axes.get_position()
+    sides: dict[str, Any] = {}
+    for name, side, limits in (("x", axes.xaxis, axes.get_xlim()), ("y", axes.yaxis, axes.get_ylim())):
+        scale = side.get_scale() if side.get_scale() in ("log", "symlog") else "linear"
+        sides[name] = {
+            "scale": scale,
+            "low": limits[0],
+            "high": limits[1],
+            "label": _shared_label(axes, name),
+        }
+        if scale == "symlog":
+            found: Any = side.get_transform()
+            sides[name] |= {"linear": found.linthresh, "slope": found.linscale / (1 - 1 / found.base)}
+    return {
+        "left": wide * place.x0, "right": wide * place.x1, "top": tall * (1 - place.y1),
+        "bottom": tall * (1 - place.y0), "along": sides["x"]["label"].startswith(ALONG), **sides,
+    }  # fmt: skip
+
+
+def _shared_label(axes: Axes, name: str) -> str:
+    """The label of an axis, or of another panel that shares it."""
+    panels = axes.get_shared_x_axes().get_siblings(axes) if name == "x" else [axes]
+    return next((text for one in (axes, *panels) if (text := getattr(one, f"get_{name}label")())), "")
 
 
 def _svg_bytes(figure: Figure) -> bytes:
@@ -262,8 +337,10 @@ def render(
     pictures = [item for section in sections for item in section.items if isinstance(item, Picture)]
     drawn: dict[int, str] = {}
     styles: dict[str, str] = {}
+    told = []
     for number, picture in enumerate(pictures, 1):
-        drawn[id(picture)] = inline_svg(picture.draw(), f"f{number}", picture.caption, styles)
+        drawn[id(picture)], panels = inline_svg(picture.draw(), f"f{number}", picture.caption, styles)
+        told.append(panels)
         if progress is not None:
             progress(number / len(pictures))
     rules = style_rules(styles)
@@ -277,10 +354,12 @@ def render(
         for section in sections
     ]
     title = f"{front.heading}: {front.kind.lower()}"
+    policy, script = script_of(Path(__file__).with_name("figures.js").read_text(encoding="utf-8"))
     text = render_template(
         "page.html.jinja", title=title, kind=front.kind, heading=front.heading, about=front.about,
         figures=front.figures, foot=front.foot, verdict=Markup(front.verdict),
         sections=parts, style=Markup(page_style()), inks=Markup(f"{_inks([rules])}\n{rules}"),
+        policy=policy, script=Markup(script), panels=Markup(json_in_page(told)),
     )  # fmt: skip
     return Page(title, text, tuple((picture.caption, picture) for picture in pictures))
 
@@ -326,6 +405,11 @@ def _environment() -> jinja2.Environment:
     )
     environment.filters["polish"] = polish
     return environment
+
+
+def json_in_page(content: Any) -> str:
+    """A JSON document that stands in an element of a page: no text in it ends the element."""
+    return json.dumps(content, allow_nan=False).replace("<", "\\u003c")
 
 
 def script_of(text: str) -> tuple[str, str]:

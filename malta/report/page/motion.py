@@ -7,7 +7,6 @@ are those of `Plant.bodies`; nothing is computed of them.
 from __future__ import annotations
 
 import io
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -218,7 +217,7 @@ def motion_page(found: Motion, about: str = "") -> Page:
     """
     from markupsafe import Markup
 
-    from malta.report.page.document import Page, page_style, render_template, script_of
+    from malta.report.page.document import Page, json_in_page, page_style, render_template, script_of
 
     meshes = [mesh_of(body) for body in found.bodies]
     upright = camera(found.up, 0.0, 0.0)
@@ -237,10 +236,9 @@ def motion_page(found: Motion, about: str = "") -> Page:
         ],
     }  # fmt: skip
     policy, script = script_of(Path(__file__).with_name("motion.js").read_text(encoding="utf-8"))
-    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
     page = render_template(
         "motion.html.jinja", title=found.title, about=about, style=Markup(page_style()), script=Markup(script),
-        policy=policy, data=Markup(text),
+        policy=policy, data=Markup(json_in_page(data)),
     )  # fmt: skip
     return Page(f"{found.title}: in motion", page)
 
