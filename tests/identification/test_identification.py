@@ -387,10 +387,14 @@ def test_excited_flights_are_replayed_too(log: Log) -> None:
     assert max(found.at_once.values()) < 1e-9
 
 
-def test_exported_laws_have_no_excitation(plan: ExcitationPlan) -> None:
-    scenario = malta.Scenario.excited(plan.signal, 0.01)
-    with pytest.raises(malta.InputError, match="excitation"):
-        malta.simulate(changed({}), CONTROLLER, scenario, engine=malta.firmware.engine_of_c())
+def test_exported_laws_take_an_excitation(plan: ExcitationPlan) -> None:
+    """The compiled C flies the multisine as the law does, and its log is replayed; what is no force is none."""
+    scenario = malta.Scenario.excited(plan.signal, 0.05)
+    flown = malta.simulate(changed({}), CONTROLLER, scenario, engine=malta.firmware.engine_of_c())
+    run = malta.simulate(changed({}), CONTROLLER, scenario)
+    assert np.abs(flown.v - run.v).max() < 1e-9
+    assert np.ptp(plan.signal(run.t), axis=0).max() > 1
+    assert malta.identification.replay_law(CONTROLLER, malta.identification.log_of(flown)).same
     with pytest.raises(malta.InputError, match="excitation"):
         malta.simulate(changed({}), CONTROLLER, malta.Scenario.excited(lambda t: np.zeros((len(t), 2)), 0.01))
 
