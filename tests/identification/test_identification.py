@@ -13,6 +13,8 @@ import pytest
 from conftest import Run
 
 import malta
+from malta.firmware.signals import Target
+from malta.firmware.step import started_state, step_of, zero_reference
 from malta.identification import ExcitationPlan, Identified, Log
 from malta.identification.data_file import read_identified, write_data
 from malta.identification.excite import model_at, predicted_spectra
@@ -397,6 +399,21 @@ def test_exported_laws_take_an_excitation(plan: ExcitationPlan) -> None:
     assert malta.identification.replay_law(CONTROLLER, malta.identification.log_of(flown)).same
     with pytest.raises(malta.InputError, match="excitation"):
         malta.simulate(changed({}), CONTROLLER, malta.Scenario.excited(lambda t: np.zeros((len(t), 2)), 0.01))
+
+
+def test_an_excitation_that_is_no_force_is_none() -> None:
+    t = Target(CONTROLLER, fidelity="force", excited=True)
+    step, reference, p = step_of(t), zero_reference(t), len(CONTROLLER.measurements)
+    limit = np.array(CONTROLLER.limits.force)
+
+    def forces(excitation: Any) -> Any:
+        readings = {"y": np.zeros(p), "y_valid": np.ones(p), "excitation": excitation}
+        return step(started_state(t, reference), reference, readings)[1]["v"]
+
+    none = forces(np.zeros(p))
+    for bad in (np.nan, np.inf, -np.inf, 1.01 * limit):
+        assert (forces(np.zeros(p) + bad) == none).all()
+    assert forces(0.01 * limit) - none == pytest.approx(0.01 * limit, rel=1e-9)
 
 
 @pytest.mark.slow
