@@ -61,6 +61,10 @@ def export(
     tunable: Annotated[
         bool, typer.Option("--tunable", help="Gains, limits and monitors as parameters, with an A2L file.")
     ] = False,
+    excitation: Annotated[
+        bool,
+        typer.Option("--excitation", help="C reads forces beside the law's, as malta excite writes them."),
+    ] = False,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -76,6 +80,8 @@ def export(
     from malta.firmware.exports import export_c, export_fmu
 
     _require_known(to, precision, until, part, fmi, platforms, clock)
+    if excitation and to == "fmu":
+        raise InputError("--excitation", "", "an FMU", "--to c")
     hertz = None if clock is None else _frequency(clock)
     controller = read_controller(gains, machine)
     chosen: Any = {"until": until, "tunable": tunable}
@@ -98,7 +104,13 @@ def export(
         folder = out or Path("build") / f"{controller.name}_c"
         with working("exporting"):
             files = export_c(
-                gains, folder, precision=cast("Any", precision), proof=proof, clock=hertz, **chosen
+                gains,
+                folder,
+                precision=cast("Any", precision),
+                proof=proof,
+                clock=hertz,
+                excitation=excitation,
+                **chosen,
             )
     if as_json:
         from malta.cli.documents.others import ExportOutput

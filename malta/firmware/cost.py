@@ -231,6 +231,8 @@ def rounding_noise(t: Target) -> RoundingNoise:
             if t.driven:
                 i = run.i_phase if t.fidelity == "phase" else run.i
                 readings |= {"i": i[k], "i_valid": np.ones(i.shape[1]), "link": run.link[k]}
+            if t.excited:
+                readings["excitation"] = np.zeros(len(plant.inputs))
             state, out = step(state, reference, readings)
             rows.append(out["v"].astype(float))
         forces[precision] = np.array(rows)

@@ -295,6 +295,7 @@ def export_c(
     proof: bool = True,
     clock: float | None = None,
     tunable: bool = False,
+    excitation: bool = False,
 ) -> list[Path]:
     """Write the controller of a gain file as a folder of C99 with its test and a report.
 
@@ -305,6 +306,7 @@ def export_c(
     proof : prove the margin again with the coefficients that single precision holds, and with other gains if tunable
     clock : of the processor, Hz, with which the report turns instructions into a share of the sample; None: 667 MHz
     tunable : gains, limits, references and monitors are in a record that the target may change, with an ASAP2 file
+    excitation : forces beside the law's are read at every sample, which the filter knows as sent
 
     Returns the files.
 
@@ -320,7 +322,7 @@ def export_c(
     path = locate(gains)
     if clock is not None:
         positive("export", "clock", clock, below=FASTEST)
-    target = replace(_target(read(path), precision, until), tunable=tunable)
+    target = replace(_target(read(path), precision, until), tunable=tunable, excited=excitation)
     folder, content = require_empty(Path(out)), content_of(path)[0]
     robust = content.verification.robust
     uncertainty = {} if robust is None else robust.uncertainty

@@ -221,7 +221,9 @@ def _engine(
     simulation, inputs = ready.simulation, ready.inputs
     c, setup = simulation.controller, simulation.setup
     _require_exported(simulation.scenario, setup)
-    native = compile_controller(_target(c, precision, setup.fidelity))
+    excitation = simulation.scenario.excitation
+    native = compile_controller(_target(c, precision, setup.fidelity, excitation is not None))
+    forces = np.zeros((len(inputs.t), 0)) if excitation is None else excitation(inputs.t)
     sizes = layout_of(simulation.plant, c, setup)
     if id(inputs) not in sessions:
         sessions.clear()
@@ -233,16 +235,17 @@ def _engine(
     def run(
         first: int, begin: FloatArray, given: FloatArray, noise: FloatArray, fast: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        ddp = inputs.motion.ddp[first : first + len(given)]
+        part = slice(first, first + len(given))
+        beside = np.hstack([inputs.motion.ddp[part], forces[part]])
         flight = _Flight(native, state, step, sizes, machine, setup)
-        return _fly(flight, first, begin, given, noise, fast, ddp, substeps)
+        return _fly(flight, first, begin, given, noise, fast, beside, substeps)
 
     return Engine(f"exported C, {precision}", run)
 
 
 @lru_cache(maxsize=16)
-def _target(c: Controller, precision: Precision, fidelity: Any) -> Target:
-    return Target(c, precision, fidelity)
+def _target(c: Controller, precision: Precision, fidelity: Any, excited: bool) -> Target:
+    return Target(c, precision, fidelity, excited=excited)
 
 
 def _require_exported(scenario: Scenario, s: Setup) -> None:
@@ -253,7 +256,6 @@ def _require_exported(scenario: Scenario, s: Setup) -> None:
         ("bearing_axes", s.turning),
         ("anticipated", s.anticipated),
         ("open_loop", s.open_loop),
-        ("excitation", scenario.excitation is not None),
     ):
         if found:
             raise InputError(
@@ -376,10 +378,10 @@ def _fly(
     given: FloatArray,
     noise: FloatArray,
     fast: FloatArray,
-    ddp: FloatArray,
+    beside: FloatArray,
     substeps: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Samples of a run: the last state, and rows."""
+    """Samples of a run: the last state, and rows. `beside`: accelerations of the reference, then the excitation."""
     inputs, outputs = f.native.Inputs(), f.native.Outputs()
     held_state = np.array(begin, dtype=float)
     states = np.empty((len(given), len(held_state)))
@@ -402,7 +404,7 @@ def _fly(
         missed = f.setup.faulty and row[around["missed"]][0]
         lost += int(missed)
         if not missed:
-            _put(f, inputs, held_state, row, read, ddp[k], places, around)
+            _put(f, inputs, held_state, row, read, beside[k], places, around)
             f.step(inputs, outputs, first + k, lost)
             lost = 0
             for name in ("xi_pred", "e", "frozen", "u_integral", "u_limited"):
@@ -441,7 +443,7 @@ def _put(
     state: FloatArray,
     row: FloatArray,
     read: FloatArray,
-    ddp: FloatArray,
+    beside: FloatArray,
     places: dict[str, slice],
     around: dict[str, slice],
 ) -> None:
@@ -449,7 +451,10 @@ def _put(
     reference = f.state.reference
     view(reference, "p")[:] = row[around["p_ref"]]
     view(reference, "dp")[:] = row[around["dp_ref"]]
-    view(reference, "ddp")[:] = ddp
+    axes = len(view(reference, "ddp"))
+    view(reference, "ddp")[:] = beside[:axes]
+    if f.native.target.excited:
+        view(inputs, "excitation")[:] = beside[axes:]
     outputs = f.sizes.row["y"]
     view(inputs, "y")[:] = read[:outputs]
     if f.native.target.driven:

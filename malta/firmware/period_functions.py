@@ -126,12 +126,12 @@ def decide(t: Target) -> Staged:
     It consists of the functions of synthesis/controller.py and simulation/current_control.py, as a simulation does.
     """
     state, reference = symbols(state_fields(t)), symbols(reference_fields(t))
-    read = symbols([f for f in input_fields(t) if f.name in ("i", "i_valid", "link")])
+    read = symbols([f for f in input_fields(t) if f.name in ("i", "i_valid", "link", "excitation")])
     y, v0 = ca.SX.sym("y_used", len(t.controller.measurements)), ca.SX.sym("v0", len(t.controller.forces))
     table = ca.SX.sym("table", table_size(t))
     with recorded_equations() as equations:
         sums = Sums(t, state)
-        after, out, place = _decided_forces(t, state, reference, y, v0, sums)
+        after, out, place = _decided_forces(t, state, reference | read, y, v0, sums)
         wanted, out["current"] = currents(t, place, out["v"], table)
         out["met"] = ca.mmax(ca.fabs(out["current"] - wanted)) > 0
         note("meet", "met: a current is not i_wanted", met=out["met"])
@@ -169,6 +169,8 @@ def _decided_forces(
     v_past, memory = recall(t, state.get("memory"), v_ff, p, dp)
     xi_ref = law_reference(c, plant, g, {"p_ref": p, "dp_ref": dp, "v_past": v_past})
     note("law_reference", "xi_ref = (q*, dq* + rate dp, memory of forces under way)", xi_ref=xi_ref)
+    if t.excited:  # after v_past: the filter knows these forces, the reference does not
+        v_ff = _excited(t, v_ff, reference["excitation"])
     xi_hat = estimated(g, state["xi_pred"], filtered(c.tracks, y, p), None, sums.add_to_states)
     frozen = freeze_moving(g, state["frozen"], dp)
     e = sum_errors(g, state["e"], frozen, y, p, sums.add_to_errors)
@@ -182,6 +184,14 @@ def _decided_forces(
         note("remember", "memory: forces under way are a sample older", memory=memory)
         after["memory"] = memory
     return after, {"xi_hat": xi_hat, "v": v, "saturated": saturated}, place
+
+
+def _excited(t: Target, v_ff: Any, excitation: Any) -> Any:
+    """The forces that are fed forward with an excitation; what is no number or beyond a limit is none."""
+    most = ca.DM(np.array(t.controller.limits.force))
+    used = ca.if_else(ca.fabs(excitation) <= most, excitation, 0)
+    note("excite", "v_beside = v_ff + excitation, where that is within the limits", v_beside=v_ff + used)
+    return v_ff + used
 
 
 class Sums:

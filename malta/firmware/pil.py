@@ -14,7 +14,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,7 +25,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.files import locate
 from malta.firmware.program import TYPES, Precision
-from malta.firmware.signals import Target, fidelity_of
+from malta.firmware.signals import Target, fidelity_of, input_fields, reference_fields
 from malta.firmware.vectors import SAMPLES, Vector, record_vectors
 from malta.gains.file import content_of, read
 from malta.model.data import plant_of
@@ -361,7 +361,9 @@ def _target_of(line: Line, path: Path, sha256: str) -> Target:
         )
     c = read(path)
     depth: Fidelity = fidelity_of(plant_of(c.parameters)) if h.commands else "force"
-    return Target(c, "double" if h.real_bytes == 8 else "float", depth)
+    t = Target(c, "double" if h.real_bytes == 8 else "float", depth)
+    read_at_once = sum(f.size for f in (*reference_fields(t), *input_fields(t)))
+    return replace(t, excited=h.readings > read_at_once)
 
 
 def _replay(

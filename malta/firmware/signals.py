@@ -53,6 +53,7 @@ class Target:
     )
     tunable: bool = False  # gains, limits, references and monitors from a record that the target may change
     gains: GainBox | None = None  # what is proven of other gains; None: nothing was asked for
+    excited: bool = False  # forces beside the law's are read at every sample
 
     def __post_init__(self) -> None:
         if self.precision not in ("double", "float"):
@@ -180,6 +181,9 @@ def input_fields(t: Target) -> list[Field]:
             ),
             Field("link", (Signal("V_link", "V"),), "measured voltage of the DC link"),
         ]
+    if t.excited:
+        meaning = "forces beside those of the law, which the filter knows as sent"
+        fields.append(Field("excitation", named("exc ", t.controller.forces, ""), meaning))
     return fields
 
 

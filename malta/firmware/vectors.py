@@ -113,6 +113,9 @@ def _readings(t: Target, run: Trajectory) -> dict[str, FloatArray]:
     if t.driven:
         i = run.i_phase if t.fidelity == "phase" else run.i
         found |= {"i": i.copy(), "i_valid": np.ones_like(i), "link": run.link.copy()}
+    if t.excited:  # a hundredth of the limits, in turn of either sign
+        signs = np.where(np.add.outer(np.arange(len(run.y)), np.arange(run.v.shape[1])) % 3, 0.01, -0.01)
+        found["excitation"] = signs * np.array(t.controller.limits.force)
     return found
 
 
@@ -127,6 +130,8 @@ def _damage(t: Target, flight: dict[str, FloatArray]) -> dict[str, FloatArray]:
     if t.driven:
         found["i"][6, 0], found["i"][11, -1], found["i_valid"][16:20, 1] = math.nan, math.inf, 0
         found["link"][21], found["link"][26], found["link"][31] = math.nan, 0.0, math.inf
+    if t.excited:
+        found["excitation"][7, 0], found["excitation"][8, -1] = math.nan, math.inf
     return found
 
 

@@ -274,7 +274,18 @@ def next_stroke(controller: Controller, log: Log, patterns: ThrustPatterns | Non
     log : of a stroke that begins and ends at rest
     patterns : of this law and reference, `thrust_patterns`; None: computed
 
-    Raises InputError for a log that is too long or another machine's, CheckError for missing samples.
+    Returns a NextStroke.
+
+    Raises InputError for a log that is too long, CheckError for another machine's and for missing samples.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/robust.json")
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(10e-3, noise=1.0))
+    >>> log = malta.identification.log_of(run)
+    >>> found = malta.identification.next_stroke(controller, log)
+    >>> found.thrust.shape, found.patterns > 0
+    ((2000,), True)
     """
     plant = plant_of(controller.parameters)
     require_same_law(log, plant.name, controller.sample_time)
@@ -338,8 +349,8 @@ class LearnedStrokes:
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
-    >>> found = malta.identification.learn_strokes(plant, controller, strokes=4, noise=0.0)
-    >>> found.axial_error[3] < 0.2 * found.axial_error[0]
+    >>> found = malta.identification.learn_strokes(plant, controller, strokes=4)
+    >>> found.axial_error[3] < 0.4 * found.axial_error[0]
     True
     """
 

@@ -13,6 +13,8 @@ import pytest
 from conftest import Run
 
 import malta
+from malta.firmware.signals import Target
+from malta.firmware.step import started_state, step_of, zero_reference
 from malta.identification import ExcitationPlan, Identified, Log
 from malta.identification.data_file import read_identified, write_data
 from malta.identification.excite import model_at, predicted_spectra
@@ -389,12 +391,31 @@ def test_excited_flights_are_replayed_too(log: Log) -> None:
     assert max(found.at_once.values()) < 1e-9
 
 
-def test_exported_laws_have_no_excitation(plan: ExcitationPlan) -> None:
-    scenario = malta.Scenario.excited(plan.signal, 0.01)
-    with pytest.raises(malta.InputError, match="excitation"):
-        malta.simulate(changed({}), CONTROLLER, scenario, engine=malta.firmware.engine_of_c())
+def test_exported_laws_take_an_excitation(plan: ExcitationPlan) -> None:
+    """The compiled C flies the multisine as the law does, and its log is replayed; what is no force is none."""
+    scenario = malta.Scenario.excited(plan.signal, 0.05)
+    flown = malta.simulate(changed({}), CONTROLLER, scenario, engine=malta.firmware.engine_of_c())
+    run = malta.simulate(changed({}), CONTROLLER, scenario)
+    assert np.abs(flown.v - run.v).max() < 1e-9
+    assert np.ptp(plan.signal(run.t), axis=0).max() > 1
+    assert malta.identification.replay_law(CONTROLLER, malta.identification.log_of(flown)).same
     with pytest.raises(malta.InputError, match="excitation"):
         malta.simulate(changed({}), CONTROLLER, malta.Scenario.excited(lambda t: np.zeros((len(t), 2)), 0.01))
+
+
+def test_an_excitation_that_is_no_force_is_none() -> None:
+    t = Target(CONTROLLER, fidelity="force", excited=True)
+    step, reference, p = step_of(t), zero_reference(t), len(CONTROLLER.measurements)
+    limit = np.array(CONTROLLER.limits.force)
+
+    def forces(excitation: Any) -> Any:
+        readings = {"y": np.zeros(p), "y_valid": np.ones(p), "excitation": excitation}
+        return step(started_state(t, reference), reference, readings)[1]["v"]
+
+    none = forces(np.zeros(p))
+    for bad in (np.nan, np.inf, -np.inf, 1.01 * limit):
+        assert (forces(np.zeros(p) + bad) == none).all()
+    assert forces(0.01 * limit) - none == pytest.approx(0.01 * limit, rel=1e-9)
 
 
 @pytest.mark.slow
