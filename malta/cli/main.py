@@ -171,7 +171,7 @@ class Grouped(TyperGroup):
                     raise
                 raise interruption(_files_text(written)) from None
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
+    def format_commands(self, _: Any, formatter: Any) -> None:
         """Write the sections of the commands."""
         for heading, commands in GROUPS.items():
             with formatter.section(heading):

@@ -311,7 +311,7 @@ def test_the_verdict_of_several_designs() -> None:
     ],
 )
 def test_a_claim_has_one_word(verdicts: list[str], word: str) -> None:
-    assert claims.verdict_word(verdicts) == word
+    assert claims.word_of(verdicts) == word
 
 
 def test_only_designs_that_are_meant_to_reproduce_a_paper_are_judged(published: dict[str, Any]) -> None:
