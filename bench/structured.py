@@ -8,7 +8,7 @@ What a peer finds is shown: its largest figure, or its gamma, beside ours.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import control
 import numpy as np

@@ -53,7 +53,7 @@ def commission(
     from malta.identification.commission import JOURNAL, steps_of
     from malta.identification.commission import commission as commission_machine
     from malta.model.data import plant_of
-    from malta.report.page.binder import binder_page, binder_text
+    from malta.report.page.document import binder_page, binder_text
 
     controller = read_controller(gains, machine)
     plant = plant_of(controller.parameters)

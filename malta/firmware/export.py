@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
-import jinja2
 import numpy as np
 
 from malta.firmware.blocks import unrolled
@@ -38,6 +37,9 @@ from malta.firmware.signals import (
 )
 from malta.firmware.step import programs_of
 from malta.firmware.supervisor import JUMP, MOST_RATE, bounds_of, reading_deviations, reference_limits
+
+if TYPE_CHECKING:
+    import jinja2
 
 MOST_POINTS = 65_535  # of a table of v0(z)
 FUSED = ("sense", "decide", "state_at")  # functions that a step consists of; the others are its pieces
@@ -79,6 +81,8 @@ def render(template: str, context: Mapping[str, Any]) -> str:
 
 @cache
 def _environment() -> jinja2.Environment:
+    import jinja2  # here: who flies a supervisor that is compiled already needs no template
+
     return jinja2.Environment(
         loader=jinja2.PackageLoader("malta.firmware"),
         undefined=jinja2.StrictUndefined,

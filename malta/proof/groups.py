@@ -2,7 +2,7 @@
 
     E(p) x' = A(p) x + B(p) u,  y = C(p) x + D(p) u,  u = h F y          h: lag, hold and delay, equal for all inputs
 
-Only couplings that are zero as exact expressions split the loop; small ones do not (rounding.py).
+Only couplings that are zero as exact expressions split the loop; small ones do not (closed_loop.py).
 """
 
 from __future__ import annotations

@@ -21,14 +21,13 @@ from malta.proof.expressions import (
     exact,
 )
 from malta.proof.groups import UncertainLoop, groups
-from malta.proof.polynomial import rounding
 from malta.proof.polynomial.characteristic import (
     Characteristic,
     map_bilinear,
     map_bounds,
     pair,
 )
-from malta.proof.polynomial.closed_loop import closed_loop, driven_group
+from malta.proof.polynomial.closed_loop import Couplings, closed_loop, driven_group, loop_parts
 from malta.proof.polynomial.family import binary
 from malta.proof.polynomial.rational import Symbolic, TooLarge, symbolic
 from malta.proof.time_limit import TimeUp
@@ -201,14 +200,14 @@ class OfLoop:
     neglect: bool = True  # whether couplings of the size of rounding are taken as zero and bounded
 
     @cached_property
-    def couplings(self) -> rounding.Couplings | None:
+    def couplings(self) -> Couplings | None:
         if self.loop.symbolic is None or not self.neglect:
             return None
-        return rounding.Couplings(self.loop, self.loop.symbolic)
+        return Couplings(self.loop, self.loop.symbolic)
 
     def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
         found: list[tuple[Polynomial, tuple[Any, ...]]] = []
-        for part in rounding.parts(self.loop, self.couplings, p):
+        for part in loop_parts(self.loop, self.couplings, p):
             key = (part.group.states, part.group.own)
             if key not in self.known:
                 self.known[key] = Characteristic(self.loop, part.group, self.names)

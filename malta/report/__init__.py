@@ -2,69 +2,35 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from malta.report.figures import distributions_figure as distributions_figure
-from malta.report.figures import encode_figure as encode_figure
-from malta.report.figures import experiment_figure as experiment_figure
-from malta.report.figures import front_figure as front_figure
-from malta.report.figures import save as save
-from malta.report.figures import stroke_figure as stroke_figure
-from malta.report.figures import worst_figure as worst_figure
-from malta.report.figures import yield_figure as yield_figure
-from malta.report.figures.drawing import STYLES as STYLES
-from malta.report.figures.drawing import new_figure as new_figure
-from malta.report.figures.margins import chain_figure as chain_figure
-from malta.report.page.report import compare_gains as compare_gains
-from malta.report.page.report import comparison_page as comparison_page
-from malta.report.page.report import gain_page as gain_page
-from malta.report.pages import CAMPAIGN_FILES as CAMPAIGN_FILES
-from malta.report.pages import CampaignFigures as CampaignFigures
-from malta.report.pages import campaign as campaign
-from malta.report.pages import design_page as design_page
-from malta.report.pages import experiment as experiment
-from malta.report.pages import front as front
-from malta.report.pages import loads as loads
-from malta.report.pages import robustness as robustness
-from malta.report.pages import sensitivity as sensitivity
-from malta.report.pages import stroke as stroke
-from malta.report.tables.campaign import box_text as box_text
-from malta.report.tables.campaign import campaign_tables as campaign_tables
-from malta.report.tables.campaign import rare_event_sentence as rare_event_sentence
-from malta.report.tables.campaign import rare_event_tables as rare_event_tables
-from malta.report.tables.campaign import run_text as run_text
-from malta.report.tables.campaign import sensitivity_sentence as sensitivity_sentence
-from malta.report.tables.campaign import sensitivity_tables as sensitivity_tables
-from malta.report.tables.campaign import spreads_table as spreads_table
-from malta.report.tables.campaign import tolerance_sentence as tolerance_sentence
-from malta.report.tables.design import bandwidth_table as bandwidth_table
-from malta.report.tables.design import loop_poles_table as loop_poles_table
-from malta.report.tables.design import poles_table as poles_table
-from malta.report.tables.design import recovery_table as recovery_table
-from malta.report.tables.design import sensitivity_table as sensitivity_table
-from malta.report.tables.experiments import claims_table as claims_table
-from malta.report.tables.experiments import experiment_table as experiment_table
-from malta.report.tables.experiments import limits_text as limits_text
-from malta.report.tables.experiments import scenarios_table as scenarios_table
-from malta.report.tables.layout import Paragraph as Paragraph
-from malta.report.tables.margins import chain_table as chain_table
-from malta.report.tables.margins import disk_table as disk_table
-from malta.report.tables.margins import gang_table as gang_table
-from malta.report.tables.margins import loop_tables as loop_tables
-from malta.report.tables.margins import open_bounds as open_bounds
-from malta.report.tables.margins import places_table as places_table
-from malta.report.tables.margins import tolerance_table as tolerance_table
-from malta.report.tables.margins import worst_case_table as worst_case_table
-from malta.report.tables.tuning import front_markdown as front_markdown
-from malta.report.tables.tuning import front_rows as front_rows
-from malta.report.tables.tuning import front_table as front_table
-from malta.report.tables.tuning import requirements_table as requirements_table
-from malta.report.verdict import verdict_html as verdict_html
-from malta.report.verdict import verdict_lines as verdict_lines
-from malta.report.verdict import verdict_text as verdict_text
+from malta.contents import contents
 
-if TYPE_CHECKING:  # loaded when the first one is drawn: commands that draw none start sooner
+if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that draw nothing start sooner
+    from malta.report.figures import distributions_figure as distributions_figure
+    from malta.report.figures import encode_figure as encode_figure
+    from malta.report.figures import experiment_figure as experiment_figure
+    from malta.report.figures import front_figure as front_figure
+    from malta.report.figures import save as save
+    from malta.report.figures import stroke_figure as stroke_figure
+    from malta.report.figures import worst_figure as worst_figure
+    from malta.report.figures import yield_figure as yield_figure
+    from malta.report.figures.drawing import STYLES as STYLES
+    from malta.report.figures.drawing import new_figure as new_figure
+    from malta.report.figures.margins import chain_figure as chain_figure
+    from malta.report.page.report import compare_gains as compare_gains
+    from malta.report.page.report import comparison_page as comparison_page
+    from malta.report.page.report import gain_page as gain_page
+    from malta.report.pages import CAMPAIGN_FILES as CAMPAIGN_FILES
+    from malta.report.pages import CampaignFigures as CampaignFigures
+    from malta.report.pages import campaign as campaign
+    from malta.report.pages import design_page as design_page
+    from malta.report.pages import experiment as experiment
+    from malta.report.pages import front as front
+    from malta.report.pages import loads as loads
+    from malta.report.pages import robustness as robustness
+    from malta.report.pages import sensitivity as sensitivity
+    from malta.report.pages import stroke as stroke
     from malta.report.plots import bode as bode
     from malta.report.plots import gang_of_four as gang_of_four
     from malta.report.plots import load_response as load_response
@@ -76,18 +42,39 @@ if TYPE_CHECKING:  # loaded when the first one is drawn: commands that draw none
     from malta.report.plots import sensitivity_curves as sensitivity_curves
     from malta.report.plots import sigma as sigma
     from malta.report.plots import step as step
+    from malta.report.tables.campaign import box_text as box_text
+    from malta.report.tables.campaign import campaign_tables as campaign_tables
+    from malta.report.tables.campaign import rare_event_sentence as rare_event_sentence
+    from malta.report.tables.campaign import rare_event_tables as rare_event_tables
+    from malta.report.tables.campaign import run_text as run_text
+    from malta.report.tables.campaign import sensitivity_sentence as sensitivity_sentence
+    from malta.report.tables.campaign import sensitivity_tables as sensitivity_tables
+    from malta.report.tables.campaign import spreads_table as spreads_table
+    from malta.report.tables.campaign import tolerance_sentence as tolerance_sentence
+    from malta.report.tables.design import bandwidth_table as bandwidth_table
+    from malta.report.tables.design import front_markdown as front_markdown
+    from malta.report.tables.design import front_rows as front_rows
+    from malta.report.tables.design import front_table as front_table
+    from malta.report.tables.design import loop_poles_table as loop_poles_table
+    from malta.report.tables.design import poles_table as poles_table
+    from malta.report.tables.design import recovery_table as recovery_table
+    from malta.report.tables.design import requirements_table as requirements_table
+    from malta.report.tables.design import sensitivity_table as sensitivity_table
+    from malta.report.tables.experiments import claims_table as claims_table
+    from malta.report.tables.experiments import experiment_table as experiment_table
+    from malta.report.tables.experiments import limits_text as limits_text
+    from malta.report.tables.experiments import scenarios_table as scenarios_table
+    from malta.report.tables.layout import Paragraph as Paragraph
+    from malta.report.tables.margins import chain_table as chain_table
+    from malta.report.tables.margins import disk_table as disk_table
+    from malta.report.tables.margins import gang_table as gang_table
+    from malta.report.tables.margins import loop_tables as loop_tables
+    from malta.report.tables.margins import open_bounds as open_bounds
+    from malta.report.tables.margins import places_table as places_table
+    from malta.report.tables.margins import tolerance_table as tolerance_table
+    from malta.report.tables.margins import worst_case_table as worst_case_table
+    from malta.report.verdict import verdict_html as verdict_html
+    from malta.report.verdict import verdict_lines as verdict_lines
+    from malta.report.verdict import verdict_text as verdict_text
 
-_PLOTS = {
-    *("bode", "gang_of_four", "load_response", "margin_map", "nichols", "nyquist"),
-    *("pzmap", "root_locus", "sensitivity_curves", "sigma", "step"),
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _PLOTS:
-        raise AttributeError(f"module 'malta.report' has no attribute {name!r}")
-    return getattr(import_module("malta.report.plots"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_PLOTS})
+__all__, __getattr__, __dir__ = contents(__name__, __file__)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import minimize
 
 from malta.errors import InputError
 from malta.model.plant import readonly
@@ -136,6 +135,8 @@ def _spread_lines(first: int, last: int, count: int) -> FloatArray:
 
 def _low_crest_phases(lines: FloatArray, random: np.random.Generator) -> FloatArray:
     """Phases of cosines of amplitude 1 with a low crest factor, rad: the norms of NORMS, one after the other."""
+    from scipy.optimize import minimize  # here: it takes long to load
+
     samples = 1 << int(np.ceil(np.log2(6 * lines[-1])))
     places = lines.astype(int)
 

@@ -1,32 +1,383 @@
 """Specification -> design: the numbers of [search] that reach what a design file asks for in [specification].
 
-The weights of an LQG are searched by tuning.lqg, the gains of a PID by tuning.pid; what is found is judged as the file
-that will be written.
+The weights of an LQG are searched here, the gains of a PID by tuning.pid; what is found is judged as the file that
+will be written.
+
+Each group of states that nothing joins to the others is searched by itself; groups that are each other's mirror image
+are computed once. One number is minimized: the worst ratio of what is found to what is asked for (asked to found where
+more is better), so 1 is reached where everything holds, and what binds has a name. Differential evolution finds the
+region, a descent by linear programs the place.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
+import numpy as np
 import tomlkit
+from scipy import optimize
 from tomlkit.items import Item
 
 from malta.display import Description, display
 from malta.errors import InputError
+from malta.margins.travel import travel_margin
 from malta.model.parameters import describe
-from malta.tuning import groups, lqg, pid
-from malta.tuning.search import DIGITS, Effort, Journal, apply_trial
+from malta.model.plant import Plant
+from malta.synthesis.requirements import Trade, ratio_of, requirements_for
+from malta.synthesis.spec import Spec, Weights
+from malta.tuning import groups, pid
+from malta.tuning.groups import STEP, Group, figures_of, groups_of
+from malta.tuning.search import (
+    DIGITS,
+    UNSTABLE,
+    Effort,
+    Journal,
+    Progress,
+    Search,
+    Trial,
+    apply_trial,
+    at_least_of,
+    base_of,
+    combine,
+    distance_outside,
+    merge,
+    model_and_controller,
+    separate,
+)
 from malta.tuning.verify import judge
 
 if TYPE_CHECKING:
     from malta.margins.loop_report import Outcome
+    from malta.model.plant import FloatArray
     from malta.synthesis.spec import Spec
     from malta.tuning.search import Progress, Trial
+
+
+# Descent by linear programs: the smallest worst ratio, or the least noise that bounds allow.
+#
+#     minimize  f(u) + steep max(floor, max_i r_i(u))        over the unit cube
+#
+# r_i are logarithms of the ratios of what is found to what is asked for, so 0 is a bound that is just reached. The
+# worst of them is as smooth as a roof: it has an edge where the best place is, which simplices and random members
+# only stumble on. Each step linearizes f and every r_i by differences and solves
+#
+#     minimize  f' d + steep s      subject to  r_i + r_i' d <= s,  s >= floor,  |d_k| <= radius
+#
+# The radius follows how well the last step was foretold.
+
+
+SMALLEST, LARGEST, FIRST = 2e-3, 0.5, 0.2  # of the radius
+DIFFERENCES = (0.02, 0.06, 0.007)  # steps of u, the next where one leads no further
+TRIES = 5  # smaller radii with one linearization
+LEAST_GAIN = 1e-6  # of a step
+
+
+class Point(NamedTuple):
+    """A place that was tried: f, and r of fixed length."""
+
+    u: FloatArray
+    f: float
+    r: FloatArray
+
+
+class Merit(NamedTuple):
+    """How bounds count beside the objective."""
+
+    steep: float = 1.0
+    floor: float = -math.inf  # of the worst r, below which it counts no more
+
+    def of(self, point: Point) -> float:
+        """Return what is minimized at a point."""
+        return point.f + self.steep * max(self.floor, float(point.r.max()))
+
+
+Look = Callable[
+    ["FloatArray"], tuple[float, "FloatArray"] | None
+]  # (f, r) of a place; None: an unstable loop
+
+
+def descend(look: Look, u: FloatArray, merit: Merit, trials: int) -> FloatArray:
+    """Go down from a place until a number of trials or until no step leads further; an unstable place stays.
+
+    >>> import numpy as np
+    >>> roof = lambda u: (0.0, np.array([u[0] - u[1], u[1] - 0.5, 0.3 - u[0]]))
+    >>> bool(
+    ...     np.allclose(
+    ...         descend(roof, np.array([0.9, 0.1]), Merit(), 200),
+    ...         [0.3667, 0.4333],
+    ...         atol=1e-3,
+    ...     )
+    ... )
+    True
+    """
+    start = look(u) if len(u) and trials > 0 else None
+    if start is None:
+        return u
+    here, radius, stuck, used = Point(u, *start), FIRST, 0, 1
+    while used < trials and stuck < len(DIFFERENCES):
+        slopes = _slopes(look, here, DIFFERENCES[stuck])
+        there, radius, tries = _advance(look, here, slopes, merit, radius)
+        used += len(u) + tries
+        here = there or here
+        if radius < SMALLEST:
+            stuck, radius = stuck + 1, FIRST / 2
+    return here.u
+
+
+def _advance(
+    look: Look, here: Point, slopes: tuple[FloatArray, FloatArray], merit: Merit, radius: float
+) -> tuple[Point | None, float, int]:
+    """The next place, or None, the next radius, and how many places were tried."""
+    for tries in range(1, TRIES + 1):
+        d, foretold = _step(here, slopes, merit, radius)
+        found = look(here.u + d)
+        there = None if found is None else Point(here.u + d, *found)
+        gain = 0.0 if there is None else merit.of(here) - merit.of(there)
+        if gain > LEAST_GAIN:
+            share = gain / max(merit.of(here) - foretold, 1e-12)
+            if share > 0.7:
+                return there, min(radius * 1.5, LARGEST), tries
+            return there, radius * (1.0 if share > 0.3 else 0.6), tries
+        radius *= 0.4
+        if radius < SMALLEST:
+            break
+    return None, radius, tries
+
+
+def _slopes(look: Look, here: Point, step: float) -> tuple[FloatArray, FloatArray]:
+    """f' and r' by differences, towards the inside of the cube; zero along what makes the loop unstable."""
+    slope, J = np.zeros(len(here.u)), np.zeros((len(here.r), len(here.u)))
+    for k in range(len(here.u)):
+        h = step if here.u[k] + step <= 1 else -step
+        there = look(here.u + h * np.eye(len(here.u))[k])
+        if there is not None:
+            slope[k], J[:, k] = (there[0] - here.f) / h, (there[1] - here.r) / h
+    return slope, J
+
+
+def _step(
+    here: Point, slopes: tuple[FloatArray, FloatArray], merit: Merit, radius: float
+) -> tuple[FloatArray, float]:
+    """The step of the linear program, and what it promises."""
+    slope, J = slopes
+    low, high = np.maximum(-radius, -here.u), np.minimum(radius, 1 - here.u)
+    floor = None if math.isinf(merit.floor) else merit.floor
+    found = optimize.linprog(
+        np.append(slope, merit.steep),
+        A_ub=np.hstack([J, -np.ones((len(J), 1))]),
+        b_ub=-here.r,
+        bounds=[*zip(low.tolist(), high.tolist(), strict=True), (floor, None)],
+    )
+    if found.x is None or found.fun is None:
+        return np.zeros(len(here.u)), merit.of(here)
+    return np.asarray(found.x[:-1]), here.f + float(found.fun)
+
+
+FRONT = (0.6, 0.7, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1)  # of the margin that is asked for
+LEAST = 1e-3  # ratio below which a figure counts as nothing
+FRUGAL = Merit(steep=100.0, floor=0.0)  # what noise can gain beside a bound that is missed
+TRADES: tuple[Trade, ...] = get_args(Trade)  # what the front has against the margin
+
+
+class _Cluster(NamedTuple):
+    """Groups that variables join, and those variables."""
+
+    variables: tuple[int, ...]
+    groups: tuple[Group, ...]
+
+
+def clusters_of(spec: Spec) -> list[_Cluster]:
+    """What can be searched by itself: groups that share no variable. Mirror images are left out."""
+    groups = groups_of(spec)
+    base = spec.weights
+    touched: list[set[int]] = []
+    middle = [math.sqrt(v.low * v.high) for v in spec.search]
+    for index in range(len(spec.search)):
+        other = [value * (1.5 if k == index else 1) for k, value in enumerate(middle)]
+        a, b = spec.vary(middle).weights, spec.vary(other).weights
+        touched.append({k for k, g in enumerate(groups) if _differ(g.part(a), g.part(b))})
+        if not touched[-1]:
+            raise InputError(
+                spec.path, f"search.numbers.{spec.search[index].name}", "no effect", "an entry that has one"
+            )
+    clusters = []
+    for variables, members in separate(touched, len(groups)):
+        distinct: dict[Any, Group] = {}
+        for k in members:
+            g = groups[k]
+            # Mirror images stay so under every weight that the search tries.
+            same = tuple(
+                tuple(
+                    tuple(np.ravel(getattr(g.part(w), name)).tolist())
+                    for name in Weights.__dataclass_fields__
+                )
+                for w in (base, spec.vary(middle).weights)
+            )
+            distinct.setdefault((g.picture, same), g)
+        clusters.append(_Cluster(variables, tuple(distinct.values())))
+    return clusters
+
+
+def _differ(a: Weights, b: Weights) -> bool:
+    """Whether they may give other gains: bases of weights that are zero do not matter."""
+    names = ("Q", "R", "Q_i", "process_variance", "sensor_variance", "drift_variance", "correlation")
+    return any((getattr(a, name) != getattr(b, name)).any() for name in names)
+
+
+def cluster_search(spec: Spec, cluster: _Cluster, delay: int, journal: Journal) -> Search:
+    """The trials of one cluster with one delay."""
+    at_least = at_least_of(spec.plant)
+
+    def compute(design: Spec) -> dict[str, float]:
+        return merge([figures_of(spec, g, design.weights, delay) for g in cluster.groups], at_least)
+
+    return Search(spec, cluster.variables, delay, journal, compute)
+
+
+def worst_ratio(search: Search, u: FloatArray) -> float:
+    """What is minimized: the worst ratio, and a little of all of them."""
+    ratios = _ratios(search.spec, search.figures(u), search.spec.specification)
+    return (max(ratios) + 0.01 * sum(ratios) / len(ratios) if ratios else UNSTABLE) + distance_outside(u)
+
+
+def _look_worst(search: Search, u: FloatArray) -> tuple[float, FloatArray] | None:
+    """The logarithms of all ratios; None for an unstable loop."""
+    figures = search.figures(u)
+    return (0.0, _logs(search.spec, figures, search.spec.specification)) if figures else None
+
+
+def _look_frugal(
+    search: Search, u: FloatArray, margin: float, kinds: Collection[str]
+) -> tuple[float, FloatArray] | None:
+    """The logarithm of noise or motion, and of the ratios at a margin with everything else as it is asked for."""
+    figures = search.figures(u)
+    if not figures:
+        return None
+    asked = _beside_trades(search.spec)
+    size = sum(math.log(figures[kind]) for kind in figures if base_of(kind) in kinds)
+    return size, _logs(search.spec, figures, asked | {"margin": margin})
+
+
+def _logs(spec: Spec, figures: Mapping[str, float], asked: Mapping[str, float]) -> FloatArray:
+    """Logarithms of ratios, each corner's margin among them; LEAST for what is next to nothing."""
+    corners = {name: asked["margin"] for name in figures if "margin" in asked and base_of(name) == "margin"}
+    ratios = _ratios(spec, figures, {**asked, **corners})
+    return np.asarray(np.log(np.clip(ratios or [LEAST], LEAST, 1 / LEAST)))
+
+
+def _ratios(spec: Spec, figures: Mapping[str, float], asked: Mapping[str, float]) -> list[float]:
+    """How near the figures are to what is asked for of them."""
+    at_least = at_least_of(spec.plant)
+    return [
+        ratio_of(asked[name], value, at_least=base_of(name) in at_least)
+        for name, value in figures.items()
+        if name in asked
+    ]
+
+
+def _names_of(plant: Plant, trade: Trade) -> list[str]:
+    """The requirements that the front shows as noise of the force, or as motion."""
+    return [name for name, r in requirements_for(plant).items() if r.trade == trade]
+
+
+def _beside_noise(spec: Spec, figures: Mapping[str, float]) -> float:
+    """The worst ratio of what is no axis of the front."""
+    asked = {k: v for k, v in _beside_trades(spec).items() if base_of(k) != "margin"}
+    return max(_ratios(spec, figures, asked), default=0.0)
+
+
+def _beside_trades(spec: Spec) -> dict[str, float]:
+    """What is asked for beside noise and motion, which the front has against the margin."""
+    free = {name for trade in TRADES for name in _names_of(spec.plant, trade)}
+    return {k: v for k, v in spec.specification.items() if base_of(k) not in free}
+
+
+def search_weights(
+    spec: Spec, journal: Journal, effort: Effort, progress: Progress | None
+) -> tuple[Trial, tuple[Trial, ...]]:
+    """Find the trial with the smallest worst ratio, and the front about it.
+
+    Raises InputError for a machine whose groups no LQG can be searched for, and for a variable without effect.
+    """
+    clusters = clusters_of(spec)
+    journal.expect(_expected(clusters, spec, effort), progress)
+    found: dict[int, list[tuple[Search, FloatArray]]] = {}
+    for delay in spec.delays:
+        found[delay] = []
+        for search in (cluster_search(spec, cluster, delay, journal) for cluster in clusters):
+            goal = partial(worst_ratio, search)
+            u = search.evolve(goal, effort.generations)
+            look = partial(_look_worst, search)
+            found[delay].append((search, descend(look, u, Merit(), effort.polish * len(search.low))))
+    worst = {delay: max(worst_ratio(s, u) for s, u in places) for delay, places in found.items()}
+    # More states are worth it only where they help.
+    delay = min(d for d, ratio in worst.items() if ratio <= 1.01 * min(worst.values()))
+    trial = combine(spec, found[delay])
+    return trial, _front(spec, found[delay], effort, trial)
+
+
+def _expected(clusters: Sequence[_Cluster], spec: Spec, effort: Effort) -> int:
+    """About how many trials there will be."""
+    total = 0
+    for cluster in clusters:
+        k = len(cluster.variables)
+        total += len(spec.delays) * (max(8 * k, 6) * (effort.generations + 1) + effort.polish * k)
+        total += 2 * len(FRONT) * effort.front * k if "margin" in spec.specification else 0
+    return total
+
+
+def _front(
+    spec: Spec, places: Sequence[tuple[Search, FloatArray]], effort: Effort, best: Trial
+) -> tuple[Trial, ...]:
+    """For margins about the one that is asked for: least force noise, least motion; margins then proven."""
+    margin = spec.specification.get("margin")
+    if margin is None or not effort.front:
+        return ()
+    most = min(1 / share for share in spec.uncertainty.values()) - 2 * STEP
+    trials = [best]
+    for trade in TRADES:
+        around = [u for _, u in places]
+        for share in FRONT:
+            if share * margin > most:
+                continue
+            for k, (search, _) in enumerate(places):
+                look = partial(
+                    _look_frugal, search, margin=share * margin, kinds=_names_of(spec.plant, trade)
+                )
+                around[k] = descend(look, around[k], FRUGAL, effort.front * len(search.low))
+            trials.append(combine(spec, [(s, u) for (s, _), u in zip(places, around, strict=True)]))
+    proven = []
+    for one in trials:
+        if one.figures and (one is best or _beside_noise(spec, one.figures) <= 1.005):
+            design = apply_trial(spec, one)
+            bound = travel_margin(spec.plant, model_and_controller(design)[1], spec.uncertainty).lower
+            proven.append(one._replace(figures=dict(one.figures) | {"margin": bound or 0.0}))
+    return _best_of(spec, proven, best)
+
+
+def _best_of(spec: Spec, trials: Sequence[Trial], best: Trial) -> tuple[Trial, ...]:
+    """Those that no other beats in the margin and in the first figures of force and motion, by margin; and `best`."""
+    unique: dict[tuple[float, ...], Trial] = {}
+    for one in trials:  # what is equal to three digits counts once
+        sizes = [-one.figures["margin"]]
+        for trade in TRADES:
+            names = _names_of(spec.plant, trade)
+            sizes += [value for name, value in one.figures.items() if base_of(name) in names][:1]
+        unique.setdefault(tuple(float(f"{size:.3g}") for size in sizes), one)
+    every = np.array(list(unique))
+    undominated = [
+        one for mine, one in zip(every, unique.values(), strict=True)
+        if one.values == best.values or not ((every <= mine).all(axis=1) & (every < mine).any(axis=1)).any()
+    ]  # fmt: skip
+    return tuple(sorted(undominated, key=lambda one: one.figures["margin"]))
 
 
 @display
@@ -94,7 +445,7 @@ def tune(
     if not spec.search:
         raise InputError(spec.path, "search", "nothing", "a table of the numbers that may vary")
     trials = Journal(journal, problem_sha256(spec), restart=restart)
-    search = pid.search_gains if spec.pid else lqg.search_weights
+    search = pid.search_gains if spec.pid else search_weights
     trial, front = search(spec, trials, effort, progress)
     chosen = apply_trial(spec, trial)
     requirements = judge(chosen)
@@ -108,7 +459,7 @@ def problem_sha256(spec: Spec) -> str:
     asked, searched = dict(spec.specification), (spec.search, spec.delays)
     loads = asdict(spec.loads) if spec.loads else None
     pushes = [asdict(bound) for bound in spec.recovery.values()]
-    settings = (lqg.FRONT, DIGITS, groups.STEP, groups.NEAR)
+    settings = (FRONT, DIGITS, groups.STEP, groups.NEAR)
     content = [describe(spec.parameters), asked, loads, pushes, searched, spec.sha256, *settings]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

@@ -34,7 +34,7 @@ pytestmark = pytest.mark.usefixtures("proven_once")
 ROOT = Path(__file__).parents[2]
 TABLE2, CALIBRATED = "design/gains/table2.json", "design/gains/calibrated.json"
 WIDTH = 100
-HEAVY = ("casadi", "control", "matplotlib", "numpy", "pint", "scipy")
+HEAVY = ("casadi", "control", "matplotlib", "numpy", "pint", "pydantic", "scipy")
 NAMES = ("table2.json", "table2.mat", "table2.npz")
 BALL = "examples/ball/design/ball.toml"  # designed in a tenth of the time
 BALLS = ("ball.json", "ball.mat", "ball.npz")
@@ -161,7 +161,7 @@ from malta.cli.main import main
 try:
     main()
 except SystemExit as ended:
-    late = {"control", "filterpy", "matplotlib.pyplot", "scipy.signal", "scipy.stats"}
+    late = {"control", "filterpy", "jinja2", "matplotlib.pyplot", "scipy.optimize", "scipy.signal", "scipy.stats"}
     print("exit", ended.code, "loaded", *sorted(set(sys.modules) & late))
 """
     command = [sys.executable, "-c", program, "simulate", TABLE2, "--option", "fidelity=force"]

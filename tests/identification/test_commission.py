@@ -20,7 +20,7 @@ from malta.identification import measure as measuring
 from malta.identification.calibration import Estimate
 from malta.identification.commission import JOURNAL, Bench, Finding, Step, commission, read_journal, steps_of
 from malta.machines.tubular import bench as tubular
-from malta.report.page.binder import binder_page, binder_text
+from malta.report.page.document import binder_page, binder_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -22,7 +22,7 @@ from malta.gains.file import read
 from malta.margins.loop_report import Outcome
 from malta.model.data import plant_of
 from malta.proof.margin import NOT_PROVEN
-from malta.report.tables.tuning import requirements_table
+from malta.report.tables.design import requirements_table
 from malta.report.verdict import verdict_html, verdict_lines, verdict_text
 from malta.synthesis.requirements import (
     SEEDS,

@@ -27,9 +27,16 @@ from malta.machines.halbach import electronics as motor
 from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.electronics import IDEAL, Options
 from malta.machines.halbach.evidence import Evidence, open_loop_dip, rise_of_dip
-from malta.machines.halbach.experiments.lift import FAULTS, LAWS, lift_force, move_reference
 from malta.machines.halbach.experiments.motions import steps_reference
-from malta.machines.halbach.experiments.open_loop import fit_servo, positions_at_rest, servo_step
+from malta.machines.halbach.experiments.open_loop import (
+    FAULTS,
+    LAWS,
+    fit_servo,
+    lift_force,
+    move_reference,
+    positions_at_rest,
+    servo_step,
+)
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import published_value
 from malta.model.plant import Plant

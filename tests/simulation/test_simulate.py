@@ -16,6 +16,8 @@ from scipy.integrate import solve_ivp
 import malta
 from malta import references
 from malta.loops.sampled_loops import sampled_loop
+from malta.merits import Merit, by_identifier
+from malta.simulation.experiments import Case, Experiment
 from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
 from malta.simulation.scenario import Scenario
@@ -178,6 +180,22 @@ def test_a_design_with_delay_tracks_on_a_machine_with_that_delay(
             - np.array([np.interp(run.y[:-delay, 4], c.feedforward.z_grid, v) for v in c.feedforward.v0.T]).T
         )
         assert stored == pytest.approx(sent, abs=1e-9)
+
+
+def test_figures_of_a_run_say_what_they_are_and_what_is_better(designs: dict[str, Design]) -> None:
+    design = designs["calibrated"]
+    run = malta.simulate(design.plant, design.controller, _stroke(10e-3))
+    found, stroke = by_identifier(run.figures), by_identifier(stroke_figures(run).figures)
+    off = np.abs(run.p - run.reference).max(axis=0)
+    assert [found[f"largest_deviation_{s.name}_m"].value for s in run.plant.outputs] == off.tolist()
+    assert stroke["axial_error_m"].value == found["largest_deviation_z_m"].value
+    assert (stroke["rise_s"].relation, stroke["overshoot_share"].relation) == ("about", "at most")
+    nearest = found["nearest_contact_share"]
+    assert (nearest.value, nearest.bound, nearest.better) == (run.contact.max(), 1.0, "low")
+    own = Merit("efficiency", 0.5, "percent", better="high")
+    figures = Experiment("stroke", "Does it follow?", (Case("stroke", run, (own,)),), (own,)).figures
+    assert [one.identifier for one in figures] == ["stroke_completed_share", "stroke_efficiency_share"]
+    assert [(one.value, one.better) for one in figures] == [(1.0, "high"), (0.5, "high")]
 
 
 def test_noise_is_the_machines_and_repeats_with_its_seed(designs: dict[str, Design]) -> None:

@@ -28,8 +28,8 @@ from malta.proof.groups import loop_of
 from malta.proof.margin import Margin
 from malta.proof.polynomial import characteristic as degrees
 from malta.proof.polynomial import enclosure
+from malta.proof.polynomial.closed_loop import loop_parts
 from malta.proof.polynomial.family import nodes, restrict, restriction_rounding
-from malta.proof.polynomial.rounding import parts
 from malta.proof.problem import OfLoop
 from malta.proof.uncertain import Compensator, closed_loop
 
@@ -231,7 +231,7 @@ def _coupled(coupling: float) -> tuple[Any, Compensator]:
 def test_couplings_that_are_taken_as_zero_are_bounded() -> None:
     system, law = _coupled(1e-14)
     problem = OfLoop(loop_of(system, law), ("k",))
-    found = parts(problem.loop, problem.couplings, [arb(4.0, 0.5)])
+    found = loop_parts(problem.loop, problem.couplings, [arb(4.0, 0.5)])
     assert [part.group.states for part in found] == [(0, 1), (2, 3)]
     for part in found:
         assert part.moves

@@ -25,9 +25,8 @@ from malta.simulation.experiments.catalogue import experiment
 from malta.synthesis.controller import linear_law, linear_law_of
 from malta.synthesis.requirements import requirements_for
 from malta.synthesis.riccati import eigenvalues
-from malta.tuning import lqg
+from malta.tuning import tune as lqg
 from malta.tuning.groups import figures_of
-from malta.tuning.lqg import cluster_search, clusters_of, worst_ratio
 from malta.tuning.search import (
     Effort,
     Journal,
@@ -36,7 +35,7 @@ from malta.tuning.search import (
     at_least_of,
     merge,
 )
-from malta.tuning.tune import Tuned, design_text, problem_sha256
+from malta.tuning.tune import Tuned, cluster_search, clusters_of, design_text, problem_sha256, worst_ratio
 from malta.tuning.tune import tune as tuned
 from malta.tuning.verify import judge
 

@@ -11,9 +11,14 @@ import numpy as np
 
 from malta.machines.halbach import electronics
 from malta.machines.halbach import electronics as motor
-from malta.machines.halbach.experiments.lift import LAWS, MOVE, move_reference, sound_moves
 from malta.machines.halbach.experiments.motions import COUNT, PAUSE, STEP, responses
-from malta.machines.halbach.experiments.open_loop import positions_at_rest
+from malta.machines.halbach.experiments.open_loop import (
+    LAWS,
+    MOVE,
+    move_reference,
+    positions_at_rest,
+    sound_moves,
+)
 from malta.machines.halbach.plant import Parameters
 from malta.margins.loop_report import LoopReport
 from malta.model.data import published_value

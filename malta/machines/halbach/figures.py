@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.machines.halbach.experiments.lift import (
+from malta.machines.halbach.experiments.motions import BEFORE, PAUSE, responses
+from malta.machines.halbach.experiments.open_loop import (
     AFTER,
     CALM,
     FAULTS,
@@ -17,7 +18,6 @@ from malta.machines.halbach.experiments.lift import (
     commanded_lift,
     lift_force,
 )
-from malta.machines.halbach.experiments.motions import BEFORE, PAUSE, responses
 from malta.report.figures.drawing import (
     MORE,
     REFERENCE,

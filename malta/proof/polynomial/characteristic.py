@@ -365,7 +365,7 @@ class Characteristic:
     def coupling_bounds(
         self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
     ) -> list[tuple[float, int]] | None:
-        """Bounds of the change of each coefficient by neglected couplings (rounding.py): (mantissa, exponent).
+        """Bounds of the change of each coefficient by neglected couplings (closed_loop.py): (mantissa, exponent).
 
         moves : bounds by powers of s or g; sides : the box, ends of each parameter
         """

@@ -71,7 +71,7 @@ class Side:
 
 
 def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until: float = math.inf) -> Family:
-    """The family over a box (P x 2, of p); moves: bounds of the effect of neglected couplings (rounding.py).
+    """The family over a box (P x 2, of p); moves: bounds of the effect of neglected couplings (closed_loop.py).
 
     Raises TooWide when a narrower box may have an enclosure, else Unproven.
     """

@@ -12,9 +12,14 @@ from malta.margins.loop_report import zone
 from malta.model.parameters import box_words
 from malta.model.signals import axis_units
 from malta.proof.margin import NOT_PROVEN, unproven
-from malta.report.tables.design import bandwidth_table, loop_poles_table, recovery_table, sensitivity_table
+from malta.report.tables.design import (
+    bandwidth_table,
+    loop_poles_table,
+    recovery_table,
+    requirements_table,
+    sensitivity_table,
+)
 from malta.report.tables.layout import Paragraph, add_row, new_table
-from malta.report.tables.tuning import requirements_table
 
 if TYPE_CHECKING:
     from malta.margins.loop_report import LoopReport

@@ -14,7 +14,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import brentq
 
 from malta.errors import CheckError
 from malta.margins.loop_report import Payload
@@ -67,6 +66,8 @@ def held_payload(plant: Plant) -> float:
 
     if share_used(0.0) >= 1:
         return 0.0
+    from scipy.optimize import brentq  # here: it takes long to load
+
     high = par.m
     while share_used(high) < 1:
         high *= 2

@@ -28,8 +28,6 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.interpolate import BPoly, PPoly
-from scipy.optimize import brentq
 
 from malta.display import Curves, Description, display, quantity
 from malta.errors import CheckError, InputError
@@ -38,6 +36,8 @@ from malta.simulation import references
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from scipy.interpolate import PPoly
 
     from malta.model.plant import FloatArray
 
@@ -82,6 +82,8 @@ class FastestStroke:
     def path(self) -> PPoly:
         """z(t), m: quintics through z, v and a at the nodes, so that the second derivative is continuous."""
         nodes = np.column_stack([self.z, self.v, self.a])
+        from scipy.interpolate import BPoly, PPoly  # here: it takes long to load
+
         return PPoly.from_bernstein_basis(BPoly.from_derivatives(self.t, nodes))
 
     def reference(self, plant: Plant, centre: float) -> references.Reference:
@@ -221,6 +223,8 @@ def sigmoid_at_peak_current(
     held, k = _holding_current(plant, distance), plant.actuator.force_constant[plant.thrust_input]
     inertia = plant.mass * abs(distance) * (2 * math.log(9)) ** 2 / (6 * math.sqrt(3) * k)
     quickest, slowest = math.sqrt(inertia / (i_max + held)), math.sqrt(inertia / (i_max - held))
+    from scipy.optimize import brentq  # here: it takes long to load
+
     rise = float(brentq(excess, 0.999 * quickest, 1.001 * slowest, xtol=1e-12))
     i, v = demand(rise)
     u = plant.actuator.L * np.gradient(i, grid * rise) + plant.actuator.R * i + emf_constant * v

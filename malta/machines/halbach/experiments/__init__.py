@@ -18,9 +18,8 @@ from typing import Any
 
 from malta.errors import InputError
 from malta.machines.halbach.electronics import Options
-from malta.machines.halbach.experiments.lift import force
 from malta.machines.halbach.experiments.motions import budget, ramp, ramp_cases, step, step_cases
-from malta.machines.halbach.experiments.open_loop import F_MOST, identify, stairs
+from malta.machines.halbach.experiments.open_loop import F_MOST, force, identify, stairs
 from malta.simulation import references
 from malta.simulation.experiments import (
     Experiment,

@@ -13,7 +13,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.machines.halbach import electronics
 from malta.machines.halbach.electronics import IDEAL, IQ_BITS, MEAN_OF, Options, Pwm
-from malta.machines.halbach.experiments.lift import lift_deviation
+from malta.machines.halbach.experiments.open_loop import lift_deviation
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
