@@ -27,7 +27,7 @@ from malta.proof.certificate import certificate, checked_file
 from malta.proof.certificate.check import check
 from malta.proof.uncertain import Compensator
 from malta.report import campaign_tables
-from malta.report.page.binder import binder_page, binder_text
+from malta.report.page.document import binder_page, binder_text
 from malta.report.tables.experiments import findings_table
 from malta.simulation.experiments.recording import columns_of_log, read_log, record
 from malta.tuning.search import Journal
