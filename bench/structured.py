@@ -55,7 +55,7 @@ def structured(runs: int) -> list[Result]:
         found["ours"] = search(task, random_starts(task.structure, 1, 0)).merit
 
     def evolution() -> None:
-        bounds = [(-WIDE, WIDE)] * n
+        bounds = optimize.Bounds(-WIDE * np.ones(n), WIDE * np.ones(n))
         found["theirs"] = optimize.differential_evolution(merit, bounds, maxiter=25, popsize=8, rng=0).fun
 
     seconds, theirs = medians(ours, evolution, runs=min(runs, 2), what="structured")
