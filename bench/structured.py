@@ -8,7 +8,7 @@ What a peer finds is shown: its largest figure, or its gamma, beside ours.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import control
 import numpy as np
@@ -55,8 +55,8 @@ def structured(runs: int) -> list[Result]:
         found["ours"] = search(task, random_starts(task.structure, 1, 0)).merit
 
     def evolution() -> None:
-        bounds, evolve = [(-WIDE, WIDE)] * n, cast("Any", optimize.differential_evolution)
-        found["theirs"] = evolve(merit, bounds, maxiter=25, popsize=8, rng=0).fun
+        bounds = optimize.Bounds(-WIDE * np.ones(n), WIDE * np.ones(n))
+        found["theirs"] = optimize.differential_evolution(merit, bounds, maxiter=25, popsize=8, rng=0).fun
 
     seconds, theirs = medians(ours, evolution, runs=min(runs, 2), what="structured")
     peer = f"differential evolution, 25 generations: {found['theirs']:.3f}"

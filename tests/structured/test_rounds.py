@@ -119,15 +119,15 @@ def test_starts_meet_and_no_other_search_finds_less() -> None:
     goals = (structured.disk_margin(0.7), structured.soft(structured.gain_limit("load", "output", 1.0)),
              structured.soft(structured.gain_limit("reference", "force", 30.0)))  # fmt: skip
     task = Task(structure, goals, (model,), rate_of(model))
-    found = [search(task, [x]) for x in random_starts(structure, 3, 1)]
-    assert [look.soft for look in found] == pytest.approx([found[0].soft] * 3, rel=2e-3)
+    found = [search(task, [x]) for x in random_starts(structure, 2, 1)]
+    assert [look.soft for look in found] == pytest.approx([found[0].soft] * 2, rel=2e-3)
     best = min(found, key=lambda look: look.merit)
 
     def merit(x: np.ndarray) -> float:
         look = task.look(x)
         return 1e3 if look is None else look.merit
 
-    beside = optimize.minimize(merit, best.x, method="Nelder-Mead", options={"maxfev": 120})
+    beside = optimize.minimize(merit, best.x, method="Nelder-Mead", options={"maxfev": 60})
     assert beside.fun > best.merit * (1 - 2e-3)
 
 
