@@ -13,7 +13,14 @@ from fuzz.designs import EXAMPLES, read_data_file, read_design_file
 from fuzz.gain_files import draw_figures, export_as_c, read_gain_file, read_shares_of, show_scenarios
 from fuzz.lines import LINES, run_line
 from fuzz.oracle import Ended
-from fuzz.records import check_certificate, read_campaign, read_log_file, read_rare_event, read_trials
+from fuzz.records import (
+    check_certificate,
+    read_campaign,
+    read_log_file,
+    read_rare_event,
+    read_run_file,
+    read_trials,
+)
 
 GAINS = ("table2", "robust", "tubular_pid", "halbach", "planar", "linear")
 DESIGNS = ("table2", "robust", "robust_observer", "tubular_pid", "halbach", "halbach_pid", "planar")
@@ -46,7 +53,8 @@ KINDS: dict[str, Kind] = {
     "data": Kind(cases((*DATA, *EXAMPLES)), read_data_file, 220),
     "campaign": Kind(cases(("manifest", "block")), read_campaign, 180),
     "certificate": Kind(cases(("continuous", "sampled")), check_certificate, 180),
-    "log": Kind(cases(("csv", "npz")), read_log_file, 160),
+    "log": Kind(cases(("csv", "npz")), read_log_file, 120),
+    "run": Kind(cases(("run",)), read_run_file, 40),
     "rare": Kind(cases(("record", "repetition")), read_rare_event, 40),
     "export": Kind(cases(("linear",)), export_as_c, 20),
     "plot": Kind(cases(("linear",)), draw_figures, 20),
