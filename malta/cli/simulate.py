@@ -347,7 +347,7 @@ def motion(
     Bodies are those that the machine's module describes: Plant(bodies=...).
 
     \b
-    Example:  malta motion design/gains/calibrated.json build/calibrated_stroke.npz
+    Example:  malta motion design/gains/robust.json build/robust_stroke.npz
     """
     from malta.files import replace_files
     from malta.model.data import plant_of

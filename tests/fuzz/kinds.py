@@ -27,6 +27,7 @@ from fuzz.records import (
     read_day,
     read_log_file,
     read_rare_event,
+    read_run_file,
     read_trials,
 )
 
@@ -61,7 +62,8 @@ KINDS: dict[str, Kind] = {
     "data": Kind(cases((*DATA, *EXAMPLES)), read_data_file, 220),
     "campaign": Kind(cases(("manifest", "block")), read_campaign, 150),
     "certificate": Kind(cases(("continuous", "sampled")), check_certificate, 180),
-    "log": Kind(cases(("csv", "npz")), read_log_file, 160),
+    "log": Kind(cases(("csv", "npz")), read_log_file, 120),
+    "run": Kind(cases(("run",)), read_run_file, 40),
     "rare": Kind(cases(("record", "repetition")), read_rare_event, 40),
     "export": Kind(cases(("linear",)), export_as_c, 20),
     "plot": Kind(cases(("linear",)), draw_figures, 20),

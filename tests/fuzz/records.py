@@ -28,8 +28,10 @@ from malta.proof.certificate.check import check
 from malta.proof.uncertain import Compensator
 from malta.report import campaign_tables
 from malta.report.page.document import binder_page, binder_text
+from malta.report.page.motion import motion_page, read_motion
 from malta.report.tables.experiments import findings_table
 from malta.simulation.experiments.recording import columns_of_log, read_log, record
+from malta.simulation.trajectory import save as save_run
 from malta.tuning.search import Journal
 
 RARE, BOUND = "deviation-y1", 1.1e-6  # m, which few runs exceed
@@ -218,6 +220,32 @@ def read_log_file(case: Case, folder: Path) -> Ended | None:
     ended = observe(recorded, folder, [str(path)]) if shown.code == 0 else shown
     if ended.code == 0 and not np.isfinite(ended.value.v0).all():
         raise Defect(f"v0 was recorded as {ended.value.v0}")
+    return ended
+
+
+@cache
+def _run_file() -> bytes:
+    """The file of a short run."""
+    controller = _plan().controller
+    run = malta.simulate(
+        malta.plant_of(controller.parameters),
+        controller,
+        malta.Scenario.stroke(1e-3, rise=3e-3, duration=0.01),
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        return save_run(run, Path(folder) / "run.npz").read_bytes()
+
+
+def read_run_file(case: Case, folder: Path) -> Ended | None:
+    """Show the motion of a run whose file was edited, where it can be read."""
+    path = folder / "run.npz"
+    try:
+        path.write_bytes(_block(_run_file(), case))
+    except Exception:  # numpy does not write every array
+        return None
+    ended = observe(lambda: motion_page(read_motion(path, _plan().plant, frames=8)), folder, [str(path)])
+    if ended.code == 0 and any(word in ended.value.html for word in ("NaN", "Infinity")):
+        raise Defect("numbers that are not finite stand in the page")
     return ended
 
 

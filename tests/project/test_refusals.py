@@ -75,7 +75,7 @@ def test_what_is_left_out_is_in_the_middle() -> None:
         (["simulate", TABLE2, "--seed", "x"], "Invalid value for '--seed'"),
         (["simulate", TABLE2, "--seed"], "--seed"),
         (["tune", "a.toml", "--front", "-1"], "Invalid value for '--front'"),
-        (["nothing"], "No such command 'nothing'; see malta --help"),
+        (["zzz"], "No such command 'zzz'; see malta --help"),
         ([LONG], "No such command 'www"),
         ([""], "No such command ''"),
     ],
