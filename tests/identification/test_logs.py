@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,7 +92,10 @@ def test_what_is_no_log_is_refused(text: str, found: str, tmp_path: Path) -> Non
 
 
 def test_arrays_that_are_no_log_are_refused(tmp_path: Path) -> None:
-    path, good = tmp_path / "bad.npz", {"y": np.zeros((2, 1)), "y_columns": np.array(["x1 [m]"])}
+    path, good = (
+        tmp_path / "bad.npz",
+        dict[str, Any]({"y": np.zeros((2, 1)), "y_columns": np.array(["x1 [m]"])}),
+    )
     for t in (np.arange(2) * 1j, np.zeros((2, 1)), np.array(["0", "1"])):
         np.savez(path, t=t, **good)
         with pytest.raises(malta.InputError, match="t: found an array of"):
