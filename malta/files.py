@@ -247,6 +247,18 @@ def writer() -> str:
     return f"{re.sub('[^A-Za-z0-9-]', '_', socket.gethostname())[:40]}.{os.getpid()}"
 
 
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """A folder for a block of files that are not kept. Raises InputError where they cannot be written."""
+    import tempfile  # where something is compiled
+
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            yield Path(folder)
+    except OSError as error:
+        raise _refused(Path(tempfile.gettempdir()), error) from error
+
+
 def _obstacle(path: Path) -> str:
     return "a folder of that name" if path.is_dir() else "a pipe or a device of that name"
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from malta.files import scratch_folder
 from malta.firmware.ctext import c_name
 from malta.firmware.export import sources
 from malta.firmware.program import TRUTHS, TYPES
@@ -318,8 +318,7 @@ def cost_on(p: Processor, files: Mapping[str, str], straight: Mapping[str, str],
     if any(tool is None for tool in tools):
         return None
     gcc, size, objdump = map(str, tools)
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
+    with scratch_folder() as folder:
         for file, text in files.items():
             (folder / file).write_text(text, encoding="utf-8")
         # A loop's instructions are executed several times: they are counted where it is written out.

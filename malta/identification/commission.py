@@ -20,7 +20,7 @@ import numpy as np
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.files import json_text, read_file, replace_files
+from malta.files import file_exists, json_text, read_file, replace_files
 from malta.gains.file import content_of
 from malta.identification.calibration import Estimate, at_rest
 from malta.identification.learn import FACTORS, learn
@@ -209,7 +209,9 @@ def commission(
         commission("design/gains/robust.json", controller, "build/day")
     """
     path, folder = Path(gains), Path(folder)
-    digest = sha256(read_file(path, "gain file", Path.read_bytes)).hexdigest()
+    digest = _digest(path)
+    if logs is not None and not Path(logs).is_dir():
+        raise InputError(logs, "", "no such folder", "one with a log for each step")
     plant = plant_of(controller.parameters)
     box = content_of(path)[0].uncertainty or {}
     list_of = tuple(steps if steps is not None else steps_of(plant, box))
@@ -263,6 +265,10 @@ def _gone(step: Step, bench: Bench, folder: Path, logs: Path | None) -> Entry:
     return Entry(step.name, step.question, str(path), log.sha256, findings)
 
 
+def _digest(path: Path) -> str:
+    return sha256(read_file(path, "file", Path.read_bytes)).hexdigest()
+
+
 def _digest_of(bench: Bench) -> str:
     """A digest of the simulated machine: its parameters, the errors of its sensors, and the seed."""
     text = f"{bench.truth.parameters!r} {sorted(bench.errors.items())!r} {bench.seed}"
@@ -285,7 +291,7 @@ def _entries_before(folder: Path, now: Commissioning) -> dict[str, Entry]:
     kept = {}
     for entry in done.entries:
         log = Path(entry.log)
-        if entry.passed and log.exists() and sha256(log.read_bytes()).hexdigest() == entry.sha256:
+        if entry.passed and file_exists(log) and log.is_file() and _digest(log) == entry.sha256:
             kept[entry.name] = entry
     return kept
 
@@ -306,10 +312,12 @@ def read_journal(path: Path) -> tuple[Commissioning, str]:
             raise InputError(path, "version", str(content["version"]), str(VERSION))
         done = Commissioning(gains, digest, machine, bench, tuple(entries), tuple(map(str, content["steps"])))
         return done, str(content["signature"])
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(path, "", f"no journal ({error!r})", "one that malta commission wrote") from error
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        raise InputError(
+            path, "", "no journal, or a damaged one", "one that malta commission wrote"
+        ) from error
 
 
 def _finding_of(table: Mapping[str, Any]) -> Finding:

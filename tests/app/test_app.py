@@ -366,6 +366,26 @@ def test_gain_files_go_through_the_checks_of_malta_design(tmp_path: Path) -> Non
     assert not (tmp_path / "design/gains/wild.json").exists()
 
 
+def test_a_session_keeps_nothing_of_the_machines_that_it_leaves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        follow, "SLOW", float("inf")
+    )  # margins are traced here, whatever else the computer does
+    client = Client(BALL, tmp_path)
+    field = client.session.files.fields["machine.m"]
+
+    def kept(number: int) -> dict[str, int]:
+        move = {"machine.m": float(field.value) * (1 + 1e-3 * number)}
+        assert "error" not in client.ask("evaluate", number=number, values=move)
+        return {
+            name: len(own) for name, own in vars(client.session).items() if isinstance(own, list | set | dict)
+        }
+
+    kept(1)
+    assert kept(2) == kept(3) == kept(4)
+
+
 # --- the server ---
 
 

@@ -62,7 +62,7 @@ KINDS: dict[str, Kind] = {
     "data": Kind(cases((*DATA, *EXAMPLES)), read_data_file, 220),
     "campaign": Kind(cases(("manifest", "block")), read_campaign, 150),
     "certificate": Kind(cases(("continuous", "sampled")), check_certificate, 180),
-    "log": Kind(cases(("csv", "npz")), read_log_file, 120),
+    "log": Kind(cases(("csv", "npz")), read_log_file, 100),
     "run": Kind(cases(("run",)), read_run_file, 40),
     "rare": Kind(cases(("record", "repetition")), read_rare_event, 40),
     "export": Kind(cases(("linear",)), export_as_c, 20),
@@ -71,6 +71,6 @@ KINDS: dict[str, Kind] = {
     "shares": Kind(cases(("table2", "linear")), read_shares_of, 40),
     "lines": Kind(LINES, run_line, 90),
     "commands": Kind(cases(("table2", "halbach", "linear")), show_scenarios, 20),
-    "names": Kind(NAMED, use_names, 40),
+    "names": Kind(NAMED, use_names, 100),
     "journal": Kind(cases(("day",)), read_day, 80),
 }

@@ -183,10 +183,16 @@ def test_a_journal_that_was_written_over_is_refused(tmp_path: Path) -> None:
     journal.write_text(journal.read_text().replace('"high": 0.5', '"high": 5.0'))
     with pytest.raises(InputError, match="signature"):
         commission(ROBUST, CONTROLLER, tmp_path, steps=made_steps(0.5, []))
-    for text in ("{}", "[]", "no", '{"entries": [1]}'):
+    for text in ("{}", "[]", "no", '{"entries": [1]}', 100_000 * "["):
         journal.write_text(text)
         with pytest.raises(InputError, match="no journal"):
             read_journal(journal)
+
+
+def test_logs_are_in_a_folder(tmp_path: Path) -> None:
+    for place in (tmp_path / "nowhere", ROBUST):
+        with pytest.raises(InputError, match="no such folder"):
+            commission(ROBUST, CONTROLLER, tmp_path, logs=place)
 
 
 def test_logs_of_a_bench_are_judged_and_waited_for(tmp_path: Path) -> None:

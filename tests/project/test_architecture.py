@@ -189,3 +189,17 @@ def test_a_machine_is_a_folder() -> None:
 def test_every_name_of_the_contents_page_is_there() -> None:
     for name in malta.__all__:
         assert getattr(malta, name) is not None
+
+
+def test_what_is_remembered_of_machines_is_bounded() -> None:
+    """Caches without an end hold texts, numbers and programs: a page that is moved for a day does not grow."""
+    endless = []
+    for path in SOURCES:
+        for node in tree_of(path).body:
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            marks = {ast.unparse(mark) for mark in node.decorator_list}
+            if marks & {"cache", "functools.cache", "lru_cache(maxsize=None)"}:
+                types = {ast.unparse(a.annotation) for a in node.args.args if a.annotation is not None}
+                endless += [(node.name, one) for one in types - {"str", "int", "Path"} if "tuple[" not in one]
+    assert endless == []

@@ -15,7 +15,7 @@ from conftest import refusal
 
 import malta
 from malta.campaigns.store import read_manifest
-from malta.files import read_file, replace_files, temporary_name, writer
+from malta.files import read_file, replace_files, scratch_folder, temporary_name, writer
 from malta.proof.certificate import checked_file
 from malta.simulation.experiments.recording import read_log
 from malta.tables import load_toml
@@ -140,6 +140,13 @@ def test_full_disk_leaves_old_files_and_no_temporary_ones(
             replace_files({old: b"new"})
     assert old.read_bytes() == b"old"
     assert names(tmp_path) == ["old.bin"]
+
+
+def test_a_full_disk_of_temporary_files_is_named() -> None:
+    with pytest.raises(malta.InputError, match=r"found No space left on device, expected a place"):  # noqa: SIM117
+        with scratch_folder() as folder:
+            raise OSError(28, "No space left on device")
+    assert not folder.exists()
 
 
 @pytest.mark.parametrize("failing", ["a.bin", "b.bin", "c.bin"])

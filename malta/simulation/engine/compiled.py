@@ -29,6 +29,7 @@ import numpy as np
 import platformdirs
 
 from malta.errors import InputError
+from malta.files import scratch_folder
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -267,11 +268,11 @@ def shared_library(
     cc = cc or compiler()
     if cc is None:
         return None
-    with tempfile.TemporaryDirectory() as folder:
+    with scratch_folder() as folder:
         for name, content in files.items():
-            (Path(folder) / name).write_bytes(content)
-        texts = [str(Path(folder) / name) for name in sorted(files) if name.endswith(".c")]
-        made = Path(folder) / "library"
+            (folder / name).write_bytes(content)
+        texts = [str(folder / name) for name in sorted(files) if name.endswith(".c")]
+        made = folder / "library"
         found = _answer([*cc, *flags, *texts, "-o", str(made), "-lm"], seconds)
         return made.read_bytes() if found is not None and found[0] == 0 else None
 
