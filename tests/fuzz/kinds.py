@@ -71,6 +71,6 @@ KINDS: dict[str, Kind] = {
     "shares": Kind(cases(("table2", "linear")), read_shares_of, 40),
     "lines": Kind(LINES, run_line, 90),
     "commands": Kind(cases(("table2", "halbach", "linear")), show_scenarios, 20),
-    "names": Kind(NAMED, use_names, 100),
-    "journal": Kind(cases(("day",)), read_day, 80),
+    "names": Kind(NAMED, use_names, 25),
+    "journal": Kind(cases(("day",)), read_day, 155),
 }
