@@ -129,16 +129,16 @@ def test_only_ratios_are_found_without_a_mass(log: Log) -> None:
 
 @pytest.mark.slow
 def test_a_known_mass_on_a_second_flight_gives_the_mass(plan: ExcitationPlan) -> None:
-    bare, loaded = (malta.identification.log_of(excited(plan, {**TRUE, "m": m})) for m in (0.38, 0.48))
+    own, loaded = (malta.identification.log_of(excited(plan, {**TRUE, "m": m})) for m in (0.38, 0.48))
     asked = ["K_A", "K_B", "m", "I_xx"]
     found = malta.identification.weigh(
-        CONTROLLER, bare, loaded, {"m": 0.1}, parameters=asked, known={"K_D": 5.5}
+        CONTROLLER, own, loaded, {"m": 0.1}, parameters=asked, known={"K_D": 5.5}
     )
     assert found.refusal == ""
     assert (np.abs(found.values - [9000.0, 5.0, 0.38, 1.3805e-3]) < 2 * found.half_widths).all()
     assert (found.half_widths / found.values < 5e-3).all()
     with pytest.raises(malta.InputError, match="what the second log's machine has more"):
-        malta.identification.weigh(CONTROLLER, bare, loaded, {"m": 0.0})
+        malta.identification.weigh(CONTROLLER, own, loaded, {"m": 0.0})
 
 
 @pytest.mark.parametrize("known", [{"I_xx": 1.45e-3, "I_yy": 1.45e-3}, {"l_S": 0.09}, {"K_D": 5.2}])
