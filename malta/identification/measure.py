@@ -396,7 +396,9 @@ def cut_loop(loop: Loop, w: FloatArray) -> Cut:
     return Cut(np.asarray(P, dtype=complex), F[..., :p], F[..., p:])
 
 
-def machines_of(predicted: Loop, box: Mapping[str, float], seed: int, samples: int = SAMPLES) -> list[Loop]:
+def machines_of(
+    predicted: Loop, box: Mapping[str, float], seed: int, samples: int | None = None
+) -> list[Loop]:
     """The machine, and those at the corners and at random places of the box, all under the same law."""
     par = predicted.plant.parameters
     names, shares = list(box), np.array(list(box.values()))
@@ -407,7 +409,7 @@ def machines_of(predicted: Loop, box: Mapping[str, float], seed: int, samples: i
     if not names:
         return [predicted]
     corners = list(product((-1.0, 1.0), repeat=len(names))) if len(names) <= CORNERS else []
-    random = np.random.default_rng(seed).uniform(-1, 1, (samples, len(names)))
+    random = np.random.default_rng(seed).uniform(-1, 1, (SAMPLES if samples is None else samples, len(names)))
     places = np.vstack([np.array(corners).reshape(-1, len(names)), random])
     found, at = [predicted], dict[str, Any](predicted.at)
     for place in places:
