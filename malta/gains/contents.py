@@ -372,11 +372,10 @@ def _parameters(plant: PlantTable, path: str | Path) -> Parameters:
         raise InputError(path, "plant.name", error.found, error.expected) from error
     units, given = units_of(record), plant.parameters or {}
     needed = set(units) - set(later_parameters(record))
-    odd = sorted(set(given) - set(units) | needed - set(given))
-    if odd:
-        raise InputError(
-            path, "plant.parameters", f"{odd[0]!r} missing or unknown", "one of " + " ".join(units)
-        )
+    if unknown := sorted(set(given) - set(units)):
+        raise InputError(path, "plant.parameters", f"{unknown[0]!r}, unknown", "one of " + " ".join(units))
+    if missing := sorted(needed - set(given)):
+        raise InputError(path, "plant.parameters", f"{missing[0]} missing", "all of " + " ".join(units))
     for key, q in given.items():
         if q.unit != units[key]:
             raise InputError(path, f"plant.parameters.{key}.unit", repr(q.unit), repr(units[key]))

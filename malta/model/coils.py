@@ -51,7 +51,9 @@ class Allocation:
     gain: FloatArray
 
     def currents(self, v: Any) -> Any:
-        """The currents of least loss for forces v, numbers or CasADi symbols: what `Plant.currents` needs, A.
+        """Compute the currents of least loss: what `Plant.currents` needs, A.
+
+        v : m forces, numbers or CasADi symbols
 
         They may exceed limits; `limited` stays within them, at the cost of a program for each v.
         """
@@ -60,7 +62,10 @@ class Allocation:
         return self.gain @ np.asarray(v, dtype=float)
 
     def limited(self, v: ArrayLike, limit: float | ArrayLike) -> FloatArray:
-        """The currents of least loss for forces v within limits (A, of each coil or one for all).
+        """Compute the currents of least loss within limits, A.
+
+        v : m forces
+        limit : A, of each coil or one for all
 
         Raises CheckError where no currents within the limits make v, and InputError for other shapes.
         """
@@ -89,8 +94,9 @@ class Allocation:
         return i
 
     def largest(self, direction: ArrayLike, limit: float | ArrayLike) -> float:
-        """The largest multiple of a direction of forces that currents within limits make; infinite without limits.
+        """Find the largest multiple of a direction of forces within limits of the currents; infinite without limits.
 
+        direction : m forces
         limit : A, of each coil or one for all
 
         Raises InputError for other shapes, and a direction of zeros.

@@ -85,7 +85,9 @@ def series(*systems: Any) -> UncertainSystem:
 def append(*systems: Any) -> UncertainSystem:
     """Put systems side by side, each with inputs and outputs of its own: y = diag(G1, G2, ...) u.
 
-    The arguments, the result and the errors are those of `series`.
+    systems : as for `series`
+
+    Returns an UncertainSystem. Raises InputError as `series` does.
 
     >>> import malta
     >>> one = malta.uncertain(lambda k: ([[-k]], [[1]], [[1]]), {"k": 2.0})
@@ -100,7 +102,9 @@ def append(*systems: Any) -> UncertainSystem:
 def parallel(*systems: Any) -> UncertainSystem:
     """Add the outputs of systems with the same inputs: y = (G1 + G2 + ...) u.
 
-    The arguments, the result and the errors are those of `series`.
+    systems : as for `series`
+
+    Returns an UncertainSystem. Raises InputError as `series` does.
 
     >>> import malta
     >>> one = malta.uncertain(lambda k: ([[-k]], [[1]], [[1]]), {"k": 2.0})
@@ -120,10 +124,13 @@ def parallel(*systems: Any) -> UncertainSystem:
 def feedback(system: Any, law: Any, sign: int = -1) -> UncertainSystem:
     """Close a loop: y = G (u + sign K y), as control.feedback does for known systems.
 
+    system : G
     law : K, from y to what is added to u
     sign : -1, or +1, which the laws of malta take
 
-    The other arguments, the result and the errors are those of `series`. Raises InputError too where I - sign D_K D_G
+    One of the two is uncertain, as for `series`.
+
+    Returns an UncertainSystem. Raises InputError as `series` does, and where I - sign D_K D_G
     is singular, or an algebraic loop has more than LARGEST_LOOP signals.
 
     >>> import control, malta
@@ -167,7 +174,10 @@ def feedback(system: Any, law: Any, sign: int = -1) -> UncertainSystem:
 def random_systems(system: UncertainSystem, count: int, ranges: Ranges, seed: int = 0) -> list[Any]:
     """Draw known systems from a box, each parameter uniformly in its range: for plots beside what is proven of all.
 
+    system : of `malta.uncertain`
+    count : of systems
     ranges : by parameter: 0.2 is +-20 % of the nominal value, (low, high) an interval in SI; others stay nominal
+    seed : of the draw
 
     Returns `count` control.StateSpaces; the same for the same seed.
 

@@ -88,7 +88,9 @@ class UncertainSystem:
         return made
 
     def state_space(self, **values: float) -> Any:
-        """The known system at given values of parameters, SI, and nominal ones of the others: a control.StateSpace.
+        """Make the known system at values of parameters, a control.StateSpace.
+
+        values : by name, SI; nominal ones of the others
 
         Raises InputError for unknown parameters, values that are no numbers, and a system without a value there.
 

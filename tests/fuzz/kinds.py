@@ -72,5 +72,5 @@ KINDS: dict[str, Kind] = {
     "lines": Kind(LINES, run_line, 90),
     "commands": Kind(cases(("table2", "halbach", "linear")), show_scenarios, 20),
     "names": Kind(NAMED, use_names, 25),
-    "journal": Kind(cases(("day",)), read_day, 155),
+    "journal": Kind(cases(("day",)), read_day, 115),
 }

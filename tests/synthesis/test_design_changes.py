@@ -65,7 +65,10 @@ def test_more_inertia_is_fed_forward() -> None:
         ("nix=3", "--set: nix: found an unknown parameter, expected one of m "),
         ("m", "--set: found 'm', expected NAME=VALUE, as m=0.56 or l_B=45mm"),
         ("name=x", "--set: name: found a change of it, expected another design file"),
-        ("weights.state.q=3", "design/calibrated.toml: weights.state: found 11 entries "),
+        (
+            "weights.state.q=3",
+            "design/calibrated.toml: weights.state.q: found none of the 10 states, expected one of x y ",
+        ),
         ("bases.state.x=60", "design/calibrated.toml: bases.state.x: found 60, expected a table"),
         ("bases.input.x=3N", "design/calibrated.toml: bases.input: found 'SI', expected a table, to change "),
     ],

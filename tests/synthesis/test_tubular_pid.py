@@ -276,7 +276,7 @@ FILTERS = "[pid.filters]"
     [
         (FILTERS, '[pid.filter]\nvalue = 1\nunit = "ms"\n' + FILTERS, "pid.filter"),
         (FILTERS, "[pid.times]", "pid.times"),
-        ('axes = "decentralized"', 'axes = "centre-of-gravity"', "pid.Kp"),
+        ('axes = "decentralized"', 'axes = "centre-of-gravity"', "pid.Kp.fx_B1"),
         ('axes = "decentralized"', 'axes = "polar"', "pid.axes"),
         ('"pid.filters.f_D"', '"pid.filters.z"', "search.numbers.axial_filter.vary"),
         ('"pid.filters.f_D"', '"pid.filter"', "search.numbers.axial_filter.vary"),
