@@ -162,6 +162,9 @@ def _quoted(unit: str) -> str:
     return repr(unit if len(unit) <= 40 else f"{unit[:37]}...")
 
 
+WHOLE = ("min", "minute")  # which nobody writes with a prefix
+
+
 def units_like(unit: str, si_unit: str) -> list[str]:
     """Units of the dimension of another, each with one name in the place of one that is like it; for a refusal."""
     from difflib import get_close_matches  # where something is wrong already
@@ -170,7 +173,9 @@ def units_like(unit: str, si_unit: str) -> list[str]:
     columns = [line.split(" = ") for line in UNITS.strip().splitlines()]
     for names in ([column[0] for column in columns], [column[min(2, len(column) - 1)] for column in columns]):
         prefixes = ["", *(name[:-1] for name in names if name.endswith("-"))]
-        known += [prefix + name for name in names if name.isalpha() for prefix in prefixes]
+        known += [
+            p + name for name in names if name.isalpha() for p in prefixes if not p or name not in WHOLE
+        ]
     for token in set(re.findall(r"[^\W\d_]+", unit[:LONGEST])):
         near = get_close_matches(token, known, n=20, cutoff=0.4)
         others += [re.sub(rf"(?<![^\W\d_]){token}(?![^\W\d_])", name, unit) for name in near]
