@@ -366,7 +366,7 @@ def test_the_figure_names_what_it_shows() -> None:
     figure.draw_without_rendering()
     texts = _texts(figure)
     assert "calibrated: where the margin goes" in texts
-    assert "100 %: m ±20 %, K_A ±20 %, K_D ±20 %, K_B ±20 %, all at once" in texts
+    assert "100 %: m K_A K_D K_B ±20 %, all at once" in texts
     left, right = figure.axes[:2]
     names = [tick.get_text() for tick in left.get_yticklabels()]
     assert names == [*(link.name for link in found.chain), "all of the travel"]
