@@ -127,7 +127,7 @@ def test_a_figure_says_what_its_panels_lines_and_legends_are() -> None:
     html = curves_page().html
     read_page(html)
     assert "<root>" not in html
-    (told,) = json.loads(re.findall(r'id="figures">(.*?)</script>', html, re.DOTALL)[0])
+    (told,) = json.loads(re.findall(r'id="panels-of-figures">(.*?)</script>', html, re.DOTALL)[0])
     assert [line["label"] for line in told["lines"]] == ["square", "<root>", "square"]  # the last by its look
     assert [entry["label"] for entry in told["legend"]] == ["square", "<root>"]
     for line, y in zip(told["lines"], (X**2, X**0.5), strict=False):
@@ -141,7 +141,7 @@ def test_a_figure_says_what_its_panels_lines_and_legends_are() -> None:
 
 POINT = """
 const [n, share, kind, down] = arguments, svg = document.querySelector("figure svg");
-const a = JSON.parse(document.getElementById("figures").textContent)[0].axes[n], m = svg.getScreenCTM();
+const a = JSON.parse(document.getElementById("panels-of-figures").textContent)[0].axes[n], m = svg.getScreenCTM();
 const p = new DOMPoint(a.left + share * (a.right - a.left), (a.top + a.bottom) / 2).matrixTransform(m);
 svg.dispatchEvent(new PointerEvent(kind, {clientX: p.x, clientY: p.y + down, bubbles: true}));
 return document.querySelector(".readout").innerText.replaceAll("−", "-").split("\\n");

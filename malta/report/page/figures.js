@@ -1,6 +1,6 @@
 // Figures of a page that answer: values under the pointer, cursors linked over all panels of one axis, zoom, channels.
 "use strict";
-const figures = JSON.parse(document.getElementById("figures").textContent);
+const figures = JSON.parse(document.getElementById("panels-of-figures").textContent);
 const SPACE = "http://www.w3.org/2000/svg";
 const panels = []; // {svg, axes, lines, cursor, dots}
 const digits = (v) => (!Number.isFinite(v) ? "" : v && (Math.abs(v) >= 1e5 || Math.abs(v) < 1e-3) ? v.toExponential(2) : String(Number(v.toPrecision(4)))).replace("-", "−");
