@@ -101,6 +101,6 @@ def test_the_command_writes_the_file(run: Run, tmp_path: Path, monkeypatch: pyte
     file.write_text(head.replace("`table2`", "`nobody`"), encoding="utf-8")
     code, _, err = run("claims", "--update", file)
     assert code == 2
-    assert "found nobody, expected one of " in err
+    assert "found 'nobody', expected one of " in err
     code, _, err = run("claims", "design/table2.toml", "--update", file)
     assert code == 2
