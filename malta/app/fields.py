@@ -122,7 +122,7 @@ def _law_fields(files: Files) -> Iterator[Field]:
 
 def _tables(table: Mapping[str, Any], path: str) -> Iterator[tuple[str, Mapping[str, Any] | None]]:
     """The innermost tables of numbers with their paths; None for a table that stands as "SI"."""
-    plain = {k: v for k, v in table.items() if _is_number(v) or (isinstance(v, Mapping) and "value" in v)}
+    plain = {k: v for k, v in table.items() if is_number(v) or (isinstance(v, Mapping) and "value" in v)}
     if plain:
         yield path, plain
     for name, entry in table.items():
@@ -237,7 +237,7 @@ def check_value(field: Field, value: object, where: str) -> float | int | bool |
         return value
     if field.kind == "choice" and isinstance(value, str):
         return value
-    if field.kind not in ("switch", "choice") and _is_number(value):
+    if field.kind not in ("switch", "choice") and is_number(value):
         number = float(value)
         if field.kind == "integer" and number.is_integer():
             return int(number)
@@ -247,6 +247,6 @@ def check_value(field: Field, value: object, where: str) -> float | int | bool |
     raise InputError(where, field.key, repr(value), expected.get(field.kind, "a finite number"))
 
 
-def _is_number(value: object) -> TypeGuard[int | float]:
+def is_number(value: object) -> TypeGuard[int | float]:
     """Whether a value is a number that a float can hold."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -HUGE < value < HUGE

@@ -86,6 +86,13 @@ def describe_error(error: Exception) -> str:
     return f"a defect of malta or of the machine's module: {type(error).__name__} ({error})"
 
 
+def failed_document(task: str, sentence: str) -> dict[str, Any]:
+    """What ended a task of the worker, "prove", "map" or "check", in a sentence: nothing is proven then."""
+    if task == "prove":
+        return {"kind": "proof", "lower": None, "upper": None, "frequency": None, "reason": sentence}
+    return {"kind": "map" if task == "map" else "failed", "error": sentence}
+
+
 # A reference followed by the linear loop of a machine: what a simulation shows, in milliseconds and without limits.
 #
 #     X+ = M X + G r,   p = C X,   v = K X + D r        X = (machine, law), r = (p*, xi*, v_ff, v0)

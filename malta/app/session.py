@@ -18,7 +18,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from malta.app.fields import HUGE
+from malta.app.fields import is_number
 from malta.app.files import (
     DesignFiles,
     Edit,
@@ -34,6 +34,7 @@ from malta.app.picture import (
     Problem,
     View,
     describe_error,
+    failed_document,
     picture,
     poles_document,
     run_names,
@@ -171,9 +172,7 @@ def _obituary(asked: Mapping[str, Any], reason: str, *, again: bool) -> dict[str
     if again:
         return mark | {"kind": "notice", "text": f"{sentence}: it was started again and asked once more"}
     sentence += ", and so did the one that was started in its place"
-    if asked["task"] == "prove":
-        return mark | {"kind": "proof", "lower": None, "upper": None, "frequency": None, "reason": sentence}
-    return mark | {"kind": "map" if asked["task"] == "map" else "failed", "error": sentence}
+    return mark | failed_document(asked["task"], sentence)
 
 
 def _describe_end(code: int) -> str:
@@ -316,7 +315,7 @@ class Session:
             if message is not None:
                 self._workers["map"].ask(message | {"task": "map", "plane": [*self._plane, self._lost]})
             return {"version": self._version}
-        if not (isinstance(at, list) and len(at) == 2 and all(map(_is_finite, at))):
+        if not (isinstance(at, list) and len(at) == 2 and all(map(is_number, at))):
             raise InputError("malta app", "at", repr(at), "two numbers")
         with self._busy:
             problem = solve(self.files.apply(self.edit))
@@ -454,11 +453,6 @@ class Session:
             self._state.notify_all()
         if self._hear is not None:
             self._hear(reply)
-
-
-def _is_finite(value: object) -> bool:
-    """Whether a value is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < HUGE
 
 
 def requirement_list(spec: Spec) -> list[Document]:

@@ -23,6 +23,7 @@ from malta.app.picture import (
     View,
     curves,
     describe_error,
+    failed_document,
     map_document,
     margin_document,
     planned_run,
@@ -142,15 +143,7 @@ def work(message: Message, opened: DesignFiles, newer: Newer) -> Iterator[dict[s
     except SupersededError:
         raise
     except Exception as error:
-        yield failure(message, error)
-
-
-def failure(message: Message, error: Exception) -> dict[str, Any]:
-    """What ended the work, in a sentence: nothing is proven then."""
-    sentence = shorten(describe_error(error))
-    if message["task"] == "prove":
-        return {"kind": "proof", "lower": None, "upper": None, "frequency": None, "reason": sentence}
-    return {"kind": "map" if message["task"] == "map" else "failed", "error": sentence}
+        yield failed_document(message["task"], shorten(describe_error(error)))
 
 
 class _Inbox:
@@ -201,7 +194,7 @@ def main() -> None:
         except SupersededError:
             continue
         except Exception as error:
-            say(message, failure(message, error))
+            say(message, failed_document(message["task"], shorten(describe_error(error))))
         say(message, {"kind": "end"})
 
 

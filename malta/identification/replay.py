@@ -196,7 +196,7 @@ def replay_law(controller: Controller, log: Log) -> LawReplay:
     )
     if twin is None or not found.doubt:
         return found
-    return replace(found, explained=_explained(plant, twin, late, noise, half))
+    return replace(found, explained=_explained(plant, twin, late, own, noise))
 
 
 def whiteness(values: FloatArray) -> float:
@@ -237,26 +237,28 @@ class _Twin:
 
 
 def _explained(
-    plant: Plant, twin: _Twin, late: FloatArray, noise: FloatArray, half: int
+    plant: Plant, twin: _Twin, late: FloatArray, own: FloatArray, noise: FloatArray
 ) -> dict[str, tuple[float, float]]:
     """By parameter: the change of it that explains most of the innovations, as a share of its value, and how much.
+
+    late : the innovations of the log, second half
+    own : those of the gain file's own machine, with noise
 
     The innovations move by a D with the change a, D from a machine that is 1 % off without noise. The power of what is
     left is compared with that beyond the own machine's noise.
     """
-    still = twin.innovation(plant, noise=0.0)[half:]
+    late_half = slice(-len(late), None)
+    still = twin.innovation(plant, noise=0.0)[late_half]
     off = (late - still) / noise
-    beyond = float(
-        (off**2).sum() - ((twin.innovation(plant, noise=1.0)[half:] - still) ** 2 / noise**2).sum()
-    )
+    beyond = float((off**2).sum() - ((own - still) ** 2 / noise**2).sum())
     found: dict[str, tuple[float, float]] = {}
     alike = twins_of(plant.parameters)
     for name in acting(plant):
         value = float(getattr(plant.parameters, name))
-        own = dict.fromkeys([name, *(n for n, other in alike.items() if other == name)], (1 + STEP) * value)
+        both = dict.fromkeys([name, *(n for n, other in alike.items() if other == name)], (1 + STEP) * value)
         par: Any = plant.parameters
         try:
-            moved = twin.innovation(plant.variant(replace(par, **own)), noise=0.0)[half:]
+            moved = twin.innovation(plant.variant(replace(par, **both)), noise=0.0)[late_half]
         except (CheckError, InputError):
             continue
         D = (moved - still) / (STEP * noise)

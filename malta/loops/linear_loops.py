@@ -165,6 +165,19 @@ class System(NamedTuple):
     C: FloatArray
     D: FloatArray
 
+    @classmethod
+    def of(cls, source: Any) -> System:
+        """The matrices of a control.StateSpace."""
+        return cls(*(np.array(M, dtype=float) for M in (source.A, source.B, source.C, source.D)))
+
+    @property
+    def balanced(self) -> System:
+        """The same system with states in balanced units."""
+        if not len(self.A):
+            return self
+        t = balanced_units(self.A, self.B, self.C)
+        return System(self.A * t / t[:, None], self.B / t[:, None], self.C * t, self.D)
+
     def response(self, s: ComplexArray) -> ComplexArray:
         """C (s - A)^-1 B + D at k complex frequencies s, in differences (z - 1) / T: k x outputs x inputs.
 
@@ -172,8 +185,7 @@ class System(NamedTuple):
         """
         if not len(self.A):
             return np.broadcast_to(self.D.astype(complex), (len(s), *self.D.shape))
-        t = balanced_units(self.A, self.B, self.C)
-        A, B, C = self.A * t / t[:, None], self.B / t[:, None], self.C * t
+        A, B, C, _ = self.balanced
         matrices = s[:, None, None] * np.eye(len(A)) - A
         try:
             found = np.linalg.solve(matrices, B.astype(complex))

@@ -12,7 +12,7 @@ import time as clock
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from malta.loops.classical import Nominal
 from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
@@ -297,11 +297,14 @@ def worst_sensitivities(
     ranges: Ranges,
     current_loops: CurrentLoops = LAST,
     *,
+    at: Literal["sensors", "forces"] = "sensors",
     time: float | None = None,
 ) -> dict[str, Gain]:
     """The largest |S| of each sensor, the other loops closed, over the modelled box, the travel and `plant.over`.
 
-    The arguments are those of travel_margin. Without a proof along the travel, it covers the middle and the end alone.
+    at : the sensors, or the forces in their place
+
+    The others are those of travel_margin. Without a proof along the travel, it covers the middle and the end alone.
     """
     from malta.proof.blocks.gain import (
         worst_case_gain,  # with all that dynamics take, which a design does not ask for
@@ -309,11 +312,11 @@ def worst_sensitivities(
 
     along, over = travel_loops(plant, controller, tuple(ranges), current_loops)
     found = {}
-    for k, sensor in enumerate(plant.outputs):
-        each = [worst_case_gain(*loop, ranges, over, channel=k, time=time) for loop in along]
+    for k, signal in enumerate(plant.outputs if at == "sensors" else plant.inputs):
+        each = [worst_case_gain(*loop, ranges, over, at=at, channel=k, time=time) for loop in along]
         worst = max(each, key=lambda gain: gain.lower)
         proven = [gain.upper for gain in each if gain.upper is not None]
-        found[sensor.name] = replace(worst, upper=max(proven) if len(proven) == len(each) else None)
+        found[signal.name] = replace(worst, upper=max(proven) if len(proven) == len(each) else None)
     return found
 
 

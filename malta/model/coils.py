@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -50,6 +51,11 @@ class Allocation:
     failed: tuple[int, ...]
     gain: FloatArray
 
+    @cached_property
+    def _rows(self) -> FloatArray:
+        """The largest entry of each row of T, by which programs are scaled; of full rank: none is zero."""
+        return np.asarray(np.abs(self.matrix).max(axis=1))
+
     def currents(self, v: Any) -> Any:
         """Compute the currents of least loss: what `Plant.currents` needs, A.
 
@@ -79,7 +85,7 @@ class Allocation:
         scale = max(
             float(most[np.isfinite(most)].max(initial=0.0)), float(np.abs(self.gain @ wanted).max()), 1e-300
         )
-        rows = np.abs(self.matrix).max(axis=1)  # of full rank: none is zero
+        rows = self._rows
         H, T = np.diag(self.resistance / self.resistance.max()), self.matrix / rows[:, None]
         quiet = {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False}
         solver = ca.conic(
@@ -109,7 +115,7 @@ class Allocation:
     def _largest(self, d: FloatArray, most: FloatArray) -> float:
         if not d.any() or np.isinf(most).all():
             return math.inf
-        rows, finite = np.abs(self.matrix).max(axis=1), most[np.isfinite(most) & (most > 0)]
+        rows, finite = self._rows, most[np.isfinite(most) & (most > 0)]
         if not finite.size:
             return 0.0 if not np.isinf(most).any() else math.inf
         unit = float(finite.max())  # A: the program is scaled by it and by the rows of T
@@ -127,9 +133,8 @@ class Allocation:
 
     def _require(self, i: FloatArray, v: FloatArray) -> None:
         """Raise CheckError unless the currents make the forces."""
-        rows = np.abs(self.matrix).max(axis=1)
-        left = float(np.abs((self.matrix @ i - v) / rows).max())
-        if not left <= ACCURACY * max(float(np.abs(i).max()), float(np.abs(v / rows).max())):
+        left = float(np.abs((self.matrix @ i - v) / self._rows).max())
+        if not left <= ACCURACY * max(float(np.abs(i).max()), float(np.abs(v / self._rows).max())):
             raise CheckError(f"{CALLER}: the currents that were found miss the forces by {left:.2g} A")
 
     def _forces(self, v: ArrayLike) -> FloatArray:

@@ -14,7 +14,7 @@ import keyword
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import dataclass, field, make_dataclass
 from functools import cache
 from numbers import Real
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack, cast
@@ -26,7 +26,7 @@ from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.formulas import formula, value_of
 from malta.model.machines import machine_names
-from malta.model.parameters import check_parameters, si
+from malta.model.parameters import check_parameters, si, symbolic_names
 from malta.model.plant import Actuator, Parameters, Plant, Signal
 
 if TYPE_CHECKING:
@@ -175,7 +175,7 @@ def _record(names: tuple[str, ...], limits: tuple[tuple[str, float, float], ...]
 
 def _reduce(record: Any) -> tuple[Any, ...]:
     """The arguments with which pickle rebuilds a record, because its class has no name in this module."""
-    values = {one.name: getattr(record, one.name) for one in fields(record) if one.name not in RESERVED}
+    values = {name: getattr(record, name) for name in symbolic_names(record)}
     return record_of, (record.system, values, record.preset)
 
 
@@ -192,7 +192,7 @@ def plant(par: Any) -> Plant:
         p = getattr(par, name)
         A, B, C = (M + p * ca.sparsify(ca.DM(T)) for M, T in zip((A, B, C), terms, strict=True))
     if s.formulas:
-        values = {one.name: getattr(par, one.name) for one in fields(par) if one.name not in RESERVED}
+        values = {name: getattr(par, name) for name in symbolic_names(par)}
         A, B, C = (_with_formulas(letter, M, s, values) for letter, M in zip(LETTERS, (A, B, C), strict=True))
 
     def position_of(y: Any) -> Any:

@@ -21,7 +21,7 @@ from malta.errors import InputError
 from malta.model.plant import readonly
 from malta.proof.box import box_of
 from malta.proof.systems import compensator_of
-from malta.proof.uncertain import UncertainSystem, describe, plural
+from malta.proof.uncertain import Compensator, UncertainSystem, describe, plural
 
 if TYPE_CHECKING:
     from malta.proof.margin import Ranges
@@ -44,7 +44,8 @@ class _Parts:
 def series(*systems: Any) -> UncertainSystem:
     """Connect systems one after the other: the first takes u, the last gives y.
 
-    systems : UncertainSystems, control.StateSpaces, TransferFunctions or matrices of gains; at least one uncertain
+    systems : UncertainSystems, control.StateSpaces, TransferFunctions, Compensators without delay and lag, or matrices
+        of gains; at least one uncertain
 
     Returns an UncertainSystem.
 
@@ -289,6 +290,11 @@ _ANY = -1.0  # the sample time of gains, which fit every system
 def _sample_time(one: Any, caller: str) -> float | None:
     if isinstance(one, UncertainSystem):
         return one.sample_time
+    if isinstance(one, Compensator):
+        if one.delay or one.lag is not None:
+            found = f"a Compensator with a delay of {one.delay} samples and a lag of {one.lag}"
+            raise InputError(caller, "law", found, "one without, and the delay and the lag as systems")
+        return one.sample_time
     if not hasattr(one, "dt"):
         return _ANY
     if one.dt is True:
@@ -306,7 +312,7 @@ def _parts(one: Any, symbols: dict[str, Any]) -> _Parts:
         A, B, C, *more = one.matrices.call([_own(one, symbols)])
         D = more[0] if more else ca.SX(C.shape[0], B.shape[1])
         return _Parts(A, B, C, D, more[1] if len(more) > 1 else ca.SX.eye(A.shape[0]))
-    shape = np.shape(one) if not hasattr(one, "ninputs") else (one.noutputs, one.ninputs)
+    shape = (one.noutputs, one.ninputs) if hasattr(one, "ninputs") else np.shape(getattr(one, "D", one))
     outputs, inputs = shape if len(shape) == 2 else (1, 1)
     law = compensator_of(one, inputs, outputs)
     n = len(law.A)

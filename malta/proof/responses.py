@@ -68,12 +68,8 @@ def _plant(system: UncertainSystem, law: Compensator, p: bytes) -> Sides:
     They are stacks, for each row of parameters.
     """
     names = len(system.names)
-    A, B, C, *more = system.every(np.frombuffer(p).reshape(-1, names) if names else np.zeros((1, 0)))
+    A, B, C, D = system.explicit(np.frombuffer(p).reshape(-1, names) if names else np.zeros((1, 0)))
     rows, n, m = B.shape
-    D = more[0] if more else np.zeros((rows, C.shape[1], m))
-    if len(more) > 1:
-        both = np.linalg.solve(more[1], np.concatenate([A, B], axis=2))
-        A, B = both[:, :, :n], both[:, :, n:]
     k, q = n if law.lag is None else n + m, C.shape[1]
     into, out, through = (np.zeros((rows, *shape)) for shape in ((k, 2 * m), (q + m, k), (q + m, 2 * m)))
     into[:, :n, m:], out[:, :q, :n], through[:, :q, m:] = B, C, D

@@ -297,8 +297,6 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
     """
     from malta.proof.uncertain import Compensator
 
-    if isinstance(law, Compensator):
-        return law
     wanted = "a Compensator, a proper control.StateSpace or TransferFunction, or a gain matrix"
     if hasattr(law, "num_list") or hasattr(law, "num_array"):
         import control
@@ -308,7 +306,9 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
         except Exception as error:  # improper, or of several inputs and outputs
             first = str(error).strip().split("\n")[0]
             raise InputError("compensator", "law", f"a TransferFunction ({first})", wanted) from error
-    if all(hasattr(law, name) for name in ("A", "B", "C", "D", "dt")):
+    if isinstance(law, Compensator):
+        found = law
+    elif all(hasattr(law, name) for name in ("A", "B", "C", "D", "dt")):
         if law.dt is True:
             raise InputError("compensator", "dt", "True", "0, or a sample time in seconds")
         T = None if not law.dt else float(law.dt)

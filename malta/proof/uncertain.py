@@ -87,6 +87,20 @@ class UncertainSystem:
             made.append(matrix)
         return made
 
+    def explicit(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """E^-1 A, E^-1 B, C and D at k rows of parameters.
+
+        p : k x parameters, in the order of `names`
+
+        Raises numpy.linalg.LinAlgError where E is singular.
+        """
+        A, B, C, *more = self.every(p)
+        D = more[0] if more else np.zeros((len(A), C.shape[1], B.shape[2]))
+        if len(more) > 1:
+            both = np.linalg.solve(more[1], np.concatenate([A, B], axis=2))
+            A, B = both[:, :, : A.shape[2]], both[:, :, A.shape[2] :]
+        return A, B, C, D
+
     def state_space(self, **values: float) -> Any:
         """Make the known system at values of parameters, a control.StateSpace.
 
@@ -108,15 +122,13 @@ class UncertainSystem:
                     "state_space", name, "an unknown parameter", "one of " + " ".join(self.names)
                 )
             p[self.names.index(name)] = number("state_space", name, value)
-        A, B, C, *more = (M[0] for M in self.every(p))
-        D = more[0] if more else np.zeros((len(C), B.shape[1]))
-        if not all(np.isfinite(M).all() for M in (A, B, C, D, *more)) or (
-            len(more) > 1 and np.linalg.det(more[1]) == 0
-        ):
+        try:
+            found = [M[0] for M in self.explicit(p)]
+        except np.linalg.LinAlgError:  # E is singular
+            found = [np.full((1, 1), np.nan)]
+        if not all(np.isfinite(M).all() for M in found):
             raise InputError("state_space", "matrices", "no value there", "parameters within their limits")
-        if len(more) > 1:
-            A, B = np.linalg.solve(more[1], A), np.linalg.solve(more[1], B)
-        return control.ss(A, B, C, D, 0 if self.sample_time is None else self.sample_time)
+        return control.ss(*found, 0 if self.sample_time is None else self.sample_time)
 
 
 @dataclass(frozen=True, eq=False)

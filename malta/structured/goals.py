@@ -228,8 +228,7 @@ def _weight_of(weight: Any) -> System:
     import control  # imports matplotlib and takes a second: only where it is used
 
     try:
-        ss = control.ss(weight)
-        found = System(*(np.array(M, dtype=float) for M in (ss.A, ss.B, ss.C, ss.D)))
+        found = System.of(control.ss(weight))
     except Exception as error:  # many kinds, as improper ones
         wanted = "a proper control system with one input and one output"
         raise InputError(CALLER, "weight", f"a {type(weight).__name__}", wanted) from error

@@ -19,9 +19,8 @@ from scipy import sparse
 
 from malta.errors import CheckError, InputError
 from malta.loops.linear_loops import System
-from malta.structured.elements import CALLER, Structure
+from malta.structured.elements import CALLER
 from malta.structured.norms import Channels, Pole, poles_of
-from malta.synthesis.state_space import balanced_units
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -65,9 +64,7 @@ def model_of(
 ) -> Model:
     """Make a model of matrices, of x+ where there is a sample time. Raises InputError for an eigenvalue -1 of those."""
     plane = system if sample_time is None else to_plane(system, sample_time)
-    t = balanced_units(plane.A, plane.B, plane.C) if len(plane.A) else np.ones(0)
-    plane = System(plane.A * t / t[:, None], plane.B / t[:, None], plane.C * t, plane.D)
-    return Model(name, plane, tuple(inputs), tuple(outputs), tuple(disturbances), sample_time, goals)
+    return Model(name, plane.balanced, tuple(inputs), tuple(outputs), tuple(disturbances), sample_time, goals)
 
 
 def to_plane(system: System, Ts: float) -> System:
@@ -95,11 +92,14 @@ def models_of_systems(plants: Any) -> list[Model]:
             raise InputError(CALLER, "plant", f"a {type(plant).__name__}", wanted) from error
         if ss.dt is True:
             raise InputError(CALLER, "plant.dt", "True", "a sample time in s, or 0")
-        matrices = System(*(np.array(M, dtype=float) for M in (ss.A, ss.B, ss.C, ss.D)))
         name = f"{ss.name}" if len(given) == 1 else f"model {k + 1}"
         found.append(
             model_of(
-                name, matrices, ss.input_labels, ss.output_labels, sample_time=float(ss.dt or 0.0) or None
+                name,
+                System.of(ss),
+                ss.input_labels,
+                ss.output_labels,
+                sample_time=float(ss.dt or 0.0) or None,
             )
         )
     first = found[0]
@@ -241,8 +241,3 @@ def _picked(signals: Any, known: dict[str, tuple[str, ...]]) -> list[int]:
             raise InputError(CALLER, "signal", repr(signal), "one of " + ", ".join([*known, *every]))
         found += own
     return found
-
-
-def close(model: Model, structure: Structure, x: FloatArray) -> ClosedLoop:
-    """Close a model by a structure at x."""
-    return ClosedLoop(model, structure.theta(x)[0])

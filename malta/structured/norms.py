@@ -18,7 +18,6 @@ from scipy import linalg
 
 from malta.errors import CheckError
 from malta.loops.linear_loops import System
-from malta.synthesis.state_space import balanced_units
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -50,14 +49,6 @@ def response_at(system: System, w: FloatArray) -> ComplexArray:
     return found
 
 
-def balanced(system: System) -> System:
-    """The same system with states in balanced units."""
-    if not len(system.A):
-        return system
-    t = balanced_units(system.A, system.B, system.C)
-    return System(system.A * t / t[:, None], system.B / t[:, None], system.C * t, system.D)
-
-
 def _sizes(system: System, w: FloatArray) -> FloatArray:
     G = response_at(system, w)
     if 1 in G.shape[1:]:
@@ -83,7 +74,7 @@ def peak_gain(system: System) -> tuple[float, float]:
     Its levels rise from gains that were found, until the Hamiltonian matrix has no imaginary eigenvalues at RISE above
     the last one (Bruinsma and Steinbuch).
     """
-    system = balanced(system)
+    system = system.balanced
     w = np.array([0.0, np.inf])
     if len(system.A):
         poles = np.linalg.eigvals(system.A)
@@ -114,7 +105,7 @@ def peaks_of(system: System) -> list[Peak]:
     One that rises above a share of the largest, between places where the gain is below it, is found for certain: these
     places are eigenvalues of a Hamiltonian matrix.
     """
-    system = balanced(system)
+    system = system.balanced
     best, where = peak_gain(system)
     if not math.isfinite(best) or best == 0.0:
         return []

@@ -16,7 +16,7 @@ from malta.errors import InputError
 from malta.loops.linear_loops import System
 from malta.loops.loop import loop
 from malta.loops.sampled_loops import LAST, SampledLoop, sampled_loop
-from malta.margins.travel import travel_loops, travel_margin
+from malta.margins.travel import travel_margin, worst_sensitivities
 from malta.model.linearize import linearize
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
@@ -64,10 +64,7 @@ class Uncertain:
     def at(self, values: Values, *, goals: bool) -> Model:
         s, T = self.system, self.sample_time
         p = np.array([values.get(n, v) for n, v in zip(s.names, s.nominal, strict=True)])
-        A, B, C, *more = (M[0] for M in s.every(p))
-        D = more[0] if more else np.zeros((len(C), B.shape[1]))
-        if len(more) > 1:
-            A, B = np.linalg.solve(more[1], A), np.linalg.solve(more[1], B)
+        A, B, C, D = (M[0] for M in s.explicit(p))
         if self.lag is not None:
             A, B = add_lags(A, B, self.lag)
         if T is not None and s.sample_time is None:
@@ -159,16 +156,8 @@ class Machine:
 
     def gains(self, law: System, goal: Goal, ranges: Ranges, time: float | None) -> dict[str, Gain]:
         assert goal.peak is not None
-        at = goal.peak[1]
-        signals = self.plant.outputs if at == "sensors" else self.plant.inputs
-        loops, over = travel_loops(self.plant, self.controller(law, "structured"), tuple(ranges))
-        found = {}
-        for k, signal in enumerate(signals):
-            each = [worst_case_gain(*one, ranges, over, at=at, channel=k, time=time) for one in loops]
-            proven = [gain.upper for gain in each if gain.upper is not None]
-            worst = max(each, key=lambda gain: gain.lower)
-            found[signal.name] = replace(worst, upper=max(proven) if len(proven) == len(each) else None)
-        return found
+        law_of = self.controller(law, "structured")
+        return worst_sensitivities(self.plant, law_of, ranges, at=goal.peak[1], time=time)
 
 
 def _name(values: Values) -> str:

@@ -26,7 +26,7 @@ from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.loops.linear_loops import System
 from malta.processes import on_one_thread
-from malta.structured.norms import balanced, peak_gain
+from malta.structured.norms import peak_gain
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -131,7 +131,7 @@ def h_infinity(plant: Any, outputs: int, inputs: int) -> Synthesized:
     if min(p1, m1, p2, m2) < 1:
         found = f"{len(whole.D)} outputs and {whole.D.shape[1]} inputs"
         raise InputError(CALLER, "plant", found, f"more than {p2} outputs and {m2} inputs")
-    own = balanced(whole)
+    own = whole.balanced
     problem, back = _normal(own, p2, m2)
     best = _smallest(problem)
     solved = _solve(problem, best * (1 + ABOVE))
@@ -348,7 +348,7 @@ def mixed_sensitivity(plant: Any, of_error: Any, of_input: Any = None, of_output
             W = control.append(*[W] * size)
         if W.ninputs != size:
             raise InputError("mixed_sensitivity", name, f"{W.ninputs} signals", f"1 or {size}")
-        sides.append(System(*(np.array(M, dtype=float) for M in (W.A, W.B, W.C, W.D))))
+        sides.append(System.of(W))
     return h_infinity(_augmented(_system_of(G), sides), p, m)
 
 
@@ -432,6 +432,5 @@ def shape_loop(plant: Any, before: Any = 1.0, after: Any = 1.0) -> Synthesized:
     norm, w = _checked(four, own, p, m, gamma)
     whole = control.ss(*own)
     whole = control.ss(system(before) * whole * system(after))
-    made = System(*(np.array(M, dtype=float) for M in (whole.A, whole.B, whole.C, whole.D)))
     coupling = float(np.abs(np.linalg.eigvals(X @ Z)).max(initial=0.0)) / (gamma**2 - 1)
-    return Synthesized(made, best, norm, w, coupling, max(x[1], z[1]))
+    return Synthesized(System.of(whole), best, norm, w, coupling, max(x[1], z[1]))

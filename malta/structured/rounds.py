@@ -183,28 +183,24 @@ def tune(
     models = target.nominal
     first = models[0]
     structure = Structure(places_of(law, first.inputs, first.outputs))
+    task = Task(structure, tuple(goals), tuple(models), rate_of(first))
+    begin, wanted = random_starts(structure, starts, seed), 1.0 if margin is None else margin
     if isinstance(target, Systems):
         if ranges is not None:
             raise InputError(
                 CALLER, "ranges", "ranges", "none for systems of python-control: malta.uncertain has some"
             )
-        look = _search(
-            Task(structure, tuple(goals), tuple(models), rate_of(first)),
-            random_starts(structure, starts, seed),
-        )
-        proof, rounds = Proof(None, {}, closed=False), 1
+        look, proof, rounds = _search(task, begin), Proof(None, {}, closed=False), 1
     else:
-        asked = _Asked(target, tuple(goals), ranges, 1.0 if margin is None else margin, over_box)
-        task = Task(structure, tuple(goals), tuple(models), rate_of(first))
-        task, look, proof, rounds = _rounds(asked, task, random_starts(structure, starts, seed))
-        models = list(task.models)
+        asked = _Asked(target, tuple(goals), ranges, wanted, over_box)
+        task, look, proof, rounds = _rounds(asked, task, begin)
     found = structure.at(look.x)
     values = {key: value for e in found.elements for key, value in e.values.items()}
     system = structure.system(look.x)
     controller = target.controller(system, name) if isinstance(target, Machine) else None
     return Tuned(
-        values, structure.order, system, first.sample_time, _reached(look, goals), tuple(m.name for m in models),
-        proof.margin, proof.peaks, None if ranges is None else (1.0 if margin is None else margin), proof.closed,
+        values, structure.order, system, first.sample_time, _reached(look, goals), tuple(m.name for m in task.models),
+        proof.margin, proof.peaks, None if ranges is None else wanted, proof.closed,
         rounds, clock.monotonic() - begun, controller,
     )  # fmt: skip
 

@@ -57,8 +57,6 @@ from malta.tuning.verify import judge
 if TYPE_CHECKING:
     from malta.margins.loop_report import Outcome
     from malta.model.plant import FloatArray
-    from malta.synthesis.spec import Spec
-    from malta.tuning.search import Progress, Trial
 
 
 # Descent by linear programs: the smallest worst ratio, or the least noise that bounds allow.

@@ -26,6 +26,11 @@ def mass() -> Any:
     return malta.uncertain(lambda m: ([[0, 1], [0, 0]], [[0], [1 / m]], [[1, 0]]), {"m": 0.1})
 
 
+def compensator(**options: Any) -> Any:
+    law = control.ss(-LEAD)
+    return malta.proof.Compensator(law.A, law.B, law.C, law.D, **options)
+
+
 def coupled(m: Any, k: Any) -> Any:
     """Two inputs and outputs, a direct path that depends on k, and a mass in E."""
     return [[0, 1], [-k, -1]], [[0, 1], [1, k]], [[1, 0], [0, 1]], [[0, 0.1 * k], [0.3, 0]], [[1, 0], [0, m]]
@@ -65,12 +70,16 @@ def test_the_margin_of_a_closed_system_is_that_of_its_loop() -> None:
 
 
 def test_a_lag_in_series_is_the_lag_of_a_compensator() -> None:
-    law = control.ss(-LEAD)
-    lag = malta.proof.Compensator(law.A, law.B, law.C, law.D, lag=500.0)
-    one = malta.robust_margin(mass(), lag, {"m": 0.5})
+    one = malta.robust_margin(mass(), compensator(lag=500.0), {"m": 0.5})
     other = malta.robust_margin(series(control.tf([500], [1, 500]), mass()), -LEAD, {"m": 0.5})
     assert one.lower is not None
     assert other.lower == pytest.approx(one.lower, rel=1e-3)
+
+
+def test_a_compensator_is_its_state_space_in_a_connection() -> None:
+    law = malta.proof.Compensator(RANDOM.A, RANDOM.B, RANDOM.C, RANDOM.D)
+    one, other = (feedback(two_by_two(), K).state_space(m=3, k=2) for K in (law, RANDOM))
+    np.testing.assert_array_equal(one(1j * W), other(1j * W))
 
 
 def test_sampled_systems_keep_their_period() -> None:
@@ -120,6 +129,9 @@ def test_a_connection_is_a_machine() -> None:
             "a solution",
         ),
         (lambda: series(mass(), "lead"), "compensator: law"),
+        (lambda: series(compensator(delay=2), mass()), "law: found a Compensator with a delay of 2 samples"),
+        (lambda: feedback(mass(), compensator(lag=500.0)), "law: found a Compensator with .* a lag of 500"),
+        (lambda: series(compensator(sample_time=0.1), mass()), "sample_time: found 0.1 s, continuous"),
         (lambda: mass().state_space(k=1), "state_space: k: found an unknown parameter"),
         (lambda: mass().state_space(m=0), "state_space: matrices: found no value"),
         (lambda: random_systems(mass(), 0, {"m": 0.1}), "count: found 0"),

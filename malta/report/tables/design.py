@@ -24,8 +24,6 @@ from malta.synthesis.requirements import Trade, requirements_for
 from malta.units import in_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from malta.loops.time_domain import Recovery
     from malta.margins.loop_report import Outcome
     from malta.model.plant import ComplexArray, FloatArray, Plant
