@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from malta.simulation.references import Motion
     from malta.simulation.scenario import Scenario
     from malta.synthesis.controller import Controller
+    from malta.synthesis.recovery import StepResponse
     from malta.synthesis.spec import Spec
 
 
@@ -87,9 +88,11 @@ def describe_error(error: Exception) -> str:
 
 
 def failed_document(task: str, sentence: str) -> dict[str, Any]:
-    """What ended a task of the worker, "prove", "map" or "check", in a sentence: nothing is proven then."""
+    """What ended a task of the worker in a sentence: nothing is proven then, nothing more is found."""
     if task == "prove":
         return {"kind": "proof", "lower": None, "upper": None, "frequency": None, "reason": sentence}
+    if task in ("tune", "front"):
+        return {"kind": "searched", "of": task, "error": sentence}
     return {"kind": "map" if task == "map" else "failed", "error": sentence}
 
 
@@ -271,7 +274,28 @@ def _frequency(curves: LoopCurves) -> dict[str, Any]:
         "S": round_values(S),
         "T": round_values(T),
         "L": round_values(np.stack([alone.T.real, alone.T.imag], axis=1)),
+        "crossover": crossovers(curves) if curves.stable else [],
     }
+
+
+def crossovers(curves: LoopCurves) -> list[tuple[float, float] | None]:
+    """The highest gain crossover of each sensor's loop, rad/s, and its phase margin there, rad; None without one.
+
+    The others are closed. The margin is the angle from -1 to the loop, 0 to 2 pi.
+    """
+    found: list[tuple[float, float] | None] = []
+    for L in curves.responses.alone("sensors").T:
+        size = np.log(np.abs(L))
+        at = np.flatnonzero(np.diff(size > 0))
+        if not len(at):
+            found.append(None)
+            continue
+        k = int(at[-1])
+        share = size[k] / (size[k] - size[k + 1])
+        w = math.exp(float(np.interp(share, [0, 1], np.log(curves.w[k : k + 2]))))
+        angle = float(np.angle(L[k]) + share * np.angle(L[k + 1] / L[k]))
+        found.append((w, (angle + math.pi) % (2 * math.pi)))
+    return found
 
 
 def run_document(problem: Problem, view: View) -> dict[str, Any] | None:
@@ -296,9 +320,7 @@ def _load(problem: Problem, view: View) -> dict[str, Any] | None:
     names = [s.name for s in problem.plant.disturbances]
     if not names or not problem.report.stable:
         return None
-    k = names.index(view.load) if view.load in names else 0
-    answer = problem.loop.sampled.answer()
-    one = answer.of(np.eye(len(names))[k])
+    answer, one, k = _answer(problem, view)
     settled = one.within(0.02)
     ends = settled[np.isfinite(settled)]
     end = max(1.3 * float(ends.max(initial=0.0)), 20 * problem.controller.sample_time)
@@ -310,6 +332,19 @@ def _load(problem: Problem, view: View) -> dict[str, Any] | None:
         "y": round_values(y),
         "largest": round_values(one.largest[:, 0]),
     }
+
+
+def _answer(problem: Problem, view: View) -> tuple[StepResponse, StepResponse, int]:
+    """Answers of the loop to all loads, to a unit of the chosen one, and which that is."""
+    names = [s.name for s in problem.plant.disturbances]
+    k = names.index(view.load) if view.load in names else 0
+    answer = problem.loop.sampled.answer()
+    return answer, answer.of(np.eye(len(names))[k]), k
+
+
+def largest_moved(problem: Problem, view: View) -> FloatArray | None:
+    """How far the chosen load moves each output at most; None without loads from outside."""
+    return _answer(problem, view)[1].largest[:, 0] if problem.plant.disturbances else None
 
 
 def _margin(problem: Problem, first: int | None) -> dict[str, Any] | None:
