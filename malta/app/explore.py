@@ -35,6 +35,10 @@ LEAST_GAIN = 1e-3  # of the logarithm that a search makes small, from one candid
 ALONG = 4  # trials for each number, of a point of the front
 EASED = (1.4, 1.2, 1.1, 1.0, 0.9, 0.8, 0.7)  # of the peak sensitivity that a PID may have, along its front
 SLACK = 0.005  # of a requirement, beyond which a point of the front misses it
+PRICES = (
+    "command noise",
+    "moved by",
+)  # of a margin, as the figures of the picture are named: of an LQG, of a PID
 LONGEST = 20.0  # s, of the proof of a point of the front
 
 
@@ -87,7 +91,7 @@ def candidates(search: Search) -> Iterator[dict[str, Any]]:
 
 
 def front(search: Search) -> Iterator[dict[str, Any]]:
-    """Designs of least noise for margins about the one that is asked for; of a PID, for peaks of sensitivity.
+    """Designs of least noise for margins about the one that is asked for; of a PID, of least errors under loads.
 
     Raises InputError as `malta.tune`, and for a design that asks for neither.
     """
@@ -115,7 +119,8 @@ def front(search: Search) -> Iterator[dict[str, Any]]:
         )
         name, ratio = nearest_limit(spec, trial, free)
         misses = {"limit": name, "ratio": ratio} if ratio > 1 + SLACK else {}
-        yield _document(search, spec, trial) | {"margin": margin.lower, "reason": margin.reason} | misses
+        found = {"margin": margin.lower, "reason": margin.reason, "price": PRICES[spec.pid is not None]}
+        yield _document(search, spec, trial) | found | misses
 
 
 def _trials_of_lqg(spec: Spec, search: Search) -> Iterator[Trial]:

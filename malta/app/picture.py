@@ -73,29 +73,6 @@ def planned_run(plant: Plant, controller: Controller, name: str) -> tuple[str, P
     return name, cases_of(name, plant, controller)[0]
 
 
-# What goes wrong behind the page, in one sentence: a page has no place for a traceback.
-
-
-def describe_error(error: Exception) -> str:
-    """The sentence of an error; of one that malta does not raise on purpose, its kind and text as well."""
-    if isinstance(error, InputError | CheckError):
-        return str(error)
-    if isinstance(error, ArithmeticError):
-        return f"numbers beyond what can be computed ({error})"
-    if isinstance(error, MemoryError):
-        return "more was asked for than this computer has memory for"
-    return f"a defect of malta or of the machine's module: {type(error).__name__} ({error})"
-
-
-def failed_document(task: str, sentence: str) -> dict[str, Any]:
-    """What ended a task of the worker in a sentence: nothing is proven then, nothing more is found."""
-    if task == "prove":
-        return {"kind": "proof", "lower": None, "upper": None, "frequency": None, "reason": sentence}
-    if task in ("tune", "front"):
-        return {"kind": "searched", "of": task, "error": sentence}
-    return {"kind": "map" if task == "map" else "failed", "error": sentence}
-
-
 # A reference followed by the linear loop of a machine: what a simulation shows, in milliseconds and without limits.
 #
 #     X+ = M X + G r,   p = C X,   v = K X + D r        X = (machine, law), r = (p*, xi*, v_ff, v0)

@@ -19,12 +19,11 @@ from typing import Any, TextIO
 
 from malta.app.explore import TASKS, Search
 from malta.app.files import DesignFiles, Edited, fingerprint, open_design
+from malta.app.followers import describe_error, failed_document
 from malta.app.picture import (
     Problem,
     View,
     curves,
-    describe_error,
-    failed_document,
     map_document,
     margin_document,
     planned_run,

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import malta
-from malta.app import session as follow
+from malta.app import followers
 from malta.app.files import Edit, TakenError, fingerprint, inside, open_design, save_design
 from malta.app.picture import View, map_document, picture, solve
 from malta.app.server import LARGEST, PAGES, Server
@@ -370,7 +370,7 @@ def test_a_session_keeps_nothing_of_the_machines_that_it_leaves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        follow, "SLOW", float("inf")
+        "malta.app.session.SLOW", float("inf")
     )  # margins are traced here, whatever else the computer does
     client = Client(BALL, tmp_path)
     field = client.session.files.fields["machine.m"]
@@ -563,7 +563,7 @@ def dying_worker(monkeypatch: pytest.MonkeyPatch, deaths: int) -> list[dict[str,
         command = [sys.executable, "-S", "-c", code + end]
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
-    monkeypatch.setattr(follow, "_start", start)
+    monkeypatch.setattr(followers, "_start", start)
     heard: list[dict[str, Any]] = []
     full = threading.Event()
 
@@ -572,7 +572,7 @@ def dying_worker(monkeypatch: pytest.MonkeyPatch, deaths: int) -> list[dict[str,
         if document["kind"] != "notice":
             full.set()
 
-    worker = follow.Worker(hear)
+    worker = followers.Worker(hear)
     worker.ask({"version": 1, "serial": 7, "task": "prove"})
     assert full.wait(60)
     worker.close()

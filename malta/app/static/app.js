@@ -2,7 +2,7 @@
 // transport: {ask(document) -> promise of a document, listen(heard)}.
 
 import { createChart } from "./chart.js";
-import { createPanel, element } from "./controls.js";
+import { createPanel, dropDown, element } from "./controls.js";
 import { exportChart } from "./export.js";
 import { color, loadView, mapView, nyquistView, poleView, runView, sensitivityView, timeGroups } from "./figures.js";
 import { digits, floored, percent, quantity } from "./numbers.js";
@@ -53,7 +53,7 @@ export async function mount(root, transport) {
   const help = button("?", "shortcuts", () => shortcuts.showModal(), { "aria-label": "shortcuts" });
   const message = element("div", { class: "message", role: "alert" });
   const pins = element("div", { class: "pins" });
-  const header = element("header", {}, element("div", { class: "name" }, element("div", { class: "which" }, title, designs), subtitle), badge, lights, pins, element("div", { class: "buttons" }, undo, redo, reset, pin, save, gains, theme, help));
+  const header = element("header", {}, element("div", { class: "name" }, element("div", { class: "which" }, title, dropDown("▾", designs)), subtitle), badge, lights, pins, element("div", { class: "buttons" }, undo, redo, reset, pin, save, gains, theme, help));
 
   const ties = element("input", { type: "checkbox", onchange: () => { state.ties = ties.checked; } });
   const redesign = element("input", { type: "checkbox", onchange: () => commit({ values: state.values, redesign: redesign.checked }) });
@@ -74,7 +74,7 @@ export async function mount(root, transport) {
     };
     const menu = element("select", { class: "menu", "aria-label": `${heading}: zoom and export`, title: "zoom and export", onchange: () => { act(menu.value); menu.value = ""; } },
       ...[["", "⋯"], ["in", "Zoom in"], ["out", "Zoom out"], ["whole", "Whole figure"], ["svg", "SVG"], ["png", "PNG"], ["csv", "CSV"]].map(([value, text]) => element("option", { value }, text)));
-    cards.append(element("article", { class: `card ${key}` }, element("div", { class: "bar" }, element("h2", {}, heading), ...tools, menu), chart.node, legend, note));
+    cards.append(element("article", { class: `card ${key}` }, element("div", { class: "bar" }, element("h2", {}, heading), ...tools, dropDown("⋯", menu)), chart.node, legend, note));
   }
   const tabs = (choices, get, set) => {
     const group = element("div", { class: "tabs", role: "group" }, ...choices.map(([value, text]) => button(text, text, () => { set(value); draw(); }, { "data-value": value })));
@@ -171,9 +171,11 @@ export async function mount(root, transport) {
       const now = pulled;
       pulled = null;
       const answer = await transport.ask({ ask: "pull", kind: now.kind, signal: now.signal, asked: now.asked, values: before ? before.values : state.values, redesign: state.redesign, run: state.run, load: state.load }).catch(() => ({ error: GONE }));
-      if (answer.error) say(answer.error, "error");
-      else say(pullText(now, answer), answer.reached ? "note" : "error");
-      place(answer.values ?? {}, now.done);
+      const text = answer.error ?? pullText(now, answer);
+      place({ ...before?.values, ...answer.values }, now.done);
+      state.told = { chart: { phase: "nyquist", run: "run", load: "load" }[now.kind] ?? "sensitivity", text }; // nothing moves under the pointer
+      draw();
+      if (now.done) say(text, answer.reached ? "note" : "error");
     }
     pulling = false;
   }
@@ -215,6 +217,7 @@ export async function mount(root, transport) {
   const changes = () => Object.fromEntries(state.description.fields.filter((field) => state.values[field.key] !== field.value).map((field) => [field.key, state.values[field.key]]));
 
   function refresh() {
+    state.told = null;
     // Nothing that was proven or measured of the last design is shown beside the numbers of the next.
     state.past = { ...state.past, ...state.requirements, ...(state.proof?.lower ? { margin: { found: state.proof.lower } } : {}) };
     if (!state.moving) last = { version: state.version, proof: state.proof, requirements: state.requirements, simulated: state.simulated };
@@ -347,6 +350,7 @@ export async function mount(root, transport) {
     if (mapped) charts.poles.legend.replaceChildren();
     else legendOf(charts.poles, Object.keys(picture.poles).filter((name) => picture.poles[name].length), state.hiddenPoles, { machine: "○", "closed loop": "×", regulator: "+", filter: "□" });
     drawTimes({ ...state, pins });
+    if (state.told) charts[state.told.chart].note.textContent = charts[state.told.chart].note.title = state.told.text;
     drawTables();
   }
 
@@ -467,7 +471,7 @@ export async function mount(root, transport) {
     const answer = await transport.ask({ ask: "designs" }).catch(() => ({ designs: [] }));
     const rows = answer.designs ?? [];
     designs.replaceChildren(...rows.map((one) => element("option", { value: one.id, selected: one.open }, `${one.folder ? `${one.folder}/` : ""}${one.name}${one.gains ? " (gain files)" : ""}`)));
-    designs.hidden = rows.length < 2;
+    designs.parentElement.hidden = rows.length < 2;
     designs.own = rows.find((one) => one.open)?.id;
   }
 

@@ -24,6 +24,9 @@ export function element(name, attributes = {}, ...children) {
   return node;
 }
 
+// A list that opens from a sign.
+export const dropDown = (sign, list) => element("span", { class: "drop" }, element("span", { "aria-hidden": "true" }, sign), list);
+
 const toNumber = (text) => (text.trim() === "" ? NaN : Number(text.trim().replace("−", "-"))); // a comma is refused: 1,000 may be one or a thousand
 
 // Slider position, 0 to STEPS, of a value, and back. With `zero` the left end of a logarithmic slider is 0.

@@ -6,31 +6,31 @@ import { digits, floored, percent, quantity } from "./numbers.js";
 const SHOWN = 6; // candidates at once, the newest
 const STARTS = { tune: "tuning from here…", front: "computing the front…" };
 
-const noiseOf = (point) => point.picture.figures.find((one) => one.label.startsWith("command noise"));
+const priceOf = (point) => point.picture.figures.find((one) => one.label.startsWith(point.price)); // of the margin
 const boundWords = (name) => name.replaceAll("_", " ");
 
 // Of points {margin, picture} those that no other beats in both, by margin; a design without a proven margin is none.
 export function undominated(points) {
-  const known = points.filter((one) => one.margin > 0 && noiseOf(one)), noise = (one) => noiseOf(one).value;
-  const beats = (a, b) => a.margin >= b.margin && noise(a) <= noise(b) && (a.margin > b.margin || noise(a) < noise(b));
+  const known = points.filter((one) => one.margin > 0 && priceOf(one)), price = (one) => priceOf(one).value;
+  const beats = (a, b) => a.margin >= b.margin && price(a) <= price(b) && (a.margin > b.margin || price(a) < price(b));
   return known.filter((one) => !known.some((other) => beats(other, one))).sort((a, b) => a.margin - b.margin);
 }
 
 export const pointText = (point) => {
-  const noise = noiseOf(point), missed = point.limit ? `, misses ${boundWords(point.limit)} by ${digits(100 * (point.ratio - 1), 2)} %` : "";
-  return `${percent(floored(point.margin))} proven · ${quantity(noise.value, noise.unit)} rms${missed}`;
+  const price = priceOf(point), missed = point.limit ? `, misses ${boundWords(point.limit)} by ${digits(100 * (point.ratio - 1), 2)} %` : "";
+  return `${percent(floored(point.margin))} proven · ${quantity(price.value, price.unit)} ${price.label.split(" [")[0]}${missed}`;
 };
 
 // state.candidates are drawn beside the design. ask(document) -> promise; place(values, done) moves the design to others.
 export function createTuner(state, { ask, place, say, redraw }) {
   const button = (text, title, press) => element("button", { type: "button", title, onclick: press }, text);
   const tune = button("Tune from here", "malta tune, begun at these numbers", () => begin("tune"));
-  const trade = button("Margin against noise", "the front about this design: least noise for each margin", () => begin("front"));
+  const trade = button("", "the front about this design: what each margin costs", () => begin("front"));
   const stop = button("Stop", "what was found stays", () => begin("stop"));
   const clear = button("Clear", "forget what was found", () => { Object.assign(state, { candidates: [], front: [] }); redraw(); });
   const status = element("p", { class: "soft", role: "status" });
   const list = element("div", { class: "found" });
-  const slider = element("input", { type: "range", min: 0, max: 0, step: 1, "aria-label": "margin against noise" });
+  const slider = element("input", { type: "range", min: 0, max: 0, step: 1, "aria-label": "point of the front" });
   const label = element("output", {});
   const master = element("div", { class: "row master" }, label, slider);
   const node = element("section", { class: "tuner", "aria-label": "search from this design" }, element("div", { class: "buttons" }, tune, trade, stop, clear), status, list, master);
@@ -71,6 +71,7 @@ export function createTuner(state, { ask, place, say, redraw }) {
   }
 
   function show() {
+    trade.textContent = `Margin against ${state.description.law === "PID" ? "load" : "noise"}`;
     stop.hidden = !found.running;
     clear.hidden = !state.candidates.length && !state.front.length;
     list.replaceChildren(...state.candidates.slice(-SHOWN).map((one) => button(`${one.name}  ${percent(one.ratio)} of ${boundWords(one.limit)}`, "take this design: nearest to its limit, or furthest beyond it, is what stands here", () => place(one.values, true))));
