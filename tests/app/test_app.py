@@ -551,7 +551,9 @@ def test_entries_that_move_together_keep_units_of_their_own(tmp_path: Path) -> N
     assert y.factor / x.factor == pytest.approx(1e-3, rel=1e-12)  # 12 um in x are 0.012 mm in y
 
 
-def dying_worker(monkeypatch: pytest.MonkeyPatch, deaths: int) -> list[dict[str, Any]]:
+def dying_worker(
+    monkeypatch: pytest.MonkeyPatch, deaths: int, task: str = "prove", version: int | None = 1
+) -> list[dict[str, Any]]:
     """What is heard of a process that exits with code 3 at the first documents, and answers the next one."""
     answer = "print(json.dumps({'kind': kind, 'serial': 7, 'version': 1}), flush=True)"
     code = f"import json, sys; sys.stdin.readline(); kind = 'begin'; {answer}; "
@@ -573,7 +575,7 @@ def dying_worker(monkeypatch: pytest.MonkeyPatch, deaths: int) -> list[dict[str,
             full.set()
 
     worker = followers.Worker(hear)
-    worker.ask({"version": 1, "serial": 7, "task": "prove"})
+    worker.ask({"version": version, "serial": 7, "task": task})
     assert full.wait(60)
     worker.close()
     assert len(started) == 2
