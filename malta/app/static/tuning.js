@@ -86,7 +86,7 @@ export function createTuner(state, { ask, place, say, redraw }) {
     slider.setAttribute("aria-valuetext", text);
   }
 
-  const slide = (done) => place(state.front[Number(slider.value)].values, done);
+  const slide = (done) => { place(state.front[Number(slider.value)].values, done); show(); };
   slider.addEventListener("input", () => slide(false));
   slider.addEventListener("change", () => slide(true));
   const reset = () => { Object.assign(found, { running: "", from: {} }); status.textContent = ""; };
