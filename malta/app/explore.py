@@ -97,9 +97,14 @@ def front(search: Search) -> Iterator[dict[str, Any]]:
     """
     spec = searched_spec(search.files, search.edited)
     asked = "peak_sensitivity" if spec.pid else "margin"
-    if asked not in spec.specification or not spec.uncertainty:
-        expected = f"{asked} in it, and an [uncertainty]: the front is about them"
-        raise InputError(spec.path.name, "specification", "another", expected)
+    if asked not in spec.specification:
+        raise InputError(
+            spec.path.name, f"specification.{asked}", "nothing", "a bound: the front is about it"
+        )
+    if not spec.uncertainty:
+        raise InputError(
+            spec.path.name, "uncertainty", "nothing", "parameters that vary: a margin is of their box"
+        )
     axes = {"margin", asked} | {name for name, r in requirements_for(spec.plant).items() if r.trade}
     free = axes if spec.pid is None else {"margin", asked}
     own = Trial(tuple(spec.value_of(v) for v in spec.search), spec.delay, {})

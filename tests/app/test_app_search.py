@@ -187,7 +187,7 @@ def test_the_margins_of_a_front_are_proven_and_below_those_of_eigenvalues(name: 
     ("path", "task", "says"),
     [
         (shipped_path("design", "planar.toml"), explore.candidates, "a table of what the design shall reach"),
-        (shipped_path("design", "planar.toml"), explore.front, "margin in it, and an"),
+        (shipped_path("design", "planar.toml"), explore.front, "specification.margin: found nothing"),
     ],
 )
 def test_a_search_without_a_goal_is_one_sentence(path: Path, task: Any, says: str) -> None:
