@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeGuard, get_args
 
 from malta.errors import InputError
@@ -54,7 +54,8 @@ class Field:
     key : of the entry, as "bases.state.x" or "machine.m"
     low, high : of the slider; a field accepts any number that the files accept
     zero : whether 0 is allowed beside a logarithmic slider
-    tuning : the name of the [search] number that moves this entry together with `linked`; "": none
+    tuning : the name of the [search] number that moves this entry together with `linked`, or of a slider of equal
+        numbers where there is no [search]; "": none
     factor : from the unit of that number to the entry's own
     """
 
@@ -87,8 +88,9 @@ class Files(Protocol):
 
 def fields_of(files: Files) -> tuple[Field, ...]:
     """All fields of a design, in the order of its file; the machine's parameters come last."""
+    law = tuple(_law_fields(files))
     return (
-        *_law_fields(files),
+        *(law if files.spec.search else _with_sliders(law, files)),
         *_sampling_fields(files),
         *_place_fields(files),
         *_machine_fields(files),
@@ -118,6 +120,34 @@ def _law_fields(files: Files) -> Iterator[Field]:
                     linked=() if variable is None else variable.entries,
                     factor=scale,
                 )  # fmt: skip
+
+
+def _with_sliders(law: tuple[Field, ...], files: Files) -> tuple[Field, ...]:
+    """The fields of a law whose file has no [search], with a slider for what most often moves: equal numbers together.
+
+    Of an LQG these are the bases of weighted states and integrals, or the weights where bases stand as "SI", and the
+    noise of process and disturbances; of a PID its gains and filters.
+    """
+    weighted = {f.key for f in law if f.key.startswith("weights.") and f.value != 0}
+    plain = {
+        f"bases.{part}" for part in ("state", "integral") if files.content.get("bases", {}).get(part) == "SI"
+    }
+    together: dict[tuple[str, str, object], list[Field]] = {}
+    for f in law:
+        table, _, name = f.key.rpartition(".")
+        part = table.rpartition(".")[2]
+        moves = table.startswith(("noise.process", "noise.drift", "pid"))
+        if part in ("state", "integral") and f"weights.{part}.{name}" in weighted:
+            moves = table.startswith("weights" if f"bases.{part}" in plain else "bases")
+        if moves and f.kind == "log" and f.value:
+            together.setdefault((table, f.unit, f.value), []).append(f)
+    named: dict[str, Field] = {}
+    for members in together.values():
+        names = " ".join(f.label for f in members)
+        for f in members:
+            linked = tuple(one.key for one in members)
+            named[f.key] = replace(f, tuning=f"{f.group[0].lower()}{f.group[1:]}: {names}", linked=linked)
+    return tuple(named.get(f.key, f) for f in law)
 
 
 def _tables(table: Mapping[str, Any], path: str) -> Iterator[tuple[str, Mapping[str, Any] | None]]:

@@ -155,6 +155,15 @@ def open_design(path: Path, spec: Spec | None = None) -> DesignFiles:
     return DesignFiles(path, raw, load_toml(spec.machine_file), spec)
 
 
+def is_design(path: Path) -> bool:
+    """Whether a TOML file says that it is a design: a machine, and a sample time."""
+    try:
+        content = load_toml(path)
+    except InputError:
+        return False
+    return "machine" in content and "sample_time" in content
+
+
 def fingerprint(spec: Spec, truth: Parameters) -> str:
     """Everything that a design and its machine are, but for their places: a proof of another text is of another design.
 

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from malta.simulation.references import Motion
     from malta.simulation.scenario import Scenario
     from malta.synthesis.controller import Controller
+    from malta.synthesis.recovery import StepResponse
     from malta.synthesis.spec import Spec
 
 
@@ -70,27 +71,6 @@ def planned_run(plant: Plant, controller: Controller, name: str) -> tuple[str, P
     if name.startswith(STEP):
         return name, step_cases(plant, controller, output=name.removeprefix(STEP), size=0.0, time=0.0)[0]
     return name, cases_of(name, plant, controller)[0]
-
-
-# What goes wrong behind the page, in one sentence: a page has no place for a traceback.
-
-
-def describe_error(error: Exception) -> str:
-    """The sentence of an error; of one that malta does not raise on purpose, its kind and text as well."""
-    if isinstance(error, InputError | CheckError):
-        return str(error)
-    if isinstance(error, ArithmeticError):
-        return f"numbers beyond what can be computed ({error})"
-    if isinstance(error, MemoryError):
-        return "more was asked for than this computer has memory for"
-    return f"a defect of malta or of the machine's module: {type(error).__name__} ({error})"
-
-
-def failed_document(task: str, sentence: str) -> dict[str, Any]:
-    """What ended a task of the worker, "prove", "map" or "check", in a sentence: nothing is proven then."""
-    if task == "prove":
-        return {"kind": "proof", "lower": None, "upper": None, "frequency": None, "reason": sentence}
-    return {"kind": "map" if task == "map" else "failed", "error": sentence}
 
 
 # A reference followed by the linear loop of a machine: what a simulation shows, in milliseconds and without limits.
@@ -271,7 +251,28 @@ def _frequency(curves: LoopCurves) -> dict[str, Any]:
         "S": round_values(S),
         "T": round_values(T),
         "L": round_values(np.stack([alone.T.real, alone.T.imag], axis=1)),
+        "crossover": crossovers(curves) if curves.stable else [],
     }
+
+
+def crossovers(curves: LoopCurves) -> list[tuple[float, float] | None]:
+    """The highest gain crossover of each sensor's loop, rad/s, and its phase margin there, rad; None without one.
+
+    The others are closed. The margin is the angle from -1 to the loop, 0 to 2 pi.
+    """
+    found: list[tuple[float, float] | None] = []
+    for L in curves.responses.alone("sensors").T:
+        size = np.log(np.abs(L))
+        at = np.flatnonzero(np.diff(size > 0))
+        if not len(at):
+            found.append(None)
+            continue
+        k = int(at[-1])
+        share = size[k] / (size[k] - size[k + 1])
+        w = math.exp(float(np.interp(share, [0, 1], np.log(curves.w[k : k + 2]))))
+        angle = float(np.angle(L[k]) + share * np.angle(L[k + 1] / L[k]))
+        found.append((w, (angle + math.pi) % (2 * math.pi)))
+    return found
 
 
 def run_document(problem: Problem, view: View) -> dict[str, Any] | None:
@@ -296,9 +297,7 @@ def _load(problem: Problem, view: View) -> dict[str, Any] | None:
     names = [s.name for s in problem.plant.disturbances]
     if not names or not problem.report.stable:
         return None
-    k = names.index(view.load) if view.load in names else 0
-    answer = problem.loop.sampled.answer()
-    one = answer.of(np.eye(len(names))[k])
+    answer, one, k = _answer(problem, view)
     settled = one.within(0.02)
     ends = settled[np.isfinite(settled)]
     end = max(1.3 * float(ends.max(initial=0.0)), 20 * problem.controller.sample_time)
@@ -310,6 +309,19 @@ def _load(problem: Problem, view: View) -> dict[str, Any] | None:
         "y": round_values(y),
         "largest": round_values(one.largest[:, 0]),
     }
+
+
+def _answer(problem: Problem, view: View) -> tuple[StepResponse, StepResponse, int]:
+    """Answers of the loop to all loads, to a unit of the chosen one, and which that is."""
+    names = [s.name for s in problem.plant.disturbances]
+    k = names.index(view.load) if view.load in names else 0
+    answer = problem.loop.sampled.answer()
+    return answer, answer.of(np.eye(len(names))[k]), k
+
+
+def largest_moved(problem: Problem, view: View) -> FloatArray | None:
+    """How far the chosen load moves each output at most; None without loads from outside."""
+    return _answer(problem, view)[1].largest[:, 0] if problem.plant.disturbances else None
 
 
 def _margin(problem: Problem, first: int | None) -> dict[str, Any] | None:

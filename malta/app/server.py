@@ -31,7 +31,7 @@ PAGES = {
     "/app.css": ("app.css", "text/css"),
     **{
         f"/{name}.js": (f"{name}.js", "text/javascript")
-        for name in ("page", "app", "controls", "chart", "figures", "numbers", "tables")
+        for name in ("page", "app", "controls", "chart", "export", "figures", "numbers", "tables", "tuning")
     },
 }
 HEADERS = {
@@ -181,7 +181,17 @@ class _Handler(BaseHTTPRequestHandler):
 # anywidget carries the messages; it comes with the extra `notebooks`.
 
 
-SCRIPTS = ("numbers", "chart", "controls", "figures", "tables", "app", "widget")  # each after what it imports
+SCRIPTS = (
+    "numbers",
+    "chart",
+    "controls",
+    "export",
+    "figures",
+    "tables",
+    "tuning",
+    "app",
+    "widget",
+)  # each after what it imports
 HEIGHT = 820  # px
 
 

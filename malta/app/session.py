@@ -6,14 +6,10 @@ evaluation that a newer one overtook is dropped, and so is what follows it in wo
 
 from __future__ import annotations
 
-import json
 import math
-import signal
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,162 +22,28 @@ from malta.app.files import (
     default_file,
     fingerprint,
     inside,
+    is_design,
     open_design,
     save_design,
     save_gains,
 )
+from malta.app.followers import Worker, describe_error
 from malta.app.picture import (
     Problem,
     View,
-    describe_error,
-    failed_document,
     picture,
     poles_document,
     run_names,
     solve,
 )
+from malta.app.pull import Handle, Pull, compare_numbers, pull_to
 from malta.errors import InputError, shorten
-from malta.processes import environment, python_module
 from malta.synthesis.requirements import requirements_for
 from malta.tuning.search import base_of
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters
     from malta.synthesis.spec import Spec
-
-
-# Worker processes that follow the newest design: each is asked, superseded, and ended where it does not give way.
-
-
-PATIENCE = 1.5  # s, from a newer design to the end of a process that still works on an older one
-
-Hear = Callable[[dict[str, Any]], None]
-
-
-class Worker:
-    """A process `malta.app.worker`, which works on the newest document it was sent.
-
-    A process that dies at a document is started again and asked once more; where that one dies too, its answer is that.
-
-    hear : called from a thread with each document that the process answers
-    """
-
-    def __init__(self, hear: Hear) -> None:
-        self._hear = hear
-        self._lock = threading.Lock()
-        self._process: subprocess.Popen[str] | None = None
-        self._asked: Mapping[str, Any] = {}
-        self._begun, self._ended, self._died = -1, -1, -1  # serials: begun with, answered, asked again
-        self._closed = False
-
-    def ask(self, message: Mapping[str, Any]) -> None:
-        """Send a document; whatever the process works on is superseded."""
-        with self._lock:
-            if self._closed:
-                return
-            self._asked = message
-            self._send()
-        watch = threading.Timer(PATIENCE, self._end_if_stuck, (message["serial"],))
-        watch.daemon = True
-        watch.start()
-
-    def close(self) -> None:
-        """End the process."""
-        with self._lock:
-            self._closed = True
-            self._end()
-
-    def _send(self) -> None:
-        if self._process is None or self._process.poll() is not None:
-            self._process = _start()
-            threading.Thread(target=self._listen, args=(self._process,), daemon=True).start()
-        assert self._process.stdin is not None
-        with suppress(OSError):  # the process is gone: the next document starts another
-            self._process.stdin.write(json.dumps(self._asked) + "\n")
-            self._process.stdin.flush()
-
-    def _listen(self, process: subprocess.Popen[str]) -> None:
-        assert process.stdout is not None
-        with suppress(ValueError):  # the stream was closed, or its last line is half of one
-            for line in process.stdout:
-                reply = json.loads(line)
-                if reply["kind"] == "begin":
-                    self._begun = reply["serial"]
-                elif reply["kind"] == "end":
-                    self._ended = reply["serial"]
-                else:
-                    self._hear(reply)
-        self._bury(process)
-
-    def _bury(self, process: subprocess.Popen[str]) -> None:
-        """Start a process that ended by itself again and ask once more; say where the second one ends as well."""
-        with self._lock:
-            if self._process is not process or self._closed:
-                return
-            serial = self._asked["serial"]
-            self._end()
-            self._begun = -1
-            if self._ended == serial:
-                return
-            again, self._died = self._died != serial, serial
-            asked = self._asked
-            if again:
-                self._send()
-        self._hear(_obituary(asked, _describe_end(process.returncode), again=again))
-
-    def _end_if_stuck(self, serial: int) -> None:
-        """End a process that has not begun with the newest document, unless it is only starting up, and ask anew."""
-        with self._lock:
-            newest = self._asked.get("serial") == serial and not self._closed
-            if newest and 0 <= self._begun < serial:
-                self._end()
-                self._begun = -1
-                self._send()
-
-    def _end(self) -> None:
-        process, self._process = self._process, None
-        if process is not None:
-            with suppress(OSError):
-                process.kill()
-            process.wait()
-            for stream in (process.stdin, process.stdout):
-                if stream is not None:
-                    with suppress(OSError):
-                        stream.close()
-
-
-def _start() -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        python_module("malta.app.worker"),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,  # of answers alone; what a machine's module prints goes where the server's errors go
-        text=True,
-        encoding="utf-8",
-        env=environment(OPENBLAS_NUM_THREADS="1"),
-        start_new_session=True,  # Ctrl-C in the terminal is the server's
-    )
-
-
-def _obituary(asked: Mapping[str, Any], reason: str, *, again: bool) -> dict[str, Any]:
-    """What is heard of a process that ended at a document. again : it was started again and asked once more"""
-    does = {"prove": "proves the margin", "map": "draws the margin map"}.get(
-        asked["task"], "simulates and judges the requirements"
-    )
-    sentence = f"the process that {does} ended by itself ({reason})"
-    mark = {"version": asked["version"], "serial": asked["serial"]}
-    if again:
-        return mark | {"kind": "notice", "text": f"{sentence}: it was started again and asked once more"}
-    sentence += ", and so did the one that was started in its place"
-    return mark | failed_document(asked["task"], sentence)
-
-
-def _describe_end(code: int) -> str:
-    """How a process ended, for a reader who did not end it."""
-    if code == -signal.SIGKILL:
-        return "it was killed, as a computer does that has no memory left"
-    if code < 0:
-        return f"signal {signal.Signals(-code).name}"
-    return f"exit code {code}"
 
 
 QUIET = 0.25  # s, after the last move until its proof begins
@@ -216,14 +78,18 @@ class Session:
         self._busy = threading.Lock()  # one evaluation at a time
         self._state = threading.Condition()
         self._newest, self._version, self._base = 0, 0, 0
-        self._news: list[Document] = []
+        self._news: list[tuple[int, Document]] = []  # numbered
         self._count = 0
+        self._slopes: tuple[Handle, View, dict[str, tuple[float, ...]]] | None = (
+            None  # of the handle that is pulled
+        )
         self._ray: int | None = None
         self._slow_margin = False
         self._traced: Parameters | None = None  # of the machine whose margin was traced last
         self._timer: threading.Timer | None = None
+        self._searched = -1  # the serial of the newest search
         self._serial, self._due = 0, set[str]()  # tasks that the workers are asked for when the page rests
-        self._workers = {task: Worker(self._tell) for task in ("check", "prove", "map")}
+        self._workers = {task: Worker(self._tell) for task in ("check", "prove", "map", "search")}
         self._plane: tuple[str, str] | None = None  # of the map that the page shows
         self._lost = 1.0  # the last eigenvalue margin, which says how wide a map is
         self._message: Document | None = None  # of the design that the workers follow
@@ -237,6 +103,10 @@ class Session:
             "evaluate": self.evaluate,
             "news": self.news,
             "map": self.map,
+            "search": self.search,
+            "pull": self.pull,
+            "designs": self.designs,
+            "switch": self.switch,
             "save": self.save,
             "gains": self.gains,
         }
@@ -322,6 +192,101 @@ class Session:
             point = {str(name): float(value) for name, value in zip(names, at, strict=True)}
             return {"version": self._version, **poles_document(problem, point)}
 
+    def search(self, body: Mapping[str, Any]) -> Document:
+        """Begin a search from the design of the page, body["task"] "tune" or "front", or end it, "stop".
+
+        What it finds follows as news without a version: it goes on while the page moves.
+        """
+        task = body.get("task")
+        if task not in ("tune", "front", "stop"):
+            raise InputError("malta app", "task", repr(task), "tune, front or stop")
+        edit = self.files.edit(body.get("values", {}), redesign=body.get("redesign", True))
+        edited = self.files.apply(edit)
+        view = View(str(body.get("run", "")), str(body.get("load", "")))
+        return {"search": self._begin_search(edit, view, fingerprint(*edited), str(task))}
+
+    def _begin_search(self, edit: Edit, view: View, design: str, task: str) -> int:
+        """Send a search to its worker, which supersedes the one before; its serial."""
+        with self._state:
+            message = self._message_of(edit, view, design) | {"version": None, "task": task}
+            self._searched = int(message["serial"])
+            self._news = [one for one in self._news if one[1]["version"] is not None]
+        self._workers["search"].ask(message)
+        return self._searched
+
+    def pull(self, body: Mapping[str, Any]) -> Document:
+        """The values with which the figure of body["kind"] and body["signal"] is body["asked"], SI: malta.app.pull."""
+        asked = body.get("asked")
+        if not is_number(asked) or asked <= 0:
+            raise InputError("malta app", "asked", repr(asked), "a number above 0")
+        with self._busy:
+            edit = self.files.edit(body.get("values", {}), redesign=body.get("redesign", True))
+            handle = Handle(str(body.get("kind", "")), str(body.get("signal", "")))
+            view = View(str(body.get("run", "")), str(body.get("load", "")))
+            one = Pull(self.files, edit, view, handle)
+            known = self._slopes is not None and self._slopes[:2] == (handle, view)
+            for fresh in (
+                not known,
+                True,
+            ):  # numbers that were compared for another design may be the wrong ones
+                if fresh:
+                    self._slopes = (handle, view, compare_numbers(one))
+                assert self._slopes is not None
+                found = pull_to(one, float(asked), self._slopes[2])
+                if found["reached"] or found["at_end"] or fresh:
+                    break
+            return found
+
+    def designs(self, _body: Mapping[str, Any]) -> Document:
+        """The design files beside this one and in the folder of the page: name, folder, whether it has gain files."""
+        found = self._found_designs()
+        own = self.files.path.resolve()
+        return {
+            "designs": [
+                {
+                    "id": str(path),
+                    "name": path.stem,
+                    "folder": default_file(self.root, path).rpartition("/")[0],
+                    "gains": (path.parent / "gains" / f"{path.stem}.json").is_file(),
+                    "open": path == own,
+                }
+                for path in found
+            ]
+        }
+
+    def _found_designs(self) -> list[Path]:
+        own = self.files.path.resolve()
+        folders = dict.fromkeys([own.parent, self.root, self.root / "design"])
+        paths = dict.fromkeys([own, *(p for folder in folders for p in sorted(folder.glob("*.toml")))])
+        return [path for path in paths if path == own or (path.resolve() == path and is_design(path))]
+
+    def switch(self, body: Mapping[str, Any]) -> Document:
+        """Open another of `designs`, body["id"]; {"unsaved": entries} where body["discard"] is not true.
+
+        Raises InputError as `malta.read_design`; the page then stays with its design.
+        """
+        chosen = [path for path in self._found_designs() if str(path) == body.get("id")]
+        if not chosen:
+            raise InputError("malta app", "id", repr(body.get("id")), "one of the designs that are listed")
+        with self._busy:
+            unsaved = self.unsaved_changes()
+            if unsaved and body.get("discard") is not True:
+                return {"unsaved": unsaved}
+            files = open_design(chosen[0])
+            solve(files.apply(Edit()))
+            self._begin_search(Edit(), View(), "", "stop")
+            self.files, self.edit, self._followed = files, Edit(), None
+            self._base += 1
+            self._ray, self._traced, self._slow_margin, self._plane, self._slopes = (
+                None,
+                None,
+                False,
+                None,
+                None,
+            )
+            self._supersede()
+            return {"open": self.open({})}
+
     def news(self, body: Mapping[str, Any]) -> Document:
         """News that are newer than body["after"], as soon as there are some; none after LONGEST_WAIT."""
         after = body.get("after", 0)
@@ -329,8 +294,7 @@ class Session:
             raise InputError("malta app", "after", repr(after), "a whole number")
         with self._state:
             self._state.wait_for(lambda: self._count > after, LONGEST_WAIT)
-            first = self._count - len(self._news)
-            return {"after": self._count, "news": self._news[max(after - first, 0) :]}
+            return {"after": self._count, "news": [item for number, item in self._news if number > after]}
 
     def save(self, body: Mapping[str, Any]) -> Document:
         """Save the design; {"exists": files} where these exist and body["replace"] is not true."""
@@ -406,26 +370,15 @@ class Session:
             if self._timer is not None:
                 self._timer.cancel()
             self._due.clear()
-            self._news = []
+            self._news = [one for one in self._news if one[1]["version"] is None]
             self._version += 1
             return self._version
 
     def _follow_later(self, edit: Edit, view: View, tasks: set[str], design: str, *, margin: bool) -> None:
         """Ask the workers for these tasks, and for those that are due, once the page rests."""
-        self._serial += 1
-        message = {
-            "version": self._version,
-            "serial": self._serial,
-            "base": self._base,
-            "path": str(self.files.path.resolve()),
-            "machine": None if self.machine is None else str(self.machine.resolve()),
-            "values": dict(edit.values),
-            "redesign": edit.redesign,
-            "design": design,
-            "run": view.run,
-            "margin": margin,
-            "plane": [*(self._plane or ()), self._lost],
-        }
+        with self._state:
+            message = self._message_of(edit, view, design)
+        message |= {"margin": margin, "plane": [*(self._plane or ()), self._lost]}
         self._message = message
 
         def ask() -> None:
@@ -443,13 +396,31 @@ class Session:
             self._timer.daemon = True
             self._timer.start()
 
+    def _message_of(self, edit: Edit, view: View, design: str) -> Document:
+        """A document for a worker, but for its task; design : the fingerprint of the design."""
+        self._serial += 1
+        return {
+            "version": self._version,
+            "serial": self._serial,
+            "base": self._base,
+            "path": str(self.files.path.resolve()),
+            "machine": None if self.machine is None else str(self.machine.resolve()),
+            "values": dict(edit.values),
+            "redesign": edit.redesign,
+            "design": design,
+            "run": view.run,
+            "load": view.load,
+        }
+
     def _tell(self, reply: Document) -> None:
-        """Take a document of a worker, unless it is of an older version."""
+        """Take a document of a worker, unless it is of an older version or of an older search."""
         with self._state:
-            if reply["version"] != self._version:
+            if reply["version"] is None and reply["serial"] != self._searched:
+                return
+            if reply["version"] not in (None, self._version):
                 return
             self._count += 1
-            self._news = [*self._news, reply][-KEPT:]
+            self._news = [*self._news, (self._count, reply)][-KEPT:]
             self._state.notify_all()
         if self._hear is not None:
             self._hear(reply)

@@ -1,4 +1,4 @@
-"""The process that follows a design: its nonlinear run, its requirements, and the proof of its margin.
+"""The process that follows a design: its nonlinear run, its requirements, the proof of its margin, searches from it.
 
 `python -m malta.app.worker` reads one JSON document a line and answers with lines of its own. A newer document ends the
 work on an older one, at the next step of that work. The process ends with its standard input.
@@ -17,13 +17,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
+from malta.app.explore import TASKS, Search
 from malta.app.files import DesignFiles, Edited, fingerprint, open_design
+from malta.app.followers import describe_error, failed_document
 from malta.app.picture import (
     Problem,
     View,
     curves,
-    describe_error,
-    failed_document,
     map_document,
     margin_document,
     planned_run,
@@ -119,7 +119,7 @@ def _proof(problem: Problem, newer: Newer) -> Iterator[dict[str, Any]]:
     }
 
 
-def _end_if(newer: Newer) -> Callable[[float, float], None]:
+def _end_if(newer: Newer) -> Callable[..., None]:
     """The progress of a search that ends where a newer design is waiting."""
 
     def look(*_bounds: float) -> None:
@@ -129,16 +129,31 @@ def _end_if(newer: Newer) -> Callable[[float, float], None]:
     return look
 
 
+def _explore(opened: DesignFiles, edited: Edited, message: Message, newer: Newer) -> Iterator[dict[str, Any]]:
+    """Designs that a search comes by, each with its number; the last document says that it ended."""
+    search = Search(
+        opened, edited, View(message["run"], message["load"]), lambda share: _end_if(newer)(share)
+    )
+    count = 0
+    for count, found in enumerate(TASKS[message["task"]](search), 1):
+        yield {"kind": "candidate", "of": message["task"], "number": count} | found
+    yield {"kind": "searched", "of": message["task"], "count": count}
+
+
 def work(message: Message, opened: DesignFiles, newer: Newer) -> Iterator[dict[str, Any]]:
     """Solve the design of a message and follow it; an error is the last document."""
+    if message["task"] == "stop":
+        return
     try:
         edited = opened.apply(opened.edit(message["values"], redesign=message["redesign"]))
         if fingerprint(*edited) != message["design"]:
             raise CheckError(
                 "the files of this design have changed since the page read them: start malta app again"
             )
-        problem = solve(edited)
-        yield from replies(problem, edited, message, newer)
+        if message["task"] in TASKS:
+            yield from _explore(opened, edited, message, newer)
+        else:
+            yield from replies(solve(edited), edited, message, newer)
         yield {"kind": "done"}
     except SupersededError:
         raise

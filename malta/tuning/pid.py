@@ -319,7 +319,7 @@ def _ratios(spec: Spec, figures: Mapping[str, float]) -> list[float]:
     return ratios
 
 
-def _load_error(figures: Mapping[str, float]) -> float:
+def load_error(figures: Mapping[str, float]) -> float:
     """Of all outputs together."""
     return math.hypot(*(value for name, value in figures.items() if name.startswith("load_error")))
 
@@ -330,7 +330,7 @@ def goal_value(search: Search, u: FloatArray, outputs: Collection[str]) -> float
     if not figures:
         return UNSTABLE + distance_outside(u)
     beyond = max([math.log(ratio) + ROOM for ratio in _ratios(search.spec, figures)], default=0.0)
-    return math.log(_load_error(figures)) + STEEP * (max(beyond, 0.0) + distance_outside(u))
+    return math.log(load_error(figures)) + STEEP * (max(beyond, 0.0) + distance_outside(u))
 
 
 def _of(figures: Mapping[str, float], outputs: Collection[str]) -> dict[str, float]:
@@ -353,7 +353,7 @@ def _polish(search: Search, u: FloatArray, trials: int, outputs: Collection[str]
     def error(u: FloatArray) -> float:
         tried.append(u.copy())
         figures = _of(search.figures(u), outputs)
-        return math.log(_load_error(figures)) if figures else 0.0
+        return math.log(load_error(figures)) if figures else 0.0
 
     def bounds(u: FloatArray) -> FloatArray:
         return np.log(_ratios(search.spec, _of(search.figures(u), outputs)) or [math.e] * count)

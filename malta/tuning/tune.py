@@ -15,7 +15,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -339,19 +339,9 @@ def _front(
     margin = spec.specification.get("margin")
     if margin is None or not effort.front:
         return ()
-    most = min(1 / share for share in spec.uncertainty.values()) - 2 * STEP
     trials = [best]
     for trade in TRADES:
-        around = [u for _, u in places]
-        for share in FRONT:
-            if share * margin > most:
-                continue
-            for k, (search, _) in enumerate(places):
-                look = partial(
-                    _look_frugal, search, margin=share * margin, kinds=_names_of(spec.plant, trade)
-                )
-                around[k] = descend(look, around[k], FRUGAL, effort.front * len(search.low))
-            trials.append(combine(spec, [(s, u) for (s, _), u in zip(places, around, strict=True)]))
+        trials += frugal_trials(spec, places, trade, effort.front)
     proven = []
     for one in trials:
         if one.figures and (one is best or _beside_noise(spec, one.figures) <= 1.005):
@@ -359,6 +349,26 @@ def _front(
             bound = travel_margin(spec.plant, model_and_controller(design)[1], spec.uncertainty).lower
             proven.append(one._replace(figures=dict(one.figures) | {"margin": bound or 0.0}))
     return _best_of(spec, proven, best)
+
+
+def frugal_trials(
+    spec: Spec, places: Sequence[tuple[Search, FloatArray]], trade: Trade, polish: int
+) -> Iterator[Trial]:
+    """Descend to the least noise of the force, or motion, for one margin after the other; margins are estimates.
+
+    places : where the searches of the design's parts begin
+    polish : trials for each number, of one margin
+    """
+    margin = spec.specification["margin"]
+    most = min(1 / share for share in spec.uncertainty.values()) - 2 * STEP
+    around = [u for _, u in places]
+    for share in FRONT:
+        if share * margin > most:
+            continue
+        for k, (search, _) in enumerate(places):
+            look = partial(_look_frugal, search, margin=share * margin, kinds=_names_of(spec.plant, trade))
+            around[k] = descend(look, around[k], FRUGAL, polish * len(search.low))
+        yield combine(spec, [(s, u) for (s, _), u in zip(places, around, strict=True)])
 
 
 def _best_of(spec: Spec, trials: Sequence[Trial], best: Trial) -> tuple[Trial, ...]:

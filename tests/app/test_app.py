@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import malta
-from malta.app import session as follow
+from malta.app import followers
 from malta.app.files import Edit, TakenError, fingerprint, inside, open_design, save_design
 from malta.app.picture import View, map_document, picture, solve
 from malta.app.server import LARGEST, PAGES, Server
@@ -370,7 +370,7 @@ def test_a_session_keeps_nothing_of_the_machines_that_it_leaves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        follow, "SLOW", float("inf")
+        "malta.app.session.SLOW", float("inf")
     )  # margins are traced here, whatever else the computer does
     client = Client(BALL, tmp_path)
     field = client.session.files.fields["machine.m"]
@@ -551,7 +551,9 @@ def test_entries_that_move_together_keep_units_of_their_own(tmp_path: Path) -> N
     assert y.factor / x.factor == pytest.approx(1e-3, rel=1e-12)  # 12 um in x are 0.012 mm in y
 
 
-def dying_worker(monkeypatch: pytest.MonkeyPatch, deaths: int) -> list[dict[str, Any]]:
+def dying_worker(
+    monkeypatch: pytest.MonkeyPatch, deaths: int, task: str = "prove", version: int | None = 1
+) -> list[dict[str, Any]]:
     """What is heard of a process that exits with code 3 at the first documents, and answers the next one."""
     answer = "print(json.dumps({'kind': kind, 'serial': 7, 'version': 1}), flush=True)"
     code = f"import json, sys; sys.stdin.readline(); kind = 'begin'; {answer}; "
@@ -563,7 +565,7 @@ def dying_worker(monkeypatch: pytest.MonkeyPatch, deaths: int) -> list[dict[str,
         command = [sys.executable, "-S", "-c", code + end]
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
-    monkeypatch.setattr(follow, "_start", start)
+    monkeypatch.setattr(followers, "_start", start)
     heard: list[dict[str, Any]] = []
     full = threading.Event()
 
@@ -572,8 +574,8 @@ def dying_worker(monkeypatch: pytest.MonkeyPatch, deaths: int) -> list[dict[str,
         if document["kind"] != "notice":
             full.set()
 
-    worker = follow.Worker(hear)
-    worker.ask({"version": 1, "serial": 7, "task": "prove"})
+    worker = followers.Worker(hear)
+    worker.ask({"version": version, "serial": 7, "task": task})
     assert full.wait(60)
     worker.close()
     assert len(started) == 2

@@ -279,6 +279,187 @@ def test_everything_has_a_name_for_screen_readers(page: Any) -> None:
     assert nameless == []
 
 
+# --- searches, handles, figures as files ---
+
+
+def click(browser: Any, words: str) -> None:
+    """Press the first button that says this, at once."""
+    found = "[...document.querySelectorAll('button')].find((one) => one.textContent === arguments[0])"
+    browser.execute_script(f"{found}.click()", words)
+
+
+def test_a_handle_is_pulled_by_keys_and_undone(page: Any) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    handle = find(page, ".card.nyquist .handle")
+    assert handle.get_attribute("role") == "slider"
+    assert handle.get_attribute("aria-label") == "phase margin of x"
+    first = handle.get_attribute("aria-valuetext")
+    _, stiffness = row(page, "stiffness")
+    page.execute_script("arguments[0].focus()", handle)
+    press(page, Keys.ARROW_DOWN)
+    wait(lambda: "phase margin of x" in text(page, ".message"))
+    assert "by stiffness and damping" in text(page, ".message")
+    wait(lambda: handle.get_attribute("aria-valuetext") != first)
+    assert float(handle.get_attribute("aria-valuetext").split("°")[0]) > float(first.split("°")[0])
+    assert stiffness.get_attribute("value") != "647.02"
+    assert page.execute_script("return document.activeElement") == handle
+    press_with_control(page, "z")
+    wait(lambda: stiffness.get_attribute("value") == "647.02")
+
+
+def test_a_handle_is_dragged_and_what_cannot_be_had_is_said(page: Any) -> None:
+    from selenium.webdriver import ActionChains
+
+    click(page, "L")
+    handle = wait(lambda: find(page, ".card.sensitivity .handle"))
+    assert handle.get_attribute("aria-label") == "crossover of x"
+    height = page.execute_script(
+        "return document.querySelector('.card.sensitivity').getBoundingClientRect().top"
+    )
+    drag = ActionChains(page).click_and_hold(handle).move_by_offset(60, 0)
+    drag.perform()
+    wait(lambda: "cannot be reached" in text(page, ".card.sensitivity .note"))
+    assert text(page, ".message") == ""  # nothing moves under the pointer
+    assert height == page.execute_script(
+        "return document.querySelector('.card.sensitivity').getBoundingClientRect().top"
+    )
+    ActionChains(page).release().perform()
+    wait(lambda: "the nearest is" in text(page, ".message"))
+
+
+def test_a_search_streams_designs_that_one_click_takes(page: Any) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    slider, number = row(page, "stiffness")
+    page.execute_script("arguments[0].focus()", slider)
+    press(page, Keys.PAGE_DOWN)
+    wait(lambda: number.get_attribute("value") != "647.02")
+    soft = number.get_attribute("value")
+    click(page, "Tune from here")
+    wait(lambda: page.find_elements("css selector", ".found button"))
+    assert page.find_elements("css selector", ".card.load .line.faint")  # as a ghost beside the design
+    press(page, Keys.ARROW_LEFT)  # and nothing stands still meanwhile
+    wait(lambda: number.get_attribute("value") != soft)
+    click(page, "Figures")
+    assert "T1" in text(page, ".tables thead")
+    click(page, "Stop")
+    wait(lambda: "stopped" in text(page, ".tuner"))
+    taken = page.execute_script(
+        "const one = document.querySelector('.found button'); one.click(); return one.textContent"
+    )
+    assert "% of" in taken
+    wait(lambda: float(number.get_attribute("value")) > float(soft))
+    press_with_control(page, "z")
+    wait(lambda: float(number.get_attribute("value")) < float(soft))
+    click(page, "Clear")
+    wait(lambda: not page.find_elements("css selector", ".found button"))
+
+
+def test_one_slider_moves_along_the_front(page: Any) -> None:
+    click(page, "Margin against load")
+    wait(lambda: "ended" in text(page, ".tuner"), 120)
+    _, number = row(page, "damping")
+    seen = []
+    slide = "const one = document.querySelector('.master input'); one.value = arguments[0]; "
+    slide += (
+        "for (const kind of ['input', 'change']) one.dispatchEvent(new Event(kind)); return Number(one.max)"
+    )
+    last = page.execute_script(slide, 0)
+    for place in range(last + 1):
+        page.execute_script(slide, place)
+        seen.append((text(page, ".master output"), number.get_attribute("value")))
+    margins = [float(words.split(" %")[0]) for words, _ in seen]
+    assert len(seen) >= 3
+    assert margins == sorted(margins)
+    assert len({value for _, value in seen}) == len(seen)  # points, nothing between them
+    assert all("moved by F_x" in words for words, _ in seen)
+    words, _ = seen[-1]
+    wait(lambda: badge(page) == f"✓ proven {words.split(' proven')[0]}")  # of the page's own proof
+
+
+def test_a_figure_is_zoomed_and_written(page: Any) -> None:
+    ticks = "return [...document.querySelectorAll('.card.load .tick')].map((one) => one.textContent).join()"
+    whole = page.execute_script(ticks)
+    page.execute_script("document.querySelector('.card.load .chart').focus()")
+    press(page, "+")
+    wait(lambda: page.execute_script(ticks) != whole)
+    press(page, "0")
+    wait(lambda: page.execute_script(ticks) == whole)
+    page.execute_script(
+        "window.kept = []; URL.createObjectURL = (blob) => { window.kept.push(blob); return 'data:,'; };"
+        "HTMLAnchorElement.prototype.click = function () { window.kept.push(this.download); };"
+    )
+    for kind in ("csv", "svg", "png"):
+        page.execute_script(
+            "const one = document.querySelector('.card.load .menu'); one.value = arguments[0];"
+            "one.dispatchEvent(new Event('change'))",
+            kind,
+        )
+    wait(lambda: page.execute_script("return window.kept.length") == 6)
+    names = page.execute_script("return window.kept.filter((one) => typeof one === 'string')")
+    assert names == [f"halbach_pid_load.{kind}" for kind in ("csv", "svg", "png")]
+    read = "const done = arguments[arguments.length - 1]; window.kept[arguments[0]].text().then(done)"
+    csv, svg = (page.execute_async_script(read, k) for k in (0, 2))
+    rows = [line.split(",") for line in csv.split("\r\n")[1:-1]]
+    assert csv.startswith('"curve","time [s]","outputs [mm]"')
+    assert max(float(y) for _, _, y in rows) == pytest.approx(1.22, abs=0.01)
+    assert "var(" not in svg
+    assert "class=" not in svg
+    assert "<text" in svg
+    assert page.execute_script("return [window.kept[4].type, window.kept[4].size > 3000]") == [
+        "image/png",
+        True,
+    ]
+
+
+def test_numbers_are_found_by_what_they_mean(page: Any) -> None:
+    seek = find(page, ".seek")
+    for words, key in (("mass", "m in kg"), ("stiffness", "stiffness"), ("gain derivative", "F_x in N s/m")):
+        page.execute_script("arguments[0].value = ''", seek)
+        seek.send_keys(words)
+        assert any(
+            one.is_displayed()
+            for one in page.find_elements("css selector", f"details[open] [aria-label^='{key}']")
+        ), words
+    seek.send_keys(" nowhere")
+    assert not [one for one in page.find_elements("css selector", ".controls .row") if one.is_displayed()]
+
+
+def test_another_design_is_chosen_on_the_page(browser: Any, tmp_path: Path) -> None:
+    design = copied(tmp_path)
+    other = design.read_text(encoding="utf-8").replace("647.02", "600").split("[specification]")[0]
+    design.with_name("other.toml").write_text(other, encoding="utf-8")
+    session = Session(design, tmp_path)
+    with Server(session) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        try:
+            browser.get(server.url)
+            wait(lambda: "stable" in badge(browser) or "proven" in badge(browser))
+            slider, _ = row(browser, "stiffness")
+            slider.send_keys("\ue014")
+            wait(lambda: "·" in text(browser, "h1"))
+            choose = "const one = document.querySelector('.which select'); one.selectedIndex = 1; "
+            choose += "one.dispatchEvent(new Event('change'))"
+            browser.execute_script(choose)
+            wait(lambda: "pid.Kp.F_x" in text(browser, "dialog.leave[open]"))
+            click(browser, "Stay")
+            assert text(browser, "h1").startswith("halbach_pid")
+            browser.execute_script(choose)
+            wait(lambda: text(browser, "dialog.leave[open]"))
+            click(browser, "Discard them")
+            wait(lambda: "[specification]" in text(browser, ".tables pre"))  # what asking means
+            assert row(browser, "proportional gains")[1].get_attribute("value") == "600"
+            assert "Tune from here searches" in text(browser, ".tables")
+            assert [line for line in browser.get_log("browser") if line["level"] == "SEVERE"] == []
+        finally:
+            browser.get("about:blank")
+            server.shutdown()
+            thread.join()
+            session.close()
+
+
 # --- the widget ---
 
 HARNESS = b"""<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">

@@ -2,17 +2,20 @@
 // transport: {ask(document) -> promise of a document, listen(heard)}.
 
 import { createChart } from "./chart.js";
-import { createPanel, element } from "./controls.js";
+import { createPanel, dropDown, element } from "./controls.js";
+import { exportChart } from "./export.js";
 import { color, loadView, mapView, nyquistView, poleView, runView, sensitivityView, timeGroups } from "./figures.js";
-import { digits, floored, percent } from "./numbers.js";
-import { countLights, differenceTable, figureTable, requirementRows } from "./tables.js";
+import { digits, floored, percent, quantity } from "./numbers.js";
+import { countLights, differenceTable, figureTable, howToAsk, requirementRows } from "./tables.js";
+import { createTuner } from "./tuning.js";
 
 const MOST_PINS = 4;
+const MOST_GHOSTS = 3; // candidates of a search that are drawn
 const MOST_UNDO = 200;
 const GONE = "malta app has ended: start it again to go on";
 const NEAR = 1.6, WIDE = 10; // of the Nyquist chart
 const SHORTCUTS = [["Ctrl Z", "undo"], ["Ctrl Y, Ctrl Shift Z", "redo"], ["P", "pin this design"], ["R", "reset to the file"], ["Ctrl S", "save the design file"],
-  ["/", "find a number"], ["?", "this list"], ["← →", "move a slider or the readout of a chart"], ["Page ↑ ↓", "move a slider by a tenth"], ["↑ ↓", "a number field by 1 %, with Shift 10 %"], ["Esc", "take a number back, hide a readout"]];
+  ["/", "find a number"], ["?", "this list"], ["← →", "move a slider, a handle or the readout of a chart"], ["+ − 0", "zoom into a chart, out, and back; a drag draws a box"], ["Page ↑ ↓", "move a slider by a tenth"], ["↑ ↓", "a number field by 1 %, with Shift 10 %"], ["Esc", "take a number back, hide a readout"]];
 
 export async function mount(root, transport) {
   root.classList.add("malta-app");
@@ -39,6 +42,7 @@ export async function mount(root, transport) {
   const badge = element("div", { class: "badge", role: "status", "aria-live": "polite" });
   const lights = element("button", { type: "button", class: "lights", title: "requirements", onclick: () => { state.table = "requirements"; drawTables(); tables.scrollTop = 0; tables.scrollIntoView({ block: "nearest" }); } });
   const speed = element("span", { class: "speed", "aria-hidden": "true" });
+  const designs = element("select", { "aria-label": "other designs", title: "open another design", onchange: () => openDesign(designs.value) });
   const title = element("h1", {}), subtitle = element("span", { class: "soft" });
   const undo = button("↶ Undo", "Ctrl Z", () => step("undo", "redo")), redo = button("↷ Redo", "Ctrl Y", () => step("redo", "undo"));
   const reset = button("Reset", "to the numbers of the file (R)", () => commit({ values: fresh(), redesign: true }));
@@ -49,7 +53,7 @@ export async function mount(root, transport) {
   const help = button("?", "shortcuts", () => shortcuts.showModal(), { "aria-label": "shortcuts" });
   const message = element("div", { class: "message", role: "alert" });
   const pins = element("div", { class: "pins" });
-  const header = element("header", {}, element("div", { class: "name" }, title, subtitle), badge, lights, pins, element("div", { class: "buttons" }, undo, redo, reset, pin, save, gains, theme, help));
+  const header = element("header", {}, element("div", { class: "name" }, element("div", { class: "which" }, title, dropDown("▾", designs)), subtitle), badge, lights, pins, element("div", { class: "buttons" }, undo, redo, reset, pin, save, gains, theme, help));
 
   const ties = element("input", { type: "checkbox", onchange: () => { state.ties = ties.checked; } });
   const redesign = element("input", { type: "checkbox", onchange: () => commit({ values: state.values, redesign: redesign.checked }) });
@@ -63,7 +67,14 @@ export async function mount(root, transport) {
     const note = element("p", { class: "note" }), legend = element("div", { class: "legend" });
     chart.note = note;
     chart.legend = legend;
-    cards.append(element("article", { class: `card ${key}` }, element("div", { class: "bar" }, element("h2", {}, heading), ...tools), chart.node, legend, note));
+    const act = (what) => {
+      if (what === "in" || what === "out") chart.zoomBy(what === "in" ? 0.6 : 1 / 0.6);
+      else if (what === "whole") chart.zoomTo();
+      else if (chart.current()) exportChart(what, `${state.description.name}_${key}`, chart.picture, chart.current(), getComputedStyle(root).getPropertyValue("--card"));
+    };
+    const menu = element("select", { class: "menu", "aria-label": `${heading}: zoom and export`, title: "zoom and export", onchange: () => { act(menu.value); menu.value = ""; } },
+      ...[["", "⋯"], ["in", "Zoom in"], ["out", "Zoom out"], ["whole", "Whole figure"], ["svg", "SVG"], ["png", "PNG"], ["csv", "CSV"]].map(([value, text]) => element("option", { value }, text)));
+    cards.append(element("article", { class: `card ${key}` }, element("div", { class: "bar" }, element("h2", {}, heading), ...tools, dropDown("⋯", menu)), chart.node, legend, note));
   }
   const tabs = (choices, get, set) => {
     const group = element("div", { class: "tabs", role: "group" }, ...choices.map(([value, text]) => button(text, text, () => { set(value); draw(); }, { "data-value": value })));
@@ -75,7 +86,7 @@ export async function mount(root, transport) {
     list.fill = (options) => { list.replaceChildren(...options.map(([value, text]) => element("option", { value }, text))); list.value = get(); list.hidden = options.length < 2; };
     return list;
   };
-  const sensTabs = tabs([["S", "S"], ["T", "T"]], () => state.sens, (value) => { state.sens = value; });
+  const sensTabs = tabs([["S", "S"], ["T", "T"], ["L", "L"]], () => state.sens, (value) => { state.sens = value; });
   const reachTabs = tabs([[NEAR, "near −1"], [WIDE, "wide"]], () => state.reach, (value) => { state.reach = Number(value); });
   const poleTabs = tabs([["slow", "slow"], ["all", "all"], ["map", "margin map"]], () => state.poles, (value) => { state.poles = value; if (value === "map") askMap(); });
   const mapXs = pick("parameter along x", () => state.mapX, (value) => { state.mapX = value; askMap(); });
@@ -101,18 +112,31 @@ export async function mount(root, transport) {
     element("label", {}, "Design file, in the folder that malta app was started in", file), saveNote,
     element("div", { class: "buttons" }, cancel, saveButton));
   const saving = element("dialog", { class: "save" }, element("h2", {}, "Save the design"), saveForm);
-  root.replaceChildren(header, message, element("main", {}, controls, cards), shortcuts, saving);
+  const leaving = element("dialog", { class: "leave" }, element("h2", {}, "This design has changes that are not saved"), element("p", {}),
+    element("form", { method: "dialog", class: "buttons" }, element("button", { value: "", class: "main" }, "Stay"), element("button", { value: "save" }, "Save…"), element("button", { value: "discard" }, "Discard them")));
+  root.replaceChildren(header, message, element("main", {}, controls, cards), shortcuts, saving, leaving);
   root.tabIndex = -1;
+
+  const tuner = createTuner(state, {
+    ask: (task) => transport.ask({ ask: "search", task, values: state.values, redesign: state.redesign, run: state.run, load: state.load }),
+    place: (values, done) => place(values, done), say, redraw: () => draw(),
+  });
 
   // --- moves ---
   const snapshot = () => ({ values: { ...state.values }, redesign: state.redesign });
   let before = null; // where a drag began
   let tied = [];
 
+  function begin() {
+    if (before) return;
+    before = snapshot();
+    state.ghost = state.failed ? null : state.picture;
+    tied = [];
+  }
+
   function change(field, value, done) {
-    if (!before) {
-      before = snapshot();
-      state.ghost = state.failed ? null : state.picture;
+    begin();
+    if (!tied.length) {
       tied = field.linked.length ? [...field.linked] : [field.key];
       if (state.ties) {
         for (const other of state.description.fields) {
@@ -120,13 +144,48 @@ export async function mount(root, transport) {
         }
       }
     }
-    for (const key of tied) state.values[key] = inUnitOf(key, value, field);
+    place(Object.fromEntries(tied.map((key) => [key, inUnitOf(key, value, field)])), done);
+  }
+
+  // Other numbers at once; done: the end of a drag, which undo goes back over.
+  function place(values, done) {
+    begin();
+    Object.assign(state.values, values);
     if (done) {
       state.ghost = null;
-      if (tied.some((key) => before.values[key] !== state.values[key])) remember(before);
+      if (Object.keys(state.values).some((key) => before.values[key] !== state.values[key])) remember(before);
       before = null;
     }
     refresh();
+  }
+
+  // --- pulling a curve: the server finds the numbers; one question at a time, and the newest pull wins ---
+  let pulling = false, pulled = null;
+
+  async function pull(kind, signal, asked, done) {
+    pulled = { kind, signal, asked, done };
+    if (pulling) return;
+    pulling = true;
+    begin();
+    while (pulled) {
+      const now = pulled;
+      pulled = null;
+      const answer = await transport.ask({ ask: "pull", kind: now.kind, signal: now.signal, asked: now.asked, values: before ? before.values : state.values, redesign: state.redesign, run: state.run, load: state.load }).catch(() => ({ error: GONE }));
+      const text = answer.error ?? pullText(now, answer);
+      place({ ...before?.values, ...answer.values }, now.done);
+      state.told = { chart: { phase: "nyquist", run: "run", load: "load" }[now.kind] ?? "sensitivity", text }; // nothing moves under the pointer
+      draw();
+      if (now.done) say(text, answer.reached ? "note" : "error");
+    }
+    pulling = false;
+  }
+
+  function pullText({ kind, signal }, { what, found, asked, reached, numbers, at_end }) {
+    const unit = { crossover: "rad/s", phase: "rad", peak: "1" }[kind] ?? state.description.outputs.find((one) => one.name === signal).unit;
+    const text = (value) => (kind === "phase" ? `${digits((180 / Math.PI) * value, 3)}°` : kind === "crossover" ? `${digits(value, 4)} rad/s` : quantity(value, unit));
+    const by = numbers.join(" and ");
+    if (reached) return `${what}: ${text(found)}, by ${by}`;
+    return `${what}: ${text(asked)} cannot be reached with ${by}${at_end.length ? `: ${at_end.join(" and ")} at the end of the slider` : " alone"}; the nearest is ${text(found)}`;
   }
 
   // Entries that move together may have units of their own.
@@ -158,6 +217,7 @@ export async function mount(root, transport) {
   const changes = () => Object.fromEntries(state.description.fields.filter((field) => state.values[field.key] !== field.value).map((field) => [field.key, state.values[field.key]]));
 
   function refresh() {
+    state.told = null;
     // Nothing that was proven or measured of the last design is shown beside the numbers of the next.
     state.past = { ...state.past, ...state.requirements, ...(state.proof?.lower ? { margin: { found: state.proof.lower } } : {}) };
     if (!state.moving) last = { version: state.version, proof: state.proof, requirements: state.requirements, simulated: state.simulated };
@@ -214,6 +274,7 @@ export async function mount(root, transport) {
 
   function hear(item) {
     if (item.kind === "gone") { say(GONE, "error"); return; }
+    if (item.version === null) { tuner.hear(item); return; }
     if (item.version > state.version || state.moving) { early.push(item); return; }
     if (item.version < state.version || !state.picture) return;
     if (item.kind === "requirement") state.requirements[item.name] = item;
@@ -273,12 +334,13 @@ export async function mount(root, transport) {
 
   function draw() {
     drawHeader();
-    const { picture } = state, pins = state.ghost ? [...state.pins, { picture: state.ghost }] : state.pins;
+    tuner.show();
+    const { picture } = state, pins = [...state.pins, ...state.candidates.slice(-MOST_GHOSTS), ...(state.ghost ? [{ picture: state.ghost }] : [])];
     if (!picture) return;
     for (const group of [sensTabs, reachTabs, poleTabs]) group.mark();
     const names = picture.frequency.sensors;
-    show(charts.sensitivity, sensitivityView(picture, pins, state.sens, state.hidden));
-    show(charts.nyquist, nyquistView(picture, pins, state.reach, state.hidden));
+    show(charts.sensitivity, sensitivityView(picture, pins, state.sens, state.hidden, pull));
+    show(charts.nyquist, nyquistView(picture, pins, state.reach, state.hidden, pull));
     const mapped = state.poles === "map", uncertain = Object.keys(state.description.parameters);
     mapXs.hidden = mapYs.hidden = !mapped || uncertain.length < 2;
     poleTabs.lastChild.hidden = uncertain.length < 2;
@@ -288,6 +350,7 @@ export async function mount(root, transport) {
     if (mapped) charts.poles.legend.replaceChildren();
     else legendOf(charts.poles, Object.keys(picture.poles).filter((name) => picture.poles[name].length), state.hiddenPoles, { machine: "○", "closed loop": "×", regulator: "+", filter: "□" });
     drawTimes({ ...state, pins });
+    if (state.told) charts[state.told.chart].note.textContent = charts[state.told.chart].note.title = state.told.text;
     drawTables();
   }
 
@@ -295,8 +358,8 @@ export async function mount(root, transport) {
     const groups = timeGroups(state.description, true), short = timeGroups(state.description, false);
     const group = groups.find((one) => one.id === state.runGroup) ?? groups[0];
     const under = short.find((one) => one.id === state.loadGroup) ?? short[0];
-    show(charts.run, runView(seen, group, state.hidden), "Too many samples for the linear loop, or no such run.");
-    show(charts.load, loadView(seen, under, state.hidden), state.description.loads.length ? "An unstable loop carries no load." : "No force acts on this machine from outside.");
+    show(charts.run, runView(seen, group, state.hidden, pull), "Too many samples for the linear loop, or no such run.");
+    show(charts.load, loadView(seen, under, state.hidden, pull), state.description.loads.length ? "An unstable loop carries no load." : "No force acts on this machine from outside.");
     const signals = group.of === "v" ? state.description.inputs : state.description.outputs;
     const named = (of, indices) => indices.map((k) => of[k].name);
     legendOf(charts.run, named(signals, group.indices), state.hidden);
@@ -317,7 +380,7 @@ export async function mount(root, transport) {
     const { table } = state;
     if (table === "requirements") {
       tables.replaceChildren(state.description.requirements.length ? element("table", { class: "requirements" }, element("tbody", {}, ...requirementRows(state.description, state)))
-        : element("p", { class: "soft" }, "The design file asks for nothing. Lines like margin = 1.5 or peak_sensitivity = 2.5 below [specification] are judged here at every move, and malta tune reaches for them."), figureTable(state));
+        : howToAsk(state), figureTable(state));
     } else tables.replaceChildren(table === "figures" ? figureTable(state) : differenceTable(state.description, state));
     const counts = countLights(state.description, state);
     lights.hidden = !state.description.requirements.length;
@@ -403,6 +466,37 @@ export async function mount(root, transport) {
     else say(answer.error ?? `wrote ${answer.written.join(", ")}`, answer.error ? "error" : "note");
   }
 
+  // --- another design ---
+  async function listDesigns() {
+    const answer = await transport.ask({ ask: "designs" }).catch(() => ({ designs: [] }));
+    const rows = answer.designs ?? [];
+    designs.replaceChildren(...rows.map((one) => element("option", { value: one.id, selected: one.open }, `${one.folder ? `${one.folder}/` : ""}${one.name}${one.gains ? " (gain files)" : ""}`)));
+    designs.parentElement.hidden = rows.length < 2;
+    designs.own = rows.find((one) => one.open)?.id;
+  }
+
+  async function openDesign(id, discard = false) {
+    say("opening…");
+    const answer = await transport.ask({ ask: "switch", id, discard }).catch(() => ({ error: GONE }));
+    say(answer.error ?? "", answer.error ? "error" : "note");
+    if (!answer.open) designs.value = designs.own;
+    if (answer.unsaved) {
+      leaving.querySelector("p").textContent = `${answer.unsaved.slice(0, 6).join(", ")}${answer.unsaved.length > 6 ? ` and ${answer.unsaved.length - 6} more` : ""}`;
+      leaving.onclose = () => { if (leaving.returnValue === "discard") openDesign(id, true); else if (leaving.returnValue === "save") openSave(); };
+      leaving.returnValue = "";
+      leaving.showModal();
+    }
+    if (!answer.open) return;
+    Object.assign(state, { undo: [], redo: [], pins: [], candidates: [], front: [], picture: null, ghost: null, proof: null, requirements: {}, past: {}, simulated: null, map: null, there: null,
+      run: answer.open.runs[0], load: answer.open.loads[0]?.name ?? "", runGroup: "", loadGroup: "", hidden: new Set(), redesign: true, poles: state.poles === "map" ? "slow" : state.poles });
+    before = null;
+    tuner.reset();
+    controls.replaceChildren();
+    state.values = Object.fromEntries(answer.open.fields.map((field) => [field.key, field.value]));
+    describe(answer.open);
+    refresh();
+  }
+
   function turnTheme() {
     const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
     root.dataset.theme = dark ? "light" : "dark";
@@ -411,7 +505,7 @@ export async function mount(root, transport) {
   // --- keys ---
   root.addEventListener("keydown", onKey);
   function onKey(event) {
-    if (saving.open || shortcuts.open) return;
+    if (saving.open || shortcuts.open || leaving.open) return;
     const key = event.key.toLowerCase(), control = event.ctrlKey || event.metaKey;
     const typing = event.target.matches?.("input[type=text], input[type=search], select");
     const typed = event.target.matches?.("input[type=text]") && event.target.value !== event.target.dataset.shown;
@@ -428,11 +522,12 @@ export async function mount(root, transport) {
 
   function describe(next) {
     state.description = next;
+    listDesigns();
     const tail = next.fields.some((field) => field.group === "Machine") ? [element("label", { class: "switch", title: "off: the controller believes in the machine of the file, and runs on this one" }, redesign, "design for the machine's numbers")] : [];
     const opened = new Set([...controls.querySelectorAll("details[open]")].map((box) => box.dataset.group));
     panel = createPanel(next, change, (text) => say(text, "error"));
     if (opened.size) for (const box of panel.nodes) box.open = opened.has(box.dataset.group);
-    controls.replaceChildren(panel.seek, element("div", { class: "switches" }, element("label", { class: "switch" }, ties, "equal values move together"), ...tail), ...panel.nodes);
+    controls.replaceChildren(tuner.node, panel.seek, element("div", { class: "switches" }, element("label", { class: "switch" }, ties, "equal values move together"), ...tail), ...panel.nodes);
     runList.fill(next.runs.map((run) => [run, run]));
     loadList.fill(next.loads.map((load) => [load.name, `1 ${load.unit} of ${load.name}`]));
     runGroups.fill(timeGroups(next, true).map((group) => [group.id, group.text]));

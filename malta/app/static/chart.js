@@ -1,4 +1,5 @@
-// A chart in SVG: axes with ticks, lines, points, shapes; a readout that follows the pointer or the arrow keys.
+// A chart in SVG: axes with ticks, lines, points, shapes; a readout that follows the pointer or the arrow keys; handles
+// that are pulled; a range that is zoomed into with the pointer or with + - 0.
 
 import { linearTicks, logTicks, tickLabel } from "./numbers.js";
 
@@ -52,13 +53,14 @@ const MARKS = {
 // A chart that fills its node. draw(view) draws
 //   x, y: {label, min, max, log}; equal: one scale for both
 //   lines: {name, xs, ys, color, dash, width, faint}; points: {name, xs, ys, mark, color, faint}
+//   handles: {key, x, y, color, label, value, pull(x, y, done)}: dots that can be dragged, or moved by arrow keys
 //   shapes: {kind: "circle" | "band" | "line" | "ray" | "text" | "area", ...}; pick(x, y): what a click does
 //   read(line, k): rows of the readout; nearest: "x" along the axis, "xy" the nearest point
 export function createChart(label) {
   const node = document.createElement("div");
   node.className = "chart";
   node.tabIndex = 0;
-  node.setAttribute("role", "img");
+  node.setAttribute("role", "group");
   const picture = svg("svg", { "aria-hidden": "true" });
   const readout = document.createElement("div");
   readout.className = "readout";
@@ -67,11 +69,16 @@ export function createChart(label) {
   node.append(picture, readout);
   const clip = `malta-clip-${++charts}`;
   let view = null, shown = null, at = null;
+  let zoom = null; // {words, x: [low, high], y: [low, high]}: what is looked at of the axes with these words
+  let held = null; // what the pointer holds: {handle, left, top} or the corner of a box {from, left, top}
+  const handles = new Map(); // buttons by key: they keep the focus while the curves move
 
   function layout() {
     const width = node.clientWidth, height = node.clientHeight;
     const right = width - MARGIN.right, bottom = height - MARGIN.bottom;
     let { x, y } = view;
+    if (zoom && zoom.words !== x.label + y.label) zoom = null;
+    if (zoom) [x, y] = [{ ...x, min: zoom.x[0], max: zoom.x[1] }, { ...y, min: zoom.y[0], max: zoom.y[1] }];
     if (view.equal) [x, y] = equalAxes(x, y, right - MARGIN.left, bottom - MARGIN.top);
     return {
       width, height, right, bottom, x, y,
@@ -156,7 +163,87 @@ export function createChart(label) {
     const cursor = svg("g", { class: "cursor" });
     picture.replaceChildren(definitions, inside, axes, front, cursor);
     node.setAttribute("aria-label", `${label}. ${view.summary ?? ""}`);
+    drawHandles(s);
     if (at) point(at);
+  }
+
+  function drawHandles(s) {
+    const wanted = new Map((view.handles ?? []).map((one) => [one.key, one]));
+    for (const [key, button] of handles) if (!wanted.has(key)) { button.remove(); handles.delete(key); }
+    for (const [key, handle] of wanted) {
+      const button = handles.get(key) ?? makeHandle(key), pulled = held?.key === key;
+      const left = pulled ? held.left : s.toX(handle.x), top = pulled ? held.top : s.toY(handle.y);
+      button.hidden = !(left >= MARGIN.left - 1 && left <= s.right + 1 && top >= MARGIN.top - 1 && top <= s.bottom + 1);
+      button.style.cssText = `left:${left}px;top:${top}px;--swatch:${handle.color}`;
+      button.title = `pull: ${handle.label}, ${handle.value}`;
+      for (const [name, value] of [["label", handle.label], ["valuetext", handle.value], ["valuenow", handle.y]]) button.setAttribute(`aria-${name}`, value);
+    }
+  }
+
+  const handleOf = (key) => view.handles?.find((one) => one.key === key);
+
+  function makeHandle(key) {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.className = "handle";
+    button.setAttribute("role", "slider");
+    button.addEventListener("pointerdown", (event) => {
+      event.stopPropagation();
+      button.setPointerCapture(event.pointerId);
+      held = { key, ...placeOf(event) };
+    });
+    button.addEventListener("pointermove", (event) => {
+      event.stopPropagation();
+      if (held?.key === key) pullHandle(placeOf(event), false);
+    });
+    const end = (event) => { if (held?.key === key) { const place = placeOf(event); pullHandle(place, true); held = null; draw(); } };
+    button.addEventListener("pointerup", end);
+    button.addEventListener("pointercancel", () => { held = null; draw(); });
+    button.addEventListener("keydown", (event) => {
+      const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+      if (!step || !shown) return;
+      event.preventDefault();
+      event.stopPropagation();
+      const handle = handleOf(key), size = event.shiftKey ? 20 : 5;
+      handle.pull(...valuesAt(shown.toX(handle.x) + size * step[0], shown.toY(handle.y) + size * step[1]), true);
+    });
+    handles.set(key, button);
+    node.append(button);
+    return button;
+  }
+
+  function pullHandle(place, done) {
+    const moved = Math.hypot(place.left - held.left, place.top - held.top) > 0 || held.moved;
+    held = { ...held, ...place, moved };
+    if (moved) handleOf(held.key)?.pull(...valuesAt(place.left, place.top), done);
+    draw();
+  }
+
+  const placeOf = (event) => { const box = node.getBoundingClientRect(); return { left: event.clientX - box.left, top: event.clientY - box.top }; };
+  function valuesAt(left, top) {
+    const back = (axis, from, to, place) => {
+      const share = (place - from) / (to - from);
+      return axis.log ? axis.min * (axis.max / axis.min) ** share : axis.min + share * (axis.max - axis.min);
+    };
+    return [back(shown.x, MARGIN.left, shown.right, left), back(shown.y, shown.bottom, MARGIN.top, top)];
+  }
+
+  // Look at the part between two corners of the figure, in pixels; without them at the whole.
+  function zoomTo(from, to) {
+    if (!shown || !view) return;
+    if (from) {
+      const [a, b] = [valuesAt(from.left, from.top), valuesAt(to.left, to.top)];
+      const sides = [0, 1].map((k) => [Math.min(a[k], b[k]), Math.max(a[k], b[k])]);
+      zoom = { words: view.x.label + view.y.label, x: sides[0], y: sides[1] };
+    } else zoom = null;
+    node.classList.toggle("zoomed", Boolean(zoom));
+    draw();
+  }
+  // The middle stays; factor: of the range that is seen.
+  function zoomBy(factor) {
+    if (!shown) return;
+    const x = (MARGIN.left + shown.right) / 2, y = (MARGIN.top + shown.bottom) / 2, dx = (factor * (shown.right - MARGIN.left)) / 2, dy = (factor * (shown.bottom - MARGIN.top)) / 2;
+    zoomTo({ left: x - dx, top: y - dy }, { left: x + dx, top: y + dy });
   }
 
   // Lines and points that can be read, in the order of the readout.
@@ -203,22 +290,41 @@ export function createChart(label) {
     readout.style.top = `${Math.max(2, Math.min(place.top - 10, shown.height - readout.offsetHeight - 4))}px`;
   }
 
+  const isInside = ({ left, top }) => shown && left >= MARGIN.left && left <= shown.right && top >= MARGIN.top && top <= shown.bottom;
+  node.addEventListener("pointerdown", (event) => {
+    const place = placeOf(event);
+    if (view && event.button === 0 && event.pointerType !== "touch" && isInside(place)) held = { from: place };
+  });
   node.addEventListener("pointermove", (event) => {
-    const box = node.getBoundingClientRect();
-    if (view) point({ left: event.clientX - box.left, top: event.clientY - box.top });
+    const place = placeOf(event);
+    if (held?.from) drawBox(place);
+    else if (view && !held) point(place);
   });
-  node.addEventListener("pointerleave", () => point(null));
-  node.addEventListener("click", (event) => {
-    if (!view?.pick || !shown) return;
-    const box = node.getBoundingClientRect(), back = (axis, to, place) => axis.min + ((place - to(axis.min)) * (axis.max - axis.min)) / (to(axis.max) - to(axis.min));
-    const left = event.clientX - box.left, top = event.clientY - box.top;
-    if (left < MARGIN.left || left > shown.right || top < MARGIN.top || top > shown.bottom) return;
-    view.pick(back(shown.x, shown.toX, left), back(shown.y, shown.toY, top));
+  function drawBox(place) {
+    const { from } = held, cursor = picture.querySelector(".cursor");
+    held.box = Math.abs(place.left - from.left) > 6 && Math.abs(place.top - from.top) > 6 ? place : null;
+    readout.hidden = true;
+    cursor.replaceChildren(...(held.box ? [svg("rect", { class: "zoom-box", x: Math.min(from.left, place.left), y: Math.min(from.top, place.top), width: Math.abs(place.left - from.left), height: Math.abs(place.top - from.top) })] : []));
+  }
+  node.addEventListener("pointerup", (event) => {
+    const place = placeOf(event), box = held?.from && held.box;
+    if (!held?.from) return;
+    const { from } = held;
+    held = null;
+    if (box) zoomTo(from, box);
+    else if (view?.pick && isInside(place)) view.pick(...valuesAt(place.left, place.top));
   });
+  node.addEventListener("click", (event) => { // of a finger, which draws no box
+    const place = placeOf(event);
+    if (event.pointerType === "touch" && view?.pick && isInside(place)) view.pick(...valuesAt(place.left, place.top));
+  });
+  node.addEventListener("dblclick", () => zoomTo());
+  node.addEventListener("pointerleave", () => { if (held?.from) held = null; point(null); });
   node.addEventListener("blur", () => point(null));
   node.addEventListener("keydown", (event) => {
-    const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key], zooms = { "+": () => zoomBy(0.6), "-": () => zoomBy(1 / 0.6), 0: () => zoomTo() }[event.key];
     if (event.key === "Escape") point(null);
+    if (zooms && !event.ctrlKey && !event.metaKey) zooms();
     if (!step || !view || !shown) return;
     event.preventDefault();
     const found = nearest(at?.left ?? (MARGIN.left + shown.right) / 2, at?.top ?? (MARGIN.top + shown.bottom) / 2);
@@ -227,7 +333,7 @@ export function createChart(label) {
     point({ left: shown.toX(found.set.xs[k]), top: shown.toY(found.set.ys[k]) });
   });
   new ResizeObserver(() => draw()).observe(node);
-  return { node, draw };
+  return { node, draw, zoomBy, zoomTo, picture, current: () => view };
 }
 
 // The range of values with some room; `zero`: whether 0 has to be in it.

@@ -5,6 +5,11 @@ import { digits, printedUnit } from "./numbers.js";
 const STEPS = 1000; // of a slider
 const DIGITS = 5; // of a number that a slider sets
 
+// What engineers call the parameters of a machine, by unit: a search for "mass" finds m in kg.
+const MEANINGS = { kg: "mass weight payload", g: "mass weight payload", "kg m^2": "inertia moment", "m/s^2": "gravity acceleration", "N/m": "stiffness attraction spring", "N/A": "force constant thrust", "N s/m": "damping friction", ohm: "resistance winding", H: "inductance winding", mH: "inductance winding", V: "voltage", A: "current", Wb: "flux linkage", mWb: "flux linkage", T: "flux density magnet remanence", "V s/m": "induced voltage back emf", Hz: "frequency", kHz: "frequency", s: "time delay period", ms: "time delay period", us: "time delay period", m: "length position", mm: "length position gap stroke", um: "length position noise gap", nm: "length noise", N: "force", "N m": "torque", rad: "angle", deg: "angle", "rad/s": "speed crossover bandwidth" };
+const TABLES = { pid: "gain controller", noise: "kalman observer filter bandwidth", weights: "cost penalty q r lqr", bases: "cost scale bryson q r lqr", uncertainty: "tolerance robustness box", operating_point: "place position" };
+const meaningOf = (field) => [field.key, field.tuning, field.group, field.note, MEANINGS[field.unit] ?? "", TABLES[field.key.split(".")[0]] ?? ""].join(" ").toLowerCase();
+
 let rows = 0;
 
 export function element(name, attributes = {}, ...children) {
@@ -18,6 +23,9 @@ export function element(name, attributes = {}, ...children) {
   node.append(...children);
   return node;
 }
+
+// A list that opens from a sign.
+export const dropDown = (sign, list) => element("span", { class: "drop" }, element("span", { "aria-hidden": "true" }, sign), list);
 
 const toNumber = (text) => (text.trim() === "" ? NaN : Number(text.trim().replace("−", "-"))); // a comma is refused: 1,000 may be one or a thousand
 
@@ -99,7 +107,7 @@ export function createPanel(description, change, fail) {
   for (const field of description.fields) {
     if (!field.tuning || tuned.has(field.tuning)) continue;
     tuned.add(field.tuning);
-    const row = createRow(field, field.tuning.replaceAll("_", " "), (value, done) => change(field, value, done), fail);
+    const row = createRow(field, field.tuning.split(":")[0].replaceAll("_", " "), (value, done) => change(field, value, done), fail);
     row.node.querySelector("label").append(element("small", {}, ` ${field.linked.map((key) => key.split(".").pop()).join(" ")}`));
     put("Tuning", row);
   }
@@ -112,13 +120,13 @@ export function createPanel(description, change, fail) {
     nodes.push(box);
     all.push(...members);
   }
-  const seek = element("input", { type: "search", class: "seek", placeholder: "find a number  ( / )", "aria-label": "find a number" });
+  const seek = element("input", { type: "search", class: "seek", placeholder: "find a number: mass, noise, gravity  ( / )", "aria-label": "find a number" });
   seek.addEventListener("input", () => {
     const text = seek.value.toLowerCase();
     for (const box of nodes) {
       let seen = 0;
       for (const row of all.filter((one) => one.node.parentElement === box)) {
-        row.node.hidden = text !== "" && !`${row.field.key} ${row.field.tuning} ${row.field.group}`.toLowerCase().includes(text);
+        row.node.hidden = !text.split(/\s+/).every((word) => meaningOf(row.field).includes(word));
         seen += row.node.hidden ? 0 : 1;
       }
       box.hidden = seen === 0;

@@ -16,20 +16,36 @@ function signalLines(names, rows, xs, hidden, { ghost = false, dashed = null } =
   })).filter((line) => !hidden.has(line.name) && line.ys.length);
 }
 
-// |S| or |T| of each sensor, with the zones of ISO 14839-3 behind S.
-export function sensitivityView(picture, pins, which, hidden) {
+// Handles where many curves agree: one of each place, so that none hides another.
+const distinct = (handles) => handles.filter((one, k) => handles.findIndex((other) => Math.abs(other.x / one.x - 1) < 0.02 && Math.abs(other.y - one.y) < 0.02 * Math.abs(one.y)) === k);
+
+const sizesOf = (frequency, which) => (which !== "L" ? frequency[which] : frequency.S.length ? frequency.L.map(([re, im]) => re.map((x, k) => Math.hypot(x, im[k]))) : []);
+
+// What can be pulled of |S| and of the loop: its largest, and where it crosses 1.
+function sizeHandles(frequency, which, rows, hidden, pull) {
+  return distinct(frequency.sensors.flatMap((name, k) => {
+    if (hidden.has(name) || !rows.length || which === "T") return [];
+    const crossing = frequency.crossover[k], top = rows[k].indexOf(Math.max(...rows[k]));
+    if (which === "S") return [{ key: name, x: frequency.w[top], y: rows[k][top], color: color(k), label: `largest |S| of ${name}`, value: digits(rows[k][top], 3), pull: (_, y, done) => pull("peak", name, Math.max(y, 1.02), done) }];
+    return crossing ? [{ key: name, x: crossing[0], y: 1, color: color(k), label: `crossover of ${name}`, value: hertz(crossing[0]), pull: (x, _, done) => pull("crossover", name, x, done) }] : [];
+  }));
+}
+
+// |S| or |T| of each sensor, with the zones of ISO 14839-3 behind S; or |L|, the others closed.
+export function sensitivityView(picture, pins, which, hidden, pull) {
   const { w, sensors } = picture.frequency;
-  const rows = picture.frequency[which];
+  const rows = sizesOf(picture.frequency, which);
   const lines = [
-    ...pins.flatMap((pin) => signalLines(sensors, pin.picture.frequency[which], pin.picture.frequency.w, hidden, { ghost: true })),
+    ...pins.flatMap((pin) => signalLines(sensors, sizesOf(pin.picture.frequency, which), pin.picture.frequency.w, hidden, { ghost: true })),
     ...signalLines(sensors, rows, w, hidden),
   ];
-  const [, top] = rangeOf(rows, { log: true });
+  const [low, top] = rangeOf(rows, { log: true });
   const zones = [[0, 3, "A"], [3, 4, "B"], [4, 5, "C"], [5, 1e9, "D"]];
   const shapes = which === "S" ? zones.map(([from, to, name]) => ({ kind: "band", from: Math.max(from, 1e-9), to, text: name === "A" ? "zone A below 3" : name, class: `zone-${name}` })) : [];
   return {
     x: { label: "frequency [rad/s]", min: w[0], max: w[w.length - 1], log: true },
-    y: { label: which === "S" ? "|S|, each sensor" : "|T|, each sensor", min: 0.01, max: Math.max(8, top), log: true },
+    y: { label: which === "L" ? "|L|, each sensor, others closed" : `|${which}|, each sensor`, min: which === "L" ? Math.max(low, 1e-3) : 0.01, max: which === "L" ? Math.min(top, 1e3) : Math.max(8, top), log: true },
+    handles: sizeHandles(picture.frequency, which, rows, hidden, pull),
     lines, shapes: [...shapes, { kind: "line", y: 1 }], nearest: "x",
     summary: rows.length ? sensors.map((name, k) => `${name}: largest ${digits(Math.max(...rows[k]), 3)}`).join(", ") : "unstable: no sensitivity",
     empty: rows.length ? "" : "An unstable loop has no sensitivity.",
@@ -41,14 +57,21 @@ export function sensitivityView(picture, pins, which, hidden) {
 }
 
 // The loop of each sensor with the others closed, about -1; the disk inside of which |S| is above 3.
-export function nyquistView(picture, pins, reach, hidden) {
+export function nyquistView(picture, pins, reach, hidden, pull) {
   const { w, sensors, L } = picture.frequency;
   const curves = (frequency, ghost) => frequency.sensors.map((name, k) => ({
     name, w: frequency.w, xs: frequency.L[k][0], ys: frequency.L[k][1], color: color(k),
     dash: DASHES[k % DASHES.length], faint: ghost, silent: ghost,
   })).filter((line) => !hidden.has(line.name));
+  // A handle stands where a loop enters the unit circle; round the circle its phase margin changes.
+  const handles = sensors.flatMap((name, k) => {
+    const crossing = picture.frequency.crossover[k];
+    if (hidden.has(name) || !crossing) return [];
+    const angle = (x, y) => Math.min(Math.max(Math.atan2(-y, -x), 0.03), 2.6); // from -1, against the clock
+    return [{ key: name, x: Math.cos(crossing[1] - Math.PI), y: Math.sin(crossing[1] - Math.PI), color: color(k), label: `phase margin of ${name}`, value: `${digits((180 / Math.PI) * crossing[1], 3)}° at ${hertz(crossing[0])}`, pull: (x, y, done) => pull("phase", name, angle(x, y), done) }];
+  });
   return {
-    equal: true, nearest: "xy",
+    equal: true, nearest: "xy", handles: distinct(handles),
     x: { label: "Re, loop of one sensor, others closed", min: -1 - reach, max: -1 + reach },
     y: { label: "Im", min: -reach, max: reach },
     shapes: [
@@ -127,7 +150,7 @@ export function timeGroups(description, withErrors) {
 const seriesOf = (run, group, k) => (group.of === "error" ? run.p[k].map((value, i) => (value === null ? null : value - run.reference[k][i])) : run[group.of][k]);
 
 // A run: the linear loop dashed, the simulation solid, the reference dotted.
-export function runView(state, group, hidden) {
+export function runView(state, group, hidden, pull) {
   const { picture, simulated, pins, description } = state;
   const run = picture.run, sources = [];
   if (!run) return null;
@@ -150,21 +173,31 @@ export function runView(state, group, hidden) {
       if (Math.max(...run.reference[k].map(Math.abs)) > 0) lines.unshift({ name: `${signals[k].name} reference`, xs: run.t, ys: run.reference[k], color: "var(--soft)", dash: "2 2", silent: true, width: 2.4 });
     }
   }
-  return timeView(lines, group, run.t, run.name);
+  const handles = group.of === "v" ? [] : group.indices.filter((k) => !hidden.has(signals[k].name)).flatMap((k) => {
+    const errors = run.p[k].map((value, i) => Math.abs(value - run.reference[k][i])), worst = errors.indexOf(Math.max(...errors)), { name } = signals[k];
+    const from = group.of === "error" ? 0 : run.reference[k][worst];
+    return picture.stable && errors[worst] > 0 ? [{ key: name, x: run.t[worst], y: seriesOf(run, group, k)[worst], color: color(k), label: `largest error of ${name}`, value: quantity(errors[worst], group.unit), pull: (_, y, done) => pull("run", name, Math.abs(y - from), done) }] : [];
+  });
+  return timeView(lines, group, run.t, run.name, handles);
 }
 
 // The outputs under a unit of one disturbance.
-export function loadView(state, group, hidden) {
+export function loadView(state, group, hidden, pull) {
   const { picture, pins, description } = state, load = picture.load;
   if (!load) return null;
   const rows = (source, ghost) => group.indices.filter((k) => !hidden.has(description.outputs[k].name)).map((k) => ({
     name: description.outputs[k].name, xs: source.t, ys: source.y[k], color: color(k), faint: ghost, silent: ghost,
   }));
   const lines = [...pins.filter((pin) => pin.picture.load?.name === load.name).flatMap((pin) => rows(pin.picture.load, true)), ...rows(load, false)];
-  return timeView(lines, group, load.t, `load ${load.name}`);
+  const handles = group.indices.filter((k) => !hidden.has(description.outputs[k].name) && load.largest[k] > 0).map((k) => {
+    const { name } = description.outputs[k], sizes = load.y[k].map(Math.abs), worst = sizes.indexOf(Math.max(...sizes));
+    return { key: name, x: load.t[worst], y: load.y[k][worst], color: color(k), label: `most that ${load.name} moves ${name}`, value: quantity(load.largest[k], group.unit), pull: (_, y, done) => pull("load", name, Math.abs(y), done) };
+  });
+  const most = Math.max(0, ...handles.map((one) => Math.abs(one.y)));
+  return timeView(lines, group, load.t, `load ${load.name}`, handles.filter((one) => Math.abs(one.y) > 1e-3 * most));
 }
 
-function timeView(lines, { unit, words }, times, title) {
+function timeView(lines, { unit, words }, times, title, handles) {
   const [low, high] = rangeOf(lines.map((line) => line.ys), { zero: true });
   const size = Math.max(Math.abs(low), Math.abs(high)), value = scaleFor(size, unit), time = scaleFor(times[times.length - 1], "s");
   const scaled = lines.map((line) => ({ ...line, xs: line.xs.map((t) => t / time.factor), ys: line.ys.map((y) => (y === null ? null : y / value.factor)) }));
@@ -173,6 +206,7 @@ function timeView(lines, { unit, words }, times, title) {
     x: { label: `time [${time.unit}]`, min: 0, max: times[times.length - 1] / time.factor },
     y: { label: `${words} [${value.unit || "1"}]`, min: low / value.factor, max: high / value.factor },
     lines: scaled, shapes: [{ kind: "line", y: 0 }],
+    handles: distinct(handles.map((one) => ({ ...one, x: one.x / time.factor, y: one.y / value.factor, pull: (x, y, done) => one.pull(x, y * value.factor, done) }))),
     summary: `${title}: ${words}, largest ${quantity(size, unit)}`,
     read: (line, k) => [
       { text: `${digits(line.xs[k], 4)} ${time.unit}`, strong: true },

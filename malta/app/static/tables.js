@@ -37,6 +37,13 @@ export function requirementRows(description, state) {
   });
 }
 
+// What asking means, for a design file that asks for nothing: lines that this very design would just meet.
+export function howToAsk(state) {
+  const peak = state.picture.figures.find((one) => one.label === "peak |S|")?.value, margin = state.picture.margin?.upper;
+  const lines = ["[specification]", ...(margin > 0 ? [`margin = ${digits(0.95 * margin, 2)}`] : []), `peak_sensitivity = ${digits(1.05 * (peak ?? 2), 2)}`];
+  return element("div", { class: "soft asking" }, element("p", {}, "This design file asks for nothing, so no figure is judged. To ask means to bound a figure in the file: each bound is judged here at every move, by malta verify and in reports, and Tune from here searches numbers that hold them all. This design would just meet"), element("pre", {}, lines.join("\n")));
+}
+
 export function countLights(description, state) {
   const counts = { true: 0, false: 0, null: 0 };
   for (const row of requirementRows(description, state)) counts[row.classList.contains("true") ? "true" : row.classList.contains("false") ? "false" : "null"] += 1;
@@ -56,7 +63,7 @@ function figureRows(figures, proof, margin) {
 // Figures of the design and of the pinned ones, the better of two marked.
 export function figureTable(state) {
   const columns = [{ name: "now", rows: figureRows(state.picture.figures, state.proof, state.picture.margin) }];
-  for (const pin of state.pins) columns.push({ name: pin.name, rows: figureRows(pin.picture.figures, pin.proof, pin.picture.margin) });
+  for (const pin of [...state.pins, ...state.candidates]) columns.push({ name: pin.name, rows: figureRows(pin.picture.figures, pin.proof, pin.picture.margin) });
   const labels = [...new Set(columns.flatMap((column) => column.rows.map((row) => row.label)))];
   const head = element("tr", {}, element("th", {}, ""), ...columns.map((column) => element("th", { scope: "col", class: "number" }, column.name)));
   const body = labels.map((label) => {
