@@ -45,6 +45,7 @@ from malta.firmware.supervisor import (
 )
 from malta.simulation import references
 from malta.simulation.inputs import motion_of
+from malta.simulation.period import state_reference
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 
@@ -226,10 +227,18 @@ def trial_context(t: Target, name: str) -> dict[str, Any]:
     }
 
 
+def _place_of_rest(t: Target, sizes: FloatArray) -> FloatArray:
+    """Readings of these sizes, of either sign by turns; with more sensors than forces, of a place that has them all."""
+    if len(t.controller.measurements) <= len(t.controller.forces):
+        return np.asarray(sizes * (-1.0) ** np.arange(len(sizes)))
+    plant, x = t.believed, np.zeros(len(t.believed.states))
+    x[list(plant.controlled)] = np.array(state_reference(plant)(sizes, 0 * sizes)).ravel()
+    return np.array(ca.DM(plant.h(ca.DM(x), 0))).ravel()
+
+
 def _faults(t: Target, per_unit: FloatArray) -> dict[str, str]:
     """How large faults are, so that their monitors act and no stronger one before them."""
     b, c = bounds_of(t), t.controller
-    signs = (-1.0) ** np.arange(len(b.settled))
     limits = np.asarray(c.limits.force, dtype=float)
     currents = np.broadcast_to(c.limits.current, len(t.believed.actuator.coils))
     sigma = np.where(np.isfinite(b.sigma), b.sigma, 0.0)
@@ -240,7 +249,7 @@ def _faults(t: Target, per_unit: FloatArray) -> dict[str, str]:
         "settled": np.maximum(3 * b.settled, 2.5 * JUMP * sigma),
         "drift_step": np.where(np.isfinite(b.jump), 0.6 * b.jump, b.settled),
         "step": 0.5 * reference_limits(t).position,
-        "rest": 3 * signs * b.settled,
+        "rest": _place_of_rest(t, 3 * b.settled),
         "per_unit": per_unit,
         "shift": 2.5 * JUMP * sigma * per_unit,
         "astray": 3 * b.range * per_unit,
