@@ -17,7 +17,7 @@ import numpy as np
 
 from malta.firmware.calibration import FNV_FACTOR, FNV_START
 from malta.firmware.ctext import c_number
-from malta.firmware.export import FUSED, call_text, piece_records
+from malta.firmware.export import FUSED, call_text, piece_records, readings_at_rest
 from malta.firmware.program import TYPES, Program, evaluate
 from malta.firmware.sensor_loss import expected_readings
 from malta.firmware.signals import (
@@ -45,7 +45,6 @@ from malta.firmware.supervisor import (
 )
 from malta.simulation import references
 from malta.simulation.inputs import motion_of
-from malta.simulation.period import state_reference
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 
@@ -229,11 +228,8 @@ def trial_context(t: Target, name: str) -> dict[str, Any]:
 
 def _place_of_rest(t: Target, sizes: FloatArray) -> FloatArray:
     """Readings of these sizes, of either sign by turns; with more sensors than forces, of a place that has them all."""
-    if len(t.controller.measurements) <= len(t.controller.forces):
-        return np.asarray(sizes * (-1.0) ** np.arange(len(sizes)))
-    plant, x = t.believed, np.zeros(len(t.believed.states))
-    x[list(plant.controlled)] = np.array(state_reference(plant)(sizes, 0 * sizes)).ravel()
-    return np.array(ca.DM(plant.h(ca.DM(x), 0))).ravel()
+    reached = readings_at_rest(t)
+    return np.asarray(sizes * (-1.0) ** np.arange(len(sizes)) if reached is None else reached @ sizes)
 
 
 def _faults(t: Target, per_unit: FloatArray) -> dict[str, str]:
