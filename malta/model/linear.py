@@ -245,11 +245,11 @@ def _place(place: str) -> tuple[int, int]:
 def _states_at_rest(A: FloatArray, B: FloatArray, C: FloatArray, coordinates: int) -> FloatArray:
     """The matrix from outputs to states at rest; to the positions q of states (q, q')."""
     n, p, half = len(A), len(C), coordinates
-    if half and p == half and np.linalg.matrix_rank(C[:, :half]) == half:
-        return np.asarray(np.linalg.inv(C[:, :half]))
     if p > B.shape[1]:  # no inputs hold all values: the nearest of those that some hold
         rests = linalg.null_space(np.hstack([A, B]))[:n]
         return np.asarray(rests @ np.linalg.pinv(C @ rests))[: half or n]
+    if half and p == half and np.linalg.matrix_rank(C[:, :half]) == half:
+        return np.asarray(np.linalg.inv(C[:, :half]))
     whole = np.block([[A, B], [C, np.zeros((p, B.shape[1]))]])
     asked = np.vstack([np.zeros((n, p)), np.eye(p)])
     return np.asarray(np.linalg.lstsq(whole, asked, rcond=None)[0][: half or n])
