@@ -37,9 +37,12 @@ from malta.firmware.signals import (
 )
 from malta.firmware.step import programs_of
 from malta.firmware.supervisor import JUMP, MOST_RATE, bounds_of, reading_deviations, reference_limits
+from malta.simulation.period import state_reference
 
 if TYPE_CHECKING:
     import jinja2
+
+    from malta.model.plant import FloatArray
 
 MOST_POINTS = 65_535  # of a table of v0(z)
 FUSED = ("sense", "decide", "state_at")  # functions that a step consists of; the others are its pieces
@@ -382,6 +385,8 @@ def stand_in_context(t: Target, name: str) -> dict[str, Any]:
         "noise": ", ".join(c_number(float(v), t.precision) for v in reading_deviations(t.believed)),
         "noise_step": c_number(2.0**-15, t.precision),
     }
+    if (reached := readings_at_rest(t)) is not None:
+        found["reached"] = ", ".join(c_number(float(v), t.precision) for v in reached.ravel())
     if not t.driven:
         return found
     program = program_of(lower(phase_currents(t), t.precision))
@@ -390,6 +395,18 @@ def stand_in_context(t: Target, name: str) -> dict[str, Any]:
         "stand_in_root": any(o.op == "SQRT" for o in program.operations),
         "current_noise": c_number(UNEVEN_SHARE * bounds_of(t).uneven, t.precision),
     }
+
+
+def readings_at_rest(t: Target) -> FloatArray | None:
+    """Readings at rest per unit reference, p x p, where fewer forces cannot hold all of them; None: p* itself."""
+    plant = t.believed
+    if len(plant.outputs) <= len(plant.inputs):
+        return None
+    p = ca.SX.sym("p", len(plant.outputs))
+    x = ca.SX.zeros(len(plant.states))
+    x[list(plant.controlled)] = state_reference(plant)(p, 0 * p)
+    slope = ca.Function("slope", [p], [ca.densify(ca.jacobian(plant.h(x, 0), p))])
+    return np.array(slope(np.zeros(len(plant.outputs))))
 
 
 def phase_currents(t: Target) -> ca.Function:

@@ -39,6 +39,7 @@ from malta.synthesis.controller import (
     freeze_moving,
     look_ahead,
     sum_errors,
+    waiting,
 )
 
 if TYPE_CHECKING:
@@ -178,8 +179,10 @@ def _decided_forces(
     xi_pred, place = look_ahead(g, sums.predict(xi_pred, xi_hat), y, dp)
     ahead = "" if c.commutation is None else " + Bd lead pull dp"
     note("predict", f"xi_pred = Ad xi_hat + Bd (v - v0){ahead}", xi_pred=xi_pred, **sums.rest("xi_rest"))
-    note("wait", "frozen = saturated", frozen=saturated)
-    after = {"xi_pred": xi_pred, "e": e, "frozen": saturated}
+    waits, square = waiting(g, saturated), len(c.forces) == len(c.measurements)
+    meaning = "frozen = saturated" if square else "frozen: a force of its column of Ki is saturated"
+    note("wait", meaning, frozen=waits)
+    after = {"xi_pred": xi_pred, "e": e, "frozen": waits}
     if memory is not None:
         note("remember", "memory: forces under way are a sample older", memory=memory)
         after["memory"] = memory
@@ -259,7 +262,7 @@ class Sums:
 def feedforward(t: Target, p: Any, dp: Any, ddp: Any) -> Any:
     """v_ff = inertia p*'' + speed p*' + position q*, the forces that the reference takes."""
     ff = t.controller.feedforward
-    v = ca.DM(ff.inertia) * ddp + ca.sparsify(ca.DM(ff.speed)) @ dp
+    v = ca.sparsify(ca.DM(ff.inertias)) @ ddp + ca.sparsify(ca.DM(ff.speed)) @ dp
     if ff.position.size:
         states = state_reference(t.believed)(p, dp)
         v += ca.sparsify(ca.DM(ff.position)) @ states[: ff.position.shape[1]]

@@ -183,6 +183,7 @@ def _context(t: Target, name: str) -> dict[str, Any]:
         "records": _records(t, name),
         "times": list(times._asdict().items()),
         "outputs": len(c.measurements),
+        "forces": len(c.forces),
         "estimated": len(c.states),
         "input_fields": input_fields(t),
         "output_fields": [f for f in output_fields(t) if f.size],

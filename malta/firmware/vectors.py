@@ -17,7 +17,7 @@ import numpy as np
 
 from malta.firmware.calibration import FNV_FACTOR, FNV_START
 from malta.firmware.ctext import c_number
-from malta.firmware.export import FUSED, call_text, piece_records
+from malta.firmware.export import FUSED, call_text, piece_records, readings_at_rest
 from malta.firmware.program import TYPES, Program, evaluate
 from malta.firmware.sensor_loss import expected_readings
 from malta.firmware.signals import (
@@ -226,10 +226,15 @@ def trial_context(t: Target, name: str) -> dict[str, Any]:
     }
 
 
+def _place_of_rest(t: Target, sizes: FloatArray) -> FloatArray:
+    """Readings of these sizes, of either sign by turns; with more sensors than forces, of a place that has them all."""
+    reached = readings_at_rest(t)
+    return np.asarray(sizes * (-1.0) ** np.arange(len(sizes)) if reached is None else reached @ sizes)
+
+
 def _faults(t: Target, per_unit: FloatArray) -> dict[str, str]:
     """How large faults are, so that their monitors act and no stronger one before them."""
     b, c = bounds_of(t), t.controller
-    signs = (-1.0) ** np.arange(len(b.settled))
     limits = np.asarray(c.limits.force, dtype=float)
     currents = np.broadcast_to(c.limits.current, len(t.believed.actuator.coils))
     sigma = np.where(np.isfinite(b.sigma), b.sigma, 0.0)
@@ -240,7 +245,7 @@ def _faults(t: Target, per_unit: FloatArray) -> dict[str, str]:
         "settled": np.maximum(3 * b.settled, 2.5 * JUMP * sigma),
         "drift_step": np.where(np.isfinite(b.jump), 0.6 * b.jump, b.settled),
         "step": 0.5 * reference_limits(t).position,
-        "rest": 3 * signs * b.settled,
+        "rest": _place_of_rest(t, 3 * b.settled),
         "per_unit": per_unit,
         "shift": 2.5 * JUMP * sigma * per_unit,
         "astray": 3 * b.range * per_unit,

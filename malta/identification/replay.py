@@ -31,6 +31,7 @@ from malta.synthesis.controller import (
     gains_of,
     look_ahead,
     sum_errors,
+    waiting,
 )
 
 if TYPE_CHECKING:
@@ -337,8 +338,8 @@ def _law_chain(simulation: Simulation) -> ca.Function:
     xi_pred, e, frozen = state[:n], state[n : n + p], state[n + p :]
     taken = filtered(c.tracks, y, given["p_ref"])
     xi_hat = estimated(g, xi_pred, taken)
-    waiting = freeze_moving(g, frozen, given["dp_ref"])
-    sums = sum_errors(g, e, waiting, y, given["p_ref"])
+    still = freeze_moving(g, frozen, given["dp_ref"])
+    sums = sum_errors(g, e, still, y, given["p_ref"])
     xi_ref = law_reference(c, plant_of(c.parameters), g, given)
     after, saturated, v = commanded(g, xi_hat, sums, xi_ref, given["v_ff"], v0)
     after, _ = look_ahead(g, after, y, given["dp_ref"])
@@ -347,6 +348,6 @@ def _law_chain(simulation: Simulation) -> ca.Function:
     step = ca.Function(
         "step",
         [state, inputs],
-        [ca.densify(ca.vertcat(after, sums, saturated)), ca.densify(ca.vertcat(v, innovation))],
+        [ca.densify(ca.vertcat(after, sums, waiting(g, saturated))), ca.densify(ca.vertcat(v, innovation))],
     )
     return step.mapaccum("replay", BLOCK)

@@ -184,11 +184,15 @@ class LoopCurves:
 
     @cached_property
     def zeros(self) -> ComplexArray:
-        """The transmission zeros of L at the sensors, finite ones, in the measure of the poles."""
+        """The transmission zeros of L, finite ones, in the measure of the poles: at the sensors, or at the forces where
+        there are fewer of them, since L at the sensors has no full rank then."""
         loop, p = self.loop, len(self.loop.outputs)
         P, F = loop.plant, loop.law
         u, n, k = len(F.C), len(P.A), len(F.A)
         B, C, D = P.B[:, :u], P.C[:p], P.D[:p, :u]
+        if u < p:
+            A = np.block([[F.A, F.B @ C], [np.zeros((n, k)), P.A]])
+            return _zeros(loop, System(A, np.vstack([F.B @ D, B]), np.hstack([F.C, F.D @ C]), F.D @ D))
         A = np.block([[P.A, B @ F.C], [np.zeros((k, n)), F.A]])
         return _zeros(loop, System(A, np.vstack([B @ F.D, F.B]), np.hstack([C, D @ F.C]), D @ F.D))
 

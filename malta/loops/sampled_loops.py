@@ -87,11 +87,11 @@ def sampled_law(
         law = with_estimated_emf(law, control.emf)
     n, m = len(controller.states), len(controller.forces)
     half = plant_of(controller.parameters).coordinates
-    p = len(controller.measurements) if controller.integrating else 0
+    p = len(controller.summed)
     # Sums of errors and stored forces in the coordinates of the modes, where these decouple.
     to_modes = np.eye(len(law.A))
     if controller.tracks == "states" and len(controller.measurements) == m == half:
-        if p:
+        if p == m:
             to_modes[n:, n:] = np.linalg.inv(controller.C[:, :half])
         for k in range(2 * half, n, m):
             to_modes[k : k + m, k : k + m] = controller.B[half:]

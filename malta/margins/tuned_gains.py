@@ -115,11 +115,12 @@ def _unfit(plant: Plant, c: Controller, uncertainty: Ranges) -> str:
 def _opened(c: Controller) -> _OpenLaw:
     """Steps 1 to 6 of synthesis/controller.py, deviations alone: states xi_pred, and e where it is fed back."""
     n, m, p, Ts = len(c.states), len(c.forces), len(c.measurements), c.sample_time
-    sums = p if c.integrating else 0
+    summed = list(c.summed)
+    sums = len(summed)
     hat = np.hstack([np.eye(n) - c.L @ c.Cd, np.zeros((n, sums))]), c.L
-    total = np.hstack([np.zeros((sums, n)), np.eye(sums)]), -Ts * np.eye(p)[:sums]
+    total = np.hstack([np.zeros((sums, n)), np.eye(sums)]), -Ts * np.eye(p)[summed]
     unity = np.where(np.abs(c.K) == 1, c.K, 0.0)
-    Ki = c.Ki[:, :sums]
+    Ki = c.Ki[:, summed]
     C, D = (-(c.K - unity) @ x + Ki @ e for x, e in zip(hat, total, strict=True))
     C_1, D_1 = (-unity @ x for x in hat)
     A, B = (np.vstack([c.Ad @ x + c.Bd @ one, e]) for x, one, e in zip(hat, (C_1, D_1), total, strict=True))

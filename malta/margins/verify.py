@@ -59,7 +59,7 @@ from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import gain_at_rest
-from malta.synthesis.lqg import kalman, lqi, lqr, weights_of
+from malta.synthesis.lqg import integrals_of, kalman, lqi, lqr, weights_of
 from malta.synthesis.riccati import add_integrals, eigenvalues
 
 if TYPE_CHECKING:
@@ -74,8 +74,9 @@ def controller_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
     k = len(c.Ad) - c.observed * len(c.forces)
     A, B, K = c.Ad[:k, :k], c.Bd[:k], c.K[:, :k]
     if c.integrating:
-        A, B = add_integrals(A, B, c.Cd[:, :k], c.sample_time)
-        K = np.hstack([K, -c.Ki])
+        summed = list(c.summed)
+        A, B = add_integrals(A, B, c.Cd[summed, :k], c.sample_time)
+        K = np.hstack([K, -c.Ki[:, summed]])
     return eigenvalues(A - B @ K), eigenvalues((np.eye(len(c.Ad)) - c.L @ c.Cd) @ c.Ad)
 
 
@@ -186,7 +187,7 @@ def bandwidths_of(
     half = np.sqrt(0.5)
     return {
         "sigma_max_T": crossing(w, T[:, 0], half, last=True),
-        "sigma_min_T": crossing(w, T[:, -1], half, last=False),
+        "sigma_min_T": crossing(w, T[:, min(L.shape[1], len(controller.forces)) - 1], half, last=False),
         "crossover_max": crossing(w, _singular_values(L)[:, 0], 1.0, last=True),
         **natural,
     }
@@ -249,7 +250,8 @@ def compensators(
     A, B, C, K, L = model.A, model.B, model.C, lqr(model, weights), kalman(model, weights)
     n, p, m = len(A), len(C), B.shape[1]
     half = believed.coordinates
-    to_modes = np.linalg.inv(C[:, :half]) if p == half else np.eye(p)
+    summed = integrals_of(model, weights).outputs
+    to_modes = np.linalg.inv(C[:, :half]) if len(summed) == p == half else np.eye(p)
     back = np.linalg.inv(to_modes)
     stages: dict[str, tuple[Compensator, bool]] = {
         "LQR": (
@@ -259,19 +261,18 @@ def compensators(
             True,
         )
     }
-    integral = bool(weights.q_i.any())
-    K_i, Ki = lqi(model, weights) if integral else (K, np.zeros((m, p)))
-    if integral:  # e' = -y, in the coordinates of the modes
-        e = np.hstack([-to_modes, np.zeros((p, n))])
+    K_i, Ki = lqi(model, weights)
+    Ki, k = (Ki @ back)[:, summed], len(summed)
+    e = -to_modes[summed]  # e' = -y, in the coordinates of the modes
+    if summed:
+        read = np.hstack([e, np.zeros((k, n))])
         D = np.hstack([np.zeros((m, p)), -K_i])
-        stages["LQI"] = Compensator(np.zeros((p, p)), e, Ki @ back, D, integrals=p), True
+        stages["LQI"] = Compensator(np.zeros((k, k)), read, Ki, D, integrals=k), True
     stages["LQG"] = Compensator(A - B @ K - L @ C, L, -K, np.zeros((m, p))), False
     last = stages["LQG"][0]
-    if integral:
-        observer = np.block([[A - B @ K_i - L @ C, B @ Ki @ back], [np.zeros((p, n + p))]])
-        last = Compensator(
-            observer, np.vstack([L, -to_modes]), np.hstack([-K_i, Ki @ back]), np.zeros((m, p)), integrals=p
-        )
+    if summed:
+        observer = np.block([[A - B @ K_i - L @ C, B @ Ki], [np.zeros((k, n + k))]])
+        last = Compensator(observer, np.vstack([L, e]), np.hstack([-K_i, Ki]), np.zeros((m, p)), integrals=k)
         stages["LQGI"] = last, False
     if np.isfinite(plant.actuator.crossover):
         stages["+ current loops"] = replace(last, lag=plant.actuator.crossover), False

@@ -72,6 +72,14 @@ def check_signals(plant: Plant) -> None:
         if len(getattr(plant, key)) != len(names[of]):
             found = f"{len(getattr(plant, key))} entries"
             raise InputError(plant.name, key, found, f"{len(names[of])}, one for each of the {of}")
+    if plant.sensors is not None:
+        lags, late = plant.sensors.lag, plant.sensors.dead_time
+        if len(lags) != len(names["outputs"]):
+            expected = f"{len(names['outputs'])}, one for each of the outputs"
+            raise InputError(plant.name, "sensors.lag", f"{len(lags)} entries", expected)
+        times = [time for time in (*lags, late) if isinstance(time, int | float)]
+        if not all(0 <= time < math.inf for time in times):
+            raise InputError(plant.name, "sensors", f"lags and dead time {times} s", "times of 0 s or more")
     both = [name for name in names["outputs"] if name in names["states"]]
     if plant.stroke not in ("", *both):
         expected = "an output that is a state of the same name" + (f", as {' '.join(both)}" if both else "")

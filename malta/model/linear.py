@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack, cast
 
 import casadi as ca
 import numpy as np
+from scipy import linalg
 
 from malta.errors import InputError
 from malta.model.data import plant_of
@@ -80,12 +81,13 @@ def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Detai
 
     States of positions and then their rates, A = [[0, I], ...], make a machine of second order. An LQG and a margin
     work for other states as well. Their reference is the rest at which the outputs have the wanted values:
-    [A B; C 0] (x*, u*) = (0, p*), in the least-squares sense. u* is not fed forward: a machine that needs some stops
-    short of the reference without integrals or observed disturbances.
+    [A B; C 0] (x*, u*) = (0, p*), in the least-squares sense; of a machine with more outputs than inputs the rest
+    with the nearest outputs. u* is not fed forward: a machine that needs some stops short of the reference without
+    integrals or observed disturbances.
 
     A : n x n; or in place of A, B and C a continuous control.StateSpace, or what `malta.uncertain` makes of a function
     B : n x m
-    C : m x n, as many outputs as inputs for a design
+    C : p x n
     details : by keyword, all optional:
     name : the machine's own name
     states, inputs, outputs : names, "z [m]" with a unit, or Signals; those of a StateSpace, else x1 x2 ..., u1, y1
@@ -243,6 +245,9 @@ def _place(place: str) -> tuple[int, int]:
 def _states_at_rest(A: FloatArray, B: FloatArray, C: FloatArray, coordinates: int) -> FloatArray:
     """The matrix from outputs to states at rest; to the positions q of states (q, q')."""
     n, p, half = len(A), len(C), coordinates
+    if p > B.shape[1]:  # no inputs hold all values: the nearest of those that some hold
+        rests = linalg.null_space(np.hstack([A, B]))[:n]
+        return np.asarray(rests @ np.linalg.pinv(C @ rests))[: half or n]
     if half and p == half and np.linalg.matrix_rank(C[:, :half]) == half:
         return np.asarray(np.linalg.inv(C[:, :half]))
     whole = np.block([[A, B], [C, np.zeros((p, B.shape[1]))]])

@@ -152,7 +152,7 @@ class Plant:
     bearing : x -> w of the touchdown bearings; zero without contact
     sense : (x, sensor errors) -> y without noise; default: h
     sensor_errors : systematic errors of the sensors
-    sensors : lag of the sensors; None: they read at once
+    sensors : `malta.LateSensors`, lags and dead time of the sensors; None: they read at once
     noise : of each sensor, rms of a sample, in the unit of the output; default: zero
     uniform : whether the noise is uniform; else normal
     resolution : of each sensor, in the unit of the output; 0: not quantized

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from malta.proof.blocks.gain import Gain as Gain
     from malta.proof.connections import append as append
     from malta.proof.connections import feedback as feedback
+    from malta.proof.connections import interconnect as interconnect
     from malta.proof.connections import parallel as parallel
     from malta.proof.connections import random_systems as random_systems
     from malta.proof.connections import series as series

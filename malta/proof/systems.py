@@ -313,7 +313,8 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
             raise InputError("compensator", "dt", "True", "0, or a sample time in seconds")
         T = None if not law.dt else float(law.dt)
         A, B, C, D = (np.asarray(M, dtype=float) for M in (law.A, law.B, law.C, law.D))
-        found = Compensator(A, B.reshape(len(A), -1), C.reshape(-1, len(A)), D, sample_time=T)
+        n, D = len(A), np.atleast_2d(D)
+        found = Compensator(A, B.reshape(n, D.shape[1]), C.reshape(len(D), n), D, sample_time=T)
     elif hasattr(law, "ninputs") or isinstance(law, bool | None):  # a response, which has no states
         raise InputError("compensator", "law", describe(law), wanted)
     else:

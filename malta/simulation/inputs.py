@@ -178,7 +178,7 @@ def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardCho
     K1 = 2 k, until the integrals correct it.
     """
     believed = plant_of(c.parameters)
-    v_ff = c.feedforward.inertia * motion.ddp + motion.dp @ c.feedforward.speed.T
+    v_ff = motion.ddp @ c.feedforward.inertias.T + motion.dp @ c.feedforward.speed.T
     hold = c.feedforward.position
     if choice == "attraction":
         believed.require_second_order("feedforward attraction")

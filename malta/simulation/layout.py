@@ -116,7 +116,7 @@ def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
         given |= {"stuck": p, "missed": 1, "sag": 1, "open": phases if s.fidelity == "phase" else 0}
     if s.outside:
         given |= {"xi_hat": n}
-    row = {"x": len(plant.states), "p": p, "y": p, "xi_hat": n, "v": m, "force": m, "saturated": p}
+    row = {"x": len(plant.states), "p": p, "y": p, "xi_hat": n, "v": m, "force": m, "saturated": m}
     row |= {"contact": len(plant.contacts), "current": coils, "met": 1 + (len(fast.flags) if fast else 0)}
     if driven:
         row |= {"i": axes, "u": axes, "link": 1}

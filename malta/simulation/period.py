@@ -55,6 +55,7 @@ from malta.synthesis.controller import (
     freeze_moving,
     look_ahead,
     sum_errors,
+    waiting,
 )
 
 # Motion of the machine between two samples: one step of the classical Runge–Kutta method under held commands.
@@ -364,17 +365,17 @@ def _control_law(
     xi_ref = law_reference(c, believed, g, given)
     frozen_now = freeze_moving(g, controller["frozen"], given["dp_ref"])
     e = sum_errors(g, controller["e"], frozen_now, y, p_ref)
-    xi_pred, frozen, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
+    xi_pred, saturated, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
     if s.open_loop:
-        v, frozen = v_ff + v0, 0 * frozen  # open loop: no limit of the feedback is reached
+        v, saturated = v_ff + v0, 0 * saturated  # open loop: no limit of the feedback is reached
     xi_pred, place = look_ahead(g, xi_pred, p_ref if s.open_loop else y, given["dp_ref"])
-    after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": frozen}
+    after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": waiting(g, saturated)}
     # The controller commutates with the machine of its gain file. The simulated machine limits the currents, and the
     # gain file does: the smaller limit counts.
     wanted = believed.currents(place, v)
     current, fast = limited_currents(plant, wanted, g["current_limit"]), electronics_of(plant, s)
     met = [ca.mmax(ca.fabs(current - wanted)) > 0]
-    row: dict[str, Any] = {"xi_hat": xi_hat, "v": v, "saturated": frozen, "current": current}
+    row: dict[str, Any] = {"xi_hat": xi_hat, "v": v, "saturated": saturated, "current": current}
     if fast is not None:
         command = keep_if_missed(s, signals, fast.held(current, place))
         electric_state = {name: machine[name] for name in fast.state}

@@ -25,6 +25,9 @@ follow, the oldest first: v - v0, and what currents commutated for an old readin
 is what was commanded then, lagging. Last come constant forces of disturbance, where the filter observes them, with
 zero for a reference. Where a disturbance is known in advance, the forces that cancel it are added to v0(z).
 
+An axis is the force and the output of one index, where there are as many of both. Else a sum of errors waits while
+any force that it drives saturates, by its column of Ki; outputs whose column is zero have no sum in the loop.
+
 Where the controller has a `commutation`, the currents of step 5 are those of y + lead p*', the place where they will
 act on the way of the reference. The filter knows what that does to the forces that pull back between readings:
 xi_pred = Ad xi_hat + Bd (v - v0 + pull lead p*'). The reference is not fed back, so the loop stays the same.
@@ -42,7 +45,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import casadi as ca
@@ -71,7 +74,7 @@ class Feedforward:
     samples: a steady ramp then takes a force, and passes the readings faster than on average.
     """
 
-    inertia: FloatArray  # kg or kg m^2, m inputs; times the output of the same index
+    inertia: FloatArray  # kg or kg m^2, m inputs; times the output of the same index, where there is one
     speed: FloatArray  # m x p, N s/m
     rate: FloatArray  # n0 / 2 x p (none without q'), rates at the samples beyond P^-1 p*', per unit of p*'
     z_grid: FloatArray  # m, g points
@@ -82,6 +85,11 @@ class Feedforward:
     def __post_init__(self) -> None:
         for name in ("inertia", "speed", "rate", "z_grid", "v0", "position"):
             object.__setattr__(self, name, readonly(getattr(self, name)))
+
+    @property
+    def inertias(self) -> FloatArray:
+        """The inertias as the matrix from p*'' to forces, m x p."""
+        return np.eye(*self.speed.shape) * self.inertia[:, None]
 
     def at(self, z: float) -> FloatArray:
         """v0(z), N, m forces."""
@@ -164,14 +172,14 @@ class Cost:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Controller:
-    """Gains, models and limits of one controller; n states, m forces, p = m measurements.
+    """Gains, models and limits of one controller; n states, m forces, p measurements.
 
         xi_hat = xi_pred + L (y - Cd xi_pred),    e += Ts (p* - y)
         v = saturate(K (xi* - xi_hat) + Ki e + v_ff + v0(z)),    xi_pred = Ad xi_hat + Bd (v - v0(z))
 
-    Force i and measurement i are of the same axis: when force i saturates, error integral i waits. Behind the n0 states
-    of the machine stand forces behind the lag of the current loops, stored forces, and observed disturbances, where the
-    design models them.
+    With p = m force i and measurement i are of the same axis: when force i saturates, error integral i waits. Else an
+    integral waits while any force saturates that its column of Ki drives. Behind the n0 states of the machine stand
+    forces behind the lag of the current loops, stored forces, and observed disturbances, where the design models them.
 
     name : of the design
     spec_sha256 : digest of all in the design file that shapes the design
@@ -244,14 +252,8 @@ class Controller:
                 object.__setattr__(self, f.name, readonly(value))
         x, u = self.operating_point
         object.__setattr__(self, "operating_point", (readonly(x), readonly(u)))
-        if len(self.forces) != len(self.measurements):
-            found = f"{len(self.forces)} forces and {len(self.measurements)} measurements"
-            expected = (
-                "as many of both: let `currents` share one force among coils that act alike, or measure less"
-            )
-            raise InputError("Controller", "forces", found, expected)
         for k in np.flatnonzero(self.braking):
-            if self.tracks == "errors" or not _is_own_state(self.C[k], int(k)):
+            if self.tracks == "errors" or k >= len(self.forces) or not _is_own_state(self.C[k], int(k)):
                 found = f"one of {self.measurements[k].name}"
                 raise InputError(
                     self.name, "braking", found, "one of an output that is the state of its index"
@@ -282,10 +284,15 @@ class Controller:
         """1 where forces of disturbance are among the states, else 0."""
         return int(self.tracks == "states" and self.states[-len(self.forces) :] == disturbances(self.forces))
 
+    @cached_property
+    def summed(self) -> tuple[int, ...]:
+        """The outputs whose sums of errors are fed back, by index."""
+        return _summed(self.Ki)
+
     @property
     def integrating(self) -> bool:
         """Whether sums of errors are fed back."""
-        return bool(self.Ki.any())
+        return bool(self.summed)
 
     @cached_property
     def sys(self) -> Any:
@@ -298,7 +305,7 @@ class Controller:
 class LinearLaw(NamedTuple):
     """The law without saturation: s+ = A s + B_y y + B_r r, v = C s + D_y y + D_r r.
 
-    s = (xi_pred, e), without e where it is not fed back, and of a law of errors without the last error, which is new at
+    s = (xi_pred, e), without sums that are not fed back, and of a law of errors without the last error, which is new at
     every sample; r = (p*, xi*, v_ff, v0).
     """
 
@@ -308,6 +315,11 @@ class LinearLaw(NamedTuple):
     C: FloatArray
     D_y: FloatArray
     D_r: FloatArray
+
+
+def _summed(Ki: FloatArray) -> tuple[int, ...]:
+    """The columns of Ki that are not zero."""
+    return tuple(np.flatnonzero(Ki.any(axis=0)).tolist())
 
 
 def _is_own_state(row: FloatArray, k: int) -> bool:
@@ -392,7 +404,7 @@ def commanded(
     v_ff: Any,
     v0: Any,
 ) -> tuple[Any, Any, Any]:
-    """Steps 3, 4 and 6: (xi_pred, frozen, v) from the estimate and the sums of errors."""
+    """Steps 3, 4 and 6: (xi_pred, forces that saturate, v) from the estimate and the sums of errors."""
     # The first sum is the same for all machines under one reference: engines compute it once a sample.
     wanted = (g["K"] @ xi_ref + v_ff) + (g["Ki"] @ e - g["K"] @ xi_hat) + v0
     if "braking" in g:
@@ -402,6 +414,16 @@ def commanded(
     saturated = v != wanted
     note("limit_forces", "v = w within +-limits.force; saturated: v is not w", v=v, saturated=saturated)
     return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), saturated, v
+
+
+def waiting(g: Mapping[str, Any], saturated: Any) -> Any:
+    """The axes that saturated, of p outputs, from those of m forces: see the head of this module."""
+    m, p = g["Ki"].shape
+    if m == p:
+        return saturated
+    of = g["Ki"].sparsity()
+    driven = [[saturated[i] for i in range(m) if of.has_nz(i, k)] for k in range(p)]
+    return ca.vertcat(*(reduce(ca.logic_or, forces) if forces else 0 for forces in driven))
 
 
 def freeze_moving(g: Mapping[str, Any], frozen: Any, dp_ref: Any) -> Any:
@@ -442,11 +464,11 @@ def _symbolic_law(
     xi_pred, e, frozen, y, p_ref, *given = args.values()
     xi_hat = estimated(g, xi_pred, filtered(tracks, y, p_ref))
     e_next = sum_errors(g, e, frozen, y, p_ref)
-    xi_pred_next, frozen_next, v = commanded(g, xi_hat, e_next, *given)
+    xi_pred_next, saturated, v = commanded(g, xi_hat, e_next, *given)
     return args, {
         "xi_pred_next": xi_pred_next,
         "e_next": e_next,
-        "frozen_next": frozen_next,
+        "frozen_next": waiting(g, saturated),
         "v": v,
         "xi_hat": xi_hat,
     }
@@ -460,7 +482,7 @@ def linear_law(c: Controller) -> LinearLaw:
     step = law(c)
     args = {step.name_in(i): ca.SX.sym(step.name_in(i), *step.size_in(i)) for i in range(step.n_in())}
     out = dict(zip(step.name_out(), step(*args.values()), strict=True))
-    blocks = _blocks(args, out, integrating=c.integrating)
+    blocks = _blocks(args, out, c.summed)
     found = LinearLaw(
         *(np.array(M) for M in ca.Function("linear", list(args.values()), blocks)(*[0] * len(args)))
     )
@@ -478,30 +500,29 @@ def linear_law_of(g: Gains, Ts: float) -> LinearLaw:
     evaluated afterwards: `linear_law` takes longer than all else in a trial.
     """
     (n, m), p = g.Bd.shape, len(g.Cd)
-    found = _law_of_gains(n, m, p, bool(g.Ki.any()))(*g, Ts)
+    found = _law_of_gains(n, m, p, _summed(g.Ki))(*g, Ts)
     A, B_y, C, D_y = (np.array(M) for M in found)
     return LinearLaw(A, B_y, np.zeros((len(A), 0)), C, D_y, np.zeros((m, 0)))
 
 
 @lru_cache(maxsize=32)
-def _law_of_gains(n: int, m: int, p: int, integrating: bool) -> ca.Function:
+def _law_of_gains(n: int, m: int, p: int, summed: tuple[int, ...]) -> ca.Function:
     """(Ad, Bd, Cd, K, Ki, L, control_time) -> (A, B_y, C, D_y)."""
     shapes = {"Ad": (n, n), "Bd": (n, m), "Cd": (p, n), "K": (m, n), "Ki": (m, p), "L": (n, p)}
     g = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
     g["control_time"] = ca.SX.sym("control_time")
     args, out = _symbolic_law(g | {"force_limit": ca.inf}, n, m, p)
-    A, B_y, _, C, D_y, _ = _blocks(args, out, integrating=integrating)
+    A, B_y, _, C, D_y, _ = _blocks(args, out, summed)
     still = [ca.DM.zeros(*symbol.shape) for symbol in args.values()]
     blocks = ca.substitute([A, B_y, C, D_y], list(args.values()), still)
     return ca.Function("law_of_gains", list(g.values()), blocks)
 
 
-def _blocks(args: Mapping[str, Any], out: Mapping[str, Any], *, integrating: bool) -> list[ca.SX]:
-    """The derivatives of a law, in the order of LinearLaw."""
-    states = ["xi_pred", "e"] if integrating else ["xi_pred"]
-    s = ca.vertcat(*(args[name] for name in states))
+def _blocks(args: Mapping[str, Any], out: Mapping[str, Any], summed: tuple[int, ...]) -> list[ca.SX]:
+    """The derivatives of a law, in the order of LinearLaw, with the sums of errors that are fed back."""
+    s = ca.vertcat(args["xi_pred"], *(args["e"][k] for k in summed))
     r = ca.vertcat(*(args[name] for name in ("p_ref", "xi_ref", "v_ff", "v0")))
-    s_next = ca.vertcat(*(out[f"{name}_next"] for name in states))
+    s_next = ca.vertcat(out["xi_pred_next"], *(out["e_next"][k] for k in summed))
     return [ca.jacobian(of, by) for of in (s_next, out["v"]) for by in (s, args["y"], r)]
 
 

@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache, partial
@@ -24,12 +24,14 @@ from malta.errors import CheckError, InputError
 from malta.files import locate
 from malta.model.data import plant_of, published, read
 from malta.model.parameters import units_of
-from malta.model.plant import Plant
+from malta.model.plant import Plant, Signal
 from malta.synthesis.design_tables import (
+    BasesTable,
     DesignFile,
     PidTable,
     ReferencesTable,
     SearchTable,
+    WeightsTable,
     specification_table,
     with_published,
 )
@@ -259,6 +261,8 @@ def _weights(content: DesignFile, plant: Plant, path: Path) -> Weights:
     assert q is not None
     assert base is not None
     assert noise is not None
+    if len(outputs) > len(inputs) and not in_positions:  # not all of them can be held
+        q, base = _with_free_outputs(q, base, integrals)
     given: dict[str, Any] = {}
     if noise.drift is not None:
         given["drift_variance"] = variances(
@@ -286,6 +290,16 @@ def _weights(content: DesignFile, plant: Plant, path: Path) -> Weights:
         coordinates=content.coordinates,
         **given,
     )
+
+
+def _with_free_outputs(
+    q: WeightsTable, base: BasesTable, integrals: Sequence[Signal]
+) -> tuple[WeightsTable, BasesTable]:
+    """The tables with a weight of 0 for each integral that is left out, on a base of 1 where that is left out too."""
+    unit = {s.name: Quantity(value=1.0, unit=s.unit) for s in integrals if not q.integral.get(s.name)}
+    weights = {s.name: 0.0 for s in integrals} | q.integral
+    given = None if base.integral is None else unit | base.integral
+    return q.model_copy(update={"integral": weights}), base.model_copy(update={"integral": given})
 
 
 def _pid(table: PidTable, plant: Plant, path: Path) -> Pid:

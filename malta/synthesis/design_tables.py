@@ -32,7 +32,11 @@ class WeightsTable(Record):
 
     state: dict[StrictStr, Finite] = entry("by state, at least 0", "1")
     input: dict[StrictStr, Finite] = entry("by input, above 0", "1")
-    integral: dict[StrictStr, Finite] = entry("by output, or by position, at least 0", "1")
+    integral: dict[StrictStr, Finite] = entry(
+        "by output, or by position, at least 0; 0: no integral, as of outputs that a machine with fewer inputs leaves "
+        "out",
+        "1",
+    )
 
 
 class BasesTable(Record):

@@ -129,8 +129,19 @@ def obstacle(model: LinearModel, weights: Weights, Ts: float) -> str:
         return f"no force moves the mode {_mode_text(mode, states)}: a force that acts on it is missing"
     for mode in lost_modes(A.T, model.C.T):
         return f"no sensor sees the mode {_mode_text(mode, states)}: a measurement of it is missing"
-    if weights.q_i.any() and _is_blocked_at_rest(A, model.B, model.C):
-        return "forces cannot move all outputs at rest (a zero at s = 0): the integrals need weights of 0"
+    outputs = [s.name for s in model.plant.outputs]
+    summed = integrals_of(model, weights).outputs
+    if summed and _rank_at_rest(A, model.B, model.C[summed]) < len(A) + len(summed):
+        forces, names = " ".join(s.name for s in model.plant.inputs), " ".join(outputs[k] for k in summed)
+        return (
+            f"{forces} cannot hold {names} at rest, each at a reference of its own (a zero at s = 0): "
+            "weights.integral needs to be 0 of outputs that cannot be held beside the others"
+        )
+    if weights.drift_variance.size and _rank_at_rest(A, model.B, model.C) < len(A) + model.B.shape[1]:
+        return (
+            f"{' '.join(outputs)} do not tell the disturbances of the forces from each other at rest: "
+            "leave out noise.drift, and take integrals"
+        )
     fastest = float(linalg.eigvals(A).real.max())
     if fastest * Ts > LONG:
         return (
@@ -151,13 +162,13 @@ def _mode_text(mode: LostMode, states: Sequence[str]) -> str:
     return f"{kind} of {' '.join(states[i] for i in mode.states)}, which is not stable"
 
 
-def _is_blocked_at_rest(A: FloatArray, B: FloatArray, C: FloatArray) -> bool:
-    """Whether [A B; C 0] has less than full row rank, rows and columns scaled to 1."""
+def _rank_at_rest(A: FloatArray, B: FloatArray, C: FloatArray) -> int:
+    """The rank of [A B; C 0], rows and columns scaled to 1."""
     system = np.block([[A, B], [C, np.zeros((len(C), B.shape[1]))]])
     for axis in (1, 0, 1):
         size = np.linalg.norm(system, axis=axis, keepdims=True)
         system = system / np.where(size > 0, size, 1.0)
-    return bool(np.linalg.matrix_rank(system, tol=1e-10) < len(system))
+    return int(np.linalg.matrix_rank(system, tol=1e-10))
 
 
 @on_one_thread
@@ -190,8 +201,8 @@ def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
 
         minimize integral of xi' Q xi + e' Q_i e + v' R v,    v = K (xi* - xi) + Ki e,   e' = p* - p
 
-    The Riccati gain on e acts as -K_e e, so Ki = -K_e; 0 where nothing weighs e. The same as control.lqr(A, B,
-    diag(Q, Q_i), R, integral_action=C)[0] = [K, Ki].
+    The Riccati gain on e acts as -K_e e, so Ki = -K_e. An output without a weight has no integral: its column is 0.
+    With a weight for each it is the same as control.lqr(A, B, diag(Q, Q_i), R, integral_action=C)[0] = [K, Ki].
 
     model : the linear model
     weights : Q, R and Q_i
@@ -208,32 +219,46 @@ def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
     ([[3.375, 2.598]], [[2.0]])
     """
     _check_sizes(model, weights)
-    n, p = len(model.A), len(model.C)
-    if not weights.q_i.any():
-        return lqr(model, weights), np.zeros((model.B.shape[1], p))
-    A = np.block([[model.A, np.zeros((n, p))], [-model.C, np.zeros((p, p))]])
-    B = np.vstack([model.B, np.zeros((p, model.B.shape[1]))])
-    gain = care(A, B, linalg.block_diag(weights.Q, integral_weight(model, weights)), weights.R, "LQI").K
-    return gain[:, :n], -gain[:, n:]
+    summed, Q_i = integrals_of(model, weights)
+    n, k, Ki = len(model.A), len(summed), np.zeros((model.B.shape[1], len(model.C)))
+    if not summed:
+        return lqr(model, weights), Ki
+    A = np.block([[model.A, np.zeros((n, k))], [-model.C[summed], np.zeros((k, k))]])
+    B = np.vstack([model.B, np.zeros((k, model.B.shape[1]))])
+    gain = care(A, B, linalg.block_diag(weights.Q, Q_i), weights.R, "LQI").K
+    Ki[:, summed] = -gain[:, n:]
+    return gain[:, :n], Ki
 
 
-def integral_weight(model: Linear, weights: Weights) -> FloatArray:
-    """Q_i of the integrals of the errors p* - p, p x p; in positions those are C_q^-1 (p* - p)."""
-    if weights.coordinates == "signals":
-        return weights.Q_i
+class Integrals(NamedTuple):
+    """The outputs whose errors p* - p are integrated, and the weight of these integrals.
+
+    Those are the outputs with a weight; in the coordinates of the positions, C_q^-1 (p* - p), all outputs or none.
+    """
+
+    outputs: list[int]  # k indices
+    weight: FloatArray  # k x k
+
+
+def integrals_of(model: Linear, weights: Weights) -> Integrals:
+    """The integrals that the weights ask for."""
+    q_i = np.diag(weights.Q_i)
+    if weights.coordinates == "signals" or not q_i.any():
+        outputs = np.flatnonzero(q_i).tolist()
+        return Integrals(outputs, np.diag(q_i[outputs]))
     to_positions = positions_from(model)
-    return np.asarray(to_positions.T @ weights.Q_i @ to_positions)
+    return Integrals(list(range(len(model.C))), np.asarray(to_positions.T @ weights.Q_i @ to_positions))
 
 
 def continuous_poles(model: LinearModel, weights: Weights) -> dict[str, ComplexArray]:
     """Poles of the continuous LQR, LQI and Kalman filter, rad/s: what the weights ask for, before sampling."""
-    p = len(model.C)
     poles = {}
     with suppress(CheckError):  # weights on the integrals alone stabilize the LQI only
         poles["LQR"] = eigenvalues(model.A - model.B @ lqr(model, weights))
-    if weights.q_i.any():
+    if summed := integrals_of(model, weights).outputs:
         K, Ki = lqi(model, weights)
-        integrating = np.block([[model.A - model.B @ K, model.B @ Ki], [-model.C, np.zeros((p, p))]])
+        rest = np.zeros((len(summed), len(summed)))
+        integrating = np.block([[model.A - model.B @ K, model.B @ Ki[:, summed]], [-model.C[summed], rest]])
         poles["LQR with integrals"] = eigenvalues(integrating)
     poles["Kalman filter"] = eigenvalues(model.A - kalman(model, weights) @ model.C)
     return {name: np.sort_complex(values) for name, values in poles.items()}
@@ -264,8 +289,8 @@ def gains(
         free = np.zeros(m)
         cost = replace(weights, q=np.append(weights.q, free), q_base=np.append(weights.q_base, free + 1))
     Ad, Bd, Cd = sampled_model(driven, Ts, delay)
-    Q_i = integral_weight(model, weights)
-    K, Ki = _sampled_regulator(driven, cost, Q_i, Ts, delay, integrated=integrated)
+    integrals = integrals_of(model, weights)
+    K, Ki = _sampled_regulator(driven, cost, integrals, Ts, delay, integrated=integrated)
     L = sampled_filter(model, weights, Ts, known, integrated=integrated)
     if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d; v takes d off, as forces under way have
         p, pushed = len(Cd), np.zeros((len(Ad), m))
@@ -539,7 +564,7 @@ def _backward_euler(
 
 
 def _sampled_regulator(
-    model: Linear, weights: Weights, Q_i: FloatArray, Ts: float, delay: int, *, integrated: bool
+    model: Linear, weights: Weights, integrals: Integrals, Ts: float, delay: int, *, integrated: bool
 ) -> tuple[FloatArray, FloatArray]:
     """K, Ki of the sampled model. With delay, a force acts on the states d samples after it is commanded.
 
@@ -561,11 +586,14 @@ def _sampled_regulator(
         pull, acting = still.H @ model.C, R - commanded
         Q = Q + N @ pull + pull.T @ N.T + pull.T @ acting @ pull
         N = N + pull.T @ acting
-    if not weights.q_i.any():
-        return dare(Ad, Bd, Q, R, N, "sampled LQR").K, np.zeros((m, p))
-    A, B = add_integrals(Ad, Bd, Cd, Ts)
-    gain = dare(A, B, linalg.block_diag(Q, Q_i * Ts), R, np.vstack([N, np.zeros((p, m))]), "sampled LQI").K
-    return gain[:, : n + m * d], -gain[:, n + m * d :]
+    Ki, (summed, Q_i) = np.zeros((m, p)), integrals
+    if not summed:
+        return dare(Ad, Bd, Q, R, N, "sampled LQR").K, Ki
+    A, B = add_integrals(Ad, Bd, Cd[summed], Ts)
+    N = np.vstack([N, np.zeros((len(summed), m))])
+    gain = dare(A, B, linalg.block_diag(Q, Q_i * Ts), R, N, "sampled LQI").K
+    Ki[:, summed] = -gain[:, n + m * d :]
+    return gain[:, : n + m * d], Ki
 
 
 def _check_sizes(model: Linear, weights: Weights) -> None:
@@ -573,6 +601,9 @@ def _check_sizes(model: Linear, weights: Weights) -> None:
     half, in_positions = n // 2, weights.coordinates == "positions"
     if in_positions:
         positions_from(model)
+        if weights.q_i.any() and not weights.q_i.all():
+            found = f"{weights.q_i.tolist()} in coordinates of positions"
+            raise InputError("Weights", "q_i", found, "weights above 0 of all integrals, or of none")
     integrals = ("q_i", "positions", half) if in_positions else ("q_i", "measured signals", p)
     for field, what, size in (("q", "states", n), ("r", "inputs", m), integrals):
         if len(getattr(weights, field)) != size:

@@ -22,7 +22,7 @@ from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import machine_part
 from malta.synthesis.filters import Gains
-from malta.synthesis.spec import Pid
+from malta.synthesis.spec import Pid, require_pairs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -62,6 +62,7 @@ def pid(
         raise InputError("pid", "Ts", f"{Ts} s", "a sample time above 0 s")
     plant, half = model.plant, len(model.A) // 2
     plant.require_second_order("pid")
+    require_pairs(plant)
     if len(terms.Kp) != len(plant.inputs):
         raise InputError("pid", "Kp", f"{len(terms.Kp)} gains", f"{len(plant.inputs)}, one for each input")
     part = machine_part(

@@ -377,6 +377,14 @@ class Spec:
         return Description(f"Spec {self.name!r} of {self.path.name}", tuple(rows))
 
 
+def require_pairs(plant: Plant) -> None:
+    """Raise InputError unless a machine has as many forces as measurements."""
+    if len(plant.inputs) != len(plant.outputs):
+        found = f"{len(plant.inputs)} forces and {len(plant.outputs)} measurements"
+        expected = "as many of both: a PID has one of each for every axis; an LQG takes any numbers"
+        raise InputError(plant.name, "pid", found, expected)
+
+
 def pid_signals(plant: Plant, axes: PidAxes = "decentralized") -> dict[str, list[Signal]]:
     """Name the gains of a PID, and its filters: each table with one signal for every axis, and the gain's unit.
 
@@ -386,9 +394,7 @@ def pid_signals(plant: Plant, axes: PidAxes = "decentralized") -> dict[str, list
         names = [s.name for s in plant.design_states[: plant.coordinates]]
         units = {"Kp": "1/s^2", "Ki": "1/s^3", "Kd": "1/s", "filters": "s"}
         return {table: [Signal(name, unit) for name in names] for table, unit in units.items()}
-    if len(plant.inputs) != len(plant.outputs):
-        found = f"{len(plant.inputs)} forces and {len(plant.outputs)} measurements"
-        raise InputError(plant.name, "pid", found, "as many of both: a PID has one of each for every axis")
+    require_pairs(plant)
     pairs = list(zip(plant.inputs, plant.outputs, strict=True))
     return {
         "Kp": [Signal(i.name, f"({i.unit}) / ({o.unit})") for i, o in pairs],

@@ -20,7 +20,7 @@ from malta.margins.verify import controller_poles
 from malta.simulation.inputs import lagging_references
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import with_lags
-from malta.synthesis.lqg import gains, integral_weight, lqg, weights
+from malta.synthesis.lqg import gains, integrals_of, lqg, weights
 from malta.synthesis.riccati import add_integrals, delay_inputs, eigenvalues, sample, sample_cost
 from malta.synthesis.spec import Spec
 
@@ -60,7 +60,7 @@ def test_the_gains_are_those_of_the_model_with_lags_and_delay(made: Made) -> Non
     assert (c.lagging, c.delay, c.observed) == (1, 1, 0)
     Q, N, R = sample_cost(A, B, linalg.block_diag(w.Q, np.zeros((5, 5))), w.R, TS)
     zeros = np.zeros((5, 5))
-    Q_i = integral_weight(made.model, w) * TS
+    Q_i = integrals_of(made.model, w).weight * TS
     full = np.block([[Q, N, np.zeros((15, 5))], [N.T, R - w.R * TS, zeros], [np.zeros((5, 20)), Q_i]])
     Ai, Bi = add_integrals(c.Ad, c.Bd, c.Cd, TS)
     X, _, _ = control.dare(Ai, Bi, full, w.R * TS, method="scipy")

@@ -153,3 +153,30 @@ def test_a_large_algebraic_loop_is_refused() -> None:
         "an algebraic loop of 5 signals"
         in refusal(lambda: feedback(system, np.eye(n)), Path("feedback")).found
     )
+
+
+def test_connected_by_names_is_connected_by_hand() -> None:
+    """A loop by names has the answer of `feedback`; what nothing feeds, doubles or does not exist is refused."""
+    plant = malta.uncertain(
+        lambda m, k: ([[0, 1], [-k / m, -0.2]], [[0], [1 / m]], [[1, 0]]), {"m": 0.1, "k": 2.0}
+    )
+    law = control.tf([3, 40], [1, 60], inputs="e", outputs="u")
+    error = control.summing_junction(["r", "-y"], "e")
+    by_names = malta.proof.interconnect([error, law, (plant, "u", "y")], ["r", "u"], ["y", "u"])
+    by_hand = malta.proof.feedback(plant, law)
+    w = np.array([0.1, 1.0, 7.0, 80.0])
+    for values in ({"m": 0.1, "k": 2.0}, {"m": 0.05, "k": 9.0}):
+        one, two = by_names.state_space(**values), by_hand.state_space(**values)
+        found = one.frequency_response(w).complex
+        assert found[0, 1] == pytest.approx(np.ravel(two.frequency_response(w).complex), rel=1e-9)
+        K = np.ravel(control.ss(law).frequency_response(w).complex)
+        assert found[0, 0] == pytest.approx(found[0, 1] * K, rel=1e-9)  # r reaches the plant by the law
+        assert found[1, 0] == pytest.approx(K * (1 - found[0, 0]), rel=1e-9)  # the law's own output
+    for systems, inputs, outputs, word in (
+        ([(plant, "u", "y")], "r", "y", "inputs"),
+        ([(plant, "u", "y"), law], "u", "y", "that nothing feeds"),
+        ([(plant, "u", "y"), (plant, "u", "y")], "u", "y", "differ"),
+        ([(plant, ["u", "v"], "y")], "u", "y", "1 and 1 of them"),
+    ):
+        with pytest.raises(malta.InputError, match=word):
+            malta.proof.interconnect(systems, inputs, outputs)

@@ -93,7 +93,7 @@ def test_control_lqr_gives_the_continuous_gains(shipped: Design) -> None:
     K = control.lqr(m.A, m.B, w.Q, w.R, method="scipy")[0]
     assert apart(K, malta.synthesis.lqr(m, w)) < 1e-9
     if w.q_i.any():
-        Q = linalg.block_diag(w.Q, lqg.integral_weight(m, w))
+        Q = linalg.block_diag(w.Q, lqg.integrals_of(m, w).weight)
         K = control.lqr(m.A, m.B, Q, w.R, integral_action=m.C, method="scipy")[0]
         assert apart(K, np.hstack(malta.synthesis.lqi(m, w))) < 1e-12
 

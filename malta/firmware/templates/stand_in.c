@@ -24,11 +24,25 @@ static {{ name }}_real noise_of(stand_in *m) {
 /* Readings of a sample; flies: whether the machine follows its reference, or rests. */
 static void read_stand_in(stand_in *m, int32_t flies, const {{ name }}_state *s,{{ " const %s_outputs *last,"|format(name) if driven }} {{ name }}_inputs *in) {
   static const {{ name }}_real noise[{{ outputs }}] = { {{ noise }} };
+{% if reached is defined %}
+  static const {{ name }}_real reached[{{ outputs }} * {{ outputs }}] = { {{ reached }} }; /* by references, at rest */
+{% endif %}
   {{ name }}_real place[{{ outputs }}];
   int32_t k;
   for (k = 0; k < {{ outputs }}; k++) {
     m->drawn[k] = (m->back == 1) ? -m->drawn[k] : (noise_of(m) * noise[k]); /* in pairs: no sum of errors drifts */
+{% if reached is defined %}
+    place[k] = m->rest[k];
+    if (flies == 1) {
+      int32_t j;
+      place[k] = {{ zero }};
+      for (j = 0; j < {{ outputs }}; j++) {
+        place[k] = place[k] + (reached[(k * {{ outputs }}) + j] * s->reference.p[j]);
+      }
+    }
+{% else %}
     place[k] = (flies == 1) ? s->reference.p[k] : m->rest[k];
+{% endif %}
     in->y[k] = place[k] + m->drawn[k];
     in->y_valid[k] = {{ one }};
   }

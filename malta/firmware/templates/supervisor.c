@@ -1070,9 +1070,19 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
     leave_out(sup, &seen);
     {{ name }}_step(s, &seen, out);
 {% endif %}
+{% if forces == outputs %}
     for (k = 0; k < OUTPUTS; k++) {
       sup->limited[k] = out->saturated[k];
     }
+{% else %}
+    for (k = 0; k < OUTPUTS; k++) { /* a force is of no output alone */
+      int32_t j;
+      sup->limited[k] = {{ zero }};
+      for (j = 0; j < {{ forces }}; j++) {
+        sup->limited[k] = (out->saturated[j] > sup->limited[k]) ? out->saturated[j] : sup->limited[k];
+      }
+    }
+{% endif %}
 {% if currents %}
     sup->commanded = 0;
     for (k = 0; k < {{ coils }}; k++) {

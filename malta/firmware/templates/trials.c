@@ -482,7 +482,7 @@ static void try_row(record *all, int32_t r, int32_t from, int32_t k) {
   } else {
     all->acted[r]++;
     const int32_t next = state_after(all, state, strongest_of(before, &f.sup));
-{% if only_stroke %}
+{% if only_stroke or reached is defined %}
     if ((f.sup.state != next) && (state != {{ NAME }}_LANDING)) { /* a landing ends without its sensor */
 {% else %}
     if (f.sup.state != next) {

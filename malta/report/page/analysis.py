@@ -223,13 +223,20 @@ def _machine(subject: Subject) -> Iterator[Entry]:
         yield Entry("uncertainty", name, share, "1")
 
 
+def _sums(c: Controller) -> str:
+    """The outputs whose errors a law integrates: "yes" for all of them, "" for none."""
+    if len(c.summed) == len(c.measurements):
+        return "yes"
+    return " ".join(c.measurements[k].name for k in c.summed)
+
+
 def _law(subject: Subject) -> Iterator[Entry]:
     c = subject.controller
     yield Entry("law", "kind", kind_of(c))
     yield Entry("law", "sample time", c.sample_time, "s")
     yield Entry("law", "delay in the design model", float(c.delay), "1")
     yield Entry("law", "lag of the current loops in the design model", "yes" if c.lagging else "no")
-    yield Entry("law", "integrals of errors", "yes" if c.integrating else "no")
+    yield Entry("law", "integrals of errors", _sums(c) or "no")
     yield Entry("law", "observed forces of disturbance", "yes" if c.observed else "no")
     yield Entry("law", "commutation", "measured place" if c.commutation is None else "predicted place")
     spec = subject.written_from
@@ -402,7 +409,8 @@ def summary_sentences(a: Analysis) -> list[str]:
     sentences = [text]
     parts = []
     if c.integrating:
-        parts.append("integrates the errors")
+        whole = len(c.summed) == len(c.measurements)
+        parts.append("integrates the errors" if whole else f"integrates the errors of {_sums(c)}")
     if c.observed:
         parts.append("estimates constant disturbance forces")
     if c.lagging:

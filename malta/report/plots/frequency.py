@@ -296,7 +296,7 @@ def gang_of_four(source: Any, controller: Any = None, *, channel: Channel = None
     source : a plant; LoopSystems; a system of python-control, the loop gain L of negative feedback or the plant P of
         L = P C; or a table name -> loop, where a pair is a tuple
     controller : of the plant, or the system C; None: the source has it
-    channel : outputs, by name; None: all. Output i stands with force i, of the same axis
+    channel : outputs, by name; None: all. Output i stands with force i, of the same axis, or with the last force
     axes : four for each channel, row by row; None: a new figure
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
@@ -318,12 +318,11 @@ def gang_of_four(source: Any, controller: Any = None, *, channel: Channel = None
         shown, force = [], ""
         for loop, curves, k, _ in having(loops, name, "sensors"):
             r = curves.responses
-            if k >= len(curves.loop.inputs):
-                continue
-            of_force = curves.loop.inputs[k]
-            force = of_force.unit
-            for panel, G in zip(panels, (r.S, r.T, r.SP, r.FS), strict=True):
-                panel.plot(curves.w, np.abs(G[:, k, k]), **styles[loop])
+            j = min(k, len(curves.loop.inputs) - 1)
+            force = curves.loop.inputs[j].unit
+            places = ((r.S, k, k), (r.T, k, k), (r.SP, k, j), (r.FS, j, k))
+            for panel, (G, row_of, column) in zip(panels, places, strict=True):
+                panel.plot(curves.w, np.abs(G[:, row_of, column]), **styles[loop])
             shown.append(curves)
         panels[0].set_title(plain(name), fontsize=8.5, loc="left", pad=3, fontweight="bold")
         units = ("-", "-", _ratio(unit, force), _ratio(force, unit))

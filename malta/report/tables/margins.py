@@ -300,8 +300,9 @@ def gang_table(found: LoopReport) -> Table:
      y        1.57   1.72                    430.5                  0.034
     <BLANKLINE>
     """
-    pairs = zip(found.plant.outputs, found.plant.inputs, strict=False)
-    units = {output.name: axis_units(output.unit, force.unit) for output, force in pairs}
+    outputs, forces_of = found.plant.outputs, found.plant.inputs
+    last = len(forces_of) - 1
+    units = {s.name: axis_units(s.unit, forces_of[min(k, last)].unit) for k, s in enumerate(outputs)}
     one = next(iter(units.values())) if len(set(units.values())) == 1 else None
     heads = (f" [{unit}]" for unit in one[:2]) if one else ("", "")
     extent = found.extent
