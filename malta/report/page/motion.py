@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.archives import read_npz
-from malta.display import quantity
+from malta.display import micro, quantity
 from malta.errors import InputError
 from malta.files import read_file
 from malta.model.rigidbody import Body, rotation
@@ -262,12 +262,13 @@ def motion_page(found: Motion | Sequence[Motion], about: str = "") -> Page:
     while len(json_in_page(data)) > LARGEST and every < FRAMES:
         every *= 2
         data = _page_data(runs, every)
+    title = runs[0].title if len(runs) == 1 else f"{len(runs)} runs"
     policy, script = script_of(Path(__file__).with_name("motion.js").read_text(encoding="utf-8"))
     page = render_template(
-        "motion.html.jinja", title=runs[0].title, about=about, style=Markup(page_style()), script=Markup(script),
+        "motion.html.jinja", title=title, about=about, style=Markup(page_style()), script=Markup(script),
         policy=policy, data=Markup(json_in_page(data)),
     )  # fmt: skip
-    return Page(f"{runs[0].title}: in motion", page)
+    return Page(f"{title}: in motion", page)
 
 
 def _page_data(runs: Sequence[Motion], every: int) -> dict[str, Any]:
@@ -289,7 +290,7 @@ def _run_data(run: Motion, every: int) -> dict[str, Any]:
     """A run for the page: what stands still has one pose."""
     shown = np.append(np.arange(0, len(run.t) - 1, every), len(run.t) - 1)
     return {
-        "name": run.title, "ended": run.ended, "t": _rounded(run.t[shown]), "factor": run.factor,
+        "name": micro(run.title), "ended": run.ended, "t": _rounded(run.t[shown]), "factor": run.factor,
         "bodies": [
             {"poses": _rounded(poses[shown] if body.moves else poses[:1]), "mean": _rounded(poses.mean(axis=0)),
              "small": small.tolist()}
