@@ -101,7 +101,7 @@ def read_motion(file: str | Path, plant: Plant, *, frames: int = FRAMES) -> Moti
     plant : the machine
     frames : at most so many
 
-    Raises InputError for a machine without bodies, and a file that is none of a run of it.
+    Raises InputError for a machine without bodies, and a file that holds no run of it.
     """
     arrays = _series(Path(file), plant)
     ended = str(np.ravel(arrays.get("verdict", [""]))[0])
