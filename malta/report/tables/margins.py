@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from malta.report.figures.drawing import Published
     from malta.synthesis.spec import Spec
 
-PROVEN = ("proven", "lost at", RADIANS, "first to give")  # headings of a proof
+PROVEN = ("proven", "lost at", "rad/s", "first to give")  # headings of a proof; 80 columns have no room for Hz
 WAYS = ("down", "up")
 NEAREST = 3  # requirements that are named though they hold
 
@@ -123,15 +123,15 @@ def chain_table(found: LoopReport) -> Table:
     Where the margin goes: margin in multiples of the uncertainty box, 100 % is the
     box
     <BLANKLINE>
-                                               first
-                                                  to  peak
-     stage      proven    lost at  rad/s (Hz)   give   |S|  zone               of
-     ────────────────────────────────────────────────────────────────────────────
-     LQR      499.95 %  not found                     1.00                 forces
-     LQI      499.95 %  not found                     1.00                 forces
-     LQG      390.34 %   390.34 %  1006 (160)     m-  1.60     A          sensors
-     LQGI     386.27 %   386.27 %  1010 (161)     m-  1.64     A          sensors
-     sampled  390.69 %   390.69 %  1047 (167)     m-  1.57     A  sensors, loaded
+                                              first
+                                                 to   peak
+     stage       proven     lost at   rad/s    give    |S|   zone                of
+     ──────────────────────────────────────────────────────────────────────────────
+     LQR       499.95 %   not found                   1.00                   forces
+     LQI       499.95 %   not found                   1.00                   forces
+     LQG       390.34 %    390.34 %    1006      m-   1.60      A           sensors
+     LQGI      386.27 %    386.27 %    1010      m-   1.64      A           sensors
+     sampled   390.69 %    390.69 %    1047      m-   1.57      A   sensors, loaded
     <BLANKLINE>
     """
     proven = any(link.margin is not NOT_PROVEN for link in found.chain)
@@ -201,14 +201,14 @@ def _coverage_text(found: LoopReport) -> str:
 
 
 def _margin_cells(margin: Margin) -> tuple[str, str, str]:
-    """Proven share, share at which the loop is lost, frequency in rad/s and Hz."""
+    """Proven share, share at which the loop is lost, frequency in rad/s."""
     if margin is NOT_PROVEN:
         return "not asked", "", ""
     low = "nothing" if margin.lower is None else f"{100 * margin.lower:.2f} %"
     if margin.time_up:
         low += " so far"
     high = "not found" if margin.exhausted else f"{100 * margin.upper:.2f} %"
-    return low, high, "" if margin.frequency is None else frequency(margin.frequency)
+    return low, high, "" if margin.frequency is None else f"{margin.frequency:.4g}"
 
 
 def _limiting_parameters(margin: Margin) -> str:
@@ -425,11 +425,11 @@ def places_table(found: LoopReport) -> Table:
     >>> rich.print(malta.report.places_table(found))
     The machine's loop: margins without the loads, the rest under them
     <BLANKLINE>
-                                                 peak        disk,
-     at            proven   lost at  rad/s (Hz)   |S|  zone    all         delay
-     ───────────────────────────────────────────────────────────────────────────
-     its values  390.69 %  390.69 %  1047 (167)  1.57     A  0.400      2719 µs,
-                                                                    13.6 samples
+                                            peak        disk,
+     at            proven   lost at  rad/s   |S|  zone    all         delay
+     ──────────────────────────────────────────────────────────────────────
+     its values  390.69 %  390.69 %   1047  1.57     A  0.400      2719 µs,
+                                                               13.6 samples
     <BLANKLINE>
     """
     extent = found.extent
