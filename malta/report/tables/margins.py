@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from malta.report.figures.drawing import Published
     from malta.synthesis.spec import Spec
 
-PROVEN = ("proven", "lost at", "rad/s", "first to give")  # headings of a proof; 80 columns have no room for Hz
+PROVEN = ("proven", "lost at", "rad/s", "first to give")  # of a proof; no room for Hz
 WAYS = ("down", "up")
 NEAREST = 3  # requirements that are named though they hold
 
