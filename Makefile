@@ -76,7 +76,8 @@ links: $(VENV)/docs  # needs a network
 bench: $(VENV)/dev  # with PAGE=docs/benchmarks.md it writes that page
 	$(BIN)/python bench/run.py $(if $(PAGE),--page $(PAGE))
 
-figures: $(VENV)/dev  # the pictures of the README, of the theory pages and of the gallery
+figures: $(VENV)/dev  # the pictures of the README, of the theory pages, of notebooks that were executed, and of the gallery
+	$(BIN)/python docs/notebook_pages.py
 	$(BIN)/python docs/page_figures.py
 	$(BIN)/python -c "import malta; c = malta.gains.read('design/gains/calibrated.json'); \
 	  run = malta.simulate(malta.plant_of(c.parameters), c, malta.Scenario.stroke()); \

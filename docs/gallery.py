@@ -62,14 +62,14 @@ def draw(names: list[str]) -> Iterator[Path]:
 
 
 def few_colours(picture: Image.Image) -> Image.Image:
-    """A picture of COLOURS colours, of which the paper keeps its own."""
-    found = picture.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    """A picture of its COLOURS most frequent colours, which stay as they are: one of each cube of 16 a side."""
     rows, counts = np.unique(np.asarray(picture).reshape(-1, 3), axis=0, return_counts=True)
-    place = int(np.bincount(np.asarray(found).ravel()).argmax())
-    palette = found.getpalette() or []
-    palette[3 * place : 3 * place + 3] = rows[counts.argmax()].tolist()
-    found.putpalette(palette)
-    return found
+    rows = rows[np.argsort(-counts, kind="stable")]
+    _, first = np.unique(rows // 16, axis=0, return_index=True)
+    chosen = rows[np.sort(first)[:COLOURS]]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.resize(chosen, (256, 3)).ravel().tolist())
+    return picture.quantize(palette=palette, dither=Image.Dither.NONE)
 
 
 def pictures(name: str, command: str, folder: Path) -> tuple[Image.Image | None, Image.Image | None]:

@@ -399,6 +399,27 @@ def positioning() -> Figure:
     return figure
 
 
+def coils() -> Figure:
+    """Currents of least loss of a plate's four coils, with all of them and with the first one open."""
+    corners = [[1, 1, 1, 1], [1, 1, -1, -1], [-1, 1, 1, -1]]  # lift, roll, pitch
+    figure, panels = new_figure(2, height=2.6)
+    for axes, forces, title in zip(
+        panels, ([4, 0, 0], [4, 1, 0]), ("lift of 4", "lift of 4, roll of 1"), strict=True
+    ):
+        for k, (failed, label) in enumerate((((), "all coils"), ((0,), "coil 1 open"))):
+            currents = malta.model.allocation(corners, failed=list(failed)).currents(forces)
+            axes.bar(
+                np.arange(1, 5) + 0.38 * (k - 0.5),
+                currents,
+                0.36,
+                color=("#c9d3de", "#404a55")[k],
+                label=label,
+            )
+        axes.set_xticks(range(1, 5))
+        finish(axes, "coil", "current", title)
+    return figure
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "value_sets": value_sets,
     "cell": cell,
@@ -411,6 +432,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "current_noise": current_noise,
     "bode": bode,
     "positioning": positioning,
+    "coils": coils,
 }
 
 

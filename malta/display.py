@@ -111,6 +111,18 @@ def number(value: float, digits: int = 4) -> str:
     return text if float(text) else "0"
 
 
+RADIANS = "rad/s (Hz)"
+
+
+def frequency(w: float, digits: int = 4) -> str:
+    """A frequency in rad/s with the same in Hz beside it, for a column that is headed RADIANS.
+
+    >>> frequency(471.2)
+    '471.2 (75.0)'
+    """
+    return f"{number(w, digits)} ({number(w / (2 * math.pi), 3)})"
+
+
 def micro(text: str) -> str:
     """A text with µm for um, and other units alike."""
     return re.sub(r"\bu(?=(?:rad|[msANV])\b)", "µ", text)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, fields
 from typing import Any, Literal, NamedTuple
 
-from malta.display import micro, number
+from malta.display import RADIANS, frequency, micro, number
 from malta.units import distinct, identifier, in_unit
 
 Better = Literal["high", "low", ""]  # "": neither
@@ -104,13 +104,15 @@ class Merit(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The value in its unit, with four digits."""
+        """The value in its unit, with four digits; a frequency in Hz too."""
         if self.kind == "stable":
             return "yes" if self.value else "NO"
         if math.isnan(self.value):
             return "none"
         if math.isinf(self.value):
             return "any"
+        if self.unit == "rad/s":
+            return frequency(self.value)
         factor, _ = ROOTS.get(self.unit) or (in_unit(1.0, self.unit), "")
         return four_digits(factor * self.value)
 
@@ -118,7 +120,7 @@ class Merit(NamedTuple):
     def heading(self) -> str:
         """The label with the unit in brackets."""
         unit = ROOTS[self.unit][1] if self.unit in ROOTS else self.unit
-        shown = {"percent": "%", "1": ""}.get(unit, micro(unit))
+        shown = {"percent": "%", "1": "", "rad/s": RADIANS}.get(unit, micro(unit))
         return f"{self.label} [{shown}]" if shown else self.label
 
     def phrase(self, digits: int = 3) -> str:

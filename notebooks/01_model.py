@@ -62,15 +62,6 @@ for at in (0, 5e-3, 10e-3, 15e-3):
 assert np.ptp(poles[:, 2]) / poles[30, 2] < 0.054
 assert np.ptp(poles[:, 0] * poles[:, 2]) < 1e-6 * poles[30, 0] * poles[30, 2]
 
-# %%
-figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-left.plot(z * 1e3, poles[:, 2], color="black", label="x, y")
-left.plot(z * 1e3, poles[:, 0], color="0.5", linestyle="--", label="alpha, beta")
-left.axhline(table["x"], color="0.7", linewidth=0.8)
-left.axhline(table["alpha"], color="0.7", linewidth=0.8)
-left.set(xlabel="operating point z_ss [mm]", ylabel="unstable pole [rad/s]", ylim=(130, 250))
-left.legend(frameon=False)
-
 # %% [markdown]
 # ## Exact and small-angle equations
 # The paper puts sin a = a and cos a = 1. The error in the tilting acceleration grows with the square of the tilt; where
@@ -84,12 +75,21 @@ rates = {
     for p in (plant, small)
 }
 error = np.abs(rates[small][:, 9] / rates[plant][:, 9] - 1)
+assert error.max() < 5e-5
+assert abs(np.log(error[-1] / error[0]) / np.log(tilts[-1] / tilts[0]) - 2) < 0.05
+
+# %%
+figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+left.plot(z * 1e3, poles[:, 2], color="black", label="x, y")
+left.plot(z * 1e3, poles[:, 0], color="0.5", linestyle="--", label="alpha, beta")
+left.axhline(table["x"], color="0.7", linewidth=0.8)
+left.axhline(table["alpha"], color="0.7", linewidth=0.8)
+left.set(xlabel="operating point z_ss [mm]", ylabel="unstable pole [rad/s]", ylim=(130, 250))
+left.legend(frameon=False)
 right.loglog(tilts * 1e3, error, color="black")
 right.set(xlabel="tilt alpha [mrad]", ylabel="error of alpha'' with small angles [1]")
 for axes in (left, right):
     axes.grid(color="0.9")
-assert error.max() < 5e-5
-assert abs(np.log(error[-1] / error[0]) / np.log(tilts[-1] / tilts[0]) - 2) < 0.05
 figure.savefig("build/01_model.png", dpi=120)
 
 # %% [markdown]

@@ -160,7 +160,7 @@ class Setting(NamedTuple):
 def study_of(name: str | None, limit: str | None, keep: str | None, cluster: str | None) -> Study | None:
     """The study that the options ask for; None for a plain campaign.
 
-    Raises InputError for an unknown study, for a cluster, and for a limit or a yield that is none or has no study.
+    Raises InputError for an unknown study, for a cluster, and for an invalid limit or yield, and one without its study.
     """
     if name is None:
         for option, given in (("--limit", limit), ("--keep", keep)):

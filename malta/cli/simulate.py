@@ -327,16 +327,30 @@ def _conclude(gains: Path, simulation: Simulation, engine: str) -> None:
         raise CheckError(f"{gains}: {simulation.scenario}: {result.outcome}")
 
 
-# `malta motion`: the bodies of a machine as they move in a run, from the run's file.
+# `malta motion`: the bodies of a machine as they move, from the files of runs and from runs that are simulated for it.
 
 
 def motion(
     gains: GainFile,
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="A .npz file of malta simulate --out.")],
+    run: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[RUN]...", help="Files (.npz) of malta simulate --out: a button each."),
+    ] = None,
+    scenario: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Simulate this too, a button for each of its runs, as faults. Repeatable.",
+            autocompletion=scenarios,
+        ),
+    ] = None,
+    witness: Annotated[
+        bool, typer.Option("--witness", help="Fly machines inside and beyond the proven margin too.")
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="A page (.html) or an animated picture (.gif). [build/RUN_motion.html]"
+            metavar="FILE",
+            help="A page (.html), or an animated picture (.gif) of the first run. [build/RUN_motion.html]",
         ),
     ] = None,
     machine: MachineFile = None,
@@ -344,22 +358,37 @@ def motion(
     """Show the machine in motion: its bodies in three dimensions, as they move in a run.
 
     The page needs no network: drag the machine to turn it, go through time with the scrubber, magnify small motion.
-    Bodies are those that the machine's module describes: Plant(bodies=...).
+    Buttons choose among the runs. Bodies are those that the machine's module describes: Plant(bodies=...).
 
     \b
-    Example:  malta motion design/gains/robust.json build/robust_stroke.npz
+    Examples:  malta motion design/gains/robust.json build/robust_stroke.npz
+               malta motion design/gains/robust.json --scenario stroke --scenario faults --witness
     """
     from malta.files import replace_files
+    from malta.gains.file import content_of
     from malta.model.data import plant_of
-    from malta.report.page.motion import motion_gif, motion_page, read_motion
+    from malta.report.page.motion import motion_gif, motion_of, motion_page, read_motion
+    from malta.simulation.experiments.catalogue import experiment, witness_flights
 
     controller = read_controller(gains, machine)
-    file = out or Path("build") / f"{run.stem}_motion.html"
+    if not (run or scenario or witness):
+        raise InputError("motion", "", "no run", "files of runs, --scenario NAME, or --witness")
+    stem = run[0].stem if run else "_".join([controller.name, *(scenario or ["witness"])[:1]])
+    file = out or Path("build") / f"{stem}_motion.html"
     if file.suffix not in (".html", ".gif"):
         raise InputError("--out", "", f"suffix {file.suffix!r}", ".html or .gif")
     plant = plant_of(controller.parameters)
-    found = read_motion(run, plant)
+    found = [read_motion(one, plant) for one in run or ()]
+    for name in scenario or ():
+        cases = experiment(name, plant, controller).cases
+        found += [motion_of(case.run, case.label if len(cases) > 1 else name) for case in cases]
+    if witness:
+        robust = content_of(gains)[0].verification.robust
+        point = None if robust is None else robust.witness
+        if point is None:
+            raise InputError(gains, "verification.robust.witness", "none", "a margin with a witness")
+        found += [motion_of(case.run, case.label) for case in witness_flights(plant, controller, point)]
     about = f"Design {controller.name}, machine {plant.name}"
-    content = motion_gif(found) if file.suffix == ".gif" else motion_page(found, about).content
+    content = motion_gif(found[0]) if file.suffix == ".gif" else motion_page(found, about).content
     replace_files({file: content})
     print_written(make_console(), [file])

@@ -47,7 +47,7 @@ def origin_of(
     current_loops : the stage, see `chosen_loops`
     loops : how many; several are those of places along the travel
 
-    Raises InputError for a file that is none.
+    Raises InputError for a file of another kind.
     """
     content = content_of(locate(Path(gains)))[1]
     law = {key: value for key, value in content.items() if key not in APART}
@@ -70,7 +70,7 @@ def disagreement(
 
     Returns one sentence, empty where the claim covers those of the gain file.
 
-    Raises InputError for a file that is none, for one without uncertain parameters, and for unknown ones.
+    Raises InputError for a file of another kind, for one without uncertain parameters, and for unknown ones.
     """
     claim, path = document.claim, locate(Path(gains))
     controller, content = read(path), content_of(path)[1]

@@ -278,7 +278,7 @@ def _digest_of(bench: Bench) -> str:
 def _entries_before(folder: Path, now: Commissioning) -> dict[str, Entry]:
     """The entries of a journal that passed with these gains on this bench, and whose logs are as they were.
 
-    Raises InputError for a journal that is none, or whose signature is not its own.
+    Raises InputError for a file that holds no journal, or a journal with another signature.
     """
     path = folder / JOURNAL
     if not path.exists():
@@ -297,7 +297,7 @@ def _entries_before(folder: Path, now: Commissioning) -> dict[str, Entry]:
 
 
 def read_journal(path: Path) -> tuple[Commissioning, str]:
-    """A journal and the signature that stands in it. Raises InputError for a file that is none."""
+    """A journal and the signature that stands in it. Raises InputError for a file of another kind."""
     try:
         content = json.loads(read_file(path, "journal", Path.read_bytes, LARGEST))
         entries = []

@@ -80,7 +80,7 @@ def root_locus(
     channel : the channel whose gain is changed, the others as they are; None: all
     at : where the gain is changed, "sensors" or "forces"
 
-    Raises InputError for an unknown parameter, a range that is none, and a value that the machine cannot have.
+    Raises InputError for an unknown parameter, an invalid range, and a value that the machine cannot have.
 
     >>> import control
     >>> found = root_locus(control.tf([1], [1, 3, 2, 0]), span=(1, 10))

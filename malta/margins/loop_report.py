@@ -474,4 +474,5 @@ def _requirements(a: LoopReport) -> Iterator[Merit]:
         if several:
             name, words = f"{name} {one.how}", f"{words}, {one.how}"
         kind = "at_least" if one.at_least else "at_most"
-        yield figure(kind, name, words, one.found, FINE.get(one.unit, one.unit), bound=one.asked)
+        unit = "percent" if one.name == "margin" else FINE.get(one.unit, one.unit)
+        yield figure(kind, name, words, one.found, unit, bound=one.asked)

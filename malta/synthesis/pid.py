@@ -55,7 +55,7 @@ def pid(
 
     The filter is Ts a / (1 - a) behind p*', so Kd would push with that time's Kd p*'': the feedforward takes it off.
 
-    Raises InputError for a sample time that is none, terms of another number than the inputs, states that are not
+    Raises InputError for an invalid sample time, more or fewer terms than inputs, states that are not
     positions and their rates; CheckError where the inputs cannot accelerate each coordinate by itself.
     """
     if not (math.isfinite(Ts) and Ts > 0):

@@ -346,7 +346,7 @@ def test_records_that_are_no_steps_are_refused() -> None:
     with pytest.raises(malta.InputError, match="7 readings at 7 times, expected 8 or more"):
         fit_servo(t[:7], t[:7], 2e-3, 205.0)
     for x, K in ((t * np.nan, 205.0), (t, -1.0)):
-        with pytest.raises(malta.InputError, match="finite ones, K above 0"):
+        with pytest.raises(malta.InputError, match="finite numbers, K above 0"):
             fit_servo(t, x, 2e-3, K)
     with pytest.raises(malta.CheckError, match="no servo of 205 N/m fits the record"):
         fit_servo(t[:10], servo_step(t[:10], 3.75, 9.41, 205.0, 2e-3), 2e-3, 205.0)

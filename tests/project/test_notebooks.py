@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import runpy
 from pathlib import Path
 from typing import Any
@@ -146,6 +147,19 @@ def test_pictures_are_on_the_pages(notebook: Path) -> None:
             shown, found = pictures(cell), found + pictures(cell)
             assert shown >= len(calls_of(ast.parse(cell["source"])))
     assert found
+
+
+@pytest.mark.parametrize("notebook", [pytest.param(n, id=n.stem) for n in NOTEBOOKS])
+def test_the_published_page_is_that_of_the_notebook(notebook: Path) -> None:
+    """The same code in the same order, every picture at its place, and at least one."""
+    folder = ROOT / "docs" / "notebooks"
+    page = (folder / f"{notebook.stem}.md").read_text(encoding="utf-8")
+    code = re.findall(r"^(```|~~~)python\n(.*?)\n\1$", page, re.MULTILINE | re.DOTALL)
+    assert [cell for _, cell in code] == [part.partition("\n")[2].strip("\n") for part in cells_of(notebook)]
+    shown = re.findall(r"^!\[.+\]\((\S+)\)$", page, re.MULTILINE)
+    assert shown
+    assert {*shown} == {file.name for file in folder.glob(f"{notebook.stem}_*.png")}
+    assert all((folder / name).stat().st_size < 100_000 for name in shown)
 
 
 def test_the_picture_of_a_figure_is_its_file(tmp_path: Path) -> None:

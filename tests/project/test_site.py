@@ -61,6 +61,14 @@ def test_every_page_is_in_a_table_of_contents() -> None:
     assert {*PAGES} - reached == set()
 
 
+@pytest.mark.parametrize("page", [page for page in PAGES if page.parent.name == "howto" and page.stem != "index"],
+                         ids=lambda page: page.stem)  # fmt: skip
+def test_every_how_to_has_a_picture(page: Path) -> None:
+    shown = re.findall(r"^!\[(.+)\]\((\S+)\)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert shown
+    assert all((page.parent / file).is_file() for _, file in shown)
+
+
 def _commands(page: Path) -> list[str]:
     text = page.read_text(encoding="utf-8")
     blocks = [(kind, block) for kind, block in FENCED.findall(text) if kind in SHELL]

@@ -50,6 +50,11 @@ def stroke(run_file: Path) -> Motion:
     return read_motion(run_file, malta.plant_of(malta.gains.read(GAINS).parameters))
 
 
+def runs_of(html: str) -> Any:
+    """The runs in a page."""
+    return json.loads(re.findall(r"id=\"motion-data\">(.*?)</script>", html, re.DOTALL)[0])["runs"]
+
+
 @pytest.mark.parametrize("form", ["box", "cylinder"])
 def test_a_body_is_closed_and_its_faces_look_outwards(form: Any) -> None:
     """Every edge belongs to two faces, which go through it in opposite directions; the volume is that of the body."""
@@ -104,10 +109,37 @@ def test_the_page_has_the_run_and_runs_no_other_script(stroke: Motion) -> None:
     assert "<b>about" not in html
     assert not re.search(r"(src|href)=\"(?!data:)", html)
     assert re.search(r"script-src 'sha256-[\w+/]{43}='", html)
-    data = json.loads(re.findall(r"id=\"motion-data\">(.*?)</script>", html, re.DOTALL)[0])
-    assert data["bodies"][-1]["poses"][-1][2] == pytest.approx(5e-3, rel=0.02)
-    z = next(one for one in data["signals"] if one["name"] == "z")
+    (only,) = runs_of(html)
+    assert only["bodies"][-1]["poses"][-1][2] == pytest.approx(5e-3, rel=0.02)
+    z = next(one for one in only["signals"] if one["name"] == "z")
     assert (z["unit"], z["values"][0]) == ("mm", pytest.approx(-5, rel=1e-3))
+
+
+def test_many_runs_stay_in_a_small_page_with_fewer_frames_each(
+    stroke: Motion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each run is there from its beginning to its end."""
+    alone = len(motion_page(stroke).html)
+    monkeypatch.setattr("malta.report.page.motion.LARGEST", alone)
+    html = motion_page([stroke] * 5).html
+    assert len(html) < 1.5 * alone
+    for run in runs_of(html):
+        assert len(run["t"]) < len(stroke.t)
+        assert (run["t"][0], run["t"][-1]) == pytest.approx((stroke.t[0], stroke.t[-1]))
+        assert len(run["bodies"][-1]["poses"]) == len(run["t"]) == len(run["signals"][0]["values"])
+
+
+def test_a_machine_inside_its_margin_comes_to_rest_and_beyond_it_touches_down(
+    tmp_path: Path, run: Run
+) -> None:
+    """At 95 and 105 % of the proven margin of the gain file, whose witness is at an end of the travel."""
+    gains = ROOT / "design" / "gains" / "robust.json"
+    run("motion", gains, "--witness", "--out", tmp_path / "m.html")
+    inside, beyond = runs_of((tmp_path / "m.html").read_text(encoding="utf-8"))
+    assert inside["ended"].startswith("completed")
+    assert beyond["ended"].startswith("touchdown")
+    x = [np.array([pose[0] for pose in one["bodies"][-1]["poses"]]) for one in (inside, beyond)]
+    assert np.abs(x[0][-20:]).max() < 0.1 * np.abs(x[0][0]) < 10 * np.abs(x[1][-1])
 
 
 def test_the_picture_moves_and_is_small(stroke: Motion) -> None:
@@ -139,6 +171,8 @@ def test_the_command_writes_and_refuses(run_file: Path, tmp_path: Path, run: Run
     for arguments, words in (
         ((GAINS, cut), "expected a run"),
         ((GAINS, run_file, "--out", tmp_path / "m.pdf"), ".html or .gif"),
+        ((GAINS,), "--scenario NAME, or --witness"),
+        ((GAINS, "--scenario", "fault"), "did you mean 'faults'"),
         ((ROOT / "design" / "gains" / "halbach.json", run_file), "expected those of halbach"),
     ):
         said = run("motion", *arguments)

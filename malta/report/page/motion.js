@@ -3,7 +3,7 @@
 const data = JSON.parse(document.getElementById("motion-data").textContent);
 const $ = (id) => document.getElementById(id);
 const canvas = $("view"), traces = $("traces"), time = $("time"), factor = $("factor"), play = $("play"), state = $("state");
-let frame = 0, turn = data.view[0], height = data.view[1], last = 0, running = false, hidden = new Set();
+let run = data.runs[0], frame = 0, turn = data.view[0], height = data.view[1], last = 0, running = false, hidden = new Set();
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
 // R_RI of Cardan angles: from the stator's frame to the body's.
@@ -22,8 +22,9 @@ function camera() {
   return [right, cross(eye, right), eye];
 }
 
-function placed(body, k) {
-  const pose = body.poses[k].map((v, j) => (body.small[j] ? body.mean[j] + magnified() * (v - body.mean[j]) : v));
+function placed(body, of) {
+  const at = of.poses[Math.min(frame, of.poses.length - 1)];
+  const pose = at.map((v, j) => (of.small[j] ? of.mean[j] + magnified() * (v - of.mean[j]) : v));
   const R = rotation(pose.slice(3));
   return body.points.map((p) => [0, 1, 2].map((j) => R[0][j] * p[0] + R[1][j] * p[1] + R[2][j] * p[2] + pose[j]));
 }
@@ -41,8 +42,8 @@ function pen(node) {
 function drawBodies() {
   const [to, width, tall] = pen(canvas), view = camera(), faces = [];
   const scale = Math.min(width, tall * 1.35) / (1.15 * data.reach);
-  for (const body of data.bodies) {
-    const points = placed(body, frame).map((p) => view.map((row) => dot(row, p)));
+  for (const [n, body] of data.bodies.entries()) {
+    const points = placed(body, run.bodies[n]).map((p) => view.map((row) => dot(row, p)));
     for (const face of body.faces) {
       const [a, b, c] = face.map((n) => points[n]);
       const normal = unit(cross(b.map((v, j) => v - a[j]), c.map((v, j) => v - a[j])));
@@ -68,12 +69,12 @@ function drawBodies() {
 
 // Traces of all signals of one unit above each other, with a line at the frame.
 function drawTraces() {
-  const [to, width, tall] = pen(traces), left = 70, right = width - 8, end = data.t[data.t.length - 1], start = data.t[0];
-  const units = [...new Set(data.signals.map((one) => one.unit))], each = tall / units.length;
+  const [to, width, tall] = pen(traces), left = 70, right = width - 8, end = run.t[run.t.length - 1], start = run.t[0];
+  const units = [...new Set(run.signals.map((one) => one.unit))], each = tall / units.length;
   const toX = (t) => left + ((right - left) * (t - start)) / (end - start || 1);
   to.font = "12px system-ui, sans-serif";
   units.forEach((name, row) => {
-    const shown = data.signals.filter((one) => one.unit === name && !hidden.has(one.name));
+    const shown = run.signals.filter((one) => one.unit === name && !hidden.has(one.name));
     const values = shown.flatMap((one) => one.values);
     let low = Math.min(0, ...values), high = Math.max(0, ...values);
     if (low === high) high = low + 1;
@@ -88,7 +89,7 @@ function drawTraces() {
     to.strokeRect(left, toY(high), right - left, toY(low) - toY(high));
     for (const one of shown) {
       to.beginPath();
-      one.values.forEach((v, k) => to[k ? "lineTo" : "moveTo"](toX(data.t[k]), toY(v)));
+      one.values.forEach((v, k) => to[k ? "lineTo" : "moveTo"](toX(run.t[k]), toY(v)));
       to.strokeStyle = css(`--c${one.k % 4}`);
       to.setLineDash([[], [7, 3], [2, 3], [9, 3, 2, 3]][one.k % 4]);
       to.lineWidth = 1.5;
@@ -98,41 +99,60 @@ function drawTraces() {
   });
   to.strokeStyle = css("--text");
   to.beginPath();
-  to.moveTo(toX(data.t[frame]), 0);
-  to.lineTo(toX(data.t[frame]), tall);
+  to.moveTo(toX(run.t[frame]), 0);
+  to.lineTo(toX(run.t[frame]), tall);
   to.stroke();
 }
 const digits = (v) => (Math.abs(v) >= 1e5 || (v && Math.abs(v) < 1e-3) ? v.toExponential(2) : String(Number(v.toPrecision(4)))).replace("-", "−");
 
 function draw() {
   time.value = frame;
-  time.setAttribute("aria-valuetext", `${digits(1e3 * data.t[frame])} ms`);
-  state.textContent = `${digits(1e3 * data.t[frame])} ms, small motion × ${digits(Number(magnified().toPrecision(2)))}`;
-  for (const one of data.signals) one.cell.textContent = digits(one.values[frame]);
+  time.setAttribute("aria-valuetext", `${digits(1e3 * run.t[frame])} ms`);
+  state.textContent = `${digits(1e3 * run.t[frame])} ms, small motion × ${digits(Number(magnified().toPrecision(2)))}`;
+  for (const one of run.signals) one.cell.textContent = digits(one.values[frame]);
   drawBodies();
   drawTraces();
 }
 
 function step(now) {
   if (!running) return;
-  if (now - last > 40) { last = now; frame = (frame + 1) % data.t.length; draw(); }
+  if (now - last > 40) { last = now; frame = (frame + 1) % run.t.length; draw(); }
   requestAnimationFrame(step);
 }
 
-for (const one of data.signals) {
-  const button = document.createElement("button");
+function signalButton(one) {
+  const button = document.createElement("button"), pressed = () => button.setAttribute("aria-pressed", String(!hidden.has(one.name)));
   one.cell = document.createElement("b");
   button.type = "button";
   button.title = "show or hide";
-  button.setAttribute("aria-pressed", "true");
   button.style.borderLeft = `4px solid var(--c${one.k % 4})`;
   button.append(`${one.name} `, one.cell, ` ${one.unit}`);
-  button.addEventListener("click", () => { if (!hidden.delete(one.name)) hidden.add(one.name); button.setAttribute("aria-pressed", String(!hidden.has(one.name))); draw(); });
-  $("signals").append(button);
+  button.addEventListener("click", () => { if (!hidden.delete(one.name)) hidden.add(one.name); pressed(); draw(); });
+  pressed();
+  return button;
 }
-time.max = data.t.length - 1;
-factor.max = Math.log10(Math.max(10, 10 * data.factor));
-factor.value = Math.log10(data.factor);
+
+// Show a run from its beginning, small motion magnified as its size asks.
+function show(chosen) {
+  run = chosen;
+  frame = 0;
+  time.max = run.t.length - 1;
+  factor.max = Math.log10(Math.max(10, 10 * run.factor));
+  factor.value = Math.log10(run.factor);
+  $("signals").replaceChildren(...run.signals.map(signalButton));
+  for (const [k, button] of [...$("runs").children].entries()) button.setAttribute("aria-pressed", String(data.runs[k] === run));
+  $("ended").textContent = run.ended ? `${run.name}: ${run.ended}` : run.name;
+  draw();
+}
+
+if (data.runs.length > 1)
+  $("runs").replaceChildren(...data.runs.map((one) => {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.textContent = one.name;
+    button.addEventListener("click", () => show(one));
+    return button;
+  }));
 time.addEventListener("input", () => { frame = Number(time.value); draw(); });
 factor.addEventListener("input", draw);
 play.addEventListener("click", () => { running = !running; play.textContent = running ? "Pause" : "Play"; if (running) requestAnimationFrame(step); });
@@ -144,8 +164,8 @@ canvas.addEventListener("pointermove", (event) => {
 });
 traces.addEventListener("pointermove", (event) => {
   const box = traces.getBoundingClientRect(), share = (event.clientX - box.left - 70) / (box.width - 78);
-  if (event.buttons || event.pointerType === "mouse") { frame = Math.max(0, Math.min(data.t.length - 1, Math.round(share * (data.t.length - 1)))); draw(); }
+  if (event.buttons || event.pointerType === "mouse") { frame = Math.max(0, Math.min(run.t.length - 1, Math.round(share * (run.t.length - 1)))); draw(); }
 });
 for (const media of ["(prefers-color-scheme: dark)", "print"]) matchMedia(media).addEventListener("change", draw);
 window.addEventListener("resize", draw);
-draw();
+show(run);

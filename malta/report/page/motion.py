@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.archives import read_npz
+from malta.display import micro, quantity
 from malta.errors import InputError
 from malta.files import read_file
 from malta.model.rigidbody import Body, rotation
@@ -26,8 +27,10 @@ if TYPE_CHECKING:
 
     from malta.model.plant import FloatArray, Plant
     from malta.report.page.document import Page
+    from malta.simulation.trajectory import Trajectory
 
-FRAMES = 240  # of a page
+FRAMES = 240  # of a run
+LARGEST = 4_500_000  # bytes of a page: runs of longer ones show fewer frames
 SIDES = 28  # of a cylinder
 SMALL = 0.01  # of the largest body: what moves less is magnified
 SHOWN = 0.12  # of the smallest side of a moving body: the largest magnified motion
@@ -50,6 +53,7 @@ class Motion:
     """The bodies of a machine, and how they move in a run.
 
     title : of the run
+    ended : how it ended, in words
     t : s, of each frame
     bodies : of the machine
     poses : of each body, frames x 6: place (m) and Cardan angles (rad)
@@ -60,6 +64,7 @@ class Motion:
     """
 
     title: str
+    ended: str
     t: FloatArray
     bodies: tuple[Body, ...]
     poses: FloatArray
@@ -96,22 +101,52 @@ def read_motion(file: str | Path, plant: Plant, *, frames: int = FRAMES) -> Moti
     plant : the machine
     frames : at most so many
 
-    Raises InputError for a machine without bodies, and a file that is none of a run of it.
+    Raises InputError for a machine without bodies, and a file that holds no run of it.
     """
+    arrays = _series(Path(file), plant)
+    ended = str(np.ravel(arrays.get("verdict", [""]))[0])
+    signals = {
+        str(name): arrays[key][:, k] for key in ("p", "v") for k, name in enumerate(arrays[f"{key}_columns"])
+    }
+    return _motion(Path(file).stem, ended, plant, arrays["t"], arrays["x"], signals, frames)
+
+
+def motion_of(run: Trajectory, title: str, *, frames: int = FRAMES) -> Motion:
+    """How a machine moves in a run.
+
+    title : of the run, as "y1 stuck"
+    frames : at most so many
+
+    Raises InputError for a machine without bodies.
+    """
+    signals = {
+        f"{signal.name} [{signal.unit}]": values[:, k]
+        for of, values in ((run.plant.outputs, run.p), (run.plant.inputs, run.v))
+        for k, signal in enumerate(of)
+    }
+    ended = f"{run.verdict.name} at {quantity(run.verdict.time, 's')}"
+    return _motion(title, ended, run.plant, run.t, run.x, signals, frames)
+
+
+def _motion(
+    title: str,
+    ended: str,
+    plant: Plant,
+    t: FloatArray,
+    x: FloatArray,
+    signals: Mapping[str, FloatArray],
+    frames: int,
+) -> Motion:
+    """Frames of a run, evenly over its time. Raises InputError for a machine without bodies."""
     if plant.bodies is None:
         raise InputError(plant.name, "bodies", "none", "bodies of the machine: Plant(bodies=...)")
-    arrays = _series(Path(file), plant)
-    kept = np.unique(np.linspace(0, len(arrays["t"]) - 1, frames).astype(int))
-    states = dict(zip((s.name for s in plant.states), arrays["x"][kept].T, strict=True))
+    kept = np.unique(np.linspace(0, len(t) - 1, frames).astype(int))
+    states = dict(zip((s.name for s in plant.states), x[kept].T, strict=True))
     bodies = tuple(plant.bodies())
     poses = np.stack([_poses(body, states, len(kept)) for body in bodies])
     small, factor = _magnified(bodies, poses)
-    signals = {
-        str(name): np.asarray(arrays[key][kept, k])
-        for key in ("p", "v")
-        for k, name in enumerate(arrays[f"{key}_columns"])
-    }
-    return Motion(Path(file).stem, arrays["t"][kept], bodies, poses, _upright(plant), small, factor, signals)
+    shown = {name: np.asarray(values[kept]) for name, values in signals.items()}
+    return Motion(title, ended, t[kept], bodies, poses, _upright(plant), small, factor, shown)
 
 
 def _series(file: Path, plant: Plant) -> Mapping[str, Any]:
@@ -210,37 +245,62 @@ def motion_gif(found: Motion, *, size: tuple[int, int] = (520, 320), frames: int
     return buffer.getvalue()
 
 
-def motion_page(found: Motion, about: str = "") -> Page:
+def motion_page(found: Motion | Sequence[Motion], about: str = "") -> Page:
     """Write the motion as one page in HTML that needs no network: turned by dragging, with a scrubber.
 
+    found : a run, or several of one machine, which the page chooses among by buttons
     about : a line below the title
+
+    The page stays below 5 MB: many runs show fewer frames each.
     """
     from markupsafe import Markup
 
     from malta.report.page.document import Page, json_in_page, page_style, render_template, script_of
 
-    meshes = [mesh_of(body) for body in found.bodies]
-    upright = camera(found.up, 0.0, 0.0)
-    data = {
-        "t": _rounded(found.t), "view": VIEW, "factor": found.factor, "up": np.eye(3)[found.up].tolist(),
-        "across": upright[2].tolist(), "along": upright[0].tolist(),
-        "reach": max(float(np.linalg.norm(body.size)) for body in found.bodies),
-        "bodies": [
-            {"points": _rounded(mesh.points), "faces": mesh.faces, "poses": _rounded(poses), "moves": bool(body.moves),
-             "mean": _rounded(poses.mean(axis=0)), "small": small.tolist()}
-            for body, mesh, poses, small in zip(found.bodies, meshes, found.poses, found.small, strict=True)
-        ],
-        "signals": [
-            {"name": name.partition(" ")[0], "k": k, **_in_fine_unit(name, values)}
-            for k, (name, values) in enumerate(found.signals.items())
-        ],
-    }  # fmt: skip
+    runs = [found] if isinstance(found, Motion) else [*found]
+    data, every = _page_data(runs, 1), 1
+    while len(json_in_page(data)) > LARGEST and every < FRAMES:
+        every *= 2
+        data = _page_data(runs, every)
+    title = runs[0].title if len(runs) == 1 else f"{len(runs)} runs"
     policy, script = script_of(Path(__file__).with_name("motion.js").read_text(encoding="utf-8"))
     page = render_template(
-        "motion.html.jinja", title=found.title, about=about, style=Markup(page_style()), script=Markup(script),
+        "motion.html.jinja", title=title, about=about, style=Markup(page_style()), script=Markup(script),
         policy=policy, data=Markup(json_in_page(data)),
     )  # fmt: skip
-    return Page(f"{found.title}: in motion", page)
+    return Page(f"{title}: in motion", page)
+
+
+def _page_data(runs: Sequence[Motion], every: int) -> dict[str, Any]:
+    """What the page's script reads: the bodies once, and each run, of which every n-th frame is kept."""
+    first = runs[0]
+    upright = camera(first.up, 0.0, 0.0)
+    return {
+        "view": VIEW, "up": np.eye(3)[first.up].tolist(), "across": upright[2].tolist(), "along": upright[0].tolist(),
+        "reach": max(float(np.linalg.norm(body.size)) for body in first.bodies),
+        "bodies": [
+            {"points": _rounded(mesh.points), "faces": mesh.faces, "moves": bool(body.moves)}
+            for body, mesh in ((body, mesh_of(body)) for body in first.bodies)
+        ],
+        "runs": [_run_data(run, every) for run in runs],
+    }  # fmt: skip
+
+
+def _run_data(run: Motion, every: int) -> dict[str, Any]:
+    """A run for the page: what stands still has one pose."""
+    shown = np.append(np.arange(0, len(run.t) - 1, every), len(run.t) - 1)
+    return {
+        "name": micro(run.title), "ended": run.ended, "t": _rounded(run.t[shown]), "factor": run.factor,
+        "bodies": [
+            {"poses": _rounded(poses[shown] if body.moves else poses[:1]), "mean": _rounded(poses.mean(axis=0)),
+             "small": small.tolist()}
+            for body, poses, small in zip(run.bodies, run.poses, run.small, strict=True)
+        ],
+        "signals": [
+            {"name": name.partition(" ")[0], "k": k, **_in_fine_unit(name, values[shown])}
+            for k, (name, values) in enumerate(run.signals.items())
+        ],
+    }  # fmt: skip
 
 
 def _in_fine_unit(name: str, values: FloatArray) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from malta.display import RADIANS, frequency
 from malta.loops.time_domain import budget_of
 from malta.merits import four_digits
 from malta.model.data import published_figures
@@ -345,14 +346,14 @@ def _classical_sheet(found: LoopReport, classical: Classical) -> Sheet:
     Ts, rows = found.controller.sample_time, []
     for disk in classical.disks:
         gain = f"{1 / disk.gain:.2f} .. {disk.gain:.2f}"
-        phase = f"+-{np.degrees(disk.phase):.1f}"
-        rows.append([disk.channels, f"{disk.size:.3f}", gain, phase, f"{disk.frequency:.4g}"])
+        phase = f"±{np.degrees(disk.phase):.1f}"
+        rows.append([disk.channels, f"{disk.size:.3f}", gain, phase, frequency(disk.frequency)])
     for name, delay in classical.delay.items():
         samples = f"{delay * 1e6:.0f} us, {delay / Ts:.1f} samples" if np.isfinite(delay) else "any"
         rows.append([f"delay at {name} alone", samples, "", "", ""])
     return plain_sheet(
         "Disk and delay margins of the sampled loop",
-        ("factor in", "disk", "gain", "phase [deg]", "rad/s"),
+        ("factor in", "disk", "gain", "phase [deg]", RADIANS),
         rows,
     )
 

@@ -60,7 +60,7 @@ def chosen_channels(
 ) -> list[tuple[str, str]]:
     """Names and units of the channels to draw: those named, or all of all loops, in their order.
 
-    Raises InputError for a channel that no loop has, and for a place that is none.
+    Raises InputError for a channel that no loop has, and for an unknown place.
     """
     if at not in PLACES:
         raise InputError("plot", "at", repr(at), " or ".join(PLACES))

@@ -283,7 +283,7 @@ def root_locus(
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
-    Raises InputError for an unknown parameter, a range that is none, and a value that the machine cannot have.
+    Raises InputError for an unknown parameter, an invalid range, and a value that the machine cannot have.
 
     >>> import control, malta
     >>> servo = control.tf([1], [1, 3, 2, 0], name="servo")

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy import sparse
 
+from malta.display import RADIANS, frequency
 from malta.loops.time_domain import SHARE, furthest
 from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, zone
 from malta.model.data import published_value
@@ -48,10 +49,10 @@ def poles_table(model: LinearModel, published: Published | None) -> Table:
     >>> rich.print(malta.report.poles_table(model, printed))
     Open-loop poles [rad/s]
     <BLANKLINE>
-     mode               x        y      z    alpha     beta
-     ──────────────────────────────────────────────────────
-     ours, +-      218.92   218.92   0.00   157.53   157.53
-     Table I, +-   218.92   218.92   0.00   157.53   157.53
+     mode              x        y      z    alpha     beta
+     ─────────────────────────────────────────────────────
+     ours, ±      218.92   218.92   0.00   157.53   157.53
+     Table I, ±   218.92   218.92   0.00   157.53   157.53
     <BLANKLINE>
     """
     n = len(model.A) // 2
@@ -62,12 +63,12 @@ def poles_table(model: LinearModel, published: Published | None) -> Table:
         return table
     names, squares = _modes(model)
     table = new_table("Open-loop poles [rad/s]", "mode", *names)
-    add_row(table, "ours, +-", *(f"{math.sqrt(abs(s)):.2f}{'j' if s < 0 else ''}" for s in squares))
+    add_row(table, "ours, ±", *(f"{math.sqrt(abs(s)):.2f}{'j' if s < 0 else ''}" for s in squares))
     at_centre = not np.any(model.operating_point.x)
     if publishes(published, "table_I", "poles") and at_centre:
         printed = [published_value(published, f"table_I.poles.{name}") for name in names]
         digits = published["table_I"]["digits"]
-        add_row(table, "Table I, +-", *(f"{value:.{digits}f}" for value in printed))
+        add_row(table, "Table I, ±", *(f"{value:.{digits}f}" for value in printed))
     return table
 
 
@@ -92,10 +93,10 @@ def loop_poles_table(margins: LoopReport, continuous: Mapping[str, ComplexArray]
     Poles [rad/s]; of sampled systems ln(lambda) / Ts
     <BLANKLINE>
      of                           poles
-     ───────────────────────────────────────────────────────────────────
+     ──────────────────────────────────────────────────────────────────
      sampled regulator            -518.6  -98.37  -19.61
-     sampled Kalman filter        -507.3+-492.9j
-     closed loop of the machine   -567.1+-588.7j  -391.9  -95.23  -20.05
+     sampled Kalman filter        -507.3±492.9j
+     closed loop of the machine   -567.1±588.7j  -391.9  -95.23  -20.05
     <BLANKLINE>
     """
     table = new_table("Poles [rad/s]; of sampled systems ln(lambda) / Ts", "of", "poles")
@@ -163,11 +164,11 @@ def sensitivity_table(margins: LoopReport) -> Table:
     >>> rich.print(malta.report.sensitivity_table(malta.verify(model, controller)))
     Peak sensitivity (ISO 14839-3 zone of the worst: A < 3, B < 4, C < 5)
     <BLANKLINE>
-     loop                 y   zone   sigma_max   at rad/s
-     ────────────────────────────────────────────────────
-     sampled           1.71      A        1.71        542
-     + current loops   1.71      A        1.71        542
-     machine           1.57      A        1.57        584
+     loop                 y   zone   sigma_max   at rad/s (Hz)
+     ─────────────────────────────────────────────────────────
+     sampled           1.71      A        1.71      542 (86.3)
+     + current loops   1.71      A        1.71      542 (86.3)
+     machine           1.57      A        1.57      584 (93.0)
     <BLANKLINE>
     """
     sensors = [k for k in margins.peak_sensitivity if k != "sigma_max"]
@@ -178,7 +179,7 @@ def sensitivity_table(margins: LoopReport) -> Table:
         *sensors,
         "zone",
         "sigma_max",
-        "at rad/s",
+        f"at {RADIANS}",
     )
     for stage in margins.stages:
         peaks = [stage.peak_sensitivity[s] for s in sensors]
@@ -188,7 +189,7 @@ def sensitivity_table(margins: LoopReport) -> Table:
             *(f"{peak:.2f}" for peak in peaks),
             zone(max(peaks)),
             f"{stage.peak_sensitivity['sigma_max']:.2f}",
-            f"{stage.peak_frequency:.3g}",
+            frequency(stage.peak_frequency, 3),
         )
     return table
 
@@ -211,7 +212,7 @@ def _pole_text(poles: ComplexArray) -> str:
         if pole.imag < -1e-6 * abs(pole):
             continue
         real = f"{pole.real:.4g}"
-        text = f"{real}+-{pole.imag:.4g}j" if pole.imag > 1e-6 * abs(pole) else real
+        text = f"{real}±{pole.imag:.4g}j" if pole.imag > 1e-6 * abs(pole) else real
         counted[text] = counted.get(text, 0) + 1
     return "  ".join(text if count == 1 else f"{text} (x{count})" for text, count in counted.items())
 
@@ -285,15 +286,23 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
     A constant load from outside, and the output that it moves furthest
     <BLANKLINE>
                                left    left     1 %
-                      moves   after   after   after     peak
-     load    output      by   0.1 s   0.3 s     [s]   over w   at rad/s
-     ──────────────────────────────────────────────────────────────────
-     1 N w   y [µm]   343.4   94.98   1.722   0.266    430.5       42.8
+                      moves   after   after   after     peak      at rad/s
+     load    output      by   0.1 s   0.3 s     [s]   over w          (Hz)
+     ─────────────────────────────────────────────────────────────────────
+     1 N w   y [µm]   343.4   94.98   1.722   0.266    430.5   42.8 (6.82)
     <BLANKLINE>
     """
     units = {s.name: s.unit for s in plant.disturbances}
     after = [f"left after {t:g} s" for t in (found[0].after if found else ())]
-    heads = ("load", "output", "moves by", *after, f"{100 * SHARE:g} % after [s]", "peak over w", "at rad/s")
+    heads = (
+        "load",
+        "output",
+        "moves by",
+        *after,
+        f"{100 * SHARE:g} % after [s]",
+        "peak over w",
+        f"at {RADIANS}",
+    )
     table = new_table("A constant load from outside, and the output that it moves furthest", *heads)
     table.columns[1].justify = "left"
     for recovered, d in furthest(found):
@@ -304,7 +313,7 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
         lengths = [number(in_unit(value, fine)) for value in (d.largest, *left)]
         settled = "never" if math.isinf(d.settled) else f"{d.settled:.3g}"
         peak = number(in_unit(d.compliance, fine))
-        add_row(table, load, f"{d.output} [{fine}]", *lengths, settled, peak, f"{d.frequency:.3g}")
+        add_row(table, load, f"{d.output} [{fine}]", *lengths, settled, peak, frequency(d.frequency, 3))
     return table
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from malta.display import RADIANS, frequency
 from malta.margins.loop_report import zone
 from malta.model.parameters import box_words
 from malta.model.signals import axis_units
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from malta.report.figures.drawing import Published
     from malta.synthesis.spec import Spec
 
-PROVEN = ("proven", "lost at", "rad/s", "first to give")  # headings of a proof
+PROVEN = ("proven", "lost at", "rad/s", "first to give")  # of a proof; no room for Hz
 WAYS = ("down", "up")
 NEAREST = 3  # requirements that are named though they hold
 
@@ -236,12 +237,12 @@ def disk_table(found: LoopReport) -> Table:
     >>> rich.print(malta.report.disk_table(found))
     Margins of the sampled loop without parameters
     <BLANKLINE>
-     factor in               disk           gain   phase [deg]   rad/s
-     ─────────────────────────────────────────────────────────────────
-     forces                 0.810   0.42 .. 2.36        +-44.1   66.57
-     sensors                0.810   0.42 .. 2.36        +-44.1   66.57
-     forces and sensors     0.400   0.67 .. 1.50        +-22.6   314.4
-     y alone                0.810   0.42 .. 2.36        +-44.1   66.57
+     factor in               disk           gain   phase [deg]     rad/s (Hz)
+     ────────────────────────────────────────────────────────────────────────
+     forces                 0.810   0.42 .. 2.36         ±44.1   66.57 (10.6)
+     sensors                0.810   0.42 .. 2.36         ±44.1   66.57 (10.6)
+     forces and sensors     0.400   0.67 .. 1.50         ±22.6   314.4 (50.0)
+     y alone                0.810   0.42 .. 2.36         ±44.1   66.57 (10.6)
      delay at y alone     2719 µs   13.6 samples
     <BLANKLINE>
     """
@@ -251,7 +252,7 @@ def disk_table(found: LoopReport) -> Table:
         "disk",
         "gain",
         "phase [deg]",
-        "rad/s",
+        RADIANS,
     )
     for disk in found.disks:
         add_row(
@@ -259,8 +260,8 @@ def disk_table(found: LoopReport) -> Table:
             disk.channels,
             f"{disk.size:.3f}",
             f"{1 / disk.gain:.2f} .. {disk.gain:.2f}",
-            f"+-{math.degrees(disk.phase):.1f}",
-            f"{disk.frequency:.4g}",
+            f"±{math.degrees(disk.phase):.1f}",
+            frequency(disk.frequency),
         )
     for name, delay in found.delay.items():
         add_row(table, f"delay at {name} alone", *_delay_cells(delay, found.controller.sample_time), "", "")
@@ -391,16 +392,16 @@ def worst_case_table(gains: Mapping[str, Gain]) -> Table:
     Worst-case peak |S| over the uncertainty and all that the margin covers, without
     loads
     <BLANKLINE>
-     sensor   found   at rad/s   proven below   zone
-     ───────────────────────────────────────────────
-     y        2.105      3.026          2.112      A
+     sensor   found   at rad/s (Hz)   proven below   zone
+     ────────────────────────────────────────────────────
+     y        2.105   3.026 (0.482)          2.112      A
     <BLANKLINE>
     """
     title = "Worst-case peak |S| over the uncertainty and all that the margin covers, without loads"
-    table = new_table(title, "sensor", "found", "at rad/s", "proven below", "zone")
+    table = new_table(title, "sensor", "found", f"at {RADIANS}", "proven below", "zone")
     for name, gain in gains.items():
         found, at = (
-            ("unstable", "") if math.isinf(gain.lower) else (f"{gain.lower:.3f}", f"{gain.frequency:.4g}")
+            ("unstable", "") if math.isinf(gain.lower) else (f"{gain.lower:.3f}", frequency(gain.frequency))
         )
         proven = "nothing proven" if gain.upper is None else f"{gain.upper:.3f}"
         reached = zone(gain.lower if gain.upper is None else gain.upper)

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from numbers import Real
 from typing import TYPE_CHECKING, Any
@@ -36,6 +36,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
+from malta.model.data import plant_of
 from malta.model.plant import Plant, Signal
 from malta.model.signals import FINE
 from malta.simulation import references
@@ -55,7 +56,7 @@ from malta.simulation.experiments import (
 from malta.simulation.layout import fidelities
 from malta.simulation.references import Motion, Reference
 from malta.simulation.scenario import Scenario
-from malta.simulation.simulate import EngineOf
+from malta.simulation.simulate import EngineOf, simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
@@ -74,6 +75,11 @@ if TYPE_CHECKING:
 
 SAMPLES = 2000  # of a run without a `time`
 BEFORE = 0.1  # share of the run before a step or a load
+BESIDE = (0.95, 1.05)  # of the way to a witness: inside the margin and beyond it
+LEAVES = 5.0  # times its push: a machine beyond the margin is shown until it has left so far
+LONGEST = 64_000  # samples of such a run
+HELD = 0.98  # of a witness at an end of the travel, where a stop is touched
+PUSH: Mapping[str, float] = {"m": 2e-5, "rad": 2e-5}  # where these begin
 CLEARANCE = 0.1  # of a step of default size, as a share of the clearance
 SIZE = 1e-5  # SI, of a step of a machine without contacts and without noise
 
@@ -197,6 +203,63 @@ def _choose(signals: Sequence[Signal], name: str, option: str) -> list[int]:
     if name not in names:
         raise InputError("simulate", option, repr(name), "all, or one of " + " ".join(names))
     return [names.index(name)]
+
+
+def witness_flights(plant: Plant, controller: Controller, witness: Mapping[str, float]) -> list[Case]:
+    """Fly the nonlinear machine with parameters inside a margin and beyond it, pushed a little at the beginning.
+
+    witness : values (SI) with which the linear loop is at its limit of stability; an output among them is where it is
+
+    Returns two runs, one inside and one beyond the margin, without the loads that the margin leaves out: weight and
+    cogging.
+
+    Example: `witness_flights(plant, controller, margin.witness)[1].run.verdict`
+    """
+    samples, beyond = SAMPLES, _fly_beside(plant, controller, witness, BESIDE[1], SAMPLES)
+    while beyond.verdict.completed and not _leaves(beyond) and samples < LONGEST:
+        samples *= 2
+        beyond = _fly_beside(plant, controller, witness, BESIDE[1], samples)
+    inside = _fly_beside(plant, controller, witness, BESIDE[0], samples)
+    sides = zip(("inside", "beyond"), BESIDE, (inside, beyond), strict=True)
+    return [Case(f"{side} the margin, at {100 * share:.0f} % of it", run, ()) for side, share, run in sides]
+
+
+def _fly_beside(
+    plant: Plant, controller: Controller, witness: Mapping[str, float], share: float, samples: int
+) -> Trajectory:
+    """A run of the machine at a share of the way from its own parameters to a witness."""
+    held = {signal.name: HELD * witness[signal.name] for signal in plant.outputs if signal.name in witness}
+    own: Any = plant.parameters
+    ends = {name: value for name, value in witness.items() if hasattr(own, name)}
+    there = plant_of(
+        replace(own, **{name: (1 - share) * getattr(own, name) + share * end for name, end in ends.items()})
+    )
+    start = {s.name: held.get(s.name, 0.0) + PUSH[s.unit] for s in plant.design_states if s.unit in PUSH}
+    options: dict[str, Any] = {"start": start} | _with_fidelity(plant, {})
+    at = there.at(**{name: value for name, value in held.items() if name in {s.name for s in there.states}})
+    if not np.array(ca.DM(there.preload(ca.DM(at.x)))).any():  # else a preload carries the loads
+        load = np.array(ca.DM(there.load(ca.DM(at.x)))).ravel()
+        options["disturbance"] = partial(_constant, wrench=-load)
+        feedforward = replace(controller.feedforward, v0=0 * controller.feedforward.v0)
+        controller = replace(controller, feedforward=feedforward)
+    duration = samples * controller.sample_time
+    return simulate(
+        there, controller, scenario_of("witness", duration, partial(_hold_at, outputs=held), options)
+    )
+
+
+def _hold_at(plant: Plant, outputs: Mapping[str, float]) -> Reference:
+    return references.hold(plant, **outputs)
+
+
+def _constant(t: FloatArray, wrench: FloatArray) -> FloatArray:
+    return np.tile(wrench, (len(t), 1))
+
+
+def _leaves(run: Trajectory) -> bool:
+    """Whether the deviation at the end is many times that of the beginning."""
+    off, tenth = np.abs(run.p - run.reference).max(axis=1), max(len(run.p) // 10, 1)
+    return bool(off[-tenth:].max() > LEAVES * off[0])
 
 
 def _duration(controller: Controller, time: float) -> float:

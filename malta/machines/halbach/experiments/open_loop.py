@@ -358,7 +358,7 @@ def fit_servo(t: FloatArray, x: FloatArray, distance: float, K: float) -> ServoF
             "fit_servo", "x", f"{len(x)} readings at {len(t)} times", f"{FEWEST} or more, of one each"
         )
     if not (np.isfinite([*t, *x, distance, K]).all() and distance and K > 0):
-        raise InputError("fit_servo", "t, x, distance, K", "a number that is none", "finite ones, K above 0")
+        raise InputError("fit_servo", "t, x, distance, K", "NaN or infinity", "finite numbers, K above 0")
 
     def off(logs: FloatArray) -> FloatArray:
         m, b = np.exp(logs)
