@@ -18,6 +18,7 @@ from malta.firmware.ctext import c_number
 from malta.firmware.export import comment, render
 from malta.firmware.program import TYPES
 from malta.firmware.signals import Field, Target, input_fields, output_fields, reference_fields, state_fields
+from malta.model.plant import Signal
 
 MAGIC = b"MALTALOG"
 LAYOUT = 1  # version of the record
@@ -25,6 +26,7 @@ ORDER = 0x01020304
 SHARE = 8  # blocks that hold the samples that are asked for; one more is being written
 LARGEST = 2_000_000_000  # bytes of a ring
 CAUSES = ("RUNS", "CALL", "FAULT", "THRESHOLD")
+FLOWN = Field("flown", (Signal("flown", "1"),), "1 where the law ran")
 MEMBERS = (
     ("period", "samples of a period of the excitation; 0: none, or the caller does not say"),
     ("watched", "output whose used reading is a trigger beyond `threshold`; -1: none"),
@@ -86,6 +88,7 @@ def ring_of(t: Target, sha256: str) -> Ring:
     c = t.controller
     parts = {"reference": reference_fields(t), "in": input_fields(t), "out": output_fields(t)}
     sample = tuple((f"{part}.{f.name}", f) for part, fields in parts.items() for f in fields if f.size)
+    sample += (("flown", FLOWN),)
     state = tuple(f for f in state_fields(t) if f.size)
     # Of a huge time the block is not computed: its memory is refused.
     block = math.ceil(min(t.logged / c.sample_time, LARGEST) / SHARE - 1e-9)

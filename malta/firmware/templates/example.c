@@ -131,7 +131,7 @@ int main(void) {
     {{ name }}_calibrate(raw, gain, offset, {{ inputs }}.y);
     {{ name }}_supervisor_step(&supervisor, &state, &{{ inputs }}, &request, &{{ outs }});
 {% if logged %}
-    {{ name }}_log_keep(&log, &state, (supervisor.monitor == -1) ? 0 : 1);
+    {{ name }}_log_keep(&log, &state, supervisor.enable, (supervisor.monitor == -1) ? 0 : 1);
 {% endif %}
     write_outputs(&{{ outs }}, supervisor.enable);
   }

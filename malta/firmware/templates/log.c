@@ -115,10 +115,11 @@ static void copy_reference(const {{ name }}_reference *from, {{ name }}_referenc
 {% endfor %}
 }
 
-void {{ name }}_log_keep({{ name }}_log *log, const {{ name }}_state *s, int32_t fault) {
+void {{ name }}_log_keep({{ name }}_log *log, const {{ name }}_state *s, int32_t flown, int32_t fault) {
   if (log->stopped == 0) {
     {{ name }}_sample *const now = &log->rows[log->next];
     copy_reference(&s->reference, &now->reference);
+    now->flown[0] = ({{ name }}_real)flown;
     if (fault != 0) {
       stop_after(log, {{ NAME }}_LOG_FAULT);
     } else if (is_beyond(log, &now->out) == 1) {

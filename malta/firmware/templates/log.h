@@ -6,7 +6,7 @@
      {{ name }}_init(&state);  {{ name }}_log_init(&log, &state, after);
      at every sample:  now = {{ name }}_log_sample(&log);  read the sensors into now->in;
                        {{ name }}_step(&state, &now->in, &now->out)  or  {{ name }}_supervisor_step(..., &now->in, ..., &now->out);
-                       {{ name }}_log_keep(&log, &state, fault)
+                       {{ name }}_log_keep(&log, &state, flown, fault)
 
    `after` samples after a trigger the ring stops. Then, or at any time between two samples, the bytes of `log` are the dump that
    `malta log` reads: write them into a file NAME.dump. The supervisor writes into now->in what the law was given. */
@@ -35,6 +35,7 @@ typedef struct {
   {{ name }}_reference reference;
   {{ name }}_inputs in;
   {{ name }}_outputs out;
+  {{ name }}_real flown[1]; /* 1 where the law ran; 0: gates were off */
 } {{ name }}_sample;
 
 /* The ring. Members may be read at any time; only `period` is the caller's to write. */
@@ -61,8 +62,9 @@ int32_t {{ name }}_log_watch({{ name }}_log *log, int32_t output, {{ name }}_rea
 /* Where the coming sample is. */
 {{ name }}_sample *{{ name }}_log_sample({{ name }}_log *log);
 
-/* The sample was stepped. fault: a trigger where it is not 0, as supervisor.monitor != -1. */
-void {{ name }}_log_keep({{ name }}_log *log, const {{ name }}_state *s, int32_t fault);
+/* The sample is over. flown: 1 where the law ran, as supervisor.enable; fault: a trigger where it is not 0, as
+   supervisor.monitor != -1. */
+void {{ name }}_log_keep({{ name }}_log *log, const {{ name }}_state *s, int32_t flown, int32_t fault);
 
 /* A trigger by call. */
 void {{ name }}_log_trigger({{ name }}_log *log);
