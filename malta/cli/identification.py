@@ -459,7 +459,15 @@ def replay(gains: GainFile, log: LogFile, machine: MachineFile = None, as_json: 
     controller = read_controller(gains, machine)
     with working(f"replaying {log}"):
         exact = replay_dump(controller, log) if log.suffix == ".dump" else None
-        found = replay_law(controller, read_log(log), same=None if exact is None else exact.first is None)
+    if exact is not None and not as_json:
+        count = f"{exact.same} of {exact.samples} samples"
+        print_text(make_console(), f"{log}: the exported C commands what is logged, to the bit, in {count}")
+    if exact is not None and exact.first is not None:
+        raise CheckError(
+            f"{log}: from {exact.first:.6g} s on the exported C commands other bits: another export flew"
+        )
+    with working(f"replaying {log}"):
+        found = replay_law(controller, read_log(log), same=None if exact is None else True)
     if as_json:
         from malta.cli.documents.others import replay_output
 
@@ -468,10 +476,6 @@ def replay(gains: GainFile, log: LogFile, machine: MachineFile = None, as_json: 
         console = make_console()
         console.print(replay_table(found, plant_of(controller.parameters)))
         same = "as logged, but for rounding" if found.same else "not those of the log"
-        if exact is not None:
-            same = f"as logged to the bit in {exact.same} of {exact.samples} samples, by the exported C"
         print_text(console, f"{log}: the commands of {controller.name} are {same}")
-    if exact is not None and exact.first is not None:
-        raise CheckError(f"{log}: from {exact.first:.6g} s on the exported C commands other bits: another export flew")
     if found.refusal:
         raise CheckError(f"{log}: {found.refusal}")

@@ -362,7 +362,11 @@ def _supervised(p: Processor, files: Mapping[str, str], name: str, folder: Path)
     return longest_path(listings, files, f"{name}_supervisor_step")
 
 
-SELDOM = ("begin_block", "stop_after", "count_down")  # functions of a ring: at a block's begin, at and after a trigger
+SELDOM = (
+    "begin_block",
+    "stop_after",
+    "count_down",
+)  # functions of a ring: at a block's begin, at and after a trigger
 
 
 class LogCost(NamedTuple):

@@ -81,7 +81,9 @@ def read_dump(content: bytes, path: Path) -> Dump:
     )  # fmt: skip
 
 
-def _described(content: bytes, count: int, path: Path) -> tuple[dict[str, str], dict[str, list[str]], int, int]:
+def _described(
+    content: bytes, count: int, path: Path
+) -> tuple[dict[str, str], dict[str, list[str]], int, int]:
     """What the text of a dump says: words, headings by vector, bytes of a number, and where the text ends."""
     where = {real: content[HEAD + real : HEAD + real + count] for real in (8, 4)}
     named = [real for real, text in where.items() if text.startswith(b"machine\t")]
@@ -221,7 +223,9 @@ def replay_dump(controller: Controller, path: str | Path) -> ExactReplay:
     dump = read_dump(read_file(path, "dump", Path.read_bytes, LARGEST), path)
     words, Ts = dump.words, controller.sample_time
     marks = {name: words[name] == "1" for name in ("excited", "tunable")}
-    t = Target(controller, cast("Any", words["precision"]), cast("Any", words["fidelity"]), **marks, logged=Ts)
+    t = Target(
+        controller, cast("Any", words["precision"]), cast("Any", words["fidelity"]), **marks, logged=Ts
+    )
     _require_same_fields(ring_of(t, ""), dump, path)
     out, known, restarts = _recomputed(t, dump)
     if not known.any():
@@ -275,5 +279,9 @@ def _recomputed(t: Target, dump: Dump) -> tuple[Any, Any, int]:
         known[k] = True
         place = rows.ctypes.data + k * rows.itemsize
         ctypes.memmove(reference, place + asked, count)
-        step(ctypes.byref(state), ctypes.c_void_p(place + read), ctypes.c_void_p(out.ctypes.data + k * out.itemsize))
+        step(
+            ctypes.byref(state),
+            ctypes.c_void_p(place + read),
+            ctypes.c_void_p(out.ctypes.data + k * out.itemsize),
+        )
     return out, known, max(restarts, 0)

@@ -90,7 +90,6 @@ int main(void) {
   static {{ name }}_request request; /* zeros: nothing is asked for */
 {% if logged %}
   static {{ name }}_log log;
-  const {{ name }}_outputs *last;
   {{ name }}_sample *now = {{ name }}_log_sample(&log);
 {% else %}
   static {{ name }}_inputs in;
@@ -117,6 +116,9 @@ int main(void) {
     ready = 0; /* a compiler's own arithmetic */
   }
   while ((ready == 1) && (wait_for_timer(&request.missed) == 1)) {
+{% if logged %}
+    const {{ name }}_outputs *const last = &now->out;
+{% endif %}
     read_buttons(&request);
     request.sto = read_sto();
     request.operate = 1; /* as soon as it has settled */
@@ -124,7 +126,6 @@ int main(void) {
       request.land = 1 - follow({{ "&stroke, &request" if stroke else "&hover" }});
     }
 {% if logged %}
-    last = &now->out;
     now = {{ name }}_log_sample(&log);
 {% endif %}
     read_sensors(&machine, &supervisor, &state, {{ "last" if logged else "&out" }}, raw, &{{ inputs }});

@@ -1,6 +1,8 @@
 /* {{ title }}: see {{ name }}_log.h. Written by malta {{ version }}. */
 #include "{{ name }}_log.h"
 
+#include <stdbool.h>
+
 /* What the law remembers before the first sample of a block: a replay begins there. */
 static void remember({{ name }}_log *log, const {{ name }}_state *s, int32_t block) {
   {{ name }}_real *const to = log->memory[block];
@@ -52,12 +54,12 @@ void {{ name }}_log_init({{ name }}_log *log, const {{ name }}_state *s, int32_t
 }
 
 int32_t {{ name }}_log_watch({{ name }}_log *log, int32_t output, {{ name }}_real threshold) {
-  const int32_t known = ((output >= 0) && (output < {{ outputs }})) ? 1 : 0;
-  if (known == 1) {
+  const bool known = (output >= 0) && (output < {{ outputs }});
+  if (known) {
     log->threshold = threshold;
     log->watched = output;
   }
-  return known;
+  return known ? 1 : 0;
 }
 
 {{ name }}_sample *{{ name }}_log_sample({{ name }}_log *log) {
@@ -77,11 +79,11 @@ void {{ name }}_log_trigger({{ name }}_log *log) {
 }
 
 /* Whether a used reading is beyond its threshold. */
-static int32_t is_beyond(const {{ name }}_log *log, const {{ name }}_outputs *out) {
-  int32_t beyond = 0;
+static bool is_beyond(const {{ name }}_log *log, const {{ name }}_outputs *out) {
+  bool beyond = false;
   if (log->watched >= 0) {
     const {{ name }}_real level = out->y_used[log->watched];
-    beyond = ((level > log->threshold) || (level < -log->threshold)) ? 1 : 0;
+    beyond = (level > log->threshold) || (level < -log->threshold);
   }
   return beyond;
 }
@@ -122,7 +124,7 @@ void {{ name }}_log_keep({{ name }}_log *log, const {{ name }}_state *s, int32_t
     now->flown[0] = ({{ name }}_real)flown;
     if (fault != 0) {
       stop_after(log, {{ NAME }}_LOG_FAULT);
-    } else if (is_beyond(log, &now->out) == 1) {
+    } else if (is_beyond(log, &now->out)) {
       stop_after(log, {{ NAME }}_LOG_THRESHOLD);
     } else {
       /* it goes on */
