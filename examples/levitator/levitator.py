@@ -2,14 +2,15 @@
 
     python levitator.py record.csv --position y:mm --current i:mA --sample-time 3.25ms --mass 2.9g
 
-The machine is x'' = p^2 x + b i about the place of the record: p the unstable pole, b the gain of the current, both free,
-from which a mass m makes the negative stiffness m p^2 and the force constant m b. The current is held between samples, so
+The machine is x'' = p^2 x + b i about the place of the record: p the unstable pole, b the gain of the current, both
+free, of which a mass m makes the negative stiffness m p^2 and the force constant m b. The current is held between
+samples, so
 
     y_k - 2 cosh(p T) y_k-1 + y_k-2 = b (cosh(p T) - 1) / p^2 (i_k-1 + i_k-2) + d + e_k + c_1 e_k-1 + c_2 e_k-2
 
 and the most likely p, b, d, c_1 and c_2 make the prediction errors e as small as they can be (prediction error method;
-L. Ljung, System Identification, 2nd ed., ch. 7): whatever law held it, and feedback biases nothing. What is reported beside
-the intervals is the size of e and whether it is white: if it is not, the machine has more than this model.
+L. Ljung, System Identification, 2nd ed., ch. 7), whatever law held it: feedback biases nothing. Beside the intervals
+stands the size of e and whether it is white: if it is not, the machine has more than this model.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from malta.units import to_si
 FEWEST = 200  # samples
 STARTS = (20.0, 60.0, 200.0)  # rad/s, of the pole where the search begins
 BEGIN = 50  # samples in which the filter forgets its start
+TOLD = 0.2  # of their values, that half of the intervals may be
 SLOWEST = 0.01  # 1 / sample time: a slower pole is not told from a drift
 LAGS = 20  # samples, over which the residual is tested
 SIGMA = 1.96  # half of a 95 % interval
@@ -71,12 +73,17 @@ def identify_levitator(y: Any, i: Any, sample_time: float) -> Levitator:
         for p in STARTS
         for sign in (-1, 1)
     ]
-    best = min(found, key=lambda one: one.cost)
+    # A filter that is not stable could cancel a pole that no current moves.
+    stable = [one for one in found if np.abs(np.roots([1, *one.x[3:]])).max() < 1]
+    if not stable:
+        raise CheckError("no unstable pole is told: the current does not move the position")
+    best = min(stable, key=lambda one: one.cost)
     e = best.fun - best.fun.mean()
     covariance = np.linalg.pinv(best.jac.T @ best.jac) * (e @ e) / len(e)
     half = SIGMA * np.sqrt(np.diag(covariance))
     pole = abs(float(best.x[0]))
-    if not (half[0] < pole and half[1] < abs(best.x[1]) and pole * sample_time > SLOWEST):
+    told = (half[:2] < TOLD * np.abs(best.x[:2])).all()
+    if not (told and pole * sample_time > SLOWEST):
         raise CheckError(
             f"no unstable pole is told: {pole:.3g} +- {half[0]:.2g} rad/s; excite more, or sample faster"
         )

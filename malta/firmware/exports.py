@@ -315,8 +315,8 @@ def export_c(
 
     Returns the files.
 
-    Raises InputError for a clock or a log that is not above 0, a folder that has files, an unknown precision, and duty cycles of
-    a machine without windings.
+    Raises InputError for a clock or a log that is not above 0, a folder that has files, an unknown precision, and duty
+    cycles of a machine without windings.
 
     >>> import malta
     >>> gains = "design/gains/tubular_pid.json"

@@ -257,7 +257,7 @@ def _require_same_fields(ring: Ring, dump: Dump, path: Path) -> None:
 
 
 def _recomputed(t: Target, dump: Dump) -> tuple[Any, Any, int]:
-    """What the C commands at each sample, as a structured array; where its state is known; how often that was put back."""
+    """What the C commands at each sample, as a structured array; where its state is known; how often it was set."""
     native = compile_controller(t)
     step, state = getattr(native.lib, f"{native.name}_step"), new_state(native)
     rows = np.ascontiguousarray(dump.rows)

@@ -264,7 +264,7 @@ def test_a_minute_with_the_simulated_machine_is_computed_again() -> None:
         return lambda inputs, outputs, _, __: rings[-1].step(inputs, outputs)
 
     c = controller("halbach")
-    scenario = malta.Scenario("hold", 66.0, malta.references.hold, noise=1.0)
+    scenario = malta.Scenario("hold", 66.0, malta.references.hold, noise=1.0, fidelity="phase")
     run = malta.simulate(malta.plant_of(c.parameters), c, scenario, engine=engine_of_c("double", stepped))
     path = Path("build/minute.dump")
     path.parent.mkdir(exist_ok=True)

@@ -77,11 +77,11 @@ def test_what_tells_no_pole_is_refused_in_one_sentence(
         assert said.count("\n") == 1
         return code, said
 
-    walk = 1e-6 * np.cumsum(np.random.default_rng(0).standard_normal((600, 2)), axis=0)
+    apart = 1e-6 * np.random.default_rng(0).standard_normal((600, 2))  # a current that moves nothing
     cases: dict[str, tuple[int, tuple[int, str]]] = {
         "200 of each at least": (1, asked(np.column_stack([y, i])[:50])),
         "does not move": (1, asked(np.column_stack([y, 0 * i]))),
-        "no unstable pole is told": (1, asked(walk)),
+        "no unstable pole is told": (1, asked(apart)),
         "no column 'y'": (2, asked(np.column_stack([y, i]), heading="x,i")),
         "could not convert": (2, asked(np.array([["1", "a"]]))),
         "unit": (2, asked(np.column_stack([y, i]), "--sample-time", "3 kg")),

@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from malta.identification.commission import Commissioning
+    from malta.identification.dump import ExactReplay
     from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
     from malta.identification.learn import Learned, LearnedStrokes
     from malta.identification.log import Log
     from malta.identification.measure import Curve, Measurement, MeasurementPlan
-    from malta.identification.dump import ExactReplay
     from malta.identification.replay import LawReplay
     from malta.proof.certificate.checked_file import Claim
     from malta.report.ledger import Ledger
