@@ -1,7 +1,7 @@
 """What a log at constant speed tells of the unbalance, and the forces beside the law's that take its response away.
 
 The line at the speed is a line like any other: the machine's model turns measured currents into motion there, and what
-is left is the unbalance's. Forces sent beside the law's at that line leave the loop, its |S| and its margin as they are.
+is left is the unbalance's. Forces sent beside the law's at that line leave the loop as it is, |S| and margin too.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def identify_unbalance(plant: Plant, log: Log) -> Unbalance:
 
 
 def next_forces(plant: Plant, controller: Controller, log: Log) -> ComplexArray:
-    """Amplitudes of the forces to be sent next beside the law's: those of the log, less LEARNED of what makes its motion.
+    """Amplitudes of the forces to be sent next beside the law's: those of the log less LEARNED of what moves it.
 
     The loop answers a force d at the speed with G d, G = S P F_d: so d - 0.8 G^-1 Y leaves a fifth of Y, if the model
     is right, and less than Y as long as G is not off by more than itself.
