@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-import casadi as ca
 import numpy as np
 
 from malta.display import Description, display
@@ -21,11 +20,10 @@ from malta.errors import InputError
 from malta.files import read_file
 from malta.firmware.flight import compile_controller, new_state
 from malta.firmware.ring import CAUSES, HEAD, LARGEST, LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
-from malta.firmware.signals import Target, place_of_readings
+from malta.firmware.signals import Target
 
 if TYPE_CHECKING:
-    from malta.identification.log import Log
-    from malta.model.plant import FloatArray, Plant
+    from malta.model.plant import FloatArray
     from malta.synthesis.controller import Controller
 
 WORDS = ("machine", "controller", "gains", "sample_time", "precision", "fidelity")
@@ -166,18 +164,6 @@ def decode_dump(content: bytes, path: Path) -> Any:
     headings["flags"] = [*(f"{name}_limit [1]" for name in forces), "trigger [1]", "off [1]"]
     head = {name: dump.words[name] for name in ("machine", "controller")}
     return head | {"sample_time": Ts, "period": dump.period * Ts}, Ts * np.arange(len(rows)), tables, headings
-
-
-def in_axes(log: Log, plant: Plant) -> Log:
-    """The log with the currents of the drive's axes, where it has those of all its phases; else the log as it is."""
-    if plant.windings is None or log.names("i") != [s.name for s in plant.drive.phases]:
-        return log
-    y, i = ca.SX.sym("y", len(plant.outputs)), ca.SX.sym("i", len(plant.drive.phases))
-    turned = ca.Function("axes", [y, i], [plant.drive.to_axes(place_of_readings(plant, y)) @ i])
-    table = log.table("y", [s.name for s in plant.outputs])
-    axes = np.array(turned.map(log.samples)(table.T, log.columns["i"].T)).T
-    columns = {**log.columns, "i": axes}
-    return replace(log, columns=columns, signals={**log.signals, "i": tuple(plant.drive.axes)})
 
 
 def _currents(given: Mapping[str, list[str]]) -> list[str]:

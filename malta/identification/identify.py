@@ -13,7 +13,6 @@ from scipy.stats import chi2 as chi2_distribution
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.dump import in_axes
 from malta.identification.log import Log
 from malta.identification.prediction import (
     Predicted,
@@ -36,6 +35,7 @@ from malta.identification.spectra import (
     Spectrum,
     between_neighbours,
     distortion_of,
+    in_axes,
     readings,
     require_closed_loop,
     require_log,

@@ -12,7 +12,7 @@ import pytest
 from conftest import Run
 
 import malta
-from malta.identification.dump import in_axes
+from malta.identification.spectra import in_axes
 from malta.report.figures.runs import log_figure
 
 ROBUST = "design/gains/robust.json"
