@@ -151,7 +151,8 @@ def decode_dump(content: bytes, path: Path) -> Any:
     if "in.i" in given and "in.link" in given and "out.command" in given:
         tables["i"], headings["i"] = readings("in.i"), given["in.i"]
         middle = 0.5 if given["out.command"][0].startswith("d_") else 0.0
-        tables["u"] = (np.asarray(rows["out.command"], dtype=float) - middle) * rows["in.link"]
+        with np.errstate(over="ignore", invalid="ignore"):  # of damage; what is no reading is refused
+            tables["u"] = (np.asarray(rows["out.command"], dtype=float) - middle) * rows["in.link"]
         headings["u"] = [h.replace("i_", "u_", 1).replace("[A]", "[V]") for h in _currents(given)]
     tables["reference"] = np.asarray(rows["reference.p"], dtype=float)
     headings["reference"] = given["in.y"]
@@ -222,7 +223,7 @@ def replay_dump(controller: Controller, path: str | Path) -> ExactReplay:
     path = Path(path)
     dump = read_dump(read_file(path, "dump", Path.read_bytes, LARGEST), path)
     words, Ts = dump.words, controller.sample_time
-    marks = {name: words[name] == "1" for name in ("excited", "tunable")}
+    marks: dict[str, Any] = {name: words[name] == "1" for name in ("excited", "tunable")}
     t = Target(
         controller, cast("Any", words["precision"]), cast("Any", words["fidelity"]), **marks, logged=Ts
     )
@@ -261,7 +262,7 @@ def _recomputed(t: Target, dump: Dump) -> tuple[Any, Any, int]:
     native = compile_controller(t)
     step, state = getattr(native.lib, f"{native.name}_step"), new_state(native)
     rows = np.ascontiguousarray(dump.rows)
-    fields = rows.dtype.fields or {}
+    fields: Mapping[str, Any] = rows.dtype.fields or {}
     names = [name for name in fields if name.startswith("out.")]
     out = np.zeros(len(rows), dtype=[(name, fields[name][0]) for name in names])
     read, asked = fields["in.y"][1], fields["reference.p"][1]

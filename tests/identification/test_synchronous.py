@@ -29,13 +29,14 @@ def rotor() -> Iterator[dict[str, Any]]:
     par: Any = spec.plant.parameters
     plant = malta.plant_of(replace(par, Omega=SPEED))
     true = malta.plant_of(replace(par, Omega=SPEED, e_u=E_U, l_u=L_U))
-    own = {name: attribute_of(plant, "synchronous", name) for name in NAMES}
+    own = {name: attribute_of(plant, MODULE, name) for name in NAMES}
     yield own | {"plant": plant, "true": true, "controller": controller}
     del machines._files["rotor"]
     for name in [name for name in sys.modules if name.startswith(f"{machines.FILES}.rotor")]:
         del sys.modules[name]
 
 
+MODULE: Any = "synchronous"  # beside rotor.py
 NAMES = ("identify_unbalance", "next_forces", "phasors", "turning_forces")
 
 
