@@ -65,6 +65,10 @@ def export(
         bool,
         typer.Option("--excitation", help="C reads forces beside the law's, as malta excite writes them."),
     ] = False,
+    log: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="C keeps the last samples in a ring with a trigger, as 100ms."),
+    ] = None,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -80,9 +84,11 @@ def export(
     from malta.firmware.exports import export_c, export_fmu
 
     _require_known(to, precision, until, part, fmi, platforms, clock)
-    if excitation and to == "fmu":
-        raise InputError("--excitation", "", "an FMU", "--to c")
-    hertz = None if clock is None else _frequency(clock)
+    for option, given in (("--excitation", excitation), ("--log", log)):
+        if given and to == "fmu":
+            raise InputError(option, "", "an FMU", "--to c")
+    hertz = None if clock is None else _quantity("--clock", clock, "Hz", "a frequency, as 168MHz")
+    seconds = None if log is None else _quantity("--log", log, "s", "a time, as 100ms")
     controller = read_controller(gains, machine)
     chosen: Any = {"until": until, "tunable": tunable}
     if to == "fmu":
@@ -110,6 +116,7 @@ def export(
                 proof=proof,
                 clock=hertz,
                 excitation=excitation,
+                log=seconds,
                 **chosen,
             )
     if as_json:
@@ -121,12 +128,12 @@ def export(
         print_written(make_console(), files)
 
 
-def _frequency(text: str) -> float:
-    """A clock in Hz. Raises InputError for another text."""
+def _quantity(option: str, text: str, unit: str, expected: str) -> float:
+    """A clock in Hz, or a time in s. Raises InputError for another text."""
     number = re.fullmatch(NUMBER, text.strip())
     if number is None:
-        raise InputError("--clock", "", repr(text), "a frequency, as 168MHz")
-    return to_si(float(number[1]), number[2] or "Hz", "Hz", "--clock", "clock")
+        raise InputError(option, "", repr(text), expected)
+    return to_si(float(number[1]), number[2] or unit, unit, option, option.strip("-"))
 
 
 def _require_known(

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
 
 
-LogFile = Annotated[Path, typer.Argument(metavar="LOG", help="A log: .csv, .npz, .mat or .parquet.")]
+LogFile = Annotated[Path, typer.Argument(metavar="LOG", help="A log: .csv, .npz, .mat, .parquet or .dump.")]
 
 
 def identify(
@@ -264,7 +264,7 @@ def _fly(plan: ExcitationPlan, plant: Plant, controller: Controller, path: Path,
 
 
 def log(
-    file: Annotated[Path, typer.Argument(metavar="LOG", help="A log: .csv, .npz, .mat or .parquet.")],
+    file: LogFile,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw it: a .png, .svg or .pdf file.")
     ] = None,
@@ -444,11 +444,13 @@ def replay(gains: GainFile, log: LogFile, machine: MachineFile = None, as_json: 
 
     Commands that differ give exit code 1: another gain file flew, or another law. So do innovations that are larger, or
     less white, than those of the gain file's own machine on the same reference and excitation; the parameter that
-    explains them is named.
+    explains them is named. Of the .dump of exported C the same C computes the commands again, which have to agree to
+    the bit.
 
     \b
     Example:  malta replay design/gains/robust.json build/stroke.npz
     """
+    from malta.identification.dump import replay_dump
     from malta.identification.log import read_log
     from malta.identification.replay import replay_law
     from malta.model.data import plant_of
@@ -456,11 +458,20 @@ def replay(gains: GainFile, log: LogFile, machine: MachineFile = None, as_json: 
 
     controller = read_controller(gains, machine)
     with working(f"replaying {log}"):
-        found = replay_law(controller, read_log(log))
+        exact = replay_dump(controller, log) if log.suffix == ".dump" else None
+    if exact is not None and not as_json:
+        count = f"{exact.same} of {exact.samples} samples"
+        print_text(make_console(), f"{log}: the exported C commands what is logged, to the bit, in {count}")
+    if exact is not None and exact.first is not None:
+        raise CheckError(
+            f"{log}: from {exact.first:.6g} s on the exported C commands other bits: another export flew"
+        )
+    with working(f"replaying {log}"):
+        found = replay_law(controller, read_log(log), same=None if exact is None else True)
     if as_json:
         from malta.cli.documents.others import replay_output
 
-        print_document(replay_output(gains, log, found))
+        print_document(replay_output(gains, log, found, exact))
     else:
         console = make_console()
         console.print(replay_table(found, plant_of(controller.parameters)))

@@ -18,6 +18,7 @@ from malta.files import scratch_folder
 from malta.firmware.ctext import c_name
 from malta.firmware.export import sources
 from malta.firmware.program import TRUTHS, TYPES
+from malta.firmware.ring import ring_sources
 from malta.firmware.signals import Target
 from malta.firmware.step import programs_of, started_state, step_of, zero_reference
 from malta.firmware.supervisor_text import supervisor_sources
@@ -359,6 +360,41 @@ def _supervised(p: Processor, files: Mapping[str, str], name: str, folder: Path)
             return 0
         listings[file] = _run([f"{p.prefix}objdump", *LISTING, listed], folder) or ""
     return longest_path(listings, files, f"{name}_supervisor_step")
+
+
+SELDOM = (
+    "begin_block",
+    "stop_after",
+    "count_down",
+)  # functions of a ring: at a block's begin, at and after a trigger
+
+
+class LogCost(NamedTuple):
+    """Instructions that a ring buffer adds to a step, at most: to most of them, and to the dearest."""
+
+    processor: str
+    each: int
+    most: int
+
+
+def log_costs(t: Target) -> list[LogCost]:
+    """What the ring buffer of an export costs on every processor whose compiler is installed."""
+    name = c_name(t.controller.name)
+    files = sources(t, "", name) | ring_sources(t, "", name)
+    file, found = f"{name}_log.c", []
+    for p in PROCESSORS:
+        with scratch_folder() as folder:
+            for one, text in files.items():
+                (folder / one).write_text(text, encoding="utf-8")
+            command = [f"{p.prefix}gcc", *FLAGS, *APART, *p.options, "-c", file, "-o", "log.o"]
+            done = _run(command, folder)
+            listing = None if done is None else _run([f"{p.prefix}objdump", *LISTING, "log.o"], folder)
+        if listing is not None:
+            own = [f"{name}_log_sample", f"{name}_log_keep"]
+            most = sum(1 + longest_path({file: listing}, files, part) for part in own)  # 1: the call
+            seldom = sum(longest_path({file: listing}, files, part) for part in SELDOM)
+            found.append(LogCost(p.name, most - seldom, most))
+    return found
 
 
 def _blocks(name: str) -> tuple[str, ...]:

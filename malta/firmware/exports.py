@@ -27,6 +27,7 @@ from malta.firmware.export import (
 from malta.firmware.fmu import build_fmu
 from malta.firmware.program import Precision
 from malta.firmware.report import report_text
+from malta.firmware.ring import ring_of, ring_sources
 from malta.firmware.signals import (
     Field,
     Target,
@@ -193,12 +194,13 @@ def folder_files(
         files = folder_files(Target(controller, "float"), sha256)
     """
     name = c_name(t.controller.name)
-    files = sources(t, sha256, name) | supervisor_sources(t, name)
+    files = sources(t, sha256, name) | supervisor_sources(t, name) | ring_sources(t, sha256, name)
     c_files = [file for file in files if file.endswith(".c")]
     context = context_of(t, programs_of(t), name, sha256) | {
         "objects": " ".join(file.removesuffix(".c") + ".o" for file in c_files),
         "c_files": " ".join(c_files),
         "driven": t.driven,
+        "logged": t.logged > 0,
         "currents": len(current_readings(t)) if t.driven else 0,
         **stand_in_context(t, name),
         **_example_context(t),
@@ -296,6 +298,7 @@ def export_c(
     clock: float | None = None,
     tunable: bool = False,
     excitation: bool = False,
+    log: float | None = None,
 ) -> list[Path]:
     """Write the controller of a gain file as a folder of C99 with its test and a report.
 
@@ -307,11 +310,13 @@ def export_c(
     clock : of the processor, Hz, with which the report turns instructions into a share of the sample; None: 667 MHz
     tunable : gains, limits, references and monitors are in a record that the target may change, with an ASAP2 file
     excitation : forces beside the law's are read at every sample, which the filter knows as sent
+    log : s, of the last samples that a ring buffer keeps, with a trigger; `malta log` and `malta replay` read its dump;
+        None: without
 
     Returns the files.
 
-    Raises InputError for a clock that is not above 0, a folder that has files, an unknown precision, and duty cycles of
-    a machine without windings.
+    Raises InputError for a clock or a log that is not above 0, a folder that has files, an unknown precision, and duty
+    cycles of a machine without windings.
 
     >>> import malta
     >>> gains = "design/gains/tubular_pid.json"
@@ -323,6 +328,9 @@ def export_c(
     if clock is not None:
         positive("export", "clock", clock, below=FASTEST)
     target = replace(_target(read(path), precision, until), tunable=tunable, excited=excitation)
+    if log is not None:
+        target = replace(target, logged=positive("export", "log", log))
+        ring_of(target, "")  # raises before anything is proven
     folder, content = require_empty(Path(out)), content_of(path)[0]
     robust = content.verification.robust
     uncertainty = {} if robust is None else robust.uncertainty

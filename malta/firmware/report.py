@@ -16,6 +16,7 @@ from malta.firmware.cost import (
     SAMPLES,
     Cost,
     costs,
+    log_costs,
     operations,
     rounded_margin,
     rounding_noise,
@@ -23,6 +24,7 @@ from malta.firmware.cost import (
 )
 from malta.firmware.export import comment, render
 from malta.firmware.period_functions import LINK_RANGE
+from malta.firmware.ring import ring_of
 from malta.firmware.signals import Target, reading_ranges
 from malta.firmware.supervisor import AWAKE, STATES, ReferenceLimits, State, monitors_of, reference_limits
 from malta.model.parameters import box_words
@@ -135,6 +137,8 @@ FILES = {
     "CMakeLists.txt": "the same with CMake",
     "_supervisor.h": "states, monitors and their reactions",
     "_supervisor.c": "the supervisor, from current offsets to landing",
+    "_log.h": "a ring buffer of the last samples, with a trigger",
+    "_log.c": "the same",
     "_parameters.c": "gains, limits, references and monitors that the target may change",
     ".a2l": "their names, units and ranges for a calibration tool, ASAP2 1.7",
     "_supervisor_test.c": "a walk through its states",
@@ -180,6 +184,7 @@ def report_text(
             ],
             "watched": watch_lines(t),
             **(_tunable_context(t, found) if t.tunable else {}),
+            **(_log_context(t, found) if t.logged else {}),
             "references": [
                 {"name": comment(s.name), "unit": s.unit, "position": p, "speed": v, "acceleration": a}
                 for s, p, v, a in zip(t.controller.measurements, *reference_limits(t), strict=True)
@@ -201,6 +206,16 @@ def _tunable_context(t: Target, found: list[Cost]) -> dict[str, Any]:
         ],
         "gain_text": comment(" ".join(gain_lines(t))),
         "tunable_costs": [(c, plain[c.processor]) for c in found if c.processor in plain],
+    }
+
+
+def _log_context(t: Target, found: list[Cost]) -> dict[str, Any]:
+    """The section about the ring buffer."""
+    plain = {c.processor: c.instructions for c in found}
+    return {
+        "ring": ring_of(t, ""),
+        "seconds": f"{t.logged:g}",
+        "log_costs": [(c, plain[c.processor]) for c in log_costs(t) if c.processor in plain],
     }
 
 

@@ -54,6 +54,7 @@ class Target:
     tunable: bool = False  # gains, limits, references and monitors from a record that the target may change
     gains: GainBox | None = None  # what is proven of other gains; None: nothing was asked for
     excited: bool = False  # forces beside the law's are read at every sample
+    logged: float = 0.0  # s, of a ring buffer of all signals; 0: none
 
     def __post_init__(self) -> None:
         if self.precision not in ("double", "float"):

@@ -169,6 +169,7 @@ def _context(t: Target, name: str) -> dict[str, Any]:
     off = _off_command(t)
     return {
         "tunable": t.tunable,
+        "logged": t.logged > 0,
         "name": name,
         "NAME": name.upper(),
         "title": comment(c.name),

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
+    from malta.identification.dump import ExactReplay as ExactReplay
+    from malta.identification.dump import replay_dump as replay_dump
     from malta.identification.excite import ExcitationPlan as ExcitationPlan
     from malta.identification.identify import Identified as Identified
     from malta.identification.identify import weigh as weigh

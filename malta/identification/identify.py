@@ -35,6 +35,7 @@ from malta.identification.spectra import (
     Spectrum,
     between_neighbours,
     distortion_of,
+    in_axes,
     readings,
     require_closed_loop,
     require_log,
@@ -252,6 +253,7 @@ def identify(
     ('', True)
     """
     plant = _known_plant(plant_of(controller.parameters), known or {}, start or {})
+    log = in_axes(log, plant)
     _require_machine(controller, plant, log)
     y, i = readings(log, robust=robust), whole(log, "i")
     names = require_parameters(plant, parameters) or candidates(plant)
@@ -313,7 +315,7 @@ def weigh(
     par = plant.parameters
     heavier = plant_with(plant, {name: float(getattr(par, name)) + more for name, more in added.items()})
     records = []
-    for flown, machine in ((log, plant), (loaded, heavier)):
+    for flown, machine in ((in_axes(log, plant), plant), (in_axes(loaded, plant), heavier)):
         _require_machine(controller, machine, flown)
         records.append(_record(machine, names, flown, readings(flown, robust=False), whole(flown, "i")))
     records[1] = records[1]._replace(added=added)

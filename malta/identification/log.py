@@ -23,6 +23,7 @@ from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.files import read_file, replace_files
 from malta.gains.encodings import read_mat
+from malta.identification.dump import decode_dump
 from malta.model.plant import Signal, readonly
 from malta.simulation.current_control import reading_errors
 from malta.simulation.excitation import Multisine
@@ -322,9 +323,10 @@ def write_log(log: Log, path: str | Path) -> Path:
     return path
 
 
-def _require_suffix(path: Path) -> None:
-    if path.suffix not in SUFFIXES:
-        raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
+def _require_suffix(path: Path, *others: str) -> None:
+    known = (*SUFFIXES, *others)
+    if path.suffix not in known:
+        raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(known))
 
 
 def _headings(log: Log, group: str) -> list[str]:
@@ -428,6 +430,8 @@ def _to_mat(log: Log) -> bytes:
 def read_log(path: str | Path) -> Log:
     """Read a log: a .csv, .npz, .mat or .parquet of malta, or a .csv of another program with headings "name [unit]".
 
+    A .dump is the memory of the ring buffer of exported C, `malta export --log`.
+
     path : the file. Units are converted to SI; a cell that is empty or nan is a missing reading.
 
     Returns a Log. Signals of headings without a prefix are found by their unit when the log is used: positions and
@@ -446,10 +450,10 @@ def read_log(path: str | Path) -> Log:
     2000
     """
     path = Path(path)
-    _require_suffix(path)
+    _require_suffix(path, ".dump")
     content = read_file(path, "log", Path.read_bytes, LARGEST)
-    decode = {".csv": _from_csv, ".npz": _from_npz, ".mat": _from_mat}.get(path.suffix, _from_parquet)
-    head, t, tables, headings = decode(content, path)
+    decoders = {".csv": _from_csv, ".npz": _from_npz, ".mat": _from_mat, ".dump": decode_dump}
+    head, t, tables, headings = decoders.get(path.suffix, _from_parquet)(content, path)
     if len(t) < 2 or not ((np.diff(t) > 0).all() and np.abs(t).max() < MOST):
         raise InputError(path, "t", "times that do not rise", "the times of the samples, in order")
     columns, signals = {}, {}

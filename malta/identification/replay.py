@@ -135,7 +135,7 @@ class LawReplay:
         return Description(f"Replay of {len(self.v)} samples", tuple(rows))
 
 
-def replay_law(controller: Controller, log: Log) -> LawReplay:
+def replay_law(controller: Controller, log: Log, *, same: bool | None = None) -> LawReplay:
     """Run a law on logged readings and compare what it commands, sample by sample.
 
     The filter starts at rest at the first reference, as a run of `malta.simulate` does; a log that begins in flight
@@ -149,6 +149,7 @@ def replay_law(controller: Controller, log: Log) -> LawReplay:
 
     controller : the gain file
     log : with measured outputs, commands and reference
+    same : whether its commands are known to be those of this law, as `replay_dump` knows; None: they are compared here
 
     Returns a LawReplay, also where its `refusal` says what is wrong.
 
@@ -176,7 +177,8 @@ def replay_law(controller: Controller, log: Log) -> LawReplay:
     names, forces = [s.name for s in plant.outputs], [s.name for s in plant.inputs]
     noise = np.sqrt(np.array(plant.noise) ** 2 + np.array(plant.resolution) ** 2 / 12)
     largest = off[half:].max(axis=0)
-    same = bool((largest <= SAME * controller.limits.force).all())
+    if same is None:
+        same = bool((largest <= SAME * controller.limits.force).all())
     rms = np.sqrt((late**2).mean(axis=0))
     twin = _Twin(controller, log) if same else None
     own = late if twin is None else twin.innovation(plant, noise=1.0)[half:]

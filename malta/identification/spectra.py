@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError
+from malta.firmware.signals import place_of_readings
 from malta.identification.log import Log, require_same_law
 from malta.identification.prediction import without_spikes
 from malta.identification.response import ResponseModel
@@ -15,7 +18,7 @@ from malta.identification.response import ResponseModel
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from malta.model.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray, Plant
 
     IntArray = NDArray[np.integer[Any]]
 
@@ -184,6 +187,18 @@ def straightened(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Spectr
     outputs = np.array(s.outputs)
     outputs[places] -= model.beyond_linear(theta, s.outputs[places], s.currents[places], s.rate * s.periods)
     return s._replace(outputs=outputs)
+
+
+def in_axes(log: Log, plant: Plant) -> Log:
+    """The log with the currents of the drive's axes, where it has those of all its phases; else the log as it is."""
+    if plant.windings is None or log.names("i") != [s.name for s in plant.drive.phases]:
+        return log
+    y, i = ca.SX.sym("y", len(plant.outputs)), ca.SX.sym("i", len(plant.drive.phases))
+    turned = ca.Function("axes", [y, i], [plant.drive.to_axes(place_of_readings(plant, y)) @ i])
+    table = log.table("y", [s.name for s in plant.outputs])
+    axes = np.array(turned.map(log.samples)(table.T, log.columns["i"].T)).T
+    columns = {**log.columns, "i": axes}
+    return replace(log, columns=columns, signals={**log.signals, "i": tuple(plant.drive.axes)})
 
 
 def readings(log: Log, *, robust: bool) -> FloatArray:

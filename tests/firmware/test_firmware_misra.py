@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from exported import PRECISIONS, require, root_text, run, texts, write_folder
+from exported import PRECISIONS, require, root_text, run, target, texts, write_folder
 
+from malta.firmware.export import sources
 from malta.firmware.program import Precision
 from malta.firmware.report import DEVIATIONS
+from malta.firmware.ring import ring_sources
 
 CHECKS = ("--addon=misra", "--enable=warning,style,performance,portability", "--std=c99", "--quiet")
 SECONDS = 600.0  # for a file, on a computer with much else to do
@@ -56,6 +59,17 @@ def test_roots_deviate_from_nothing(precision: Precision, tmp_path: Path) -> Non
     require("cppcheck")
     (tmp_path / "root.c").write_text(root_text(precision), encoding="utf-8")
     assert deviations(tmp_path / "root.c") == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["halbach", "planar"])
+def test_rings_deviate_from_nothing(name: str, tmp_path: Path) -> None:
+    """The C of a ring buffer; macros of its header are for the caller (2.5)."""
+    require("cppcheck")
+    t = replace(target(name, "float"), logged=1.0)
+    for file, text in (sources(t, "0" * 64, name) | ring_sources(t, "0" * 64, name)).items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    assert {rule for _, rule in deviations(tmp_path / f"{name}_log.c", GCC)} == {"2.5"}
 
 
 def deviations(path: Path, *options: str) -> list[tuple[str, str]]:

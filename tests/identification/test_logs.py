@@ -12,6 +12,7 @@ import pytest
 from conftest import Run
 
 import malta
+from malta.identification.spectra import in_axes
 from malta.report.figures.runs import log_figure
 
 ROBUST = "design/gains/robust.json"
@@ -148,3 +149,21 @@ def test_commands_write_and_show_a_log(run: Run, tmp_path: Path) -> None:
     assert (said.code, "as logged" in said.out, "K_D -11 %" in said.err) == (1, True, True)
     other = run("replay", "design/gains/calibrated.json", file, "--json")
     assert (other.code, json.loads(other.out)["same"]) == (1, False)
+
+
+def test_currents_of_phases_become_those_of_axes() -> None:
+    """A dump of C down to duty cycles has phase currents; the run knows both."""
+    scenario = malta.Scenario(
+        "hold", 0.01, malta.references.hold, fidelity="phase", quantize=False, noise=0.0
+    )
+    plant = malta.plant_of(CONTROLLER.parameters)
+    run = malta.simulate(plant, CONTROLLER, scenario)
+    log = malta.identification.log_of(run)
+    phases = replace(
+        log, columns={**log.columns, "i": run.i_phase}, signals={**log.signals, "i": plant.drive.phases}
+    )
+    found = in_axes(phases, plant)
+    assert found.names("i") == [s.name for s in plant.drive.axes]
+    assert found.columns["i"] == pytest.approx(run.i, abs=1e-5)
+    assert np.abs(run.i).max() > 0.1
+    assert in_axes(log, plant) is log

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from malta.identification.commission import Commissioning
+    from malta.identification.dump import ExactReplay
     from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
     from malta.identification.learn import Learned, LearnedStrokes
@@ -338,6 +339,9 @@ class ReplayOutput(Part):
     whiteness: dict[str, float] = Field(description="largest autocorrelation, in standard deviations")
     own_machine_rms: dict[str, float] = Field(description="of innovations of the gain file's own machine, SI")
     explained: dict[str, Explained] = Field(description="by parameter, where the innovations are refused")
+    samples_to_the_bit: int | None = Field(
+        default=None, description="of a dump: with the commands of the exported C; null of other logs"
+    )
     refusal: str = Field(description="why the log is not of this law on its machine; empty: it is")
 
 
@@ -511,7 +515,7 @@ def learned_strokes_output(
     )
 
 
-def replay_output(gains: Path, log: Path, found: LawReplay) -> ReplayOutput:
+def replay_output(gains: Path, log: Path, found: LawReplay, exact: ExactReplay | None) -> ReplayOutput:
     """The document of a replay."""
     return ReplayOutput.of(
         found,
@@ -519,6 +523,7 @@ def replay_output(gains: Path, log: Path, found: LawReplay) -> ReplayOutput:
         log=log,
         own_machine_rms=found.own if found.same else {},
         explained={name: Explained(change=a, share=b) for name, (a, b) in found.explained.items()},
+        samples_to_the_bit=None if exact is None else exact.same,
     )
 
 

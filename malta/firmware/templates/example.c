@@ -2,6 +2,10 @@
    the first six; as they are here, they run on a PC. Written by malta {{ version }}. */
 #include "{{ name }}.h"
 #include "{{ name }}_supervisor.h"
+{% if logged %}
+#include "{{ name }}_log.h"
+{% endif %}
+{% set inputs, outs = ("now->in", "now->out") if logged else ("in", "out") %}
 
 #include <stdbool.h>
 {% include "exact.c" %}
@@ -63,6 +67,11 @@ static void write_outputs(const {{ name }}_outputs *out, int32_t enable) {
   (void)enable;
 }
 
+{% if logged %}
+/* The bytes of the ring, to be written into a file NAME.dump. */
+static void write_dump(const {{ name }}_log *log) { (void)log; }
+
+{% endif %}
 /* What a machine in operation shall do next: 1 while it moves. */
 {% if stroke %}
 static int32_t follow({{ name }}_stroke *stroke, {{ name }}_request *request) {
@@ -79,8 +88,13 @@ int main(void) {
   static {{ name }}_supervisor supervisor;
   static {{ name }}_state state;
   static {{ name }}_request request; /* zeros: nothing is asked for */
+{% if logged %}
+  static {{ name }}_log log;
+  {{ name }}_sample *now = {{ name }}_log_sample(&log);
+{% else %}
   static {{ name }}_inputs in;
   static {{ name }}_outputs out;
+{% endif %}
   static stand_in machine;
   {{ name }}_real raw[{{ outputs }}];
   {{ name }}_real gain[{{ outputs }}];
@@ -94,22 +108,37 @@ int main(void) {
 {% endif %}
   {{ name }}_init(&state);
   {{ name }}_supervisor_init(&supervisor);
+{% if logged %}
+  {{ name }}_log_init(&log, &state, {{ NAME }}_LOG_ROWS / 2);
+{% endif %}
   read_calibration(gain, offset);
   if ({{ name }}_self_test() == 0) {
     ready = 0; /* a compiler's own arithmetic */
   }
   while ((ready == 1) && (wait_for_timer(&request.missed) == 1)) {
+{% if logged %}
+    const {{ name }}_outputs *const last = &now->out;
+{% endif %}
     read_buttons(&request);
     request.sto = read_sto();
     request.operate = 1; /* as soon as it has settled */
     if ((supervisor.state == {{ NAME }}_OPERATE) && (request.land == 0)) {
       request.land = 1 - follow({{ "&stroke, &request" if stroke else "&hover" }});
     }
-    read_sensors(&machine, &supervisor, &state, &out, raw, &in);
-    {{ name }}_calibrate(raw, gain, offset, in.y);
-    {{ name }}_supervisor_step(&supervisor, &state, &in, &request, &out);
-    write_outputs(&out, supervisor.enable);
+{% if logged %}
+    now = {{ name }}_log_sample(&log);
+{% endif %}
+    read_sensors(&machine, &supervisor, &state, {{ "last" if logged else "&out" }}, raw, &{{ inputs }});
+    {{ name }}_calibrate(raw, gain, offset, {{ inputs }}.y);
+    {{ name }}_supervisor_step(&supervisor, &state, &{{ inputs }}, &request, &{{ outs }});
+{% if logged %}
+    {{ name }}_log_keep(&log, &state, supervisor.enable, (supervisor.monitor == -1) ? 0 : 1);
+{% endif %}
+    write_outputs(&{{ outs }}, supervisor.enable);
   }
+{% if logged %}
+  write_dump(&log);
+{% endif %}
   /* 0 where it moved and landed, and no monitor acted */
   return ((request.land == 1) && (supervisor.state == {{ NAME }}_OFF) && (supervisor.monitor == -1)) ? 0 : 1;
 }

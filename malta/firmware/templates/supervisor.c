@@ -1013,7 +1013,7 @@ static void copy_inputs(const {{ name }}_inputs *in, {{ name }}_inputs *seen) {
 {% endfor %}
 }
 
-void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name }}_inputs *in,
+void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s, {{ "" if logged else "const " }}{{ name }}_inputs *in,
                        const {{ name }}_request *request, {{ name }}_outputs *out) {
   {{ name }}_inputs seen;
   {{ name }}_real expected[OUTPUTS];
@@ -1062,12 +1062,18 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
     guide(sup, s, request);
 {% if fallback %}
     estimated = leave_out(sup, s, expected, &seen);
+{% if logged %}
+    copy_inputs(&seen, in);
+{% endif %}
     {{ name }}_step(s, &seen, out);
     if (estimated == 1) {
       predict(s, out);
     }
 {% else %}
     leave_out(sup, &seen);
+{% if logged %}
+    copy_inputs(&seen, in);
+{% endif %}
     {{ name }}_step(s, &seen, out);
 {% endif %}
 {% if forces == outputs %}

@@ -75,8 +75,8 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup);
    Without a fit arithmetic it is off. */
 void {{ name }}_supervisor_take_over({{ name }}_supervisor *sup, const {{ name }}_real rest[{{ outputs }}]);
 
-/* One sample. Any numbers may be in `in` and in the request's reference, also NaN and infinity. */
-void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name }}_inputs *in,
+/* One sample. Any numbers may be in `in` and in the request's reference, also NaN and infinity.{{ " What the law is given is\n   written into `in`: currents without offsets, and readings that are left out are invalid." if logged }} */
+void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s, {{ "" if logged else "const " }}{{ name }}_inputs *in,
                        const {{ name }}_request *request, {{ name }}_outputs *out);
 
 #ifdef __cplusplus
