@@ -13,14 +13,6 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
-    from malta.structured.elements import Element as Element
-    from malta.structured.elements import Place as Place
-    from malta.structured.elements import gain as gain
-    from malta.structured.elements import lead as lead
-    from malta.structured.elements import notch as notch
-    from malta.structured.elements import pid as pid
-    from malta.structured.elements import states as states
-    from malta.structured.elements import transfer as transfer
     from malta.structured.goals import Goal as Goal
     from malta.structured.goals import disk_margin as disk_margin
     from malta.structured.goals import gain_limit as gain_limit
@@ -35,5 +27,13 @@ if TYPE_CHECKING:
     from malta.structured.riccati import shape_loop as shape_loop
     from malta.structured.rounds import Tuned as Tuned
     from malta.structured.rounds import tune as tune
+    from malta.synthesis.elements import Element as Element
+    from malta.synthesis.elements import Place as Place
+    from malta.synthesis.elements import gain as gain
+    from malta.synthesis.elements import lead as lead
+    from malta.synthesis.elements import notch as notch
+    from malta.synthesis.elements import pid as pid
+    from malta.synthesis.elements import states as states
+    from malta.synthesis.elements import transfer as transfer
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

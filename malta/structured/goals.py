@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
-from malta.loops.linear_loops import System
-from malta.structured.elements import CALLER
 from malta.structured.loops import ClosedLoop
 from malta.structured.norms import Channels, gain_slope, noise, peaks_of, response_at
+from malta.synthesis.elements import CALLER
+from malta.synthesis.state_space import System
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

@@ -18,9 +18,10 @@ import numpy as np
 from scipy import sparse
 
 from malta.errors import CheckError, InputError
-from malta.loops.linear_loops import System
-from malta.structured.elements import CALLER
 from malta.structured.norms import Channels, Pole, poles_of
+from malta.synthesis.elements import CALLER
+from malta.synthesis.state_space import System
+from malta.synthesis.structure import OF_INPUTS, OF_OUTPUTS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 JOINS = 1e-12  # of the largest entries of its row and column: smaller ones are rounding
-OF_INPUTS = ("reference", "load", "disturbance")
-OF_OUTPUTS = ("error", "output", "force", "acting")
 
 
 @dataclass(frozen=True, eq=False)

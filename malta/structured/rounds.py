@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 from malta.display import Description, ceil_to, display, floor_to, quantity
 from malta.errors import CheckError, InputError
-from malta.loops.linear_loops import System
 from malta.processes import on_one_thread
 from malta.proof.margin import Margin, Ranges
-from malta.structured.elements import CALLER, Structure, places_of, sample_law
 from malta.structured.goals import Goal
 from malta.structured.loops import Model
 from malta.structured.minimax import Look
 from malta.structured.plants import Machine, Systems, Uncertain, Values, target_of
 from malta.structured.search import ROOM, Task, contradiction, random_starts, rate_of, search
+from malta.synthesis.elements import CALLER, Structure, places_of, sample_law
+from malta.synthesis.state_space import System
 
 if TYPE_CHECKING:
     from malta.proof.blocks.gain import Gain

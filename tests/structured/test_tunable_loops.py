@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from malta import structured
-from malta.loops.linear_loops import System
-from malta.structured.elements import Structure, places_of, sample_law
 from malta.structured.loops import ClosedLoop, Model, models_of_systems
 from malta.structured.norms import noise, peak_gain, peaks_of
+from malta.synthesis.elements import Structure, places_of, sample_law
+from malta.synthesis.state_space import System
 
 GOALS = {
     "sensitivity": structured.sensitivity(2.0),
