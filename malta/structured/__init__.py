@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
+    from malta.structured.design import TunedDesign as TunedDesign
+    from malta.structured.design import tune_design as tune_design
     from malta.structured.goals import Goal as Goal
     from malta.structured.goals import disk_margin as disk_margin
     from malta.structured.goals import gain_limit as gain_limit
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from malta.structured.goals import poles as poles
     from malta.structured.goals import sensitivity as sensitivity
     from malta.structured.goals import soft as soft
+    from malta.structured.goals import stable_law as stable_law
     from malta.structured.goals import tracking as tracking
     from malta.structured.riccati import Synthesized as Synthesized
     from malta.structured.riccati import h_infinity as h_infinity

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from malta.model.plant import FloatArray
 
+ZERO = 1e-9  # of a law's largest entry: a pole of that size is an integral
 JOINS = 1e-12  # of the largest entries of its row and column: smaller ones are rounding
 
 
@@ -206,6 +207,14 @@ class ClosedLoop:
         """The poles with their derivatives by M, each group by itself; count of each, the slowest first, 0: all."""
         (A, _, _, _), by = self.whole
         return [pole for x in self.groups for pole in poles_of(A[np.ix_(x, x)], by.B2[x], by.C2[:, x], count)]
+
+    def law_poles(self) -> list[Pole]:
+        """The poles of the law with their derivatives by theta, without those at 0, its integrals."""
+        m, p = len(self.model.inputs), len(self.model.outputs)
+        A = self.theta[m:, p:]
+        B2, C2 = np.eye(len(self.theta))[m:], np.eye(self.theta.shape[1])[:, p:]
+        size = float(np.abs(A).max(initial=0.0))
+        return [pole for pole in poles_of(A, B2, C2) if abs(pole.value) > ZERO * size] if size else []
 
     def rows(self, signals: Any) -> list[int]:
         """The outputs of these names. Raises InputError for unknown ones."""

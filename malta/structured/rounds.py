@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import itertools
 import time as clock
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from malta.display import Description, ceil_to, display, floor_to, quantity
 from malta.errors import CheckError, InputError
@@ -137,6 +139,8 @@ def tune(
     starts: int = 3,
     seed: int = 0,
     name: str = "structured",
+    keep: bool = False,
+    note: Callable[[str], None] | None = None,
 ) -> Tuned:
     """Find the parameters of a law's elements that meet goals, and prove what they promise over ranges of parameters.
 
@@ -154,6 +158,8 @@ def tune(
     starts : of the search, the first from the elements' own values
     seed : of the further ones
     name : of the controller
+    keep : whether first values that hold all hard goals, with the proofs, stand as they are
+    note : called with what is being done
 
     Returns a Tuned. Its `closed` and its `certificate` say whether the proofs hold what was asked for.
 
@@ -193,7 +199,8 @@ def tune(
         look, proof, rounds = _search(task, begin), Proof(None, {}, closed=False), 1
     else:
         asked = _Asked(target, tuple(goals), ranges, wanted, over_box)
-        task, look, proof, rounds = _rounds(asked, task, begin)
+        held = _holding(asked, task) if keep else None
+        task, look, proof, rounds = _rounds(asked, task, begin, note) if held is None else held
     found = structure.at(look.x)
     values = {key: value for e in found.elements for key, value in e.values.items()}
     system = structure.system(look.x)
@@ -267,16 +274,31 @@ def _search(task: Task, starts: Sequence[Any]) -> Look:
     return look
 
 
-def _rounds(asked: _Asked, task: Task, starts: Sequence[Any]) -> tuple[Task, Look, Proof, int]:
+def _holding(asked: _Asked, task: Task) -> tuple[Task, Look, Proof, int] | None:
+    """The first values, where they hold all hard goals and the proof closes."""
+    look = task.look(np.zeros(len(task.structure.parameters)))
+    if look is None or look.hard > 1 + ROOM:
+        return None
+    proof = asked.prove(task.structure.system(look.x))
+    return (task, look, proof, 0) if proof.closed or asked.ranges is None else None
+
+
+def _rounds(
+    asked: _Asked, task: Task, starts: Sequence[Any], note: Callable[[str], None] | None
+) -> tuple[Task, Look, Proof, int]:
     """Tune and prove until the proof closes, or cannot: then the last law that meets the goals stands."""
+    say = note or (lambda _: None)
+    say("tuning")
     look = _search(task, starts)
     for count in itertools.count(1):
+        say(f"round {count}: proof")
         proof = asked.prove(task.structure.system(look.x))
         known = {(model.name, model.goals) for model in task.models}
         new = tuple(m for m in proof.refuting if (m.name, m.goals) not in known)
         if proof.closed or not new or count == ROUNDS:
             break
         more = replace(task, models=(*task.models, *new))
+        say(f"round {count + 1}: tuning on {len(more.models)} models")
         try:
             look = _search(more, [look.x])
         except (CheckError, InputError):

@@ -100,7 +100,7 @@ def read_structure(
     signals that no loop has, and notches that no law of this sample time has.
     """
     axes = table.axes or "decentralized"
-    units = {name: gains for name, gains in _units_by_axis(plant, axes)}
+    units = dict(_units_by_axis(plant, axes))
     law: dict[str, tuple[str, ...]] = {}
     found: dict[str, StructuredElement] = {}
     for axis, names in table.law.items():
@@ -185,12 +185,12 @@ def _element(
         raise where.refuse(
             "frequency", found, f"less than half of sampling, {nyquist:.0f} rad/s: no sampled law has more"
         )
-    found_element = StructuredElement(name, table.kind, numbers, units, bounds)
+    found = StructuredElement(name, table.kind, numbers, units, bounds)
     try:
-        make_element(found_element)
+        make_element(found)
     except InputError as error:  # the element does not know the file
         raise where.refuse(error.field.partition(".")[2], error.found, error.expected) from error
-    return found_element
+    return found
 
 
 def _goal(name: str, table: GoalTable, plant: Plant, where: _Where) -> StructuredGoal:
