@@ -45,9 +45,9 @@ def tune_design(
 ) -> TunedDesign:
     """Tune the law of a design file for its [goals] and for its [specification], until the margin is proven.
 
-    Of [specification] these are goals: the margin, the peak sensitivity, and noise of forces and motions at rest. The
-    others, as flights, are judged by `malta tune --check`. Goals hold in the middle of the travel and at its ends, and at
-    the design's operating point in all else.
+    Of [specification] these are goals: the margin, the peak sensitivity, and noise of forces and motions at rest. Others,
+    as flights, are judged by `malta tune --check`. Goals hold in the middle of the travel and at its ends, and at the
+    design's operating point in all else.
 
     spec : a design with [structure], from `malta.read_design`
     keep : leave numbers that hold all hard goals, with the proof, as they stand
@@ -56,7 +56,7 @@ def tune_design(
 
     Returns a TunedDesign.
 
-    Raises InputError for another design, for one without goals, and for a structure that does not stabilize the machine;
+    Raises InputError for another design, one without goals, and a structure that does not stabilize the machine;
     CheckError where no law meets the hard goals, with two that hold each other.
 
     >>> import malta
@@ -118,10 +118,8 @@ def design_goals(spec: Spec) -> list[Goal]:
         if requirement.trade is None or not sensors:
             continue
         kind, signals = own[requirement.trade]
-        if requirement.indices is not None:
-            names = [signals[k].name for k in requirement.indices(plant)]
-        else:
-            names = [signal]
+        of = requirement.indices
+        names = [signal] if of is None else [signals[k].name for k in of(plant)]
         found += [noise_limit(sensors, f"{kind} {n}", bound, name=f"{base} {n}") for n in names]
     assert spec.structure is not None
     for given in spec.structure.goals:

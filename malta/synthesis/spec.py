@@ -396,8 +396,10 @@ class Spec:
         own = hashlib.sha256(change.encode()).hexdigest()
         return replace(self, **({"law": law, "sha256": own} | fields))
 
-    def _law_with(self, numbers: Mapping[str, float], field: str) -> Weights | Pid:
+    def _law_with(self, numbers: Mapping[str, float], field: str) -> Weights | Pid | StructuredLaw:
         """The law with other numbers, SI, by their place in the file. Raises InputError as `place_of` does."""
+        if isinstance(self.law, StructuredLaw):
+            return self._structure_with(self.law, numbers, field)
         names = [name for name in self.law.__dataclass_fields__ if name not in ("axes", "coordinates")]
         fields: dict[str, Any] = {name: np.array(getattr(self.law, name)) for name in names}
         for entry, si in numbers.items():
@@ -406,6 +408,22 @@ class Spec:
                 raise InputError(self.path, entry, "an entry that this design leaves out", "one that it has")
             fields[place][index] = si * si if squared else si
         return replace(self.law, **fields)
+
+    def _structure_with(self, law: StructuredLaw, numbers: Mapping[str, float], field: str) -> StructuredLaw:
+        """A law of elements with other numbers, SI, by their place, as "structure.elements.radial.Kp"."""
+        own = {
+            f"structure.elements.{e.name}.{key}": (k, key)
+            for k, e in enumerate(law.elements)
+            for key, value in e.numbers.items()
+            if isinstance(value, float)
+        }
+        changed = list(law.elements)
+        for entry, si in numbers.items():
+            if entry not in own:
+                raise InputError(self.path, field, repr(entry), "one of " + " ".join(own))
+            k, key = own[entry]
+            changed[k] = replace(changed[k], numbers={**changed[k].numbers, key: float(si)})
+        return replace(law, elements=tuple(changed))
 
     def value_of(self, variable: Variable) -> float:
         """Return the number that the file holds for a variable of the search, in the variable's unit.
