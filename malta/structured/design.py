@@ -45,9 +45,9 @@ def tune_design(
 ) -> TunedDesign:
     """Tune the law of a design file for its [goals] and for its [specification], until the margin is proven.
 
-    Of [specification] these are goals: the margin, the peak sensitivity, and noise of forces and motions at rest. Others,
-    as flights, are judged by `malta tune --check`. Goals hold in the middle of the travel and at its ends, and at the
-    design's operating point in all else.
+    Of [specification] these are goals: the margin, the peak sensitivity, and noise of forces and motions at rest.
+    Others, as flights, are judged by `malta tune --check`. Goals hold in the middle of the travel and at its ends, and
+    at the design's operating point in all else.
 
     spec : a design with [structure], from `malta.read_design`
     keep : leave numbers that hold all hard goals, with the proof, as they stand
