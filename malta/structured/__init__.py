@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from malta.synthesis.elements import gain as gain
     from malta.synthesis.elements import lead as lead
     from malta.synthesis.elements import notch as notch
+    from malta.synthesis.elements import observer as observer
     from malta.synthesis.elements import pid as pid
     from malta.synthesis.elements import states as states
     from malta.synthesis.elements import transfer as transfer

@@ -54,6 +54,7 @@ class Tuned:
     rounds : of tuning and proving
     seconds : s
     controller : of a machine, for gain files, verification, simulation and export
+    against : where the proof does not close: the goals that hold each other once what refutes the law is a model
 
     >>> import control
     >>> from malta import structured
@@ -78,6 +79,7 @@ class Tuned:
     rounds: int
     seconds: float
     controller: Controller | None
+    against: str = ""
 
     @property
     def sampled(self) -> System:
@@ -98,7 +100,8 @@ class Tuned:
             else f"Not proven: stability over the ranges ({self.margin.reason or 'the nominal loop is lost'})."
         ]
         if self.asked is not None and (low or 0.0) < self.asked:
-            found.append(f"Asked for were {self.asked:g} times: the proof does not close.")
+            why = f" {self.against}." if self.against else ""
+            found.append(f"Asked for were {self.asked:g} times: the proof does not close.{why}")
         for (goal, channel), gain in self.peaks.items():
             if gain.upper is None:
                 found.append(
@@ -208,7 +211,7 @@ def tune(
     return Tuned(
         values, structure.order, system, first.sample_time, _reached(look, goals), tuple(m.name for m in task.models),
         proof.margin, proof.peaks, None if ranges is None else wanted, proof.closed,
-        rounds, clock.monotonic() - begun, controller,
+        rounds, clock.monotonic() - begun, controller, proof.against,
     )  # fmt: skip
 
 
@@ -220,6 +223,7 @@ class Proof:
     peaks: Mapping[tuple[str, str], Gain]
     closed: bool
     refuting: tuple[Model, ...] = ()
+    against: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,7 +308,9 @@ def _rounds(
         except (CheckError, InputError):
             try:
                 look = _search(more, [look.x, *starts])
-            except (CheckError, InputError):
+            except (CheckError, InputError) as error:
+                words = str(error).rpartition("structured: ")[2]
+                proof = replace(proof, against=words[0].upper() + words[1:])
                 break
         task = more
     return task, look, proof, count
