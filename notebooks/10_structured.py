@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Laws of a given structure, and how small a law can be
 #
-# `robust` holds 350 % of the box on MALTA, with an observer of all states, lags and sums of errors: 20 states in the law.
-# A decentralized law has a few for each sensor and the actuator beside it, which the paper calls unsuitable for five
-# coupled axes. Its elements are tuned on the machine's own loop, and every margin below is proven.
+# `robust` holds 350 % of the box on MALTA, with an observer of all states, lags and sums of errors: 20 states in the
+# law. A decentralized law has a few for each sensor and the actuator beside it, which the paper calls unsuitable for
+# five coupled axes. Its elements are tuned on the machine's own loop, and every margin below is proven.
 #
 # **Question:** how many states does a law need that holds 340 % anywhere in the travel, with |S| of at most 2?
 
@@ -31,8 +31,9 @@ Path("build").mkdir(exist_ok=True)
 # %% [markdown]
 # ## A design file with [structure]
 # `design/structured.toml`: a PID and a lead of each axis, the four radial ones with one set of numbers. Goals are its
-# `[specification]` as far as that is a figure of the linear loop, and two soft goals of stiffness. The file's numbers hold
-# all hard goals and the proof, so they stay as they are; from other numbers the same call tunes them, in a minute.
+# `[specification]` as far as that is a figure of the linear loop, and two soft goals of stiffness. The file's numbers
+# hold all hard goals and the proof, so they stay as they are; from other numbers the same call tunes them, in a
+# minute.
 
 # %%
 spec = malta.read_design("design/structured.toml")
@@ -48,13 +49,14 @@ assert round(found.tuned.margin.lower, 3) == 3.078
 assert max(found.tuned.reached.values()) <= 1
 
 # %% [markdown]
-# **Judgement.** 307.8 % with three states an axis, |S| below 2 in the middle of the travel and at its ends. Noise of a
-# bearing force and of the thrust are at their bounds: they, not the margin, stop the stiffness.
+# **Judgement.** 307.8 % with three states an axis, |S| below 2 in the middle of the travel and at its ends. Noise of
+# a bearing force and of the thrust are at their bounds: they, not the margin, stop the stiffness.
 
 # %% [markdown]
 # ## The law of `robust`, truncated
-# What it does at the sensors is a system of 20 states: x and y have 8 each, the stroke 4. Its integrals are kept, and of the
-# rest the states of the smallest Hankel singular values are left out (balanced truncation, in the s of Tustin's rule).
+# What it does at the sensors is a system of 20 states: x and y have 8 each, the stroke 4. Its integrals are kept, and
+# of the rest the states of the smallest Hankel singular values are left out (balanced truncation, in the s of
+# Tustin's rule).
 
 # %%
 plant, box = spec.plant, dict(spec.uncertainty)
@@ -117,14 +119,14 @@ assert 3.2 < truncations[18] < 3.4
 assert truncations[16] == 0
 
 # %% [markdown]
-# **Judgement.** Truncation leaves 329 % with 18 states, and an unstable loop with 16. It does not know what the margin is
-# lost at, so `robust` cannot be made smaller this way.
+# **Judgement.** Truncation leaves 329 % with 18 states, and an unstable loop with 16. It does not know what the
+# margin is lost at, so `robust` cannot be made smaller this way.
 
 # %% [markdown]
 # ## Laws that are tuned for the margin
-# PDs and PIDs of single axes, tuned with the margin as a goal: |S| of at most 2 at the centre and the ends, at most 0.55 N of
-# noise of the bearing forces, which is what `robust` may have, and 0.8 N of the thrust. From margin to margin the search
-# began where it had ended, some minutes in all. Here its numbers are judged and proven again.
+# PDs and PIDs of single axes, tuned with the margin as a goal: |S| of at most 2 at the centre and the ends, at most
+# 0.55 N of noise of the bearing forces, which is what `robust` may have, and 0.8 N of the thrust. From margin to
+# margin the search began where it had ended, some minutes in all. Here its numbers are judged and proven again.
 
 # %%
 level = np.sqrt(np.square(plant.noise) + np.square(plant.resolution) / 12)
@@ -180,15 +182,15 @@ axes.legend(frameon=False, loc="lower left")
 figure.savefig("build/10_order.png", dpi=120)
 
 # %% [markdown]
-# **Judgement.** Five states hold 374 %, one for each axis; ten, with sums of errors that carry a constant load, 372 %. A
-# law without states holds nothing: forces that follow positions alone add no damping. So the smallest law found that keeps
-# 340 % has 5 states, or 10 where loads leave no error, against the 20 of `robust`. Its states are not what its margin
-# needs: they answer its other requirements, as a load of 1 N that is carried in a tenth of a second.
+# **Judgement.** Five states hold 374 %, one for each axis; ten, with sums of errors that carry a constant load, 372
+# %. A law without states holds nothing: forces that follow positions alone add no damping. So the smallest law found
+# that keeps 340 % has 5 states, or 10 where loads leave no error, against the 20 of `robust`. Its states are not what
+# its margin needs: they answer its other requirements, as a load of 1 N that is carried in a tenth of a second.
 
 # %% [markdown]
 # ## Beside HIFOO and hinfstruct
-# AC7 of COMPleib, a transport aircraft of 9 states with one input and two sensors (Gangsaas et al., IEEE TAC 31, 1986):
-# the static law of the least H-infinity norm. 0.0651 is quoted for HIFOO.
+# AC7 of COMPleib, a transport aircraft of 9 states with one input and two sensors (Gangsaas et al., IEEE TAC 31,
+# 1986): the static law of the least H-infinity norm. 0.0651 is quoted for HIFOO.
 
 # %%
 given = tomllib.loads(Path("tests/structured/compleib.toml").read_text(encoding="utf-8"))["AC7"]

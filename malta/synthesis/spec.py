@@ -492,14 +492,20 @@ def process_signals(plant: Plant, coordinates: Coordinates) -> list[Signal]:
 
 
 def place_of(
-    entry: str, plant: Plant, where: Path, field: str = "search", law: Weights | Pid | None = None
+    entry: str,
+    plant: Plant,
+    where: Path,
+    field: str = "search",
+    law: Weights | Pid | StructuredLaw | None = None,
 ) -> Entry:
     """Find where an entry of the design file stands in Weights or Pid.
 
     law : whose coordinates or axes count; None: signals and single sensors
 
-    Raises InputError for an entry that no design file has.
+    Raises InputError for an entry that no design file has, and for a law of elements, which is not searched so.
     """
+    if isinstance(law, StructuredLaw):
+        raise InputError(where, field, repr(entry), "none beside [structure]: its elements have low and high")
     coordinates: Coordinates = law.coordinates if isinstance(law, Weights) else "signals"
     axes: PidAxes = law.axes if isinstance(law, Pid) else "decentralized"
     integrals = integral_signals(plant, coordinates)

@@ -185,12 +185,12 @@ def _element(
         raise where.refuse(
             "frequency", found, f"less than half of sampling, {nyquist:.0f} rad/s: no sampled law has more"
         )
-    found = StructuredElement(name, table.kind, numbers, units, bounds)
+    made = StructuredElement(name, table.kind, numbers, units, bounds)
     try:
-        make_element(found)
+        make_element(made)
     except InputError as error:  # the element does not know the file
         raise where.refuse(error.field.partition(".")[2], error.found, error.expected) from error
-    return found
+    return made
 
 
 def _goal(name: str, table: GoalTable, plant: Plant, where: _Where) -> StructuredGoal:
@@ -279,7 +279,7 @@ def with_values(law: StructuredLaw, values: Mapping[str, float]) -> StructuredLa
     changed = []
     for one in law.elements:
         made = make_element(one).at(values).values
-        new = {key.partition(".")[2]: value for key, value in made.items()}
+        new: dict[str, Any] = {key.partition(".")[2]: value for key, value in made.items()}
         if one.kind == "transfer":
             n = len(one.numbers["denominator"]) - 1
             new = {
