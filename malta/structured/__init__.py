@@ -1,8 +1,9 @@
 """Laws of a given structure, tuned on figures with exact derivatives and proven; H-infinity laws of full order.
 
-elements   what is tuned: gains, PIDs, leads, notches, transfer functions, state spaces, and where they stand
-goals      what is asked for: sensitivity, disks, gains, noise, tracking, poles
+elements   what is tuned: gains, PIDs, leads, notches, transfer functions, observers, state spaces, diagrams of them
+goals      what is asked for: sensitivity, disks, gains, noise, tracking, poles, a stable law
 tune       from a start to a proof: goals on models, worst parameters from proofs, until they close
+tune_design  the same of a design file with [structure]
 h_infinity from a generalized plant to the best law of its order, by two Riccati equations
 """
 
@@ -13,7 +14,6 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
-    from malta.structured.design import TunedDesign as TunedDesign
     from malta.structured.design import tune_design as tune_design
     from malta.structured.goals import Goal as Goal
     from malta.structured.goals import disk_margin as disk_margin

@@ -54,7 +54,7 @@ def tune_design(
     starts : of the search, the first from the file's numbers; further ones have fixed seeds
     note : called with what is being done
 
-    Returns a TunedDesign.
+    Returns the `spec` with the numbers that were found, and `tuned`, what they reach and what is proven of them.
 
     Raises InputError for another design, one without goals, and a structure that does not stabilize the machine;
     CheckError where no law meets the hard goals, with two that hold each other.

@@ -134,7 +134,10 @@ class Element:
         return Element(f"{self.name} + {other.name}", _joined(self, other), matrices)
 
     def feedback(self, other: Element) -> Element:
-        """This element with another in its negative feedback: self / (1 + other self)."""
+        """This element with another in its negative feedback: self / (1 + other self).
+
+        other : from the outputs of this element to its inputs
+        """
         k = len(self.parameters)
 
         def matrices(values: Sequence[Any]) -> Matrices:

@@ -12,6 +12,9 @@ import pytest
 from conftest import ROOT, Run, one_sentence, refusal
 
 import malta
+from malta.app.files import open_design
+from malta.report.page.analysis import design_entries
+from malta.report.page.report import subject_of
 from malta.structured.design import design_goals, structured_text, tune_design
 from malta.synthesis.controller import linear_law
 from malta.tuning.search import model_and_controller
@@ -114,6 +117,17 @@ def test_a_worse_start_is_tuned_to_the_same_figures_and_written(spec: Spec, tmp_
     again = malta.read_design(target)
     assert tune_design(again, keep=True).spec is again
     assert again.sha256 != spec.sha256
+
+
+def test_a_report_and_the_live_page_show_the_elements(spec: Spec) -> None:
+    entries = design_entries(subject_of(GAINS, spec=spec))
+    shown = {e.name: (e.value, e.unit) for e in entries if e.group == "elements of the law"}
+    assert len(shown) == 12
+    assert shown["radial Kp"] == (79917.0, "N/m")
+    files = open_design(FILE)
+    edited = files.apply(files.edit({"structure.elements.axial.Kp": 15.0})).spec
+    assert edited.structure is not None
+    assert edited.structure.elements[2].numbers["Kp"] == 15e3
 
 
 def test_numbers_change_by_their_place(spec: Spec) -> None:

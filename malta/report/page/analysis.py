@@ -156,6 +156,7 @@ GROUPS = (
         "uncertainty",
         "law",
         "PID gains",
+        "elements of the law",
         "weights",
         "bases",
         "cost",
