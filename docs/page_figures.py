@@ -425,7 +425,7 @@ def order() -> Figure:
     figure, (axes,) = new_figure(1, 5.2, 3.4)
     laws = {
         "robust, truncated": ("o", ((20, 3.502), (18, 3.289), (16, 0.0))),
-        "tuned for the margin": ("s", ((5, 3.742), (10, 3.718))),
+        "tuned for the margin": ("s", ((5, 3.742), (10, 3.718), (15, 3.819))),
         "structured, tuned for stiffness": ("D", ((15, 3.077),)),
     }
     for (label, (mark, points)), style in zip(laws.items(), STYLES, strict=False):

@@ -17,6 +17,7 @@ from malta.report.page.analysis import design_entries
 from malta.report.page.report import subject_of
 from malta.structured.design import design_goals, structured_text, tune_design
 from malta.synthesis.controller import linear_law
+from malta.synthesis.structure import with_values
 from malta.tuning.search import model_and_controller
 from malta.tuning.verify import judge
 
@@ -148,6 +149,53 @@ def test_commands_take_the_gain_file(run: Run, tmp_path: Path) -> None:
     assert (tmp_path / "c" / "structured.c").exists()
     code, _, err = run("tune", FILE, "--out", ROOT / "design")
     assert (code, "the design file that was given" in one_sentence(err)) == (2, True)
+
+
+CENTRED = """
+[structure]
+axes = "centre-of-gravity"
+
+[structure.law]
+x = ["all", "shape"]
+y = ["all", "shape"]
+z = ["all", "shape"]
+alpha = ["all", "shape"]
+beta = ["all", "shape"]
+
+[structure.elements.all]
+kind = "pid"
+Kp = { value = 1e5, unit = "1/s^2" }
+Kd = { value = 400, unit = "1/s" }
+filter = { value = 0.1, unit = "ms" }
+
+[structure.elements.shape]
+kind = "transfer"
+numerator = [1, 2000]
+denominator = [1, 3000]
+
+"""
+
+
+def test_laws_of_coordinates_push_with_all_actuators(tmp_path: Path) -> None:
+    """v = G^-1 K(s) P^-1 e, where the design model is q'' = .. + G v, y = P q; numbers are changed by their names."""
+    text = FILE.read_text(encoding="utf-8").replace("../data", (ROOT / "data").as_posix())
+    path = tmp_path / "centred.toml"
+    text = text[: text.index("[structure]")] + CENTRED + text[text.index("[goals.") :]
+    path.write_text(text, encoding="utf-8")
+    spec = malta.read_design(path)
+    model, c = model_and_controller(spec)
+    law, z = linear_law(c), np.exp(1j * 2e3 * spec.sample_time)
+    found = -(law.C @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B_y) + law.D_y)
+    s = 2 / spec.sample_time * (z - 1) / (z + 1)
+    one = (1e5 + 400 * s / (1 + 1e-4 * s)) * (s + 2000) / (s + 3000)
+    G, P = model.force_map, model.C[:, :5]
+    np.testing.assert_allclose(found, one * np.linalg.inv(G) @ np.linalg.inv(P), rtol=1e-9, atol=1e-6)
+    assert spec.structure is not None
+    changed = with_values(spec.structure, {"shape.a0": 5e3, "all.Kp": 2e5})
+    assert changed.elements[0].numbers["Kp"] == 2e5
+    assert changed.elements[1].numbers == {"numerator": (1.0, 2000.0), "denominator": (1.0, 5000.0)}
+    written_text = structured_text(replace(spec, law=changed), tmp_path / "found.toml")
+    assert "denominator = [1.0, 5000.0]" in written_text
 
 
 RADIAL = '[structure.elements.radial]\nkind = "pid"'
