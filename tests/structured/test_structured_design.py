@@ -12,7 +12,8 @@ import pytest
 from conftest import ROOT, Run, one_sentence, refusal
 
 import malta
-from malta.app.files import open_design
+from malta.app.explore import searched_spec
+from malta.app.files import Edit, open_design
 from malta.report.page.analysis import design_entries
 from malta.report.page.report import subject_of
 from malta.structured.design import design_goals, structured_text, tune_design
@@ -272,18 +273,21 @@ def test_goals_of_a_file_that_contradict_each_other_are_named(tmp_path: Path) ->
     path = written(tmp_path, ("force_noise = { value = 0.5", "force_noise = { value = 0.05"))
     found = tune_design(malta.read_design(path)).tuned
     assert not found.closed
-    assert "Asked for were 3 times: the proof does not close." in found.certificate
-    assert re.search(
-        r"hard goals: .*force_noise fy_B1 \(.* against .*(sensitivity 2|stability)", found.certificate
-    )
+    words = found.certificate
+    assert "Asked for were 3 times: the proof does not close." in words
+    assert re.search(r"hard goals: .+ against ", words)
     path = written(tmp_path, ("peak_sensitivity = 2 ", "peak_sensitivity = 1.2 "))
-    with pytest.raises(malta.CheckError, match=r"hard goals: sensitivity 1\.2 of \w+ .* against "):
+    with pytest.raises(malta.CheckError, match=r"hard goals: .+ against ") as caught:
         tune_design(malta.read_design(path))
+    assert "sensitivity 1.2" in str(caught.value)
 
 
 def test_a_search_of_weights_refuses_elements(spec: Spec) -> None:
     with pytest.raises(malta.InputError, match="tune_design"):
         malta.tune(spec)
+    files = open_design(FILE)
+    with pytest.raises(malta.InputError, match="malta tune"):
+        searched_spec(files, files.apply(Edit()))
     with pytest.raises(malta.InputError, match=r"\[structure\]|structure"):
         tune_design(malta.read_design(ROOT / "design" / "table2.toml"))
     bare = replace(spec, specification={}, law=replace(spec.law, goals=()))
