@@ -420,6 +420,24 @@ def coils() -> Figure:
     return figure
 
 
+def order() -> Figure:
+    """Proven margins of laws of MALTA by their states, as notebooks/10_structured.py computes and asserts them."""
+    figure, (axes,) = new_figure(1, 5.2, 3.4)
+    laws = {
+        "robust, truncated": ("o", ((20, 3.502), (18, 3.289), (16, 0.0))),
+        "tuned for the margin": ("s", ((5, 3.742), (10, 3.718), (15, 3.819))),
+        "structured, tuned for stiffness": ("D", ((15, 3.077),)),
+    }
+    for (label, (mark, points)), style in zip(laws.items(), STYLES, strict=False):
+        axes.plot(*zip(*points, strict=True), mark, label=label, fillstyle="none", color=style["color"])
+    axes.axhline(3.4, color="#8a8a8a", linewidth=1, linestyle="--")
+    axes.set_ylim(-0.2, 4.2)
+    axes.set_xlim(0, 21)
+    axes.legend(frameon=False, loc="lower left")
+    finish(axes, "states of the law", "proven margin [boxes of ±20 %]", "")
+    return figure
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "value_sets": value_sets,
     "cell": cell,
@@ -433,6 +451,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "bode": bode,
     "positioning": positioning,
     "coils": coils,
+    "order": order,
 }
 
 

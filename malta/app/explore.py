@@ -54,9 +54,12 @@ class Search(NamedTuple):
 def searched_spec(files: DesignFiles, edited: Edited) -> Spec:
     """The design of the page with what may vary: the numbers of [search], else the sliders of the page's first group.
 
-    Raises InputError for a machine that differs from the one that is designed for.
+    Raises InputError for a machine that differs from the one that is designed for, and for a law of [structure].
     """
     spec = edited.spec
+    if spec.structure is not None:
+        expected = "`malta tune`, which tunes elements until their proof closes"
+        raise InputError(spec.path.name, "structure", "a law of elements", expected)
     if edited.truth != spec.parameters:
         found, expected = "a machine that differs from the design's", "a design for the machine's numbers"
         raise InputError(spec.path.name, "search", found, expected)

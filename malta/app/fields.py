@@ -98,10 +98,12 @@ def fields_of(files: Files) -> tuple[Field, ...]:
 
 
 def _law_fields(files: Files) -> Iterator[Field]:
-    """Weights, bases, noise, and the gains of a PID."""
+    """Weights, bases, noise, the gains of a PID, and the numbers of elements."""
     variables = {entry: v for v in files.spec.search for entry in v.entries}
-    for table in ("weights", "bases", "noise", "pid"):
+    for table in ("weights", "bases", "noise", "pid", "structure"):
         for path, entries in _tables(files.content.get(table, {}), table):
+            if table == "structure" and path.endswith((".low", ".high")):  # bounds of a search
+                continue
             for name, entry in (files.expand(path) if entries is None else entries).items():
                 key = f"{path}.{name}"
                 value, unit = (entry["value"], entry["unit"]) if isinstance(entry, Mapping) else (entry, "")
@@ -174,7 +176,7 @@ def _range(value: float, *, zero: bool, share: bool) -> tuple[float, float, Kind
 
 def _sampling_fields(files: Files) -> Iterator[Field]:
     """Sample time, delay, and the switches of the design model."""
-    content, group, lqg = files.content, "Sampling", files.spec.pid is None
+    content, group, lqg = files.content, "Sampling", files.spec.kind == "LQG"
     time = content["sample_time"]
     low, high = time["value"] / NARROW, time["value"] * NARROW
     yield Field("sample_time", group, "sample time", time["value"], time["unit"], "log", low, high)

@@ -129,7 +129,7 @@ class Session:
             "summary": spec.summary,
             "machine": spec.plant.name,
             "preset": spec.parameters.preset,
-            "law": "PID" if spec.pid else "LQG",
+            "law": spec.kind,
             "file": default_file(self.root, files.path),
             "fields": [asdict(field) for field in files.fields.values()],
             "runs": run_names(problem.plant, problem.controller),

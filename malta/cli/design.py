@@ -58,6 +58,8 @@ def design(
 ) -> None:
     """Design controllers: synthesize, verify, simulate, write gain files.
 
+    A law of [structure] is tuned first, unless the file's numbers hold its goals: `malta tune` writes what it finds.
+
     Gain files are replaced only by a design that is stable on the machine and completes its main job, as the stroke.
 
     With --set the gain files have the name of the design and its changes, so that those of the unchanged design stand.
@@ -124,6 +126,10 @@ def _run_design(
     from malta.synthesis.lqg import synthesize
 
     spec = read_changed_design(file, changes)
+    if spec.structure is not None:
+        from malta.structured.design import tune_design
+
+        spec = tune_design(spec, keep=True, note=note).spec
     plant, job = spec.plant, main_job(spec.plant)
     paths = [out / f"{spec.name}{suffix}" for suffix in gains.SUFFIXES]
     picture = figures / f"{spec.name}_{job}.png"
@@ -304,7 +310,9 @@ def tune(
 ) -> None:
     """Find the numbers of a design for what its file asks for: margin, bandwidth, noise, experiments.
 
-    Of an LQG these are weights, bases and noise. Of a PID they are gains, and what its [cost] names is made small.
+    Of an LQG these are weights, bases and noise. Of a PID they are gains, and what its [cost] names is made small. Of a
+    law of [structure] they are the numbers of its elements, tuned on [goals] and [specification] until the margin is
+    proven, in a minute and without trials.
 
     The design file that is found is the one that was given, with other numbers. Every trial is kept in the folder: the
     same command goes on where it was ended. Exit code 1 when something asked for is not reached; the nearest design is
@@ -329,6 +337,9 @@ def tune(
         raise InputError(target, "", "the design file that was given", "another --out, or --overwrite")
     if file_exists(target) and not overwrite:
         raise InputError(target, "", "a design file", "another --out, or --overwrite")
+    if spec.structure is not None:
+        _tune_structure(spec, target, as_json=as_json)
+        return
     effort = Effort(generations=generations, front=front)
     tuned = _search(spec, journal, effort, restart=restart)
     files = _write(spec, tuned, target)
@@ -339,6 +350,31 @@ def tune(
     else:
         _print_tables(tuned, files)
     _require_all(tuned.requirements, target)
+
+
+def _tune_structure(spec: Spec, target: Path, *, as_json: bool) -> None:
+    """Tune the elements of a law, write the design file that is found, and judge it."""
+    from malta import report
+    from malta.structured.design import structured_text, tune_design
+    from malta.tuning.verify import judge
+
+    with working(f"tuning {spec.name}") as work:
+        found = tune_design(spec, note=work.note)
+        replace_files({target: structured_text(found.spec, target).encode()})
+        work.note("requirements")
+        requirements = judge(found.spec)
+    if as_json:
+        from malta.cli.documents.loops import RequirementPart
+        from malta.cli.documents.others import TuneOutput
+
+        parts = [RequirementPart.of(one) for one in requirements]
+        print_document(TuneOutput(design=spec.name, files=[str(target)], requirements=parts))
+    else:
+        console = make_console()
+        console.print(found.tuned.certificate, soft_wrap=True)
+        console.print(report.requirements_table(requirements))
+        print_written(console, [target])
+    _require_all(requirements, target)
 
 
 def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:

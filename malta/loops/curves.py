@@ -29,9 +29,9 @@ from malta.loops.classical import (
     find_tops,
     margins_of_channel,
 )
-from malta.loops.linear_loops import LinearLoop, Place, System, linear_loop
+from malta.loops.linear_loops import LinearLoop, Place, linear_loop
 from malta.processes import on_one_thread
-from malta.synthesis.state_space import balanced_units
+from malta.synthesis.state_space import System, balanced_units
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Signal

@@ -12,10 +12,9 @@ lost their digits.
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from scipy import linalg
@@ -27,7 +26,7 @@ from malta.model.plant import Plant, Signal
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, LinearLaw, linear_law
 from malta.synthesis.riccati import eigenvalues
-from malta.synthesis.state_space import balanced_units, named_system, reference_names, set_point
+from malta.synthesis.state_space import System, balanced_units, named_system, reference_names, set_point
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -155,47 +154,6 @@ GONE = 1e-6  # |z| of the poles of pure delay
 STILL = 1e-6  # of a pole's frequency: growth that counts as none
 SAME = 1e-3  # of a response: the error of states that still are those of a transfer function
 ROUNDING = 1e-14  # of a matrix whose eigenvalues are taken
-
-
-class System(NamedTuple):
-    """x' = A x + B u, y = C x + D u; of a sampled system (x+ - x) / T = A x + B u."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-
-    @classmethod
-    def of(cls, source: Any) -> System:
-        """The matrices of a control.StateSpace."""
-        return cls(*(np.array(M, dtype=float) for M in (source.A, source.B, source.C, source.D)))
-
-    @property
-    def balanced(self) -> System:
-        """The same system with states in balanced units."""
-        if not len(self.A):
-            return self
-        t = balanced_units(self.A, self.B, self.C)
-        return System(self.A * t / t[:, None], self.B / t[:, None], self.C * t, self.D)
-
-    def response(self, s: ComplexArray) -> ComplexArray:
-        """C (s - A)^-1 B + D at k complex frequencies s, in differences (z - 1) / T: k x outputs x inputs.
-
-        NaN at a frequency that no double number tells from a pole.
-        """
-        if not len(self.A):
-            return np.broadcast_to(self.D.astype(complex), (len(s), *self.D.shape))
-        A, B, C, _ = self.balanced
-        matrices = s[:, None, None] * np.eye(len(A)) - A
-        try:
-            found = np.linalg.solve(matrices, B.astype(complex))
-        except np.linalg.LinAlgError:  # a frequency on a pole: beside it
-            beside = matrices + 1e-9 * s[:, None, None] * np.eye(len(A))
-            found = np.full((len(s), *B.shape), np.nan, dtype=complex)
-            for k, one in enumerate(beside):
-                with suppress(np.linalg.LinAlgError):
-                    found[k] = np.linalg.solve(one, B)
-        return np.asarray(C @ found + self.D)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ import numpy as np
 
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
-from malta.loops.linear_loops import LinearLoop, System
+from malta.loops.linear_loops import LinearLoop
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.loops.sampled_loops import SampledLoop
 from malta.model.plant import position_in
@@ -32,6 +32,7 @@ from malta.proof.responses import find_peaks
 from malta.synthesis.recovery import StepResponse, step_response
 from malta.synthesis.requirements import Noise
 from malta.synthesis.riccati import sample
+from malta.synthesis.state_space import System
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant

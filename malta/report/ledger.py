@@ -215,7 +215,7 @@ def claim_of(
 
     reproducing : names of the designs that are meant to reproduce the paper
     """
-    shown = [e for e in found if not (row.of_lqg and e.spec.pid)]
+    shown = [e for e in found if not row.of_lqg or e.spec.kind == "LQG"]
     figures = [row.value(e) if e in shown else math.nan for e in found]
     values = [in_unit(figure, row.unit) for figure in figures]
     ours = tuple(_shown(row, figure) for figure in figures)

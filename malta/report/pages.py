@@ -74,13 +74,15 @@ def design_page(
     made += ", with the lag of the current loops" if spec.current_lag else ""
     if spec.pid is not None:
         made = f"PID, {_rate_text(spec.sample_time)}"
+    if spec.structure is not None:
+        made = f"elements of a given structure, {_rate_text(spec.sample_time)}"
     made += ", commutated for the predicted place" if spec.commutation == "predicted" else ""
     return Group(
         Paragraph(f"{spec.name}: {spec.summary}", style="bold"),
         Paragraph(f"{model.plant.name}, preset {spec.parameters.preset}, {made}"),
         "",
         poles_table(model, published),
-        loop_poles_table(margins, continuous_poles(model, spec.weights) if spec.pid is None else None),
+        loop_poles_table(margins, continuous_poles(model, spec.weights) if spec.kind == "LQG" else None),
         bandwidth_table(margins, published),
         sensitivity_table(margins),
         *([] if margins.robust is None else [_margin_text(margins)]),

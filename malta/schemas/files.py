@@ -11,7 +11,7 @@ from malta.errors import InputError
 from malta.gains.schema import GainFile
 from malta.model.data import MachineFile
 from malta.model.parameters import units_of
-from malta.synthesis.design_file import LQG, ONLY_LQG
+from malta.synthesis.design_file import LQG, NOT_BESIDE, ONLY_LQG
 from malta.synthesis.design_tables import AnyBound, DesignFile, specification_record
 from malta.synthesis.requirements import requirements_for
 
@@ -118,12 +118,11 @@ def design_schema(plant: Plant | None = None) -> Schema:
         _name_signals(schema, plant)
     schema = change_nodes(schema, _or_published)
     schema["$defs"]["Published"] = PUBLISHED
-    laws = {
-        "if": {"required": ["pid"]},
-        "then": {"properties": dict.fromkeys(ONLY_LQG, False)},
-        "else": {"required": list(LQG)},
-    }
-    return schema | laws
+    laws: Schema = {"required": list(LQG)}
+    for law, others in NOT_BESIDE.items():
+        alone = {"properties": dict.fromkeys((*ONLY_LQG, *others), False)}
+        laws = {"if": {"required": [law]}, "then": alone, "else": laws}
+    return schema | {"allOf": [laws]}
 
 
 def data_schema(plant: Plant | None = None) -> Schema:
@@ -154,6 +153,7 @@ def _name_signals(schema: Schema, plant: Plant) -> None:
         "BasesTable": {"integral": integrals},
         "NoiseTable": dict.fromkeys(("process", "drift"), axes) | {"correlation": positions},
         "PidTable": dict.fromkeys(("Kp", "Ki", "Kd", "filters"), axes),
+        "StructureTable": {"law": [*outputs, *positions]},
         "CostTable": {"load": inputs, "force_noise": inputs, "sensor_noise": outputs},
     }
     for table, partial in some.items():

@@ -1,8 +1,9 @@
 """Laws of a given structure, tuned on figures with exact derivatives and proven; H-infinity laws of full order.
 
-elements   what is tuned: gains, PIDs, leads, notches, transfer functions, state spaces, and where they stand
-goals      what is asked for: sensitivity, disks, gains, noise, tracking, poles
+elements   what is tuned: gains, PIDs, leads, notches, transfer functions, observers, state spaces, diagrams of them
+goals      what is asked for: sensitivity, disks, gains, noise, tracking, poles, a stable law
 tune       from a start to a proof: goals on models, worst parameters from proofs, until they close
+tune_design  the same of a design file with [structure]
 h_infinity from a generalized plant to the best law of its order, by two Riccati equations
 """
 
@@ -13,14 +14,7 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
-    from malta.structured.elements import Element as Element
-    from malta.structured.elements import Place as Place
-    from malta.structured.elements import gain as gain
-    from malta.structured.elements import lead as lead
-    from malta.structured.elements import notch as notch
-    from malta.structured.elements import pid as pid
-    from malta.structured.elements import states as states
-    from malta.structured.elements import transfer as transfer
+    from malta.structured.design import tune_design as tune_design
     from malta.structured.goals import Goal as Goal
     from malta.structured.goals import disk_margin as disk_margin
     from malta.structured.goals import gain_limit as gain_limit
@@ -28,6 +22,7 @@ if TYPE_CHECKING:
     from malta.structured.goals import poles as poles
     from malta.structured.goals import sensitivity as sensitivity
     from malta.structured.goals import soft as soft
+    from malta.structured.goals import stable_law as stable_law
     from malta.structured.goals import tracking as tracking
     from malta.structured.riccati import Synthesized as Synthesized
     from malta.structured.riccati import h_infinity as h_infinity
@@ -35,5 +30,14 @@ if TYPE_CHECKING:
     from malta.structured.riccati import shape_loop as shape_loop
     from malta.structured.rounds import Tuned as Tuned
     from malta.structured.rounds import tune as tune
+    from malta.synthesis.elements import Element as Element
+    from malta.synthesis.elements import Place as Place
+    from malta.synthesis.elements import gain as gain
+    from malta.synthesis.elements import lead as lead
+    from malta.synthesis.elements import notch as notch
+    from malta.synthesis.elements import observer as observer
+    from malta.synthesis.elements import pid as pid
+    from malta.synthesis.elements import states as states
+    from malta.synthesis.elements import transfer as transfer
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

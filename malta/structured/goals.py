@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
-from malta.loops.linear_loops import System
-from malta.structured.elements import CALLER
 from malta.structured.loops import ClosedLoop
-from malta.structured.norms import Channels, gain_slope, noise, peaks_of, response_at
+from malta.structured.norms import Channels, Pole, gain_slope, noise, peaks_of, response_at
+from malta.synthesis.elements import CALLER
+from malta.synthesis.state_space import System
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -213,9 +213,44 @@ def poles(decay: float = 0.0, damping: float = 0.0, fastest: float = math.inf) -
         raise InputError(
             CALLER, "poles", found, "a decay above 0, a damping below 1, or poles faster than the decay"
         )
-    parts = [f"decay {decay:g} 1/s"] * (decay > 0) + [f"damping {damping:g}"] * (damping > 0)
-    unit = ", ".join(parts + [f"up to {fastest:g} rad/s"] * math.isfinite(fastest))
-    return Goal("poles", partial(_poles, decay, damping, fastest), unit=unit)
+    bounds = _PoleBounds(decay, damping, fastest)
+    return Goal("poles", partial(_poles, bounds), unit=bounds.words)
+
+
+def stable_law(decay: float = 0.0, damping: float = 0.0, fastest: float = math.inf) -> Goal:
+    """The law itself is stable, integrals aside: its own poles, with the loop open, as `poles` has those of the loop.
+
+    A law with a pole in the right half plane holds the loop, and runs away where an input saturates or a sensor fails.
+    Integrals, poles at 0 that no parameter moves, are left out.
+
+    decay, damping, fastest : of all other poles, as in `poles`
+
+    Raises InputError as `poles`.
+
+    >>> from malta import structured
+    >>> structured.stable_law(fastest=1e4).unit
+    'stable, up to 10000 rad/s'
+    """
+    if not (decay >= 0 and 0 <= damping < 1 and fastest > decay):
+        found = f"decay {decay}, damping {damping}, fastest {fastest}"
+        raise InputError(CALLER, "stable_law", found, "0 or more, 0 to 1, and poles faster than the decay")
+    bounds = _PoleBounds(decay, damping, fastest)
+    made = partial(_law_poles, bounds)
+    return Goal("stable law", made, unit=", ".join(filter(None, ["stable", bounds.words])))
+
+
+class _PoleBounds(NamedTuple):
+    """What is asked of all poles: 1/s, a ratio, rad/s."""
+
+    decay: float
+    damping: float
+    fastest: float
+
+    @property
+    def words(self) -> str:
+        parts = [f"decay {self.decay:g} 1/s"] * (self.decay > 0)
+        parts += [f"damping {self.damping:g}"] * (self.damping > 0)
+        return ", ".join(parts + [f"up to {self.fastest:g} rad/s"] * math.isfinite(self.fastest))
 
 
 def _require_positive(name: str, value: float) -> None:
@@ -314,11 +349,23 @@ def _noise(
     return [Figure(goal, "", math.nan, value / limit, loop.slope(slope / limit))]
 
 
-def _poles(decay: float, damping: float, fastest: float, loop: ClosedLoop) -> list[Figure]:
+def _poles(asked: _PoleBounds, loop: ClosedLoop) -> list[Figure]:
+    found = _pole_figures(asked, loop.poles(), loop.model.sample_time, damped=asked.damping > 0)
+    return [Figure("poles", kind, size, value, loop.slope(slope)) for kind, size, value, slope in found]
+
+
+def _law_poles(asked: _PoleBounds, loop: ClosedLoop) -> list[Figure]:
+    found = _pole_figures(asked, loop.law_poles(), loop.model.sample_time, damped=True)
+    return [Figure("stable law", *figure) for figure in found]
+
+
+def _pole_figures(
+    asked: _PoleBounds, poles_: Sequence[Pole], T: float | None, *, damped: bool
+) -> list[tuple[str, float, float, FloatArray]]:
     """Figures that are 1 at the bound: decay / -Re would jump at 0, so a difference over the decay counts."""
     found = []
-    T = loop.model.sample_time
-    for pole in loop.poles():
+    decay, damping, fastest = asked
+    for pole in poles_:
         s, slope = pole.value, pole.slope
         if T is not None:  # the pole ln(z) / T that the sampled loop has
             half = s * T / 2
@@ -330,15 +377,14 @@ def _poles(decay: float, damping: float, fastest: float, loop: ClosedLoop) -> li
             continue
         grown = (np.conj(s) * slope).real / size  # of |s|
         if decay:
-            found.append(("decay", s, 2 + s.real / decay, slope.real / decay))
-        if damping:
+            found.append(("decay", size, 2 + s.real / decay, slope.real / decay))
+        if damped:
             ratio, by = -s.real / size, -slope.real / size + s.real * grown / size**2
-            found.append(("damping", s, 1 + damping - ratio, -by))
+            found.append(("damping", size, 1 + damping - ratio, -by))
         if math.isfinite(fastest):
-            found.append(("fastest", s, size / fastest, grown / fastest))
+            found.append(("fastest", size, size / fastest, grown / fastest))
     top = max((f[2] for f in found), default=0.0)
-    near = [f for f in found if f[2] >= min(top, 0.5)]
-    return [Figure("poles", kind, abs(s), value, loop.slope(slope)) for kind, s, value, slope in near]
+    return [f for f in found if f[2] >= min(top, 0.5)]
 
 
 def stability(loop: ClosedLoop, rate: float) -> list[Figure]:

@@ -18,18 +18,18 @@ import numpy as np
 from scipy import sparse
 
 from malta.errors import CheckError, InputError
-from malta.loops.linear_loops import System
-from malta.structured.elements import CALLER
 from malta.structured.norms import Channels, Pole, poles_of
+from malta.synthesis.elements import CALLER
+from malta.synthesis.state_space import System
+from malta.synthesis.structure import OF_INPUTS, OF_OUTPUTS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from malta.model.plant import FloatArray
 
+ZERO = 1e-9  # of a law's largest entry: a pole of that size is an integral
 JOINS = 1e-12  # of the largest entries of its row and column: smaller ones are rounding
-OF_INPUTS = ("reference", "load", "disturbance")
-OF_OUTPUTS = ("error", "output", "force", "acting")
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,6 +207,14 @@ class ClosedLoop:
         """The poles with their derivatives by M, each group by itself; count of each, the slowest first, 0: all."""
         (A, _, _, _), by = self.whole
         return [pole for x in self.groups for pole in poles_of(A[np.ix_(x, x)], by.B2[x], by.C2[:, x], count)]
+
+    def law_poles(self) -> list[Pole]:
+        """The poles of the law with their derivatives by theta, without those at 0, its integrals."""
+        m, p = len(self.model.inputs), len(self.model.outputs)
+        A = self.theta[m:, p:]
+        B2, C2 = np.eye(len(self.theta))[m:], np.eye(self.theta.shape[1])[:, p:]
+        size = float(np.abs(A).max(initial=0.0))
+        return [pole for pole in poles_of(A, B2, C2) if abs(pole.value) > ZERO * size] if size else []
 
     def rows(self, signals: Any) -> list[int]:
         """The outputs of these names. Raises InputError for unknown ones."""

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import linalg
 
 from malta.errors import CheckError
-from malta.loops.linear_loops import System
+from malta.synthesis.state_space import System
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray

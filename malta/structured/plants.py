@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
-from malta.loops.linear_loops import System
 from malta.loops.loop import loop
 from malta.loops.sampled_loops import LAST, SampledLoop, sampled_loop
 from malta.margins.travel import travel_margin, worst_sensitivities
@@ -25,11 +24,11 @@ from malta.proof.machine.windings import chosen_loops
 from malta.proof.margin import Margin, Ranges
 from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator, UncertainSystem
-from malta.structured.elements import CALLER, sample_law
 from malta.structured.goals import Goal
 from malta.structured.loops import Model, model_of, models_of_systems
+from malta.synthesis.elements import CALLER, sample_law
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
-from malta.synthesis.state_space import controller_of
+from malta.synthesis.state_space import System, controller_of
 
 if TYPE_CHECKING:
     from malta.synthesis.controller import Controller

@@ -24,9 +24,9 @@ from scipy.linalg import matrix_balance
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.loops.linear_loops import System
 from malta.processes import on_one_thread
 from malta.structured.norms import peak_gain
+from malta.synthesis.state_space import System
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

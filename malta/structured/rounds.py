@@ -10,21 +10,23 @@ from __future__ import annotations
 
 import itertools
 import time as clock
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from malta.display import Description, ceil_to, display, floor_to, quantity
 from malta.errors import CheckError, InputError
-from malta.loops.linear_loops import System
 from malta.processes import on_one_thread
 from malta.proof.margin import Margin, Ranges
-from malta.structured.elements import CALLER, Structure, places_of, sample_law
 from malta.structured.goals import Goal
 from malta.structured.loops import Model
 from malta.structured.minimax import Look
 from malta.structured.plants import Machine, Systems, Uncertain, Values, target_of
 from malta.structured.search import ROOM, Task, contradiction, random_starts, rate_of, search
+from malta.synthesis.elements import CALLER, Structure, places_of, sample_law
+from malta.synthesis.state_space import System
 
 if TYPE_CHECKING:
     from malta.proof.blocks.gain import Gain
@@ -52,6 +54,7 @@ class Tuned:
     rounds : of tuning and proving
     seconds : s
     controller : of a machine, for gain files, verification, simulation and export
+    against : where the proof does not close: the goals that hold each other once what refutes the law is a model
 
     >>> import control
     >>> from malta import structured
@@ -76,6 +79,7 @@ class Tuned:
     rounds: int
     seconds: float
     controller: Controller | None
+    against: str = ""
 
     @property
     def sampled(self) -> System:
@@ -96,7 +100,8 @@ class Tuned:
             else f"Not proven: stability over the ranges ({self.margin.reason or 'the nominal loop is lost'})."
         ]
         if self.asked is not None and (low or 0.0) < self.asked:
-            found.append(f"Asked for were {self.asked:g} times: the proof does not close.")
+            why = f" {self.against}." if self.against else ""
+            found.append(f"Asked for were {self.asked:g} times: the proof does not close.{why}")
         for (goal, channel), gain in self.peaks.items():
             if gain.upper is None:
                 found.append(
@@ -137,6 +142,8 @@ def tune(
     starts: int = 3,
     seed: int = 0,
     name: str = "structured",
+    keep: bool = False,
+    note: Callable[[str], None] | None = None,
 ) -> Tuned:
     """Find the parameters of a law's elements that meet goals, and prove what they promise over ranges of parameters.
 
@@ -154,6 +161,8 @@ def tune(
     starts : of the search, the first from the elements' own values
     seed : of the further ones
     name : of the controller
+    keep : whether first values that hold all hard goals, with the proofs, stand as they are
+    note : called with what is being done
 
     Returns a Tuned. Its `closed` and its `certificate` say whether the proofs hold what was asked for.
 
@@ -193,7 +202,8 @@ def tune(
         look, proof, rounds = _search(task, begin), Proof(None, {}, closed=False), 1
     else:
         asked = _Asked(target, tuple(goals), ranges, wanted, over_box)
-        task, look, proof, rounds = _rounds(asked, task, begin)
+        held = _holding(asked, task) if keep else None
+        task, look, proof, rounds = _rounds(asked, task, begin, note) if held is None else held
     found = structure.at(look.x)
     values = {key: value for e in found.elements for key, value in e.values.items()}
     system = structure.system(look.x)
@@ -201,7 +211,7 @@ def tune(
     return Tuned(
         values, structure.order, system, first.sample_time, _reached(look, goals), tuple(m.name for m in task.models),
         proof.margin, proof.peaks, None if ranges is None else wanted, proof.closed,
-        rounds, clock.monotonic() - begun, controller,
+        rounds, clock.monotonic() - begun, controller, proof.against,
     )  # fmt: skip
 
 
@@ -213,6 +223,7 @@ class Proof:
     peaks: Mapping[tuple[str, str], Gain]
     closed: bool
     refuting: tuple[Model, ...] = ()
+    against: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,22 +278,39 @@ def _search(task: Task, starts: Sequence[Any]) -> Look:
     return look
 
 
-def _rounds(asked: _Asked, task: Task, starts: Sequence[Any]) -> tuple[Task, Look, Proof, int]:
+def _holding(asked: _Asked, task: Task) -> tuple[Task, Look, Proof, int] | None:
+    """The first values, where they hold all hard goals and the proof closes."""
+    look = task.look(np.zeros(len(task.structure.parameters)))
+    if look is None or look.hard > 1 + ROOM:
+        return None
+    proof = asked.prove(task.structure.system(look.x))
+    return (task, look, proof, 0) if proof.closed or asked.ranges is None else None
+
+
+def _rounds(
+    asked: _Asked, task: Task, starts: Sequence[Any], note: Callable[[str], None] | None
+) -> tuple[Task, Look, Proof, int]:
     """Tune and prove until the proof closes, or cannot: then the last law that meets the goals stands."""
+    say = note or (lambda _: None)
+    say("tuning")
     look = _search(task, starts)
     for count in itertools.count(1):
+        say(f"round {count}: proof")
         proof = asked.prove(task.structure.system(look.x))
         known = {(model.name, model.goals) for model in task.models}
         new = tuple(m for m in proof.refuting if (m.name, m.goals) not in known)
         if proof.closed or not new or count == ROUNDS:
             break
         more = replace(task, models=(*task.models, *new))
+        say(f"round {count + 1}: tuning on {len(more.models)} models")
         try:
             look = _search(more, [look.x])
         except (CheckError, InputError):
             try:
                 look = _search(more, [look.x, *starts])
-            except (CheckError, InputError):
+            except (CheckError, InputError) as error:
+                words = str(error).rpartition("structured: ")[2]
+                proof = replace(proof, against=words[0].upper() + words[1:])
                 break
         task = more
     return task, look, proof, count

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.structured.elements import CALLER, Structure
 from malta.structured.goals import Figure, Goal, stability
 from malta.structured.loops import ClosedLoop, Model
 from malta.structured.minimax import Effort, Look, Slope, by_x, minimize
+from malta.synthesis.elements import CALLER, Structure
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

@@ -50,12 +50,14 @@ from malta.synthesis.spec import (
     Pid,
     PidAxes,
     Spec,
+    StructuredLaw,
     Variable,
     Weights,
     integral_signals,
     pid_signals,
     process_signals,
 )
+from malta.synthesis.structure import read_structure
 from malta.tables import Quantity, load_toml, validate
 from malta.units import to_si
 
@@ -179,12 +181,13 @@ LATER = (
     "inertia_feedforward",
     "commutation",
     "references",
+    "structure",
 )  # keys that change no design without them
 
 
 def _fingerprint(content: DesignFile) -> str:
     """SHA-256 of all that shapes the design."""
-    other = {"summary", "machine", "cost", "specification", "search"}
+    other = {"summary", "machine", "cost", "specification", "search", "goals"}
     other |= {name for name in LATER if getattr(content, name) == DesignFile.model_fields[name].default}
     shaping = json.dumps(content.model_dump(exclude=other, exclude_none=True), sort_keys=True)
     return hashlib.sha256(shaping.encode()).hexdigest()
@@ -229,8 +232,11 @@ def _sample_time(content: DesignFile, path: Path) -> float:
     return Ts
 
 
-def _law(content: DesignFile, plant: Plant, path: Path) -> Weights | Pid:
+def _law(content: DesignFile, plant: Plant, path: Path) -> Weights | Pid | StructuredLaw:
     try:
+        if content.structure is not None:
+            Ts = _sample_time(content, path)
+            return read_structure(content.structure, content.goals or {}, plant, Ts, path)
         return _weights(content, plant, path) if content.pid is None else _pid(content.pid, plant, path)
     except InputError as error:  # the record does not know the file
         raise InputError(path, error.field, error.found, error.expected) from error
@@ -238,15 +244,28 @@ def _law(content: DesignFile, plant: Plant, path: Path) -> Weights | Pid:
 
 LQG = ("discretization", "delay", "weights", "bases", "noise")
 ONLY_LQG = (*LQG, "current_lag", "coordinates")
+NOT_BESIDE = {"pid": (), "structure": ("pid", "cost", "search", "pause", "braking", "commutation")}
 
 
 def _require_law(content: DesignFile, raw: Mapping[str, Any], path: Path) -> None:
-    """InputError unless the file describes an LQG or a PID, whole and alone."""
-    for name in ONLY_LQG:
-        if content.pid is None and name in LQG and name not in raw:
-            raise InputError(path, name, "nothing", "this key")
-        if content.pid is not None and name in raw:
-            raise InputError(path, name, "this key beside [pid]", "one of them: an LQG, or a PID")
+    """InputError unless the file describes an LQG, a PID or a law of a given structure, whole and alone."""
+    other = next((name for name in ("structure", "pid") if getattr(content, name) is not None), None)
+    if other is None:
+        missing = next((name for name in LQG if name not in raw), None)
+        if missing is not None:
+            raise InputError(path, missing, "nothing", "this key")
+    for name in () if other is None else (*ONLY_LQG, *NOT_BESIDE[other]):
+        if name in raw:
+            expected = "one of them: an LQG, a PID, or a law of a given structure"
+            raise InputError(path, name, f"this key beside [{other}]", expected)
+    if content.goals is not None and other != "structure":
+        raise InputError(
+            path, "goals", "this table without [structure]", "[specification], or a law of [structure]"
+        )
+    if other == "structure" and not content.current_loop_delay:
+        raise InputError(
+            path, "current_loop_delay", "false beside [structure]", "true: such a law is tuned with it"
+        )
 
 
 def _weights(content: DesignFile, plant: Plant, path: Path) -> Weights:
@@ -357,9 +376,8 @@ def _specification(content: DesignFile, spec: Spec) -> dict[str, Any]:
     table, path = content.specification, spec.path
     if table is None:
         return {}
-    law = "PID" if spec.pid else "LQG"
     known = requirements_for(spec.plant)
-    able = {name: r for name, r in known.items() if law in r.laws}
+    able = {name: r for name, r in known.items() if r.suits(spec.kind)}
     for name in table:
         if name in known and name not in able:
             other = " or ".join(f"an {one}" if one == "LQG" else f"a {one}" for one in known[name].laws)

@@ -72,6 +72,73 @@ class PidTable(Record):
     filters: dict[StrictStr, Quantity] | None = entry("time constants by input; this or filter", default=None)
 
 
+Numbers = dict[StrictStr, Quantity]
+Signals = Annotated[list[StrictStr], Field(min_length=1)]
+Coefficients = Annotated[list[Finite], Field(min_length=1, max_length=30)]
+
+
+class ElementTable(Record):
+    """[structure.elements.NAME]: numbers at which a search starts; the kind says which."""
+
+    kind: Literal["gain", "pid", "lead", "notch", "transfer"] = entry("what the element is")
+    value: Quantity | None = entry("of a gain", default=None)
+    Kp: Quantity | None = entry("of a pid", default=None)
+    Ki: Quantity | None = entry("of a pid; without it, none", default=None)
+    Kd: Quantity | None = entry("of a pid; without it, none", default=None)
+    filter: Quantity | None = entry("time constant of the rate of a pid with Kd", default=None)
+    zero: Quantity | None = entry("of a lead", "rad/s", default=None)
+    pole: Quantity | None = entry("of a lead", "rad/s", default=None)
+    frequency: Quantity | None = entry("of a notch", "rad/s", default=None)
+    depth: Positive | None = entry("damping ratio of the zeros of a notch", "1", default=None)
+    damping: Positive | None = entry("damping ratio of the poles of a notch", "1", default=None)
+    numerator: Coefficients | None = entry("of a transfer, highest power first, SI", default=None)
+    denominator: Coefficients | None = entry("of a transfer, highest power first, SI", default=None)
+    low: Numbers = entry("smallest values of some of these numbers", default={})
+    high: Numbers = entry("largest values", default={})
+
+
+class StructureTable(Record):
+    """[structure]: a law of named elements, in place of weights, bases and noise, or of [pid]."""
+
+    axes: PidAxes | None = entry("what an axis is; without it, an output with its input", default=None)
+    law: dict[StrictStr, list[StrictStr]] = entry("by output, or by position: elements, one behind the other")
+    elements: dict[Annotated[StrictStr, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")], ElementTable] = entry(
+        "elements by a name of your choice"
+    )
+
+
+class WeightTable(Record):
+    """A stable transfer function, coefficients in SI, the highest power first."""
+
+    numerator: Coefficients = entry("coefficients", "1")
+    denominator: Coefficients = entry("coefficients", "1")
+
+
+class GoalTable(Record):
+    """[goals.NAME]: what the law is tuned for beside [specification]; the kind says which entries there are."""
+
+    kind: Literal[
+        "sensitivity", "disk_margin", "gain_limit", "noise_limit", "tracking", "poles", "stable_law"
+    ] = entry("a goal of malta.structured")
+    soft: StrictBool = entry("whether it is made as small as hard goals allow", default=False)
+    peak: Annotated[Finite, Field(gt=1)] | None = entry("of a sensitivity or tracking", "1", default=None)
+    least: Annotated[Finite, Field(gt=0, lt=2)] | None = entry("of a disk_margin", "1", default=None)
+    at: Literal["sensors", "forces"] | None = entry("where a sensitivity or disk is measured", default=None)
+    channels: Signals | None = entry("outputs, or inputs at forces; without it, all", default=None)
+    inputs: Signals | None = entry('of a gain_limit, as "load fx_B1"', default=None)
+    outputs: Signals | None = entry('of a gain_limit or noise_limit, as "output x1"', default=None)
+    limit: Quantity | None = entry("of a gain, outputs over inputs, or of noise, rms", default=None)
+    weight: WeightTable | None = entry("in front of a gain", default=None)
+    levels: Numbers | None = entry(
+        "of noise by input, of one sample; without it, of the sensors", default=None
+    )
+    time: Quantity | None = entry("of tracking", "s", default=None)
+    steady: Positive | None = entry("|S| at rest, of tracking", "1", default=None)
+    decay: Quantity | None = entry("least decay of poles", "1/s", default=None)
+    damping: Annotated[Finite, Field(ge=0, lt=1)] | None = entry("least damping of poles", "1", default=None)
+    fastest: Quantity | None = entry("largest size of poles", "rad/s", default=None)
+
+
 class CostTable(Record):
     """[cost]: the loads that a PID is judged by."""
 
@@ -151,6 +218,8 @@ class DesignFile(Record):
     bases: BasesTable | None = entry("what a weight of 1 is worth", default=None)
     noise: NoiseTable | None = entry("noise of one sample that the filter expects", default=None)
     pid: PidTable | None = entry("gains of a PID, in place of weights, bases and noise", default=None)
+    structure: StructureTable | None = entry("a law of named elements, in place of both", default=None)
+    goals: dict[StrictStr, GoalTable] | None = entry("what a law of [structure] is tuned for", default=None)
     uncertainty: dict[StrictStr, Annotated[Finite, Field(gt=0, lt=1)]] = entry(
         "by parameter: half width of the box of the margin, relative", "1"
     )

@@ -67,6 +67,7 @@ from malta.synthesis.spec import (
     Spec,
     Weights,
 )
+from malta.synthesis.structure import structured_controller
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -496,7 +497,10 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
         "position_feedforward": spec.position_feedforward,
     }
     try:
-        if spec.pid is not None:
+        if spec.structure is not None:
+            del named["current_loop_delay"]
+            controller = structured_controller(model, spec.structure, spec.sample_time, **named)
+        elif spec.pid is not None:
             controller = pid(model, spec.pid, spec.sample_time, **named)
         else:
             named["current_lag"] = spec.current_lag

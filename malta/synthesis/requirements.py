@@ -23,6 +23,7 @@ from scipy import special
 
 from malta.model.machines import attribute_of
 from malta.model.plant import Plant, Signal
+from malta.synthesis.spec import Law as Law
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Parameters
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from malta.synthesis.recovery import RecoveryBound, StepResponse
     from malta.synthesis.spec import Spec
 
-Law = Literal["LQG", "PID"]
 Trade = Literal["force", "motion"]
 Form = Literal["number", "switch", "outputs", "inputs", "loads"]
 Verdict = Literal["holds", "fails", "undecided"]
@@ -141,6 +141,7 @@ class Requirement:
     trade : what the Pareto front shows it as, against the margin: noise of the force, or motion
     heading : its words in the Pareto front, without "motion"; none: not shown, or by the signal's name
     meaning : what is bounded, in words, for schemas and pages
+    indices : of the inputs (force) or outputs (motion) whose noise at rest it bounds; None: it bounds no such noise
     """
 
     name: str
@@ -156,6 +157,11 @@ class Requirement:
     trade: Trade | None = None
     heading: str = ""
     meaning: str = ""
+    indices: Indices | None = None
+
+    def suits(self, law: Law) -> bool:
+        """Whether a kind of law can be asked for it: one of a given structure for what all others can be."""
+        return law in self.laws or (law == "structure" and {"LQG", "PID"} <= {*self.laws})
 
     def signals(self, plant: Plant) -> tuple[Signal, ...]:
         """Return the signals that can be bounded one by one; none for one bound of the whole machine."""
@@ -269,6 +275,7 @@ def motion_of(name: str, outputs: Indices, heading: str) -> Requirement:
         trade="motion",
         heading=heading,
         meaning=meaning,
+        indices=outputs,
     )
 
 
@@ -291,6 +298,7 @@ def force_noise_of(name: str, inputs: Indices, heading: str) -> Requirement:
         trade="force",
         heading=heading,
         meaning=meaning,
+        indices=inputs,
     )
 
 

@@ -35,6 +35,7 @@ Discretization = Literal["backward-euler", "zoh", "sampled-data"]
 Coordinates = Literal["signals", "positions"]
 PidAxes = Literal["decentralized", "centre-of-gravity"]
 Place = Literal["measured", "predicted"]
+Law = Literal["LQG", "PID", "structure"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +191,46 @@ class Loads:
     sensor_noise: tuple[float, ...]  # p, m or rad rms of one sample
 
 
+@dataclass(frozen=True)
+class StructuredElement:
+    """An element of [structure.elements].
+
+    kind : "gain", "pid", "lead", "notch" or "transfer"
+    numbers : SI, by the names of malta.structured; coefficients of a transfer function as tuples
+    units : SI units of the numbers
+    bounds : (low, high) of some of them, SI
+    """
+
+    name: str
+    kind: str
+    numbers: Mapping[str, Any]
+    units: Mapping[str, str]
+    bounds: Mapping[str, tuple[float, float]]
+
+
+class StructuredGoal(NamedTuple):
+    """An entry of [goals]: the arguments of a goal of malta.structured, SI."""
+
+    name: str
+    kind: str
+    soft: bool
+    arguments: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class StructuredLaw:
+    """A law of named elements, and its goals.
+
+    law : by axis, elements one behind the other
+    axes : "decentralized": an output with the input of its index; "centre-of-gravity": a coordinate with all inputs
+    """
+
+    law: Mapping[str, tuple[str, ...]]
+    elements: tuple[StructuredElement, ...]
+    goals: tuple[StructuredGoal, ...]
+    axes: PidAxes = "decentralized"
+
+
 class Variable(NamedTuple):
     """A number that the search may choose: entries of the design file that share it."""
 
@@ -216,7 +257,7 @@ class Spec:
     discretization : "sampled-data", "zoh" or "backward-euler"
     delay : samples between measurement and force in the design model
     current_loop_delay : whether the current loops are designed with the machine's dead time
-    law : the weights of an LQG, or the gains of a PID
+    law : the weights of an LQG, the gains of a PID, or elements of a given structure with their goals
     uncertainty : relative, either way, by parameter
     current_lag : whether the lag of the current loops is in the design model
     pause : p, m/s: of the reference, above which sums of errors wait; 0: never
@@ -250,7 +291,7 @@ class Spec:
     discretization: Discretization
     delay: int
     current_loop_delay: bool
-    law: Weights | Pid
+    law: Weights | Pid | StructuredLaw
     uncertainty: Mapping[str, float]
     current_lag: bool = False
     pause: tuple[float, ...] = ()
@@ -277,20 +318,31 @@ class Spec:
 
     @property
     def weights(self) -> Weights:
-        """Of an LQG. InputError for a PID, which has none."""
-        if isinstance(self.law, Pid):
-            raise InputError(self.path, "pid", "a PID controller", "weights, bases and noise of an LQG")
+        """Of an LQG. InputError for other laws, which have none."""
+        if not isinstance(self.law, Weights):
+            found = ("pid", "a PID controller") if self.pid else ("structure", "a law of a given structure")
+            raise InputError(self.path, *found, "weights, bases and noise of an LQG")
         return self.law
 
     @property
     def pid(self) -> Pid | None:
-        """Gains of a PID; None for an LQG."""
+        """Gains of a PID; None for other laws."""
         return self.law if isinstance(self.law, Pid) else None
 
     @property
+    def structure(self) -> StructuredLaw | None:
+        """Elements and goals of a law of a given structure; None for other laws."""
+        return self.law if isinstance(self.law, StructuredLaw) else None
+
+    @property
+    def kind(self) -> Law:
+        """The kind of the law: "LQG", "PID" or "structure"."""
+        return "PID" if self.pid else "structure" if self.structure else "LQG"
+
+    @property
     def axes(self) -> PidAxes:
-        """What the axes of a PID are; of an LQG, which has none, as of a PID that does not say."""
-        return self.law.axes if isinstance(self.law, Pid) else "decentralized"
+        """What the axes of the law are; of an LQG, which has none, as of a PID that does not say."""
+        return "decentralized" if isinstance(self.law, Weights) else self.law.axes
 
     def place_of(self, entry: str, field: str = "search") -> Entry:
         """Find where an entry of the file stands in the law.
@@ -344,8 +396,10 @@ class Spec:
         own = hashlib.sha256(change.encode()).hexdigest()
         return replace(self, **({"law": law, "sha256": own} | fields))
 
-    def _law_with(self, numbers: Mapping[str, float], field: str) -> Weights | Pid:
+    def _law_with(self, numbers: Mapping[str, float], field: str) -> Weights | Pid | StructuredLaw:
         """The law with other numbers, SI, by their place in the file. Raises InputError as `place_of` does."""
+        if isinstance(self.law, StructuredLaw):
+            return self._structure_with(self.law, numbers, field)
         names = [name for name in self.law.__dataclass_fields__ if name not in ("axes", "coordinates")]
         fields: dict[str, Any] = {name: np.array(getattr(self.law, name)) for name in names}
         for entry, si in numbers.items():
@@ -354,6 +408,22 @@ class Spec:
                 raise InputError(self.path, entry, "an entry that this design leaves out", "one that it has")
             fields[place][index] = si * si if squared else si
         return replace(self.law, **fields)
+
+    def _structure_with(self, law: StructuredLaw, numbers: Mapping[str, float], field: str) -> StructuredLaw:
+        """A law of elements with other numbers, SI, by their place, as "structure.elements.radial.Kp"."""
+        own = {
+            f"structure.elements.{e.name}.{key}": (k, key)
+            for k, e in enumerate(law.elements)
+            for key, value in e.numbers.items()
+            if isinstance(value, float)
+        }
+        changed = list(law.elements)
+        for entry, si in numbers.items():
+            if entry not in own:
+                raise InputError(self.path, field, repr(entry), "one of " + " ".join(own))
+            k, key = own[entry]
+            changed[k] = replace(changed[k], numbers={**changed[k].numbers, key: float(si)})
+        return replace(law, elements=tuple(changed))
 
     def value_of(self, variable: Variable) -> float:
         """Return the number that the file holds for a variable of the search, in the variable's unit.
@@ -369,7 +439,8 @@ class Spec:
     def description(self) -> Description:
         """Its machine, its law and what is asked of it."""
         rows = [("machine", f"{self.plant.name}, preset {self.parameters.preset!r}")]
-        kind = "PID" if self.pid else f"LQG, {self.discretization}"
+        kind = {"structure": "given structure"}.get(self.kind, self.kind)
+        kind += f", {self.discretization}" if self.kind == "LQG" else ""
         rows.append(("law", f"{kind}, every {quantity(self.sample_time, 's')}, delay {self.delay}"))
         rows.append(("uncertainty", box_words(self.uncertainty, self.parameters) or "none"))
         asked = ", ".join(f"{name} {value:g}" for name, value in self.specification.items())
@@ -421,14 +492,20 @@ def process_signals(plant: Plant, coordinates: Coordinates) -> list[Signal]:
 
 
 def place_of(
-    entry: str, plant: Plant, where: Path, field: str = "search", law: Weights | Pid | None = None
+    entry: str,
+    plant: Plant,
+    where: Path,
+    field: str = "search",
+    law: Weights | Pid | StructuredLaw | None = None,
 ) -> Entry:
     """Find where an entry of the design file stands in Weights or Pid.
 
     law : whose coordinates or axes count; None: signals and single sensors
 
-    Raises InputError for an entry that no design file has.
+    Raises InputError for an entry that no design file has, and for a law of elements, which is not searched so.
     """
+    if isinstance(law, StructuredLaw):
+        raise InputError(where, field, repr(entry), "none beside [structure]: its elements have low and high")
     coordinates: Coordinates = law.coordinates if isinstance(law, Weights) else "signals"
     axes: PidAxes = law.axes if isinstance(law, Pid) else "decentralized"
     integrals = integral_signals(plant, coordinates)

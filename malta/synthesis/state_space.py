@@ -8,8 +8,10 @@ p* ---(+)->| s+ = A s + B u  |--> v          u = p* - y, negative feedback
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -17,14 +19,14 @@ from scipy.linalg import matrix_balance
 
 from malta.errors import InputError
 from malta.model.data import plant_of
-from malta.model.linearize import linearize
+from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import OperatingPoint, Plant, Signal
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, linear_law
 from malta.synthesis.feedforward import machine_part
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 CALLER = "controller_of"
 ERROR = "[e]"  # what follows a measurement's name in the name of its last error
@@ -59,20 +61,41 @@ def controller_of(
     (0.001, True)
     """
     A, B, C, D, Ts = _discrete(sys)
-    p, m, n = len(plant.outputs), len(plant.inputs), len(A)
+    p, m = len(plant.outputs), len(plant.inputs)
     if D.shape != (m, p):
         found, wanted = f"{D.shape[1]} inputs and {D.shape[0]} outputs", f"{p} errors and {m} forces"
         raise InputError(CALLER, "sys", found, f"{wanted} of the {plant.name}")
     if not all(np.isfinite(M).all() for M in (A, B, C, D)):
         raise InputError(CALLER, "sys", "NaN or infinity", "finite numbers")
     model = linearize(plant, plant.at() if point is None else point)
-    part = machine_part(model, Ts, plant.actuator.delay(Ts), current_loop_delay=True)
+    return law_of_errors(System(A, B, C, D), sys.state_labels, model, Ts, name=name or sys.name)
+
+
+def law_of_errors(
+    law: System,
+    labels: Sequence[str],
+    model: LinearModel,
+    Ts: float,
+    *,
+    name: str,
+    position_feedforward: bool = False,
+) -> Controller:
+    """A sampled law s+ = A s + B u, v = C s + D u of the errors u = p* - y as a controller; labels: of its states."""
+    A, B, C, D = law
+    plant, n, (m, p) = model.plant, len(A), D.shape
+    part = machine_part(
+        model,
+        Ts,
+        plant.actuator.delay(Ts),
+        current_loop_delay=True,
+        position_feedforward=position_feedforward,
+    )
     # xi* = 0: there are no rates at the samples for the feedforward to correct.
     part["feedforward"] = replace(part["feedforward"], rate=np.zeros_like(part["feedforward"].rate))
-    states = (Signal(label, "1") for label in sys.state_labels)
+    states = (Signal(label, "1") for label in labels)
     return Controller(
         **part,
-        name=name or sys.name,
+        name=name,
         states=(*states, *(Signal(s.name + ERROR, s.unit) for s in plant.outputs)),
         Ad=np.block([[A, -B], [np.zeros((p, n + p))]]),
         Bd=np.zeros((n + p, m)),
@@ -139,6 +162,47 @@ def balanced_units(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     whole[: n + len(C), : n + B.shape[1]] = np.block([[A, B], [C, np.zeros((len(C), B.shape[1]))]])
     _, (units, _) = matrix_balance(whole, permute=False, separate=True)
     return np.asarray(units[:n])
+
+
+class System(NamedTuple):
+    """x' = A x + B u, y = C x + D u; of a sampled system (x+ - x) / T = A x + B u."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+
+    @classmethod
+    def of(cls, source: Any) -> System:
+        """The matrices of a control.StateSpace."""
+        return cls(*(np.array(M, dtype=float) for M in (source.A, source.B, source.C, source.D)))
+
+    @property
+    def balanced(self) -> System:
+        """The same system with states in balanced units."""
+        if not len(self.A):
+            return self
+        t = balanced_units(self.A, self.B, self.C)
+        return System(self.A * t / t[:, None], self.B / t[:, None], self.C * t, self.D)
+
+    def response(self, s: ComplexArray) -> ComplexArray:
+        """C (s - A)^-1 B + D at k complex frequencies s, in differences (z - 1) / T: k x outputs x inputs.
+
+        NaN at a frequency that no double number tells from a pole.
+        """
+        if not len(self.A):
+            return np.broadcast_to(self.D.astype(complex), (len(s), *self.D.shape))
+        A, B, C, _ = self.balanced
+        matrices = s[:, None, None] * np.eye(len(A)) - A
+        try:
+            found = np.linalg.solve(matrices, B.astype(complex))
+        except np.linalg.LinAlgError:  # a frequency on a pole: beside it
+            beside = matrices + 1e-9 * s[:, None, None] * np.eye(len(A))
+            found = np.full((len(s), *B.shape), np.nan, dtype=complex)
+            for k, one in enumerate(beside):
+                with suppress(np.linalg.LinAlgError):
+                    found[k] = np.linalg.solve(one, B)
+        return np.asarray(C @ found + self.D)
 
 
 def reference_names(c: Controller) -> list[str]:

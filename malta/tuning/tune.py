@@ -445,6 +445,10 @@ def tune(
     >>> tuned.reached, [requirement.name for requirement in tuned.requirements]
     (True, ['margin', 'peak_sensitivity', 'motion y', 'force_noise f'])
     """
+    if spec.structure is not None:
+        raise InputError(
+            spec.path, "structure", "a law of elements", "malta.structured.tune_design, which tunes them"
+        )
     if not spec.specification:
         raise InputError(spec.path, "specification", "nothing", "a table of what the design shall reach")
     if spec.plant.sensors is not None:

@@ -32,7 +32,16 @@ from fuzz.records import (
 )
 
 GAINS = ("table2", "robust", "tubular_pid", "halbach", "planar", "linear")
-DESIGNS = ("table2", "robust", "robust_observer", "tubular_pid", "halbach", "halbach_pid", "planar")
+DESIGNS = (
+    "table2",
+    "robust",
+    "robust_observer",
+    "tubular_pid",
+    "structured",
+    "halbach",
+    "halbach_pid",
+    "planar",
+)
 DATA = ("tubular", "halbach", "planar")
 
 

@@ -34,6 +34,7 @@ SLOW = {
     "malta.export_fmu",
     "malta.simulation.fastest_stroke",
     "malta.ledger",
+    "malta.structured.tune_design",
     "malta.simulation.replayed",
     "malta.report.CampaignFigures",
     "malta.report.campaign",

@@ -14,9 +14,9 @@ from scipy import optimize
 
 import malta
 from malta import structured
-from malta.structured.elements import Structure, places_of
 from malta.structured.loops import models_of_systems
 from malta.structured.search import Task, random_starts, rate_of, search
+from malta.synthesis.elements import Structure, places_of
 
 if TYPE_CHECKING:
     from malta.proof.uncertain import UncertainSystem

@@ -11,11 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import malta
 from malta import structured
-from malta.loops.linear_loops import System
-from malta.structured.elements import Structure, places_of, sample_law
 from malta.structured.loops import ClosedLoop, Model, models_of_systems
-from malta.structured.norms import noise, peak_gain, peaks_of
+from malta.structured.norms import noise, peak_gain, peaks_of, response_at
+from malta.synthesis.elements import Structure, places_of, sample_law
+from malta.synthesis.state_space import System
 
 GOALS = {
     "sensitivity": structured.sensitivity(2.0),
@@ -26,6 +27,7 @@ GOALS = {
     "tracking": structured.tracking(0.05),
     "noise": structured.noise_limit({"load": 1e-3}, "output", 1e-3),
     "poles": structured.poles(decay=5.0, damping=0.5, fastest=1e3),
+    "stable law": structured.stable_law(decay=5.0, damping=0.5, fastest=1e3),
 }
 
 
@@ -170,3 +172,55 @@ def test_a_law_by_places_acts_in_coordinates() -> None:
     places = [structured.Place(left[:, [k]], structured.gain(f"g{k}", k + 2.0), right[[k]]) for k in range(2)]
     structure = Structure(places_of(places, ["f", "g"], ["a", "b"]))
     assert np.allclose(structure.system(np.zeros(2)).D, left @ np.diag([2.0, 3.0]) @ right)
+
+
+def test_diagrams_of_elements_are_those_of_their_responses() -> None:
+    a = structured.pid("a", 2.0, 3.0, 0.5, 0.1)
+    b, n = structured.lead("b", 5.0, 50.0), structured.notch("n", 7.0, 0.1, 0.9)
+    w = np.array([0.3, 2.0, 9.0, 40.0])
+
+    def response(element: structured.Element) -> np.ndarray:
+        return np.asarray(response_at(element.system, w)[:, 0, 0])
+
+    A, B, N = (response(e) for e in (a, b, n))
+    np.testing.assert_allclose(response(a + b), A + B, rtol=1e-12)
+    np.testing.assert_allclose(response(a.feedback(b * n)), A / (1 + A * B * N), rtol=1e-12)
+    assert list((a + b).values)[-1] == "b.pole"
+    with pytest.raises(malta.InputError, match="one parameter twice"):
+        a.feedback(a)
+
+
+def test_an_observer_has_the_poles_of_its_regulator_and_of_its_filter() -> None:
+    """The separation theorem: those of A - B K and A - L C."""
+    A, B, C = np.array([[0.0, 1.0], [100.0, 0.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
+    K, L = np.array([[300.0, 20.0]]), np.array([[80.0], [3000.0]])
+    law = control.ss(*structured.observer("lqg", (A, B, C), K, L).system)
+    closed = control.feedback(control.ss(A, B, C, 0) * law, 1).poles()
+    expected = np.concatenate([np.linalg.eigvals(A - B @ K), np.linalg.eigvals(A - L @ C)])
+    np.testing.assert_allclose(np.sort_complex(closed), np.sort_complex(expected), rtol=1e-9)
+    with pytest.raises(malta.InputError, match="matrices that fit"):
+        structured.observer("lqg", (A, B, C), K, L.T)
+
+
+def test_a_plant_that_only_an_unstable_law_holds_has_no_stable_one() -> None:
+    """A pole at 3 between zeros at 2 and at infinity: parity interlacing (Youla, Bongiorno and Lu) fails."""
+    plant = control.ss(control.tf([1, -2], [1, -4, 3]))
+    A, B, C = plant.A, plant.B, plant.C
+    K, L = control.place(A, B, [-2, -3]), control.place(A.T, C.T, [-4, -5]).T
+    law = structured.observer("lqg", (A, B, C), K, L)
+    assert np.linalg.eigvals(law.system.A).real.max() > 0
+    held = structured.tune(plant, law, [], starts=1)
+    assert np.linalg.eigvals(held.law.A).real.max() > 0
+    with pytest.raises(malta.CheckError, match="stable law of damping"):
+        structured.tune(plant, law, [structured.stable_law()], starts=1)
+
+
+@pytest.mark.slow
+def test_a_stable_law_counts_no_integrals() -> None:
+    law = structured.pid("axis", Kp=3.0, Ki=1.0, Kd=2.0, filter=0.1)
+    goals = [structured.stable_law(fastest=8.0), structured.soft(structured.sensitivity(2.0))]
+    found = structured.tune(control.tf([1], [1, 0, 0]), law, goals, starts=1)
+    assert found.values["axis.filter"] >= 1 / 8
+    assert found.reached["stable law"] <= 1
+    with pytest.raises(malta.InputError, match="faster than the decay"):
+        structured.stable_law(decay=2.0, fastest=1.0)

@@ -44,13 +44,13 @@ class Evidence:
     parameters: planar.Parameters
     controller: Controller
     margins: LoopReport
-    # experiments : with "ahead" and "slower"; without "delay" for a PID, which predicts nothing
+    # experiments : with "ahead" and "slower"; without "delay" for other laws than an LQG, which predict nothing
     experiments: Mapping[str, Experiment]
 
 
 def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
     """Design a controller, prove its margins and run the experiments."""
-    found = run_design(spec, EXPERIMENT_NAMES[: -1 if spec.pid is not None else None], progress)
+    found = run_design(spec, EXPERIMENT_NAMES[: None if spec.kind == "LQG" else -1], progress)
     par: Any = spec.parameters
     # A few runs, and nothing to compile.
     ahead = steps_ahead(spec.plant, found.controller, engine="virtual machine")

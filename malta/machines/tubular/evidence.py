@@ -90,7 +90,7 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
         model,
         controller,
         margins,
-        None if spec.pid else lqr(model, spec.weights),
+        lqr(model, spec.weights) if spec.kind == "LQG" else None,
         experiments,
         stroke_figures(slow),
         published_value(published, "dc_link.speed"),
@@ -184,7 +184,7 @@ def stiffness_ratio(e: Evidence) -> float:
 
 def is_solved_for_ratio(e: Evidence) -> bool:
     """Whether the bases of a design are those that `calibrate` solves for K1 / k = IMPLIED_RATIO."""
-    if e.spec.pid is not None:
+    if e.spec.kind != "LQG":
         return False
     plant = e.model.plant
     solved = calibrate(linearize(plant, plant.at()), e.spec.weights, IMPLIED_RATIO).q_base

@@ -24,7 +24,7 @@ from malta.model.signals import FINE
 from malta.report.figures.drawing import micro, number
 from malta.simulation.experiments import progress_of_part
 from malta.simulation.experiments.catalogue import experiment, main_job
-from malta.synthesis.spec import Pid, Weights, integral_signals, pid_signals, process_signals
+from malta.synthesis.spec import Pid, StructuredLaw, Weights, integral_signals, pid_signals, process_signals
 from malta.tuning.verify import verify, with_requirements
 from malta.units import identifier, in_unit
 
@@ -156,6 +156,7 @@ GROUPS = (
         "uncertainty",
         "law",
         "PID gains",
+        "elements of the law",
         "weights",
         "bases",
         "cost",
@@ -240,7 +241,7 @@ def _law(subject: Subject) -> Iterator[Entry]:
     yield Entry("law", "observed forces of disturbance", "yes" if c.observed else "no")
     yield Entry("law", "commutation", "measured place" if c.commutation is None else "predicted place")
     spec = subject.written_from
-    if spec is not None and spec.pid is None:
+    if spec is not None and spec.kind == "LQG":
         yield Entry("law", "discretization", spec.discretization)
     for signal, pause in zip(c.measurements, c.pause, strict=False):
         if pause:
@@ -273,6 +274,12 @@ def _weights(subject: Subject) -> Iterator[Entry]:
         for table, signals in pid_signals(plant, law.axes).items():
             plain = [Signal(s.name, re.sub(r"\((\w+)\)", r"\1", s.unit).replace(" / ", "/")) for s in signals]
             yield from _row("PID gains", f"{table} ", plain, getattr(law, table))
+    elif isinstance(law, StructuredLaw):
+        for element in law.elements:
+            for key, value in element.numbers.items():
+                if isinstance(value, float):
+                    unit = re.sub(r"\((\w+)\)", r"\1", element.units[key]).replace(" / ", "/")
+                    yield Entry("elements of the law", f"{element.name} {key}", value, unit)
     elif isinstance(law, Weights):
         integrals = integral_signals(plant, law.coordinates)
         for table, states, weight, base in (

@@ -20,7 +20,7 @@ import numpy as np
 from scipy import linalg
 
 from malta.errors import InputError
-from malta.loops.linear_loops import System
+from malta.synthesis.state_space import System
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -65,7 +65,7 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class Element:
-    """A tunable part of a law. `a * b` is one behind the other, b first.
+    """A tunable part of a law: `a * b` is b, then a; `a + b` both side by side; `a.feedback(b)` a loop of both.
 
     name : of the element; parameters are called "name.parameter"
     parameters : what is searched, with the values at which a search starts
@@ -120,16 +120,49 @@ class Element:
             A = ca.blockcat([[A2, B2 @ C1], [ca.DM(A1.shape[0], A2.shape[0]), A1]])
             return A, ca.vertcat(B2 @ D1, B1), ca.horzcat(C2, D2 @ C1), D2 @ D1
 
-        named = [
-            replace(p, name=name)
-            for e in (self, other)
-            for p, name in zip(e.parameters, e.values, strict=True)
-        ]
-        names = [p.name for p in named]
-        twice = next((n for n in names if names.count(n) > 1), None)
-        if twice is not None:
-            raise InputError(CALLER, twice, "one parameter twice", "elements of different names in a series")
-        return Element(f"{self.name} {other.name}", tuple(named), matrices)
+        return Element(f"{self.name} {other.name}", _joined(self, other), matrices)
+
+    def __add__(self, other: Element) -> Element:
+        """This element beside another: the sum of their outputs."""
+        k = len(self.parameters)
+
+        def matrices(values: Sequence[Any]) -> Matrices:
+            A1, B1, C1, D1 = self.matrices(values[:k])
+            A2, B2, C2, D2 = other.matrices(values[k:])
+            return ca.diagcat(A1, A2), ca.vertcat(B1, B2), ca.horzcat(C1, C2), D1 + D2
+
+        return Element(f"{self.name} + {other.name}", _joined(self, other), matrices)
+
+    def feedback(self, other: Element) -> Element:
+        """This element with another in its negative feedback: self / (1 + other self).
+
+        other : from the outputs of this element to its inputs
+        """
+        k = len(self.parameters)
+
+        def matrices(values: Sequence[Any]) -> Matrices:
+            A1, B1, C1, D1 = (ca.SX(M) for M in self.matrices(values[:k]))
+            A2, B2, C2, D2 = (ca.SX(M) for M in other.matrices(values[k:]))
+            E = ca.inv(ca.SX.eye(D1.shape[0]) + D1 @ D2)  # y = E (C1 x1 - D1 C2 x2 + D1 u)
+            C, D = ca.horzcat(E @ C1, -E @ D1 @ C2), E @ D1
+            into = ca.vertcat(B1, ca.SX(B2.shape[0], B1.shape[1]))
+            back = ca.vertcat(-B1 @ D2, B2)
+            A = ca.diagcat(A1, A2)
+            n1 = A1.shape[0]
+            A[:n1, n1:] = -B1 @ C2
+            return A + back @ C, into + back @ D, C, D
+
+        return Element(f"{self.name} / {other.name}", _joined(self, other), matrices)
+
+
+def _joined(*elements: Element) -> tuple[Parameter, ...]:
+    """The parameters of several elements under their whole names. Raises InputError for a name that comes twice."""
+    named = [replace(p, name=name) for e in elements for p, name in zip(e.parameters, e.values, strict=True)]
+    names = [p.name for p in named]
+    twice = next((n for n in names if names.count(n) > 1), None)
+    if twice is not None:
+        raise InputError(CALLER, twice, "one parameter twice", "elements of different names in one diagram")
+    return tuple(named)
 
 
 def _positive(
@@ -349,6 +382,50 @@ def states(name: str, start: Any, pattern: Any = None) -> Element:
             made[which][i, j] = value
         A, B, C, D = made
         return A, B, C, D
+
+    return Element(name, tuple(parameters), matrices)
+
+
+def observer(name: str, model: Any, K: Any, L: Any) -> Element:
+    """State feedback of an observer, as an LQG has it, whose gains are tuned: the order is that of the model.
+
+    xi' = (A - B K - L C) xi + L e,   v = K xi        xi: minus the observed states, since e = -y at rest
+
+    A model of lower order than the plant gives a reduced observer.
+
+    name : of the element
+    model : continuous control.StateSpace without D, or A, B and C; n states, m inputs, p outputs
+    K : m x n, regulator at which a search starts
+    L : n x p, observer
+
+    Raises InputError for matrices that do not fit.
+
+    >>> from malta import structured
+    >>> body = [[0, 1], [100, 0]], [[0], [1]], [[1, 0]]
+    >>> law = structured.observer("lqg", body, [[300, 20]], [[80], [3000]])
+    >>> law.order, len(law.parameters), law.system.C.tolist()
+    (2, 4, [[300.0, 20.0]])
+    """
+    given = (model.A, model.B, model.C) if hasattr(model, "A") else model
+    A, B, C, K, L = (np.atleast_2d(np.asarray(M, dtype=float)) for M in (*given, K, L))
+    (n, m), p = B.shape, len(C)
+    shapes = [M.shape for M in (A, C, K, L)]
+    if shapes != [(n, n), (p, n), (m, n), (n, p)] or not all(np.isfinite(M).all() for M in (A, B, C, K, L)):
+        raise InputError(CALLER, name, f"A, C, K and L of shapes {shapes}", "matrices that fit, of numbers")
+
+    parameters = [
+        Parameter(
+            f"{letter}{i}{j}", float(M[i, j]), float(np.abs(M[i] if letter == "K" else M[:, j]).max()) or 1.0
+        )
+        for letter, M in (("K", K), ("L", L))
+        for i, j in np.ndindex(*M.shape)
+    ]
+
+    def matrices(v: Sequence[Any]) -> Matrices:
+        k = ca.vertcat(*(ca.horzcat(*v[i * n : (i + 1) * n]) for i in range(m)))
+        rest = v[m * n :]
+        gain = ca.vertcat(*(ca.horzcat(*rest[i * p : (i + 1) * p]) for i in range(n)))
+        return ca.DM(A) - ca.DM(B) @ k - gain @ ca.DM(C), gain, k, ca.DM(m, p)
 
     return Element(name, tuple(parameters), matrices)
 
