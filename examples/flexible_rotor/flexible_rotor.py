@@ -3,8 +3,9 @@
 A machine of a user's own: malta knows it by this file alone, which flexible_rotor.toml names. In this folder,
 
     python beam.py                     matrices.csv from the rotor's dimensions, and its published frequencies
-    malta verify design/gains/flexible_rotor.json --machine flexible_rotor.py
-    python notebook.py                 Campbell diagram, mode shapes, unbalance, as figures in build/
+
+law.py has the control law and the search that found it, analysis.py what an engineer of rotors asks: Campbell diagram,
+unbalance response, separation margins, and a bound of what the modes leave out. docs/howto/flexible_rotor.md shows them.
 
 matrices.csv has M, G and K of the free rotor in one plane, a displacement and a slope of each node in turn; beam.py
 wrote it, and any other program may. The rotor stands upright, turns with the speed Omega, and is the same in x and y:
@@ -105,10 +106,6 @@ def modes(count: int) -> Modes:
     return Modes(w, shapes, shapes.T @ G @ shapes, *at)
 
 
-PLANES = ("x", "y")
-COORDINATES = ("r1", "r2", *(f"b{k + 1}" for k in range(BENDING)))
-POSITIONS = tuple(Signal(f"{name}_{plane}", "1") for plane in PLANES for name in COORDINATES)
-RATES = tuple(Signal(f"{s.name}_dot", "1/s") for s in POSITIONS)
 AXES = ("Ax", "Bx", "Ay", "By")
 DISTURBANCES = tuple(Signal(f"F_{name}", "N") for name in ("Lx", "Rx", "Ly", "Ry"))
 
@@ -118,20 +115,25 @@ def both(matrix: Any) -> Any:
     return ca.DM(np.kron(np.eye(2), matrix))
 
 
-def plant(par: Parameters) -> Plant:
-    """The rotor on its bearings. Every proof covers all speeds up to Omega_max."""
-    m = modes(BENDING)
+def plant(par: Parameters, bending: int = BENDING) -> Plant:
+    """The rotor on its bearings, with this many bending modes. Every proof covers all speeds up to Omega_max."""
+    m, n = modes(bending), 2 * (bending + 2)
+    names = ("r1", "r2", *(f"b{k + 1}" for k in range(bending)))
     lever, reading, discs = both(m.magnets), both(m.sensors), both(m.discs)
-    n = len(POSITIONS)
-    upright = both(np.vstack([np.linalg.inv(m.sensors[:, :2]), np.zeros((BENDING, 2))]))
+    upright = both(np.vstack([np.linalg.inv(m.sensors[:, :2]), np.zeros((bending, 2))]))
     return Plant(
         name="flexible_rotor",
         parameters=par,
-        states=POSITIONS + RATES,
+        states=tuple(
+            Signal(f"{name}_{plane}{end}", unit)
+            for end, unit in (("", "m kg^0.5"), ("_dot", "m kg^0.5/s"))
+            for plane in "xy"
+            for name in names
+        ),
         inputs=tuple(Signal(f"f_{axis}", "N") for axis in AXES),
         outputs=tuple(Signal(f"s_{axis}", "m") for axis in AXES),
         disturbances=DISTURBANCES,
-        f=lambda x, u, w: motion(par, x, lever.T @ u + discs.T @ w),
+        f=lambda x, u, w: motion(par, m, x, lever.T @ u + discs.T @ w),
         h=lambda x, _: reading @ x[:n],
         position_of=lambda y: upright @ y,
         forces=lambda x, i: magnets(par, lever @ x[:n], i),
@@ -145,17 +147,15 @@ def plant(par: Parameters) -> Plant:
         contact=lambda x: used(par, lever @ x[:n]),
         noise=(par.s_n,) * 4,
         over={"Omega": (0.0, par.Omega_max)},
-        variant=plant,
+        variant=lambda other: plant(other, bending),
     )
 
 
-def motion(par: Parameters, x: Any, push: Any) -> Any:
+def motion(par: Parameters, m: Modes, x: Any, push: Any) -> Any:
     """x' under forces on the modes."""
-    m, n = modes(BENDING), len(POSITIONS)
-    q, rate = x[:n], x[n:]
-    half = n // 2
-    g = ca.DM(m.gyroscopic)
-    turning = par.Omega * ca.vertcat(-(g @ rate[half:]), g @ rate[:half])
+    n = 2 * len(m.w)
+    q, rate, g = x[:n], x[n:], ca.DM(m.gyroscopic)
+    turning = par.Omega * ca.vertcat(-(g @ rate[n // 2 :]), g @ rate[: n // 2])
     w = ca.DM(np.tile(m.w, 2))
     return ca.vertcat(rate, push + turning - 2 * par.zeta * w * rate - par.kappa * w**2 * q)
 
