@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -420,6 +421,22 @@ def coils() -> Figure:
     return figure
 
 
+def flexible_rotor(name: str) -> Figure:
+    """A figure of examples/flexible_rotor."""
+    from importlib import import_module
+
+    from malta.model.data import plant_of, read
+
+    folder = Path(__file__).parents[1] / "examples" / "flexible_rotor"
+    machine = malta.machine(folder / "flexible_rotor.py")
+    law, figures = (import_module(f"{machine.__name__}.{part}") for part in ("law", "figures"))
+    par = read(folder / "flexible_rotor.toml")
+    if name == "rest":
+        return figures.rest(par, law.REST)  # type: ignore[no-any-return]
+    plant = plant_of(par)
+    return getattr(figures, name)(plant, law.controller(plant))  # type: ignore[no-any-return]
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "value_sets": value_sets,
     "cell": cell,
@@ -433,6 +450,9 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "bode": bode,
     "positioning": positioning,
     "coils": coils,
+    "flexible_whirl": partial(flexible_rotor, "whirl"),
+    "flexible_unbalance": partial(flexible_rotor, "unbalance"),
+    "flexible_rest": partial(flexible_rotor, "rest"),
 }
 
 

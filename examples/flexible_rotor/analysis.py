@@ -81,7 +81,7 @@ class Critical(NamedTuple):
 
 
 def criticals(response: Response, operation: tuple[float, float]) -> list[Critical]:
-    """The peaks of the larger sensor's amplitude, each with what API 617 asks for.
+    """The peaks of both sensors that fall to half power on both sides, each with what API 617 asks for.
 
     AF < 2.5: nothing; else 17 % (1 - 1/(AF - 1.5)) below the range, 10 % + 17 % (1 - 1/(AF - 1.5)) above it.
     """
@@ -91,10 +91,9 @@ def criticals(response: Response, operation: tuple[float, float]) -> list[Critic
         for k in np.flatnonzero((a[1:-1] > a[:-2]) & (a[1:-1] >= a[2:])) + 1:
             under = a < HALF_POWER * a[k]
             left, right = np.flatnonzero(under[:k]), np.flatnonzero(under[k:])
-            if not len(left):
+            if not (len(left) and len(right)):
                 continue
-            end = speeds[k + right[0]] if len(right) else math.inf
-            AF = float(speeds[k] / (end - speeds[left[-1]]))
+            AF = float(speeds[k] / (speeds[k + right[0]] - speeds[left[-1]]))
             low, high = operation
             apart = (low - speeds[k]) / low if speeds[k] < low else (speeds[k] - high) / high
             asked = 0.17 * (1 - 1 / (AF - 1.5)) if AF >= 2.5 else 0.0
