@@ -53,6 +53,7 @@ def whirl(plant: Plant, controller: Controller) -> Figure:
             right.plot(np.full(len(found), speed * RPM), found, ".", markersize=2.5, color=colour,
                        label=label if not k else "")  # fmt: skip
     right.plot(speeds * RPM, speeds / (2 * math.pi), label="1x, the unbalance", **STYLES[3])
+    right.set_ylim(0, 600)
     _finish(right, "speed [rpm]", "frequency [Hz]", "Campbell diagram")
     return figure
 
@@ -69,8 +70,8 @@ def unbalance(plant: Plant, controller: Controller) -> Figure:
         )
     for name, share in analysis.ISO_14839_2.items():
         left.axhline(1e6 * share * par.c_r, color="0.5", linewidth=0.8, linestyle=":")
-        left.text(2, 1e6 * share * par.c_r * 0.8, f"zone {name}", fontsize=7, color="0.3")
-    left.set_ylim(0.1, 400)
+        left.text(1600 * "ABC".index(name), 1e6 * share * par.c_r * 0.72, f"zone {name}", fontsize=7, color="0.3")
+    left.set_ylim(0.1, 500)
     _finish(left, "speed [rpm]", "amplitude [µm]", "G2.5 unbalance; displacement zones of ISO 14839-2")
     w = np.geomspace(10, 3e4, 500)
     for k, speed in enumerate((1.0, par.Omega_max)):
