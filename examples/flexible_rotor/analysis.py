@@ -112,9 +112,12 @@ def zone(share: float) -> str:
 #
 #     R(jw) = Phi_s Z^-1 Phi_m',      Z = W^2 - w^2 + 2 j w zeta W -+ w Omega g,
 #
-# in forward and backward whirl. For any matrix T with N = Herm(T Z) > 0, |R|^2 <= |Phi_s N^-1 Phi_s'| |Phi_m T' N^-1 T Phi_m'|,
-# since x' N x = Re x' T Phi_m' f for Z x = Phi_m' f. T is the inverse of the unitary factor of Z in the middle of a cell of
-# frequency and speed; N over the cell is above that in the middle less what Z changes by. So a cell is covered, not sampled.
+# in forward and backward whirl. For any matrix T with N = Herm(T Z) > 0,
+#
+#     |R|^2 <= |Phi_s N^-1 Phi_s'| |Phi_m T' N^-1 T Phi_m'|,      x' N x = Re x' T Phi_m' f for Z x = Phi_m' f.
+#
+# T is the inverse of the unitary factor of Z in the middle of a cell of frequency and speed; N over the cell is above
+# that in the middle less what Z changes by. So a cell is covered, not sampled.
 
 
 ROUNDING = 1e-12  # of the size of Z, allowed for floating point
@@ -127,7 +130,9 @@ class RestBound(NamedTuple):
     cells: int
 
 
-def bound_rest(par: Any, weight: Any, *, kept: int = flexible_rotor.BENDING, lowest: float = 1.0) -> RestBound:
+def bound_rest(
+    par: Any, weight: Any, *, kept: int = flexible_rotor.BENDING, lowest: float = 1.0
+) -> RestBound:
     """Cover all frequencies and speeds with cells on which |R| < |W| is shown, halving cells until it is.
 
     weight : W(s), a control.TransferFunction whose |W| rises with frequency
@@ -147,7 +152,10 @@ def bound_rest(par: Any, weight: Any, *, kept: int = flexible_rotor.BENDING, low
         T = (U @ V).conj().T
         half = (b - a) / 2
         off = half * (2 * w + half) + 2 * half * par.zeta * w_k.max()
-        off += gyro * (b * max(abs(low), abs(high)) - w * abs(Omega) if b > a else 0.0) + gyro * b * (high - low) / 2
+        off += (
+            gyro * (b * max(abs(low), abs(high)) - w * abs(Omega) if b > a else 0.0)
+            + gyro * b * (high - low) / 2
+        )
         N = (V.conj().T * s) @ V - (off + ROUNDING * s[0]) * np.eye(len(s))
         least, own = np.linalg.eigh(N)
         if least[0] <= 0:
@@ -159,7 +167,10 @@ def bound_rest(par: Any, weight: Any, *, kept: int = flexible_rotor.BENDING, low
     # Above the top every mode is far below: |Z| >= w^2 - w_max^2 - w Omega |g|.
     above = top**2 - w_k.max() ** 2 - top * par.Omega_max * gyro
     largest = float(np.linalg.norm(sensors, 2) * np.linalg.norm(magnets, 2) / above / W(top))
-    stack, count = [(0.0, lowest, -par.Omega_max, par.Omega_max), (lowest, top, -par.Omega_max, par.Omega_max)], 0
+    stack, count = (
+        [(0.0, lowest, -par.Omega_max, par.Omega_max), (lowest, top, -par.Omega_max, par.Omega_max)],
+        0,
+    )
     while stack:
         a, b, low, high = stack.pop()
         share = size(a, b, low, high) / W(a)

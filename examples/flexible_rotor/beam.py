@@ -40,10 +40,10 @@ class Matrices(NamedTuple):
 def element(length: float, d: float, steel: dict[str, float]) -> Matrices:
     """A round shaft element of diameter d."""
     E, G, rho = steel["E"], steel["G"], steel["rho"]
-    A, I, L, nu = math.pi / 4 * d**2, math.pi / 64 * d**4, length, E / (2 * G) - 1
+    A, bend, L, nu = math.pi / 4 * d**2, math.pi / 64 * d**4, length, E / (2 * G) - 1
     shear = 6 * (1 + nu) / (7 + 6 * nu)
-    P = 12 * E * I / (shear * G * A * L**2)
-    K = _symmetric(12, 6 * L, -12, 6 * L, (4 + P) * L**2, (2 - P) * L**2) * E * I / ((1 + P) * L**3)
+    P = 12 * E * bend / (shear * G * A * L**2)
+    K = _symmetric(12, 6 * L, -12, 6 * L, (4 + P) * L**2, (2 - P) * L**2) * E * bend / ((1 + P) * L**3)
     moved = _symmetric(
         312 + 588 * P + 280 * P**2, (44 + 77 * P + 35 * P**2) * L, 108 + 252 * P + 140 * P**2,
         -(26 + 63 * P + 35 * P**2) * L, (8 + 14 * P + 7 * P**2) * L**2, -(6 + 14 * P + 7 * P**2) * L**2,
@@ -52,7 +52,7 @@ def element(length: float, d: float, steel: dict[str, float]) -> Matrices:
         36, (3 - 15 * P) * L, -36, (3 - 15 * P) * L,
         (4 + 5 * P + 10 * P**2) * L**2, (-1 - 5 * P + 5 * P**2) * L**2,
     )  # fmt: skip
-    turned = turned * rho * I / (30 * L * (1 + P) ** 2)
+    turned = turned * rho * bend / (30 * L * (1 + P) ** 2)
     return Matrices(moved * rho * A * L / (840 * (1 + P) ** 2) + turned, 2 * turned, K)
 
 
@@ -94,7 +94,9 @@ def whirl(free: Matrices, Omega: float, stiffness: float) -> Matrix:
     for end in (0, len(K) - 2):
         K[end, end] += stiffness
     n = len(M)
-    A = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), 1j * Omega * np.linalg.solve(M, G)]])
+    A = np.block(
+        [[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), 1j * Omega * np.linalg.solve(M, G)]]
+    )
     w = np.linalg.eigvals(A).imag
     return np.asarray(w[np.argsort(np.abs(w))])
 

@@ -65,12 +65,12 @@ def unbalance(plant: Plant, controller: Controller) -> Figure:
     found = analysis.unbalance_response(plant, controller, np.linspace(5.0, par.Omega_max, 70))
     for k, end in enumerate("AB"):
         left.semilogy(found.speeds * RPM, 1e6 * found.sensors[:, k], label=f"sensor {end}", **STYLES[k])
-        left.semilogy(
-            found.speeds * RPM, 1e6 * found.magnets[:, k], label=f"magnet {end}", **STYLES[k + 2]
-        )
+        left.semilogy(found.speeds * RPM, 1e6 * found.magnets[:, k], label=f"magnet {end}", **STYLES[k + 2])
     for name, share in analysis.ISO_14839_2.items():
         left.axhline(1e6 * share * par.c_r, color="0.5", linewidth=0.8, linestyle=":")
-        left.text(1600 * "ABC".index(name), 1e6 * share * par.c_r * 0.72, f"zone {name}", fontsize=7, color="0.3")
+        left.text(
+            1600 * "ABC".index(name), 1e6 * share * par.c_r * 0.72, f"zone {name}", fontsize=7, color="0.3"
+        )
     left.set_ylim(0.1, 500)
     _finish(left, "speed [rpm]", "amplitude [µm]", "G2.5 unbalance; displacement zones of ISO 14839-2")
     w = np.geomspace(10, 3e4, 500)
@@ -91,11 +91,19 @@ def rest(par: flexible_rotor.Parameters, weight: Any) -> Figure:
     figure = Figure(figsize=(5.0, 3.2), layout="constrained")
     axes = figure.subplots()
     k = flexible_rotor.BENDING + 2
-    m, w = flexible_rotor.modes(30), np.unique(np.concatenate([np.geomspace(300, 1e5, 500), np.linspace(5500, 6300, 300)]))
+    m, w = (
+        flexible_rotor.modes(30),
+        np.unique(np.concatenate([np.geomspace(300, 1e5, 500), np.linspace(5500, 6300, 300)])),
+    )
     for i, speed in enumerate((-par.Omega_max, 0.0, par.Omega_max)):
-        Z = [np.diag(m.w[k:] ** 2 - x**2 + 2j * x * par.zeta * m.w[k:]) + x * speed * m.gyroscopic[k:, k:] for x in w]
+        Z = [
+            np.diag(m.w[k:] ** 2 - x**2 + 2j * x * par.zeta * m.w[k:]) + x * speed * m.gyroscopic[k:, k:]
+            for x in w
+        ]
         R = m.sensors[:, k:] @ np.linalg.solve(np.array(Z), m.magnets[:, k:].T[None])
         axes.loglog(w, np.linalg.norm(R, 2, axis=(1, 2)), label=f"{speed * RPM:.0f} rpm", **STYLES[i])
     axes.loglog(w, np.abs(weight(1j * w)), label="|W|", **STYLES[3])
-    _finish(axes, "frequency [rad/s]", "magnet to sensor [m/N]", "The rest of the modes; backward whirl: negative")
+    _finish(
+        axes, "frequency [rad/s]", "magnet to sensor [m/N]", "The rest of the modes; backward whirl: negative"
+    )
     return figure

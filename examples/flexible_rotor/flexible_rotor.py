@@ -4,8 +4,8 @@ A machine of a user's own: malta knows it by this file alone, which flexible_rot
 
     python beam.py                     matrices.csv from the rotor's dimensions, and its published frequencies
 
-law.py has the control law and the search that found it, analysis.py what an engineer of rotors asks: Campbell diagram,
-unbalance response, separation margins, and a bound of what the modes leave out. docs/howto/flexible_rotor.md shows them.
+law.py has the control law and the search that found it, analysis.py what an engineer of rotors asks: whirl, unbalance,
+separation margins, and a bound of what the modes leave out. docs/howto/flexible_rotor.md shows them.
 
 matrices.csv has M, G and K of the free rotor in one plane, a displacement and a slope of each node in turn; beam.py
 wrote it, and any other program may. The rotor stands upright, turns with the speed Omega, and is the same in x and y:

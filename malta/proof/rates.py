@@ -7,9 +7,9 @@ xi at the samples, P piecewise linear in p. With the frozen loop xi+ = Phi(p) xi
 
     Phi(p)' P(p) Phi(p) <= (1 - g) P(p),      -d P(p) <= dP/dp <= d P(p)      on every piece of the interval
 
-V falls in every sample where (sqrt(1 - g) + e)^2 exp(rate T d) < 1, e the change of Phi, in the norm of P, by the motion
-of p within a sample. g is proven at the ends of a piece, and between them by the second derivative: a matrix function is no further
-from its chord than h^2/8 sup |F''|. All is in balls; floating point only chooses P.
+V falls in every sample where (sqrt(1 - g) + e)^2 exp(rate T d) < 1, e the change of Phi, in the norm of P, by the
+motion of p within a sample. g is proven at the ends of a piece, and between them by the second derivative: a matrix
+function is no further from its chord than h^2/8 sup |F''|. All is in balls; floating point only chooses P.
 """
 
 from __future__ import annotations
@@ -98,7 +98,10 @@ class _Loop:
         M = self.M[0] + self.M[1] * arb(p)
         top = ((M * arb(self.T)).exp() * self.R).tolist()[: self.n]
         rows = self.L.tolist()
-        return arb_mat([[a + b for a, b in zip(*pair, strict=True)] for pair in zip(rows, top, strict=False)] + rows[self.n :])
+        return arb_mat(
+            [[a + b for a, b in zip(*pair, strict=True)] for pair in zip(rows, top, strict=False)]
+            + rows[self.n :]
+        )
 
 
 class _Piece(NamedTuple):
@@ -166,12 +169,16 @@ def _loop_of(system: UncertainSystem, law: Compensator, name: str) -> _Loop:
     if name not in system.names:
         raise InputError(CALLER, "name", repr(name), "one of " + " ".join(system.names))
     if law.sample_time is None or system.sample_time is not None or law.lag is not None:
-        raise InputError(CALLER, "compensator", "another loop", "a continuous system under a sampled law without a lag")
+        raise InputError(
+            CALLER, "compensator", "another loop", "a continuous system under a sampled law without a lag"
+        )
     p = ca.SX(ca.DM(system.nominal))
     p[system.names.index(name)] = q = ca.SX.sym("q")
     made = [ca.SX(M) for M in system.matrices.call([p])]
     if len(made) > 3 or ca.depends_on(ca.veccat(*made[1:]), q):
-        raise InputError(CALLER, "system", f"B, C, D or E that depend on {name}, or D or E", "A alone that does")
+        raise InputError(
+            CALLER, "system", f"B, C, D or E that depend on {name}, or D or E", "A alone that does"
+        )
     slope = ca.jacobian(ca.vec(made[0]), q)
     if ca.depends_on(slope, q):
         raise InputError(CALLER, "system", f"an A that is not affine in {name}", "A_0 + p A_1")
@@ -179,7 +186,9 @@ def _loop_of(system: UncertainSystem, law: Compensator, name: str) -> _Loop:
     A, B, C, A1 = (np.array(ca.DM(M)) for M in parts)
     plain = _closed(A, A1, B, C, law)
     with np.errstate(all="ignore"):
-        _, (t, _) = linalg.matrix_balance(_middle(plain.at(float(system.nominal[system.names.index(name)]))), permute=False, separate=True)
+        _, (t, _) = linalg.matrix_balance(
+            _middle(plain.at(float(system.nominal[system.names.index(name)]))), permute=False, separate=True
+        )
     n, own = len(A), len(A) + law.delay * B.shape[1]
     x, u, s = t[:n], 2.0 ** np.round(np.log2(t[n:own]).mean()) if own > n else 1.0, t[own:]
     law = replace(
@@ -213,7 +222,7 @@ def _closed(A: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray, law: Co
 
 
 def _ball(M: FloatArray) -> Any:
-    return arb_mat(*M.shape, [arb(float(x)) for x in M.ravel()])
+    return arb_mat(len(M), M.shape[1], [arb(float(x)) for x in M.ravel()])
 
 
 def _put(rows: list[list[Any]], i: int, j: int, M: Any) -> None:
@@ -260,10 +269,10 @@ class _Choice:
             return None
         _, V = np.linalg.eig(frozen[len(frozen) // 2])
         back = np.linalg.pinv(V)
-        acts = np.abs(back @ (frozen[-1] - frozen[0]) @ V)  # of p on the modes, which are scaled so that it is small
-        _, (size, _) = linalg.matrix_balance(
-            acts + 1e-9 * acts.max() + 1e-300, permute=False, separate=True
-        )
+        acts = np.abs(
+            back @ (frozen[-1] - frozen[0]) @ V
+        )  # of p on the modes, which are scaled so that it is small
+        _, (size, _) = linalg.matrix_balance(acts + 1e-9 * acts.max() + 1e-300, permute=False, separate=True)
         back = back / size[:, None]
         return cls(loop, (back.conj().T @ back).real, radius**-share)
 
@@ -348,7 +357,9 @@ def _prove(
     (Phi_a, P_a), (Phi_b, P_b) = one, two
     P, D = (P_a + P_b) * arb(0.5), (P_b - P_a) * (arb(1) / arb(h))
     try:
-        X = _ball(np.linalg.inv(np.linalg.cholesky(_middle(P))).T)  # units in which P is one, but for rounding
+        X = _ball(
+            np.linalg.inv(np.linalg.cholesky(_middle(P))).T
+        )  # units in which P is one, but for rounding
     except np.linalg.LinAlgError:
         return None
     back = X.inv()
