@@ -75,7 +75,7 @@ def test_modes_have_mass_one_and_the_rotors_mass(example: Any) -> None:
 
 
 def test_amplification_and_separation_margins_are_those_of_API_617(example: Any) -> None:
-    """AF of a mode of damping 0.1 is about 1/(2 zeta) = 5; it asks 17 % (1 - 1/3.5) below the range, 10 % more above."""
+    """AF of a damping of 0.1 is about 1/(2 zeta) = 5; it asks 17 % (1 - 1/3.5) below the range, 10 % more above."""
     analysis = example("analysis")
     speeds = np.linspace(1.0, 300.0, 3000)
     a = 1 / np.abs(100.0**2 - speeds**2 + 20j * speeds)

@@ -1,12 +1,12 @@
-"""The first bending mode of the mover, which the model leaves out: a free tube of the printed mass and inertias.
+"""The mover's first bending mode, which the model leaves out: a free tube of the printed mass and inertias.
 
-A tube of outer radius r_o (printed) has m (r_o^2 + r_i^2) / 2 = I_zz and m (r_o^2 + r_i^2) / 4 + m L^2 / 12 = I_xx, which
-gives its bore and length. A free Euler-Bernoulli beam bends first with
+A tube of outer radius r_o (printed) has m (r_o^2 + r_i^2) / 2 = I_zz and m (r_o^2 + r_i^2) / 4 + m L^2 / 12 = I_xx,
+which gives its bore and length. A free Euler-Bernoulli beam bends first with
 
     w_1 = k^2 sqrt(E I / (m L^3)),   k = 4.7300,   I = pi / 4 (r_o^4 - r_i^4),
 
-and moves the sensors by phi_S phi_B / m / (s^2 + 2 zeta w_1 s + w_1^2) of a radial force. Stiffness and damping of magnets
-glued on a tube are not known: both are arguments.
+and moves the sensors by phi_S phi_B / m / (s^2 + 2 zeta w_1 s + w_1^2) of a radial force. Stiffness and damping of
+magnets glued on a tube are not known: both are arguments.
 
 Source: R. D. Blevins, Formulas for Natural Frequency and Mode Shape, 1979, table 8-1: the free beam.
 """
