@@ -120,16 +120,15 @@ def write(path: Path, free: Matrices) -> None:
         writer.writerows(rows)
 
 
-def main() -> None:
-    """Write the matrices, and compare."""
-    write(FOLDER / "matrices.csv", assemble(FINE))
+def compare() -> None:
+    """Print natural frequencies beside the published ones."""
     known = published()
-    print("[rad/s]        " + " ".join(f"{k:>8d}" for k in range(1, 7)))
     for case in known["case"]:
         ours = np.abs(whirl(assemble(known["element"]), case["speed"] * math.pi / 30, known["stiffness"]))
-        print(f"{case['speed']:5d} rpm ours " + " ".join(f"{w:8.2f}" for w in ours[:6]))
-        print("      published " + " ".join(f"{w:8.2f}" for w in case["frequencies"]))
+        for name, row in (("ours", ours[:6]), ("published", case["frequencies"])):
+            print(f"{case['speed']:4d} rpm, {name:9s} " + " ".join(f"{w:7.2f}" for w in row) + " rad/s")
 
 
 if __name__ == "__main__":
-    main()
+    write(FOLDER / "matrices.csv", assemble(FINE))
+    compare()

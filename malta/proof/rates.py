@@ -298,7 +298,7 @@ def _pieces(
             known[p] = Phi, choice.at(Phi)
         return known[p]
 
-    g = 1 - choice.scale**-1.5  # of what P has at its nodes, 1 - scale^-2
+    g = float(1 - choice.scale**-1.5)  # of what P has at its nodes, 1 - scale^-2
     norms = _Units(loop, at((low + high) / 2)[1], max(abs(low), abs(high)))
     found, stack = list[_Piece](), [(low, high)]
     while stack:
