@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -435,6 +436,43 @@ def order() -> Figure:
     axes.set_xlim(0, 21)
     axes.legend(frameon=False, loc="lower left")
     finish(axes, "states of the law", "proven margin [boxes of ±20 %]", "")
+
+
+def flexible_rotor(name: str) -> Figure:
+    """A figure of examples/flexible_rotor."""
+    from importlib import import_module
+
+    from malta.model.data import plant_of, read
+
+    folder = Path(__file__).parents[1] / "examples" / "flexible_rotor"
+    machine = malta.machine(folder / "flexible_rotor.py")
+    law, figures = (import_module(f"{machine.__name__}.{part}") for part in ("law", "figures"))
+    par = read(folder / "flexible_rotor.toml")
+    if name == "rest":
+        return figures.rest(par, law.REST)  # type: ignore[no-any-return]
+    plant = plant_of(par)
+    return getattr(figures, name)(plant, law.controller(plant))  # type: ignore[no-any-return]
+
+
+def bending() -> Figure:
+    """How much larger the mover's first bending mode may be, as a block, over its frequency; gain file robust."""
+    from malta.machines.tubular.bending import bending_block, first_bending
+    from malta.margins.travel import travel_loops
+
+    controller = malta.gains.read("design/gains/robust.json")
+    own: Any = controller.parameters
+    ((system, law),), over = travel_loops(malta.plant_of(own), controller, ("m",))
+    frequencies = np.array([8e3, 12e3, 16e3, 20e3, 24e3, 28e3])
+    figure, (axes,) = new_figure(width=5.0, height=3.0)
+    for zeta, style in ((0.005, STYLES[0]), (0.02, STYLES[1])):
+        blocks = [bending_block(own, system, (0, 2), w, zeta) for w in frequencies]
+        proven = [malta.dynamic_margin(system, law, {}, block, over=over).lower for block in blocks]
+        axes.loglog(frequencies / (2e3 * np.pi), proven, marker="o", label=f"damping {zeta:.1%}", **style)
+    axes.axhline(1, color="#b5432a", linewidth=1, linestyle="--", label="the mode itself")
+    for E, text in ((30e9, "30 GPa"), (160e9, "160 GPa")):
+        axes.axvline(first_bending(own, E) / (2e3 * np.pi), color="0.6", linewidth=0.8)
+        axes.text(first_bending(own, E) / (2e3 * np.pi), 0.03, text, rotation=90, **GREY)
+    finish(axes, "first bending frequency [kHz]", "proven multiple of the mode")
     return figure
 
 
@@ -452,6 +490,10 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "positioning": positioning,
     "coils": coils,
     "order": order,
+    "flexible_whirl": partial(flexible_rotor, "whirl"),
+    "flexible_unbalance": partial(flexible_rotor, "unbalance"),
+    "bending": bending,
+    "flexible_rest": partial(flexible_rotor, "rest"),
 }
 
 

@@ -197,9 +197,9 @@ figure.savefig("build/10_order.png", dpi=120)
 # tenth of a second.
 
 # %% [markdown]
-# ## Beside HIFOO and hinfstruct
+# ## A public plant
 # AC7 of COMPleib, a transport aircraft of 9 states with one input and two sensors (Gangsaas et al., IEEE TAC 31,
-# 1986): the static law of the least H-infinity norm. 0.0651 is quoted for HIFOO.
+# 1986): the static law of the least H-infinity norm.
 
 # %%
 given = tomllib.loads(Path("tests/structured/compleib.toml").read_text(encoding="utf-8"))["AC7"]

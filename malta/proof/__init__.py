@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from malta.proof.connections import random_systems as random_systems
     from malta.proof.connections import series as series
     from malta.proof.margin import Margin as Margin
+    from malta.proof.rates import RateBound as RateBound
+    from malta.proof.rates import varying as varying
     from malta.proof.robust import margin_of_polynomial as margin_of_polynomial
     from malta.proof.uncertain import Compensator as Compensator
     from malta.proof.uncertain import UncertainSystem as UncertainSystem
