@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import control
 import numpy as np
 from firmware import firmware
+from identification import identification
 from live import live_page
 from margins import margin, published
 from page import update_page
@@ -399,6 +400,7 @@ WORKLOADS: dict[str, Callable[[int], list[Result]]] = {
     "firmware": firmware,
     "live": live_page,
     "structured": structured,
+    "identification": identification,
 }
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.identification.excite import excite as excite
     from malta.identification.identify import identify as identify
     from malta.identification.learn import learn as learn
-    from malta.identification.log import read_log as read_log
+    from malta.identification.log_files import read_log as read_log
     from malta.identification.measure import measure as measure
     from malta.identification.measure import plan_measurement as plan_measurement
     from malta.loops.loop import loop as loop

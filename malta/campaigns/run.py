@@ -380,7 +380,11 @@ def main_campaign(
     progress: Progress | None = None,
 ) -> Campaign:
     """The campaign of `main_yields`."""
+    return campaign(main_plan(controller, spec, machines, settle=settle), progress=progress)
+
+
+def main_plan(controller: Controller, spec: Spec, machines: int = MACHINES, *, settle: bool = True) -> Plan:
+    """The plan of `main_campaign`."""
     job = main_job(spec.plant)
     options = settling(job, spec.plant) if settle else {}
-    plan = Plan(controller, job, dict(spec.uncertainty), samples=machines, options=options)
-    return campaign(plan, progress=progress)
+    return Plan(controller, job, dict(spec.uncertainty), samples=machines, options=options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,6 +28,7 @@ from malta.errors import CheckError, InputError
 if TYPE_CHECKING:
     from malta.identification.excite import ExcitationPlan
     from malta.model.plant import FloatArray, Plant, Signal
+    from malta.proof.blocks.gain import Gain
     from malta.synthesis.controller import Controller
 
 
@@ -83,7 +85,7 @@ def identify(
     from malta.identification.data_file import write_data
     from malta.identification.identify import identify as identify_parameters
     from malta.identification.identify import weigh
-    from malta.identification.log import read_log
+    from malta.identification.log_files import read_log
     from malta.identification.response import units_of_model
     from malta.model.data import plant_of
     from malta.report.tables.experiments import identified_table, in_time_table, quality_table
@@ -246,7 +248,8 @@ def _write_forces(path: Path, Ts: float, signals: Sequence[Signal], forces: Floa
 
 def _fly(plan: ExcitationPlan, plant: Plant, controller: Controller, path: Path, seed: int | None) -> Path:
     """Fly an excitation and write its log. Raises CheckError when the flight ends early."""
-    from malta.identification.log import log_of, write_log
+    from malta.identification.log import log_of
+    from malta.identification.log_files import write_log
     from malta.simulation.scenario import Scenario
     from malta.simulation.simulate import simulate
 
@@ -275,7 +278,7 @@ def log(
     \b
     Example:  malta log build/robust.npz --out build/log.png
     """
-    from malta.identification.log import read_log
+    from malta.identification.log_files import read_log
     from malta.report.tables.experiments import log_table
 
     found = read_log(file)
@@ -323,6 +326,9 @@ def learn(
             "--next", metavar="FILE", help="Write the thrust that the next stroke is sent too (.csv)."
         ),
     ] = None,
+    v0: Annotated[
+        bool, typer.Option("--v0", help="Learn v0(z), what holds the machine, from the log of a slow stroke.")
+    ] = False,
     strokes: Annotated[
         int,
         typer.Option(
@@ -341,18 +347,26 @@ def learn(
 
     The new gain file commutates with the learned force constant, and its filter predicts with it: the next stroke needs
     no feedback to correct the thrust. With --next the thrust over time that was missing is written, which the next
-    stroke is sent beside the law's. --strokes does both on the simulated machine, with --set as another one, and
-    computes by how much errors shrink over the box of the gain file.
+    stroke is sent beside the law's. With --v0 the log is of a slow stroke, and the thrust that holds the machine along
+    it, against cogging and other loads, goes into the table v0(z) of the new gain file. --strokes learns the constant
+    and the thrust over time on the simulated machine, with --set as another one, and
+    proves by how much errors shrink over the box of the gain file.
 
     \b
     Example:  malta learn design/gains/robust.json build/stroke.npz --out build
+              malta learn design/gains/robust.json build/slow.npz --v0 --out build
               malta learn design/gains/robust.json --strokes 6 --set K_D=4.68
     """
     controller = read_controller(gains, machine)
+    if v0 and (strokes or parameter or following):
+        other = "--strokes" if strokes else "--next" if following else "--parameter"
+        raise InputError("learn", "--v0", f"--v0 and {other}", "one of them")
     if (log is None) == (strokes == 0):
         raise InputError("learn", "LOG", "a log and --strokes" if log else "nothing", "a log, or --strokes N")
     if strokes:
         _learn_strokes(gains, controller, strokes, change, uncertain, out, as_json=as_json)
+    elif log is not None and v0:
+        _learn_v0(gains, controller, log, out, as_json=as_json)
     elif log is not None:
         _learn_from(gains, controller, log, parameter, following, out, as_json=as_json)
 
@@ -370,7 +384,7 @@ def _learn_from(
     """Learn from the log of one stroke."""
     from malta.identification.learn import learn as learn_thrust
     from malta.identification.learn import next_stroke
-    from malta.identification.log import read_log
+    from malta.identification.log_files import read_log
     from malta.model.data import plant_of
 
     read = read_log(log)
@@ -398,6 +412,29 @@ def _learn_from(
     print_written(console, files)
 
 
+def _learn_v0(gains: Path, controller: Controller, log: Path, out: Path | None, *, as_json: bool) -> None:
+    """Learn v0(z) of the thrust from the log of a slow stroke."""
+    from malta.identification.holding import learn_v0
+    from malta.identification.log_files import read_log
+    from malta.model.data import plant_of
+
+    found = learn_v0(controller, read_log(log))
+    files = [] if out is None else verify_and_write(found.controller, gains, out)
+    if as_json:
+        from malta.cli.documents.others import learned_v0_output
+
+        print_document(learned_v0_output(gains, log, found, files))
+        return
+    console, plant = make_console(), plant_of(controller.parameters)
+    low, high = 1e3 * found.z[0], 1e3 * found.z[-1]
+    print_text(
+        console,
+        f"{log}: v0({plant.stroke}) of {plant.thrust} from {low:.3g} to {high:.3g} mm changes by "
+        f"{found.change.min():.3g} to {found.change.max():.3g} N, each +- {1.96 * found.deviation.max():.2g} N",
+    )
+    print_written(console, files)
+
+
 def _learn_strokes(
     gains: Path,
     controller: Controller,
@@ -409,14 +446,16 @@ def _learn_strokes(
     as_json: bool,
 ) -> None:
     """Fly strokes on the simulated machine, each taught by those before."""
-    from malta.identification.learn import contraction, learn_strokes
+    from malta.identification.convergence import contraction
+    from malta.identification.learn import learn_strokes
     from malta.model.data import plant_of, published_figures
     from malta.report.tables.experiments import strokes_table
 
     plant = plant_of(change_machine(controller.parameters, change))
     with working(f"{strokes} strokes"):
         found = learn_strokes(plant, controller, strokes=strokes)
-        box = read_uncertainty(gains, uncertain, controller.parameters, published_figures(plant.name))
+    box = read_uncertainty(gains, uncertain, controller.parameters, published_figures(plant.name))
+    with working("proving that errors shrink"):
         shrinks = contraction(controller, box) if box else None
     files = [] if out is None else verify_and_write(found.controller, gains, out)
     if as_json:
@@ -426,14 +465,28 @@ def _learn_strokes(
         return
     console = make_console()
     console.print(strokes_table(found))
+    print_text(
+        console,
+        f"the next stroke would be sent up to {abs(found.thrust).max():.3g} N beside the law's thrust, and without "
+        f"noise of the sensors its largest axial error would be {1e6 * found.repeatable:.3g} um",
+    )
     if shrinks is not None:
-        print_text(
-            console,
-            f"the next stroke would be sent up to {abs(found.thrust).max():.3g} N beside the law's thrust; at the "
-            f"corners of the box what it can move of the error shrinks to {100 * shrinks:.3g} % at most "
-            "from stroke to stroke (computed, not proven)",
-        )
+        print_text(console, _proven_contraction(shrinks))
     print_written(console, files)
+
+
+def _proven_contraction(found: Gain) -> str:
+    """By how much errors shrink over the box, in words."""
+    if found.upper is None:
+        return f"that errors shrink over the box is not proven: {found.reason}"
+    at = ", ".join(f"{name} = {value:.4g}" for name, value in found.witness.items())
+    left = f"at most {100 * found.upper:.3g} % of an error that thrust can make is left by the next stroke"
+    verdict = f"proven over the box: {left}" if found.upper < 1 else "errors may grow within the box"
+    return (
+        f"{verdict}; found: {100 * found.lower:.3g} % at {found.frequency / (2 * math.pi):.3g} Hz with {at}. Not "
+        "covered: loads along the stroke and saturation (the loop is linear), noise that differs from stroke to "
+        "stroke, and responses that outlast the log"
+    )
 
 
 # `malta replay`: the law of a gain file on the readings of a log.
@@ -451,7 +504,7 @@ def replay(gains: GainFile, log: LogFile, machine: MachineFile = None, as_json: 
     Example:  malta replay design/gains/robust.json build/stroke.npz
     """
     from malta.identification.dump import replay_dump
-    from malta.identification.log import read_log
+    from malta.identification.log_files import read_log
     from malta.identification.replay import replay_law
     from malta.model.data import plant_of
     from malta.report.tables.experiments import replay_table

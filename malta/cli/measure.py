@@ -118,7 +118,7 @@ def _measured(
 ) -> Measurement:
     """The measurement over the gain file's box, or over the intervals of an identified machine."""
     from malta.identification.data_file import read_identified
-    from malta.identification.log import read_log
+    from malta.identification.log_files import read_log
     from malta.identification.measure import measure as measure_loop
     from malta.model.data import published_figures
 

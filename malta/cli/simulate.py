@@ -198,7 +198,8 @@ def simulate(
     published = published_figures(plant.name)
     files = [] if out is None else _save(simulation, out, published) + _save_gains(simulation, gains, out)
     if log is not None:
-        from malta.identification.log import log_of, write_log
+        from malta.identification.log import log_of
+        from malta.identification.log_files import write_log
 
         files.append(write_log(log_of(simulation.experiment.run), log))
     if as_json:

@@ -7,19 +7,21 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
+    from malta.identification.convergence import contraction as contraction
     from malta.identification.dump import ExactReplay as ExactReplay
     from malta.identification.dump import replay_dump as replay_dump
     from malta.identification.excite import ExcitationPlan as ExcitationPlan
+    from malta.identification.holding import LearnedV0 as LearnedV0
+    from malta.identification.holding import learn_v0 as learn_v0
     from malta.identification.identify import Identified as Identified
     from malta.identification.identify import weigh as weigh
     from malta.identification.learn import Learned as Learned
     from malta.identification.learn import LearnedStrokes as LearnedStrokes
-    from malta.identification.learn import contraction as contraction
     from malta.identification.learn import learn_strokes as learn_strokes
     from malta.identification.learn import next_stroke as next_stroke
     from malta.identification.log import Log as Log
     from malta.identification.log import log_of as log_of
-    from malta.identification.log import write_log as write_log
+    from malta.identification.log_files import write_log as write_log
     from malta.identification.measure import Measurement as Measurement
     from malta.identification.measure import MeasurementPlan as MeasurementPlan
     from malta.identification.replay import LawReplay as LawReplay

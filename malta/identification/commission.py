@@ -24,7 +24,8 @@ from malta.files import file_exists, json_text, read_file, replace_files
 from malta.gains.file import content_of
 from malta.identification.calibration import Estimate, at_rest
 from malta.identification.learn import FACTORS, learn
-from malta.identification.log import log_of, read_log, write_log
+from malta.identification.log import log_of
+from malta.identification.log_files import read_log, write_log
 from malta.identification.measure import SAME_LAW, measure, plan_measurement
 from malta.loops.loop import loop
 from malta.model.data import plant_of

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +12,8 @@ from scipy.signal import fftconvolve
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.log import Log, log_of, reference_spline, require_same_law
-from malta.identification.measure import cut_loop, machines_of
+from malta.identification.log import Log, log_of, reference_spline, require_same_law, sample_excitation
+from malta.identification.measure import cut_loop
 from malta.loops.loop import Loop, loop
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names
@@ -25,15 +24,17 @@ from malta.simulation.trajectory import stroke_figures
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant
+    from malta.simulation.trajectory import Trajectory
     from malta.synthesis.controller import Controller
 
 SMALLEST = 0.05  # of the thrust's limit, that a stroke has to take
 FACTORS = (0.5, 2.0)  # of the thrust, beyond which something else is wrong
 FORCE = 0.8  # of what the model says is missing, that the next stroke is sent
-FINE = 6.0  # knots of the force in a period of the highest frequency of the reference
+LEAST = 0.25  # of that, where the error is noise
+FINE = 4.0  # knots of the force in a period of the highest frequency of the reference
 POWER = 0.999  # of the acceleration of the reference: it is below that frequency
-WEAK = 3e-3  # of the force that moves the stroke most: what moves it less is sent with restraint
-NOISE = 2.0  # standard deviations, below which nothing is learned from a pattern of the error
+WEAK = 3e-3  # of the force that moves the stroke most: forces that move it less are no patterns
+NOISE = 2.0  # standard deviations, above which a pattern of the error is counted
 LONGEST = 20_000  # samples of a stroke's log
 
 
@@ -160,7 +161,7 @@ def _stroke(
     """
     stroke, thrust, Ts = believed.stroke, believed.thrust_input, controller.sample_time
     z_ref, z = log.table("reference", [stroke])[:, 0], log.table("y", [stroke])[:, 0]
-    f = _thrust(believed, log)
+    f = believed_thrust(believed, log)
     if not (np.isfinite(z).all() and np.isfinite(f).all()) or log.survey.gaps:
         raise CheckError(f"{log.source}: samples are missing")
     t = Ts * np.arange(len(z_ref))
@@ -176,7 +177,7 @@ def _stroke(
     return a, curved, along, f - np.interp(z, table.z_grid, table.v0[:, thrust])
 
 
-def _thrust(believed: Plant, log: Log) -> FloatArray:
+def believed_thrust(believed: Plant, log: Log) -> FloatArray:
     """The thrust that the law believes the measured currents to make, N; its command where no current is measured."""
     if believed.windings is None or not log.names("i"):
         return np.asarray(log.table("v", [believed.thrust])[:, 0])
@@ -202,7 +203,7 @@ class ThrustPatterns:
 
     B : samples x knots, cubic splines of thrust that begin and end with zero
     U, s, V : of the linear loop's error that they make, H B = U diag(s) V', where H is the lower triangular Toeplitz
-        matrix of its response from thrust to stroke
+        matrix of its response from thrust to stroke; without s below 3 permille of the largest
     """
 
     B: FloatArray
@@ -210,18 +211,13 @@ class ThrustPatterns:
     s: FloatArray
     V: FloatArray
 
-    @property
-    def inverse(self) -> FloatArray:
-        """Patterns' shares per error, knots x samples: V diag(s / (s^2 + s_w^2)) U', s_w 3 permille of the largest."""
-        weak = WEAK * self.s[0]
-        return np.asarray(self.V @ (self.s / (self.s**2 + weak**2) * self.U).T)
-
 
 def thrust_patterns(believed: Loop, reference: FloatArray) -> ThrustPatterns:
     """The patterns for a loop and a reference of the stroke at its samples, m."""
     B = _splines(believed.sample_time, reference)
     U, s, Vt = np.linalg.svd(_moved(believed, B), full_matrices=False)
-    return ThrustPatterns(B, U, s, Vt.T)
+    kept = s >= WEAK * s[0]
+    return ThrustPatterns(B, U[:, kept], s[kept], Vt[kept].T)
 
 
 def _splines(Ts: float, reference: FloatArray) -> FloatArray:
@@ -263,12 +259,13 @@ class NextStroke:
 def next_stroke(controller: Controller, log: Log, patterns: ThrustPatterns | None = None) -> NextStroke:
     """What the next stroke is sent beside the law's thrust, from the log of the one before.
 
-        d_(j+1) = d_j + 0.8 B (H B)^+ U shrink(U' e_j)
+        d_(j+1) = d_j + 0.8 a_j B (H B)^+ e_j,     a_j = max(1/4, 1 - K sigma^2 / |U' e_j|^2)
 
-    with the error e of the readings, the thrust d that was sent (the log's excitation), patterns B and the linear
+    with the error e of the readings, the thrust d that was sent (the log's excitation), K patterns B and the linear
     loop's response H (lifted form of iterative learning; Bristow, Tharayil, Alleyne, IEEE Control Systems 26(3), 2006).
-    Of an error u' e of a pattern 1 - (2 sigma / u' e)^2 is learned, of one below 2 sigma of the sensor nothing: so
-    noise is not learned. The filter has to know d as sent, as `Scenario(excitation=...)` has it.
+    The share a_j is that of the patterns' error which is not noise of the sensor, sigma (James and Stein): near the end
+    strokes are averaged. As it is one number for all patterns, `contraction` proves by how much errors shrink. The
+    filter has to know d as sent, as `Scenario(excitation=...)` has it.
 
     controller : the gain file that flew
     log : of a stroke that begins and ends at rest
@@ -302,38 +299,10 @@ def next_stroke(controller: Controller, log: Log, patterns: ThrustPatterns | Non
     sigma = float(np.hypot(plant.noise[k], plant.resolution[k] / np.sqrt(12)))
     e = reference - y
     seen = found.U.T @ e
-    kept = np.maximum(0.0, 1 - (NOISE * sigma) ** 2 / np.maximum(seen**2, 1e-300))
-    more = found.B @ (found.inverse @ (found.U @ (kept * seen)))
+    share = max(LEAST, 1 - len(seen) * sigma**2 / max(float(seen @ seen), 1e-300))
+    more = found.B @ (found.V @ (seen / found.s))
     size = float(np.sqrt((e**2).mean()))
-    return NextStroke(sent + FORCE * more, size, int((kept > 0).sum()), sigma)
-
-
-def contraction(controller: Controller, box: Mapping[str, float], *, distance: float = 10e-3) -> float:
-    """By how much the error of a stroke shrinks to the next one at least, over a box: below 1 it shrinks.
-
-    The largest 2-norm of U' (I - 0.8 H(theta) B (H B)^+) U: of what patterns of thrust can move of the error, without
-    noise, in the linear loop. It is computed at the machine and at the corners of the box, and not proven in between.
-
-    controller : the gain file
-    box : parameters with shares of their values, as {"m": 0.2}
-    distance : of the stroke, m
-
-    >>> import malta
-    >>> controller = malta.gains.read("design/gains/robust.json")
-    >>> malta.identification.contraction(controller, {"K_D": 0.2}) < 0.9
-    True
-    """
-    plant, Ts = plant_of(controller.parameters), controller.sample_time
-    scenario = Scenario.stroke(distance)
-    t = Ts * np.arange(scenario.samples(Ts))
-    believed = loop(plant, controller)
-    found = thrust_patterns(believed, scenario.reference(plant)(t).p[:, plant.stroke_output])
-    inverse, unit = found.inverse @ found.U, np.eye(len(found.s))
-    machines = machines_of(believed, box, 0, samples=0)
-    return max(
-        float(np.linalg.norm(unit - FORCE * found.U.T @ _moved(one, found.B) @ inverse, 2))
-        for one in machines
-    )
+    return NextStroke(sent + FORCE * share * more, size, int((np.abs(seen) > NOISE * sigma).sum()), sigma)
 
 
 @display
@@ -342,6 +311,7 @@ class LearnedStrokes:
     """Strokes of a simulated machine, each sent what the ones before taught.
 
     axial_error : m, the largest true error of each stroke
+    repeatable : m, the same of the next stroke without noise of the sensors: what learning has left
     patterns : of each stroke, how many patterns of its error rose above the noise
     thrust : k, N: what the next stroke would be sent beside the law's
     controller : the law with the force constant that the first stroke taught
@@ -355,6 +325,7 @@ class LearnedStrokes:
     """
 
     axial_error: tuple[float, ...]
+    repeatable: float
     patterns: tuple[int, ...]
     thrust: FloatArray
     controller: Controller
@@ -363,6 +334,7 @@ class LearnedStrokes:
     def description(self) -> Description:
         """The error of each stroke."""
         rows = [(f"stroke {k + 1}", f"{1e6 * e:.3g} um") for k, e in enumerate(self.axial_error)]
+        rows.append(("the next one without noise", f"{1e6 * self.repeatable:.3g} um"))
         return Description(f"Strokes of {self.controller.name!r}", tuple(rows))
 
 
@@ -407,11 +379,16 @@ def learn_strokes(
     thrust: FloatArray = np.zeros(
         scenario.samples(law.sample_time) - scenario.settling_samples(law.sample_time)
     )
-    for k in range(strokes):
-        sent = _sent(law.sample_time, thrust, plant) if thrust.any() else None
-        run = simulate(plant, law, scenario.replace(seed=seed + k, excitation=sent))
+
+    def fly(flown: Scenario, name: str) -> Trajectory:
+        sent = sample_excitation(law.sample_time, plant, thrust) if thrust.any() else None
+        run = simulate(plant, law, flown.replace(excitation=sent))
         if not run.verdict.completed:
-            raise CheckError(f"stroke {k + 1}: {run.verdict.name} at {run.verdict.time:.4g} s")
+            raise CheckError(f"{name}: {run.verdict.name} at {run.verdict.time:.4g} s")
+        return run
+
+    for k in range(strokes):
+        run = fly(scenario.replace(seed=seed + k), f"stroke {k + 1}")
         errors.append(stroke_figures(run).axial_error)
         log = log_of(run)
         if k == 0:
@@ -423,17 +400,5 @@ def learn_strokes(
             patterns = thrust_patterns(loop(plant_of(law.parameters), law), reference)
         after = next_stroke(law, log, patterns)
         thrust, counts = after.thrust, [*counts, after.patterns]
-    return LearnedStrokes(tuple(errors), tuple(counts), thrust, law)
-
-
-def _sent(Ts: float, thrust: FloatArray, plant: Plant) -> Callable[[FloatArray], FloatArray]:
-    """A thrust at the samples of a stroke as an excitation; none before and after it."""
-
-    def forces(t: FloatArray) -> FloatArray:
-        k = np.round(np.asarray(t) / Ts).astype(int)
-        found = np.zeros((len(k), len(plant.inputs)))
-        during = (k >= 0) & (k < len(thrust))
-        found[during, plant.thrust_input] = thrust[k[during]]
-        return found
-
-    return forces
+    still = fly(scenario.replace(noise=0.0, quantize=False), "the next stroke without noise")
+    return LearnedStrokes(tuple(errors), stroke_figures(still).axial_error, tuple(counts), thrust, law)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ import numpy as np
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.log import Log, reference_spline, require_same_law
+from malta.identification.log import Log, reference_spline, require_same_law, sample_excitation
 from malta.identification.response import acting
 from malta.model.data import plant_of
 from malta.model.parameters import twins_of
@@ -180,7 +180,7 @@ def replay_law(controller: Controller, log: Log, *, same: bool | None = None) ->
     if same is None:
         same = bool((largest <= SAME * controller.limits.force).all())
     rms = np.sqrt((late**2).mean(axis=0))
-    twin = _Twin(controller, log) if same else None
+    twin = _Twin(controller, log, (simulation, inputs)) if same else None
     own = late if twin is None else twin.innovation(plant, noise=1.0)[half:]
     unlike = np.abs(_autocorrelations(late) - _autocorrelations(own)).max(axis=1)
     found = LawReplay(
@@ -218,25 +218,25 @@ def _autocorrelations(table: FloatArray) -> FloatArray:
 
 
 class _Twin:
-    """The machine of a gain file, or one near it, on the reference and the excitation of a log."""
+    """The machine of a gain file, or one near it, on the reference and the excitation of a log.
 
-    def __init__(self, controller: Controller, log: Log) -> None:
-        self.controller, self.log = controller, log
+    given : what the law is given on that log, `_inputs`
+    """
+
+    def __init__(self, controller: Controller, log: Log, given: tuple[Simulation, Inputs]) -> None:
+        self.controller, self.log, self.given = controller, log, given
 
     def innovation(self, plant: Plant, noise: float) -> FloatArray:
         """Innovations of the law on this machine, k x p. Raises CheckError where it does not fly to the end."""
-        motion, forces = _sent(self.controller, self.log)
         fidelity: Any = "force" if plant.windings is None else "dq"
-        scenario = Scenario(
-            "replay", self.log.samples * self.controller.sample_time, lambda _: motion,
-            excitation=forces, noise=noise, quantize=noise > 0, fidelity=fidelity,
-            seed=SEED,
-        )  # fmt: skip
+        scenario = self.given[0].scenario.replace(
+            noise=noise, quantize=noise > 0, fidelity=fidelity, seed=SEED
+        )
         run = simulate(plant, self.controller, scenario)
         if not run.verdict.completed:
             end = f"{run.verdict.name} at {run.verdict.time:.4g} s"
             raise CheckError(f"{self.log.source}: the gain file's machine does not fly this reference: {end}")
-        return _run(*_inputs(self.controller, self.log), run.y)[1]
+        return _run(*self.given, run.y)[1]
 
 
 def _explained(
@@ -273,34 +273,22 @@ def _explained(
     return found
 
 
-def _sent(
-    controller: Controller, log: Log
-) -> tuple[Callable[[Any], Motion], Callable[[Any], FloatArray] | None]:
-    """The reference of a log as a function of time, and its excitation; None where nothing was excited."""
+def _inputs(controller: Controller, log: Log) -> tuple[Simulation, Inputs]:
+    """What the law was given at every sample, from the reference and the excitation of a log."""
     plant, Ts = plant_of(controller.parameters), controller.sample_time
-    spline = reference_spline(log, [s.name for s in plant.outputs], Ts)
+    names = [s.name for s in plant.outputs]
+    spline = reference_spline(log, names, Ts)
     sent = log.columns.get("excitation", np.zeros((log.samples, 0)))
 
     def motion(t: Any) -> Motion:
         return Motion(spline(t), spline(t, 1), spline(t, 2))
 
-    def forces(t: Any) -> FloatArray:
-        return np.asarray(sent[np.clip(np.round(np.asarray(t) / Ts).astype(int), 0, log.samples - 1)])
-
-    return motion, forces if sent.any() else None
-
-
-def _inputs(controller: Controller, log: Log) -> tuple[Simulation, Inputs]:
-    """What the law was given at every sample, from the reference and the excitation of a log."""
-    plant, Ts = plant_of(controller.parameters), controller.sample_time
-    function, excitation = _sent(controller, log)
     t = Ts * np.arange(log.samples)
-    motion = function(t)._replace(p=log.table("reference", [s.name for s in plant.outputs]))
-    scenario = Scenario(
-        "replay", log.samples * Ts, lambda _: function, fidelity="force", excitation=excitation
-    )
+    given = motion(t)._replace(p=log.table("reference", names))
+    excitation = sample_excitation(Ts, plant, sent) if sent.any() else None
+    scenario = Scenario("replay", log.samples * Ts, lambda _: motion, fidelity="force", excitation=excitation)
     simulation = simulation_of(plant, controller, scenario)
-    return simulation, Inputs(t, motion, sample_inputs(simulation, motion, t))
+    return simulation, Inputs(t, given, sample_inputs(simulation, given, t))
 
 
 def _run(simulation: Simulation, inputs: Inputs, y: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -297,54 +297,6 @@ def test_the_data_file_keeps_intervals(found: Identified, tmp_path: Path) -> Non
         read_identified("data/tubular.toml")
 
 
-@pytest.mark.parametrize("K_D", [4.68, 5.72])
-def test_one_stroke_teaches_the_thrust(K_D: float) -> None:
-    stroke = malta.Scenario.stroke(10e-3, noise=1.0, quantize=True)
-    machine = changed({"K_D": K_D, "F_c": 0.6})
-    before = malta.simulate(machine, CONTROLLER, stroke)
-    found = malta.learn(CONTROLLER, malta.identification.log_of(before))
-    assert found.parameter == "K_D"
-    assert found.after == pytest.approx(K_D, rel=0.01)
-    after = malta.simulate(machine, found.controller, stroke)
-    errors = [malta.simulation.stroke_figures(run).axial_error for run in (before, after)]
-    assert errors[1] < 0.5 * errors[0]
-
-
-def test_strokes_teach_the_next_one_what_is_missing() -> None:
-    """A machine with other mass, thrust and cogging: with noise from 0.4 mm to what the noise moves, in six strokes."""
-    machine = changed({"m": 0.3, "K_D": 6.2, "F_c": 0.8})
-    found = malta.identification.learn_strokes(machine, CONTROLLER, strokes=6)
-    first, second, *taught = 1e6 * np.array(found.axial_error)
-    assert (first > 300, 40 < second < 80, taught[0] < 0.5 * second, taught[-1] < 10) == (True,) * 4
-    assert found.patterns[0] == 0
-    assert found.patterns[1] > 2 * found.patterns[5]
-    # Without noise no stroke is worse than the one before.
-    still = malta.identification.learn_strokes(machine, CONTROLLER, strokes=5, noise=0.0)
-    assert (np.diff(still.axial_error) < 1e-9).all()
-    with pytest.raises(malta.InputError, match="expected 1 or more"):
-        malta.identification.learn_strokes(machine, CONTROLLER, strokes=0)
-
-
-def test_errors_shrink_at_the_corners_of_the_box() -> None:
-    assert malta.identification.contraction(CONTROLLER, {"m": 0.2, "K_D": 0.2}) < 0.9
-    # A machine with 2.6 times the thrust on mass is moved too far by what is learned.
-    assert malta.identification.contraction(CONTROLLER, {"m": 0.45, "K_D": 0.45}) > 1
-
-
-def test_what_the_next_stroke_is_sent_needs_a_stroke_of_this_law() -> None:
-    run = malta.simulate(changed({}), CONTROLLER, malta.Scenario.stroke(10e-3, noise=1.0))
-    log = malta.identification.log_of(run)
-    found = malta.identification.next_stroke(CONTROLLER, log)
-    assert found.thrust[[0, -1]] == pytest.approx([0, 0], abs=0.2)
-    assert found.noise == pytest.approx(np.hypot(15e-6, 15e-6 / np.sqrt(12)), rel=0.05)
-    holes = np.array(log.columns["y"])
-    holes[7] = np.nan
-    with pytest.raises(malta.CheckError, match="samples are missing"):
-        malta.identification.next_stroke(CONTROLLER, with_columns(log, y=holes))
-    with pytest.raises(malta.CheckError, match="a log of a rotor"):
-        malta.identification.next_stroke(CONTROLLER, replace(log, machine="rotor"))
-
-
 def test_a_law_replays_its_own_log_and_no_other() -> None:
     run = malta.simulate(changed({"m": 0.4}), CONTROLLER, malta.Scenario.stroke(10e-3, noise=1.0))
     log = malta.identification.log_of(run)

@@ -19,11 +19,13 @@ if TYPE_CHECKING:
     from malta.identification.commission import Commissioning
     from malta.identification.dump import ExactReplay
     from malta.identification.excite import ExcitationPlan
+    from malta.identification.holding import LearnedV0
     from malta.identification.identify import Identified
     from malta.identification.learn import Learned, LearnedStrokes
     from malta.identification.log import Log
     from malta.identification.measure import Curve, Measurement, MeasurementPlan
     from malta.identification.replay import LawReplay
+    from malta.proof.blocks.gain import Gain
     from malta.proof.certificate.checked_file import Claim
     from malta.report.ledger import Ledger
     from malta.synthesis.spec import Spec
@@ -298,6 +300,19 @@ class LearnOutput(Part):
     files: Files
 
 
+class LearnedV0Output(Part):
+    """What `malta learn --v0 --json` prints."""
+
+    kind: Literal["malta-learned-v0-output"] = Field(default="malta-learned-v0-output", alias="schema")
+    version: Literal[1] = 1
+    gains: Name
+    log: Name
+    z: list[float] = Field(description="m, places of the table v0(z) that the log has seen")
+    change: list[float] = Field(description="N, of v0 of the thrust at these places")
+    deviation: list[float] = Field(description="N, standard deviations of the change")
+    files: Files
+
+
 class LearnedStrokesOutput(Part):
     """What `malta learn --strokes --json` prints."""
 
@@ -309,8 +324,9 @@ class LearnedStrokesOutput(Part):
     axial_error_m: list[float] = Field(description="the largest true error of each stroke")
     patterns: list[int] = Field(description="of each stroke: patterns of its error that rose above the noise")
     largest_thrust_N: float = Field(description="that the next stroke would be sent beside the law's")
+    repeatable_error_m: float = Field(description="the largest axial error of the next stroke without noise")
     contraction: float | None = Field(
-        description="of the error over the corners of the box, computed; null: no box"
+        description="proven bound of what a stroke leaves of an error that thrust can make, over the box; null: none"
     )
     files: Files
 
@@ -501,8 +517,16 @@ def learn_output(gains: Path, log: Path, found: Learned, files: Iterable[Path]) 
     return LearnOutput.of(found, gains=gains, log=log, files=files)
 
 
+def learned_v0_output(gains: Path, log: Path, found: LearnedV0, files: Iterable[Path]) -> LearnedV0Output:
+    """The document of v0(z) from a slow stroke."""
+    z, change, deviation = (table.tolist() for table in (found.z, found.change, found.deviation))
+    return LearnedV0Output(
+        gains=str(gains), log=str(log), z=z, change=change, deviation=deviation, files=list(map(str, files))
+    )
+
+
 def learned_strokes_output(
-    gains: Path, found: LearnedStrokes, shrinks: float | None, files: Iterable[Path]
+    gains: Path, found: LearnedStrokes, shrinks: Gain | None, files: Iterable[Path]
 ) -> LearnedStrokesOutput:
     """The document of strokes that learned."""
     return LearnedStrokesOutput(
@@ -510,7 +534,8 @@ def learned_strokes_output(
         axial_error_m=list(found.axial_error),
         patterns=list(found.patterns),
         largest_thrust_N=float(abs(found.thrust).max()),
-        contraction=shrinks,
+        repeatable_error_m=found.repeatable,
+        contraction=None if shrinks is None else shrinks.upper,
         files=list(map(str, files)),
     )
 

@@ -33,7 +33,7 @@ from malta.machines.tubular.evidence import (
 )
 from malta.machines.tubular.evidence import evidence as evidence
 from malta.machines.tubular.experiments.strokes import SETTLE
-from malta.machines.tubular.further_claims import BRAKE, CAPTURE, MEANS, RULE_OF_THUMB
+from malta.machines.tubular.further_claims import BRAKE, CAPTURE, MEANS, RULE_OF_THUMB, TAUGHT
 from malta.machines.tubular.further_claims import ROWS as FIGURE_13
 from malta.report.ledger import (
     ZONE_NOTE,
@@ -489,6 +489,7 @@ YIELDS: tuple[Row, ...] = (
 )
 ROWS = (
     *YIELDS,
+    *TAUGHT,
     *POLES_AND_LQR,
     *LOOPS,
     *RULE_OF_THUMB,

@@ -1,0 +1,363 @@
+"""Logs as files that other programs read: .csv with units, .npz, .mat and .parquet."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from hashlib import sha256
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.archives import read_npz
+from malta.errors import InputError
+from malta.files import read_file, replace_files
+from malta.gains.encodings import read_mat
+from malta.identification.dump import decode_dump
+from malta.identification.log import GROUPS, Log
+from malta.model.plant import Signal
+from malta.units import is_unit_of, to_si
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+VERSION = 1
+LARGEST = 2_000_000_000  # bytes of a log
+MOST = 1e30  # SI: no reading is beyond it, and squares and sums of those within are numbers
+SUFFIXES = (".csv", ".npz", ".mat", ".parquet")
+TEXTS = ("machine", "controller")  # of a file's head; sample_time and period are numbers, s
+
+
+def without_idle(log: Log) -> Log:
+    """The log without columns of currents and voltages that are zero throughout."""
+    columns, signals = dict(log.columns), dict(log.signals)
+    for group in ("i", "u"):
+        table = columns.get(group, np.zeros((0, 0)))
+        used = [k for k in range(table.shape[1]) if table[:, k].any()]
+        columns[group], signals[group] = table[:, used], tuple(signals.get(group, ())[k] for k in used)
+    return replace(log, columns=columns, signals=signals)
+
+
+def write_log(log: Log, path: str | Path) -> Path:
+    """Write a log as .csv, .npz, .mat or .parquet; docs/formats/log.md describes the files.
+
+    log : what to write
+    path : the suffix chooses the encoding; .parquet needs pyarrow
+
+    Returns the path. Raises InputError for another suffix, without pyarrow, and for a file that cannot be written.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/robust.json")
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
+    >>> malta.identification.write_log(
+    ...     malta.identification.log_of(run), "build/stand.npz"
+    ... ).name
+    'stand.npz'
+    """
+    path = Path(path)
+    _require_suffix(path)
+    log = without_idle(log)
+    encoders: dict[str, Callable[[Log], bytes]] = {".csv": _to_csv, ".npz": _to_npz, ".mat": _to_mat}
+    encode = encoders.get(path.suffix, _to_parquet)
+    replace_files({path: encode(log)})
+    return path
+
+
+def _require_suffix(path: Path, *others: str) -> None:
+    known = (*SUFFIXES, *others)
+    if path.suffix not in known:
+        raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(known))
+
+
+def _headings(log: Log, group: str) -> list[str]:
+    return [f"{s.name} [{s.unit}]" for s in log.signals.get(group, ())]
+
+
+def _head(log: Log) -> dict[str, str]:
+    """What a text says of a log beside its columns."""
+    names = {"machine": log.machine, "controller": log.controller}
+    return names | {"sample_time": f"{log.sample_time!r} s", "period": f"{log.period!r} s"}
+
+
+def _one_table(log: Log) -> tuple[list[str], FloatArray]:
+    """Headings with prefixes, and all columns beside t."""
+    present = [group for group in GROUPS if log.names(group)]
+    headings = ["t [s]", *(GROUPS[g] + name for g in present for name in _headings(log, g))]
+    return headings, np.column_stack([log.t, *(log.columns[group] for group in present)])
+
+
+def _arrow(path: Path | str) -> tuple[Any, Any]:
+    """pyarrow and its module of Parquet files. Raises InputError where it is not installed."""
+    try:
+        return import_module("pyarrow"), import_module("pyarrow.parquet")
+    except ImportError:
+        expected = "pyarrow, as by pip install pyarrow; or .csv, .npz, .mat"
+        raise InputError(path, "", "a .parquet file without pyarrow", expected) from None
+
+
+def _to_parquet(log: Log) -> bytes:
+    """A column of doubles for each heading, and the head as metadata of the schema."""
+    arrow, parquet = _arrow("log")
+    headings, table = _one_table(log)
+    head = {"malta log": str(VERSION)} | _head(log)
+    buffer = io.BytesIO()
+    parquet.write_table(arrow.table(list(table.T.copy()), names=headings, metadata=head), buffer)
+    return buffer.getvalue()
+
+
+def _from_parquet(content: bytes, path: Path) -> Decoded:
+    arrow, parquet = _arrow(path)
+    try:
+        read = parquet.read_table(io.BytesIO(content), use_threads=False)
+        columns = [
+            np.asarray(column.cast(arrow.float64()).to_numpy(), dtype=float) for column in read.columns
+        ]
+    except (arrow.ArrowException, OSError, ValueError) as error:
+        raise InputError(
+            path, "", f"a damaged file ({str(error)[:80]})", "a Parquet file of numbers"
+        ) from error
+    stored = read.schema.metadata or {}
+    words = {
+        name.decode(errors="replace"): value.decode(errors="replace").split()
+        for name, value in stored.items()
+    }
+    head = {name: text[0] for name, text in words.items() if text}
+    if not columns:
+        raise InputError(path, "", "no columns", "t [s], x1 [m], ...")
+    return _tabulated(head, [name.strip() for name in read.column_names], np.column_stack(columns), path)
+
+
+def _to_csv(log: Log) -> bytes:
+    """A head of comments, a line of headings, and a line a sample."""
+    present = [group for group in GROUPS if log.names(group)]
+    head = [f"# malta log {VERSION}", *(f"# {name} {value}" for name, value in _head(log).items())]
+    headings, table = _one_table(log)
+    head.append(",".join(headings))
+    buffer = io.StringIO()
+    buffer.write("\n".join(head) + "\n")
+    sent = ("reference", "excitation")  # with all digits: they are differentiated
+    formats = ["%.12g", *("%.17g" if g in sent else "%.9g" for g in present for _ in log.names(g))]
+    np.savetxt(buffer, table, fmt=formats, delimiter=",")
+    return buffer.getvalue().encode()
+
+
+def _arrays(log: Log) -> dict[str, Any]:
+    """What the binary files hold."""
+    arrays: dict[str, Any] = {"malta_log": np.array([VERSION]), "t": log.t}
+    arrays |= {"sample_time": np.array([log.sample_time]), "period": np.array([log.period])}
+    for group in GROUPS:
+        if log.names(group):
+            arrays |= {group: log.columns[group], f"{group}_columns": np.array(_headings(log, group))}
+    return arrays
+
+
+def _to_npz(log: Log) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, machine=np.array([log.machine]), controller=np.array([log.controller]), **_arrays(log))
+    return buffer.getvalue()
+
+
+def _to_mat(log: Log) -> bytes:
+    from scipy.io import savemat
+
+    buffer: Any = io.BytesIO()  # any: scipy's stubs know only file names
+    arrays = {k: a.astype(object) if a.dtype.kind == "U" else a for k, a in _arrays(log).items()}
+    arrays |= {"machine": log.machine, "controller": log.controller, "t": log.t[:, None]}
+    savemat(buffer, arrays)
+    return bytes(buffer.getvalue())
+
+
+def read_log(path: str | Path) -> Log:
+    """Read a log: a .csv, .npz, .mat or .parquet of malta, or a .csv of another program with headings "name [unit]".
+
+    A .dump is the memory of the ring buffer of exported C, `malta export --log`.
+
+    path : the file. Units are converted to SI; a cell that is empty or nan is a missing reading.
+
+    Returns a Log. Signals of headings without a prefix are found by their unit when the log is used: positions and
+    angles are measured outputs, forces and torques commands, currents and voltages those of the axes.
+
+    Raises InputError: no such file, another suffix, damage, headings that are no "name [unit]", times that do not rise.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/robust.json")
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(noise=1.0))
+    >>> file = malta.identification.write_log(
+    ...     malta.identification.log_of(run), "build/stand.csv"
+    ... )
+    >>> malta.read_log(file).samples
+    2000
+    """
+    path = Path(path)
+    _require_suffix(path, ".dump")
+    content = read_file(path, "log", Path.read_bytes, LARGEST)
+    decoders = {".csv": _from_csv, ".npz": _from_npz, ".mat": _from_mat, ".dump": decode_dump}
+    head, t, tables, headings = decoders.get(path.suffix, _from_parquet)(content, path)
+    if len(t) < 2 or not ((np.diff(t) > 0).all() and np.abs(t).max() < MOST):
+        raise InputError(path, "t", "times that do not rise", "the times of the samples, in order")
+    columns, signals = {}, {}
+    for group in tables:
+        columns[group], signals[group] = _in_si(tables[group], headings[group], path)
+    if "y" not in columns:
+        raise InputError(path, "y", "no measured outputs", "columns of positions, as x1 [m]")
+    Ts = _seconds(head, "sample_time", path) or float(np.median(np.diff(t)))
+    names = (str(head.get("machine", "")), str(head.get("controller", "")))
+    period = _seconds(head, "period", path)
+    return Log(str(path), *names, Ts, period, t, columns, signals, sha256(content).hexdigest())
+
+
+def _seconds(head: Mapping[str, Any], name: str, path: Path) -> float:
+    """A time of a file's head; 0 where it has none."""
+    found = head.get(name, 0.0)
+    try:
+        seconds = float(found)
+    except (TypeError, ValueError):
+        seconds = math.nan
+    if not 0 <= seconds < MOST:
+        raise InputError(path, name, repr(found), "a number of seconds")
+    return seconds
+
+
+Decoded = tuple[dict[str, Any], "FloatArray", dict[str, "FloatArray"], dict[str, list[str]]]
+"""What a file holds: its head, t, and by group a table and its headings."""
+
+
+def _from_csv(content: bytes, path: Path) -> Decoded:
+    """The head, times, tables and headings of a .csv."""
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(path, "", "bytes that are no text", "UTF-8") from error
+    lines = text.split("\n", 40)
+    comments = [line[1:].split() for line in lines if line.startswith("#")]
+    head: dict[str, Any] = {words[0]: words[1] for words in comments if len(words) > 1}
+    first = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), None)
+    if first is None:
+        raise InputError(path, "", "no line of headings", 'a line as "t [s],x1 [um],..."')
+    names = [name.strip() for name in lines[first].split(",")]
+    try:
+        rows = io.StringIO(text)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a file without rows, which is refused below
+            if re.search(r",\s*(,|$)", text, re.M):  # empty cells: missing readings
+                values = np.genfromtxt(rows, delimiter=",", skip_header=first + 1, ndmin=2)
+            else:
+                values = np.loadtxt(rows, delimiter=",", skiprows=first + 1, comments=None, ndmin=2)
+    except ValueError as error:
+        raise InputError(path, "", f"a line that cannot be read ({str(error)[:80]})", "numbers") from error
+    if not values.size:
+        raise InputError(path, "", "headings alone", "a line of numbers for each sample")
+    if values.shape[1] != len(names):
+        raise InputError(path, "", f"{values.shape[-1]} cells in a line", f"{len(names)}, as headings")
+    return _tabulated(head, names, values, path)
+
+
+def _tabulated(head: dict[str, Any], names: list[str], values: FloatArray, path: Path) -> Decoded:
+    """The tables of a file that is one table, whose first column is t."""
+    if not names[0].startswith("t ") and names[0] != "t":
+        raise InputError(path, names[0], "the first column", "t [s]")
+    places: dict[str, list[int]] = {}
+    for k, name in enumerate(names[1:], start=1):
+        group = _group_of(name, path)
+        places.setdefault(group, []).append(k)
+    scale = to_si(1.0, _parts(names[0], path)[1], "s", path, "t")
+    tables = {group: values[:, found] for group, found in places.items()}
+    headings = {
+        group: [names[k].removeprefix(GROUPS[group]) for k in found] for group, found in places.items()
+    }
+    return head, values[:, 0] * scale, tables, headings
+
+
+def _group_of(heading: str, path: Path) -> str:
+    """The group of a column of a .csv by its prefix, or by its unit."""
+    for group, prefix in GROUPS.items():
+        if prefix and heading.startswith(prefix):
+            return group
+    unit = _parts(heading, path)[1]
+    for si_unit, group in (("m", "y"), ("rad", "y"), ("N", "v"), ("N m", "v"), ("A", "i"), ("V", "u")):
+        if is_unit_of(unit, si_unit):
+            return group
+    raise InputError(
+        path, heading, f"unit {unit!r}", "one of m, rad, N, N m, A, V, or a prefix as ref. or flag."
+    )
+
+
+def _parts(heading: str, path: Path) -> tuple[str, str]:
+    """Name and unit of a heading."""
+    name, bracket, rest = heading.partition("[")
+    if not bracket or not rest.endswith("]") or not name.strip():
+        raise InputError(path, heading, "a heading without unit", 'one as "x1 [um]"')
+    return name.strip(), rest[:-1].strip()
+
+
+SI_UNITS = ("m", "rad", "N", "N m", "A", "V", "1")
+
+
+def _in_si(table: FloatArray, headings: list[str], path: Path) -> tuple[FloatArray, tuple[Signal, ...]]:
+    """A table in SI, and its signals."""
+    table, signals = np.array(table, dtype=float), []
+    for k, heading in enumerate(headings):
+        name, unit = _parts(heading, path)
+        si_unit = next((one for one in SI_UNITS if is_unit_of(unit, one)), None)
+        if si_unit is None:
+            raise InputError(path, heading, f"unit {unit!r}", "one of " + ", ".join(SI_UNITS))
+        table[:, k] *= to_si(1.0, unit, si_unit, path, name)
+        far = np.flatnonzero(np.abs(table[:, k]) >= MOST)
+        if len(far):
+            found = f"{table[far[0], k]:g} in sample {far[0] + 1}"
+            raise InputError(path, heading, found, "a reading, or nothing where it is missing")
+        signals.append(Signal(name, si_unit))
+    return table, tuple(signals)
+
+
+def _from_npz(content: bytes, path: Path) -> Decoded:
+    try:
+        arrays = read_npz(content)
+    except ValueError as error:
+        found = f"a file that numpy cannot read safely ({error})"
+        raise InputError(path, "", found, "an .npz archive, not compressed") from error
+    return _from_arrays(arrays, path)
+
+
+def _from_mat(content: bytes, path: Path) -> Decoded:
+    try:
+        given = read_mat(content)
+    except ValueError as error:
+        raise InputError(path, "", f"a damaged file ({error})", "a MAT-file of version 5") from error
+    arrays = {
+        name: np.array(value) if isinstance(value, str | list) else value for name, value in given.items()
+    }
+    if "t" in arrays:
+        arrays["t"] = np.ravel(arrays["t"])
+    return _from_arrays(arrays, path)
+
+
+def _from_arrays(arrays: Mapping[str, Any], path: Path) -> Decoded:
+    """Head, times, tables and headings of the arrays of a file; also those of a run of `malta simulate --out`."""
+    head = {
+        name: arrays[name].ravel()[0] for name in (*TEXTS, "sample_time", "period")
+        if name in arrays and arrays[name].size
+    }  # fmt: skip
+    t = arrays.get("t", np.zeros(0))
+    if t.dtype.kind not in "fiu" or t.ndim != 1:
+        raise InputError(path, "t", f"an array of {t.dtype}, {t.shape}", "the times of the samples, in order")
+    tables, headings = {}, {}
+    for group in GROUPS:
+        if group not in arrays:
+            continue
+        table, names = arrays[group], arrays.get(f"{group}_columns")
+        if names is None or names.dtype.kind != "U":
+            raise InputError(path, f"{group}_columns", "no headings", f"those of {group}")
+        if table.dtype.kind not in "fiub" or table.shape != (len(t), len(names)):
+            found = f"an array of {table.dtype}, {table.shape}"
+            raise InputError(path, group, found, f"numbers, ({len(t)}, {len(names)})")
+        tables[group], headings[group] = table, [str(name) for name in names]
+    return head, np.asarray(t, dtype=float), tables, headings

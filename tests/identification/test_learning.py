@@ -1,0 +1,175 @@
+"""Learning from strokes: the force constant, what the next stroke is sent, and the proof that errors shrink."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from scipy.linalg import toeplitz
+
+import malta
+from malta.identification.learn import ThrustPatterns, thrust_patterns
+from malta.identification.measure import cut_loop, machines_of
+from malta.loops.loop import Loop
+from malta.synthesis.feedforward import static_feedforward
+
+if TYPE_CHECKING:
+    from malta.model.plant import Plant
+
+CONTROLLER = malta.gains.read("design/gains/robust.json")
+
+
+def changed(values: dict[str, float]) -> Plant:
+    par: Any = CONTROLLER.parameters
+    return malta.plant_of(replace(par, **values))
+
+
+@pytest.mark.parametrize("K_D", [4.68, 5.72])
+def test_one_stroke_teaches_the_thrust(K_D: float) -> None:
+    stroke = malta.Scenario.stroke(10e-3, noise=1.0, quantize=True)
+    machine = changed({"K_D": K_D, "F_c": 0.6})
+    before = malta.simulate(machine, CONTROLLER, stroke)
+    found = malta.learn(CONTROLLER, malta.identification.log_of(before))
+    assert found.parameter == "K_D"
+    assert found.after == pytest.approx(K_D, rel=0.01)
+    after = malta.simulate(machine, found.controller, stroke)
+    errors = [malta.simulation.stroke_figures(run).axial_error for run in (before, after)]
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_strokes_teach_the_next_one_what_is_missing() -> None:
+    """A machine with other mass, thrust and cogging: with noise from 0.4 mm to what the noise moves, in six strokes."""
+    machine = changed({"m": 0.3, "K_D": 6.2, "F_c": 0.8})
+    found = malta.identification.learn_strokes(machine, CONTROLLER, strokes=6)
+    first, second, *taught = 1e6 * np.array(found.axial_error)
+    assert (first > 300, 40 < second < 80, taught[0] < 0.5 * second, taught[-1] < 10) == (True,) * 4
+    assert found.repeatable < 7e-6
+    assert found.patterns[0] == 0
+    assert found.patterns[1] > 2 * found.patterns[5]
+    # Without noise no stroke is worse than the one before.
+    still = malta.identification.learn_strokes(machine, CONTROLLER, strokes=5, noise=0.0)
+    assert (np.diff(still.axial_error) < 1e-9).all()
+    with pytest.raises(malta.InputError, match="expected 1 or more"):
+        malta.identification.learn_strokes(machine, CONTROLLER, strokes=0)
+
+
+def test_a_slow_stroke_teaches_the_table_that_holds_the_machine() -> None:
+    """Another cogging: the gain file's table becomes the machine's, within its deviations, and the stroke gains."""
+    machine = changed({"F_c": 0.9, "phi_c": 0.5})
+    slow = malta.Scenario.stroke(10e-3, rise=0.15, noise=1.0, settle=0.3)
+    log = malta.identification.log_of(malta.simulate(machine, CONTROLLER, slow))
+    found = malta.identification.learn_v0(CONTROLLER, log)
+    k, true = machine.thrust_input, static_feedforward(machine)
+    table = found.controller.feedforward
+    missed = table.v0[:, k] - np.interp(table.z_grid, true.z_grid, true.v0[:, k])
+    inside = np.isin(table.z_grid, found.z)
+    assert found.z[[0, -1]] == pytest.approx([-5e-3, 5e-3], abs=0.26e-3)
+    assert abs(missed[inside]).max() < 4 * found.deviation.max() < 0.05
+    assert abs(found.change).max() > 0.4
+    others = np.delete(table.v0, k, axis=1)
+    assert np.array_equal(others, np.delete(CONTROLLER.feedforward.v0, k, axis=1))
+    outside = table.v0[:, k] - CONTROLLER.feedforward.v0[:, k]
+    assert outside[0] == pytest.approx(found.change[0], abs=0.05)  # it goes on as at the last place
+    errors = [
+        malta.simulation.stroke_figures(malta.simulate(machine, law, slow.replace(noise=0.0))).axial_error
+        for law in (CONTROLLER, found.controller)
+    ]
+    assert errors[1] < 0.05 * errors[0]
+
+
+def test_v0_needs_a_slow_stroke_that_moves() -> None:
+    for stroke, says in (
+        (malta.Scenario.stroke(10e-3), "accelerates the mover by 25"),
+        (malta.Scenario.stroke(0.5e-3, rise=0.15), "a stroke of 0.5 mm"),
+    ):
+        log = malta.identification.log_of(malta.simulate(changed({}), CONTROLLER, stroke))
+        with pytest.raises(malta.InputError, match=says):
+            malta.identification.learn_v0(CONTROLLER, log)
+
+
+def test_errors_are_proven_to_shrink_over_the_box() -> None:
+    """The bound holds the lifted operator of a stroke's log at every machine tried, and is near the largest of them."""
+    box = {"K_D": 0.2}
+    proven = malta.identification.contraction(CONTROLLER, box)
+    assert proven.upper is not None
+    assert proven.lower <= proven.upper < 1.011 * proven.lower
+    patterns, believed = stroke_patterns()
+    lifted = [lifted_norm(patterns, one) for one in machines_of(believed, box, 0, samples=0)]
+    assert 0.2 < lifted[0] < 0.21  # of the gain file's own machine: 1 - 0.8, and the slope of cogging
+    assert max(lifted) == pytest.approx(proven.upper, rel=0.03)
+    assert max(lifted) < proven.upper + 0.01  # the slope of cogging is not in the proof
+
+
+def test_parameters_that_do_not_move_the_stroke_do_not_count() -> None:
+    proven = malta.identification.contraction(CONTROLLER, {"K_A": 0.2, "K_B": 0.2})
+    assert proven.upper == pytest.approx(0.2, rel=0.02)
+
+
+def test_what_is_not_proven_says_why() -> None:
+    with pytest.raises(malta.InputError, match="unknown parameter"):
+        malta.identification.contraction(CONTROLLER, {"k": 0.1})
+    with pytest.raises(malta.InputError, match="no parameter"):
+        malta.identification.contraction(CONTROLLER, {})
+    table2 = malta.identification.contraction(malta.gains.read("design/gains/table2.json"), {"K_D": 0.1})
+    assert (table2.upper, "misses it by" in table2.reason) == (None, True)
+
+
+@pytest.mark.slow
+def test_errors_shrink_over_the_whole_box_but_not_beyond() -> None:
+    """K_D / m is one entry of the matrices: the proof of four parameters is one of an interval of that."""
+    names = ("m", "K_A", "K_B", "K_D")
+    proven = malta.identification.contraction(CONTROLLER, dict.fromkeys(names, 0.2))
+    assert proven.upper is not None
+    assert proven.lower == pytest.approx(0.8592, abs=1e-3)
+    assert proven.lower < proven.upper < 0.87
+    assert (proven.witness["m"], proven.witness["K_D"]) == (pytest.approx(0.288), pytest.approx(6.24))
+    ratio = malta.identification.contraction(CONTROLLER, {"K_D": (5.2 * 0.8 / 1.2, 5.2 * 1.2 / 0.8)})  # type: ignore[dict-item]
+    assert ratio.lower == pytest.approx(
+        proven.lower, rel=1e-3
+    )  # the same machines, on the route of one parameter
+    patterns, believed = stroke_patterns()
+    lifted = [
+        lifted_norm(patterns, one)
+        for one in machines_of(believed, dict.fromkeys(("m", "K_D"), 0.2), 0, samples=4)
+    ]
+    assert 0.8 < max(lifted) < 0.868
+    # A machine with 2.6 times the thrust on mass is moved too far by what is learned.
+    assert malta.identification.contraction(CONTROLLER, {"m": 0.45, "K_D": 0.45}).lower > 1
+
+
+def stroke_patterns() -> tuple[ThrustPatterns, Loop]:
+    believed = malta.loop(malta.plant_of(CONTROLLER.parameters), CONTROLLER)
+    scenario = malta.Scenario.stroke(10e-3)
+    t = believed.sample_time * np.arange(scenario.samples(believed.sample_time))
+    reference = scenario.reference(believed.plant)(t).p[:, believed.plant.stroke_output]
+    return thrust_patterns(believed, reference), believed
+
+
+def lifted_norm(patterns: ThrustPatterns, machine: Loop) -> float:
+    """The 2-norm of U' (1 - 0.8 H B (H_0 B)^+) U: on the samples of one log."""
+    cut = machine.plant.stroke_output, machine.plant.thrust_input
+    N, Ts = len(patterns.B), machine.sample_time
+    w = 2 * np.pi * np.fft.rfftfreq(2 * N, Ts)
+    G = np.zeros(len(w), dtype=complex)
+    G[1:-1] = cut_loop(machine, w[1:-1]).G[:, *cut]
+    H = toeplitz(np.fft.irfft(G, 2 * N)[:N], np.zeros(N))
+    moved = patterns.U.T @ H @ patterns.B @ (patterns.V / patterns.s)
+    return float(np.linalg.norm(np.eye(len(patterns.s)) - 0.8 * moved, 2))
+
+
+def test_what_the_next_stroke_is_sent_needs_a_stroke_of_this_law() -> None:
+    run = malta.simulate(changed({}), CONTROLLER, malta.Scenario.stroke(10e-3, noise=1.0))
+    log = malta.identification.log_of(run)
+    found = malta.identification.next_stroke(CONTROLLER, log)
+    assert found.thrust[[0, -1]] == pytest.approx([0, 0], abs=0.2)
+    assert found.noise == pytest.approx(np.hypot(15e-6, 15e-6 / np.sqrt(12)), rel=0.05)
+    holes = np.array(log.columns["y"])
+    holes[7] = np.nan
+    with pytest.raises(malta.CheckError, match="samples are missing"):
+        malta.identification.next_stroke(
+            CONTROLLER, replace(log, columns={**log.columns, "y": holes}, sha256="")
+        )
+    with pytest.raises(malta.CheckError, match="a log of a rotor"):
+        malta.identification.next_stroke(CONTROLLER, replace(log, machine="rotor"))
