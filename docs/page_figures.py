@@ -436,6 +436,7 @@ def order() -> Figure:
     axes.set_xlim(0, 21)
     axes.legend(frameon=False, loc="lower left")
     finish(axes, "states of the law", "proven margin [boxes of ±20 %]", "")
+    return figure
 
 
 def flexible_rotor(name: str) -> Figure:

@@ -49,9 +49,8 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
 
 TOLERANCE = 1e-2  # relative distance between the proven bound and the largest value found
-ALIKE = 1e-6  # by which V T_0 may miss z^-r B at any frequency of a grid
+ALIKE = 1e-6  # by which V T_0 may miss z^-r B
 ON_CIRCLE = 1e-9  # by which a zero of T_0 has to be off the circle
-GRID = 2000  # frequencies
 
 
 class Filter(NamedTuple):
@@ -104,7 +103,7 @@ def contraction(controller: Controller, box: Mapping[str, float], *, time: float
     bounds the 2-norm of what `next_stroke` leaves of an error that thrust can make, where it learns with its full
     gain; with a share s of it, 1 - s (1 - c) does. It covers the linear sampled loop at the operating point, without
     the slope of loads along the stroke; not saturation, not noise that differs from stroke to stroke, and no response
-    that goes on after the log has ended. That V inverts T_0 is evaluated on a grid of frequencies and counted in.
+    that goes on after the log has ended. By how much V misses the inverse of T_0 is proven too, and counted in.
 
     controller : the gain file
     box : parameters with shares of their values, as {"m": 0.2}
@@ -130,10 +129,13 @@ def contraction(controller: Controller, box: Mapping[str, float], *, time: float
     if system.matrices.n_out() > 3:
         return _unproven("currents that depend on the position and are held are not covered")
     axis = _axis(system, law, plant.stroke_output)
-    inverse, passed, missed = _inverse(axis)
-    if not missed < ALIKE:
-        return _unproven(f"the inverse of the stroke's response misses it by {missed:.2g}")
-    system, law = _learning(axis, inverse, passed)
+    inverse = _inverse(axis)
+    if inverse is None:
+        return _unproven("the stroke's response has no inverse")
+    missed = _missed(axis, *inverse)
+    if missed is None or not missed < ALIKE:
+        return _unproven("the inverse of the stroke's response is not proven to be near enough")
+    system, law = _learning(axis, *inverse, FORCE)
     channel = (law.C.shape[0] - 1, law.B.shape[1] - 1)
     entries = _as_entries(system, law, box)
     system, ranges = (system, dict(box)) if entries is None else entries
@@ -241,8 +243,16 @@ def _reached(flow: NDArray[np.bool_], start: int) -> NDArray[np.bool_]:
     return found
 
 
-def _inverse(axis: Axis) -> tuple[Filter, Filter, float]:
-    """V, z^-r B, and by how much V T_0 misses z^-r B at most, on a grid of frequencies; infinity: there is no V."""
+def _missed(axis: Axis, inverse: Filter, passed: Filter) -> float | None:
+    """A proven bound of |z^-r B - V T_0| over all frequencies; None where nothing is proven."""
+    system, law = _learning(axis, inverse, passed, 1.0)
+    channel = (law.C.shape[0] - 1, law.B.shape[1] - 1)
+    own = {name: (x, x) for name, x in zip(system.names, system.nominal.tolist(), strict=True)}
+    return worst_case_gain(system, law, own, of="effort", channel=channel, tolerance=TOLERANCE).upper
+
+
+def _inverse(axis: Axis) -> tuple[Filter, Filter] | None:
+    """V and z^-r B, in floating point; None where there is no V."""
     of = axis.response
     n, r, answer = len(of.A), 1, of.B
     while not (of.C @ answer).any() and r < n:  # samples until the stroke answers: so many zeros are missing
@@ -253,7 +263,7 @@ def _inverse(axis: Axis) -> tuple[Filter, Filter, float]:
     zeros = zeros[np.argsort(np.abs(zeros))[: n - r]]
     outside = np.abs(zeros) > 1
     if len(zeros) < n - r or (np.abs(np.abs(zeros) - 1) < ON_CIRCLE).any():
-        return of, of, math.inf
+        return None
     far, at = zeros[outside].conj(), np.exp(1j * np.array([0.01, 0.02]) * np.pi)
     scale = np.prod(at[:, None] - poles, axis=1) / np.prod(at[:, None] - zeros, axis=1) * of.response(at)
     kept = np.concatenate([zeros[~outside], 1 / far, np.zeros(r)])
@@ -262,11 +272,10 @@ def _inverse(axis: Axis) -> tuple[Filter, Filter, float]:
         inverse = _filter(poles, kept, 1 / float((scale.mean() * np.prod(-far)).real))
         passed = _filter(zeros[outside], 1 / far, float((1 / np.prod(-far)).real))
     except ValueError:  # rounding has parted zeros or poles that are conjugate
-        return of, of, math.inf
+        return None
     for _ in range(r):
         passed = Filter(0 * one, one, one, 0 * one).after(passed)
-    z = np.exp(1j * np.pi * np.append(np.geomspace(1e-6, 1e-2, GRID), np.linspace(1e-2, 1, GRID)))
-    return inverse, passed, float(np.abs(of.response(z) * inverse.response(z) / passed.response(z) - 1).max())
+    return inverse, passed
 
 
 def _filter(zeros: ComplexArray, poles: ComplexArray, gain: float) -> Filter:
@@ -283,8 +292,8 @@ def _filter(zeros: ComplexArray, poles: ComplexArray, gain: float) -> Filter:
     return found
 
 
-def _learning(axis: Axis, V: Filter, passed: Filter) -> tuple[UncertainSystem, Compensator]:
-    """The axis with one more reading w and one more command e_out, both last."""
+def _learning(axis: Axis, V: Filter, passed: Filter, share: float) -> tuple[UncertainSystem, Compensator]:
+    """The axis with one more reading w and one more command e_out = (z^-r B - share T V) w, both last."""
     system, c = axis.system, axis.law
     n, (m, q), more = len(c.A), c.D.shape, len(V.A) + len(passed.A)
     into = np.eye(n)[:, axis.summed : axis.summed + 1]
@@ -293,7 +302,7 @@ def _learning(axis: Axis, V: Filter, passed: Filter) -> tuple[UncertainSystem, C
     B = np.hstack([np.vstack([c.B, np.zeros((more, q))]), np.vstack([into @ V.D, V.B, passed.B])])
     C = linalg.block_diag(np.hstack([c.C, np.zeros((m, len(V.A)))]), passed.C)
     D = linalg.block_diag(c.D, passed.D)
-    D[m, axis.stroke] = -FORCE
+    D[m, axis.stroke] = -share
     order = [*range(n - c.integrals), *range(n, n + more), *range(n - c.integrals, n)]
     law = replace(c, A=A[np.ix_(order, order)], B=B[order], C=C[:, order], D=D)
     p = ca.SX.sym("p", len(system.names))
