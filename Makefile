@@ -17,7 +17,7 @@ export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export OPENBLAS_NUM_THREADS ?= 1
 export MPLCONFIGDIR ?= $(CURDIR)/$(VENV)/matplotlib
 
-.PHONY: design test slow fuzz mutants check lint types notebooks docs links bench figures architecture coverage clean
+.PHONY: design test slow times fuzz mutants check lint types notebooks docs links bench figures architecture coverage clean
 
 design: $(VENV)/runtime
 	$(BIN)/malta design
@@ -30,6 +30,9 @@ test: $(VENV)/dev
 
 slow: $(VENV)/dev
 	$(BIN)/python -m pytest -n auto --dist loadgroup -m slow
+
+times: $(VENV)/dev  # measures the fast tests, and lists those that take longer than a second as slow
+	PYTHONPATH=tests $(BIN)/python -m seconds
 
 fuzz: $(VENV)/dev
 	PYTHONPATH=tests $(BIN)/python -m fuzz

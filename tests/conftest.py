@@ -53,7 +53,7 @@ DESIGNS = ("table2", "calibrated")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    hypothesis.settings.load_profile("fast" if config.option.markexpr == "not slow" else "untimed")
+    hypothesis.settings.load_profile("fast" if "not slow" in config.option.markexpr else "untimed")
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False  # pytest-xdist keeps the order below
 
@@ -83,7 +83,16 @@ LONGEST = (
 )
 
 
+LISTED = frozenset((ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").splitlines())
+
+
+@pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that were measured to take long are `slow` too: see seconds.py."""
+    for item in items:
+        if item.nodeid in LISTED:
+            item.add_marker(pytest.mark.slow)
+            item.add_marker(pytest.mark.listed)
     items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONGEST)
 
 

@@ -1,0 +1,50 @@
+"""`make times`: measure the processor time of every fast test, and write the list of those that `make test` leaves out.
+
+A test's own time counts, with that of the processes that it starts, and not that of what fixtures make for many tests.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+from collections.abc import Generator
+from pathlib import Path
+
+import pytest
+
+LIST = Path(__file__).parent / "slow.txt"
+LIMIT = 0.8  # s of processor time
+
+
+def processor_time() -> float:
+    """Seconds of this process and of its children that have ended."""
+    own, children = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
+
+
+class Times:
+    """A plugin of pytest that adds up the time of each test's call."""
+
+    def __init__(self) -> None:
+        self.spent = dict[str, float]()
+
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Generator[None]:
+        begun = processor_time()
+        yield
+        self.spent[item.nodeid] = processor_time() - begun
+
+
+def main() -> int:
+    """Run the fast tests and those of the list, and write the list anew where all pass."""
+    times = Times()
+    code = int(pytest.main(["-q", "-m", "not slow or listed"], plugins=[times]))
+    if code == 0:
+        slow = sorted(name for name, spent in times.spent.items() if spent > LIMIT)
+        LIST.write_text("".join(f"{name}\n" for name in slow), encoding="utf-8")
+        print(f"{LIST.name}: {len(slow)} of {len(times.spent)} tests take more than {LIMIT} s")
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
