@@ -19,7 +19,7 @@ from IPython.display import display
 from scipy.linalg import block_diag
 
 import malta
-from malta.synthesis.lqg import integral_weight
+from malta.synthesis.lqg import integrals_of
 from malta.synthesis.riccati import add_integrals, sample, sample_cost, sample_noise
 
 # The project's root, wherever Jupyter was started.
@@ -88,7 +88,7 @@ saved, weights = malta.gains.read("design/gains/calibrated.json"), specs["calibr
 Ts, m = saved.sample_time, model.B.shape[1]
 A, B = add_integrals(*sample(model.A, model.B, Ts), model.C, Ts)
 Q, N, R = sample_cost(model.A, model.B, weights.Q, weights.R, Ts)
-Q = block_diag(Q, integral_weight(model, weights) * Ts)
+Q = block_diag(Q, integrals_of(model, weights).weight * Ts)
 K = control.dlqr(A, B, Q, R, np.vstack([N, np.zeros((m, m))]), method="scipy")[0]
 expected = np.hstack([saved.K, -saved.Ki])
 off_K = np.abs(K - expected).max() / np.abs(expected).max()

@@ -40,7 +40,7 @@ def static_law(name: str, starts: int) -> tuple[float, np.ndarray]:
     left, right = np.eye(w + m)[:, w:], np.eye(z + y)[z:]
     loads, outputs = [f"load {s}" for s in labels["w"]], [f"output {s}" for s in labels["z"]]
     goal = structured.soft(structured.gain_limit(loads, outputs, 1.0, name="norm"))
-    K = -np.ones((m, y))
+    K: np.ndarray = -np.ones((m, y))
     for count in (starts, 1):
         law = structured.states("K", (np.zeros((0, 0)), np.zeros((0, y)), np.zeros((m, 0)), -K))
         found = structured.tune(plant, [structured.Place(left, law, right)], [goal], starts=count)

@@ -290,6 +290,7 @@ def test_a_search_of_weights_refuses_elements(spec: Spec) -> None:
         searched_spec(files, files.apply(Edit()))
     with pytest.raises(malta.InputError, match=r"\[structure\]|structure"):
         tune_design(malta.read_design(ROOT / "design" / "table2.toml"))
-    bare = replace(spec, specification={}, law=replace(spec.law, goals=()))
+    assert spec.structure is not None
+    bare = replace(spec, specification={}, law=replace(spec.structure, goals=()))
     with pytest.raises(malta.InputError, match="a goal"):
         tune_design(bare)
