@@ -69,7 +69,7 @@ def disc(d: float, bore: float, width: float, rho: float) -> tuple[float, float,
 
 def assemble(length: float) -> Matrices:
     """The free rotor of dimensions.toml, of elements of this length, m."""
-    rotor = tomllib.loads((FOLDER / "dimensions.toml").read_text(encoding="utf-8"))
+    rotor = tomllib.loads((FOLDER / "source" / "dimensions.toml").read_text(encoding="utf-8"))
     count = round(rotor["shaft"]["length"] / length)
     found = Matrices(*(np.zeros((2 * count + 2, 2 * count + 2)) for _ in range(3)))
     one = element(length, rotor["shaft"]["diameter"], rotor["steel"])
@@ -103,7 +103,7 @@ def whirl(free: Matrices, Omega: float, stiffness: float) -> Matrix:
 
 def published() -> dict[str, Any]:
     """What the source of dimensions.toml prints."""
-    return tomllib.loads((FOLDER / "dimensions.toml").read_text(encoding="utf-8"))["published"]
+    return tomllib.loads((FOLDER / "source" / "dimensions.toml").read_text(encoding="utf-8"))["published"]
 
 
 def write(path: Path, free: Matrices) -> None:
