@@ -363,7 +363,7 @@ def motion(
 
     \b
     Examples:  malta motion design/gains/robust.json build/robust_stroke.npz
-               malta motion design/gains/robust.json --scenario stroke --scenario faults --witness
+               malta motion design/gains/robust.json --scenario faults --witness
     """
     from malta.files import replace_files
     from malta.gains.file import content_of

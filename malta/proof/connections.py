@@ -196,7 +196,8 @@ def interconnect(
     >>> error = control.summing_junction(["r", "-y"], "e")
     >>> lead = control.tf([40, 800], [1, 80], inputs="e", outputs="v")
     >>> drive = control.tf([500], [1, 500], inputs="v", outputs="f")
-    >>> closed = malta.proof.interconnect([error, lead, drive, (mass, "f", "y")], "r", "y")
+    >>> parts = [error, lead, drive, (mass, "f", "y")]
+    >>> closed = malta.proof.interconnect(parts, "r", "y")
     >>> print(malta.robust_margin(closed, [[0.0]], {"m": 0.5}))
     proven 197.57 %, lost at 197.57 % at 168.5 rad/s
     """

@@ -142,8 +142,9 @@ def varying(
 
     >>> import malta
     >>> import control
-    >>> spring = malta.uncertain(lambda k: ([[0, 1], [-k, -1]], [[0], [1]], [[1, 0]]), {"k": 2.0})
-    >>> law = control.ss([], [], [], [[-1.0]], 0.01)  # u = -y at 100 Hz: a stiffness from 2 to 4
+    >>> damped = lambda k: ([[0, 1], [-k, -1]], [[0], [1]], [[1, 0]])
+    >>> spring = malta.uncertain(damped, {"k": 2.0})
+    >>> law = control.ss([], [], [], [[-1.0]], 0.01)  # u = -y: a stiffness from 2 to 4
     >>> found = malta.proof.varying(spring, law, "k", (1.0, 3.0))
     >>> found.rate > 2.0, found.rate < 3.0  # N/m/s
     (True, True)

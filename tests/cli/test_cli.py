@@ -206,7 +206,7 @@ def test_designed_gains_can_be_read(designed: tuple[Path, str]) -> None:
 def test_design_prints_table_I_beside_ours(designed: tuple[Path, str]) -> None:
     _, printed = designed
     rows = [line.split() for line in printed.splitlines()]
-    ours = [row[2:] for row in rows if row[:2] == ["ours,", "+-"]]
+    ours = [row[2:] for row in rows if row[:2] == ["ours,", "±"]]
     assert ours == [["218.92", "218.92", "0.00", "157.53", "157.53"]] * 2
     assert [row[3:] for row in rows if row[:2] == ["Table", "I,"]] == ours
 
@@ -281,7 +281,7 @@ def test_design_without_names_takes_the_folder(
         ((TS, 'sample_time = { value = 10, unit = "s" }'), 1, "overflow"),
         ((PROCESS, f"process = {forces('1e200')}"), 2, "noise.process.fx_B1: found inf"),
         ((PROCESS, f"process = {forces('1e-200')}"), 2, "noise.process.fx_B1: found 0"),
-        ((INTEGRAL, "integral = { x1 = 1, y1 = 0, x2 = 0, y2 = 0, z = 0 }"), 1, "LQI: "),
+        ((INTEGRAL, "integral = { x1 = 1e40, y1 = 1, x2 = 1, y2 = 1, z = 1 }"), 1, "stab"),
         ((INPUT_BASES, f"input = {forces('1e200')}"), 2, "bases: found [1e+200, "),
         ((INPUT_BASES, f"input = {forces('1e-200')}"), 2, "bases: found [1e-200, "),
         ((INPUT_BASES, 'input = "metric"'), 2, "bases.input: found 'metric'"),
@@ -291,7 +291,7 @@ def test_design_without_names_takes_the_folder(
         "10 s",
         "loud",
         "silent",
-        "an integral of one axis",
+        "a huge integral",
         "large bases",
         "small bases",
         "metric",
@@ -315,13 +315,8 @@ def test_design_that_cannot_be_computed_names_its_file(
     [
         ((TS, 'sample_time = { value = 5, unit = "ms" }'), ("", ""), "is unstable, |lambda| = 1."),
         (("", ""), (R_MAX, "r_max  = { value = 0.001,"), "touchdown at sensor plane"),
-        (
-            (INTEGRAL, "integral = { x1 = 1, y1 = 0, x2 = 0, y2 = 0, z = 0 }"),
-            ("", ""),
-            "LQI: ",
-        ),
     ],
-    ids=["unstable", "touches down", "no solution"],
+    ids=["unstable", "touches down"],
 )
 def test_failing_design_leaves_old_gains(
     run: Run, tmp_path: Path, design: tuple[str, str], machine: tuple[str, str], found: str

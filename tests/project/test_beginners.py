@@ -101,7 +101,7 @@ DESIGNS = {
     ),
     "a rate for a position": (
         [(H, "h=lambda x, _: x[1]")],
-        "a zero at s = 0): the integrals need weights of 0",
+        "a zero at s = 0): weights.integral needs to be 0",
     ),
     "a long sample": (
         [(SAMPLE, '{ value = 200, unit = "ms" }')],

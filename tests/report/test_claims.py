@@ -316,7 +316,9 @@ def test_a_claim_has_one_word(verdicts: list[str], word: str) -> None:
 
 def test_only_designs_that_are_meant_to_reproduce_a_paper_are_judged(published: dict[str, Any]) -> None:
     """The figures of the others stand there; of the machine alone, of inputs and beside, any design is judged."""
-    found: Any = [SimpleNamespace(spec=SimpleNamespace(name=name, pid=None)) for name in ("table2", "robust")]
+    found: Any = [
+        SimpleNamespace(spec=SimpleNamespace(name=name, kind="LQG")) for name in ("table2", "robust")
+    ]
     values = {"table2": 16.2e-3, "robust": 20e-3}
     row = Row("rise", "ms", "{:.1f}", lambda e: values[e.spec.name], "figure_12.rise_time", why="so")
 
@@ -461,7 +463,7 @@ def test_what_a_design_was_solved_for_is_found_by_its_bases(found: Found) -> Non
     first, second = found.evidence
     assert (is_solved_for_ratio(first), is_solved_for_ratio(second)) == (False, True)
     weights = second.spec.weights
-    stiffer: Any = SimpleNamespace(pid=None, weights=replace(weights, q_base=weights.q_base * 0.99))
+    stiffer: Any = SimpleNamespace(kind="LQG", weights=replace(weights, q_base=weights.q_base * 0.99))
     assert not is_solved_for_ratio(replace(second, spec=stiffer))
 
 
