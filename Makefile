@@ -31,7 +31,7 @@ test: $(VENV)/dev
 slow: $(VENV)/dev
 	$(BIN)/python -m pytest -n auto --dist loadgroup -m slow
 
-times: $(VENV)/dev  # measures the fast tests, and lists those that take longer than a second as slow
+times: $(VENV)/dev  # measures the fast tests, and lists those that take long as slow
 	PYTHONPATH=tests $(BIN)/python -m seconds
 
 fuzz: $(VENV)/dev

@@ -203,3 +203,10 @@ def test_what_is_remembered_of_machines_is_bounded() -> None:
                 types = {ast.unparse(a.annotation) for a in node.args.args if a.annotation is not None}
                 endless += [(node.name, one) for one in types - {"str", "int", "Path"} if "tuple[" not in one]
     assert endless == []
+
+
+def test_listed_tests_exist() -> None:
+    """`make times` writes the list anew; a test that got another name would be a fast one again, unseen."""
+    for line in (ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").splitlines():
+        file, name = line.partition("[")[0].split("::")
+        assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), line

@@ -21,6 +21,7 @@ from malta import references
 from malta.loops.sampled_loops import machine_loop
 from malta.machines.tubular import claims as tubular
 from malta.machines.tubular import evidence as tubular_evidence
+from malta.machines.tubular import further_claims
 from malta.machines.tubular.evidence import (
     EXPERIMENT_NAMES,
     SEEDS,
@@ -104,6 +105,7 @@ def found(designs: dict[str, Design], published: dict[str, Any]) -> Found:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tubular, "evidence", kept)
         patch.setattr(tubular_evidence, "MACHINES", 256)
+        patch.setattr(further_claims, "LEARNERS", 3)
         ledger = claims.ledger([designs[name].spec for name in NAMES], published, shares.append)
     return Found(ledger, tuple(made), tuple(shares), {})
 
@@ -362,6 +364,7 @@ def test_a_claim_shows_its_figures(found: Found, published: dict[str, Any]) -> N
     assert claim(published=None, unit="deg").ours == (f"{math.degrees(0.5):.2f}", f"{math.degrees(0.25):.2f}")
 
 
+@pytest.mark.slow
 def test_a_figure_that_is_not_published_is_missed(found: Found) -> None:
     row = next(r for r in tubular.rows() if r.published == "figure_12.rise_time")
     with pytest.raises(malta.InputError) as caught:
@@ -385,6 +388,7 @@ def test_designs_of_another_machine_are_refused(
 # The ledger as it stands
 
 
+@pytest.mark.slow
 def test_the_table_has_a_line_for_each_claim(found: Found) -> None:
     assert (found.ledger.machine, found.ledger.designs) == ("tubular", NAMES)
     lines = found.ledger.markdown().split("\n")
@@ -401,6 +405,7 @@ def test_the_table_has_a_line_for_each_claim(found: Found) -> None:
         assert line.isprintable()
 
 
+@pytest.mark.slow
 def test_the_work_is_told(found: Found) -> None:
     shares = found.shares
     assert list(shares) == sorted(shares)
@@ -408,6 +413,7 @@ def test_the_work_is_told(found: Found) -> None:
     assert shares[-1] == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_a_reason_stands_beside_whatever_is_not_reproduced(found: Found) -> None:
     rows = {row.subject: row for row in tubular.rows()}
     for claim in found.ledger.claims:
@@ -458,6 +464,7 @@ VERDICTS = {
 }
 
 
+@pytest.mark.slow
 def test_what_a_design_was_solved_for_is_found_by_its_bases(found: Found) -> None:
     """K1 / k = 4 of other bases would be a finding; of bases that were solved for 4 it is none."""
     first, second = found.evidence
@@ -467,6 +474,7 @@ def test_what_a_design_was_solved_for_is_found_by_its_bases(found: Found) -> Non
     assert not is_solved_for_ratio(replace(second, spec=stiffer))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", list(VERDICTS))
 def test_the_verdicts(found: Found, start: str) -> None:
     assert found.claim(start).verdict.startswith(VERDICTS[start])
@@ -475,6 +483,7 @@ def test_the_verdicts(found: Found, start: str) -> None:
 # The figures by another route
 
 
+@pytest.mark.slow
 def test_poles_by_hand(found: Found, par: Parameters) -> None:
     """sqrt(2 K_A / m), sqrt(2 K_A l_B^2 / I_xx); and Table IV's K_A as the note has it."""
     x, alpha = (math.sqrt(2 * par.K_A * arm) for arm in (1 / par.m, par.l_B**2 / par.I_xx))
@@ -490,6 +499,7 @@ def test_poles_by_hand(found: Found, par: Parameters) -> None:
         assert found.value("change of the poles", name) == pytest.approx(100 * (largest / x - 1), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_stiffness_ratio_is_the_scalar_riccati_equations(found: Found) -> None:
     """K1 / k = 1 + sqrt(1 + q / (r_eff k^2)) with k = 2 K_A, r_eff = r / 2, whatever the rate weighs."""
     for name, expected in zip(NAMES, (2.0, 4.0), strict=True):
@@ -502,6 +512,7 @@ def test_the_stiffness_ratio_is_the_scalar_riccati_equations(found: Found) -> No
         assert by_hand == pytest.approx(expected, abs=5e-4)
 
 
+@pytest.mark.slow
 def test_the_full_state_share_follows_from_the_ratio(found: Found) -> None:
     """Stable while (1 - s) K1 > (1 + s) k: the corner s = (n - 1) / (n + 1) is n = 2: 167 %, n = 4: 300 % of 20 %."""
     for name, expected in zip(NAMES, ("167", "300"), strict=True):
@@ -538,6 +549,7 @@ def _radius(design: Design, share: float) -> float:
     return float(np.abs(np.linalg.eigvals(np.block(rows))).max())
 
 
+@pytest.mark.slow
 def test_the_share_on_the_machine_by_hand(found: Found, designs: dict[str, Design]) -> None:
     """33 and 162 %: where the largest eigenvalue of matrices written out leaves the unit circle, K_A up, K_B down.
 
@@ -550,6 +562,7 @@ def test_the_share_on_the_machine_by_hand(found: Found, designs: dict[str, Desig
         assert 100 * share == pytest.approx(expected, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fidelity", ["force", "dq"])
 @pytest.mark.parametrize(("beyond", "grows"), [(0.93, False), (1.1, True)])
 def test_the_share_on_the_machine_simulated(
@@ -573,6 +586,7 @@ def test_the_share_on_the_machine_simulated(
         assert (late < early / 1.5) != grows
 
 
+@pytest.mark.slow
 def test_bandwidths_are_where_the_loop_has_them(found: Found, designs: dict[str, Design]) -> None:
     for name, design in designs.items():
         stage = machine_loop(design.model, design.controller)
@@ -593,6 +607,7 @@ def test_bandwidths_are_where_the_loop_has_them(found: Found, designs: dict[str,
         )
 
 
+@pytest.mark.slow
 def test_the_peak_sensitivity_is_on_the_circle_that_it_should_be(
     found: Found, designs: dict[str, Design]
 ) -> None:
@@ -606,6 +621,7 @@ def test_the_peak_sensitivity_is_on_the_circle_that_it_should_be(
         assert (peak < 3) == (name == "calibrated")
 
 
+@pytest.mark.slow
 def test_current_loops_by_hand(found: Found, designs: dict[str, Design]) -> None:
     """|Kp - j Ki / w| = |R + j w L| at the crossover; the phase there, with the dead time that was designed for."""
     for name, dead_time in zip(NAMES, (0.0, 75e-6), strict=True):
@@ -621,6 +637,7 @@ def test_current_loops_by_hand(found: Found, designs: dict[str, Design]) -> None
     assert found.claim("current loops: phase margin").ours == ("60.0", "60.0")
 
 
+@pytest.mark.slow
 def test_the_link_by_hand(found: Found) -> None:
     """0.5 * 0.36 kg * (5 m/s)^2 = 4.5 J into 88 mF at 45 V: 1.12 V; the linear estimate E / (C V) is 1.14 V."""
     rise = math.sqrt(45**2 + 2 * 4.5 / 88e-3) - 45
@@ -628,6 +645,7 @@ def test_the_link_by_hand(found: Found) -> None:
     assert pytest.approx(1.136, abs=5e-4) == 4.5 / (88e-3 * 45)
 
 
+@pytest.mark.slow
 def test_what_the_notes_say_is_so(found: Found, designs: dict[str, Design]) -> None:
     par: Any = designs["table2"].spec.parameters
     assert f"{2 * math.pi / par.L_p * par.F_c:.0f} N/m" in found.claim("1 N along z").verdict
@@ -647,6 +665,7 @@ def test_what_the_notes_say_is_so(found: Found, designs: dict[str, Design]) -> N
         assert found.value("at rest: radial", name) < 0.8 * par.s_r * 1e6
 
 
+@pytest.mark.slow
 def test_the_slowest_radial_pole_is_among_the_regulators(found: Found) -> None:
     for name, evidence in zip(NAMES, found.evidence, strict=True):
         slowest = found.value("slowest radial pole", name)
@@ -658,6 +677,7 @@ def test_the_slowest_radial_pole_is_among_the_regulators(found: Found) -> None:
     assert -1 / found.value("slowest radial pole", "calibrated") < 0.2
 
 
+@pytest.mark.slow
 def test_cogging_pushes_a_soft_axis_aside(found: Found) -> None:
     """F_c |sin| at 5 mm is 0.43 N: `calibrated` yields to it by a sixth of a millimetre, table2 beyond its stops."""
     held = 0.5 * abs(math.sin(2 * math.pi * 5 / 15))
@@ -673,6 +693,7 @@ def test_cogging_pushes_a_soft_axis_aside(found: Found) -> None:
             assert error > 5
 
 
+@pytest.mark.slow
 def test_what_a_newton_along_z_meets_is_what_the_machine_does(found: Found) -> None:
     """The simulated mover, with lags as the linear loop has them and without noise; not 1 / K[z, z], 19 um."""
     second = found.evidence[1]
@@ -688,6 +709,7 @@ def test_what_a_newton_along_z_meets_is_what_the_machine_does(found: Found) -> N
         assert 1 < ratio < 2
 
 
+@pytest.mark.slow
 def test_a_payload_is_moved_as_the_stroke_is_published(found: Found) -> None:
     """The largest that keeps all bounds of Figs 12 and 13, and 10 % more does not; overshoot is one of them."""
     bounds = {"stroke: overshoot": 0.015, "stroke: axial error": 0.6e-3, "stroke: radial deviation": 20e-6}
@@ -705,6 +727,7 @@ def test_a_payload_is_moved_as_the_stroke_is_published(found: Found) -> None:
     assert carried == pytest.approx([0.116, 0.732], rel=0.05)
 
 
+@pytest.mark.slow
 def test_figures_are_those_of_the_experiments(found: Found) -> None:
     """What a user sees of `malta simulate` is what the ledger says."""
     for name, evidence in zip(NAMES, found.evidence, strict=True):
@@ -731,6 +754,7 @@ def test_figures_are_those_of_the_experiments(found: Found) -> None:
         assert evidence.experiments["tilt"].cases[0].merits[0].label == "SP2: largest deviation, true"
 
 
+@pytest.mark.slow
 def test_figures_of_chance_show_their_interval(found: Found) -> None:
     """Student's interval of a mean, and of a mean square; what is no chance has none."""
     values = [3.0, 4.0, 5.0]
@@ -747,6 +771,7 @@ def test_figures_of_chance_show_their_interval(found: Found) -> None:
     assert not any("±" in cell for cell in poles.ours)
 
 
+@pytest.mark.slow
 def test_a_rest_before_the_stroke_takes_radial_deviations_off(found: Found) -> None:
     """`calibrated`: a third in the median; table2, whose integrals take minutes, loses more of its machines instead."""
     first, second = found.evidence
@@ -754,6 +779,7 @@ def test_a_rest_before_the_stroke_takes_radial_deviations_off(found: Found) -> N
     assert first.strokes.yields.completed.share < first.unsettled.yields.completed.share
 
 
+@pytest.mark.slow
 def test_releases_are_those_of_the_experiment(found: Found) -> None:
     """The force limit decides, not the gains: 0.91 of what it allows, and every start inside the bearings returns."""
     if compiler() is None:
@@ -764,6 +790,7 @@ def test_releases_are_those_of_the_experiment(found: Found) -> None:
         assert found.value("released aside, downwards", name) < found.value("released aside, along x", name)
 
 
+@pytest.mark.slow
 def test_rests_are_those_of_many_seeds(found: Found) -> None:
     """The mean square over seeds, of runs made one by one."""
     for name, e in zip(NAMES, found.evidence, strict=True):
@@ -780,6 +807,7 @@ def rest_scenario(seed: int) -> Scenario:
     return replace(Scenario("hold", (RESTING + 6000) * 50e-6, references.hold), seed=seed, **REAL)
 
 
+@pytest.mark.slow
 def test_the_rule_of_thumb_by_hand(found: Found) -> None:
     """The paper asks for twice the largest unstable pole, 218.92 rad/s, and has 400 rad/s."""
     for name in NAMES:
@@ -791,6 +819,7 @@ def test_the_rule_of_thumb_by_hand(found: Found) -> None:
     assert f"{400 / 218.92:.2f} times its 218.92" in claim.verdict
 
 
+@pytest.mark.slow
 def test_the_braking_resistor_holds_the_link(found: Found) -> None:
     """Braked at the force limit from 5 m/s, the resistor switched by the sample: the link stays below 46.12 V."""
     resistance = found.value("braking resistor: largest resistance", "calibrated")
@@ -806,6 +835,7 @@ def test_the_braking_resistor_holds_the_link(found: Found) -> None:
     assert found.claim("braking resistor: capacitance").published == "≤ 88"
 
 
+@pytest.mark.slow
 def test_means_at_rest_are_of_the_order_that_the_paper_prints(
     found: Found, published: dict[str, Any]
 ) -> None:
