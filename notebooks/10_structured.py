@@ -20,6 +20,7 @@ from scipy import linalg
 import malta
 from malta import structured
 from malta.structured.loops import to_plane
+from malta.structured.reduction import split_integrals, truncate
 from malta.synthesis.controller import linear_law
 from malta.synthesis.elements import sample_law
 from malta.synthesis.state_space import System
@@ -65,54 +66,26 @@ plant, box = spec.plant, dict(spec.uncertainty)
 robust = malta.gains.read("design/gains/robust.json")
 T, F = robust.sample_time, linear_law(robust)
 GROUPS = {"x": [0, 2], "y": [1, 3], "z": [4]}  # sensors and actuators that the law joins
-
-
-def integrals_and_rest(part: System) -> tuple[System, System]:
-    """A system in s, split at poles of 1 rad/s."""
-    A, B, C, D = part.balanced
-    S, Z, k = linalg.schur(A, sort=lambda re, im: bool(np.hypot(re, im) < 1.0))
-    V = Z.copy()
-    V[:, k:] += Z[:, :k] @ linalg.solve_sylvester(S[:k, :k], -S[k:, k:], -S[:k, k:])
-    A, B, C = np.linalg.solve(V, A @ V), np.linalg.solve(V, B), C @ V
-    return System(0 * A[:k, :k], B[:k], C[:, :k], 0 * D), System(A[k:, k:], B[k:], C[:, k:], D)
-
-
-def truncated(part: System, order: int) -> System:
-    """Balanced truncation of a stable system."""
-    A, B, C, D = part
-    P = linalg.cholesky(linalg.solve_continuous_lyapunov(A, -B @ B.T), lower=True)
-    Q = linalg.cholesky(linalg.solve_continuous_lyapunov(A.T, -C.T @ C), lower=True)
-    U, sizes, V = linalg.svd(Q.T @ P)
-    left = (U[:, :order] / np.sqrt(sizes[:order])).T @ Q.T
-    right = P @ V[:order].T / np.sqrt(sizes[:order])
-    return System(left @ A @ right, left @ B, C @ right, D)
-
-
 parts = {}
 for group, k in GROUPS.items():
     whole = control.ss(F.A, -F.B_y[:, k], F.C[k], -F.D_y[np.ix_(k, k)], T)
-    parts[group] = integrals_and_rest(to_plane(System.of(control.minreal(whole, 1e-9, verbose=False)), T))
+    parts[group] = split_integrals(to_plane(System.of(control.minreal(whole, 1e-9, verbose=False)), T))
 assert [len(rest.A) for _, rest in parts.values()] == [6, 6, 3]
-
-
-def reduced(radial: int) -> System:
-    """The law with this many states beside the integrals in x and in y."""
-    A, B, C, D = [], [], [], np.zeros((5, 5))
+truncations = {}
+for states in (6, 5, 4):  # beside the integrals, in x and in y
+    states_of, driven, read, direct = [], [], [], np.zeros((5, 5))
     for group, k in GROUPS.items():
         integrals, rest = parts[group]
-        rest = truncated(rest, 3 if group == "z" else radial)
-        for one in (integrals, rest):
-            B.append(np.zeros((len(one.A), 5)))
-            C.append(np.zeros((5, len(one.A))))
-            B[-1][:, k], C[-1][k] = one.B, one.C
-            A.append(one.A)
-        D[np.ix_(k, k)] = rest.D
-    return sample_law(System(linalg.block_diag(*A), np.vstack(B), np.hstack(C), D), T)
-
-
-truncations = {}
-for states in (6, 5, 4):
-    reduction = control.ss(*reduced(states), T, name=f"robust_{states}")
+        rest = truncate(rest, 3 if group == "z" else states)
+        for part in (integrals, rest):
+            driven.append(np.zeros((len(part.A), 5)))
+            read.append(np.zeros((5, len(part.A))))
+            driven[-1][:, k], read[-1][k] = part.B, part.C
+            states_of.append(part.A)
+        direct[np.ix_(k, k)] = rest.D
+    joined = System(linalg.block_diag(*states_of), np.vstack(driven), np.hstack(read), direct)
+    sampled = sample_law(joined, T)
+    reduction = control.ss(*sampled, T, name=f"robust_{states}")
     margins = malta.verify(plant, malta.synthesis.controller_of(reduction, plant), box)
     assert margins.robust is not None
     truncations[reduction.nstates] = margins.robust.lower or 0.0
@@ -141,29 +114,25 @@ goals = [
     structured.noise_limit(sensors, "force f_D", 0.8, name="f_D"),
 ]
 
-
-def decentralized(radial: structured.Element, axial: structured.Element) -> dict[str, structured.Element]:
-    return {"x1": radial, "y1": radial, "x2": radial, "y2": radial, "z": axial}
-
-
 LAWS = {
-    "PD": decentralized(
+    "PD": (
         structured.pid("radial", Kp=60.00e3, Kd=85.35, filter=78.90e-6),
         structured.pid("axial", Kp=13.00e3, Kd=67.50, filter=1.682e-3),
     ),
-    "PID": decentralized(
+    "PID": (
         structured.pid("radial", Kp=67.57e3, Ki=532.3e3, Kd=84.44, filter=78.45e-6),
         structured.pid("axial", Kp=13.26e3, Ki=344.5e3, Kd=80.05, filter=2.089e-3),
     ),
 }
 radial = structured.pid("radial", Kp=67.46e3, Ki=163.4e3, Kd=84.55, filter=36.22e-6)
 axial = structured.pid("axial", Kp=14.69e3, Ki=412.4e3, Kd=85.83, filter=1.914e-3)
-LAWS["PID and lead"] = decentralized(
+LAWS["PID and lead"] = (
     radial * structured.lead("radial_lead", zero=77446.0, pole=26588.0),
     axial * structured.lead("axial_lead", zero=2381.4, pole=2071.7),
 )
 tuned, proven = dict[str, structured.Tuned](), dict[str, float]()
-for name, law in LAWS.items():
+for name, (radial, axial) in LAWS.items():
+    law = {**dict.fromkeys(("x1", "y1", "x2", "y2"), radial), "z": axial}
     one = structured.tune(plant, law, goals, ranges=box, margin=3.4, sample_time=T, starts=1, keep=True)
     tuned[name] = one
     print(f"{name}, {one.order} states: {one.certificate}")

@@ -77,8 +77,7 @@ def test_notebook_runs_from_its_own_folder(notebook: Path, monkeypatch: pytest.M
     runpy.run_path(str(notebook), run_name="__main__")
     pyplot.close("all")
     text = notebook.read_text(encoding="utf-8")
-    # Functions belong in malta/; the tenth reduces a law in a way of its own, which nothing else uses.
-    assert notebook.stem == "10_structured" or "\ndef " not in text
+    assert "\ndef " not in text  # functions belong in malta/
     assert "assert " in text
     assert text.startswith("# %% [markdown]\n# # ")
 
