@@ -281,7 +281,7 @@ def test_design_without_names_takes_the_folder(
         ((TS, 'sample_time = { value = 10, unit = "s" }'), 1, "overflow"),
         ((PROCESS, f"process = {forces('1e200')}"), 2, "noise.process.fx_B1: found inf"),
         ((PROCESS, f"process = {forces('1e-200')}"), 2, "noise.process.fx_B1: found 0"),
-        ((INTEGRAL, "integral = { x1 = 1e40, y1 = 1, x2 = 1, y2 = 1, z = 1 }"), 1, "stab"),
+        ((INTEGRAL, "integral = { x1 = 1e100, y1 = 1, x2 = 1, y2 = 1, z = 1 }"), 1, "LQI: "),
         ((INPUT_BASES, f"input = {forces('1e200')}"), 2, "bases: found [1e+200, "),
         ((INPUT_BASES, f"input = {forces('1e-200')}"), 2, "bases: found [1e-200, "),
         ((INPUT_BASES, 'input = "metric"'), 2, "bases.input: found 'metric'"),
@@ -315,8 +315,9 @@ def test_design_that_cannot_be_computed_names_its_file(
     [
         ((TS, 'sample_time = { value = 5, unit = "ms" }'), ("", ""), "is unstable, |lambda| = 1."),
         (("", ""), (R_MAX, "r_max  = { value = 0.001,"), "touchdown at sensor plane"),
+        ((INTEGRAL, "integral = { x1 = 1e100, y1 = 1, x2 = 1, y2 = 1, z = 1 }"), ("", ""), "LQI: "),
     ],
-    ids=["unstable", "touches down"],
+    ids=["unstable", "touches down", "no solution"],
 )
 def test_failing_design_leaves_old_gains(
     run: Run, tmp_path: Path, design: tuple[str, str], machine: tuple[str, str], found: str
