@@ -19,7 +19,7 @@ def par() -> Any:
 
 
 def test_the_tube_has_the_printed_mass_and_inertias(par: Any) -> None:
-    t, R = bending.tube(par), bending.RADIUS
+    t, R = bending.tube(par), bending.radius()
     m = t.density * math.pi * (R**2 - t.bore**2) * t.length
     assert m == pytest.approx(0.360)
     assert m * (R**2 + t.bore**2) / 2 == pytest.approx(4.7707e-5)

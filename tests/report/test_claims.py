@@ -57,6 +57,7 @@ INPUTS = {
     "travel.z_ss": "an input: the range of the row on the poles over +-15 mm",
     "position_controller.uncertainty": "an input of both design files",
     "dc_link.speed": "an input of the row on the link's rise",
+    "figure_1.shaft": "an input of the mover's first bending mode, see test_tubular_bending",
     "figure_12.stroke": "an input of the stroke, see test_experiments",
     "figure_14.resolution": "an input: the sensors' steps, see test_experiments",
     "figure_16.radius": "an input of the tilt, see test_experiments",

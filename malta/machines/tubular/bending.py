@@ -14,17 +14,18 @@ Source: R. D. Blevins, Formulas for Natural Frequency and Mode Shape, 1979, tabl
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from malta.model.data import published_figures, published_value
 from malta.proof.blocks.blocks import Dynamic
 
 if TYPE_CHECKING:
     from malta.machines.tubular.plant import Parameters
     from malta.proof.uncertain import UncertainSystem
 
-RADIUS = 13.5e-3  # m, half of the shaft's 27 mm, Fig. 1
 FREE = 4.730040744862704  # k of the first mode of a free beam
 SIZE = 2.0  # the square of sqrt 2: two forces, and two sensors, of one plane
 
@@ -44,13 +45,19 @@ class Tube(NamedTuple):
     area_moment: float
 
 
+@lru_cache(maxsize=1)
+def radius() -> float:
+    """The outer radius of the shaft that the paper prints, m."""
+    return published_value(published_figures("tubular") or {}, "figure_1.shaft") / 2
+
+
 def tube(par: Parameters) -> Tube:
     """The tube that has the printed mass and inertias."""
     squares = 2 * par.I_zz / par.m
-    bore = math.sqrt(squares - RADIUS**2)
+    bore = math.sqrt(squares - radius() ** 2)
     length = math.sqrt(12 * (par.I_xx / par.m - squares / 4))
-    volume = math.pi * (RADIUS**2 - bore**2) * length
-    return Tube(bore, length, par.m / volume, math.pi / 4 * (RADIUS**4 - bore**4))
+    volume = math.pi * (radius() ** 2 - bore**2) * length
+    return Tube(bore, length, par.m / volume, math.pi / 4 * (radius() ** 4 - bore**4))
 
 
 def first_bending(par: Parameters, E: float) -> float:

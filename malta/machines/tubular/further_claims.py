@@ -15,14 +15,14 @@ from malta.errors import CheckError, InputError
 from malta.identification.learn import learn
 from malta.identification.log import log_of
 from malta.machines.tubular.evidence import Evidence, link_rise, mean_at_rest
-from malta.machines.tubular.experiments.strokes import delayed_stroke
+from malta.machines.tubular.experiments.strokes import delayed_stroke, stroke_merits
 from malta.model.data import plant_of, published_figures, published_value
 from malta.report.ledger import Chance, Row, bandwidth
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.experiments.catalogue import experiment
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-from malta.simulation.trajectory import Trajectory, stroke_figures
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.feedforward import static_feedforward
 
 if TYPE_CHECKING:
@@ -270,13 +270,8 @@ def _within_published(run: Trajectory, e: Evidence) -> bool:
     """Whether a stroke was completed within the bounds of Figs 12 and 13."""
     if not run.verdict.completed:
         return False
-    found = stroke_figures(run)
-    sizes = {
-        "figure_12.overshoot": found.overshoot,
-        "figure_12.axial_error": found.axial_error,
-        "figure_13.radial_deviation": max(found.radial.values()),
-    }
-    return all(size <= published_value(e.published, name) for name, size in sizes.items())
+    bounded = (m for m in stroke_merits(run) if m.published and m.relation == "at most")
+    return all(m.value <= published_value(e.published, m.published) for m in bounded)
 
 
 def taught_share(stroke: int, e: Evidence) -> Chance:
