@@ -13,7 +13,7 @@ from itertools import chain
 from typing import Any, NamedTuple
 
 from malta.app.files import DesignFiles, Edited
-from malta.app.picture import View, picture, solve
+from malta.app.picture import Problem, View, picture, solve
 from malta.errors import InputError
 from malta.margins.travel import travel_margin
 from malta.synthesis.requirements import ratio_of, requirements_for
@@ -85,7 +85,8 @@ def candidates(search: Search) -> Iterator[dict[str, Any]]:
         badness = _badness(spec, trial)
         if best is not None and badness < best - LEAST_GAIN:
             name, ratio = nearest_limit(spec, trial)
-            yield _document(search, spec, trial) | {
+            problem = solve(Edited(apply_trial(spec, trial), search.edited.truth))
+            yield _document(search, spec, trial, problem) | {
                 "limit": name,
                 "ratio": ratio,
                 "trials": len(journal.known),
@@ -128,7 +129,7 @@ def front(search: Search) -> Iterator[dict[str, Any]]:
         name, ratio = nearest_limit(spec, trial, free)
         misses = {"limit": name, "ratio": ratio} if ratio > 1 + SLACK else {}
         found = {"margin": margin.lower, "reason": margin.reason, "price": PRICES[spec.pid is not None]}
-        yield _document(search, spec, trial) | found | misses
+        yield _document(search, spec, trial, problem) | found | misses
 
 
 def _trials_of_lqg(spec: Spec, search: Search) -> Iterator[Trial]:
@@ -174,7 +175,7 @@ def _badness(spec: Spec, trial: Trial) -> float:
     return math.log(load_error(trial.figures)) + STEEP * max(beyond - 2 * ROOM, 0.0)
 
 
-def _document(search: Search, spec: Spec, trial: Trial) -> dict[str, Any]:
+def _document(search: Search, spec: Spec, trial: Trial, problem: Problem) -> dict[str, Any]:
     """A design that was found: its numbers in the units of the file, and its picture."""
     fields, values = search.files.fields, dict[str, float]()
     for variable, value in zip(spec.search, trial.values, strict=True):
@@ -182,7 +183,6 @@ def _document(search: Search, spec: Spec, trial: Trial) -> dict[str, Any]:
             values[key] = float(f"{value * fields[key].factor:.12g}")
     if spec.pid is None:
         values["delay"] = trial.delay
-    problem = solve(Edited(apply_trial(spec, trial), search.edited.truth))
     return {"values": values, "picture": picture(problem, search.view)}
 
 

@@ -169,7 +169,10 @@ def pull_to(pull: Pull, asked: float, slopes: Mapping[str, tuple[float, ...]]) -
     ends = np.log([[f.low for f in fields], [f.high for f in fields]])
     start = np.log([pull.value_of(f) for f in fields])
     ends = np.array([np.minimum(ends[0], start), np.maximum(ends[1], start)])
-    look = lambda u: pull.figure(dict(zip(chosen, u.tolist(), strict=True)))  # noqa: E731
+
+    def look(u: Any) -> tuple[float, ...] | None:
+        return pull.figure(dict(zip(chosen, u.tolist(), strict=True)))
+
     J = np.array([slopes[key] for key in chosen]).T
     u, logarithm = _solve(look, start, math.log(asked), J, ends)
     at_end = [

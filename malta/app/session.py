@@ -54,6 +54,11 @@ KEPT = 1000  # news of one version
 Document = dict[str, Any]
 
 
+def _view_of(body: Mapping[str, Any]) -> View:
+    """What a document of the page looks at beside the design."""
+    return View(str(body.get("run", "")), str(body.get("load", "")))
+
+
 class Session:
     """The state of a page: the files, the newest edit, and what follows it.
 
@@ -153,11 +158,11 @@ class Session:
                 return {"number": number, "stale": True}
             began, cpu = time.perf_counter(), time.thread_time()
             try:
-                edit = self.files.edit(body.get("values", {}), redesign=body.get("redesign", True))
+                edit = self._edit_of(body)
             except InputError as error:
                 self._followed = None
                 return {"number": number, "version": self._supersede(), "error": shorten(str(error))}
-            view = View(str(body.get("run", "")), str(body.get("load", "")))
+            view = _view_of(body)
             same = edit == self._followed
             self.edit = self._followed = edit
             version = self._version if same else self._supersede()
@@ -200,9 +205,9 @@ class Session:
         task = body.get("task")
         if task not in ("tune", "front", "stop"):
             raise InputError("malta app", "task", repr(task), "tune, front or stop")
-        edit = self.files.edit(body.get("values", {}), redesign=body.get("redesign", True))
+        edit = self._edit_of(body)
         edited = self.files.apply(edit)
-        view = View(str(body.get("run", "")), str(body.get("load", "")))
+        view = _view_of(body)
         return {"search": self._begin_search(edit, view, fingerprint(*edited), str(task))}
 
     def _begin_search(self, edit: Edit, view: View, design: str, task: str) -> int:
@@ -220,9 +225,9 @@ class Session:
         if not is_number(asked) or asked <= 0:
             raise InputError("malta app", "asked", repr(asked), "a number above 0")
         with self._busy:
-            edit = self.files.edit(body.get("values", {}), redesign=body.get("redesign", True))
+            edit = self._edit_of(body)
             handle = Handle(str(body.get("kind", "")), str(body.get("signal", "")))
-            view = View(str(body.get("run", "")), str(body.get("load", "")))
+            view = _view_of(body)
             one = Pull(self.files, edit, view, handle)
             known = self._slopes is not None and self._slopes[:2] == (handle, view)
             for fresh in (
@@ -277,13 +282,8 @@ class Session:
             self._begin_search(Edit(), View(), "", "stop")
             self.files, self.edit, self._followed = files, Edit(), None
             self._base += 1
-            self._ray, self._traced, self._slow_margin, self._plane, self._slopes = (
-                None,
-                None,
-                False,
-                None,
-                None,
-            )
+            self._ray = self._traced = self._plane = self._slopes = None
+            self._slow_margin = False
             self._supersede()
             return {"open": self.open({})}
 
@@ -299,7 +299,7 @@ class Session:
     def save(self, body: Mapping[str, Any]) -> Document:
         """Save the design; {"exists": files} where these exist and body["replace"] is not true."""
         with self._busy:
-            edit = self.files.edit(body.get("values", {}), redesign=body.get("redesign", True))
+            edit = self._edit_of(body)
             target = inside(self.root, str(body.get("file", "")))
             try:
                 self.files, written = save_design(
@@ -395,6 +395,10 @@ class Session:
             self._timer = threading.Timer(QUIET, ask)
             self._timer.daemon = True
             self._timer.start()
+
+    def _edit_of(self, body: Mapping[str, Any]) -> Edit:
+        """The edit that a document of the page asks for."""
+        return self.files.edit(body.get("values", {}), redesign=body.get("redesign", True))
 
     def _message_of(self, edit: Edit, view: View, design: str) -> Document:
         """A document for a worker, but for its task; design : the fingerprint of the design."""

@@ -131,9 +131,7 @@ def _end_if(newer: Newer) -> Callable[..., None]:
 
 def _explore(opened: DesignFiles, edited: Edited, message: Message, newer: Newer) -> Iterator[dict[str, Any]]:
     """Designs that a search comes by, each with its number; the last document says that it ended."""
-    search = Search(
-        opened, edited, View(message["run"], message["load"]), lambda share: _end_if(newer)(share)
-    )
+    search = Search(opened, edited, View(message["run"], message["load"]), _end_if(newer))
     count = 0
     for count, found in enumerate(TASKS[message["task"]](search), 1):
         yield {"kind": "candidate", "of": message["task"], "number": count} | found
