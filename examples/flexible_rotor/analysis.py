@@ -163,7 +163,9 @@ def bound_rest(
         left, right = sensors @ own / np.sqrt(least), (own.conj().T @ T @ magnets.T) / np.sqrt(least)[:, None]
         return float(np.linalg.norm(left, 2) * np.linalg.norm(right, 2))
 
-    W = lambda w: abs(complex(weight(1j * w)))  # noqa: E731
+    def W(w: float) -> float:
+        return abs(complex(weight(1j * w)))
+
     # Above the top every mode is far below: |Z| >= w^2 - w_max^2 - w Omega |g|.
     above = top**2 - w_k.max() ** 2 - top * par.Omega_max * gyro
     largest = float(np.linalg.norm(sensors, 2) * np.linalg.norm(magnets, 2) / above / W(top))

@@ -8,7 +8,9 @@ from that.
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -134,11 +136,10 @@ def decode_dump(content: bytes, path: Path) -> Any:
     """
     dump = read_dump(content, path)
     rows, given = dump.rows, dump.headings
-    try:
+    Ts = math.nan
+    with suppress(ValueError):
         Ts = float(dump.words["sample_time"])
-    except ValueError:
-        raise InputError(path, "sample_time", dump.words["sample_time"], "a number of seconds") from None
-    if not 0 < Ts < np.inf:
+    if not 0 < Ts < math.inf:
         raise InputError(path, "sample_time", dump.words["sample_time"], "a number of seconds")
 
     def readings(name: str) -> FloatArray:

@@ -71,7 +71,7 @@ def tune_design(
     asked = design_goals(spec)
     if not asked and "margin" not in spec.specification:
         raise InputError(spec.path, "goals", "nothing", "a goal, or a margin in [specification]")
-    model = linearize(plant, plant.at(**spec.operating_point))
+    own = places_in(law, linearize(plant, plant.at(**spec.operating_point)))
     shares = (0.0, 1.0, -1.0) if plant.has_stroke else (None,)
     places = [
         dict(spec.operating_point) | ({} if share is None else {plant.stroke: share * plant.travel})
@@ -79,7 +79,7 @@ def tune_design(
     ]
     try:
         found = tune(
-            plant, places_in(law, model), asked,
+            plant, own, asked,
             ranges=spec.uncertainty or None, margin=spec.specification.get("margin"),
             sample_time=spec.sample_time, places=places, starts=starts, name=spec.name, keep=keep, note=note,
         )  # fmt: skip
@@ -87,17 +87,10 @@ def tune_design(
         raise InputError(spec.path, f"structure: {error.field}", error.found, error.expected) from error
     except CheckError as error:
         raise CheckError(f"{spec.path}: {error}") from error
-    values = law_values(spec)
+    values = {name: value for place in own for name, value in place.element.values.items()}
     if all(math.isclose(found.values[name], value, rel_tol=1e-12) for name, value in values.items()):
         return TunedDesign(spec, found)
     return TunedDesign(replace(spec, law=with_values(law, found.values)), found)
-
-
-def law_values(spec: Spec) -> dict[str, float]:
-    """The numbers of a design's elements by "element.parameter", SI."""
-    model = linearize(spec.plant, spec.plant.at(**spec.operating_point))
-    assert spec.structure is not None
-    return {k: v for place in places_in(spec.structure, model) for k, v in place.element.values.items()}
 
 
 def design_goals(spec: Spec) -> list[Goal]:

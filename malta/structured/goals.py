@@ -204,16 +204,9 @@ def poles(decay: float = 0.0, damping: float = 0.0, fastest: float = math.inf) -
     >>> structured.poles(decay=10.0).name
     'poles'
     """
-    if not (decay >= 0 and 0 <= damping < 1 and fastest > decay) or (decay, damping, fastest) == (
-        0,
-        0,
-        math.inf,
-    ):
-        found = f"decay {decay}, damping {damping}, fastest {fastest}"
-        raise InputError(
-            CALLER, "poles", found, "a decay above 0, a damping below 1, or poles faster than the decay"
-        )
+    expected = "a decay above 0, a damping below 1, or poles faster than the decay"
     bounds = _PoleBounds(decay, damping, fastest)
+    bounds.require("poles", expected, some=True)
     return Goal("poles", partial(_poles, bounds), unit=bounds.words)
 
 
@@ -231,10 +224,8 @@ def stable_law(decay: float = 0.0, damping: float = 0.0, fastest: float = math.i
     >>> structured.stable_law(fastest=1e4).unit
     'stable, up to 10000 rad/s'
     """
-    if not (decay >= 0 and 0 <= damping < 1 and fastest > decay):
-        found = f"decay {decay}, damping {damping}, fastest {fastest}"
-        raise InputError(CALLER, "stable_law", found, "0 or more, 0 to 1, and poles faster than the decay")
     bounds = _PoleBounds(decay, damping, fastest)
+    bounds.require("stable_law", "0 or more, 0 to 1, and poles faster than the decay")
     made = partial(_law_poles, bounds)
     return Goal("stable law", made, unit=", ".join(filter(None, ["stable", bounds.words])))
 
@@ -245,6 +236,13 @@ class _PoleBounds(NamedTuple):
     decay: float
     damping: float
     fastest: float
+
+    def require(self, goal: str, expected: str, *, some: bool = False) -> None:
+        """Raise InputError for numbers that no poles have, and, where `some` is asked for, for no bound at all."""
+        decay, damping, fastest = self
+        possible = decay >= 0 and 0 <= damping < 1 and fastest > decay
+        if not possible or (some and self == (0, 0, math.inf)):
+            raise InputError(CALLER, goal, f"decay {decay}, damping {damping}, fastest {fastest}", expected)
 
     @property
     def words(self) -> str:

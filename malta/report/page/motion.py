@@ -258,15 +258,14 @@ def motion_page(found: Motion | Sequence[Motion], about: str = "") -> Page:
     from malta.report.page.document import Page, json_in_page, page_style, render_template, script_of
 
     runs = [found] if isinstance(found, Motion) else [*found]
-    data, every = _page_data(runs, 1), 1
-    while len(json_in_page(data)) > LARGEST and every < FRAMES:
+    every = 1
+    while len(data := json_in_page(_page_data(runs, every))) > LARGEST and every < FRAMES:
         every *= 2
-        data = _page_data(runs, every)
     title = runs[0].title if len(runs) == 1 else f"{len(runs)} runs"
     policy, script = script_of(Path(__file__).with_name("motion.js").read_text(encoding="utf-8"))
     page = render_template(
         "motion.html.jinja", title=title, about=about, style=Markup(page_style()), script=Markup(script),
-        policy=policy, data=Markup(json_in_page(data)),
+        policy=policy, data=Markup(data),
     )  # fmt: skip
     return Page(f"{title}: in motion", page)
 
