@@ -128,7 +128,7 @@ def _with_sliders(law: tuple[Field, ...], files: Files) -> tuple[Field, ...]:
     """The fields of a law whose file has no [search], with a slider for what most often moves: equal numbers together.
 
     Of an LQG these are the bases of weighted states and integrals, or the weights where bases stand as "SI", and the
-    noise of process and disturbances; of a PID its gains and filters.
+    noise of process and disturbances; of a PID its gains and filters; of a law of [structure] those of its elements.
     """
     weighted = {f.key for f in law if f.key.startswith("weights.") and f.value != 0}
     plain = {
@@ -138,7 +138,7 @@ def _with_sliders(law: tuple[Field, ...], files: Files) -> tuple[Field, ...]:
     for f in law:
         table, _, name = f.key.rpartition(".")
         part = table.rpartition(".")[2]
-        moves = table.startswith(("noise.process", "noise.drift", "pid"))
+        moves = table.startswith(("noise.process", "noise.drift", "pid", "structure"))
         if part in ("state", "integral") and f"weights.{part}.{name}" in weighted:
             moves = table.startswith("weights" if f"bases.{part}" in plain else "bases")
         if moves and f.kind == "log" and f.value:
