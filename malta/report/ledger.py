@@ -321,7 +321,7 @@ def _distance(bound: float, value: float) -> str:
     """
     if value == bound:
         return ""
-    if bound == 0 or value * bound < 0:
+    if bound == 0 or (value != 0 and (value < 0) != (bound < 0)):  # a product may underflow
         return "on the other side of zero" if bound else "other than zero"
     ratio = abs(value / bound)
     if abs(ratio - 1) <= CLOSE + ROUNDING:
