@@ -205,8 +205,8 @@ def block_size(plan: Plan, session: Session) -> int:
     if workers is not None and workers < 1:
         raise InputError("campaign", "workers", str(workers), "at least 1")
     size = block or (BLOCK if plan.law == "own" and (compiled.compiler() or cluster) else SLOW_BLOCK)
-    if size < 1 or size % compiled.LANES:
-        raise InputError("campaign", "block", f"{size} runs", f"a multiple of {compiled.LANES}")
+    if size < 1 or size % compiled.MOST_LANES:
+        raise InputError("campaign", "block", f"{size} runs", f"a multiple of {compiled.MOST_LANES}")
     while not block and BLOCK <= size < LARGE_BLOCK and plan.samples > FILES * size:
         size *= 2
     return size

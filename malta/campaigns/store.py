@@ -39,7 +39,7 @@ from malta.errors import InputError
 from malta.files import file_exists, read_file, remove_leftovers, replace_files, writer
 from malta.firmware.flight import engine_of_c
 from malta.simulation.engine.batch import is_compiled, simulate_many
-from malta.simulation.engine.compiled import LANES
+from malta.simulation.engine.compiled import MOST_LANES
 from malta.simulation.engine.digest import LARGEST_FIGURE, Batch, verdicts
 from malta.simulation.experiments import Progress
 from malta.simulation.scenario import Scenario
@@ -92,7 +92,7 @@ def fly(
 ) -> Block:
     """Simulate the `count` runs of a plan from run `first` on.
 
-    first : a multiple of LANES, so that a run has the same place in its group of machines in every block
+    first : a multiple of MOST_LANES, so that a run has the same place in its group of machines in every block
     workers : threads; None: one for each core
     """
     machines = draw_machines(plan, first, count)
@@ -167,8 +167,8 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], int]:
     for key, expected in (("schema", SCHEMA), ("version", VERSION)):
         if content.get(key) != expected:
             raise InputError(path, key, repr(content.get(key, "nothing")), repr(expected))
-    if not isinstance(size, int) or size < 1 or size % LANES:
-        raise InputError(path, "block", repr(size), f"a multiple of {LANES}")
+    if not isinstance(size, int) or size < 1 or size % MOST_LANES:
+        raise InputError(path, "block", repr(size), f"a multiple of {MOST_LANES}")
     return content, size
 
 

@@ -96,7 +96,7 @@ def test_who_is_told_may_stop(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_numbers_in_lanes_are_those_of_the_whole_array() -> None:
-    own = {2: np.arange(11.0), 0: -np.arange(11.0)}
+    own = {2: np.arange(2 * LANES - 5.0), 0: -np.arange(2 * LANES - 5.0)}
     same = np.array([9.0, 0.5, 9.0])
     numbers, whole = numbers_in_lanes(same, own, 2), repeat_in_lanes(same, own, 2)
     assert np.array_equal(numbers.own, whole[:, numbers.places])

@@ -118,7 +118,6 @@ def _note(sentence: str) -> None:
     logging.getLogger("malta").warning(sentence)
 
 
-LANES = 8
 PATIENCE = 300.0  # s for a compilation, which takes some seconds
 FLAGS = (
     *("-std=gnu11", "-O2", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
@@ -152,6 +151,12 @@ def _processor() -> str:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return "".join(sorted({x for x in lines if x.startswith(("flags", "model name", "Features"))}))
     return platform.processor() + platform.machine()
+
+
+# Doubles of one register of the processor, or two of them: more make text that is compiled for four times as long and
+# flies slower.
+LANES = 8 if "avx512dq" in _processor() else 4
+MOST_LANES = 8  # blocks of runs are multiples of it, whatever the processor
 
 
 @cache

@@ -33,17 +33,28 @@ enum { PADDED = (2 * COLUMNS + LANES - 1) / LANES * LANES };
     real x = row[i], y = row[j]; \
     row[i] = MIXED(x, y, low), row[j] = MIXED(x, y, high); \
   }
+#if LANES == 8
 #define EVEN 0, 8, 2, 10, 4, 12, 6, 14
 #define ODD 1, 9, 3, 11, 5, 13, 7, 15
 #define PAIRS 0, 1, 8, 9, 4, 5, 12, 13
 #define OTHERS 2, 3, 10, 11, 6, 7, 14, 15
 #define FRONT 0, 1, 2, 3, 8, 9, 10, 11
 #define BACK 4, 5, 6, 7, 12, 13, 14, 15
-static inline void transpose(real *row) { /* LANES is 8 */
+static inline void transpose(real *row) {
   TURN(0, 1, EVEN, ODD) TURN(2, 3, EVEN, ODD) TURN(4, 5, EVEN, ODD) TURN(6, 7, EVEN, ODD)
   TURN(0, 2, PAIRS, OTHERS) TURN(1, 3, PAIRS, OTHERS) TURN(4, 6, PAIRS, OTHERS) TURN(5, 7, PAIRS, OTHERS)
   TURN(0, 4, FRONT, BACK) TURN(1, 5, FRONT, BACK) TURN(2, 6, FRONT, BACK) TURN(3, 7, FRONT, BACK)
 }
+#else /* 4 */
+#define EVEN 0, 4, 2, 6
+#define ODD 1, 5, 3, 7
+#define FRONT 0, 1, 4, 5
+#define BACK 2, 3, 6, 7
+static inline void transpose(real *row) {
+  TURN(0, 1, EVEN, ODD) TURN(2, 3, EVEN, ODD)
+  TURN(0, 2, FRONT, BACK) TURN(1, 3, FRONT, BACK)
+}
+#endif
 static inline void look_up(const Grid *g, real at, real *v) {
   real u = larger(smaller((at - g->first) * g->per_metre, (real){0} + (double)(g->n - 2)), (real){0});
   whole index = __builtin_convertvector(u, whole);

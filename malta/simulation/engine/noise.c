@@ -20,6 +20,13 @@ static bits64 split_mix(bits64 key, uint64_t count) {
 #define CHOSEN(x, y, ...) __builtin_shuffle(x, y, (bits32){__VA_ARGS__})
 #define UNCONTRACTED __attribute__((noinline, optimize("fp-contract=off")))
 #endif
+#if LANES == 8
+#define ODD_WORDS 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31
+#define EVEN_WORDS 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30
+#else /* 4 */
+#define ODD_WORDS 1, 3, 5, 7, 9, 11, 13, 15
+#define EVEN_WORDS 0, 2, 4, 6, 8, 10, 12, 14
+#endif
 #if defined(__AVX512F__) && LANES == 8 /* macros: nothing is inlined where other options hold */
 #define ROOT(x) ((single)_mm512_sqrt_ps((__m512)(x)))
 #define WIDENED(x) ((real)_mm512_cvtps_pd((__m256)(x)))
@@ -40,8 +47,8 @@ static UNCONTRACTED void draw(bits64 key, uint64_t count, const real *scale, rea
 #pragma GCC unroll 8
   for (int j = 0; j < 2 * OUTPUTS; j += 2) {
     bits32 x = (bits32)split_mix(key, count + j), w = (bits32)split_mix(key, count + j + 1);
-    bits32 high = CHOSEN(x, w, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
-    bits32 low = CHOSEN(x, w, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+    bits32 high = CHOSEN(x, w, ODD_WORDS);
+    bits32 low = CHOSEN(x, w, EVEN_WORDS);
     /* u = m 2^k with m from sqrt(1/2) to sqrt(2); log m by a polynomial, relative error 2e-7 */
     bits32 m = (bits32)__builtin_convertvector(high | 1, single);
     whole32 k = (whole32)(m - 0x3f3504f3u) >> 23;
