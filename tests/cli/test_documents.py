@@ -19,7 +19,7 @@ from malta.units import distinct, identifier, unit_factor, unit_suffix
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
-TABLE2 = "design/gains/table2.json"
+TABLE2, HALBACH = "design/gains/table2.json", "design/gains/halbach.json"
 FEW: dict[str, dict[str, Any]] = {"capture": {"points": 5}, "supervised-faults": {"only": "stuck"}}
 SI = re.compile(r"(_(1|s2?|m2?|A|rad|Hz|N|J|W|V|kg|share|per|samples))+$")
 
@@ -169,16 +169,16 @@ def test_studies(run: Run, tmp_path: Path, name: str, arguments: list[str]) -> N
 
 @pytest.mark.slow
 def test_the_others(run: Run, tmp_path: Path) -> None:
-    said = run("design", "design/table2.toml", "--json", "--out", tmp_path, "--figures", tmp_path)
+    said = run("design", "design/calibrated.toml", "--json", "--out", tmp_path, "--figures", tmp_path)
     assert document(said, "design-output")["designs"][0]["merits"]["rise_s"] > 0
     certificate = tmp_path / "c.json"
-    said = run("verify", TABLE2, "--uncertain", "m=10%", "--certificate", certificate, "--json")
+    said = run("verify", HALBACH, "--uncertain", "m=10%", "--certificate", certificate, "--json")
     assert document(said, "verify-output")["robust"]["travel"]["lower"] > 1
-    same = ("--gains", TABLE2, "--uncertain", "m=10%")
+    same = ("--gains", HALBACH, "--uncertain", "m=10%")
     assert document(run("check", certificate, *same, "--json"), "check-output")["compared"]
-    document(run("export", TABLE2, "--out", tmp_path / "c", "--json"), "export-output")
-    document(run("report", TABLE2, "--no-proof", "--out", tmp_path / "r.html", "--json"), "report-output")
-    assert document(run("tune", "design/robust.toml", "--check", "--json"), "tune-output")["search"] is None
+    document(run("export", HALBACH, "--out", tmp_path / "c", "--json"), "export-output")
+    document(run("report", HALBACH, "--no-proof", "--out", tmp_path / "r.html", "--json"), "report-output")
+    assert document(run("tune", "examples/ball/design/ball.toml", "--check", "--json"), "tune-output")["search"] is None
 
 
 @pytest.mark.slow

@@ -539,7 +539,7 @@ def test_a_long_proof_says_where_it_is(run: Run, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["calibrated", "robust", "tubular_pid", "halbach_late", "halbach_pid"])
+@pytest.mark.parametrize("name", ["robust", "tubular_pid", "halbach_late", "halbach_pid"])
 def test_shipped_designs(tmp_path: Path, name: str) -> None:
     path, content = shipped(name, tmp_path)
     own = {p["name"]: 0.2 for p in content["claim"]["parameters"] if p["down"]}

@@ -204,7 +204,7 @@ def test_colours_turn_and_unprintable_characters_are_marked() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["robust", "halbach"])
+@pytest.mark.parametrize("name", ["calibrated", "halbach"])
 def test_the_margins_in_a_report_are_those_of_verify(name: str, tmp_path: Path, run: Run) -> None:
     gains, out = ROOT / "design" / "gains" / f"{name}.json", tmp_path / "page.html"
     assert run("report", gains, "--out", out).code == 0
@@ -222,7 +222,7 @@ def test_the_margins_in_a_report_are_those_of_verify(name: str, tmp_path: Path, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["robust", "planar", "tubular_pid"])
+@pytest.mark.parametrize("name", ["planar", "tubular_pid"])
 def test_the_report_of_a_shipped_design_on_screens_and_paper(
     name: str, tmp_path: Path, browser: Any, run: Run
 ) -> None:
@@ -275,7 +275,7 @@ def test_an_unstable_loop_has_a_page_that_says_so(tmp_path: Path, run: Run) -> N
 
 @pytest.mark.slow
 def test_a_campaign_and_the_requirements_stand_in_the_page(tmp_path: Path, run: Run) -> None:
-    gains, folder, out = ROOT / "design" / "gains" / "robust.json", tmp_path / "c", tmp_path / "page.html"
+    gains, folder, out = ROOT / "design" / "gains" / "halbach_pid.json", tmp_path / "c", tmp_path / "page.html"
     report = "report", gains, "--no-proof", "--campaign", folder, "--out", out
     assert run("campaign", gains, "--samples", "64", "--out", folder).code == 0
     assert run(*report).code == 0
@@ -286,7 +286,7 @@ def test_a_campaign_and_the_requirements_stand_in_the_page(tmp_path: Path, run: 
     lights = cells_of(html, "[specification] of the design file")[1:]
     asked = {row[1]: row[0] for row in lights}
     assert asked["peak sensitivity"].startswith("✓")
-    assert len(lights) > 30
+    assert len(lights) > 8
     before = out.read_bytes()
     assert run(*report).code == 0
     assert out.read_bytes() == before

@@ -351,7 +351,7 @@ def test_the_front_trades_margin_for_noise(
     monkeypatch.setattr(lqg, "FRONT", (0.65, 0.95))
     asked = ASKED
     radial = replace(spec, specification=asked, delays=(0,), search=spec.search[:8])
-    found = tuned(radial, effort=Effort(generations=0, polish=0, front=20))
+    found = tuned(radial, effort=Effort(generations=0, polish=0, front=8))
     margins = [one.figures["margin"] for one in found.front]
     assert margins == sorted(margins)
     assert any(one.values == found.trial.values for one in found.front)
