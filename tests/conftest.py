@@ -72,6 +72,8 @@ LONGEST = (
         "many_parameters",
     ),
     *(
+        "claims",
+        "identification",
         "export_cli",
         "firmware_trials",
         "firmware_misra",
@@ -83,16 +85,21 @@ LONGEST = (
 )
 
 
+# Modules whose fixtures take longest: all their tests run in one worker, which makes them once.
+TOGETHER = ("claims", "identification", "measure", "requirements", "tune", "tune_pid")
 LISTED = frozenset((ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").splitlines())
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that were measured to take long are `slow` too: see seconds.py."""
+    """Tests that were measured to take long are `slow` too: see seconds.py. The longest modules come first."""
     for item in items:
         if item.nodeid in LISTED:
             item.add_marker(pytest.mark.slow)
             item.add_marker(pytest.mark.listed)
+        module = item.path.stem.removeprefix("test_")
+        if module in TOGETHER:
+            item.add_marker(pytest.mark.xdist_group(module))
     items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONGEST)
 
 
