@@ -128,6 +128,7 @@ def _order(member: Mapping[str, int], block: int, blocks: int, path: Path) -> An
     return (begin + np.arange(count)) % rows
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of damaged bytes; what is no reading is refused
 def decode_dump(content: bytes, path: Path) -> Any:
     """Head, times, tables and headings of a dump, as `malta.read_log` has them of every file.
 
@@ -152,8 +153,7 @@ def decode_dump(content: bytes, path: Path) -> Any:
     if "in.i" in given and "in.link" in given and "out.command" in given:
         tables["i"], headings["i"] = readings("in.i"), given["in.i"]
         middle = 0.5 if given["out.command"][0].startswith("d_") else 0.0
-        with np.errstate(over="ignore", invalid="ignore"):  # of damage; what is no reading is refused
-            tables["u"] = (np.asarray(rows["out.command"], dtype=float) - middle) * rows["in.link"]
+        tables["u"] = (np.asarray(rows["out.command"], dtype=float) - middle) * rows["in.link"]
         headings["u"] = [h.replace("i_", "u_", 1).replace("[A]", "[V]") for h in _currents(given)]
     tables["reference"] = np.asarray(rows["reference.p"], dtype=float)
     headings["reference"] = given["in.y"]

@@ -178,7 +178,10 @@ def test_the_others(run: Run, tmp_path: Path) -> None:
     assert document(run("check", certificate, *same, "--json"), "check-output")["compared"]
     document(run("export", HALBACH, "--out", tmp_path / "c", "--json"), "export-output")
     document(run("report", HALBACH, "--no-proof", "--out", tmp_path / "r.html", "--json"), "report-output")
-    assert document(run("tune", "examples/ball/design/ball.toml", "--check", "--json"), "tune-output")["search"] is None
+    assert (
+        document(run("tune", "examples/ball/design/ball.toml", "--check", "--json"), "tune-output")["search"]
+        is None
+    )
 
 
 @pytest.mark.slow

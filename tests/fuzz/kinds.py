@@ -25,6 +25,7 @@ from fuzz.records import (
     check_certificate,
     read_campaign,
     read_day,
+    read_dump_file,
     read_log_file,
     read_rare_event,
     read_run_file,
@@ -64,14 +65,15 @@ def _of_form(suffix: str) -> Read:
 
 
 KINDS: dict[str, Kind] = {
-    "gains.json": Kind(cases(GAINS), _of_form(".json"), 220),
+    "gains.json": Kind(cases(GAINS), _of_form(".json"), 200),
     "gains.npz": Kind(cases(GAINS), _of_form(".npz"), 200),
     "gains.mat": Kind(cases(GAINS), _of_form(".mat"), 200),
-    "design": Kind(cases((*DESIGNS, *EXAMPLES)), read_design_file, 260),
-    "data": Kind(cases((*DATA, *EXAMPLES)), read_data_file, 220),
+    "design": Kind(cases((*DESIGNS, *EXAMPLES)), read_design_file, 240),
+    "data": Kind(cases((*DATA, *EXAMPLES)), read_data_file, 200),
     "campaign": Kind(cases(("manifest", "block")), read_campaign, 150),
     "certificate": Kind(cases(("continuous", "sampled")), check_certificate, 180),
     "log": Kind(cases(("csv", "npz")), read_log_file, 100),
+    "dump": Kind(cases(("dump",)), read_dump_file, 60),
     "run": Kind(cases(("run",)), read_run_file, 40),
     "rare": Kind(cases(("record", "repetition")), read_rare_event, 40),
     "export": Kind(cases(("linear",)), export_as_c, 20),

@@ -21,6 +21,8 @@ from malta.campaigns.plan import Plan
 from malta.campaigns.rare import rare_event, read_design_point, write_event
 from malta.campaigns.run import campaign
 from malta.campaigns.store import MANIFEST, block_name, read_plan, seal
+from malta.firmware.ring import LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
+from malta.firmware.signals import Target
 from malta.identification.calibration import Estimate
 from malta.identification.commission import Commissioning, Entry, Finding, read_journal
 from malta.proof.certificate import certificate, checked_file
@@ -261,6 +263,42 @@ def _log_npz(tree: Any, case: Case) -> bytes:
     arrays: dict[str, Any] = {"t": rows[:, 0], "y": rows[:, 1:2], "y_columns": headings[1:2]}
     np.savez(buffer, **arrays, v=rows[:, 2:], v_columns=headings[2:])
     return cut(buffer.getvalue(), case.cuts)
+
+
+@cache
+def _dump() -> tuple[Ring, dict[str, Any]]:
+    """The ring of the Halbach motor, and its dump as tables: members of the head, lines of text, samples."""
+    controller = malta.gains.read(ROOT / "design" / "gains" / "halbach.json")
+    ring = ring_of(Target(controller, "float", logged=4.0), "0" * 64)
+    members = dict.fromkeys((name for name, _ in MEMBERS), 0) | {"next": 60, "watched": -1, "triggered": -1}
+    rows = np.random.default_rng(1).normal(size=(ring.rows + 1, ring.numbers)).round(3)
+    return ring, {"members": members, "text": [line.split("\t") for line in ring.text], "rows": rows.tolist()}
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _dump_bytes(ring: Ring, tree: Any) -> bytes:
+    lines = ["\t".join(map(str, line)) for line in tree["text"]]
+    text = "\n".join([*lines, ""]).encode(errors="surrogatepass")
+    text += bytes(-len(text) % 8)
+    head = np.array([LAYOUT, len(text), *tree["members"].values()], "<i4")
+    states = bytes(ring.real_bytes * (1 + ring.blocks * ring.remembered))
+    order = np.array(ORDER, "<u4").tobytes()
+    after = states[: ring.real_bytes] + text + states[ring.real_bytes :]
+    return MAGIC + order + head.tobytes() + after + np.array(tree["rows"], "<f4").tobytes()
+
+
+def read_dump_file(case: Case, folder: Path) -> Ended | None:
+    """Read the edited dump of a ring buffer as a log, and show it."""
+    ring, tree = _dump()
+    path = folder / "mine.dump"
+    try:
+        path.write_bytes(cut(_dump_bytes(ring, edited(tree, case.edits)), case.cuts))
+    except Exception:  # numpy does not write every array
+        return None
+    ended = observe(lambda: malta.read_log(path), folder, [str(path)])
+    if ended.code == 0 and not np.isfinite(ended.value.t).all():
+        raise Defect("times that are not finite were read")
+    return observe(line("log", str(path)), folder, [str(path)]) if ended.code == 0 else ended
 
 
 @cache

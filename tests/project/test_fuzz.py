@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from hypothesis import Phase
 
+from fuzz.cases import Case
+from fuzz.edits import Cut
 from fuzz.kinds import KINDS
 from fuzz.session import cases_of
 
@@ -28,6 +30,13 @@ def test_input_is_read_or_refused_in_a_sentence(name: str) -> None:
 def test_much_input_is_read_or_refused_in_a_sentence(name: str) -> None:
     read = _read_all(name, KINDS[name].share)
     assert read > KINDS[name].share / 2, "most cases have to reach the reader"
+
+
+def test_shifted_samples_of_a_dump_are_refused_without_a_warning(tmp_path: Path) -> None:
+    """A byte more in the middle: some numbers are signalling NaNs, which numpy warns of where it converts them."""
+    ended = KINDS["dump"].read(Case("dump", cuts=(Cut("insert", 0.5, 2),)), tmp_path)
+    assert ended is not None
+    assert ended.code == 2
 
 
 def _read_all(name: str, count: int) -> int:

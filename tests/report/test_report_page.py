@@ -275,7 +275,11 @@ def test_an_unstable_loop_has_a_page_that_says_so(tmp_path: Path, run: Run) -> N
 
 @pytest.mark.slow
 def test_a_campaign_and_the_requirements_stand_in_the_page(tmp_path: Path, run: Run) -> None:
-    gains, folder, out = ROOT / "design" / "gains" / "halbach_pid.json", tmp_path / "c", tmp_path / "page.html"
+    gains, folder, out = (
+        ROOT / "design" / "gains" / "halbach_pid.json",
+        tmp_path / "c",
+        tmp_path / "page.html",
+    )
     report = "report", gains, "--no-proof", "--campaign", folder, "--out", out
     assert run("campaign", gains, "--samples", "64", "--out", folder).code == 0
     assert run(*report).code == 0
