@@ -20,8 +20,8 @@ from malta.firmware.signals import Target, fidelity_of
 from malta.synthesis.controller import Controller
 
 PRECISIONS: tuple[Precision, ...] = ("double", "float")
-# A shipped design of each kind of law and machine, in one precision each, by turns. The text of table2 and calibrated is
-# that of robust with other numbers, that of halbach_late has all that halbach's has; planar_pid is one of
+# A shipped design of each kind of law and machine, in one precision each, by turns. The text of table2 and calibrated
+# is that of robust with other numbers, that of halbach_late has all that halbach's has; planar_pid is one of
 # test_unusual_exports.
 KINDS: tuple[tuple[str, Precision], ...] = (
     *(("halbach_late", "float"), ("halbach_pid", "double"), ("robust", "double")),
