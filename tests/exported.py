@@ -25,7 +25,7 @@ PRECISIONS: tuple[Precision, ...] = ("double", "float")
 # test_unusual_exports.
 KINDS: tuple[tuple[str, Precision], ...] = (
     *(("halbach_late", "float"), ("halbach_pid", "double"), ("robust", "double")),
-    *(("robust_observer", "float"), ("tubular_pid", "double"), ("planar", "float")),
+    *(("robust_observer", "float"), ("tubular_pid", "double"), ("planar", "double")),
 )
 EXACT = ("-std=c99", "-ffp-contract=off", "-fno-math-errno")
 START = Path(__file__).parent / "targets"  # of a program on a Cortex-M

@@ -16,7 +16,7 @@ from malta.firmware.vectors import out_of_reach
 LINES = 95.0  # % of each file that a run executes
 
 
-@pytest.mark.parametrize(("name", "precision"), of_each_kind("halbach_late"))
+@pytest.mark.parametrize(("name", "precision"), of_each_kind())
 def test_it_reaches_what_the_design_has(name: str, precision: Precision, tmp_path: Path) -> None:
     """Lines of the law, the pieces and the supervisor; each monitor by its name, or why it is not there."""
     require("gcc", "gcov")
