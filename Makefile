@@ -29,7 +29,7 @@ test: $(VENV)/dev
 	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow"
 
 slow: $(VENV)/dev
-	$(BIN)/python -m pytest -n auto --dist loadgroup -m slow
+	$(BIN)/python -m pytest -n auto --dist loadfile -m slow
 
 times: $(VENV)/dev  # measures the fast tests, and lists those that take long as slow
 	PYTHONPATH=tests $(BIN)/python -m seconds

@@ -58,7 +58,8 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.loadscopereorder = False  # pytest-xdist keeps the order below
 
 
-# Modules whose tests take longest: parallel workers begin with them, so that none of them is left alone at the end.
+# Modules whose tests take longest: parallel workers, which take whole modules, begin with them, so that none of them is
+# left alone at the end.
 LONGEST = (
     *(
         "chain",
@@ -85,8 +86,6 @@ LONGEST = (
 )
 
 
-# Modules whose fixtures take longest: all their tests run in one worker, which makes them once.
-TOGETHER = ("claims", "identification", "measure", "requirements", "tune", "tune_pid")
 LISTED = frozenset((ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").splitlines())
 
 
@@ -97,9 +96,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if item.nodeid in LISTED:
             item.add_marker(pytest.mark.slow)
             item.add_marker(pytest.mark.listed)
-        module = item.path.stem.removeprefix("test_")
-        if module in TOGETHER:
-            item.add_marker(pytest.mark.xdist_group(module))
     items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONGEST)
 
 

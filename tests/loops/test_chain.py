@@ -57,7 +57,7 @@ STAGES = ["LQR", "LQI", "LQG", "LQGI", "+ current loops", "sampled", "machine"]
 DESIGNS = ("table2", "calibrated")
 
 
-SLOW = (pytest.mark.slow, pytest.mark.xdist_group("chain"))  # in one worker, which computes each chain once
+SLOW = pytest.mark.slow
 CHAINED = [pytest.param(name, marks=SLOW) for name in DESIGNS]
 
 
@@ -120,7 +120,6 @@ def test_places_stand_for_both_sides_of_the_travel(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("chain")
 def test_what_is_proven_over_the_travel_is_proven_at_its_places() -> None:
     """The loss that is found beside the travel's witness is that of a search at the place alone."""
     c = gains.read("design/gains/calibrated.json")
@@ -358,7 +357,6 @@ def _texts(figure: Figure) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("chain")
 def test_the_figure_names_what_it_shows() -> None:
     found = chain_of("calibrated")
     worst = {"x1": Gain(2.4, 2.41, 500.0, {}, 1, 0.0), "z": Gain(1.9, 1.91, 90.0, {}, 1, 0.0)}
@@ -387,7 +385,6 @@ def test_the_figure_names_what_it_shows() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("chain")
 def test_unstable_loops_and_unproven_margins_are_drawn() -> None:
     found = chain_of("calibrated")
     c = gains.read("design/gains/calibrated.json")

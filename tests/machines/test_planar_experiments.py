@@ -506,7 +506,6 @@ def test_an_axis_that_cannot_brake_is_refused(lqg: Design) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("planar")  # where its margin is proven once
 def test_design(run: Run, tmp_path: Path) -> None:
     """From the design file to gain files and a figure: they are the shipped ones, bit for bit but for dates."""
     code, out, _ = run("design", "design/planar.toml", "--out", tmp_path, "--figures", tmp_path)

@@ -18,11 +18,6 @@ from malta.report import new_figure, save
 pytestmark = pytest.mark.usefixtures("proven_once")
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
-SLOW = {name: [pytest.mark.slow] for name in ("03_experiments", "05_halbach", "06_planar", "08_firmware")} | {
-    "04_robustness": [pytest.mark.slow, pytest.mark.xdist_group("chain")]  # where its margins are proven once
-}
-
-
 PAGES = [*NOTEBOOKS, *sorted((ROOT / "examples").glob("*/notebook.py"))]
 DRAWING = (
     "stroke",
@@ -66,10 +61,7 @@ def test_there_are_notebooks() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "notebook",
-    [pytest.param(n, marks=SLOW.get(n.stem, []), id=n.stem) for n in NOTEBOOKS],
-)
+@pytest.mark.parametrize("notebook", [pytest.param(n, id=n.stem) for n in NOTEBOOKS])
 def test_notebook_runs_from_its_own_folder(notebook: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As Jupyter starts it."""
     monkeypatch.chdir(notebook.parent)

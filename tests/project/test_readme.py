@@ -82,12 +82,7 @@ def _is_noisy(machine: str, subject: str) -> bool:
         pytest.param("tubular", DESIGNS["tubular"], id="tubular"),
         pytest.param("tubular", OBSERVED, marks=pytest.mark.slow, id="observed"),
         pytest.param("halbach", DESIGNS["halbach"], marks=pytest.mark.slow, id="halbach"),
-        pytest.param(
-            "planar",
-            DESIGNS["planar"],
-            marks=[pytest.mark.slow, pytest.mark.xdist_group("planar")],
-            id="planar",
-        ),
+        pytest.param("planar", DESIGNS["planar"], marks=pytest.mark.slow, id="planar"),
     ],
 )
 def test_the_table_of_claims_is_computed(
