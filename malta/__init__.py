@@ -62,9 +62,9 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.simulation.simulate import simulate as simulate
     from malta.synthesis.design_file import read_design as read_design
     from malta.synthesis.lqg import lqg as lqg
-    from malta.synthesis.lqg import synthesize as synthesize
     from malta.synthesis.lqg import weights as weights
     from malta.synthesis.spec import Spec as Spec
+    from malta.synthesis.synthesize import synthesize as synthesize
     from malta.tuning.tune import tune as tune
     from malta.tuning.verify import verify as verify
     from malta.units import in_unit as in_unit

@@ -32,7 +32,7 @@ from malta.simulation.engine.engines import evaluate
 from malta.simulation.experiments.catalogue import cases_of, main_job, series_of, step_cases
 from malta.simulation.inputs import feedforward, motion_of, past_forces
 from malta.simulation.period import state_reference
-from malta.synthesis.lqg import synthesize
+from malta.synthesis.synthesize import synthesize
 from malta.units import in_unit
 
 if TYPE_CHECKING:

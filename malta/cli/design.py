@@ -123,7 +123,7 @@ def _run_design(
     from malta.model.data import published_beside
     from malta.model.linearize import linearize
     from malta.simulation.experiments.catalogue import main_job
-    from malta.synthesis.lqg import synthesize
+    from malta.synthesis.synthesize import synthesize
 
     spec = read_changed_design(file, changes)
     if spec.structure is not None:

@@ -37,7 +37,7 @@ from malta.model.linearize import LinearModel, linearize
 from malta.model.machines import require_part
 from malta.simulation.experiments import Experiment, Progress, progress_of_part
 from malta.simulation.experiments.catalogue import experiment
-from malta.synthesis.lqg import synthesize
+from malta.synthesis.synthesize import synthesize
 from malta.units import in_unit
 
 if TYPE_CHECKING:

@@ -1,6 +1,6 @@
 """Laws of a given structure, tuned on figures with exact derivatives and proven; H-infinity laws of full order.
 
-elements   what is tuned: gains, PIDs, leads, notches, transfer functions, observers, state spaces, diagrams of them
+elements   what is tuned: gains, PIDs, leads, notches, transfer functions, observers, LQGs, state spaces, diagrams
 goals      what is asked for: sensitivity, disks, gains, noise, tracking, poles, a stable law
 tune       from a start to a proof: goals on models, worst parameters from proofs, until they close
 tune_design  the same of a design file with [structure]
@@ -39,5 +39,6 @@ if TYPE_CHECKING:
     from malta.synthesis.elements import pid as pid
     from malta.synthesis.elements import states as states
     from malta.synthesis.elements import transfer as transfer
+    from malta.synthesis.tunable_lqg import lqg as lqg
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

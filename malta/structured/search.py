@@ -41,8 +41,11 @@ class Task:
 
     def look(self, x: FloatArray) -> Look | None:
         """All figures at x; None where a model with goals is unstable."""
-        theta, slope = self.structure.theta(x)
         found: list[Slope] = []
+        try:
+            theta, slope = self.structure.theta(x)
+        except CheckError:  # weights of an LQG so far apart that nothing solves its equations
+            return None
         for model in self.models:
             loop = ClosedLoop(model, theta)
             try:
@@ -61,9 +64,9 @@ class Task:
 
     def look_stable(self, x: FloatArray) -> Look | None:
         """The growth of all models alone, which a first search makes small."""
-        theta, slope = self.structure.theta(x)
         found: list[Slope] = []
         try:
+            theta, slope = self.structure.theta(x)
             for model in self.models:
                 figures = self._stable(ClosedLoop(model, theta))
                 found += by_x(figures, slope, model.name, hard=False)

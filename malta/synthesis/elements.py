@@ -27,6 +27,11 @@ if TYPE_CHECKING:
 
 CALLER = "structured"
 Matrices = tuple[Any, Any, Any, Any]  # A, B, C and D in CasADi
+Solve = Callable[["FloatArray"], tuple["FloatArray", "FloatArray"]]
+
+
+def _themselves(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return values, np.eye(len(values))
 
 
 @dataclass(frozen=True)
@@ -45,9 +50,13 @@ class Parameter:
     low: float = -math.inf
     high: float = math.inf
 
-    def value(self, x: Any) -> Any:
-        """The value at x, of numbers or CasADi symbols."""
-        return self.start + self.scale * x if self.scale else self.start * ca.exp(x)
+    def value(self, x: float) -> float:
+        """The value at x."""
+        return self.start + self.scale * x if self.scale else self.start * float(ca.exp(x))
+
+    def slope(self, x: float) -> float:
+        """The derivative of the value by x."""
+        return self.scale or self.value(x)
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -69,7 +78,9 @@ class Element:
 
     name : of the element; parameters are called "name.parameter"
     parameters : what is searched, with the values at which a search starts
-    matrices : CasADi values of the parameters, in their order -> A, B, C and D
+    matrices : CasADi values of the parameters, in their order, or of what is solved for -> A, B, C and D
+    solve : values of the parameters -> what `matrices` takes, and its derivative by them; the values themselves, but
+        of an LQG, whose gains solve two Riccati equations
 
     >>> from malta import structured
     >>> law = structured.pid("axial", Kp=2e3, Ki=1e4, Kd=5.0, filter=1e-4)
@@ -81,6 +92,7 @@ class Element:
     name: str
     parameters: tuple[Parameter, ...]
     matrices: Callable[[Sequence[Any]], Matrices] = field(repr=False)
+    solve: Solve = field(default=_themselves, repr=False)
 
     @property
     def values(self) -> dict[str, float]:
@@ -88,9 +100,14 @@ class Element:
         return {p.name if "." in p.name else f"{self.name}.{p.name}": p.start for p in self.parameters}
 
     @cached_property
+    def numbers(self) -> FloatArray:
+        """What `matrices` takes at the present values."""
+        return self.solve(np.array([p.start for p in self.parameters]))[0]
+
+    @cached_property
     def system(self) -> System:
         """The element with its present values."""
-        made = self.matrices([ca.DM(p.start) for p in self.parameters])
+        made = self.matrices([ca.DM(number) for number in self.numbers])
         return System(*(np.atleast_2d(np.array(ca.DM(M), dtype=float)) for M in made))
 
     @property
@@ -112,7 +129,7 @@ class Element:
 
     def __mul__(self, other: Element) -> Element:
         """This element behind another."""
-        k = len(self.parameters)
+        k = len(self.numbers)
 
         def matrices(values: Sequence[Any]) -> Matrices:
             A1, B1, C1, D1 = other.matrices(values[k:])
@@ -120,25 +137,29 @@ class Element:
             A = ca.blockcat([[A2, B2 @ C1], [ca.DM(A1.shape[0], A2.shape[0]), A1]])
             return A, ca.vertcat(B2 @ D1, B1), ca.horzcat(C2, D2 @ C1), D2 @ D1
 
-        return Element(f"{self.name} {other.name}", _joined(self, other), matrices)
+        return Element(
+            f"{self.name} {other.name}", _joined(self, other), matrices, _side_by_side(self, other)
+        )
 
     def __add__(self, other: Element) -> Element:
         """This element beside another: the sum of their outputs."""
-        k = len(self.parameters)
+        k = len(self.numbers)
 
         def matrices(values: Sequence[Any]) -> Matrices:
             A1, B1, C1, D1 = self.matrices(values[:k])
             A2, B2, C2, D2 = other.matrices(values[k:])
             return ca.diagcat(A1, A2), ca.vertcat(B1, B2), ca.horzcat(C1, C2), D1 + D2
 
-        return Element(f"{self.name} + {other.name}", _joined(self, other), matrices)
+        return Element(
+            f"{self.name} + {other.name}", _joined(self, other), matrices, _side_by_side(self, other)
+        )
 
     def feedback(self, other: Element) -> Element:
         """This element with another in its negative feedback: self / (1 + other self).
 
         other : from the outputs of this element to its inputs
         """
-        k = len(self.parameters)
+        k = len(self.numbers)
 
         def matrices(values: Sequence[Any]) -> Matrices:
             A1, B1, C1, D1 = (ca.SX(M) for M in self.matrices(values[:k]))
@@ -152,7 +173,9 @@ class Element:
             A[:n1, n1:] = -B1 @ C2
             return A + back @ C, into + back @ D, C, D
 
-        return Element(f"{self.name} / {other.name}", _joined(self, other), matrices)
+        return Element(
+            f"{self.name} / {other.name}", _joined(self, other), matrices, _side_by_side(self, other)
+        )
 
 
 def _joined(*elements: Element) -> tuple[Parameter, ...]:
@@ -165,7 +188,19 @@ def _joined(*elements: Element) -> tuple[Parameter, ...]:
     return tuple(named)
 
 
-def _positive(
+def _side_by_side(*elements: Element) -> Solve:
+    """What several elements solve, each from its own parameters."""
+    ends = np.cumsum([len(e.parameters) for e in elements])[:-1]
+
+    def solve(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        own = zip(elements, np.split(values, ends), strict=True)
+        numbers, slopes = zip(*(e.solve(v) for e, v in own), strict=True)
+        return np.concatenate(numbers), linalg.block_diag(*slopes)
+
+    return solve
+
+
+def keep_sign(
     element: str, bounds: Mapping[str, tuple[float, float]] | None, **starts: float
 ) -> list[Parameter]:
     """Parameters that keep their sign. Raises InputError for zeros, and for bounds of others."""
@@ -200,7 +235,7 @@ def gain(name: str, value: float, *, bounds: Bounds | None = None) -> Element:
     0
     """
     none = ca.DM(0, 0), ca.DM(0, 1), ca.DM(1, 0)
-    return Element(name, tuple(_positive(name, bounds, value=value)), lambda v: (*none, v[0]))
+    return Element(name, tuple(keep_sign(name, bounds, value=value)), lambda v: (*none, v[0]))
 
 
 def pid(
@@ -247,7 +282,7 @@ def pid(
             D,
         )
 
-    return Element(name, tuple(_positive(name, bounds, **terms)), matrices)
+    return Element(name, tuple(keep_sign(name, bounds, **terms)), matrices)
 
 
 def lead(name: str, zero: float, pole: float, *, bounds: Bounds | None = None) -> Element:
@@ -269,7 +304,7 @@ def lead(name: str, zero: float, pole: float, *, bounds: Bounds | None = None) -
         share = v[1] / v[0]
         return -v[1], v[1], 1 - share, share
 
-    return Element(name, tuple(_positive(name, bounds, zero=zero, pole=pole)), matrices)
+    return Element(name, tuple(keep_sign(name, bounds, zero=zero, pole=pole)), matrices)
 
 
 def notch(
@@ -296,7 +331,7 @@ def notch(
         return A, ca.vertcat(0, 1), ca.horzcat(0, 2 * (zeta - damped) * w), ca.DM(1)
 
     terms = {"frequency": frequency, "depth": depth, "damping": damping}
-    return Element(name, tuple(_positive(name, bounds, **terms)), matrices)
+    return Element(name, tuple(keep_sign(name, bounds, **terms)), matrices)
 
 
 def _require_above_zero(element: str, **values: float) -> None:
@@ -523,13 +558,13 @@ class Structure:
 
     @cached_property
     def _theta(self) -> ca.Function:
-        """x -> [D C; B A], and its derivative by x."""
-        x = ca.SX.sym("x", len(self.parameters))
+        """What the elements solve -> [D C; B A], and its derivative by that."""
+        numbers = ca.SX.sym("numbers", sum(len(e.numbers) for e in self.elements))
         first, made = 0, {}
         for e in self.elements:
-            values = [p.value(x[first + k]) for k, p in enumerate(e.parameters)]
-            made[e.name] = [ca.SX(M) for M in e.matrices(values)]
-            first += len(values)
+            own = [numbers[first + k] for k in range(len(e.numbers))]
+            made[e.name] = [ca.SX(M) for M in e.matrices(own)]
+            first += len(own)
         (m, _), (_, p) = self.places[0].left.shape, self.places[0].right.shape
         D, A, B, C = ca.SX(m, p), list[Any](), list[Any](), list[Any]()
         for left, element, right in self.places:
@@ -537,12 +572,22 @@ class Structure:
             D = D + left @ d @ right
             A, B, C = [*A, a], [*B, b @ right], [*C, left @ c]
         theta = ca.densify(ca.blockcat([[D, ca.horzcat(*C)], [ca.vertcat(*B), ca.diagcat(*A)]]))
-        return ca.Function("theta", [x], [theta, ca.jacobian(theta, x)])
+        return ca.Function("theta", [numbers], [theta, ca.jacobian(theta, numbers)])
+
+    @cached_property
+    def _solve(self) -> Solve:
+        return _side_by_side(*self.elements)
 
     def theta(self, x: FloatArray) -> tuple[FloatArray, Any]:
-        """[D C; B A] of the continuous law at x, and its derivative by x: entries, column by column, x parameters."""
-        theta, slope = self._theta(x)
-        return np.array(theta), slope.sparse() if hasattr(slope, "sparse") else np.array(slope)
+        """[D C; B A] of the continuous law at x, and its derivative by x: entries, column by column, x parameters.
+
+        Raises CheckError where an LQG has no solution.
+        """
+        pairs = list(zip(self.parameters, x.tolist(), strict=True))
+        numbers, by_value = self._solve(np.array([p.value(one) for p, one in pairs]))
+        theta, slope = self._theta(numbers)
+        by_x = by_value * np.array([p.slope(one) for p, one in pairs])
+        return np.array(theta), slope.sparse() @ by_x
 
     def system(self, x: FloatArray) -> System:
         """The continuous law at x."""
@@ -556,9 +601,8 @@ class Structure:
         first = 0
         for e in self.elements:
             k = len(e.parameters)
-            numbers = (
-                float(ca.DM(p.value(v))) for p, v in zip(e.parameters, x[first : first + k], strict=True)
-            )
+            own = x[first : first + k].tolist()
+            numbers = (p.value(v) for p, v in zip(e.parameters, own, strict=True))
             values |= dict(zip(e.values, numbers, strict=True))
             first += k
         new = {e.name: e.at(values) for e in self.elements}

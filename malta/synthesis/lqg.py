@@ -25,8 +25,7 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, NamedTuple, get_args
 
 import numpy as np
 from scipy import linalg
@@ -42,7 +41,7 @@ from malta.synthesis.controller import (
     lagging_forces,
     stored_forces,
 )
-from malta.synthesis.feedforward import commutate_ahead, machine_part
+from malta.synthesis.feedforward import machine_part
 from malta.synthesis.filters import (
     Gains,
     Linear,
@@ -53,7 +52,6 @@ from malta.synthesis.filters import (
     with_lags,
 )
 from malta.synthesis.filters import kalman as kalman
-from malta.synthesis.pid import pid
 from malta.synthesis.riccati import (
     add_integrals,
     care,
@@ -64,10 +62,8 @@ from malta.synthesis.riccati import (
 )
 from malta.synthesis.spec import (
     Discretization,
-    Spec,
     Weights,
 )
-from malta.synthesis.structure import structured_controller
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -126,10 +122,9 @@ def obstacle(model: LinearModel, weights: Weights, Ts: float) -> str:
     """
     A = held(model).A
     states = [s.name for s in model.plant.design_states]
-    for mode in lost_modes(A, model.B):
-        return f"no force moves the mode {_mode_text(mode, states)}: a force that acts on it is missing"
-    for mode in lost_modes(A.T, model.C.T):
-        return f"no sensor sees the mode {_mode_text(mode, states)}: a measurement of it is missing"
+    reason = out_of_reach(A, model.B, model.C, states)
+    if reason:
+        return reason
     outputs = [s.name for s in model.plant.outputs]
     summed = integrals_of(model, weights).outputs
     if summed and _rank_at_rest(A, model.B, model.C[summed]) < len(A) + len(summed):
@@ -149,6 +144,15 @@ def obstacle(model: LinearModel, weights: Weights, Ts: float) -> str:
             f"the sample time of {Ts:.4g} s is too long for the unstable pole at {fastest:.4g} rad/s, which grows "
             f"{math.exp(min(fastest * Ts, 700)):.3g}-fold in it: at most about {0.3 / fastest:.1g} s"
         )
+    return ""
+
+
+def out_of_reach(A: FloatArray, B: FloatArray, C: FloatArray, states: Sequence[str]) -> str:
+    """A mode that is not stable and that no input moves, or no output sees, in one sentence; "" without one."""
+    for mode in lost_modes(A, B):
+        return f"no force moves the mode {_mode_text(mode, states)}: a force that acts on it is missing"
+    for mode in lost_modes(A.T, C.T):
+        return f"no sensor sees the mode {_mode_text(mode, states)}: a measurement of it is missing"
     return ""
 
 
@@ -192,7 +196,7 @@ def lqr(model: Linear, weights: Weights) -> FloatArray:
     >>> K.round(6).tolist()  # w_n = 2 rad/s: K1 = w_n^2, K2 = sqrt(2) w_n
     [[4.0, 2.828427]]
     """
-    _check_sizes(model, weights)
+    check_sizes(model, weights)
     return care(model.A, model.B, weights.Q, weights.R, "LQR").K
 
 
@@ -219,7 +223,7 @@ def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
     >>> K.round(3).tolist(), Ki.round(3).tolist()
     ([[3.375, 2.598]], [[2.0]])
     """
-    _check_sizes(model, weights)
+    check_sizes(model, weights)
     summed, Q_i = integrals_of(model, weights)
     n, k, Ki = len(model.A), len(summed), np.zeros((model.B.shape[1], len(model.C)))
     if not summed:
@@ -365,7 +369,7 @@ def lqg(
         raise InputError(
             "lqg", "drift", "integrals with a weight", "weights.integral all 0: one of them takes off loads"
         )
-    _check_sizes(model, weights)
+    check_sizes(model, weights)
     lag = model.plant.actuator.crossover if current_lag else None
     _require_lag(model, lag, discretization)
     try:
@@ -474,84 +478,6 @@ def _without_bases(
     return Weights(q, one(q), r, one(r), q_i, one(q_i), w, v, drift)
 
 
-@on_one_thread
-def synthesize(spec: Spec, model: LinearModel) -> Controller:
-    """Design the controller that a design file asks for.
-
-    spec : from `malta.read_design`
-    model : the machine's linear model at the design's operating point
-
-    Returns a Controller.
-
-    Raises InputError and CheckError, which name the file.
-
-    >>> import malta
-    >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> controller.name, controller.K.shape  # position, rate, and a stored force
-    ('ball', (1, 3))
-    """
-    named: dict[str, Any] = {
-        "name": spec.name,
-        "current_loop_delay": spec.current_loop_delay,
-        "position_feedforward": spec.position_feedforward,
-    }
-    try:
-        if spec.structure is not None:
-            del named["current_loop_delay"]
-            controller = structured_controller(model, spec.structure, spec.sample_time, **named)
-        elif spec.pid is not None:
-            controller = pid(model, spec.pid, spec.sample_time, **named)
-        else:
-            named["current_lag"] = spec.current_lag
-            controller = lqg(model, spec.weights, spec.sample_time, spec.discretization, spec.delay, **named)
-    except InputError as error:
-        raise InputError(spec.path, f"{error.where}: {error.field}", error.found, error.expected) from error
-    except (CheckError, np.linalg.LinAlgError) as error:
-        raise CheckError(f"{spec.path}: {error}") from error
-    if spec.inertia_feedforward != 1:
-        old = controller.feedforward
-        scaled = replace(old, inertia=spec.inertia_feedforward * np.asarray(old.inertia))
-        controller = replace(controller, feedforward=scaled)
-    if spec.commutation == "predicted":
-        try:
-            controller = commutate_ahead(controller, model)
-        except InputError as error:
-            raise InputError(spec.path, error.field, error.found, error.expected) from error
-    if spec.pause and not controller.integrating:
-        raise InputError(
-            spec.path, "pause", "a law without sums of errors", "one with integrals, or no pause"
-        )
-    references = np.array(spec.references) if spec.references else controller.references
-    return replace(
-        controller,
-        spec_sha256=spec.sha256,
-        pause=np.array(spec.pause),
-        braking=braking_errors(controller, spec.braking, spec.path),
-        references=references,
-    )
-
-
-def braking_errors(c: Controller, decelerations: Sequence[float], path: str | Path) -> FloatArray:
-    """Errors from which axes brake at these decelerations, m/s^2: a / rate^2, with the rate of approach of each axis.
-
-    Within them speed follows the error, v = rate times error, where rate = K_position / K_rate; beyond them it is the
-    speed from which the deceleration a stops, v^2 = 2 a (error - a / rate^2 / 2). Both meet with one slope.
-
-    Raises InputError for an axis whose own force does not answer its position and its rate.
-    """
-    found, half = np.array(decelerations), len(c.A) // 2
-    for k in np.flatnonzero(found):
-        near, damped = c.K[k, k], c.K[k, half + k] if half + k < len(c.A) else 0.0
-        if not (near > 0 and damped > 0):
-            name = c.measurements[k].name
-            raise InputError(
-                path, f"braking.{name}", "an axis without both", "a feedback of position and of rate"
-            )
-        found[k] /= (near / damped) ** 2
-    return found
-
-
 def _backward_euler(
     model: Linear, weights: Weights, Ts: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -600,7 +526,8 @@ def _sampled_regulator(
     return gain[:, : n + m * d], Ki
 
 
-def _check_sizes(model: Linear, weights: Weights) -> None:
+def check_sizes(model: Linear, weights: Weights) -> None:
+    """Raise InputError for weights and noise of other numbers than a model's states, inputs and outputs."""
     n, m, p = len(model.A), model.B.shape[1], len(model.C)
     half, in_positions = n // 2, weights.coordinates == "positions"
     if in_positions:

@@ -22,8 +22,8 @@ from scipy import optimize, sparse
 from malta.errors import InputError
 from malta.files import file_exists, read_file, replace_files
 from malta.model.linearize import linearize
-from malta.synthesis.lqg import synthesize
 from malta.synthesis.requirements import requirements_for
+from malta.synthesis.synthesize import synthesize
 
 if TYPE_CHECKING:
     from malta.model.linearize import LinearModel

@@ -30,7 +30,7 @@ from malta.report.ledger import ledger
 from malta.simulation.experiments import Experiment
 from malta.simulation.experiments.catalogue import cases_of, experiments_of
 from malta.synthesis.controller import law, linear_law
-from malta.synthesis.lqg import braking_errors
+from malta.synthesis.synthesize import braking_errors
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant

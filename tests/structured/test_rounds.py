@@ -104,9 +104,11 @@ def test_what_was_found_holds_on_the_loop_itself() -> None:
     K = control.ss(*found.sampled, 1e-3)
     S = control.feedback(1, plant * K)
     assert control.linfnorm(S - 0.5)[0] <= 1 / 0.9 * (1 + 1e-6)
-    assert control.linfnorm(plant * S)[0] == pytest.approx(
-        1e-3 * found.reached["gain load -> output"], rel=1e-4
-    )
+    points = np.exp(
+        1e-3j * np.geomspace(1e-2, 3e3, 4000)
+    )  # a flat peak, of which control.linfnorm may miss a hundredth
+    largest = np.abs((plant * S)(points)).max()
+    assert largest == pytest.approx(1e-3 * found.reached["gain load -> output"], rel=1e-4)
     assert "Nothing is proven" in found.certificate
 
 
