@@ -146,12 +146,14 @@ def structured_text(spec: Spec, target: Path) -> str:
     tables: Any = document
     assert spec.structure is not None
     for element in spec.structure.elements:
-        table = tables["structure"]["elements"][element.name]
-        for key, value in element.numbers.items():
+        own = tables["structure"]["elements"][element.name]
+        for place, value in element.numbers.items():
+            *within, key = place.split(".")  # "state.x" of an LQG
+            table = own[within[0]] if within else own
             if isinstance(value, tuple):
                 table[key] = [float(f"{v:.{DIGITS}g}") for v in value]
             elif hasattr(table[key], "items"):
-                unit = to_si(1.0, table[key]["unit"], element.units[key], spec.path, key)
+                unit = to_si(1.0, table[key]["unit"], element.units[place], spec.path, place)
                 table[key]["value"] = tomlkit.value(f"{value / unit:.{DIGITS}g}")
             else:
                 table[key] = tomlkit.value(f"{value:.{DIGITS}g}")

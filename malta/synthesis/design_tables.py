@@ -80,7 +80,7 @@ Coefficients = Annotated[list[Finite], Field(min_length=1, max_length=30)]
 class ElementTable(Record):
     """[structure.elements.NAME]: numbers at which a search starts; the kind says which."""
 
-    kind: Literal["gain", "pid", "lead", "notch", "transfer"] = entry("what the element is")
+    kind: Literal["gain", "pid", "lead", "notch", "transfer", "lqg"] = entry("what the element is")
     value: Quantity | None = entry("of a gain", default=None)
     Kp: Quantity | None = entry("of a pid", default=None)
     Ki: Quantity | None = entry("of a pid; without it, none", default=None)
@@ -93,7 +93,16 @@ class ElementTable(Record):
     damping: Positive | None = entry("damping ratio of the poles of a notch", "1", default=None)
     numerator: Coefficients | None = entry("of a transfer, highest power first, SI", default=None)
     denominator: Coefficients | None = entry("of a transfer, highest power first, SI", default=None)
-    low: Numbers = entry("smallest values of some of these numbers", default={})
+    state: Numbers | None = entry("of an lqg: a state weighs (x / this)^2; without an entry, 0", default=None)
+    integral: Numbers | None = entry(
+        "of an lqg: the integral of an error weighs (s / this)^2; else none", default=None
+    )
+    input: Numbers | None = entry("of an lqg: an input weighs (u / this)^2", default=None)
+    process: Numbers | None = entry("of an lqg: standard deviations of noise, by input", default=None)
+    sensor: Numbers | None = entry("of an lqg: standard deviations of noise, by output", default=None)
+    low: Numbers = entry(
+        'smallest values of some of these numbers; of an lqg by "state.x" and so on', default={}
+    )
     high: Numbers = entry("largest values", default={})
 
 
@@ -101,7 +110,9 @@ class StructureTable(Record):
     """[structure]: a law of named elements, in place of weights, bases and noise, or of [pid]."""
 
     axes: PidAxes | None = entry("what an axis is; without it, an output with its input", default=None)
-    law: dict[StrictStr, list[StrictStr]] = entry("by output, or by position: elements, one behind the other")
+    law: dict[StrictStr, list[StrictStr]] = entry(
+        'by output, or by position: elements, one behind the other; an lqg under "all"'
+    )
     elements: dict[Annotated[StrictStr, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")], ElementTable] = entry(
         "elements by a name of your choice"
     )

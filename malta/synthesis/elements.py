@@ -92,7 +92,7 @@ class Element:
     name: str
     parameters: tuple[Parameter, ...]
     matrices: Callable[[Sequence[Any]], Matrices] = field(repr=False)
-    solve: Solve = field(default=_themselves, repr=False)
+    solve: Solve = field(default_factory=lambda: _themselves, repr=False)
 
     @property
     def values(self) -> dict[str, float]:

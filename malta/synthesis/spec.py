@@ -195,8 +195,9 @@ class Loads:
 class StructuredElement:
     """An element of [structure.elements].
 
-    kind : "gain", "pid", "lead", "notch" or "transfer"
-    numbers : SI, by the names of malta.structured; coefficients of a transfer function as tuples
+    kind : "gain", "pid", "lead", "notch", "transfer" or "lqg"
+    numbers : SI, by the names of malta.structured; coefficients of a transfer function as tuples; of an lqg by
+        "state.x" and so on
     units : SI units of the numbers
     bounds : (low, high) of some of them, SI
     """

@@ -3,6 +3,7 @@
 [structure.law]                                # by sensor, or by coordinate: elements, one behind the other
 x1 = ["radial", "roll_off"]
 y1 = ["radial", "roll_off"]                    # one element in several places has its numbers once
+all = ["regulator"]                            # an LQG, of all errors
 
 [structure.elements.radial]
 kind = "pid"
@@ -31,14 +32,23 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.model.linearize import LinearModel
-from malta.model.plant import Plant
+from malta.model.plant import Plant, Signal
 from malta.synthesis import elements
 from malta.synthesis.controller import Controller
 from malta.synthesis.design_tables import ElementTable, GoalTable, StructureTable
-from malta.synthesis.elements import Element, Place, Structure, sample_law
+from malta.synthesis.elements import Element, Place, Structure, keep_sign, sample_law
+from malta.synthesis.lqg import weights
 from malta.synthesis.pid import axes_of
-from malta.synthesis.spec import PidAxes, StructuredElement, StructuredGoal, StructuredLaw, pid_signals
+from malta.synthesis.spec import (
+    PidAxes,
+    StructuredElement,
+    StructuredGoal,
+    StructuredLaw,
+    Weights,
+    pid_signals,
+)
 from malta.synthesis.state_space import law_of_errors
+from malta.synthesis.tunable_lqg import lqg
 from malta.tables import Quantity
 from malta.units import to_si
 
@@ -56,13 +66,16 @@ class Kind(NamedTuple):
     required: tuple[str, ...]
 
 
+WHOLE = ("input", "process", "sensor")  # tables of an LQG with an entry of every signal
 ELEMENTS = {
     "gain": Kind({"value": "Kp"}, ("value",)),
     "pid": Kind({"Kp": "Kp", "Ki": "Ki", "Kd": "Kd", "filter": "s"}, ("Kp",)),
     "lead": Kind({"zero": "rad/s", "pole": "rad/s"}, ("zero", "pole")),
     "notch": Kind({"frequency": "rad/s", "depth": "1", "damping": "1"}, ("frequency", "depth", "damping")),
     "transfer": Kind({"numerator": "", "denominator": ""}, ("numerator", "denominator")),
+    "lqg": Kind(dict.fromkeys(("state", "integral", "input", "process", "sensor"), "by signal"), WHOLE),
 }
+ALL = "all"  # in place of an axis: all errors, to all inputs
 SENSORS = {"at": "", "channels": ""}
 POLES = {"decay": "1/s", "damping": "1", "fastest": "rad/s"}
 GOALS = {
@@ -100,7 +113,9 @@ def read_structure(
     signals that no loop has, and notches that no law of this sample time has.
     """
     axes = table.axes or "decentralized"
-    units = dict(_units_by_axis(plant, axes))
+    units = {ALL: _units_of_lqg(plant)} | (
+        dict(_units_by_axis(plant, axes)) if any(axis != ALL for axis in table.law) else {}
+    )
     law: dict[str, tuple[str, ...]] = {}
     found: dict[str, StructuredElement] = {}
     for axis, names in table.law.items():
@@ -115,6 +130,9 @@ def read_structure(
             if name not in table.elements:
                 raise where.refuse(axis, repr(name), "one of " + " ".join(table.elements))
             one = table.elements[name]
+            if (one.kind == "lqg") != (axis == ALL) or (axis == ALL and len(names) > 1):
+                found_here = f"{' '.join(names)} with a {one.kind}"
+                raise where.refuse(axis, found_here, f"one lqg under {ALL}, other elements under an axis")
             element = _element(name, one, own, Ts, _Where(path, f"structure.elements.{name}"))
             if found.setdefault(name, element) != element:
                 raise where.refuse(axis, f"{name} of another unit", "axes of one unit for one element")
@@ -135,6 +153,16 @@ def _units_by_axis(plant: Plant, axes: PidAxes) -> Iterator[tuple[str, Mapping[s
     for k, signal in enumerate(gains["Kp"]):
         name = plant.outputs[k].name if axes == "decentralized" else signal.name
         yield name, {key: gains[key][k].unit for key in PLAIN}
+
+
+def _units_of_lqg(plant: Plant) -> Mapping[str, str]:
+    """The units of an LQG's sizes and standard deviations: by "state.x" and so on."""
+    sums = [Signal(s.name, f"{s.unit} s") for s in plant.outputs]
+    tables = {
+        "state": plant.design_states, "integral": sums, "input": plant.inputs,
+        "process": plant.inputs, "sensor": plant.outputs,
+    }  # fmt: skip
+    return {f"{table}.{s.name}": s.unit for table, signals in tables.items() for s in signals}
 
 
 def _entries(table: Any, kind: Kind, where: _Where) -> Iterator[tuple[str, Any, str]]:
@@ -166,13 +194,17 @@ def _element(
     numbers: dict[str, Any] = {}
     units: dict[str, str] = {}
     for key, value, unit in _entries(table, kind, where):
+        if unit == "by signal":
+            units |= axis
+            numbers |= _sizes(key, value, axis, where)
+            continue
         units[key] = axis.get(unit, unit)
         numbers[key] = _si(value, units[key], where, key) if unit else tuple(value)
     bounds: dict[str, tuple[float, float]] = {}
     for side, table_of in enumerate((table.low, table.high)):
         for key, value in table_of.items():
-            if key not in numbers or not kind.units[key]:
-                able = [k for k in numbers if kind.units[k]]
+            able = [k for k, number in numbers.items() if isinstance(number, float)]
+            if key not in able:
                 raise where.refuse(
                     f"{('low', 'high')[side]}.{key}", "an unknown number", "one of " + " ".join(able)
                 )
@@ -187,10 +219,31 @@ def _element(
         )
     made = StructuredElement(name, table.kind, numbers, units, bounds)
     try:
-        make_element(made)
+        if table.kind == "lqg":  # made on a model, later
+            keep_sign(name, bounds, **numbers)
+        else:
+            make_element(made)
     except InputError as error:  # the element does not know the file
         raise where.refuse(error.field.partition(".")[2], error.found, error.expected) from error
     return made
+
+
+def _sizes(
+    key: str, table: Mapping[str, Quantity], units: Mapping[str, str], where: _Where
+) -> dict[str, float]:
+    """A table of an LQG's numbers, SI. Raises InputError for unknown signals, missing ones, and numbers not above 0."""
+    known = [name.partition(".")[2] for name in units if name.startswith(f"{key}.")]
+    _require_known(list(table), known, where, key)
+    missing = next((name for name in known if name not in table), None)
+    if missing is not None and key in WHOLE:
+        raise where.refuse(key, f"no {missing}", "an entry of " + " ".join(known))
+    found = {
+        f"{key}.{name}": _si(q, units[f"{key}.{name}"], where, f"{key}.{name}") for name, q in table.items()
+    }
+    low = next((name for name, value in found.items() if not value > 0), None)
+    if low is not None:
+        raise where.refuse(low, f"{found[low]:g} {units[low]}", "more than 0; leave out what has no weight")
+    return found
 
 
 def _goal(name: str, table: GoalTable, plant: Plant, where: _Where) -> StructuredGoal:
@@ -249,19 +302,38 @@ def _require_known(names: Sequence[str], known: Sequence[str], where: _Where, ke
 # The law as elements in their places, and as a controller.
 
 
-def make_element(given: StructuredElement) -> Element:
-    """Make the element of a design file. Raises InputError for numbers that it cannot have."""
+def make_element(given: StructuredElement, model: LinearModel | None = None) -> Element:
+    """Make the element of a design file. Raises InputError for numbers that it cannot have.
+
+    model : that an LQG is designed for
+    """
     bounds = {"bounds": dict(given.bounds)} if given.bounds else {}
+    if given.kind == "lqg":
+        assert model is not None
+        return lqg(given.name, model, _weights_of(given, model.plant), **bounds)
     made: Element = getattr(elements, given.kind)(given.name, **given.numbers, **bounds)
     return made
 
 
+def _weights_of(given: StructuredElement, plant: Plant) -> Weights:
+    """The weights and variances of an LQG's sizes; what has no size has no weight."""
+    q, r, q_i, w, v = (
+        np.array([given.numbers.get(f"{table}.{s.name}", math.inf) for s in signals]) ** power
+        for table, signals, power in (
+            ("state", plant.design_states, -2.0),
+            ("input", plant.inputs, -2.0),
+            ("integral", plant.outputs, -2.0),
+            ("process", plant.inputs, 2.0),
+            ("sensor", plant.outputs, 2.0),
+        )
+    )
+    return weights(q, r, w, v, q_i=q_i)
+
+
 def places_in(law: StructuredLaw, model: LinearModel) -> tuple[Place, ...]:
     """The elements of a design file in their places on a machine."""
-    axes = axes_of(model, law.axes)
-    own = {one.name: make_element(one) for one in law.elements}
+    own = {one.name: make_element(one, model) for one in law.elements}
     products: dict[tuple[str, ...], Element] = {}  # of the same elements: one product, with its numbers once
-    names = [name for name, _ in _units_by_axis(model.plant, law.axes)]
     found = []
     for axis, series in law.law.items():
         if series not in products:
@@ -269,18 +341,28 @@ def places_in(law: StructuredLaw, model: LinearModel) -> tuple[Place, ...]:
             for name in series[1:]:
                 product = product * own[name]
             products[series] = product
-        k = names.index(axis)
-        found.append(Place(axes.inputs[:, [k]], products[series], axes.of_outputs[[k]]))
+        found.append(_place(axis, products[series], model, law.axes))
     return tuple(found)
+
+
+def _place(axis: str, element: Element, model: LinearModel, axes: PidAxes) -> Place:
+    """An element on its axis, or of all errors."""
+    m, p = len(model.plant.inputs), len(model.plant.outputs)
+    if axis == ALL:
+        return Place(np.eye(m), element, np.eye(p))
+    sides, names = axes_of(model, axes), [name for name, _ in _units_by_axis(model.plant, axes)]
+    k = names.index(axis)
+    return Place(sides.inputs[:, [k]], element, sides.of_outputs[[k]])
 
 
 def with_values(law: StructuredLaw, values: Mapping[str, float]) -> StructuredLaw:
     """The same law with other numbers, by "element.parameter"."""
     changed = []
     for one in law.elements:
-        made = make_element(one).at(values).values
-        new: dict[str, Any] = {key.partition(".")[2]: value for key, value in made.items()}
+        new = {key: values.get(f"{one.name}.{key}", value) for key, value in one.numbers.items()}
         if one.kind == "transfer":
+            made = make_element(one).at(values).values
+            new = {key.partition(".")[2]: value for key, value in made.items()}
             n = len(one.numbers["denominator"]) - 1
             new = {
                 "numerator": tuple(new[f"b{k}"] for k in range(n, -1, -1)),

@@ -65,7 +65,8 @@ def lqg(name: str, model: Any, weights: Weights, *, bounds: Bounds | None = None
     >>> import malta
     >>> from malta import structured
     >>> body = [[0, 1], [100, 0]], [[0], [1]], [[1, 0]]
-    >>> law = structured.lqg("lqg", body, malta.weights(q=[1e6, 0], r=[1], w=[1e-2], v=[1e-12]))
+    >>> weights = malta.weights(q=[1e6, 0], r=[1], w=[1e-2], v=[1e-12])
+    >>> law = structured.lqg("lqg", body, weights)
     >>> law.order, {key: f"{value:g}" for key, value in law.values.items()}
     (2, {'lqg.state.x0': '0.001', 'lqg.input.u0': '1', 'lqg.process.u0': '0.1', 'lqg.sensor.y0': '1e-06'})
     """
