@@ -142,8 +142,9 @@ def expected_readings(t: Target) -> ca.Function:
 def prediction_correction(t: Target) -> ca.Function:
     """xi_hat -> what a sample of the machine's equations adds to the linear model of the filter, by Euler's method.
 
-    Ts (f(x, u, 0) - A x - B u) for the mechanical states, with the forces u that act by the filter's own states; 0 for
-    a model without such states.
+    Ts (f(x, u0 + u, 0) - f(0, u0, 0) - A x - B u) for the mechanical states, with the forces u that act by the filter's
+    own states; 0 for a model without such states. u0 is what acts at rest, as a voltage that holds a sphere, and what
+    is left of f there cancels the loads.
     """
     c, plant = t.controller, t.believed
     xi = ca.SX.sym("xi_hat", len(c.states))
@@ -152,7 +153,11 @@ def prediction_correction(t: Target) -> ca.Function:
     for k, index in enumerate(plant.controlled):
         x[index] = xi[k]
     u = xi[n : n + m] if c.lagging + c.delay else ca.SX.zeros(m)
-    rate = plant.f(x, u, ca.SX.zeros(len(plant.disturbances)))[list(plant.controlled)]
+    held, outside = ca.DM(plant.at().u), ca.SX.zeros(len(plant.disturbances))
+    rate = plant.f(x, held + u, outside) - plant.f(
+        ca.DM.zeros(len(plant.states)), held, ca.DM.zeros(outside.shape)
+    )
+    rate = rate[list(plant.controlled)]
     linear = ca.sparsify(ca.DM(c.A)) @ xi[:n] + ca.sparsify(ca.DM(c.B)) @ u
     more = ca.vertcat(c.sample_time * (rate - linear), ca.SX.zeros(len(c.states) - n))
     return ca.Function("correction", [xi], [ca.densify(more)], ["xi_hat"], ["more"])

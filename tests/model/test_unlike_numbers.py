@@ -6,13 +6,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from test_unusual_exports import passes
 
 import malta
 from malta.errors import CheckError, InputError
+from malta.firmware.flight import view
+from malta.firmware.sensor_loss import prediction_correction
 from malta.firmware.signals import Target
+from malta.firmware.supervised import Flown, Interference, Requests, supervised_engine
+from malta.firmware.supervisor import STATES
 from malta.margins.verify import controller_poles
 from malta.synthesis.controller import law
 from malta.synthesis.pid import pid
@@ -221,7 +226,45 @@ def test_what_is_proven_of_the_magnet(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_magnets_c_passes_its_own_test(tmp_path: Path) -> None:
-    spec = malta.read_design("examples/magnet/design/magnet.toml")
+@pytest.mark.parametrize("name", ["magnet", "with_current"])
+def test_the_magnets_c_passes_its_own_test(name: str, tmp_path: Path) -> None:
+    spec = malta.read_design(f"examples/magnet/design/{name}.toml")
     c = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     passes(Target(c, "double", "force"), tmp_path)
+
+
+def test_the_equations_of_a_filter_without_a_sensor_rest_where_the_magnet_does() -> None:
+    """Beside the voltage that holds the sphere they add nothing to the linear model there, and no slope to it."""
+    spec = malta.read_design("examples/magnet/design/with_current.toml")
+    t = Target(malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at())), "double", "force")
+    xi = ca.SX.sym("xi", len(t.controller.states))
+    more = prediction_correction(t)(xi)
+    rest, slope = ca.Function("more", [xi], [more, ca.jacobian(more, xi)])(0)
+    assert np.abs(np.array(rest)).max() < 1e-15
+    assert np.abs(np.array(slope)).max() < 1e-12 * np.abs(t.controller.A).max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [0, 1])
+def test_the_magnet_that_loses_a_sensor_is_held_by_the_other_until_it_lands(lost: int) -> None:
+    """Its position is known by what motion induces in its current: the sphere stays within 0.1 mm for 11.5 ms."""
+    spec = malta.read_design("examples/magnet/design/with_current.toml")
+    c = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+
+    def lose(t: float, inputs: Any, _: Any) -> None:
+        if t >= 0.1:
+            view(inputs, "y")[lost] = np.nan
+
+    flights: list[Flown] = []
+    requests = Requests(take_over=(1.5e-3, 0.0), operate=0.0, start=9.0)
+    engine = supervised_engine(flights, requests, faults=Interference(lose, lambda _t, _o: None))
+    scenario = malta.Scenario("hold", 0.2, malta.references.hold, fidelity="force", noise=1.0, seed=1)
+    run = malta.simulate(spec.plant, c, scenario, engine=engine)
+    (flown,) = flights
+    states = [list(STATES)[k] for k in flown.state]
+    seen = [one for one, before in zip(states, ["", *states], strict=False) if one != before]
+    assert seen[:3] == ["OPERATE", "HOLD", "LANDING"]
+    assert "FAULT" not in seen
+    landing = flown.t[states.index("LANDING")]
+    assert landing == pytest.approx(0.1 + 11.5e-3, abs=1e-3)
+    assert np.abs(run.x[run.t <= landing, 0]).max() < 1e-4

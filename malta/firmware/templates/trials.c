@@ -230,7 +230,7 @@ static void disturb_currents(flight *f, int32_t monitor, int32_t n) {
 
 {% endif %}
 /* Faults of the filter's memory and of the law's sums: what a broken machine or a flipped bit does to them. */
-static void disturb_states(flight *f, int32_t monitor, int32_t k) {
+static void disturb_states(flight *f, int32_t monitor, int32_t k{{ ", int32_t n" if reached is defined }}) {
 {% if tracks_errors %}
   if (monitor == {{ NAME }}_MONITOR_ASTRAY) {
     f->s.reference.p[k] = beyond_range[k];
@@ -249,8 +249,12 @@ static void disturb_states(flight *f, int32_t monitor, int32_t k) {
 {% endif %}
   if ((monitor == {{ NAME }}_MONITOR_SATURATION) || (monitor == {{ NAME }}_MONITOR_HELPLESS)) {
     int32_t j;
+{% if reached is defined %}
+    /* by turns: a current that is measured and answers no voltage leads the filter astray before the row acts */
+    const {{ name }}_real sum = ((n % 2) == 0) ? {{ over.sum }} : -({{ over.sum }});
+{% endif %}
     for (j = 0; j < {{ outputs }}; j++) {
-      f->s.e[j] = {{ over.sum }};
+      f->s.e[j] = {{ "sum" if reached is defined else over.sum }};
     }
 {% if observed %}
     for (j = {{ estimated - forces }}; j < {{ estimated }}; j++) {
@@ -358,7 +362,7 @@ static void fly_with_fault(record *all, flight *f, const {{ name }}_monitor *row
   disturb_currents(f, row->monitor, n);
 {% endif %}
   disturb_sensors(f, row->monitor, k, n);
-  disturb_states(f, row->monitor, k);
+  disturb_states(f, row->monitor, k{{ ", n" if reached is defined }});
   disturb_request(&request, row, f->sup.state, k);
   fly_sample(all, f, &request);
 }
