@@ -450,7 +450,7 @@ def flexible_rotor(name: str) -> Figure:
     law, figures = (import_module(f"{machine.__name__}.{part}") for part in ("law", "figures"))
     par = read(folder / "flexible_rotor.toml")
     if name == "rest":
-        return figures.rest(par, law.REST)  # type: ignore[no-any-return]
+        return figures.rest(par, law.rest_weight())  # type: ignore[no-any-return]
     plant = plant_of(par)
     return getattr(figures, name)(plant, law.controller(plant))  # type: ignore[no-any-return]
 

@@ -34,7 +34,14 @@ def _finish(axes: Any, x: str, y: str, title: str) -> None:
 
 def whirl(plant: Plant, controller: Controller) -> Figure:
     """Shapes of the four bending modes at rest, and the Campbell diagram."""
-    figure, (left, right) = _new()
+    figure, axes = _new()
+    draw_whirl(axes, plant, controller)
+    return figure
+
+
+def draw_whirl(axes: Any, plant: Plant, controller: Controller) -> None:
+    """Draw the shapes and the Campbell diagram on two axes."""
+    left, right = axes
     m = flexible_rotor.modes(flexible_rotor.BENDING)
     z = flexible_rotor.NODE * np.arange(len(m.shapes) // 2)
     for k in range(flexible_rotor.BENDING):
@@ -55,12 +62,18 @@ def whirl(plant: Plant, controller: Controller) -> Figure:
     right.plot(speeds * RPM, speeds / (2 * math.pi), label="1x, the unbalance", **STYLES[3])
     right.set_ylim(0, 600)
     _finish(right, "speed [rpm]", "frequency [Hz]", "Campbell diagram")
-    return figure
 
 
 def unbalance(plant: Plant, controller: Controller) -> Figure:
     """The unbalance response with the zones of ISO 14839-2, and |S| with those of ISO 14839-3."""
-    figure, (left, right) = _new()
+    figure, axes = _new()
+    draw_unbalance(axes, plant, controller)
+    return figure
+
+
+def draw_unbalance(axes: Any, plant: Plant, controller: Controller) -> None:
+    """Draw the response and |S| on two axes."""
+    left, right = axes
     par: Any = plant.parameters
     found = analysis.unbalance_response(plant, controller, np.linspace(5.0, par.Omega_max, 70))
     for k, end in enumerate("AB"):
@@ -83,6 +96,20 @@ def unbalance(plant: Plant, controller: Controller) -> Figure:
         right.text(11, below - 0.3, f"zone {name}", fontsize=7, color="0.3")
     right.set_ylim(0, 5.5)
     _finish(right, "frequency [rad/s]", "|S| of the worst sensor", "Sensitivity zones of ISO 14839-3")
+
+
+def flown_unbalance(e: Any, _: Any = None) -> Figure:
+    """Of the experiment `unbalance`: modes, Campbell diagram and response of the rotor, and what was flown."""
+    figure = Figure(figsize=(9.6, 7.2), layout="constrained")
+    (top, bottom), run = figure.subplots(2, 2), e.run
+    draw_whirl(top, run.plant, run.controller)
+    draw_unbalance(bottom, run.plant, run.controller)
+    for k, end in enumerate("AB"):
+        flown = 1e6 * e.curves["flown"][:, k]
+        bottom[0].plot(
+            e.curves["speed"] * RPM, flown, "o", color=STYLES[k]["color"], label=f"sensor {end}, flown"
+        )
+    bottom[0].legend(frameon=False, fontsize=7)
     return figure
 
 
@@ -107,3 +134,6 @@ def rest(par: flexible_rotor.Parameters, weight: Any) -> Figure:
         axes, "frequency [rad/s]", "magnet to sensor [m/N]", "The rest of the modes; backward whirl: negative"
     )
     return figure
+
+
+FIGURES = {"unbalance": flown_unbalance}

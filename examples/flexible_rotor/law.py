@@ -1,63 +1,44 @@
-"""The control law of the flexible rotor: on each axis a PD, a notch and a lag, alike in x and y; and how it was found.
+"""The control law of the flexible rotor: that of design/flexible_rotor.toml, whose numbers `malta tune` found.
 
-structure(plant)    named elements of malta.structured, with the values that `tune` found, rounded
+design()            the design file: on each axis a PD, a notch and a lag, alike in x and y, and its goals
 controller(plant)   the law as it runs, sampled by Tustin's rule
-tune(plant)         the search, from these values: |S| <= 2.7 at rest and at full speed, the rest's block within 0.9,
-                    and the smallest motion of the sensors under forces on the discs
+continuous(plant)   the law before it is sampled: A, B, C and D of the errors
+rest_weight()       W in m/N, above the modes that are left out: the weight of the goal `rest`, which counts in um/N
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import control
 import numpy as np
 
 import malta
-from malta import structured
+from malta.synthesis.elements import Structure
+from malta.synthesis.structure import places_in
 
-SAMPLE_TIME = 1e-4  # s
-VALUES = {
-    "A": {
-        "pid": {"Kp": 0.898e6, "Kd": 9.86e3, "filter": 844e-6},
-        "notch": {"frequency": 1028.0, "depth": 0.327, "damping": 1.817},
-        "lead": {"zero": 13020.0, "pole": 4121.0},
-    },
-    "B": {
-        "pid": {"Kp": 0.898e6, "Kd": 6.19e3, "filter": 566e-6},
-        "notch": {"frequency": 1266.0, "depth": 0.586, "damping": 1.008},
-        "lead": {"zero": 12070.0, "pole": 4064.0},
-    },
-}  # SI, by the end of the rotor
-REST = control.tf(1.8e-7 * np.array([1.0, 1600.0, 800.0**2]), [1.0, 8000.0, 4000.0**2])  # m/N, above the rest
+FILE = Path(__file__).resolve().parent / "design" / "flexible_rotor.toml"
+MICRO = 1e-6
 
 
-def structure(plant: malta.Plant) -> dict[str, Any]:
-    """The law of each sensor."""
-    found = {}
-    for end, v in VALUES.items():
-        lag = structured.lead(f"{end}_lag", **v["lead"], bounds={"pole": (2e3, 3e4)})
-        pd = structured.pid(end, **v["pid"], bounds={"filter": (1.5e-4, 1)})
-        within = {"frequency": (1e3, 8e3), "depth": (0.05, 3), "damping": (0.1, 3)}
-        found[end] = lag * pd * structured.notch(f"{end}_notch", **v["notch"], bounds=within)
-    return {s.name: found[s.name[2]] for s in plant.outputs}
+def design() -> Any:
+    """The design file, read and checked."""
+    return malta.read_design(FILE)
 
 
 def controller(plant: malta.Plant) -> malta.Controller:
     """The law as it runs."""
-    whole = control.append(*(control.ss(*e.system.balanced) for e in structure(plant).values()))
-    sampled = control.c2d(whole, SAMPLE_TIME, "tustin")
-    return malta.synthesis.controller_of(sampled, plant, name="flexible_rotor")
+    return malta.synthesize(design(), malta.linearize(plant, plant.at()))
 
 
-def tune(plant: malta.Plant) -> structured.Tuned:
-    """The search that found VALUES; two minutes."""
-    par: Any = plant.parameters
-    outputs = [f"output {s.name}" for s in plant.outputs]
-    goals = [
-        structured.sensitivity(2.7),
-        structured.gain_limit("reference", "force", 0.9, weight=REST, name="rest"),
-        structured.soft(structured.gain_limit("disturbance", outputs, 1e-6, name="compliance")),
-    ]
-    places = [{"Omega": 0.0}, {"Omega": par.Omega_max}]
-    return structured.tune(plant, structure(plant), goals, sample_time=SAMPLE_TIME, places=places, starts=1)
+def continuous(plant: malta.Plant) -> Any:
+    """The law before it is sampled."""
+    structure = Structure(places_in(design().structure, malta.linearize(plant, plant.at())))
+    return structure.system(np.zeros(len(structure.parameters)))
+
+
+def rest_weight() -> control.TransferFunction:
+    """W(s), m/N."""
+    (rest,) = (goal for goal in design().structure.goals if goal.name == "rest")
+    return MICRO * control.tf(*map(list, rest.arguments["weight"]))

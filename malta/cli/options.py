@@ -353,6 +353,7 @@ MachineFile = Annotated[
         "--machine",
         metavar="FILE",
         envvar="MALTA_MACHINE",
+        callback=lambda path: None if path is None else locate(path),
         help="Module of a machine of your own, as rotor.py.",
         rich_help_panel=MACHINE,
         show_envvar=True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Callable
@@ -46,8 +47,8 @@ def tune_design(
     """Tune the law of a design file for its [goals] and for its [specification], until the margin is proven.
 
     Of [specification] these are goals: the margin, the peak sensitivity, and noise of forces and motions at rest.
-    Others, as flights, are judged by `malta tune --check`. Goals hold in the middle of the travel and at its ends, and
-    at the design's operating point in all else.
+    Others, as flights, are judged by `malta tune --check`. Goals hold in the middle of the travel and at its ends, at
+    the ends of what proofs cover, as rest and full speed of a rotor, and at the design's operating point in all else.
 
     spec : a design with [structure], from `malta.read_design`
     keep : leave numbers that hold all hard goals, with the proof, as they stand
@@ -74,8 +75,11 @@ def tune_design(
     own = places_in(law, linearize(plant, plant.at(**spec.operating_point)))
     shares = (0.0, 1.0, -1.0) if plant.has_stroke else (None,)
     places = [
-        dict(spec.operating_point) | ({} if share is None else {plant.stroke: share * plant.travel})
+        dict(spec.operating_point)
+        | ({} if share is None else {plant.stroke: share * plant.travel})
+        | dict(zip(plant.over, ends, strict=True))
         for share in shares
+        for ends in itertools.product(*plant.over.values())
     ]
     try:
         found = tune(

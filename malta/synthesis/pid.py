@@ -97,7 +97,7 @@ def axes_of(model: LinearModel, axes: PidAxes) -> Axes:
     half = len(model.A) // 2
     P, one = model.C[:, :half], np.eye(half)
     if axes == "decentralized":
-        return Axes(one, P, one)
+        return Axes(np.eye(len(P)), P, np.eye(model.B.shape[1]))
     try:
         return Axes(np.linalg.inv(P), one, np.linalg.inv(model.force_map))
     except np.linalg.LinAlgError as error:
