@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
@@ -16,7 +18,8 @@ from . import flexible_rotor
 if TYPE_CHECKING:
     from malta import Controller, Plant
 
-ISO_14839_2 = {"A": 0.3, "B": 0.4, "C": 0.5}  # of the clearance, peak displacement
+LIMITS = tomllib.loads((Path(__file__).parent / "source" / "limits.toml").read_text(encoding="utf-8"))
+ISO_14839_2 = {name: one["value"] / 100 for name, one in LIMITS["zones"].items()}  # of the clearance
 HALF_POWER = math.sqrt(0.5)
 
 
@@ -77,14 +80,11 @@ class Critical(NamedTuple):
     speed: float  # rad/s
     amplification: float  # AF = N_c / (N_2 - N_1), the half-power points about it
     margin: float  # distance from the range of operation, share of its end
-    required: float  # share; 0 for AF < 2.5, a critically damped peak
+    required: float  # share; 0 of a critically damped peak
 
 
 def criticals(response: Response, operation: tuple[float, float]) -> list[Critical]:
-    """The peaks of both sensors that fall to half power on both sides, each with what API 617 asks for.
-
-    AF < 2.5: nothing; else 17 % (1 - 1/(AF - 1.5)) below the range, 10 % + 17 % (1 - 1/(AF - 1.5)) above it.
-    """
+    """The peaks of both sensors that fall to half power on both sides, each with what API 617 asks for."""
     found = []
     speeds = response.speeds
     for a in response.sensors.T:
@@ -96,11 +96,19 @@ def criticals(response: Response, operation: tuple[float, float]) -> list[Critic
             AF = float(speeds[k] / (speeds[k + right[0]] - speeds[left[-1]]))
             low, high = operation
             apart = (low - speeds[k]) / low if speeds[k] < low else (speeds[k] - high) / high
-            asked = 0.17 * (1 - 1 / (AF - 1.5)) if AF >= 2.5 else 0.0
-            if AF >= 2.5 and speeds[k] > high:
-                asked += 0.10
+            asked = required_margin(AF, "above" if speeds[k] > high else "below")
             found.append(Critical(float(speeds[k]), AF, float(apart), asked))
     return sorted(found)
+
+
+def required_margin(AF: float, side: str) -> float:
+    """The separation margin that source/limits.toml has of a peak "below" or "above" the range of operation."""
+    known = LIMITS["separation"]
+    if not known["least"]["value"] < AF:
+        return 0.0
+    base, most = (known[side][name]["value"] for name in ("base", "most"))
+    asked = base + known["scale"]["value"] * (1 - 1 / (AF - known["offset"]["value"]))
+    return float(min(most, asked)) / 100
 
 
 def zone(share: float) -> str:

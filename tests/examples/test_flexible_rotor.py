@@ -75,7 +75,10 @@ def test_modes_have_mass_one_and_the_rotors_mass(example: Any) -> None:
 
 
 def test_amplification_and_separation_margins_are_those_of_API_617(example: Any) -> None:
-    """AF of a damping of 0.1 is about 1/(2 zeta) = 5; it asks 17 % (1 - 1/3.5) below the range, 10 % more above."""
+    """AF of a damping of 0.1 is about 1/(2 zeta) = 5; it asks 17 % (1 - 1/3.5) below the range, 10 % more above.
+
+    Nothing is asked up to 2.5, and at most 16 % and 26 % of any peak.
+    """
     analysis = example("analysis")
     speeds = np.linspace(1.0, 300.0, 3000)
     a = 1 / np.abs(100.0**2 - speeds**2 + 20j * speeds)
@@ -86,6 +89,10 @@ def test_amplification_and_separation_margins_are_those_of_API_617(example: Any)
     assert below.required == pytest.approx(0.17 * (1 - 1 / (below.amplification - 1.5)))
     assert above.required == pytest.approx(below.required + 0.1)
     assert below.margin == pytest.approx(0.34, abs=0.01)
+    asked = analysis.required_margin
+    assert [asked(AF, side) for AF in (2.5, 2.51, 1e9) for side in ("below", "above")] == pytest.approx(
+        [0, 0, 0.17 / 101, 0.1 + 0.17 / 101, 0.16, 0.26]
+    )
     assert [analysis.zone(share) for share in (0.2, 0.35, 0.45, 0.6)] == ["A", "B", "C", "D"]
 
 
