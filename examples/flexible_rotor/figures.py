@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 import malta
 from malta.margins.loop_report import ZONES
+from malta.report.figures.inline import InlineFigure
 
 from . import analysis, flexible_rotor
 
@@ -21,7 +22,7 @@ RPM = 30 / math.pi
 
 
 def _new() -> tuple[Figure, Any]:
-    figure = Figure(figsize=(7.6, 3.6), layout="constrained")
+    figure = InlineFigure(figsize=(7.6, 3.6), layout="constrained")
     return figure, figure.subplots(1, 2)
 
 
@@ -100,7 +101,7 @@ def draw_unbalance(axes: Any, plant: Plant, controller: Controller) -> None:
 
 def flown_unbalance(e: Any, _: Any = None) -> Figure:
     """Of the experiment `unbalance`: modes, Campbell diagram and response of the rotor, and what was flown."""
-    figure = Figure(figsize=(9.6, 7.2), layout="constrained")
+    figure = InlineFigure(figsize=(9.6, 7.2), layout="constrained")
     (top, bottom), run = figure.subplots(2, 2), e.run
     draw_whirl(top, run.plant, run.controller)
     draw_unbalance(bottom, run.plant, run.controller)
@@ -115,7 +116,7 @@ def flown_unbalance(e: Any, _: Any = None) -> Figure:
 
 def rest(par: flexible_rotor.Parameters, weight: Any) -> Figure:
     """What four bending modes leave out, at three speeds, beside the weight that bounds it at all of them."""
-    figure = Figure(figsize=(5.0, 3.2), layout="constrained")
+    figure = InlineFigure(figsize=(5.0, 3.2), layout="constrained")
     axes = figure.subplots()
     k = flexible_rotor.BENDING + 2
     m, w = (
