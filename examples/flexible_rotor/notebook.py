@@ -80,7 +80,7 @@ malta.report.experiment_figure(flown)
 # Peaks of the response with their amplification factors, and what API 617 asks for between 1500 and 3000 rpm.
 
 # %%
-response = analysis.unbalance_response(plant, controller, np.linspace(5.0, par.Omega_max, 70))
+response = analysis.unbalance_response(plant, controller, np.linspace(5.0, par.Omega_max, 140))
 for peak in analysis.criticals(response, (1500 / RPM, 3000 / RPM)):
     print(
         f"{peak.speed * RPM:.0f} rpm: AF {peak.amplification:.1f}, {peak.margin:.0%} away, asked {peak.required:.0%}"
