@@ -122,6 +122,7 @@ PATIENCE = 300.0  # s for a compilation, which takes some seconds
 FLAGS = (
     *("-std=gnu11", "-O2", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
     *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),
+    "-fno-tree-slp-vectorize",  # which may compute a number twice, rounded in two ways: v != w then means nothing
 )
 NATIVE = ("-march=native", "-mtune=generic")  # tuned for a compiler's guess of a processor, text is slower
 
