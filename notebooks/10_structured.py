@@ -22,7 +22,7 @@ from malta import structured
 from malta.structured.loops import to_plane
 from malta.structured.reduction import split_integrals, truncate
 from malta.synthesis.controller import linear_law
-from malta.synthesis.elements import sample_law
+from malta.synthesis.places import sample_law
 from malta.synthesis.state_space import System
 
 # The project's root, wherever Jupyter was started.

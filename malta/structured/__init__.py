@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from malta.structured.rounds import Tuned as Tuned
     from malta.structured.rounds import tune as tune
     from malta.synthesis.elements import Element as Element
-    from malta.synthesis.elements import Place as Place
     from malta.synthesis.elements import gain as gain
     from malta.synthesis.elements import lead as lead
     from malta.synthesis.elements import notch as notch
@@ -39,6 +38,7 @@ if TYPE_CHECKING:
     from malta.synthesis.elements import pid as pid
     from malta.synthesis.elements import states as states
     from malta.synthesis.elements import transfer as transfer
+    from malta.synthesis.places import Place as Place
     from malta.synthesis.tunable_lqg import lqg as lqg
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

@@ -26,7 +26,8 @@ from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator, UncertainSystem
 from malta.structured.goals import Goal
 from malta.structured.loops import Model, model_of, models_of_systems
-from malta.synthesis.elements import CALLER, sample_law
+from malta.synthesis.elements import CALLER
+from malta.synthesis.places import sample_law
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 from malta.synthesis.state_space import System, controller_of
 

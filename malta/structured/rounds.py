@@ -25,7 +25,8 @@ from malta.structured.loops import Model
 from malta.structured.minimax import Look
 from malta.structured.plants import Machine, Systems, Uncertain, Values, target_of
 from malta.structured.search import ROOM, Task, contradiction, random_starts, rate_of, search
-from malta.synthesis.elements import CALLER, Structure, places_of, sample_law
+from malta.synthesis.elements import CALLER
+from malta.synthesis.places import Structure, places_of, sample_law
 from malta.synthesis.state_space import System
 
 if TYPE_CHECKING:

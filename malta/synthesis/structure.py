@@ -36,9 +36,10 @@ from malta.model.plant import Plant, Signal
 from malta.synthesis import elements
 from malta.synthesis.controller import Controller
 from malta.synthesis.design_tables import ElementTable, GoalTable, StructureTable
-from malta.synthesis.elements import Element, Place, Structure, keep_sign, sample_law
+from malta.synthesis.elements import Element, keep_sign
 from malta.synthesis.lqg import weights
 from malta.synthesis.pid import axes_of
+from malta.synthesis.places import Place, Structure, sample_law
 from malta.synthesis.spec import (
     PidAxes,
     StructuredElement,

@@ -15,7 +15,7 @@ import malta
 from malta import structured
 from malta.structured.loops import ClosedLoop, Model, models_of_systems
 from malta.structured.norms import noise, peak_gain, peaks_of, response_at
-from malta.synthesis.elements import Structure, places_of, sample_law
+from malta.synthesis.places import Structure, places_of, sample_law
 from malta.synthesis.state_space import System
 
 GOALS = {
