@@ -26,6 +26,7 @@ from malta.model.plant import position_in
 from malta.simulation import references
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
+from malta.synthesis.schedule import SCHEDULED
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -184,7 +185,6 @@ def _loops(after: Mapping[int, list[int]], nodes: Iterable[int], start: int) -> 
 # What single precision does to a controller: its coefficients, its margin, and the noise of its rounding.
 
 
-ROUNDED = ("Ad", "Bd", "Cd", "K", "Ki", "L")
 SAMPLES = 200  # over which the noise of rounding is measured
 
 
@@ -197,8 +197,13 @@ class RoundingNoise(NamedTuple):
 
 def rounded(c: Controller) -> Controller:
     """The controller with the coefficients that single precision holds."""
-    values: dict[str, Any] = {name: getattr(c, name).astype(np.float32).astype(float) for name in ROUNDED}
-    return replace(c, **values)
+
+    def held(record: Any) -> dict[str, Any]:
+        return {name: getattr(record, name).astype(np.float32).astype(float) for name in SCHEDULED}
+
+    if c.schedule is None:
+        return replace(c, **held(c))
+    return replace(c, **held(c), schedule=replace(c.schedule, **held(c.schedule)))
 
 
 def rounded_margin(c: Controller, uncertainty: dict[str, float]) -> Margin | None:

@@ -41,6 +41,7 @@ from malta.synthesis.controller import (
     sum_errors,
     waiting,
 )
+from malta.synthesis.schedule import scheduled
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -86,13 +87,13 @@ def sense(t: Target) -> Staged:
             *(f for f in input_fields(t) if f.name in ("y", "y_valid")),
         ]
     )
-    expected = ca.sparsify(ca.DM(c.Cd)) @ a["xi_pred"]
-    if c.tracks == "errors":
-        expected = a["p"]
     reach = reading_ranges(t.believed)
     most = ca.DM(FAR * reach)
-    bounded = ca.fmax(ca.fmin(expected, most), -most)
     with recorded_equations() as equations:
+        expected = scheduled(numbers(t), c.schedule, a["p"])["Cd"] @ a["xi_pred"]
+        if c.tracks == "errors":
+            expected = a["p"]
+        bounded = ca.fmax(ca.fmin(expected, most), -most)
         used, refused = gate(a["y"], a["y_valid"], reach, bounded)
         instead = "Cd xi_pred" if c.tracks == "states" else "p"
         meaning = f"y_used = y where it may be used, else {instead} within +-{FAR:g} r; refused: not used"
@@ -163,8 +164,9 @@ def _decided_forces(
     t: Target, state: dict[str, Any], reference: dict[str, Any], y: Any, v0: Any, sums: Sums
 ) -> tuple[dict[str, Any], dict[str, Any], Any]:
     """The law: the state after the sample, the outputs down to forces, and the place for which currents commutate."""
-    c, plant, g = t.controller, t.believed, numbers(t)
+    c, plant = t.controller, t.believed
     p, dp = reference["p"], reference["dp"]
+    g = scheduled(numbers(t), c.schedule, p)
     note("reference_states", "q_ref = (q*, dq*), which is at rest at p", q_ref=state_reference(plant)(p, dp))
     v_ff = feedforward(t, p, dp, reference["ddp"])
     v_past, memory = recall(t, state.get("memory"), v_ff, p, dp)

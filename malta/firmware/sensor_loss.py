@@ -47,7 +47,8 @@ def gains_without(t: Target) -> Gains:
     places = np.zeros(1)
     if plant.has_stroke and plant.travel:
         places = np.linspace(-plant.travel, plant.travel, PLACES)
-    if c.noise is None or c.cost is None or c.tracks == "errors" or len(c.measurements) < 2:
+    unknown = c.noise is None or c.cost is None or c.tracks == "errors" or c.schedule is not None
+    if unknown or len(c.measurements) < 2:
         return Gains(places, {})
     W, V = _process_noise(c), c.noise.sensor
     xi = ca.SX.sym("xi", len(c.states))

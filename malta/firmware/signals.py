@@ -62,6 +62,8 @@ class Target:
         if self.fidelity not in fidelities(self.believed):
             found = f"a {self.believed.name} without a model of its current loops"
             raise InputError("export", self.controller.name, found, "an export down to currents")
+        if self.tunable and self.controller.schedule is not None:
+            raise InputError("export", "tunable", "a scheduled law", "a law of one set of gains")
         if self.driven and self.controller.current_loop is None:
             found = "a gain file with no current loops"
             raise InputError("export", self.controller.name, found, "an export down to currents")

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
+import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError
@@ -29,6 +30,7 @@ from malta.synthesis.controller import (
     lagging_forces,
     stored_forces,
 )
+from malta.synthesis.schedule import SCHEDULED, Schedule
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Parameters
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 # The table of a machine from plain matrices in a gain file, from and to its parameters.
 
 
+SAME = 1e-9  # of the largest entry: matrices that are the same but for rounding
 LINEAR = "linear"  # the name of all such machines; their own names are their presets
 
 
@@ -120,6 +123,7 @@ class _Layout(NamedTuple):
     coordinates: Coordinates  # of the integrals and of process noise
     correlated: int  # correlations of noise
     holding: int  # rows of feedforward.position
+    places: int  # of a schedule; 0 without one
 
     def shapes(self) -> dict[str, dict[str, tuple[int, ...]]]:
         """Shapes of all arrays of a file, by table and key."""
@@ -127,7 +131,8 @@ class _Layout(NamedTuple):
         n, n0 = len(self.states), len(plant.design_states)
         m, p = len(plant.inputs), len(plant.outputs)
         g, coils = self.grid, len(plant.actuator.coils)
-        in_positions, half = self.coordinates == "positions", n0 // 2
+        in_positions, half, places = self.coordinates == "positions", n0 // 2, self.places
+        matrices = {"Ad": (n, n), "Bd": (n, m), "Cd": (p, n), "K": (m, n), "Ki": (m, p), "L": (n, p)}
         return {
             "model": {"A": (n0, n0), "B": (n0, m), "C": (p, n0), "Ad": (n, n), "Bd": (n, m), "Cd": (p, n)},
             "gains": {"K": (m, n), "Ki": (m, p), "L": (n, p)},
@@ -143,6 +148,10 @@ class _Layout(NamedTuple):
             "limits": {"current": (coils,), "force": (m,), "voltage": (coils,)},
             "cost": {"state": (n0,), "input": (m,), "integral": (half if in_positions else p,)},
             "commutation": {"pull": (m, p)},
+            "schedule": {
+                "places": (places,),
+                **{key: (places * rows, columns) for key, (rows, columns) in matrices.items()},
+            },
             "noise": {
                 "process": (half if in_positions else m,),
                 "sensor": (p,),
@@ -162,6 +171,8 @@ def controller_of(file: GainFile, path: str | Path) -> Controller:
         raise InputError(path, "plant.linear", "a table", "none without a table law, as version 2 has it")
     if file.commutation is not None and file.law is None:
         raise InputError(path, "commutation", "a table", "none without a table law, as version 2 has it")
+    if file.schedule is not None and (file.law is None or _tracks_errors(file)):
+        raise InputError(path, "schedule", "a table", 'none without law.tracks = "states"')
     require_plain_name(file.design.name, path, "design.name")
     par = _parameters(file.plant, path)
     layout = _layout(file, par, path)
@@ -194,11 +205,40 @@ def controller_of(file: GainFile, path: str | Path) -> Controller:
         commutation=None
         if file.commutation is None
         else Commutation(file.commutation.lead, **arrays["commutation"]),
+        schedule=_schedule(file, arrays, layout, path),
     )
     try:
         return Controller(**fields)
     except InputError as error:  # the record does not know the file
         raise InputError(path, f"law.{error.field}", error.found, error.expected) from error
+
+
+def _schedule(file: GainFile, arrays: Arrays, layout: _Layout, path: str | Path) -> Schedule | None:
+    """The matrices at the places of a schedule; None where the file has none.
+
+    Raises InputError for an unknown output, places that do not rise, and matrices at the operating point that are not
+    the file's own.
+    """
+    if file.schedule is None:
+        return None
+    plant, given = layout.plant, arrays["schedule"]
+    names = [s.name for s in plant.outputs]
+    if file.schedule.variable not in names:
+        raise InputError(path, "schedule.variable", repr(file.schedule.variable), "one of " + " ".join(names))
+    output, places = names.index(file.schedule.variable), given["places"]
+    stacked = {key: given[key].reshape(len(places), -1, given[key].shape[1]) for key in SCHEDULED}
+    try:
+        made = Schedule(file.schedule.variable, output, places, **stacked)
+    except InputError as error:
+        raise InputError(path, "schedule.places", error.found, error.expected) from error
+    x = plant.point(arrays["operating_point"]["x"]).x
+    here = made.at(float(ca.DM(plant.h(ca.DM(x), 0))[output]))
+    for key, M in (arrays["model"] | arrays["gains"]).items():
+        if key in here and not np.abs(M - here[key]).max() <= SAME * np.abs(M).max(initial=0.0):
+            raise InputError(
+                path, f"schedule.{key}", "other numbers at the operating point", "those beside it"
+            )
+    return made
 
 
 def _of_outputs(
@@ -255,7 +295,9 @@ def _layout(file: GainFile, par: Parameters, path: str | Path) -> _Layout:
     if coordinates == "positions" or correlated:
         _require_positions(file, plant, path)
     holding = len(file.feedforward.position or ())
-    return _Layout(plant, states, observed, len(file.feedforward.z_grid), coordinates, correlated, holding)
+    places = 0 if file.schedule is None else len(file.schedule.places)
+    grid = len(file.feedforward.z_grid)
+    return _Layout(plant, states, observed, grid, coordinates, correlated, holding, places)
 
 
 def _require_positions(file: GainFile, plant: Plant, path: str | Path) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 from malta.archives import read_npz
 from malta.errors import InputError
 from malta.files import read_file
+from malta.synthesis.schedule import SCHEDULED
 from malta.tables import require_shallow
 
 # A strict reader of MAT-files, level 5: the elements that gain files are made of, and no others.
@@ -226,6 +227,7 @@ def _numbers(parts: Iterator[tuple[int, memoryview]], rows: int, columns: int, w
 
 MAT_HEADER = 116  # bytes of descriptive text that open a MAT-file
 MATRICES = (
+    *(f"schedule.{name}" for name in SCHEDULED),
     "model.",
     "gains.",
     "feedforward.v0",
@@ -244,6 +246,7 @@ VECTORS = (
     "operating_point.",
     "feedforward.inertia",
     "feedforward.z_grid",
+    "schedule.places",
     "limits.",
     "cost.",
     "noise.",

@@ -11,9 +11,9 @@ limits.voltage is null where voltages have no limit. A simulation keeps the smal
 of forces and currents always, of voltages where it has windings (fidelities dq and phase; the smallest of the file's).
 A machine with electronics of its own keeps its own voltages.
 
-A file of version 2 has one more table, law, and may have others: plant.linear of a machine from plain matrices, and
-commutation. What law.tracks, law.coordinates and commutation mean for the control law stands in synthesis/controller.py
-and synthesis/filters.py.
+A file of version 2 has one more table, law, and may have others: plant.linear of a machine from plain matrices,
+commutation, and schedule. What law.tracks, law.coordinates and commutation mean for the control law stands in
+synthesis/controller.py and synthesis/filters.py, what schedule means in synthesis/schedule.py.
 
 There plant.parameters and its terms may be null, feedforward.rate without rates among the states, and limits.current
 and limits.force without limits. The states of a law of errors are its own, then its last errors. An
@@ -53,6 +53,7 @@ from malta.model.parameters import units_of, values_of
 from malta.synthesis.controller import (
     Controller,
 )
+from malta.synthesis.schedule import SCHEDULED, Schedule
 from malta.tables import validate
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def document(controller: Controller, margins: LoopReport) -> dict[str, Any]:
     extended = linear or c.tracks == "errors" or not c.feedforward.rate.size or bool(c.lagging) or ahead
     extended = extended or in_positions or bool(c.feedforward.position.size) or bool(c.pause.size)
     extended = extended or bool(c.braking.size)
-    extended = extended or bool(c.references.size)
+    extended = extended or bool(c.references.size) or c.schedule is not None
     law: dict[str, Any] = {"tracks": c.tracks} | ({"coordinates": "positions"} if in_positions else {})
     law |= {"pause": c.pause} if c.pause.size else {}
     law |= {"braking": c.braking} if c.braking.size else {}
@@ -117,6 +118,7 @@ def document(controller: Controller, margins: LoopReport) -> dict[str, Any]:
         "feedforward": _table(c.feedforward, "inertia", "speed", "rate", "z_grid", "v0", later=("position",)),
         "current_loop": _table(c.current_loop, "Kp", "Ki", "sample_time"),
         **({"commutation": _table(c.commutation, "lead", "pull")} if ahead else {}),
+        **({} if c.schedule is None else {"schedule": _schedule_table(c.schedule)}),
         "limits": _table(c.limits, "current", "voltage", "force"),
         "verification": {
             "poles": margins.poles.pairs,
@@ -141,6 +143,12 @@ def _table(record: Any, *keys: str, later: tuple[str, ...] = ()) -> dict[str, An
         return None
     used = tuple(key for key in later if getattr(record, key).size)
     return {key: getattr(record, key) for key in keys + used}
+
+
+def _schedule_table(schedule: Schedule) -> dict[str, Any]:
+    """A schedule: the matrices of one place below those of another."""
+    stacked = {name: np.vstack([*getattr(schedule, name)]) for name in SCHEDULED}
+    return {"variable": schedule.variable, "places": schedule.places, **stacked}
 
 
 def _robust(margins: LoopReport) -> dict[str, Any] | None:

@@ -1,7 +1,7 @@
 """The tables of a gain file, as pydantic checks them, with the meaning, the unit and the shape of each entry.
 
 Sizes: n0 mechanical states, n states with stored forces and disturbances, m forces, p measurements, c coils, g
-positions.
+positions of the stroke, or places of a schedule.
 Checks that need the machine or the shapes of other entries stand in contents.py.
 """
 
@@ -157,6 +157,19 @@ class Gains(Record):
     L: Matrix = entry("of the filter, filter form", shape="n x p")
 
 
+class Schedule(Record):
+    """The matrices of a scheduled law at places of an output, those of one place below those of another; version 2."""
+
+    variable: StrictStr = entry("output whose reference chooses the matrices, linear between places")
+    places: Vector = entry("rising places of the output", "SI", shape="g")
+    Ad: Matrix = entry("as in model", shape="g n x n")
+    Bd: Matrix = entry("as in model", shape="g n x m")
+    Cd: Matrix = entry("as in model", shape="g p x n")
+    K: Matrix = entry("as in gains", shape="g m x n")
+    Ki: Matrix = entry("as in gains", shape="g m x p")
+    L: Matrix = entry("as in gains", shape="g n x p")
+
+
 class Cost(Record):
     """Diagonals of Q, R and Q_i, which the regulator minimizes, SI."""
 
@@ -273,6 +286,10 @@ class GainFile(Record):
     feedforward: Feedforward = entry("what is added to the forces for a reference")
     current_loop: CurrentLoop | None = entry("PI controllers of the currents; null: currents follow at once")
     commutation: Commutation | None = entry("commutation ahead; version 2", default=None)
+    schedule: Schedule | None = entry(
+        "matrices at places of an output; model and gains are those at the operating point; version 2",
+        default=None,
+    )
     limits: Limits = entry("largest values, either way")
     verification: Verification = entry("poles, bandwidth, peaks and margin")
     provenance: Provenance = entry("versions of what computed the gains")

@@ -33,6 +33,7 @@ from malta.synthesis.controller import (
     sum_errors,
     waiting,
 )
+from malta.synthesis.schedule import scheduled
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant
@@ -325,6 +326,7 @@ def _law_chain(simulation: Simulation) -> ca.Function:
     given = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     y, v0 = ca.SX.sym("y", p), ca.SX.sym("v0", m)
     g = {name: ca.SX(value) for name, value in (gains_of(c) | {"rate": ca.DM(c.feedforward.rate)}).items()}
+    g = dict(scheduled(g, c.schedule, given["p_ref"]))
     xi_pred, e, frozen = state[:n], state[n : n + p], state[n + p :]
     taken = filtered(c.tracks, y, given["p_ref"])
     xi_hat = estimated(g, xi_pred, taken)

@@ -29,6 +29,7 @@ from malta.processes import on_one_thread
 from malta.proof.machine.windings import CurrentLoops, chosen_loops, left_out
 from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.robust import robust_margin
+from malta.synthesis.controller import law_at
 from malta.synthesis.riccati import eigenvalues
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ class Loop:
     What is not in it is named by `left_out`.
 
     plant : the machine, with its parameters
-    controller : its controller
+    controller : its controller; of a schedule the law that it has there
     at : states that are not zero, SI, by name
     current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; or "lag"
 
@@ -256,4 +257,4 @@ def loop_from(source: Plant | Loop, controller: Controller | None, position: flo
 def _remembered(
     plant: Plant, controller: Controller, at: tuple[tuple[str, float], ...], current_loops: CurrentLoops
 ) -> Loop:
-    return Loop(plant, controller, dict(at), current_loops)
+    return Loop(plant, law_at(controller, plant, plant.state(dict(at))), dict(at), current_loops)

@@ -43,7 +43,7 @@ from malta.proof.machine.windings import (
     with_windings,
 )
 from malta.proof.uncertain import Compensator, UncertainSystem, held_gain, is_commutated
-from malta.synthesis.controller import Controller, LinearLaw, linear_law, with_readings, with_slope
+from malta.synthesis.controller import Controller, LinearLaw, law_at, linear_law, with_readings, with_slope
 from malta.synthesis.recovery import StepResponse, step_response
 from malta.synthesis.riccati import add_lags, delay_inputs, eigenvalues, sample
 
@@ -225,6 +225,7 @@ def sampled_loop(
 
     The controller commutates with its own parameters, and the currents produce forces with the machine's parameters.
     """
+    controller = law_at(controller, model.plant, model.operating_point.x)
     model, law = commanded_model(model, controller), linear_law(controller)
     A, B, C = model.A, model.B, model.C
     if model.E.any():
@@ -387,6 +388,7 @@ def machine_system(
     current_loops: CurrentLoops = LAST,
 ) -> tuple[UncertainSystem, Compensator]:
     """The machine at the states `at` in parameters by name, and its control law: the arguments of robust_margin."""
+    controller = law_at(controller, plant, plant.at(**at).x)
     believed = plant_of(controller.parameters)
     driven = chosen_loops(plant, controller, current_loops) == "pi"
     system, H = _commanded_system(plant, believed, tuple(names), tuple(at.items()), driven)

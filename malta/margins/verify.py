@@ -87,6 +87,9 @@ def unstable_gain(c: Controller) -> tuple[str, float] | None:
     An LQG is judged by its regulator and its filter. A PID or a law of errors has no model and is judged on the machine
     that it names.
     """
+    if c.schedule is not None:
+        fixed = (replace(c, **matrices, schedule=None) for matrices in map(c.schedule.at, c.schedule.places))
+        return next((found for found in map(unstable_gain, fixed) if found is not None), None)
     if c.cost is None:
         plant = plant_of(c.parameters)
         model = linearize(plant, plant.point(c.operating_point[0]))

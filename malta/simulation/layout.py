@@ -21,6 +21,7 @@ from malta.model.parameters import acting_names, twins_of
 from malta.model.plant import Plant, symbolic
 from malta.model.sensors import Electronics
 from malta.synthesis.controller import Controller, CurrentLoop, gains_of
+from malta.synthesis.schedule import SCHEDULED
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 SHARED = (
     *("Ad", "Bd", "Cd", "K", "Ki", "L", "force_limit", "control_time", "Kp", "Ki_current", "rate"),
     *("pause", "braking", "lead", "ahead", "grid_ends", "substep"),
+    *("places", *(f"{name}_steps" for name in SCHEDULED)),
 )
 
 Fidelity = Literal["force", "dq", "phase"]

@@ -324,6 +324,10 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         raise InputError(f"scenario {s.name}", "anticipated", f"estimator {s.estimator}", "steady-state")
     if s.scheduled and c.tracks == "errors":
         raise InputError(f"scenario {s.name}", "scheduled", "a law of errors", "one with a filter of states")
+    if c.schedule is not None and (s.scheduled or s.estimator != "steady-state"):
+        field, found = ("scheduled", "C of the reading") if s.scheduled else ("estimator", s.estimator)
+        expected = "the filter of the gain file, beside a law that is scheduled"
+        raise InputError(f"scenario {s.name}", field, found, expected)
     known = [signal.name for signal in plant.sensor_errors]
     for name, value in (s.sensor_errors or {}).items():
         if name not in known:

@@ -38,13 +38,15 @@ Ad = diag(1, a), Bd = 0, L = (P^-1, (1 - a) P^-1 / Ts), and it has neither a cos
 So is any discrete linear system s+ = A s + B u, v = C s + D u of the errors u = p* - y, as an H-infinity controller
 (`tracks` = "errors", state_space.controller_of). Step 2 takes y - p* in place of y, and xi* = 0:
 xi = (s, y - p*), Ad = [[A, -B], [0, 0]], Bd = 0, Cd = 0, L = (0, 1), K = (-C, D), Ki = 0.
+
+Where a law has a `schedule`, its matrices are those at the reference p* of one output (schedule.py).
 """
 
 from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache, reduce
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -53,7 +55,8 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.model.equations import note
-from malta.model.plant import Parameters, Signal, readonly
+from malta.model.plant import Parameters, Plant, Signal, readonly
+from malta.synthesis.schedule import SCHEDULED, Schedule, scheduled
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -208,6 +211,8 @@ class Controller:
         and its sum of errors waits, 0: never; none: no axis does. Only of outputs that are the state of their index.
     tracks : what the filter takes: "states" (y) or "errors" (y - p*)
     commutation : place for which currents are commutated; None: the reading y
+    schedule : matrices at places of the reference of an output; Ad, Bd, Cd, K, Ki and L are those at the operating
+        point; None: one set of matrices
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
@@ -244,6 +249,7 @@ class Controller:
     braking: FloatArray = field(default_factory=lambda: np.zeros(0), metadata={"later": True})
     tracks: Tracks = field(default="states", metadata={"later": True})
     commutation: Commutation | None = field(default=None, metadata={"later": True})
+    schedule: Schedule | None = field(default=None, metadata={"later": True})
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -263,7 +269,8 @@ class Controller:
         return (
             f"Controller({self.name!r}, preset {self.parameters.preset!r}, {len(self.states)} states, "
             f"{len(self.forces)} forces, {1e-3 / self.sample_time:g} kHz, delay {self.delay}"
-            f"{', current lag' if self.lagging else ''})"
+            f"{', current lag' if self.lagging else ''}"
+            f"{f', scheduled over {self.schedule.variable}' if self.schedule else ''})"
         )
 
     @cached_property
@@ -344,7 +351,10 @@ def disturbances(inputs: tuple[Signal, ...]) -> tuple[Signal, ...]:
 
 def gains_of(c: Controller) -> dict[str, ca.DM]:
     """What the law computes with, sparse: exact zeros cost nothing at run time."""
-    matrices = {name: ca.sparsify(ca.DM(getattr(c, name))) for name in ("Ad", "Bd", "Cd", "K", "Ki", "L")}
+    if c.schedule is None:
+        matrices = {name: ca.sparsify(ca.DM(getattr(c, name))) for name in SCHEDULED}
+    else:
+        matrices = c.schedule.numbers()
     matrices |= {"force_limit": ca.DM(c.limits.force), "control_time": ca.DM(c.sample_time)}
     if c.pause.any():
         matrices["pause"] = ca.sparsify(ca.DM(c.pause))
@@ -451,17 +461,19 @@ def law(c: Controller) -> ca.Function:
 
     (xi_pred, e, frozen, y, p_ref, xi_ref, v_ff, v0) -> (xi_pred, e, frozen, v, xi_hat)
     """
-    args, outputs = _symbolic_law(gains_of(c), len(c.states), len(c.forces), len(c.measurements), c.tracks)
+    n, m, p = len(c.states), len(c.forces), len(c.measurements)
+    args, outputs = _symbolic_law(gains_of(c), n, m, p, c.tracks, c.schedule)
     return ca.Function("law", list(args.values()), list(outputs.values()), list(args), list(outputs))
 
 
 def _symbolic_law(
-    g: Mapping[str, Any], n: int, m: int, p: int, tracks: Tracks = "states"
+    g: Mapping[str, Any], n: int, m: int, p: int, tracks: Tracks = "states", schedule: Schedule | None = None
 ) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
     """Symbols of the law's arguments and expressions of its results, each by name; gains may be symbols too."""
     sizes = {"xi_pred": n, "e": p, "frozen": p, "y": p, "p_ref": p, "xi_ref": n, "v_ff": m, "v0": m}
     args = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     xi_pred, e, frozen, y, p_ref, *given = args.values()
+    g = scheduled(g, schedule, p_ref)
     xi_hat = estimated(g, xi_pred, filtered(tracks, y, p_ref))
     e_next = sum_errors(g, e, frozen, y, p_ref)
     xi_pred_next, saturated, v = commanded(g, xi_hat, e_next, *given)
@@ -474,12 +486,28 @@ def _symbolic_law(
     }
 
 
+def law_at(c: Controller, plant: Plant, x: FloatArray) -> Controller:
+    """The law that a controller has at rest at the states x of a plant: itself, or its schedule's matrices there."""
+    if c.schedule is None:
+        return c
+    return _fixed(c, float(ca.DM(plant.h(ca.DM(x), 0))[c.schedule.output]))
+
+
+@lru_cache(maxsize=64)  # records compare by identity: what is known of a fixed law is found again
+def _fixed(c: Controller, r: float) -> Controller:
+    assert c.schedule is not None
+    return replace(c, **c.schedule.at(r), schedule=None)
+
+
 @lru_cache(
     maxsize=8
 )  # every loop of a controller asks for it; records compare by identity, so no hit is stale
 def linear_law(c: Controller) -> LinearLaw:
-    """The control law linearized where no axis saturates: exact, by differentiating `law`."""
-    step = law(c)
+    """The control law linearized where no axis saturates: exact, by differentiating `law`.
+
+    Of a schedule it is the law at the operating point; `law_at` has those at other references.
+    """
+    step = law(replace(c, schedule=None))
     args = {step.name_in(i): ca.SX.sym(step.name_in(i), *step.size_in(i)) for i in range(step.n_in())}
     out = dict(zip(step.name_out(), step(*args.values()), strict=True))
     blocks = _blocks(args, out, c.summed)

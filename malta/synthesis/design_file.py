@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,7 @@ from malta.synthesis.design_tables import (
     DesignFile,
     PidTable,
     ReferencesTable,
+    ScheduleTable,
     SearchTable,
     WeightsTable,
     specification_table,
@@ -164,6 +166,7 @@ def spec_of(
         references=_references(content.references, plant, path),
         commutation=content.commutation,
         law=_law(content, plant, path),
+        schedule=_schedule(content.schedule, plant, path),
         uncertainty=dict(content.uncertainty),
     )
     return replace(
@@ -182,6 +185,7 @@ LATER = (
     "commutation",
     "references",
     "structure",
+    "schedule",
 )  # keys that change no design without them
 
 
@@ -221,6 +225,20 @@ def _references(given: ReferencesTable | None, plant: Plant, path: Path) -> tupl
     return tuple(_rates(of or {}, plant, path, f"references.{key}", per) for key, of, per in limits)
 
 
+def _schedule(given: ScheduleTable | None, plant: Plant, path: Path) -> tuple[str, tuple[float, ...]] | None:
+    """The output and the places of a schedule, SI; None without one."""
+    if given is None:
+        return None
+    units = {s.name: s.unit for s in plant.outputs}
+    if given.variable not in units:
+        raise InputError(path, "schedule.variable", repr(given.variable), "one of " + " ".join(units))
+    unit = units[given.variable]
+    places = [to_si(place, given.unit, unit, path, "schedule.places") for place in given.places]
+    if not all(a < b for a, b in pairwise(places)):
+        raise InputError(path, "schedule.places", str(given.places), "places that rise")
+    return given.variable, tuple(places)
+
+
 def _sample_time(content: DesignFile, path: Path) -> float:
     """In s. InputError for none, and for a delay that the discretization does not know."""
     Ts = to_si(content.sample_time.value, content.sample_time.unit, "s", path, "sample_time")
@@ -244,7 +262,10 @@ def _law(content: DesignFile, plant: Plant, path: Path) -> Weights | Pid | Struc
 
 LQG = ("discretization", "delay", "weights", "bases", "noise")
 ONLY_LQG = (*LQG, "current_lag", "coordinates")
-NOT_BESIDE = {"pid": (), "structure": ("pid", "cost", "search", "pause", "braking", "commutation")}
+NOT_BESIDE = {
+    "pid": (),
+    "structure": ("pid", "cost", "search", "pause", "braking", "commutation", "schedule"),
+}
 
 
 def _require_law(content: DesignFile, raw: Mapping[str, Any], path: Path) -> None:
@@ -258,6 +279,10 @@ def _require_law(content: DesignFile, raw: Mapping[str, Any], path: Path) -> Non
         if name in raw:
             expected = "one of them: an LQG, a PID, or a law of a given structure"
             raise InputError(path, name, f"this key beside [{other}]", expected)
+    if content.schedule is not None and content.search is not None:
+        raise InputError(
+            path, "search", "this table beside [schedule]", "one of them: no search is scheduled"
+        )
     if content.goals is not None and other != "structure":
         raise InputError(
             path, "goals", "this table without [structure]", "[specification], or a law of [structure]"

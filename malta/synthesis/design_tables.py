@@ -168,6 +168,16 @@ class ReferencesTable(Record):
     acceleration: dict[StrictStr, Quantity] | None = entry("its largest acceleration", default=None)
 
 
+class ScheduleTable(Record):
+    """[schedule]: the law is designed at places of an output and interpolated between them."""
+
+    variable: StrictStr = entry("output whose reference chooses the matrices of the law")
+    places: Annotated[list[Finite], Field(min_length=2, max_length=20)] = entry(
+        "rising places of the output, at each of which the machine is linearized, in the unit beside them"
+    )
+    unit: StrictStr = entry("unit of the places")
+
+
 class Range(Record):
     """An entry of [search.numbers]: one number, and the entries of the file that share it."""
 
@@ -231,6 +241,7 @@ class DesignFile(Record):
     pid: PidTable | None = entry("gains of a PID, in place of weights, bases and noise", default=None)
     structure: StructureTable | None = entry("a law of named elements, in place of both", default=None)
     goals: dict[StrictStr, GoalTable] | None = entry("what a law of [structure] is tuned for", default=None)
+    schedule: ScheduleTable | None = entry("places of an output at which a law is designed", default=None)
     uncertainty: dict[StrictStr, Annotated[Finite, Field(gt=0, lt=1)]] = entry(
         "by parameter: half width of the box of the margin, relative", "1"
     )

@@ -272,6 +272,7 @@ class Spec:
     recovery : what the entries "recovery NAME" of the specification bound, by NAME
     search : numbers that a search may choose
     delays : that a search may choose from
+    schedule : an output and its places, SI, at which the law is designed; None: at the operating point alone
 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
@@ -306,6 +307,7 @@ class Spec:
     recovery: Mapping[str, RecoveryBound] = dataclass_field(default_factory=dict)
     search: tuple[Variable, ...] = ()
     delays: tuple[int, ...] = ()
+    schedule: tuple[str, tuple[float, ...]] | None = None
 
     @property
     def plant(self) -> Plant:
@@ -443,6 +445,8 @@ class Spec:
         kind = {"structure": "given structure"}.get(self.kind, self.kind)
         kind += f", {self.discretization}" if self.kind == "LQG" else ""
         rows.append(("law", f"{kind}, every {quantity(self.sample_time, 's')}, delay {self.delay}"))
+        if self.schedule is not None:
+            rows.append(("schedule", f"{len(self.schedule[1])} places of {self.schedule[0]}"))
         rows.append(("uncertainty", box_words(self.uncertainty, self.parameters) or "none"))
         asked = ", ".join(f"{name} {value:g}" for name, value in self.specification.items())
         rows += [("specification", asked or "none"), ("sha256", self.sha256[:12])]

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.model.linearize import LinearModel
+from malta.model.linearize import LinearModel, linearize
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import commutate_ahead
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
+from malta.synthesis.schedule import point_at, schedule_laws
 from malta.synthesis.spec import Spec
 from malta.synthesis.structure import structured_controller
 
@@ -40,24 +41,15 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
     >>> controller.name, controller.K.shape  # position, rate, and a stored force
     ('ball', (1, 3))
     """
-    named: dict[str, Any] = {
-        "name": spec.name,
-        "current_loop_delay": spec.current_loop_delay,
-        "position_feedforward": spec.position_feedforward,
-    }
-    try:
-        if spec.structure is not None:
-            del named["current_loop_delay"]
-            controller = structured_controller(model, spec.structure, spec.sample_time, **named)
-        elif spec.pid is not None:
-            controller = pid(model, spec.pid, spec.sample_time, **named)
-        else:
-            named["current_lag"] = spec.current_lag
-            controller = lqg(model, spec.weights, spec.sample_time, spec.discretization, spec.delay, **named)
-    except InputError as error:
-        raise InputError(spec.path, f"{error.where}: {error.field}", error.found, error.expected) from error
-    except (CheckError, np.linalg.LinAlgError) as error:
-        raise CheckError(f"{spec.path}: {error}") from error
+    controller = _law_at(spec, model)
+    if spec.schedule is not None:
+        plant, (variable, places) = spec.plant, spec.schedule
+        points = [point_at(plant, model.operating_point.x, variable, place) for place in places]
+        laws = [_law_at(spec, linearize(plant, point)) for point in points]
+        try:
+            controller = schedule_laws(laws, variable, about=controller)
+        except InputError as error:
+            raise InputError(spec.path, "schedule", error.found, error.expected) from error
     if spec.inertia_feedforward != 1:
         old = controller.feedforward
         scaled = replace(old, inertia=spec.inertia_feedforward * np.asarray(old.inertia))
@@ -79,6 +71,29 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
         braking=braking_errors(controller, spec.braking, spec.path),
         references=references,
     )
+
+
+def _law_at(spec: Spec, model: LinearModel) -> Controller:
+    """The law alone at the operating point of a model. Raises InputError and CheckError, which name the file."""
+    named: dict[str, Any] = {
+        "name": spec.name,
+        "current_loop_delay": spec.current_loop_delay,
+        "position_feedforward": spec.position_feedforward,
+    }
+    try:
+        if spec.structure is not None:
+            del named["current_loop_delay"]
+            controller = structured_controller(model, spec.structure, spec.sample_time, **named)
+        elif spec.pid is not None:
+            controller = pid(model, spec.pid, spec.sample_time, **named)
+        else:
+            named["current_lag"] = spec.current_lag
+            controller = lqg(model, spec.weights, spec.sample_time, spec.discretization, spec.delay, **named)
+    except InputError as error:
+        raise InputError(spec.path, f"{error.where}: {error.field}", error.found, error.expected) from error
+    except (CheckError, np.linalg.LinAlgError) as error:
+        raise CheckError(f"{spec.path}: {error}") from error
+    return controller
 
 
 def braking_errors(c: Controller, decelerations: Sequence[float], path: str | Path) -> FloatArray:

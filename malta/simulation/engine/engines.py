@@ -333,7 +333,8 @@ def shape_of(plant: Plant, c: Controller, setup: Setup) -> Shape:
     )
     fixed = (*shape_parameters(par).items(), *acting_names(par))
     columns = columns_of(c)
-    return Shape((type(par), kin, twins, fixed, patterns, columns, c.tracks, c.parameters), plant, c, setup)
+    law = (c.tracks, None if c.schedule is None else c.schedule.output)
+    return Shape((type(par), kin, twins, fixed, patterns, columns, *law, c.parameters), plant, c, setup)
 
 
 @lru_cache(maxsize=32)

@@ -1,0 +1,202 @@
+"""Gain scheduling: the matrices of a law at places of a reference, linear between them and constant beyond.
+
+    M(r) = M_0 + sum_k s_k (M_k+1 - M_k),   s_k = (r - p_k) / (p_k+1 - p_k), held within 0 .. 1
+
+for M = Ad, Bd, Cd, K, Ki and L, at the rising places p_0 .. p_g of the reference r of one output. It is the reference
+that schedules, not the reading: at a constant reference the law is linear and its loop is that of M(r), without a slope
+of M. A machine far off its reference has the law of its reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import InputError
+from malta.model.data import plant_of
+from malta.model.equations import note
+from malta.model.linearize import linearize
+from malta.model.plant import readonly
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray, OperatingPoint, Plant
+    from malta.synthesis.controller import Controller
+
+SCHEDULED = ("Ad", "Bd", "Cd", "K", "Ki", "L")
+
+
+@dataclass(frozen=True, eq=False)
+class Schedule:
+    """The matrices of a law at rising places of the reference of an output; g places.
+
+    variable : the output
+    output : its index
+    places : g, SI
+    Ad, Bd, Cd, K, Ki, L : matrices of a Controller, g of each
+
+    >>> import numpy as np
+    >>> from malta.synthesis.schedule import Schedule
+    >>> one = np.ones((2, 1, 1))
+    >>> K = np.array([[[1.0]], [[3.0]]])
+    >>> made = Schedule("y", 0, np.array([0.0, 1e-3]), one, one, one, K, one, one)
+    >>> made.at(0.25e-3)["K"].tolist(), made.at(5e-3)["K"].tolist()
+    ([[1.5]], [[3.0]])
+    """
+
+    variable: str
+    output: int
+    places: FloatArray
+    Ad: FloatArray
+    Bd: FloatArray
+    Cd: FloatArray
+    K: FloatArray
+    Ki: FloatArray
+    L: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("places", *SCHEDULED):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+        p = self.places
+        if len(p) < 2 or not (np.isfinite(p).all() and (np.diff(p) > 0).all()):
+            raise InputError("schedule", "places", str(p.tolist()), "at least two rising places")
+
+    @property
+    def cells(self) -> list[tuple[float, float]]:
+        """The intervals between neighbouring places."""
+        return list(pairwise(self.places.tolist()))
+
+    def at(self, r: float) -> dict[str, FloatArray]:
+        """The matrices at a reference r of the output, SI."""
+        shares = [min(max((r - a) / (b - a), 0.0), 1.0) for a, b in self.cells]
+        found = {}
+        for name in SCHEDULED:
+            matrices = getattr(self, name)
+            M = np.array(matrices[0])
+            for share, step in zip(shares, np.diff(matrices, axis=0), strict=True):
+                M = M + share * step
+            found[name] = M
+        return found
+
+    def numbers(self) -> dict[str, ca.DM]:
+        """What the law computes with, sparse: the first matrices, and the steps to the next ones beside each other."""
+        found = {"places": ca.DM(self.places)}
+        for name in SCHEDULED:
+            matrices = getattr(self, name)
+            found[name] = ca.sparsify(ca.DM(matrices[0]))
+            found[f"{name}_steps"] = ca.sparsify(ca.DM(np.hstack([*np.diff(matrices, axis=0)])))
+        return found
+
+
+def scheduled(g: Mapping[str, Any], schedule: Schedule | None, p_ref: Any) -> Mapping[str, Any]:
+    """The numbers of a law at a reference p*: as they are, or with the matrices that its schedule has there.
+
+    g : numbers by name, constants or symbols, see controller.gains_of
+    """
+    if schedule is None:
+        return g
+    r, p = p_ref[schedule.output], g["places"]
+    shares = [ca.fmax(ca.fmin((r - p[k]) / (p[k + 1] - p[k]), 1), 0) for k in range(len(schedule.cells))]
+    meaning = f"shares: how far the reference of {schedule.variable} is from each place to the next, 0 to 1"
+    note("schedule", meaning, shares=ca.vertcat(*shares))
+    found = dict(g)
+    for name in SCHEDULED:
+        M = found[name]
+        for share, step in zip(shares, ca.horzsplit(found.pop(f"{name}_steps"), M.shape[1]), strict=True):
+            if step.nnz():  # what is equal at two places costs nothing
+                M = M + share * step
+        found[name] = M
+    return found
+
+
+CALLER = "schedule_laws"
+ALIKE = ("parameters", "sample_time", "states", "forces", "measurements")  # of all laws of a schedule
+
+
+def schedule_laws(
+    laws: Sequence[Controller], variable: str, *, about: Controller | None = None
+) -> Controller:
+    """Make one law of several, which are designed at places along an output: linear between them.
+
+    The law takes the place from the reference of the output. Feedforward, limits, cost and noise are those of `about`:
+    what else holds the machine elsewhere is left to the sums of errors.
+
+    laws : LQG or PID controllers of one machine, whose operating points are the places
+    variable : the output
+    about : the controller whose operating point, feedforward and limits the law has; None: the middle one of `laws`
+
+    Returns a Controller with a `schedule`.
+
+    Raises InputError for another output, laws that differ in more than their matrices, laws of errors, and machines
+    whose currents depend on the reading.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball_pid.toml")
+    >>> models = [malta.linearize(spec.plant, spec.plant.at(q=q)) for q in (-1e-3, 1e-3)]
+    >>> soft = spec.replace({"pid.Kp.f": 6e3})
+    >>> laws = [malta.synthesize(one, model) for one, model in zip((soft, spec), models)]
+    >>> law = malta.synthesis.schedule_laws(laws, "y")
+    >>> law.schedule.places.tolist(), law.schedule.at(0.0)["K"].round(3).tolist()
+    ([-0.001, 0.001], [[7000.0, 25.0]])
+    """
+    if not laws:
+        raise InputError(CALLER, "laws", "none", "at least two")
+    ordered = sorted(laws, key=lambda c: _place(c, variable))
+    base = ordered[len(laws) // 2] if about is None else about
+    for law in laws:
+        _require_alike(base, law)
+    made = Schedule(
+        variable,
+        _output(base, variable),
+        np.array([_place(c, variable) for c in ordered]),
+        **{name: np.array([getattr(c, name) for c in ordered]) for name in SCHEDULED},
+    )
+    here = _place(base, variable)
+    if not made.places[0] <= here <= made.places[-1]:
+        found = f"an operating point at {here:g}"
+        raise InputError(CALLER, "about", found, f"one within the places, {made.places.tolist()}")
+    return replace(base, **made.at(here), schedule=made)
+
+
+def point_at(plant: Plant, x: FloatArray, variable: str, place: float) -> OperatingPoint:
+    """The operating point at rest where an output is at a place, and the other outputs are as at the states x."""
+    names = [s.name for s in plant.outputs]
+    if variable not in names:
+        raise InputError(plant.name, "schedule.variable", repr(variable), "an output: " + " ".join(names))
+    y = np.array(ca.DM(plant.h(ca.DM(x), 0)), dtype=float).ravel()
+    y[names.index(variable)] = place
+    q = np.array(ca.DM(plant.position_of(ca.DM(y))), dtype=float).ravel()
+    return plant.point(np.concatenate([q, np.zeros(len(plant.controlled) - len(q))]))
+
+
+def _output(c: Controller, variable: str) -> int:
+    names = [s.name for s in c.measurements]
+    if variable not in names:
+        raise InputError(CALLER, "variable", repr(variable), "an output: " + " ".join(names))
+    return names.index(variable)
+
+
+def _place(c: Controller, variable: str) -> float:
+    """Where the output is at a law's operating point, SI."""
+    plant = plant_of(c.parameters)
+    return float(ca.DM(plant.h(ca.DM(plant.point(c.operating_point[0]).x), 0))[_output(c, variable)])
+
+
+def _require_alike(base: Controller, law: Controller) -> None:
+    """Raise InputError for laws that no schedule takes together."""
+    if law.tracks == "errors":
+        raise InputError(CALLER, law.name, "a law of errors, as of a structure", "an LQG or a PID")
+    if law.schedule is not None or law.commutation is not None:
+        found = "a scheduled law" if law.schedule is not None else "a law that commutates ahead"
+        raise InputError(CALLER, law.name, found, "a plain LQG or PID")
+    for name in ALIKE:
+        if getattr(law, name) != getattr(base, name):
+            raise InputError(CALLER, law.name, f"another {name.replace('_', ' ')}", "laws of one form")
+    plant = plant_of(law.parameters)
+    if linearize(plant, plant.point(law.operating_point[0])).E.any():  # their pull is in the law's references
+        expected = "a machine whose currents do not depend on where it is"
+        raise InputError(CALLER, law.name, "currents that are held", expected)
