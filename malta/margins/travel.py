@@ -14,11 +14,16 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
+import casadi as ca
+import numpy as np
+
+from malta.errors import InputError
 from malta.loops.classical import Nominal
 from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
+from malta.margins.scheduled_loops import cells_of
 from malta.model.data import plant_of
 from malta.model.parameters import units_of
-from malta.model.plant import off_stroke
+from malta.model.plant import off_stroke, position_at
 from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of
 from malta.proof.expressions import NotAnalytic
@@ -40,6 +45,7 @@ from malta.proof.time_limit import TimeUp, time_limit
 from malta.proof.uncertain import Compensator, UncertainSystem, is_commutated, model_of
 from malta.proof.weak_coupling.held_currents import held_machine
 from malta.proof.weak_coupling.weak_coupling import HeldLoop
+from malta.synthesis.schedule import point_at
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -100,17 +106,29 @@ class Extent:
 NOWHERE = Extent()  # a machine without a travel and without intervals of parameters
 
 
-def extent_of(plant: Plant, names: Iterable[str] = ()) -> Extent:
-    """The extent of a plant's proofs, without the uncertain parameters `names`, whose ranges grow with the margin."""
+def extent_of(plant: Plant, names: Iterable[str] = (), controller: Controller | None = None) -> Extent:
+    """The extent of a plant's proofs, without the uncertain parameters `names`, whose ranges grow with the margin.
+
+    controller : whose schedule is the course, from its first place to its last
+    """
     uncertain = set(names)
     over = {name: interval for name, interval in plant.over.items() if name not in uncertain}
     units = units_of(plant.parameters)
+    if controller is not None and (schedule := controller.schedule) is not None:
+        units = {s.name: s.unit for s in plant.outputs} | units
+        over = {schedule.variable: (float(schedule.places[0]), float(schedule.places[-1]))} | over
+        return Extent(over=over, units={name: units[name] for name in over})
     stroke = plant.stroke if plant.has_stroke else ""
     return Extent(stroke, plant.travel, over, {name: units[name] for name in over})
 
 
-def machine_at(plant: Plant, course: str, position: float) -> tuple[Plant, dict[str, float]]:
+def machine_at(
+    plant: Plant, course: str, position: float, controller: Controller | None = None
+) -> tuple[Plant, dict[str, float]]:
     """The plant at a position of its course (SI), and the states that are not zero there."""
+    if controller is not None and controller.schedule is not None:
+        x = plant.point(controller.operating_point[0]).x
+        return plant, position_at(plant, point_at(plant, x, course, position).x)
     if plant.has_stroke:
         return plant, {plant.stroke: position}
     if not course:
@@ -127,8 +145,13 @@ def positions_of(plant: Plant, extent: Extent, shares: Iterable[float]) -> tuple
     return tuple((value,) for value in sorted({own, *extent.over.get(extent.course, ())}))
 
 
-def own_position(plant: Plant, extent: Extent, states: Mapping[str, float]) -> float:
-    """The position of the machine along its course (SI): the stroke in `states`, else the value of the parameter."""
+def own_position(
+    plant: Plant, extent: Extent, states: Mapping[str, float], controller: Controller | None = None
+) -> float:
+    """The position of the machine along its course (SI): the output of a schedule, the stroke, or the parameter."""
+    if controller is not None and controller.schedule is not None:
+        x = plant.point(controller.operating_point[0]).x
+        return float(np.array(ca.DM(plant.h(ca.DM(x), 0))).ravel()[controller.schedule.output])
     if extent.stroke or not extent.course:
         return states.get(extent.stroke, 0.0)
     return float(getattr(plant.parameters, extent.course))
@@ -172,6 +195,8 @@ def travel_margin(
     """
     names, begun, problem = tuple(names or ranges), clock.monotonic(), None
     end = deadline(begun, time)
+    if controller.schedule is not None:
+        return _scheduled_margin(plant, controller, ranges, current_loops, names, end, progress)
     try:
         with time_limit(end):
             along, over = travel_loops(plant, controller, names, current_loops)
@@ -193,10 +218,60 @@ def travel_margin(
     return replace(found, reason=f"{here}; {found.reason}" if found.reason else here)
 
 
+CELLS = 0.7  # of the time, for the proofs between the places of a schedule
+
+
+def _scheduled_margin(
+    plant: Plant,
+    controller: Controller,
+    ranges: Ranges,
+    current_loops: CurrentLoops,
+    names: tuple[str, ...],
+    end: float,
+    progress: Progress | None,
+) -> Margin:
+    """The margin at every constant reference of a schedule; where that is not proven, at its places."""
+    schedule, begun = controller.schedule, clock.monotonic()
+    assert schedule is not None
+    over, until = dict(extent_of(plant, names).over), begun + CELLS * (end - begun)
+    found, why = list[Margin](), ""
+    try:
+        with time_limit(until):
+            cells = cells_of(plant, controller, (*names, *over), current_loops)
+    except TimeUp:
+        cells = "time was up before the model was written out"
+    for k, cell in enumerate([] if isinstance(cells, str) else cells):
+        left = max((until - clock.monotonic()) / (len(cells) - k), BRIEFEST)
+        outside = over | {schedule.variable: cell.interval}
+        found.append(robust_margin(cell.system, cell.law, ranges, outside, time=left, progress=progress))
+        if found[-1].lower is None:
+            low, high = cell.interval
+            why = f"between {low:g} and {high:g}: {found[-1].reason}"
+            break
+    spent = clock.monotonic() - begun
+    if found and not why:
+        return replace(smallest_margin(found), seconds=spent)
+    along, _ = travel_loops(plant, controller, names, current_loops)
+    left = max(end - clock.monotonic(), BRIEFEST)
+    margin = common_margin(along, ranges, over, time=left, progress=progress)
+    here = f"at {len(along)} places of {schedule.variable}, {NOT_BETWEEN}"
+    return replace(margin, reason="; ".join(filter(None, (here, why or str(cells), margin.reason))))
+
+
+def smallest_margin(margins: Sequence[Margin]) -> Margin:
+    """One margin that holds at several places: the smallest lower and the smallest upper bound."""
+    lower = None if any(m.lower is None for m in margins) else min(m.lower or 0.0 for m in margins)
+    reason = "; ".join(dict.fromkeys(m.reason for m in margins if m.reason))
+    return replace(min(margins, key=lambda m: m.upper), lower=lower, reason=reason)
+
+
 def travel_loops(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
 ) -> tuple[list[tuple[UncertainSystem, Compensator]], dict[str, tuple[float, float]]]:
-    """The loops whose common margin travel_margin proves, and the intervals that do not grow with the margin."""
+    """The loops whose common margin travel_margin proves, and the intervals that do not grow with the margin.
+
+    Of a schedule these are the loops at its places.
+    """
     along, extent = margin_along(plant, controller, names, current_loops), extent_of(plant, names)
     return along, extent.intervals if len(along) == 1 else dict(extent.over)
 
@@ -207,6 +282,11 @@ def margin_along(
 ) -> list[tuple[UncertainSystem, Compensator]]:
     """The machine's loop with its position as a parameter; where that is too long, its loops at ENDS of the travel."""
     extent = extent_of(plant, names)
+    if controller.schedule is not None:
+        every = (*names, *extent.over)
+        return [
+            loop_at(plant, controller, every, z, current_loops) for z in controller.schedule.places.tolist()
+        ]
     if not (plant.has_stroke and _is_long(plant, controller, names)):
         at = {plant.stroke: 0.0} if plant.has_stroke else {}
         at |= off_stroke(plant, plant.point(controller.operating_point[0]).x)
@@ -277,7 +357,7 @@ def place_margin(
     travel the search takes EACH at most.
     """
     names = tuple(names or ranges)
-    if not plant.has_stroke:
+    if not plant.has_stroke or controller.schedule is not None:
         return robust_margin(*loop_at(plant, controller, names, position, current_loops), ranges)
     along, over = travel_loops(plant, controller, names, current_loops)
     if plant.stroke in over:
@@ -306,6 +386,8 @@ def worst_sensitivities(
 
     The others are those of travel_margin. Without a proof along the travel, it covers the middle and the end alone.
     """
+    if controller.schedule is not None:
+        raise InputError("worst_case", controller.name, "a scheduled law", "a law of one set of matrices")
     from malta.proof.blocks.gain import (
         worst_case_gain,  # with all that dynamics take, which a design does not ask for
     )
@@ -324,6 +406,8 @@ def places_along(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
 ) -> tuple[tuple[float, ...], ...]:
     """The places along the course that a report shows: for each its position, or +position and -position (SI)."""
+    if controller.schedule is not None:
+        return tuple((z,) for z in controller.schedule.places.tolist())
     shares = PLACES if covers_travel(plant, controller, names, current_loops) else ENDS
     return positions_of(plant, extent_of(plant, names), shares)
 
@@ -358,7 +442,7 @@ def loop_at(
     current_loops: CurrentLoops = LAST,
 ) -> tuple[UncertainSystem, Compensator]:
     """The machine's loop at a position along its course (SI); equal arguments return the same records."""
-    there, at = machine_at(plant, extent_of(plant, names).course, position)
+    there, at = machine_at(plant, extent_of(plant, names, controller).course, position, controller)
     at |= off_stroke(plant, plant.point(controller.operating_point[0]).x)
     return machine_system(there, controller, names, at, current_loops)
 
@@ -374,6 +458,6 @@ def loaded_loop_at(
 
     names : the uncertain parameters, which are no course
     """
-    there, at = machine_at(plant, extent_of(plant, names).course, position)
+    there, at = machine_at(plant, extent_of(plant, names, controller).course, position, controller)
     at |= off_stroke(plant, plant.point(controller.operating_point[0]).x)
     return loaded_loop(there, controller, at, current_loops)

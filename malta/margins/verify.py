@@ -6,7 +6,7 @@ The loops and their signals are those of loops.py; at the sensors S = (I - P F)^
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
@@ -44,6 +44,7 @@ from malta.margins.travel import (
     own_position,
     place_margin,
     places_along,
+    smallest_margin,
     travel_margin,
 )
 from malta.model.data import plant_of
@@ -127,7 +128,7 @@ def linear_report(
             robust = travel_margin(model.plant, controller, uncertainty, current_loops, time=time)
     except np.linalg.LinAlgError as error:
         raise CheckError(f"{controller.name}: the loop cannot be computed ({error})") from error
-    extent = extent_of(model.plant, uncertainty)
+    extent = extent_of(model.plant, uncertainty, controller)
     return replace(found, uncertainty=dict(uncertainty), robust=robust, extent=extent)
 
 
@@ -155,7 +156,9 @@ def machine_report(model: LinearModel, controller: Controller) -> LoopReport:
         closed_loop=whole.poles,
     )
     bandwidths = bandwidths_of(model, controller, whole.sampled, stable=stage.stable)
-    return LoopReport(model, controller, poles, (stage,), bandwidths, extent=extent_of(model.plant))
+    return LoopReport(
+        model, controller, poles, (stage,), bandwidths, extent=extent_of(model.plant, controller=controller)
+    )
 
 
 def _grid(Ts: float) -> FloatArray:
@@ -302,7 +305,7 @@ class _Question:
 
     @cached_property
     def extent(self) -> Extent:
-        return extent_of(self.plant, self.names)
+        return extent_of(self.plant, self.names, self.controller)
 
     @cached_property
     def whole(self) -> bool:
@@ -413,7 +416,7 @@ def _links(q: _Question) -> tuple[Link, ...]:
         own = name in (SAMPLED, MACHINE)
         if own:
             stage = q if name == last else replace(q, current_loops="lag")
-            position = own_position(q.plant, q.extent, at)
+            position = own_position(q.plant, q.extent, at, q.controller)
             loop = stage.loaded_loop_at(position)
             margin = stage.margin_at(position) if q.proof else NOT_PROVEN
         else:
@@ -457,10 +460,3 @@ def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:
         places.append(Place(positions[0], margin, peak, disk, delay))
         q.report()
     return tuple(places), worst_of(classical)
-
-
-def smallest_margin(margins: Sequence[Margin]) -> Margin:
-    """One margin that holds at several places: the smallest lower and the smallest upper bound."""
-    lower = None if any(m.lower is None for m in margins) else min(m.lower or 0.0 for m in margins)
-    reason = "; ".join(dict.fromkeys(m.reason for m in margins if m.reason))
-    return replace(min(margins, key=lambda m: m.upper), lower=lower, reason=reason)

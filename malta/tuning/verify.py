@@ -256,7 +256,8 @@ def verify(
         )
     plant = model.plant
     if worst_case is None:
-        worst_case = proof and bool(box) and covers_travel(plant, controller, tuple(box), current_loops)
+        whole = controller.schedule is None and bool(box)
+        worst_case = proof and whole and covers_travel(plant, controller, tuple(box), current_loops)
     worst = worst_sensitivities(plant, controller, box, current_loops, time=time) if worst_case else {}
     reach((1 + MOST) / 2)
     carried = payload(plant, controller) if found.stable and proof else None
