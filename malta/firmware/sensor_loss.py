@@ -47,8 +47,8 @@ def gains_without(t: Target) -> Gains:
     places = np.zeros(1)
     if plant.has_stroke and plant.travel:
         places = np.linspace(-plant.travel, plant.travel, PLACES)
-    unknown = c.noise is None or c.cost is None or c.tracks == "errors" or c.schedule is not None
-    if unknown or len(c.measurements) < 2:
+    plain = c.tracks == "states" and c.schedule is None
+    if c.noise is None or c.cost is None or not plain or len(c.measurements) < 2:
         return Gains(places, {})
     W, V = _process_noise(c), c.noise.sensor
     xi = ca.SX.sym("xi", len(c.states))

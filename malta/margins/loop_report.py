@@ -300,6 +300,15 @@ class LoopReport:
         return NOT_BETWEEN not in self.travel.reason
 
     @property
+    def places_covered(self) -> str:
+        """Where the margin holds, in words: over all that is proven at once, or at the places that stand for it."""
+        if self.covers_travel:
+            return str(self.extent)
+        if self.controller.schedule is not None:
+            return f"at the places of {self.controller.schedule.variable}"
+        return "in the middle and at the end of the travel"
+
+    @property
     def classical(self) -> Classical | None:
         """Disk and delay margins and gang of four at the operating point; None for an unstable loop."""
         return self.loop.classical if self.stable else None
@@ -338,7 +347,7 @@ class LoopReport:
         for key, value in self.bandwidth.items():
             lines.append(f"bandwidth, {BANDWIDTHS[key]}: {value / (2 * np.pi):.2f} Hz ({value:.1f} rad/s)")
         if self.uncertainty:
-            where = str(self.extent) if self.covers_travel else "in the middle and at the end of the travel"
+            where = self.places_covered
             lines += [
                 f"uncertainty: {box_words(self.uncertainty, self.plant.parameters)}",
                 f"{f'robust {where}'.rstrip()}: {self.robust}",

@@ -5,6 +5,7 @@ each change M_b - M_a that acts on a signal q of the law is led through the mach
 of gain s:
 
     law:  eta = (M_b - M_a) q,   M q = M_a q + tau        machine:  tau = s eta
+    or:   eta = q,               M q = M_a q + (M_b - M_a) tau
 
 The machine, too, is at rest where the output is at r: its states count from there, and r is a parameter beside its own.
 """
@@ -14,21 +15,22 @@ from __future__ import annotations
 import keyword
 import math
 from dataclasses import fields, make_dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from malta.loops.sampled_loops import whole_samples
 from malta.model.data import plant_of
 from malta.model.parameters import si, units_of
 from malta.model.plant import Plant, readonly
+from malta.model.sensors import whole_samples
 from malta.proof.machine.parametric_plants import of_plant
 from malta.proof.machine.windings import CurrentLoops, chosen_loops
 from malta.proof.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from malta.model.plant import FloatArray
     from malta.synthesis.controller import Controller
@@ -42,8 +44,9 @@ class Cell(NamedTuple):
     interval: tuple[float, float]
 
 
+@lru_cache(maxsize=8)  # several margins need the same loops; records compare by identity
 def cells_of(
-    plant: Plant, controller: Controller, names: Sequence[str], current_loops: CurrentLoops
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops
 ) -> list[Cell] | str:
     """The loops between the places of a controller's schedule, in parameters by name; or why there are none."""
     schedule = controller.schedule
@@ -70,7 +73,7 @@ def plant_along(plant: Plant, variable: str, place: float) -> Plant:
     record: Any = make_dataclass(
         own.__name__, [(variable, float, si(unit, default=place))], bases=(own,), frozen=True, eq=True
     )
-    values = {f.name: getattr(plant.parameters, f.name) for f in fields(plant.parameters)}  # type: ignore[arg-type]
+    values = {f.name: getattr(plant.parameters, f.name) for f in fields(plant.parameters)}
     return _moved(plant, variable, record(**values))
 
 
@@ -121,11 +124,14 @@ def law_between(
     def product(signal: FloatArray, *keys: str) -> FloatArray:
         M, change = (np.hstack([at[key] for key in keys]) for at in (one, two))
         change = change - M
-        moving = np.flatnonzero(change.any(axis=1))
-        found = M @ signal
-        found[moving] += tau[len(changes) : len(changes) + len(moving)]
-        changes.extend(change[moving] @ signal)
-        return found
+        rows_of, columns_of = (np.flatnonzero(change.any(axis=axis)) for axis in (1, 0))
+        # as few channels as the change has rows or columns
+        into, out = change[rows_of], np.eye(len(M))[:, rows_of]
+        if len(columns_of) < len(rows_of):
+            into, out = np.eye(len(signal))[columns_of], change[:, columns_of]
+        own = tau[len(changes) : len(changes) + len(into)]
+        changes.extend(into @ signal)
+        return np.asarray(M @ signal + out @ own)
 
     total = np.zeros((p, len(rows)))
     total[sums] = e - T * y[sums]
@@ -144,7 +150,7 @@ def law_between(
 def _with_channels(
     system: UncertainSystem, crossover: float, cell: tuple[float, float], channels: int
 ) -> UncertainSystem:
-    """The system with its inputs behind a lag, where there is one, and with channels of gain s; r is its last parameter.
+    """The system, its inputs behind a lag where there is one, with channels of gain s; r is its last parameter.
 
     crossover : of the lag, rad/s; inf: none
     """

@@ -237,11 +237,11 @@ def _scheduled_margin(
     found, why = list[Margin](), ""
     try:
         with time_limit(until):
-            cells = cells_of(plant, controller, (*names, *over), current_loops)
+            cells = cells_of(plant, controller, (*ranges, *over), current_loops)
     except TimeUp:
         cells = "time was up before the model was written out"
-    for k, cell in enumerate([] if isinstance(cells, str) else cells):
-        left = max((until - clock.monotonic()) / (len(cells) - k), BRIEFEST)
+    for cell in [] if isinstance(cells, str) else cells:
+        left = max(until - clock.monotonic(), BRIEFEST)
         outside = over | {schedule.variable: cell.interval}
         found.append(robust_margin(cell.system, cell.law, ranges, outside, time=left, progress=progress))
         if found[-1].lower is None:
@@ -415,8 +415,8 @@ def places_along(
 def covers_travel(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
 ) -> bool:
-    """Whether one proof covers the whole travel."""
-    return len(margin_along(plant, controller, names, current_loops)) == 1
+    """Whether one proof covers the whole travel; of a schedule, one proof between any two of its places."""
+    return controller.schedule is not None or len(margin_along(plant, controller, names, current_loops)) == 1
 
 
 def depends_on_course(

@@ -93,9 +93,9 @@ def design_page(
 def _margin_text(margins: LoopReport) -> Paragraph:
     box = box_words(margins.uncertainty, margins.plant.parameters)
     assert margins.robust is not None
-    where = str(margins.extent).replace("the travel", "the whole travel")
-    if not margins.covers_travel:
-        where = "in the middle and at the end of the travel"
+    where = margins.places_covered
+    if margins.covers_travel:
+        where = where.replace("the travel", "the whole travel")
     return Paragraph(f"{f'Parametric margin {where}'.rstrip()} ({box}): {margins.robust}\n")
 
 

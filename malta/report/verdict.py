@@ -99,7 +99,8 @@ def _margin(found: LoopReport) -> VerdictLine:
         filter(None, (f"of {box_words(found.uncertainty, found.plant.parameters)}", str(found.extent)))
     )
     if not found.covers_travel:
-        of += " (only in its middle and at its end)"
+        own = "in its middle and at its end" if found.controller.schedule is None else found.places_covered
+        of += f" (only {own})"
     stairs = _stairs(found)
     if margin is None or margin.reason == "not asked":
         return VerdictLine("margin", "not proven", "the proof was left out (--no-proof)")

@@ -70,7 +70,7 @@ class Schedule:
         """The intervals between neighbouring places."""
         return list(pairwise(self.places.tolist()))
 
-    def at(self, r: float) -> dict[str, FloatArray]:
+    def at(self, r: float) -> dict[str, Any]:
         """The matrices at a reference r of the output, SI."""
         shares = [min(max((r - a) / (b - a), 0.0), 1.0) for a, b in self.cells]
         found = {}

@@ -178,6 +178,10 @@ def _load_errors(design: SynthesizedDesign) -> list[Outcome]:
     return outcomes
 
 
+CONSTANT = (
+    "the law is scheduled over the reference of {0}: margins hold at every constant reference, no bound of its rate is "
+    "proven; figures without a place are those at the operating point"
+)
 MOST = 0.5  # of the time of a verification, which the margins take
 
 
@@ -254,6 +258,8 @@ def verify(
         found = staged_report(
             found, box, progress=lambda share: reach(MOST * share), bounds=bounds, time=time, proof=proof
         )
+    if controller.schedule is not None:
+        found = replace(found, notes=(*found.notes, CONSTANT.format(controller.schedule.variable)))
     plant = model.plant
     if worst_case is None:
         whole = controller.schedule is None and bool(box)

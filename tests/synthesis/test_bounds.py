@@ -20,7 +20,7 @@ from tampering import claiming
 
 import malta
 from malta.margins.loop_report import Stage
-from malta.margins.verify import smallest_margin
+from malta.margins.travel import smallest_margin
 from malta.proof.box import below
 from malta.proof.certificate import certificate, check, checked_file, checked_loop
 from malta.proof.exclusion import exclusion

@@ -195,7 +195,7 @@ def open_bounds(found: LoopReport) -> list[str]:
 def _coverage_text(found: LoopReport) -> str:
     """The positions and parameters that the margin over the extent covers, as a row of a table."""
     if not found.covers_travel:
-        return "middle and end of it"
+        return found.places_covered if found.controller.schedule is not None else "middle and end of it"
     parts = ["all of the travel"] if found.extent.stroke else []
     return ", ".join([*parts, found.extent.values] if found.extent.over else parts)
 
@@ -349,7 +349,8 @@ def tolerance_table(found: LoopReport) -> Table:
     """
     anywhere = ["anywhere in the travel"] if found.extent.stroke else []
     anywhere += [f"for {found.extent.values}"] if found.extent.over else []
-    where = " and ".join(anywhere) if found.covers_travel else "in its middle and at its end"
+    own = "in its middle and at its end" if found.controller.schedule is None else found.places_covered
+    where = " and ".join(anywhere) if found.covers_travel else own
     table = new_table(
         f"One at a time, proven {where}".rstrip(), "parameter", "down to", "up to", "share in the margin"
     )
