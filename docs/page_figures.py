@@ -24,6 +24,7 @@ import malta
 from malta.proof.certificate import certificate
 from malta.proof.robust import law_of
 from malta.proof.weak_coupling import taylor
+from malta.synthesis.schedule import point_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -455,6 +456,35 @@ def flexible_rotor(name: str) -> Figure:
     return getattr(figures, name)(plant, law.controller(plant))  # type: ignore[no-any-return]
 
 
+def scheduled() -> Figure:
+    """Of examples/magnet: one law and a scheduled one over a gap from 2 to 8 mm, standing and moving."""
+    spec = malta.read_design("examples/magnet/design/scheduled.toml")
+    plant = spec.plant
+    law = malta.synthesize(spec, malta.linearize(plant, plant.at()))
+    figure, (standing, moving) = new_figure(2, height=3.0)
+    places = np.linspace(-3e-3, 3e-3, 61)
+
+    def course(t: FloatArray) -> malta.references.Motion:
+        s, ds, dds = (x[:, None] for x in malta.references.quintic(t - 0.5, 0.4))
+        return malta.references.Motion(6e-3 * s - 3e-3, 6e-3 * ds, 6e-3 * dds)
+
+    scenario = malta.Scenario("along", 1.5, lambda _: course, fidelity="force", settle=0.2)
+    laws = {"law of 5 mm": replace(law, schedule=None), "scheduled": law}
+    for (label, one), style in zip(laws.items(), STYLES, strict=False):
+        rest = [point_at(plant, np.zeros(3), "y", place).x for place in places]
+        loops = [malta.loop(plant, one, q=x[0], i=x[2]) for x in rest]
+        peaks = [malta.loops.peak_sensitivity(o.nominal, "sensors") if o.stable else np.nan for o in loops]
+        standing.semilogy(5 - 1e3 * places, peaks, label=label, **style)
+        run = malta.simulate(plant, one, scenario)
+        moving.plot(run.t, 1e6 * (run.p[:, 0] - run.reference[:, 0]), label=label, **style)
+    standing.axhline(4, color="0.6", linewidth=0.8)
+    standing.text(6.2, 4.1, "zones B and C of ISO 14839-3", **GREY)
+    moving.set_ylim(-120, 120)
+    finish(standing, "gap [mm]", "peak |S|", "at rest")
+    finish(moving, "time [s]", "off the reference [µm]", "from a gap of 8 mm to 2 mm")
+    return figure
+
+
 def bending() -> Figure:
     """How much larger the mover's first bending mode may be, as a block, over its frequency; gain file robust."""
     from malta.machines.tubular.bending import bending_block, first_bending
@@ -494,6 +524,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "flexible_whirl": partial(flexible_rotor, "whirl"),
     "flexible_unbalance": partial(flexible_rotor, "unbalance"),
     "bending": bending,
+    "scheduled": scheduled,
     "flexible_rest": partial(flexible_rotor, "rest"),
 }
 

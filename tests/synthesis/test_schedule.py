@@ -49,14 +49,15 @@ def _along(low: float, high: float) -> malta.Scenario:
     return malta.Scenario("along", 0.35, lambda _: course, noise=1.0, fidelity="force", settle=0.1)
 
 
-def _rest(plant: malta.Plant, place: float) -> dict[str, float]:
+def _rest(plant: malta.Plant, place: float) -> dict[str, Any]:
     x = point_at(plant, np.zeros(len(plant.states)), "y", place).x
     return dict(zip([s.name for s in plant.states], x.tolist(), strict=True))
 
 
 def test_a_schedule_of_equal_matrices_is_the_fixed_law_to_the_bit(spec: Any, controller: Controller) -> None:
     assert controller.schedule is not None
-    equal = replace(controller.schedule, **{k: np.array([getattr(controller, k)] * 5) for k in SCHEDULED})
+    matrices: dict[str, Any] = {k: np.array([getattr(controller, k)] * 5) for k in SCHEDULED}
+    equal = replace(controller.schedule, **matrices)
     runs = [
         malta.simulate(spec.plant, replace(controller, schedule=one), _along(-1e-3, 1e-3))
         for one in (equal, None)
@@ -75,7 +76,7 @@ def test_matrices_are_linear_between_places_and_constant_beyond(controller: Cont
             np.array([np.interp(r, schedule.places, M) for M in getattr(schedule, name).reshape(5, -1).T])
             for name in ("K", "L", "Cd")
         )
-        args = {name: np.zeros(f.size1_in(i)) for i, name in enumerate(f.name_in())}
+        args: dict[str, Any] = {name: np.zeros(f.size1_in(i)) for i, name in enumerate(f.name_in())}
         args |= {"xi_pred": np.arange(1.0, n + 1) * 1e-4, "y": [r], "p_ref": [r], "frozen": [1]}
         found = f(**args)
         hat = args["xi_pred"] + L * (r - Cd @ args["xi_pred"])
@@ -115,7 +116,7 @@ def test_the_loop_between_places_is_that_of_the_law_there(spec: Any, controller:
         for r in rng.uniform(low, high, 3):
             R, m = plant.parameters.R * rng.uniform(0.8, 1.2), plant.parameters.m * rng.uniform(0.9, 1.1)
             A, B, C, D = (M[0] for M in system.explicit(np.array([R, m, r])))
-            A, B = sample(A, B, F.sample_time)
+            A, B = sample(A, B, controller.sample_time)
             around = np.linalg.inv(np.eye(len(F.D)) - F.D @ D)
             from_x, from_law = around @ F.D @ C, around @ F.C
             whole = np.block(
@@ -124,7 +125,7 @@ def test_the_loop_between_places_is_that_of_the_law_there(spec: Any, controller:
             heavy = plant.variant(replace(plant.parameters, R=R, m=m))
             at = _rest(heavy, float(r))
             alone, law_there = machine_system(heavy, controller, [], at, "lag")
-            own = np.exp(instability(alone, law_there, np.zeros((1, 0)))[0] * F.sample_time)
+            own = np.exp(instability(alone, law_there, np.zeros((1, 0)))[0] * controller.sample_time)
             assert np.abs(np.linalg.eigvals(whole)).max() == pytest.approx(own, rel=1e-9)
 
 
@@ -153,7 +154,7 @@ def test_the_margin_holds_at_random_places(spec: Any, controller: Controller) ->
 def test_nothing_is_proven_where_the_law_is_unstable_at_a_place(spec: Any, controller: Controller) -> None:
     """The fixed law as a schedule of equal matrices: lost at the near end."""
     assert controller.schedule is not None
-    matrices = {k: np.array([getattr(controller, k)] * 2) for k in SCHEDULED}
+    matrices: dict[str, Any] = {k: np.array([getattr(controller, k)] * 2) for k in SCHEDULED}
     equal = Schedule("y", 0, np.array([2e-3, 3e-3]), **matrices)
     margin = travel_margin(spec.plant, replace(controller, schedule=equal), {"R": 0.2}, time=20)
     assert not margin.lower
@@ -216,7 +217,7 @@ def test_a_gain_file_with_another_schedule_is_refused(
     ],
 )
 def test_what_no_schedule_can_be_is_refused_in_a_sentence(entries: dict[str, Any], said: str) -> None:
-    with pytest.raises(malta.InputError, match=said):
+    with pytest.raises(malta.InputError, match=said):  # noqa: PT012  reading or designing refuses
         spec = malta.read_design(MAGNET, entries=entries)
         malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
 
