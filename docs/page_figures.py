@@ -13,6 +13,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import control
 import matplotlib as mpl
 import numpy as np
@@ -24,7 +25,6 @@ import malta
 from malta.proof.certificate import certificate
 from malta.proof.robust import law_of
 from malta.proof.weak_coupling import taylor
-from malta.synthesis.schedule import point_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -462,7 +462,7 @@ def scheduled() -> Figure:
     plant = spec.plant
     law = malta.synthesize(spec, malta.linearize(plant, plant.at()))
     figure, (standing, moving) = new_figure(2, height=3.0)
-    places = np.linspace(-3e-3, 3e-3, 61)
+    places, w = np.linspace(-3e-3, 3e-3, 61), np.geomspace(1, np.pi / spec.sample_time, 1000)
 
     def course(t: FloatArray) -> malta.references.Motion:
         s, ds, dds = (x[:, None] for x in malta.references.quintic(t - 0.5, 0.4))
@@ -471,9 +471,9 @@ def scheduled() -> Figure:
     scenario = malta.Scenario("along", 1.5, lambda _: course, fidelity="force", settle=0.2)
     laws = {"law of 5 mm": replace(law, schedule=None), "scheduled": law}
     for (label, one), style in zip(laws.items(), STYLES, strict=False):
-        rest = [point_at(plant, np.zeros(3), "y", place).x for place in places]
-        loops = [malta.loop(plant, one, q=x[0], i=x[2]) for x in rest]
-        peaks = [malta.loops.peak_sensitivity(o.nominal, "sensors") if o.stable else np.nan for o in loops]
+        currents = [float(ca.DM(plant.position_of([place]))[2]) for place in places]
+        loops = [malta.loop(plant, one, q=y, i=i) for y, i in zip(places, currents, strict=True)]
+        peaks = [np.abs(o.sensitivity(w)).max() if o.stable else np.nan for o in loops]
         standing.semilogy(5 - 1e3 * places, peaks, label=label, **style)
         run = malta.simulate(plant, one, scenario)
         moving.plot(run.t, 1e6 * (run.p[:, 0] - run.reference[:, 0]), label=label, **style)
