@@ -16,7 +16,8 @@ from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import commutate_ahead
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
-from malta.synthesis.schedule import point_at, schedule_laws
+from malta.synthesis.schedule import point_at
+from malta.synthesis.scheduling import schedule_laws
 from malta.synthesis.spec import Spec
 from malta.synthesis.structure import structured_controller
 
