@@ -8,5 +8,6 @@ from malta.contents import contents
 
 if TYPE_CHECKING:
     from malta.margins.loop_report import LoopReport as LoopReport
+    from malta.margins.scheduled_loops import schedule_rate as schedule_rate
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

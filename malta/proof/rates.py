@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import time as clock
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import casadi as ca
 import numpy as np
@@ -27,11 +27,14 @@ from scipy import linalg
 from malta.display import Description, display, floor_to, quantity
 from malta.errors import InputError
 from malta.processes import on_one_thread
+from malta.proof.expressions import NotAnalytic
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.robust import law_of
 from malta.proof.uncertain import Compensator, UncertainSystem, interval, positive
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from malta.model.plant import FloatArray
 
 CALLER = "varying"
@@ -72,7 +75,7 @@ class RateBound:
         head = f"{self.name} in {self.low:g} .. {self.high:g}: "
         if self.rate is None:
             return head + f"nothing proven ({self.reason})"
-        return head + f"proven for every course with |d{self.name}/dt| up to {floor_to(self.rate, 3):g}"
+        return head + f"proven for every course with |d{self.name}/dt| up to {_rounded(self.rate):g}"
 
     @property
     def description(self) -> Description:
@@ -81,6 +84,12 @@ class RateBound:
         if self.decay is not None:
             rows.insert(0, ("decay when frozen", quantity(floor_to(self.decay, 3), "1/s")))
         return Description(str(self), tuple(rows))
+
+
+def _rounded(rate: float) -> float:
+    """A proven bound to three decimals, or three digits where it is small; never more than it is."""
+    digits = 3 if rate >= 1 or not rate > 0 else 2 - math.floor(math.log10(rate))
+    return floor_to(rate, max(digits, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +101,16 @@ class _Loop:
     R: Any  # xi -> (x, u)
     n: int
     T: float
+    over: tuple[float, float] = (0.0, 0.0)  # of p
+
+    @property
+    def cells(self) -> list[CellOfLoop]:
+        """The intervals within which Phi is one smooth function of p."""
+        return [CellOfLoop(self.at, *self.over)]
+
+    def norms(self, P: Any) -> Norms:
+        """What is needed of changes of Phi, in units in which P is about one."""
+        return _Units(self, P, max(map(abs, self.over)))
 
     def at(self, p: float) -> Any:
         """Phi in balls."""
@@ -104,6 +123,55 @@ class _Loop:
         )
 
 
+class CellOfLoop(NamedTuple):
+    """Phi of p in balls, within an interval of p."""
+
+    at: Callable[[float], Any]
+    low: float
+    high: float
+
+
+class Changes(NamedTuple):
+    """Bounds of how Phi changes within an interval of p, in the units of a piece."""
+
+    spread: float  # by a change of e^(M T) of size one
+    first: float  # within a sample, by a p that moves at rate one, to first order
+    bent: float  # of Phi'' in p
+
+
+class Norms(Protocol):
+    """Bounds of how Phi changes."""
+
+    speed: float  # of e^(M t) in its units, 1/s
+    slope: float  # of M with p
+
+    def changes(self, X: Any, back: Any, low: float, high: float) -> Changes:
+        """Within an interval, in the units X; a sample that begins in it ends less than its width beyond."""
+        ...
+
+
+class MovingLoop(Protocol):
+    """A frozen sampled loop xi+ = Phi(p) xi along an interval of p."""
+
+    @property
+    def T(self) -> float:
+        """The sample time, s."""
+        ...
+
+    @property
+    def cells(self) -> list[CellOfLoop]:
+        """The intervals within which Phi is one smooth function of p, in order."""
+        ...
+
+    def at(self, p: float) -> Any:
+        """Phi in balls."""
+        ...
+
+    def norms(self, P: Any) -> Norms:
+        """What is needed of changes of Phi, in units in which P is about one."""
+        ...
+
+
 class _Piece(NamedTuple):
     """What is proven between two values of p."""
 
@@ -111,6 +179,7 @@ class _Piece(NamedTuple):
     fall: float  # g
     slope: float  # d
     spread: float  # of the change within a sample: |N e R| <= spread |e| in the norm of P
+    first: float  # of the change within a sample at rate one, to first order
 
 
 @on_one_thread
@@ -154,6 +223,13 @@ def varying(
     positive(CALLER, "time", time)
     with precision(BITS):
         loop = _loop_of(system, law_of(system, compensator, CALLER), name)
+        return rate_bound(replace(loop, over=(low, high)), name, begun, time)
+
+
+def rate_bound(loop: MovingLoop, name: str, begun: float, time: float) -> RateBound:
+    """The bound of a loop over all its cells, in a search that began at a time and may last another."""
+    low, high = loop.cells[0].low, loop.cells[-1].high
+    with precision(BITS):
         reason = "the loop is unstable at a frozen value"
         for share in SHARES:
             found = _pieces(loop, low, high, share, begun + time)
@@ -189,7 +265,7 @@ def _loop_of(system: UncertainSystem, law: Compensator, name: str) -> _Loop:
     plain = _closed(A, A1, B, C, law)
     with np.errstate(all="ignore"):
         _, (t, _) = linalg.matrix_balance(
-            _middle(plain.at(float(system.nominal[system.names.index(name)]))), permute=False, separate=True
+            middle(plain.at(float(system.nominal[system.names.index(name)]))), permute=False, separate=True
         )
     n, own = len(A), len(A) + law.delay * B.shape[1]
     x, u, s = t[:n], 2.0 ** np.round(np.log2(t[n:own]).mean()) if own > n else 1.0, t[own:]
@@ -204,8 +280,8 @@ def _closed(A: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray, law: Co
     (n, m), k, d = B.shape, len(law.A), law.delay
     size, own = n + m * d + k, n + m * d
     out = [[arb(0)] * size for _ in range(m)]  # of the law
-    _put(out, 0, 0, _ball(law.D) * _ball(C))
-    _put(out, 0, own, _ball(law.C))
+    _put(out, 0, 0, ball(law.D) * ball(C))
+    _put(out, 0, own, ball(law.C))
     L = [[arb(0)] * size for _ in range(size)]
     R = [[arb(int(i == j)) for j in range(size)] for i in range(n)]
     if d:
@@ -215,15 +291,15 @@ def _closed(A: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray, law: Co
         L[own - m : own] = out
     else:
         R += out
-    _put(L, own, 0, _ball(law.B) * _ball(C))
-    _put(L, own, own, _ball(law.A))
+    _put(L, own, 0, ball(law.B) * ball(C))
+    _put(L, own, own, ball(law.A))
     M0, M1 = np.zeros((n + m, n + m)), np.zeros((n + m, n + m))
     M0[:n, :n], M0[:n, n:], M1[:n, :n] = A, B, A1
     assert law.sample_time is not None
-    return _Loop((_ball(M0), _ball(M1)), arb_mat(L), arb_mat(R), n, law.sample_time)
+    return _Loop((ball(M0), ball(M1)), arb_mat(L), arb_mat(R), n, law.sample_time)
 
 
-def _ball(M: FloatArray) -> Any:
+def ball(M: FloatArray) -> Any:
     return arb_mat(len(M), M.shape[1], [arb(float(x)) for x in M.ravel()])
 
 
@@ -233,7 +309,7 @@ def _put(rows: list[list[Any]], i: int, j: int, M: Any) -> None:
         rows[i + k][j : j + len(row)] = row
 
 
-def _middle(M: Any) -> FloatArray:
+def middle(M: Any) -> FloatArray:
     return np.array([[float(x.mid()) for x in row] for row in M.tolist()]).reshape(M.nrows(), M.ncols())
 
 
@@ -245,7 +321,7 @@ def _size(M: Any) -> float:
 def _is_positive(F: Any) -> bool:
     """Whether a symmetric matrix of balls is positive definite: near one after a congruence, by its rows."""
     try:
-        X = _ball(np.linalg.inv(np.linalg.cholesky(_middle(F))).T)
+        X = ball(np.linalg.inv(np.linalg.cholesky(middle(F))).T)
     except np.linalg.LinAlgError:
         return False
     rows = (X.transpose() * F * X).tolist()
@@ -258,14 +334,14 @@ def _is_positive(F: Any) -> bool:
 class _Choice:
     """P(p) in floating point: of the frozen loop with a faster clock, from one Q."""
 
-    loop: _Loop
+    loop: MovingLoop
     Q: FloatArray
     scale: float  # of Phi, above 1
 
     @classmethod
-    def of(cls, loop: _Loop, low: float, high: float, share: float) -> _Choice | None:
+    def of(cls, loop: MovingLoop, low: float, high: float, share: float) -> _Choice | None:
         """None where a frozen loop is unstable."""
-        frozen = [_middle(loop.at(p)) for p in np.linspace(low, high, 9)]
+        frozen = [middle(loop.at(p)) for p in np.linspace(low, high, 9)]
         radius = max(np.abs(np.linalg.eigvals(Phi)).max() for Phi in frozen)
         if not radius < 1:
             return None
@@ -280,39 +356,39 @@ class _Choice:
 
     def at(self, Phi: Any) -> Any:
         """P as balls of no width; symmetric."""
-        P = linalg.solve_discrete_lyapunov(self.scale * _middle(Phi).T, self.Q)
-        return _ball((P + P.T) / 2)
+        P = linalg.solve_discrete_lyapunov(self.scale * middle(Phi).T, self.Q)
+        return ball((P + P.T) / 2)
 
 
 def _pieces(
-    loop: _Loop, low: float, high: float, share: float, until: float
-) -> tuple[list[_Piece], _Units] | str:
+    loop: MovingLoop, low: float, high: float, share: float, until: float
+) -> tuple[list[_Piece], Norms] | str:
     """The pieces of the interval, each proven; else why not."""
     choice = _Choice.of(loop, low, high, share)
     if choice is None:
         return "the loop is unstable at a frozen value"
-    known: dict[float, tuple[Any, Any]] = {}
+    known, nodes = dict[tuple[float, float], Any](), dict[float, Any]()
 
-    def at(p: float) -> tuple[Any, Any]:
-        if p not in known:
-            Phi = loop.at(p)
-            known[p] = Phi, choice.at(Phi)
-        return known[p]
+    def node(cell: CellOfLoop, p: float) -> tuple[Any, Any]:
+        if (cell.low, p) not in known:
+            known[cell.low, p] = Phi = cell.at(p)
+            nodes.setdefault(p, choice.at(Phi))  # P is one where two cells meet
+        return known[cell.low, p], nodes[p]
 
     g = float(1 - choice.scale**-1.5)  # of what P has at its nodes, 1 - scale^-2
-    norms = _Units(loop, at((low + high) / 2)[1], max(abs(low), abs(high)))
-    found, stack = list[_Piece](), [(low, high)]
+    norms = loop.norms(choice.at(loop.at((low + high) / 2)))
+    found, stack = list[_Piece](), [(cell, cell.low, cell.high) for cell in reversed(loop.cells)]
     while stack:
         if clock.monotonic() > until:
             return "time was up"
-        a, b = stack.pop()
-        piece = _prove(loop, norms, g, b - a, at(a), at(b))
+        cell, a, b = stack.pop()
+        piece = _prove(norms, g, (a, b), node(cell, a), node(cell, b))
         if piece is not None:
             found.append(piece)
         elif b - a < LEAST * (high - low):
             return f"no piece was proven at {a:g}"
         else:
-            stack += [((a + b) / 2, b), (a, (a + b) / 2)]
+            stack += [(cell, (a + b) / 2, b), (cell, a, (a + b) / 2)]
     return found, norms
 
 
@@ -324,58 +400,61 @@ class _Units:
     """
 
     def __init__(self, loop: _Loop, P: Any, most: float) -> None:
+        self.n, self.T = loop.n, loop.T
         n = loop.n
-        self.U = _ball(np.linalg.inv(np.linalg.cholesky(_middle(P)[:n, :n])).T)
+        self.U = ball(np.linalg.inv(np.linalg.cholesky(middle(P)[:n, :n])).T)
         self.back = self.U.inv()
         A, A1 = (self.back * _part(M, n, n) * self.U for M in loop.M)
-        self.slope = _spectral(A1)
-        self.speed = _spectral(A) + most * self.slope
+        self.slope = spectral(A1)
+        self.speed = spectral(A) + most * self.slope
         top, rest = loop.R.tolist()[:n], loop.R.tolist()[n:]
         drive = arb_mat([row[n:] for row in loop.M[0].tolist()[:n]])
         self.reads = self.back * arb_mat(top), self.back * drive * arb_mat(rest) * arb(loop.T)
 
-    def spread(self, n: int, X: Any, back: Any) -> float:
-        """|change of Phi xi| over |xi| in the units X, of a change of size one of x."""
-        into = _spectral(arb_mat([row[:n] for row in back.tolist()]) * self.U)
-        return into * sum(_spectral(read * X) for read in self.reads)
+    def changes(self, X: Any, back: Any, low: float, high: float) -> Changes:  # noqa: ARG002
+        """The same in every interval."""
+        into = spectral(_part(back, back.nrows(), self.n) * self.U)
+        spread = into * sum(spectral(read * X) for read in self.reads)
+        grown, T = math.exp(self.speed * self.T), self.T
+        return Changes(spread, spread * grown * self.slope * T**2, spread * (T * self.slope) ** 2 * grown)
 
 
 def _part(M: Any, rows: int, columns: int) -> Any:
     return arb_mat([row[:columns] for row in M.tolist()[:rows]])
 
 
-def _spectral(M: Any) -> float:
+def spectral(M: Any) -> float:
     """An upper bound of the largest singular value, close to it."""
-    near = float(np.linalg.norm(_middle(M), 2)) * (1 + 1e-6) + 1e-300
+    near = float(np.linalg.norm(middle(M), 2)) * (1 + 1e-6) + 1e-300
     n = M.ncols()
     gram = arb_mat([[arb(near) ** 2 * int(i == j) for j in range(n)] for i in range(n)]) - M.transpose() * M
     return near if _is_positive(gram) else _size(M)
 
 
 def _prove(
-    loop: _Loop, norms: _Units, g: float, h: float, one: tuple[Any, Any], two: tuple[Any, Any]
+    norms: Norms, g: float, ends: tuple[float, float], one: tuple[Any, Any], two: tuple[Any, Any]
 ) -> _Piece | None:
-    """The piece between two nodes (Phi, P), of width h; None where it is not proven."""
+    """The piece between two nodes (Phi, P) at its ends; None where it is not proven."""
+    h = ends[1] - ends[0]
     (Phi_a, P_a), (Phi_b, P_b) = one, two
     P, D = (P_a + P_b) * arb(0.5), (P_b - P_a) * (arb(1) / arb(h))
     try:
-        X = _ball(
-            np.linalg.inv(np.linalg.cholesky(_middle(P))).T
-        )  # units in which P is one, but for rounding
+        X = ball(np.linalg.inv(np.linalg.cholesky(middle(P))).T)  # units in which P is one, but for rounding
     except np.linalg.LinAlgError:
         return None
     back = X.inv()
-    d = float(np.abs(linalg.eigvalsh(_middle(D), _middle(P))).max()) * (1 + 1e-6) + 1e-12
+    d = float(np.abs(linalg.eigvalsh(middle(D), middle(P))).max()) * (1 + 1e-6) + 1e-12
     if h * d / 2 > 0.5 or not all(_is_positive(P * arb(d) + D * arb(sign)) for sign in (1, -1)):
         return None
     wide = math.sqrt((1 + h * d / 2) / (1 - h * d / 2)) * (1 + 1e-9)  # of norms within the piece
-    off = _size(X.transpose() * P * X - _ball(np.eye(P.nrows())))
+    off = _size(X.transpose() * P * X - ball(np.eye(P.nrows())))
     if off > NEAR:
         return None
     near = math.sqrt((1 + off) / (1 - off)) * (1 + 1e-9)  # norms in P over those in X
-    spread = near * norms.spread(loop.n, X, back)
-    T = loop.T
-    bent = spread * (T * norms.slope) ** 2 * math.exp(norms.speed * T)
+    try:
+        spread, first, bent = (near * size for size in norms.changes(X, back, *ends))
+    except NotAnalytic:  # of a piece that is too wide
+        return None
     chord = near * _size(back * (Phi_b - Phi_a) * X) / h + h / 2 * bent
     size = wide + h**2 / 8 * bent
     pi = 1 + h * d / 2
@@ -383,18 +462,23 @@ def _prove(
     for Phi, own in ((Phi_a, P_a), (Phi_b, P_b)):
         if not _is_positive(own * (1 - arb(g)) - Phi.transpose() * own * Phi - P * arb(curved)):
             return None
-    return _Piece(h, g, d / (1 - h * d / 2), spread * wide)
+    return _Piece(h, g, d / (1 - h * d / 2), spread * wide, first * wide)
 
 
-def _rate(pieces: list[_Piece], loop: _Loop, norms: _Units) -> float:
-    """The largest rate found for which V falls in every sample."""
+def _rate(pieces: list[_Piece], loop: MovingLoop, norms: Norms) -> float:
+    """The largest rate found for which V falls in every sample.
+
+    What the motion of p within a sample changes beyond the first order is at most y^2 e^y / 2, y = rate T^2 slope.
+    """
     T = loop.T
     steep = [max(p.slope for p in pieces[max(k - 1, 0) : k + 2]) for k in range(len(pieces))]
 
     def falls(rate: float) -> bool:
-        moved = math.exp(norms.speed * T) * math.expm1(rate * T**2 * norms.slope) * (1 + 1e-9)
+        y = rate * T**2 * norms.slope
+        beyond = math.exp(norms.speed * T + y) * y**2 / 2 * (1 + 1e-9)
         return rate * T <= min(p.width for p in pieces) and all(
-            (math.sqrt(1 - p.fall) + p.spread * moved) ** 2 * math.exp(rate * T * d) < 1 - 1e-12
+            (math.sqrt(1 - p.fall) + rate * p.first + p.spread * beyond) ** 2 * math.exp(rate * T * d)
+            < 1 - 1e-12
             for p, d in zip(pieces, steep, strict=True)
         )
 

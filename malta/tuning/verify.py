@@ -16,6 +16,7 @@ from malta.loops.loop import Loop, loop_of_model
 from malta.loops.sampled_loops import LAST
 from malta.loops.time_domain import bounded_deviation, noise_of, worst_along
 from malta.margins.loop_report import BANDWIDTHS, LoopReport, Outcome
+from malta.margins.scheduled_loops import schedule_rate
 from malta.margins.travel import covers_travel, worst_sensitivities
 from malta.margins.verify import linear_report, staged_report
 from malta.model.data import plant_of
@@ -178,10 +179,7 @@ def _load_errors(design: SynthesizedDesign) -> list[Outcome]:
     return outcomes
 
 
-CONSTANT = (
-    "the law is scheduled over the reference of {0}: margins hold at every constant reference, no bound of its rate is "
-    "proven; figures without a place are those at the operating point"
-)
+RATE = 60.0  # s, of the search for how fast the reference of a schedule may move
 MOST = 0.5  # of the time of a verification, which the margins take
 
 
@@ -259,7 +257,9 @@ def verify(
             found, box, progress=lambda share: reach(MOST * share), bounds=bounds, time=time, proof=proof
         )
     if controller.schedule is not None:
-        found = replace(found, notes=(*found.notes, CONSTANT.format(controller.schedule.variable)))
+        found = replace(
+            found, notes=(*found.notes, _schedule_note(model.plant, controller, time, proof=proof))
+        )
     plant = model.plant
     if worst_case is None:
         whole = controller.schedule is None and bool(box)
@@ -268,6 +268,20 @@ def verify(
     reach((1 + MOST) / 2)
     carried = payload(plant, controller) if found.stable and proof else None
     return with_requirements(replace(found, worst=worst, payload=carried), spec, proof=proof, flights=flights)
+
+
+def _schedule_note(plant: Plant, controller: Controller, time: float | None, *, proof: bool) -> str:
+    """What the margins of a scheduled law are of, and how fast its reference may move."""
+    assert controller.schedule is not None
+    of = f"scheduled over the reference of {controller.schedule.variable}: margins are those of constant references, "
+    of += "figures without a place those of the operating point"
+    if not proof:
+        return of
+    bound = schedule_rate(plant, controller, time=RATE if time is None else time)
+    unit = next(s.unit for s in plant.outputs if s.name == bound.name)
+    if bound.rate is None:
+        return f"{of}; nothing is proven of a reference that moves ({bound.reason})"
+    return f"{of}; with the machine at its reference, nominal: {bound} {unit}/s"
 
 
 def with_requirements(found: LoopReport, spec: Spec | None, *, proof: bool, flights: bool) -> LoopReport:
