@@ -465,10 +465,10 @@ def scheduled() -> Figure:
     places, w = np.linspace(-3e-3, 3e-3, 61), np.geomspace(1, np.pi / spec.sample_time, 1000)
 
     def course(t: FloatArray) -> malta.references.Motion:
-        s, ds, dds = (x[:, None] for x in malta.references.quintic(t - 0.5, 0.4))
+        s, ds, dds = (x[:, None] for x in malta.references.quintic(t - 2.1, 2.0))  # 2.85 mm/s at most
         return malta.references.Motion(6e-3 * s - 3e-3, 6e-3 * ds, 6e-3 * dds)
 
-    scenario = malta.Scenario("along", 1.5, lambda _: course, fidelity="force", settle=0.2)
+    scenario = malta.Scenario("along", 4.5, lambda _: course, fidelity="force", settle=0.2)
     laws = {"law of 5 mm": replace(law, schedule=None), "scheduled": law}
     for (label, one), style in zip(laws.items(), STYLES, strict=False):
         currents = [float(ca.DM(plant.position_of([place]))[2]) for place in places]
@@ -479,7 +479,7 @@ def scheduled() -> Figure:
         moving.plot(run.t, 1e6 * (run.p[:, 0] - run.reference[:, 0]), label=label, **style)
     standing.axhline(4, color="0.6", linewidth=0.8)
     standing.text(6.2, 4.1, "zones B and C of ISO 14839-3", **GREY)
-    moving.set_ylim(-120, 120)
+    moving.set_ylim(-100, 100)
     finish(standing, "gap [mm]", "peak |S|", "at rest")
     finish(moving, "time [s]", "off the reference [µm]", "from a gap of 8 mm to 2 mm")
     return figure

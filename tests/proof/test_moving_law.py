@@ -32,6 +32,7 @@ def _damping() -> Compensator:
     return compensator_of(lead, 1, 1)
 
 
+@pytest.mark.slow
 def test_a_constant_law_has_the_bound_of_the_affine_proof() -> None:
     """One bound of P, and two of curvature and of the motion within a sample: the older one is coarser."""
     spring, law = malta.uncertain(_spring, {"k": 2.0}), _damping()
@@ -74,6 +75,7 @@ def magnet() -> tuple[Any, Any]:
     return spec.plant, malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
 
 
+@pytest.mark.slow
 def test_the_enclosure_holds_the_loop_and_its_curvature(magnet: tuple[Any, Any]) -> None:
     """Phi at a place beside the machine's own loop; Phi'' on an interval beside differences of Phi."""
     cells = cells_of(*magnet, (), "lag")
@@ -93,6 +95,7 @@ def test_the_enclosure_holds_the_loop_and_its_curvature(magnet: tuple[Any, Any])
             assert np.abs(found).max() > 0.3 * bounds.max()
 
 
+@pytest.mark.slow
 def test_courses_as_fast_as_proven_decay(magnet: tuple[Any, Any]) -> None:
     """The machine between samples in steps, its place on sawtooths of the proven rate; the law that of the sample."""
     bound = schedule_rate(*magnet)

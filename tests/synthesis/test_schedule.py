@@ -95,6 +95,7 @@ def test_the_machine_follows_where_the_fixed_law_is_unstable(spec: Any, controll
     assert abs(run.p[-1, 0] - 3e-3) < 1e-4
 
 
+@pytest.mark.slow
 def test_the_engines_and_the_c_code_fly_the_same(spec: Any, controller: Controller) -> None:
     """The C is written from the expressions of the simulation: a sum may be taken in another order."""
     scenario = _along(-3e-3, 3e-3)
