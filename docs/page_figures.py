@@ -468,7 +468,7 @@ def scheduled() -> Figure:
         s, ds, dds = (x[:, None] for x in malta.references.quintic(t - 2.1, 2.0))  # 2.85 mm/s at most
         return malta.references.Motion(6e-3 * s - 3e-3, 6e-3 * ds, 6e-3 * dds)
 
-    scenario = malta.Scenario("along", 4.5, lambda _: course, fidelity="force", settle=0.2)
+    scenario = malta.Scenario("along", 5.0, lambda _: course, fidelity="force", settle=0.2)
     laws = {"law of 5 mm": replace(law, schedule=None), "scheduled": law}
     for (label, one), style in zip(laws.items(), STYLES, strict=False):
         currents = [float(ca.DM(plant.position_of([place]))[2]) for place in places]

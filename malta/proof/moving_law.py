@@ -2,8 +2,8 @@
 
 Between samples x' = A(p) x + B(p) v, while the law has the p of the sample: xi+ = Phi(p) xi and what the motion of p
 within the sample changes, Phi = L(p) + N e^(M(p) T) R(p), M = [[A, B], [0, 0]], R: xi -> (x, v). The law may be another
-function of p from interval to interval, as that of a schedule, but Phi is continuous. Phi'' is enclosed on each piece in
-balls: the exponential of [[M, M', M''/2], [0, M, M'], [0, 0, M]] T has e^(M T) and its derivatives in its first rows.
+function of p from interval to interval, as that of a schedule, but Phi is continuous. Phi'' is enclosed on each piece
+in balls: the exponential of [[M, M', M''/2], [0, M, M'], [0, 0, M]] T has e^(M T) and its derivatives in its first row.
 """
 
 from __future__ import annotations
