@@ -47,8 +47,12 @@ def origin_of(
     current_loops : the stage, see `chosen_loops`
     loops : how many; several are those of places along the travel
 
-    Raises InputError for a file of another kind.
+    Raises InputError for a file of another kind, and for a scheduled law, whose proof the checker does not know.
     """
+    if controller.schedule is not None:
+        raise InputError(
+            gains, "schedule", "a scheduled law", "a law of one set of matrices for a certificate"
+        )
     content = content_of(locate(Path(gains)))[1]
     law = {key: value for key, value in content.items() if key not in APART}
     stage = chosen_loops(plant, controller, current_loops)

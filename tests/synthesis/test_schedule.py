@@ -13,6 +13,7 @@ import pytest
 
 import malta
 from malta.firmware.signals import Target
+from malta.gains.certified import origin_of
 from malta.gains.encodings import content_sha256, encode
 from malta.loops.sampled_loops import machine_system
 from malta.margins.scheduled_loops import cells_of
@@ -259,6 +260,8 @@ def test_what_a_scheduled_law_does_not_have_is_refused(spec: Any, controller: Co
             malta.simulate(plant, controller, scenario)
     with pytest.raises(malta.InputError, match="worst_case: scheduled"):
         worst_sensitivities(plant, controller, {"R": 0.2})
+    with pytest.raises(malta.InputError, match="for a certificate"):
+        origin_of("scheduled.json", plant, controller, "lag", 5)
     with pytest.raises(malta.InputError, match="one set of gains"):
         Target(controller, fidelity="force", tunable=True)
 
