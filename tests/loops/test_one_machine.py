@@ -260,3 +260,16 @@ def test_the_derivative_of_the_flight_anywhere_in_box_and_travel(name: str) -> N
         check_proven_loop(
             plant, c, names, nominal * (1 + 0.2 * spread), (-0.93, -0.41, 0.0, 0.37, 0.88)[k % 5]
         )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [-2.2e-3, 0.0, 1.5e-3, 3e-3])
+def test_the_loop_of_a_schedule_is_the_derivative_of_the_flight_at_its_reference(place: float) -> None:
+    """No slope of a matrix is in it, whatever the sums of errors hold there: the reference chooses the matrices."""
+    spec = malta.read_design("examples/magnet/design/scheduled.toml")
+    plant = spec.plant
+    c = malta.synthesize(spec, malta.linearize(plant, plant.at()))
+    at = {"q": place, "i": float(plant.position_of([place])[2])}
+    ours = machine_loop(loaded_model(plant, 0.0, tuple(at.items())), c)
+    flown = derivative_at_rest(plant, c, plant.at(**at).x)
+    assert distance(poles(ours.closed, c.sample_time), poles(flown, c.sample_time)) < SAME
