@@ -18,13 +18,17 @@ from malta.app.server import Server
 from malta.app.session import Session
 from malta.files import shipped_path
 
-ASKED = 0.15  # s, of a move
+ASKED = 0.1  # s of processor time, of a move
 MOVES = 25  # of a run; the first of each is left out, which traces the machine
 CASES = {  # design file -> keys that are moved, a number of the law and one of the machine
     "design/robust.toml": ("bases.state.x", "machine.m"),
+    "design/robust_observer.toml": ("bases.state.x", "machine.K_D"),
     "design/tubular_pid.toml": ("pid.Kd.fx_B1", "machine.m"),
+    "design/structured.toml": ("structure.elements.radial.Kd", "machine.m"),
+    "design/halbach.toml": ("bases.state.x", "machine.m"),
     "design/halbach_pid.toml": ("pid.Kp.F_x", "machine.m"),
-    "design/planar.toml": ("bases.integral.x", "machine.m"),
+    "design/planar.toml": ("bases.integral.x", "machine.m", "machine.B_r"),
+    "design/planar_pid.toml": ("pid.Kp.F_x", "machine.m"),
     "examples/rotor/design/rotor.toml": ("bases.state.x", "machine.m"),
 }
 
@@ -37,7 +41,7 @@ class Moves(NamedTuple):
 
 
 def live_page(runs: int) -> list[Result]:
-    """Moves of one number at a time: the median and the 95th percentile beside what the page asks for."""
+    """Moves of one number at a time: processor time, the median and the 95th percentile beside what the page asks for."""
     rows = []
     for file, keys in CASES.items():
         for key in keys:
@@ -45,7 +49,7 @@ def live_page(runs: int) -> list[Result]:
             for name, share in (("median", 50), ("95 %", 95)):
                 label = f"{Path(file).stem}, {key}, {name}"
                 rows.append(
-                    Result(label, float(np.percentile(seconds.wall, share)), "asked for", ASKED, "at least 1")
+                    Result(label, float(np.percentile(seconds.cpu, share)), "asked for", ASKED, "at least 1")
                 )
     return rows
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -23,6 +23,7 @@ from malta.errors import CheckError
 from malta.loops.classical import Nominal, remembered
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim
+from malta.model.families import traced
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import off_stroke, position_in, readonly
 from malta.model.sensors import whole_samples, with_lags
@@ -227,18 +228,21 @@ def sampled_loop(
     """
     controller = law_at(controller, model.plant, model.operating_point.x)
     model, law = commanded_model(model, controller), linear_law(controller)
-    A, B, C = model.A, model.B, model.C
-    if model.E.any():
-        A, B = A - model.E @ C, np.hstack([B, model.E])
-    plant, true, late = model.plant, None, 0
+    plant, late = model.plant, 0
+    A, B, C, true = _between_samples(model, sensors=sensors)
     if sensors and plant.sensors is not None:
-        true, late = C, whole_samples(plant, controller.sample_time)
-        A, B, C = (np.array(ca.DM(M)) for M in with_lags(plant.sensors, A, B, C))
+        late = whole_samples(plant, controller.sample_time)
     if feedforward:
         law = with_slope(law, feedforward_slope(model, controller))
     if current_loops == "pi":
-        A, Ad, Bd, law = _driven(model, controller, (A, B, C), delay, law, forces_alone=forces_alone)
-        continuous = A
+        continuous, Ad, Bd, control = _driven(model, controller, delay, sensors)
+        if forces_alone or not len(control.emf[0]):
+            Bd, law = (
+                Bd[:, : len(controller.forces)],
+                forecast_as_forces(law, control, controller.sample_time),
+            )
+        else:
+            law = with_estimated_emf(law, control.emf)
     else:
         continuous = A
         if current_loops == "lag" and math.isfinite(plant.actuator.crossover):
@@ -253,24 +257,33 @@ def sampled_loop(
     return SampledLoop(Ad, Bd, Cd, law, controller.sample_time, true, continuous)
 
 
-def _driven(
-    model: LinearModel,
-    controller: Controller,
-    abc: tuple[FloatArray, FloatArray, FloatArray],
-    delay: int,
-    law: LinearLaw,
-    *,
-    forces_alone: bool,
-) -> tuple[FloatArray, FloatArray, FloatArray, LinearLaw]:
-    """The machine with its windings between samples; behind its current controllers, from the law's outputs; the law.
+def _between_samples(
+    model: LinearModel, *, sensors: bool
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray | None]:
+    """A, B with the readings on which held currents hang, C, and C of the true outputs where lags of sensors count."""
+    A, B, C, lags = model.A, model.B, model.C, model.plant.sensors
+    if model.E.any():
+        A, B = A - model.E @ C, np.hstack([B, model.E])
+    if not sensors or lags is None:
+        return A, B, C, None
+    A, B, read = (np.array(ca.DM(M)) for M in with_lags(lags, A, B, C))
+    return A, B, read, C
 
-    Under load the link's voltage is a state. The voltages that the law forecasts, M^+ emf(x_hat), are outputs of the
-    law beside its forces, or with `forces_alone` part of these.
+
+@lru_cache(maxsize=4)  # a loop has it twice, with and without forecast voltages; records compare by identity
+def _driven(
+    model: LinearModel, controller: Controller, delay: int, sensors: bool
+) -> tuple[FloatArray, FloatArray, FloatArray, CurrentControl]:
+    """The machine with its windings between samples; sampled behind its current controllers; and these.
+
+    Under load the link's voltage is a state. The voltages that the law forecasts, M^+ emf(x_hat), are inputs of the
+    sampled machine after its forces.
     """
     plant, point, m, Ts = model.plant, model.operating_point, len(controller.forces), controller.sample_time
     believed = plant_of(controller.parameters)
     windings = windings_of(plant, believed, point, np.eye(m))
     control = current_control(controller, windings, point)
+    *abc, _ = _between_samples(model, sensors=sensors)
     A, B, C = (np.array(ca.DM(M)) for M in with_windings(plant, windings, point.x, *abc))
     phi, share = C[-m:], None
     link = link_at_rest(plant, windings, point, axis_map(believed, point)) if point.loaded else None
@@ -278,9 +291,7 @@ def _driven(
         A = np.block([[A, B @ link.share[:, None]], [link.by_phi @ phi, np.array([[link.rate]])]])
         B, phi, share = np.vstack([B, link.by_w[None]]), _pad(phi, len(A)), link.share
     Ad, Bd = sample_driven((A, B, phi), control.loop, windings.R, Ts, delay, share)
-    if forces_alone or not len(control.emf[0]):
-        return A, Ad, Bd[:, :m], forecast_as_forces(law, control, Ts)
-    return A, Ad, Bd, with_estimated_emf(law, control.emf)
+    return readonly(A), readonly(Ad), readonly(Bd), control
 
 
 def _stored_readings(
@@ -329,12 +340,17 @@ def machine_loop(
 def disturbance_map(model: LinearModel) -> FloatArray:
     """B_w of xi' = A xi + B v + B_w w: n states of the design model x disturbances."""
     plant, point = model.plant, model.operating_point
+    (found,) = traced(_disturbances, plant, None, point.loaded)(point.x, point.u)
+    return readonly(found[list(plant.controlled)])
+
+
+def _disturbances(plant: Plant, _believed: None, loaded: bool) -> tuple[list[Any], list[Any]]:
+    """(x, u) -> the slope of the rates by disturbances, under the loads or without them."""
     kind = ca.MX if plant.tabulated else ca.SX
-    x, w = kind.sym("x", len(plant.states)), kind.sym("w", len(plant.disturbances))
-    acting = w + plant.load(x) if point.loaded else w
-    rate = plant.f(x, kind(ca.DM(point.u)), acting)
-    found = ca.Function("B_w", [x, w], [ca.densify(ca.jacobian(rate, w))])(point.x, 0)
-    return readonly(np.array(found)[list(plant.controlled)])
+    sizes = {"x": len(plant.states), "u": len(plant.inputs), "w": len(plant.disturbances)}
+    x, u, w = (kind.sym(name, size) for name, size in sizes.items())
+    slope = ca.densify(ca.jacobian(plant.f(x, u, w + plant.load(x) if loaded else w), w))
+    return [x, u], [ca.substitute([slope], [w], [kind.zeros(w.numel())])[0]]
 
 
 def push_through(A: FloatArray, B_w: FloatArray, Ts: float, size: int) -> FloatArray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -161,8 +161,12 @@ def machine_report(model: LinearModel, controller: Controller) -> LoopReport:
     )
 
 
-def _grid(Ts: float) -> FloatArray:
-    return np.geomspace(1e-2, np.pi / Ts, 240)
+@lru_cache(maxsize=4)  # peaks and bandwidths need it; loops compare by identity
+def _on_grid(loop: SampledLoop) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+    """Frequencies up to half of sampling, rad/s, and the loop gain and the sensitivity there."""
+    w = np.geomspace(1e-2, np.pi / loop.sample_time, 240)
+    L = loop.loop_gain(w)
+    return w, L, np.linalg.inv(np.eye(len(loop.Cd)) + L)
 
 
 def stage_of(name: str, stage: SampledLoop, sensors: list[str]) -> Stage:
@@ -171,11 +175,11 @@ def stage_of(name: str, stage: SampledLoop, sensors: list[str]) -> Stage:
     if radius >= 1:
         return Stage(name, dict.fromkeys([*sensors, "sigma_max"], np.nan), np.nan, radius)
 
-    def sizes(w: FloatArray) -> FloatArray:
-        S = stage.sensitivity(w)
+    def sizes(S: ComplexArray) -> FloatArray:
         return np.column_stack([np.abs(np.einsum("kii->ki", S)), _singular_values(S)[:, 0]])
 
-    peaks, at = find_peaks(sizes, _grid(stage.sample_time))
+    w, _, S = _on_grid(stage)
+    peaks, at = find_peaks(lambda near: sizes(stage.sensitivity(near)), w, sizes(S))
     return Stage(name, dict(zip([*sensors, "sigma_max"], peaks.tolist(), strict=True)), float(at[-1]), radius)
 
 
@@ -186,9 +190,7 @@ def bandwidths_of(
     natural = _natural_frequencies(commanded_model(model, controller), controller)
     if not stable:
         return {key: np.nan for key in BANDWIDTHS if not key.startswith("w_n")} | natural
-    w = _grid(machine.sample_time)
-    L = machine.loop_gain(w)
-    S = machine.sensitivity(w)
+    w, L, S = _on_grid(machine)
     T = _singular_values(np.eye(len(machine.Cd)) - S)
     half = np.sqrt(0.5)
     return {

@@ -107,9 +107,14 @@ def _check_intervals(plant: Plant) -> None:
 
 def check_plant(plant: Plant) -> None:
     """Check a plant. Raises InputError when its fields do not fit, or a function of it fails or has a wrong size."""
+    check_numbers(plant)
+    check_symbols(plant)
+
+
+def check_numbers(plant: Plant) -> None:
+    """The part of `check_plant` that depends on the numbers of a plant's parameters."""
     check_signals(plant)
     check_equations(plant)
-    check_symbols(plant)
 
 
 def check_equations(plant: Plant) -> None:

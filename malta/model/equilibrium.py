@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError
+from malta.model.families import Traced, traced
 from malta.model.plant import OperatingPoint, Plant
 
 if TYPE_CHECKING:
@@ -55,12 +56,12 @@ def solve(
     still : a residual that is zero, unless the scales of v make all of it small
     share : the same, of the sum of |dr/dv| |v|
     """
-    values = np.array(starts[0])
-    residual = np.full(equations(values)[0].shape, np.nan)
+    values, residual = np.array(starts[0]), np.zeros(0)
     open_rows = np.ones(len(values), dtype=bool)
     smallest = np.full(len(values), np.inf)
     for start in starts:
         found, r, J = _descend(equations, start, scales, open_rows)
+        residual = residual if residual.size else np.full(r.shape, np.nan)
         sizes = _sizes(J, scales)
         with np.errstate(invalid="ignore"):
             room = np.maximum(
@@ -238,9 +239,7 @@ def _named(plant: Plant, x: FloatArray) -> str:
 @lru_cache(maxsize=32)  # plants compare by identity
 def chain(plant: Plant, believed: Plant | None) -> tuple[ca.Function, ca.Function]:
     """(x, v) -> inputs that the currents of v make; (x, v) -> these currents, A."""
-    kind = ca.MX if (believed or plant).tabulated else ca.SX
-    x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))
-    i = (believed or plant).currents(plant.h(x, kind.zeros(len(plant.inputs))), v)
+    x, v, i = _currents_of(plant, believed)
     made = ca.Function("inputs", [x, v], [ca.densify(plant.forces(x, i))])
     return made, ca.Function("currents", [x, v], [ca.densify(i)])
 
@@ -256,14 +255,21 @@ def _rates_of(plant: Plant, x: Any, u: Any, w: Any) -> Any:
 
 def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> FloatArray:
     """The inputs that hold the machine at rest, or that cancel its loads alone; one row for each row of states."""
+    left = traced(_rates_left, plant, None, loads_alone)
+    start = np.zeros((len(states), len(plant.inputs)))
+    found = solve(_equations(left, states), [start], _scales(plant), STILL, SHARE)
+    _require_solved(plant, found.left, "input", states)
+    return found.values
+
+
+def _rates_left(plant: Plant, _believed: None, loads_alone: bool) -> tuple[list[Any], list[Any]]:
+    """(x, u) -> rates at rest under the loads, or what the loads alone make of them, and their slope by u."""
     m, w = len(plant.inputs), len(plant.disturbances)
     x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", m)
     rate = _rates_of(plant, x, u, plant.load(x))
     if loads_alone:
         rate -= _rates_of(plant, x, ca.SX.zeros(m), ca.SX.zeros(w))
-    found = solve(_equations(x, u, rate, states), [np.zeros((len(states), m))], _scales(plant), STILL, SHARE)
-    _require_solved(plant, found.left, "input", states)
-    return found.values
+    return [x, u], [rate, ca.jacobian(rate, u)]
 
 
 def _commands(
@@ -279,13 +285,8 @@ def _commands(
 
     before : commands to start from, beside the inputs and shares of the limits
     """
-    made, _ = chain(plant, believed)
-    kind = ca.MX if (believed or plant).tabulated else ca.SX
-    x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))
-    w = plant.load(x) if loaded else kind.zeros(len(plant.disturbances))
-    u = kind.sym("u", len(plant.inputs))
-    left = _rates_of(plant, x, made(x, v), w) - _rates_of(plant, x, u, w)
-    equations = _equations(ca.vertcat(x, u), v, left, np.hstack([states, inputs]))
+    made = traced(_made, plant, believed)
+    equations = _equations(traced(_effect_missed, plant, believed, loaded), np.hstack([states, inputs]))
     scales = _scales(plant)
     rough = np.where(inputs < 0, -1.0, 1.0) * scales
     starts = [
@@ -297,29 +298,50 @@ def _commands(
     ]
     found = solve(equations, starts, scales, STILL, SHARE)
     _require_solved(plant, found.left, "command", states, inputs if not loaded else None)
-    acting = np.array(made.map(len(states))(states.T, found.values.T)).T
+    acting = made.each(states, found.values)[0].T
     near = np.abs(acting - inputs) <= 1e-12 * np.maximum(np.abs(inputs), scales)
     return found.values, np.where(near, inputs, acting)
 
 
-def _nearer(made: ca.Function, states: FloatArray, inputs: FloatArray) -> FloatArray:
+def _made(plant: Plant, believed: Plant | None) -> tuple[list[Any], list[Any]]:
+    """(x, v) -> inputs that the currents of v make."""
+    x, v, i = _currents_of(plant, believed)
+    return [x, v], [ca.densify(plant.forces(x, i))]
+
+
+def _currents_of(plant: Plant, believed: Plant | None) -> tuple[Any, Any, Any]:
+    """Symbols for the states x and the command v, and the currents of v there."""
+    kind = ca.MX if (believed or plant).tabulated else ca.SX
+    x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))
+    return x, v, (believed or plant).currents(plant.h(x, kind.zeros(len(plant.inputs))), v)
+
+
+def _effect_missed(plant: Plant, believed: Plant | None, loaded: bool) -> tuple[list[Any], list[Any]]:
+    """((x, u), v) -> rates under the currents of v without those under the inputs u, and their slope by v."""
+    x, v, i = _currents_of(plant, believed)
+    kind = type(x)
+    w = plant.load(x) if loaded else kind.zeros(len(plant.disturbances))
+    u = kind.sym("u", len(plant.inputs))
+    left = _rates_of(plant, x, ca.densify(plant.forces(x, i)), w) - _rates_of(plant, x, u, w)
+    return [ca.vertcat(x, u), v], [left, ca.jacobian(left, v)]
+
+
+def _nearer(made: Traced, states: FloatArray, inputs: FloatArray) -> FloatArray:
     """The inputs as a command, or zero where that makes inputs which are nearer to these."""
     off = [
-        np.abs(np.array(made.map(len(states))(states.T, command.T)).T - inputs).sum(axis=1)
+        np.abs(made.each(states, command)[0].T - inputs).sum(axis=1)
         for command in (np.zeros_like(inputs), inputs)
     ]
     nearer = np.isfinite(off[0]) & ~(off[1] <= off[0])
     return np.where(nearer[:, None], 0.0, inputs)
 
 
-def _equations(given: Any, unknown: Any, left: Any, rows: FloatArray) -> Equations:
-    """The residual and its Jacobian by the unknown, row by row of what is given."""
-    count, size = len(rows), unknown.numel()
-    both = ca.Function("residual", [given, unknown], [left, ca.jacobian(left, unknown)])
+def _equations(residual: Traced, rows: FloatArray) -> Equations:
+    """The residual and its slope by the unknown, row by row of what is given."""
 
     def evaluate(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        r, J = (np.array(value) for value in both.map(count)(rows.T, values.T))
-        return r.T, J.reshape(-1, count, size).swapaxes(0, 1)
+        r, J = residual.each(rows, values)
+        return r.T, J.reshape(-1, len(rows), values.shape[1]).swapaxes(0, 1)
 
     return evaluate
 

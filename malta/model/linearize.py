@@ -19,6 +19,7 @@ import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.model.equilibrium import chain, commanded
+from malta.model.families import traced
 from malta.model.plant import OperatingPoint, Plant, readonly
 
 if TYPE_CHECKING:
@@ -132,11 +133,8 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
     if not np.isfinite(point.x).all() or not np.isfinite(point.u).all():
         raise CheckError(f"{plant.name}: a state or a `preload` is not finite: x = {point.x}, u = {point.u}")
     point = commanded(plant, point, believed)
-    kind = ca.MX if (believed or plant).tabulated else ca.SX
-    x, u, v = kind.sym("x", n), kind.sym("u", m), kind.sym("v", m)
-    w = plant.load(x) if point.loaded else kind.zeros(len(plant.disturbances))
-    derivatives = ca.Function("derivatives", [x, u, v], list(jacobians(plant, believed, x, u, v, w)))
-    A, B, C, E, _, ratio = (np.array(value) for value in derivatives(point.x, point.u, point.v))
+    derivatives = traced(_derivatives, plant, believed, point.loaded)
+    A, B, C, E, _, ratio = derivatives(point.x, point.u, point.v)
     keep = list(plant.controlled)
     A, B, C, E = A[np.ix_(keep, keep)], _without_rounding(B[keep]), C[:, keep], E[keep]
     if not np.isfinite(ratio).all():
@@ -144,6 +142,15 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
     if not all(np.isfinite(M).all() for M in (A, B, C, E)):
         raise CheckError(f"{plant.name}: the linear model is not finite at x = {point.x.tolist()}")
     return LinearModel(plant, point, A, B, C, E)
+
+
+def _derivatives(plant: Plant, believed: Plant | None, loaded: bool) -> tuple[list[Any], list[Any]]:
+    """(x, u, v) -> what `jacobians` returns, under the loads or without them."""
+    kind = ca.MX if (believed or plant).tabulated else ca.SX
+    sizes = {"x": len(plant.states), "u": len(plant.inputs), "v": len(plant.inputs)}
+    x, u, v = (kind.sym(name, size) for name, size in sizes.items())
+    w = plant.load(x) if loaded else kind.zeros(len(plant.disturbances))
+    return [x, u, v], list(jacobians(plant, believed, x, u, v, w))
 
 
 def _without_rounding(B: FloatArray) -> FloatArray:

@@ -100,12 +100,15 @@ def _law(law: Compensator, w: bytes) -> tuple[ComplexArray, ComplexArray, Comple
     return s, turned, np.asarray(F, dtype=complex)
 
 
-def find_peaks(sizes: Callable[[FloatArray], FloatArray], w: FloatArray) -> tuple[FloatArray, FloatArray]:
+def find_peaks(
+    sizes: Callable[[FloatArray], FloatArray], w: FloatArray, values: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """The largest value of each column of sizes(w) (k x n) over the frequencies w, and where it lies (rad/s).
 
-    The grid is refined three times around each peak.
+    The grid is refined three times around each peak. values : sizes(w), where they are known
     """
-    around, values = np.tile(w, (sizes(w[:1]).shape[1], 1)), sizes(w).T
+    values = (sizes(w) if values is None else values).T
+    around = np.tile(w, (len(values), 1))
     for _ in range(3):
         k = values.argmax(axis=1)
         rows = np.arange(len(k))

@@ -24,7 +24,9 @@ import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.model.data import plant_of
+from malta.model.families import traced
 from malta.model.linearize import linearize
+from malta.model.plant import readonly
 from malta.proof.uncertain import Compensator, is_commutated
 from malta.synthesis.riccati import delay_inputs, sample
 
@@ -126,11 +128,17 @@ def current_control(controller: Controller, windings: Windings, point: Operating
     return CurrentControl(controller.current_loop, windings, _estimated(controller, believed, slope, point.x))
 
 
+@lru_cache(maxsize=16)  # several parts of a loop need it; records compare by identity
 def axis_map(plant: Plant, point: OperatingPoint) -> FloatArray:
     """M: the slope of the commanded axis currents by the commanded forces, axes x forces."""
-    v = ca.SX.sym("v", len(plant.inputs))
-    axes = plant.drive.command(plant.currents(plant.h(ca.SX(point.x), 0), v))
-    return np.array(ca.Function("M", [v], [ca.densify(ca.jacobian(axes, v))])(_command(point)))
+    return readonly(traced(_axis_slope, plant)(point.x, _command(point))[0])
+
+
+def _axis_slope(plant: Plant, _believed: None) -> tuple[list[Any], list[Any]]:
+    """(x, v) -> M."""
+    x, v = ca.SX.sym("x", len(plant.states)), ca.SX.sym("v", len(plant.inputs))
+    axes = plant.drive.command(plant.currents(plant.h(x, 0), v))
+    return [x, v], [ca.densify(ca.jacobian(axes, v))]
 
 
 def _command(point: OperatingPoint) -> FloatArray:
@@ -140,8 +148,13 @@ def _command(point: OperatingPoint) -> FloatArray:
 
 def emf_slope(plant: Plant, x: FloatArray) -> FloatArray:
     """The slope of the induced voltages by the states, axes x states."""
-    z = ca.SX.sym("x", len(plant.states))
-    return np.array(ca.Function("E", [z], [ca.densify(ca.jacobian(plant.drive.emf(z), z))])(x))
+    return np.asarray(traced(_emf_slope, plant)(x)[0])
+
+
+def _emf_slope(plant: Plant, _believed: None) -> tuple[list[Any], list[Any]]:
+    """x -> the slope."""
+    x = ca.SX.sym("x", len(plant.states))
+    return [x], [ca.densify(ca.jacobian(plant.drive.emf(x), x))]
 
 
 def estimated_rows(slope: FloatArray, L: FloatArray, Cd: FloatArray) -> tuple[FloatArray, FloatArray]:
