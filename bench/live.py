@@ -41,7 +41,7 @@ class Moves(NamedTuple):
 
 
 def live_page(runs: int) -> list[Result]:
-    """Moves of one number at a time: processor time, the median and the 95th percentile beside what the page asks for."""
+    """Processor time of moves of one number: the median and the 95th percentile beside what the page asks for."""
     rows = []
     for file, keys in CASES.items():
         for key in keys:

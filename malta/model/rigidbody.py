@@ -19,6 +19,22 @@ from typing import Any, Literal, NamedTuple
 import casadi as ca
 
 
+class Resultant(NamedTuple):
+    """The force or the torque of a group of inputs, as pictures show it: an arrow from the middle of a body.
+
+    name : of the group, as "module 1"
+    inputs : their names along x, y and z of the stator, "" for none
+
+    >>> import malta
+    >>> planar = malta.plant_of(malta.read("data/planar.toml"))
+    >>> [one.inputs for one in planar.bodies()[1].resultants]
+    [('F_x', 'F_y', 'F_z'), ('T_x', 'T_y', 'T_z')]
+    """
+
+    name: str
+    inputs: tuple[str, str, str]
+
+
 class Body(NamedTuple):
     """A body of a machine as pictures show it; nothing is computed of it.
 
@@ -27,6 +43,7 @@ class Body(NamedTuple):
     size : along x, y and z, m
     place : of its middle, m, beside what it moves by
     moves : states that move it along x, y, z and turn it by Cardan angles about them, "" for none; (): it stands still
+    resultants : of the inputs, where they act: on this body, or on the mover in the middle of this one
 
     >>> import malta
     >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
@@ -39,6 +56,7 @@ class Body(NamedTuple):
     size: tuple[float, float, float]
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)
     moves: tuple[str, ...] = ()
+    resultants: tuple[Resultant, ...] = ()
 
 
 class Trig(NamedTuple):

@@ -20,6 +20,7 @@ from malta.machines.tubular.plant import measured
 from malta.model.rigidbody import Body
 from malta.report.page.motion import (
     VIEW,
+    arrow_size,
     camera,
     magnify,
     mesh_of,
@@ -115,6 +116,27 @@ def test_the_page_has_the_run_and_runs_no_other_script(stroke: Motion) -> None:
     assert (z["unit"], z["values"][0]) == ("mm", pytest.approx(-5, rel=1e-3))
 
 
+def test_arrows_are_the_forces_that_acted_where_the_modules_are(stroke: Motion, run_file: Path) -> None:
+    """At rest the modules carry the weight of the mover, upwards; the drives push along the stroke."""
+    par: Any = malta.gains.read(GAINS).parameters
+    one, two, drives = stroke.arrows
+    assert [arrow.name for arrow in stroke.arrows] == ["module 1", "module 2", "drives"]
+    assert [float(stroke.poses[arrow.body, 0, 2]) for arrow in (one, two)] == pytest.approx(
+        [-par.l_B, par.l_B]
+    )
+    assert one.values[0, 1] + two.values[0, 1] == pytest.approx(par.m * par.g, rel=1e-3)
+    with np.load(run_file) as saved:
+        assert drives.values[:, 2].max() == pytest.approx(saved["force"][:, 4].max(), rel=0.01)
+    assert np.abs(drives.values[:, :2]).max() == 0
+    size, largest = arrow_size(stroke, "N"), np.abs(drives.values).max()
+    assert size == 20
+    assert size <= largest < 2.5 * size
+    assert arrow_size(stroke, "N m") == 0
+    (only,) = runs_of(motion_page(stroke).html)
+    assert [arrow["scale"] for arrow in only["arrows"]] == [20] * 3
+    assert only["arrows"][0]["values"][0][1] == pytest.approx(one.values[0, 1], rel=1e-5)
+
+
 def test_many_runs_stay_in_a_small_page_with_fewer_frames_each(
     stroke: Motion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -159,6 +181,8 @@ def test_every_machine_shows_a_body_that_its_states_move(name: str) -> None:
     moves = [state for body in plant.bodies() for state in body.moves if state]
     assert moves
     assert {*moves} <= {s.name for s in plant.states}
+    pushed = [name for body in plant.bodies() for one in body.resultants for name in one.inputs if name]
+    assert sorted(pushed) == sorted(s.name for s in plant.inputs)
     assert all(min(body.size) > 0 for body in plant.bodies())
 
 
@@ -190,5 +214,11 @@ def test_the_page_runs_in_a_browser(stroke: Motion, tmp_path: Path, browser: Any
     first = browser.execute_script(picture)
     move = "const t = document.getElementById('time'); t.value = t.max; t.dispatchEvent(new Event('input'));"
     browser.execute_script(move)
-    assert browser.execute_script(picture) != first
+    moved = browser.execute_script(picture)
+    assert moved != first
+    assert browser.find_element("id", "forces").get_attribute("aria-pressed") == "true"
+    browser.find_element("id", "forces").click()
+    assert browser.execute_script(picture) != moved
+    browser.find_element("id", "forces").click()
+    assert browser.execute_script(picture) == moved
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []

@@ -43,7 +43,7 @@ from malta.model.plant import (
     Plant,
     Signal,
 )
-from malta.model.rigidbody import Body
+from malta.model.rigidbody import Body, Resultant
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,8 @@ def plant(par: Parameters) -> Plant:
 def _bodies(par: Parameters) -> tuple[Body, ...]:
     """A slider above the magnets; the source prints no sizes but those of the travel and the gap."""
     size = par.travel
+    thrust = (Resultant("coils", (FORCE.name, "", "")),)
     return (
         Body("magnets", "box", (4 * size, size, 0.3 * size), (0.0, 0.0, -0.3 * size - par.z_0)),
-        Body("slider", "box", (1.5 * size, size, 0.3 * size), moves=("x",)),
+        Body("slider", "box", (1.5 * size, size, 0.3 * size), moves=("x",), resultants=thrust),
     )

@@ -44,6 +44,7 @@ from malta.model.plant import (
 )
 from malta.model.rigidbody import (
     Body,
+    Resultant,
     acceleration,
     principal_angles,
     rotate,
@@ -191,9 +192,10 @@ def _bodies(par: Parameters) -> tuple[Body, ...]:
     height = math.sqrt(max(12 * par.I_x / par.m - side**2, (0.05 * side) ** 2))
     wide, thick = side + 2 * par.xy_max, 0.05 * side
     moves = tuple(s.name for s in POSITIONS)
+    wrench = (Resultant("coils", ("F_x", "F_y", "F_z")), Resultant("coils", ("T_x", "T_y", "T_z")))
     return (
         Body("magnets", "box", (wide, wide, thick), (0.0, 0.0, -(thick + height) / 2)),
-        Body("mover", "box", (side, side, height), moves=moves),
+        Body("mover", "box", (side, side, height), moves=moves, resultants=wrench),
     )
 
 

@@ -36,6 +36,7 @@ from malta.model.rigidbody import (
     EXACT,
     SMALL_ANGLE,
     Body,
+    Resultant,
     Trig,
     acceleration,
     principal_angles,
@@ -202,11 +203,15 @@ def _bodies(par: Parameters) -> tuple[Body, ...]:
     length = math.sqrt(max(12 * par.I_xx / par.m - 3 * radius**2, radius**2))
     bore = 2.6 * radius
     modules = (
-        Body(f"module {k + 1}", "cylinder", (bore, bore, 1.8 * par.l_B), (0.0, 0.0, sign * par.l_B))
-        for k, sign in enumerate((-1, 1))
-    )
-    moves = tuple(s.name for s in POSITIONS)
-    return (*modules, Body("mover", "cylinder", (2 * radius, 2 * radius, length), moves=moves))
+        Body(
+            f"module {k}", "cylinder", (bore, bore, 1.8 * par.l_B), (0.0, 0.0, sign * par.l_B),
+            resultants=(Resultant(f"module {k}", (f"fx_B{k}", f"fy_B{k}", "")),),
+        )
+        for k, sign in ((1, -1), (2, 1))
+    )  # fmt: skip
+    moves, drives = tuple(s.name for s in POSITIONS), (Resultant("drives", ("", "", "f_D")),)
+    size = (2 * radius, 2 * radius, length)
+    return (*modules, Body("mover", "cylinder", size, moves=moves, resultants=drives))
 
 
 def _actuator(par: Parameters, constants: tuple[float, ...]) -> Actuator:

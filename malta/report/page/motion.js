@@ -2,7 +2,7 @@
 "use strict";
 const data = JSON.parse(document.getElementById("motion-data").textContent);
 const $ = (id) => document.getElementById(id);
-const canvas = $("view"), traces = $("traces"), time = $("time"), factor = $("factor"), play = $("play"), state = $("state");
+const canvas = $("view"), traces = $("traces"), time = $("time"), factor = $("factor"), play = $("play"), state = $("state"), forces = $("forces");
 let run = data.runs[0], frame = 0, turn = data.view[0], height = data.view[1], last = 0, running = false, hidden = new Set();
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
@@ -22,9 +22,13 @@ function camera() {
   return [right, cross(eye, right), eye];
 }
 
-function placed(body, of) {
+function poseOf(of) {
   const at = of.poses[Math.min(frame, of.poses.length - 1)];
-  const pose = at.map((v, j) => (of.small[j] ? of.mean[j] + magnified() * (v - of.mean[j]) : v));
+  return at.map((v, j) => (of.small[j] ? of.mean[j] + magnified() * (v - of.mean[j]) : v));
+}
+
+function placed(body, of) {
+  const pose = poseOf(of);
   const R = rotation(pose.slice(3));
   return body.points.map((p) => [0, 1, 2].map((j) => R[0][j] * p[0] + R[1][j] * p[1] + R[2][j] * p[2] + pose[j]));
 }
@@ -64,6 +68,45 @@ function drawBodies() {
       to.lineWidth = 0.5;
     } else { to.strokeStyle = css(layer ? "--soft" : "--line"); to.lineWidth = 1; }
     to.stroke();
+  }
+  if (forces.getAttribute("aria-pressed") === "true")
+    drawArrows(to, view, scale, ([x, y]) => [width / 2 + scale * x, tall / 2 - scale * y], tall);
+}
+
+// Forces and torques of the actuators, each from the middle of its body, and the arrow of each unit's scale.
+function drawArrows(to, view, scale, toPixels, tall) {
+  for (const one of run.arrows) {
+    const start = poseOf(run.bodies[one.body]).slice(0, 3), end = start.map((v, j) => v + (one.scale && (data.arrow * one.values[frame][j]) / one.scale));
+    const [from, tip] = [start, end].map((p) => toPixels(view.map((row) => dot(row, p))));
+    drawArrow(to, from, tip, one.unit);
+  }
+  const scales = new Map(run.arrows.filter((one) => one.scale).map((one) => [one.unit, one.scale]));
+  [...scales].forEach(([name, size], row) => {
+    const y = tall - 14 - 20 * row, length = scale * data.arrow;
+    drawArrow(to, [12, y], [12 + length, y], name);
+    to.font = "12px system-ui, sans-serif";
+    to.textAlign = "left";
+    to.fillText(`${digits(size)} ${name}`, 20 + length, y + 4);
+  });
+}
+
+const HEAD = 9; // px
+function drawArrow(to, [x, y], [u, v], name) {
+  const length = Math.hypot(u - x, v - y), torque = name !== "N";
+  to.fillStyle = css(torque ? "--c2" : "--c1");
+  if (length < 2) return;
+  const [a, b] = [(u - x) / length, (v - y) / length], head = Math.min(HEAD, length);
+  to.beginPath();
+  to.moveTo(x, y);
+  to.lineTo(u - (a * head) / 2, v - (b * head) / 2);
+  for (const [ink, wide] of [[css("--page"), 6], [to.fillStyle, 3]]) { to.strokeStyle = ink; to.lineWidth = wide; to.stroke(); }
+  for (const back of torque ? [0, head] : [0]) {
+    const [p, q] = [u - a * back, v - b * back];
+    to.beginPath();
+    to.moveTo(p, q);
+    to.lineTo(p - a * head - 0.45 * b * head, q - b * head + 0.45 * a * head);
+    to.lineTo(p - a * head + 0.45 * b * head, q - b * head - 0.45 * a * head);
+    to.fill();
   }
 }
 
@@ -155,6 +198,8 @@ if (data.runs.length > 1)
   }));
 time.addEventListener("input", () => { frame = Number(time.value); draw(); });
 factor.addEventListener("input", draw);
+forces.hidden = !data.runs.some((one) => one.arrows.length);
+forces.addEventListener("click", () => { forces.setAttribute("aria-pressed", String(forces.getAttribute("aria-pressed") !== "true")); draw(); });
 play.addEventListener("click", () => { running = !running; play.textContent = running ? "Pause" : "Play"; if (running) requestAnimationFrame(step); });
 canvas.addEventListener("pointermove", (event) => {
   if (!event.buttons) return;

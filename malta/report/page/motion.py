@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,7 +23,7 @@ from malta.files import read_file
 from malta.model.rigidbody import Body, rotation
 
 if TYPE_CHECKING:
-    from PIL import Image
+    from PIL import Image, ImageDraw, ImageFont
 
     from malta.model.plant import FloatArray, Plant
     from malta.report.page.document import Page
@@ -33,11 +33,13 @@ FRAMES = 240  # of a run
 LARGEST = 4_500_000  # bytes of a page: runs of longer ones show fewer frames
 SIDES = 28  # of a cylinder
 SMALL = 0.01  # of the largest body: what moves less is magnified
+HEAD = 16.0  # of an arrow, pixels of the animated picture at twice its size
+ARROW = 0.2  # of the largest body: the arrow of the scale
 SHOWN = 0.12  # of the smallest side of a moving body: the largest magnified motion
 VIEW = (math.radians(-38), math.radians(24))  # turn about the upright axis, and height of the eye
 INKS: Mapping[str, tuple[int, int, int]] = {
     "paper": (255, 255, 255), "mover": (86, 143, 196), "still": (150, 150, 150), "text": (40, 44, 48),
-    "trace": (125, 41, 6),
+    "trace": (125, 41, 6), "force": (176, 58, 8), "torque": (40, 44, 48),
 }  # fmt: skip
 
 
@@ -46,6 +48,15 @@ class Mesh(NamedTuple):
 
     points: FloatArray  # n x 3
     faces: tuple[tuple[int, ...], ...]
+
+
+class Arrow(NamedTuple):
+    """A force or a torque of the actuators in a run, drawn from the middle of a body."""
+
+    name: str
+    unit: str
+    body: int
+    values: FloatArray  # frames x 3, along the stator's axes, SI
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +72,7 @@ class Motion:
     small : the coordinates that are magnified, of each body
     factor : by which, as a first choice
     signals : series of numbers beside the picture, by their names with units, frames each
+    arrows : forces and torques of the actuators, as they acted
     """
 
     title: str
@@ -72,6 +84,7 @@ class Motion:
     small: FloatArray
     factor: float
     signals: Mapping[str, FloatArray]
+    arrows: tuple[Arrow, ...] = ()
 
 
 def mesh_of(body: Body) -> Mesh:
@@ -108,7 +121,8 @@ def read_motion(file: str | Path, plant: Plant, *, frames: int = FRAMES) -> Moti
     signals = {
         str(name): arrays[key][:, k] for key in ("p", "v") for k, name in enumerate(arrays[f"{key}_columns"])
     }
-    return _motion(Path(file).stem, ended, plant, arrays["t"], arrays["x"], signals, frames)
+    series = arrays["t"], arrays["x"], arrays["force"]
+    return _motion(Path(file).stem, ended, plant, series, signals, frames)
 
 
 def motion_of(run: Trajectory, title: str, *, frames: int = FRAMES) -> Motion:
@@ -125,19 +139,22 @@ def motion_of(run: Trajectory, title: str, *, frames: int = FRAMES) -> Motion:
         for k, signal in enumerate(of)
     }
     ended = f"{run.verdict.name} at {quantity(run.verdict.time, 's')}"
-    return _motion(title, ended, run.plant, run.t, run.x, signals, frames)
+    return _motion(title, ended, run.plant, (run.t, run.x, run.force), signals, frames)
 
 
 def _motion(
     title: str,
     ended: str,
     plant: Plant,
-    t: FloatArray,
-    x: FloatArray,
+    series: tuple[FloatArray, FloatArray, FloatArray],
     signals: Mapping[str, FloatArray],
     frames: int,
 ) -> Motion:
-    """Frames of a run, evenly over its time. Raises InputError for a machine without bodies."""
+    """Frames of a run, evenly over its time. Raises InputError for a machine without bodies.
+
+    series : times, states and acting inputs
+    """
+    t, x, force = series
     if plant.bodies is None:
         raise InputError(plant.name, "bodies", "none", "bodies of the machine: Plant(bodies=...)")
     kept = np.unique(np.linspace(0, len(t) - 1, frames).astype(int))
@@ -146,7 +163,32 @@ def _motion(
     poses = np.stack([_poses(body, states, len(kept)) for body in bodies])
     small, factor = _magnified(bodies, poses)
     shown = {name: np.asarray(values[kept]) for name, values in signals.items()}
-    return Motion(title, ended, t[kept], bodies, poses, _upright(plant), small, factor, shown)
+    arrows = _arrows(bodies, plant, force[kept])
+    return Motion(title, ended, t[kept], bodies, poses, _upright(plant), small, factor, shown, arrows)
+
+
+def _arrows(bodies: Sequence[Body], plant: Plant, force: FloatArray) -> tuple[Arrow, ...]:
+    """The resultants of each body in every frame."""
+    columns = dict(zip((s.name for s in plant.inputs), force.T, strict=True))
+    units, none = {s.name: s.unit for s in plant.inputs}, np.zeros(len(force))
+    return tuple(
+        Arrow(one.name, next(units[name] for name in one.inputs if name), k,
+              np.column_stack([columns.get(name, none) for name in one.inputs]))
+        for k, body in enumerate(bodies) for one in body.resultants
+    )  # fmt: skip
+
+
+def arrow_size(found: Motion, unit: str) -> float:
+    """The force or torque, SI, whose arrow is as long as the scale of the picture: 1, 2 or 5 times a power of ten.
+
+    It is the largest of these below the largest of the run; 0 where nothing acts.
+    """
+    sizes = [np.linalg.norm(one.values, axis=1).max() for one in found.arrows if one.unit == unit]
+    largest = float(max(sizes, default=0.0))
+    if largest <= 0:
+        return 0.0
+    power = 10.0 ** math.floor(math.log10(largest))
+    return max(step * power for step in (1, 2, 5) if step * power <= largest)
 
 
 def _series(file: Path, plant: Plant) -> Mapping[str, Any]:
@@ -160,7 +202,12 @@ def _series(file: Path, plant: Plant) -> Mapping[str, Any]:
     t = arrays.get("t", np.zeros((0, 0)))
     if t.ndim != 1 or not len(t):
         raise InputError(file, "t", "no times", f"a {kind}")
-    for key, signals in (("x", plant.states), ("p", plant.outputs), ("v", plant.inputs)):
+    for key, signals in (
+        ("x", plant.states),
+        ("p", plant.outputs),
+        ("v", plant.inputs),
+        ("force", plant.inputs),
+    ):
         names = [f"{s.name} [{s.unit}]" for s in signals]
         columns = [str(name) for name in np.ravel(arrays.get(f"{key}_columns", []))]
         if columns != names:
@@ -238,7 +285,7 @@ def motion_gif(found: Motion, *, size: tuple[int, int] = (520, 320), frames: int
                       for n, mesh in enumerate(meshes) for k in (0, len(found.t) // 2, len(found.t) - 1)])  # fmt: skip
     shown = np.unique(np.linspace(0, len(found.t) - 1, frames).astype(int))
     pictures = [_draw_frame(found, int(k), meshes, view, ends, size) for k in shown]
-    palette = pictures[len(pictures) // 2].quantize(32, Image.Quantize.MAXCOVERAGE)
+    palette = pictures[len(pictures) // 2].quantize(48, Image.Quantize.MAXCOVERAGE)
     drawn = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     buffer = io.BytesIO()
     drawn[0].save(buffer, "GIF", save_all=True, append_images=drawn[1:], duration=66, loop=0, optimize=True)
@@ -277,6 +324,7 @@ def _page_data(runs: Sequence[Motion], every: int) -> dict[str, Any]:
     return {
         "view": VIEW, "up": np.eye(3)[first.up].tolist(), "across": upright[2].tolist(), "along": upright[0].tolist(),
         "reach": max(float(np.linalg.norm(body.size)) for body in first.bodies),
+        "arrow": ARROW * max(max(body.size) for body in first.bodies),
         "bodies": [
             {"points": _rounded(mesh.points), "faces": mesh.faces, "moves": bool(body.moves)}
             for body, mesh in ((body, mesh_of(body)) for body in first.bodies)
@@ -298,6 +346,11 @@ def _run_data(run: Motion, every: int) -> dict[str, Any]:
         "signals": [
             {"name": name.partition(" ")[0], "k": k, **_in_fine_unit(name, values[shown])}
             for k, (name, values) in enumerate(run.signals.items())
+        ],
+        "arrows": [
+            {"name": one.name, "unit": one.unit, "body": one.body, "scale": arrow_size(run, one.unit),
+             "values": _rounded(one.values[shown])}
+            for one in run.arrows
         ],
     }  # fmt: skip
 
@@ -347,13 +400,12 @@ def _draw_frame(
             pen.line(
                 [*outline, outline[0]], fill=INKS["still"] if normal[2] > 0 else (205, 205, 205), width=2
             )
-    font = ImageFont.truetype(str(Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), 26)
-    names = list(found.signals)
-    chosen = max(
-        (name for name in names if name.endswith("[m]")),
-        key=lambda name: float(np.ptp(found.signals[name])),
-        default=names[0],
+    _draw_arrows(
+        pen, found, k, lambda point: middle + scale * (view @ point - (low + high) / 2)[:2] * [1, -1]
     )
+    font = ImageFont.truetype(str(Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), 26)
+    outputs = [name for name in found.signals if name.endswith("[m]")] or [*found.signals][:1]
+    chosen = max(outputs, key=lambda name: float(np.ptp(found.signals[name])))
     y = found.signals[chosen]
     left, right, top, bottom = 40, big[0] - 40, 0.86 * big[1], 0.96 * big[1]
     along = left + (right - left) * (found.t - found.t[0]) / max(found.t[-1] - found.t[0], 1e-12)
@@ -364,6 +416,7 @@ def _draw_frame(
     pen.ellipse([trace[k][0] - 8, trace[k][1] - 8, trace[k][0] + 8, trace[k][1] + 8], fill=INKS["trace"])
     pen.text((left, 16), f"{1e3 * found.t[k]:6.1f} ms", fill=INKS["text"], font=font)
     pen.text((right, 16), f"small motion × {found.factor:g}", fill=INKS["text"], font=font, anchor="ra")
+    _draw_scale(pen, found, np.array([right, top - 22]), scale, font)
     pen.text(
         (left, int(top) - 36),
         f"{chosen.partition(' ')[0]}: {1e3 * y[k]:.2f} mm",
@@ -371,6 +424,54 @@ def _draw_frame(
         font=font,
     )
     return picture.resize(size, Image.Resampling.LANCZOS)
+
+
+def _draw_arrows(
+    pen: ImageDraw.ImageDraw, found: Motion, k: int, place: Callable[[FloatArray], FloatArray]
+) -> None:
+    """Forces with one head, torques with two, from the middle of their bodies; place : metres -> pixels."""
+    whole = ARROW * max(max(body.size) for body in found.bodies)
+    for one in found.arrows:
+        size, start = arrow_size(found, one.unit), magnify(found, k, one.body, found.factor)[:3]
+        if size:
+            ends = place(start), place(start + one.values[k] * whole / size)
+            _draw_arrow(
+                pen, *ends, INKS["force" if one.unit == "N" else "torque"], heads=1 + (one.unit != "N")
+            )
+
+
+def _draw_scale(
+    pen: ImageDraw.ImageDraw, found: Motion, end: FloatArray, scale: float, font: ImageFont.FreeTypeFont
+) -> None:
+    """The arrow of the scale of forces up to an end, with its size before it. scale : pixels a metre"""
+    size, length = arrow_size(found, "N"), scale * ARROW * max(max(body.size) for body in found.bodies)
+    if size:
+        start = end - [length, 0]
+        _draw_arrow(pen, start, end, INKS["force"], heads=1)
+        pen.text(
+            (float(start[0]) - 14, float(end[1])), f"{size:g} N", fill=INKS["force"], font=font, anchor="rm"
+        )
+
+
+def _draw_arrow(
+    pen: ImageDraw.ImageDraw, start: FloatArray, tip: FloatArray, ink: tuple[int, int, int], *, heads: int
+) -> None:
+    """A line with filled heads; what is shorter than a head is not drawn."""
+    length = float(np.linalg.norm(tip - start))
+    if length < HEAD:
+        return
+    along = (tip - start) / length
+    aside = np.array([-along[1], along[0]])
+    pen.line([*start.tolist(), *(tip - HEAD / 2 * along).tolist()], fill=ink, width=5)
+    for n in range(heads):
+        at = tip - n * HEAD * along
+        pen.polygon(
+            [
+                (float(x), float(y))
+                for x, y in (at, *(at - HEAD * along + s * 0.4 * HEAD * aside for s in (1, -1)))
+            ],
+            fill=ink,
+        )
 
 
 def _layer(moves: bool, normal: FloatArray) -> int:
