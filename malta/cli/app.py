@@ -29,7 +29,9 @@ def app(
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Only print the address of the page.")
     ] = False,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Of 127.0.0.1; 0: any that is free.")] = 0,
+    port: Annotated[
+        int, typer.Option(metavar="N", min=0, max=65535, help="Of 127.0.0.1; 0: any that is free.")
+    ] = 0,
     machine_file: MachineFile = None,
 ) -> None:
     """Open a page to design with: sliders for weights, gains and the machine, curves at every move, then the proof.

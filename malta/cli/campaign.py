@@ -335,11 +335,11 @@ STUDY = "A study in place of plain runs"  # a panel of the help
 def campaign(
     ctx: typer.Context,
     gains: GainFileOrNone = None,
-    samples: Annotated[int, typer.Option(help="How many.", rich_help_panel=MACHINE)] = 10_000,
+    samples: Annotated[int, typer.Option(metavar="N", help="How many.", rich_help_panel=MACHINE)] = 10_000,
     spread: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="[NAME=]SHARE",
+            metavar="SHARE|NAME=SHARE",
             help="Of parameters: 20%, m=10%. [the gain file's]",
             rich_help_panel=MACHINE,
         ),
@@ -353,23 +353,29 @@ def campaign(
         ),
     ] = None,
     sampler: Annotated[
-        str, typer.Option(help="latin-hypercube or sobol.", rich_help_panel=MACHINE)
+        str, typer.Option(metavar="WORD", help="latin-hypercube or sobol.", rich_help_panel=MACHINE)
     ] = "latin-hypercube",
-    seed: Annotated[int, typer.Option(help="Of machines and noise.", rich_help_panel=MACHINE)] = 0,
+    seed: Annotated[
+        int, typer.Option(metavar="N", help="Of machines and noise.", rich_help_panel=MACHINE)
+    ] = 0,
     change: Changes = None,
     machine: MachineFile = None,
     scenario: Annotated[
         str | None,
-        typer.Option(help=f"Their job: {SCENARIOS}", autocompletion=scenarios, rich_help_panel=RUN),
+        typer.Option(
+            metavar="SCENARIO", help=f"Their job: {SCENARIOS}", autocompletion=scenarios, rich_help_panel=RUN
+        ),
     ] = None,
     case: Annotated[
-        str | None, typer.Option(help="Of a scenario of several runs. [the first]", rich_help_panel=RUN)
+        str | None,
+        typer.Option(metavar="NAME", help="Of a scenario of several runs. [the first]", rich_help_panel=RUN),
     ] = None,
     option: OwnOptions = None,
     law: Annotated[
         str,
         typer.Option(
             "--controller",
+            metavar="WORD",
             help="own; or c, c-float: the exported C flies.",
             show_default=False,
             rich_help_panel=RUN,
@@ -378,6 +384,7 @@ def campaign(
     study: Annotated[
         str | None,
         typer.Option(
+            metavar="WORD",
             help="rare (probability), sensitivity (Sobol indices) or tolerances.",
             rich_help_panel=STUDY,
         ),
@@ -391,25 +398,25 @@ def campaign(
         ),
     ] = None,
     keep: Annotated[
-        str | None, typer.Option(metavar="YIELD", help="Of tolerances: 99%.", rich_help_panel=STUDY)
+        str | None, typer.Option(metavar="SHARE", help="Of tolerances: 99%.", rich_help_panel=STUDY)
     ] = None,
-    workers: Annotated[int | None, typer.Option(help="Threads. [one for each core]")] = None,
+    workers: Annotated[int | None, typer.Option(metavar="N", help="Threads. [one for each core]")] = None,
     cluster: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Workers of a Dask scheduler: tcp://host:8786."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder of blocks and figures. [build/campaigns/]"),
+        typer.Option(metavar="FOLDER", help="Folder of blocks and figures. [build/campaigns/]"),
     ] = None,
     design: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE",
+            metavar="DESIGN",
             help="Design file whose [specification] counts too.",
         ),
     ] = None,
-    worst: Annotated[int, typer.Option(min=0, max=1000, help="Runs to list.")] = 5,
+    worst: Annotated[int, typer.Option(metavar="N", min=0, max=1000, help="Runs to list.")] = 5,
     status: Annotated[
         Path | None,
         typer.Option(

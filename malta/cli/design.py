@@ -51,9 +51,10 @@ def design(
     ] = None,
     change: DesignChanges = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the gain files. [gains/ beside the design file]")
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Folder of the gain files. [gains/ beside the design file]"),
     ] = None,
-    figures: Annotated[Path, typer.Option(help="Folder of the figures.")] = Path("build"),
+    figures: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the figures.")] = Path("build"),
     as_json: AsJson = False,
 ) -> None:
     """Design controllers: synthesize, verify, simulate, write gain files.
@@ -289,16 +290,22 @@ def tune(
         ),
     ],
     out: Annotated[
-        Path, typer.Option(help="Folder of the design file that is found, the trials, the front.")
+        Path,
+        typer.Option(
+            metavar="FOLDER", help="Folder of the design file that is found, the trials, the front."
+        ),
     ] = Path("build/tuned"),
     check: Annotated[
         bool, typer.Option("--check", help="Only judge the design as it stands in the file.")
     ] = False,
     generations: Annotated[
-        int, typer.Option(min=0, help="Of the global search; 0 starts from the file's numbers.")
+        int, typer.Option(metavar="N", min=0, help="Of the global search; 0 starts from the file's numbers.")
     ] = 8,
     front: Annotated[
-        int, typer.Option(min=0, help="Trials for each number and point of the Pareto front; 0: no front.")
+        int,
+        typer.Option(
+            metavar="N", min=0, help="Trials for each number and point of the Pareto front; 0: no front."
+        ),
     ] = 12,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a design file of that name.")

@@ -28,35 +28,47 @@ if TYPE_CHECKING:
 
 def export(
     gains: GainFile,
-    to: Annotated[str, typer.Option("--to", metavar="FORM", help="c: a folder of C99; fmu: one file.")] = "c",
-    precision: Annotated[str, typer.Option(help="float or double, of the C.")] = "double",
+    to: Annotated[str, typer.Option("--to", metavar="WORD", help="c: a folder of C99; fmu: one file.")] = "c",
+    precision: Annotated[str, typer.Option(metavar="WORD", help="float or double, of the C.")] = "double",
     until: Annotated[
         str | None,
         typer.Option(
-            help="How far down the C goes: currents, or duty-cycles. [as far as the machine is modelled]"
+            metavar="WORD",
+            help="How far down the C goes: currents, or duty-cycles. [as far as the machine is modelled]",
         ),
     ] = None,
     part: Annotated[
         str | None,
         typer.Option(
-            help="Of an FMU: controller, supervised, machine, or loop of controller and machine. [controller]"
+            metavar="WORD",
+            help="Of an FMU: controller, supervised, machine, or loop of controller and machine. [controller]",
         ),
     ] = None,
-    fmi: Annotated[int | None, typer.Option(help="Version of an FMU's interface: 2 or 3. [2]")] = None,
+    fmi: Annotated[
+        int | None, typer.Option(metavar="N", help="Version of an FMU's interface: 2 or 3. [2]")
+    ] = None,
     platforms: Annotated[
         str | None,
-        typer.Option(help="Binaries of an FMU, by ziglang: all, or win64,aarch64-linux... [this computer]"),
+        typer.Option(
+            metavar="WORD",
+            help="Binaries of an FMU, by ziglang: all, or win64,aarch64-linux... [this computer]",
+        ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="The folder, new or empty, or the .fmu file. [build/NAME_c, build/NAME_PART.fmu]"),
+        typer.Option(
+            metavar="FILE|FOLDER",
+            help="The folder, new or empty, or the .fmu file. [build/NAME_c, build/NAME_PART.fmu]",
+        ),
     ] = None,
     proof: Annotated[
         bool, typer.Option(help="Prove the margin again with the coefficients of float, and other gains.")
     ] = True,
     clock: Annotated[
         str | None,
-        typer.Option(help="Of the processor, for the report's share of a sample: 168MHz. [667MHz]"),
+        typer.Option(
+            metavar="QUANTITY", help="Of the processor, for the report's share of a sample: 168MHz. [667MHz]"
+        ),
     ] = None,
     tunable: Annotated[
         bool, typer.Option("--tunable", help="Gains, limits and monitors as parameters, with an A2L file.")
@@ -67,7 +79,7 @@ def export(
     ] = False,
     log: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="C keeps the last samples in a ring with a trigger, as 100ms."),
+        typer.Option(metavar="QUANTITY", help="C keeps the last samples in a ring with a trigger, as 100ms."),
     ] = None,
     machine: MachineFile = None,
     as_json: AsJson = False,
@@ -175,8 +187,8 @@ def _require_known(
 def pil(
     gains: GainFile,
     port: Annotated[str, typer.Option(metavar="PORT", help="Of the serial line: /dev/ttyUSB0, COM3.")],
-    baud: Annotated[int, typer.Option(help="Its speed.")] = 115200,
-    timeout: Annotated[float, typer.Option(help="To wait for each answer [s].")] = 2.0,
+    baud: Annotated[int, typer.Option(metavar="N", help="Its speed.")] = 115200,
+    timeout: Annotated[float, typer.Option(metavar="SECONDS", help="To wait for each answer [s].")] = 2.0,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:

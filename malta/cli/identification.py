@@ -54,7 +54,7 @@ def identify(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", metavar="FILE", help="Write a data file, as robust-identified.toml."),
+        typer.Option("--out", "-o", metavar="DATA", help="Write a data file, as robust-identified.toml."),
     ] = None,
     robust: Annotated[
         bool, typer.Option("--robust", help="Take outliers for missing (Student's likelihood in time).")
@@ -134,15 +134,24 @@ def identify(
 
 def excite(
     gains: GainFile,
-    force: Annotated[str | None, typer.Option(help="Largest force of each input, as 2N.")] = None,
-    current: Annotated[
-        str | None, typer.Option(help="Largest current beside that at rest, as 200mA. [10 % of its limit]")
+    force: Annotated[
+        str | None, typer.Option(metavar="QUANTITY", help="Largest force of each input, as 2N.")
     ] = None,
-    motion: Annotated[str | None, typer.Option(help="Largest motion of any output, as 20um.")] = None,
-    period: Annotated[float, typer.Option(help="Of the multisine [s].")] = 1.0,
-    periods: Annotated[int, typer.Option(help="That are logged, after one in which the loop settles.")] = 10,
+    current: Annotated[
+        str | None,
+        typer.Option(
+            metavar="QUANTITY", help="Largest current beside that at rest, as 200mA. [10 % of its limit]"
+        ),
+    ] = None,
+    motion: Annotated[
+        str | None, typer.Option(metavar="QUANTITY", help="Largest motion of any output, as 20um.")
+    ] = None,
+    period: Annotated[float, typer.Option(metavar="SECONDS", help="Of the multisine [s].")] = 1.0,
+    periods: Annotated[
+        int, typer.Option(metavar="N", help="That are logged, after one in which the loop settles.")
+    ] = 10,
     band: Annotated[str, typer.Option(metavar="LOW..HIGH", help="Lowest and highest line [Hz].")] = "2..400",
-    lines: Annotated[int, typer.Option(help="Of each input.")] = 12,
+    lines: Annotated[int, typer.Option(metavar="N", help="Of each input.")] = 12,
     parameters: Annotated[
         list[str] | None,
         typer.Option("--parameter", "-p", metavar="NAME", help="Whose accuracy is predicted. Repeatable."),
@@ -150,7 +159,10 @@ def excite(
     change: Changes = None,
     seed: Seed = None,
     shift: Annotated[
-        int, typer.Option(help="Inputs by which lines are dealt later; 0, 1, ... excite each line in each.")
+        int,
+        typer.Option(
+            metavar="N", help="Inputs by which lines are dealt later; 0, 1, ... excite each line in each."
+        ),
     ] = 0,
     out: Annotated[
         Path | None,
@@ -159,7 +171,7 @@ def excite(
     log: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Fly it on the simulated machine: its log: .csv, .npz, .mat, .parquet."
+            metavar="LOG", help="Fly it on the simulated machine: its log: .csv, .npz, .mat, .parquet."
         ),
     ] = None,
     machine: MachineFile = None,

@@ -49,6 +49,13 @@ STUDIES = {
 }
 
 
+KINDS = {
+    "integer": "N",
+    "integer range": "N",
+    "text": "WORD",
+}  # of a value that its option names nothing better for
+
+
 class Command(TyperCommand):
     """A command whose help has a panel for each group of options."""
 

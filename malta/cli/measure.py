@@ -38,14 +38,16 @@ def measure(
     uncertain: Uncertain = None,
     identified: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="A data file of malta identify: its machine and intervals."),
+        typer.Option(metavar="DATA", help="A data file of malta identify: its machine and intervals."),
     ] = None,
     plan: Annotated[
         bool, typer.Option("--plan", help="What to fly, and what it will tell.", rich_help_panel=PLAN)
     ] = False,
     width: Annotated[
         str | None,
-        typer.Option(help="Half of the widest 95 % band of |S|, as 2%.", rich_help_panel=PLAN),
+        typer.Option(
+            metavar="SHARE", help="Half of the widest 95 % band of |S|, as 2%.", rich_help_panel=PLAN
+        ),
     ] = None,
     separate: Annotated[
         bool,
@@ -53,11 +55,13 @@ def measure(
             "--separate", help="A flight for each input: nothing is interpolated.", rich_help_panel=PLAN
         ),
     ] = False,
-    motion: Annotated[str | None, typer.Option(help="Largest motion, as 20um.", rich_help_panel=PLAN)] = None,
+    motion: Annotated[
+        str | None, typer.Option(metavar="QUANTITY", help="Largest motion, as 20um.", rich_help_panel=PLAN)
+    ] = None,
     band: Annotated[
         str, typer.Option(metavar="LOW..HIGH", help="Of the lines [Hz].", rich_help_panel=PLAN)
     ] = "2..400",
-    lines: Annotated[int, typer.Option(help="Of each input.", rich_help_panel=PLAN)] = 12,
+    lines: Annotated[int, typer.Option(metavar="N", help="Of each input.", rich_help_panel=PLAN)] = 12,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw it: a .png, .svg or .pdf file.")
     ] = None,

@@ -322,12 +322,12 @@ OwnOptions = Annotated[
     ),
 ]
 Yes = Annotated[bool, typer.Option("--yes", help="Start work of more than ten minutes too.")]
-Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]", rich_help_panel=RUN)]
+Seed = Annotated[int | None, typer.Option(metavar="N", help="Seed of the noise. [0]", rich_help_panel=RUN)]
 DesignFile = Annotated[
     Path | None,
     typer.Option(
         "--design",
-        metavar="FILE",
+        metavar="DESIGN",
         help="Design file whose [specification] is judged. [NAME.toml beside the gain file's folder]",
     ),
 ]
@@ -351,7 +351,7 @@ MachineFile = Annotated[
     Path | None,
     typer.Option(
         "--machine",
-        metavar="FILE",
+        metavar="MODULE",
         envvar="MALTA_MACHINE",
         callback=lambda path: None if path is None else locate(path),
         help="Module of a machine of your own, as rotor.py.",

@@ -110,10 +110,15 @@ def print_text(console: Console, text: str) -> None:
     console.print(Paragraph(text))
 
 
-def print_line(console: Console, text: str) -> None:
-    """Print a line that has names of files: whole in files and pipes, folded on a terminal."""
+def print_line(console: Console, text: str, style: str = "") -> None:
+    """Print a line that has names of files: whole in files and pipes, folded on a terminal.
+
+    style : on a terminal with colours, as rich has it
+    """
+    from malta.report.tables.layout import Paragraph
+
     if console.is_terminal:
-        print_text(console, text)
+        console.print(Paragraph(text, style))
     else:
         console.print(text, soft_wrap=True)
 

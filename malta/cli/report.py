@@ -211,7 +211,9 @@ def plot(
     channel: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="A channel to draw. Repeatable. [all]")
     ] = None,
-    at: Annotated[str, typer.Option(help="Where the loop is cut: sensors or forces.")] = "sensors",
+    at: Annotated[
+        str, typer.Option(metavar="WORD", help="Where the loop is cut: sensors or forces.")
+    ] = "sensors",
     parameter: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Root locus: a parameter of the machine, or gain. [gain]"),

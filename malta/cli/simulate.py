@@ -106,7 +106,12 @@ def simulate(
     gains: GainFile,
     scenario: Annotated[
         str | None,
-        typer.Option(help=f"What to simulate: {SCENARIOS}", autocompletion=scenarios, rich_help_panel=RUN),
+        typer.Option(
+            metavar="SCENARIO",
+            help=f"What to simulate: {SCENARIOS}",
+            autocompletion=scenarios,
+            rich_help_panel=RUN,
+        ),
     ] = None,
     change: Changes = None,
     option: OwnOptions = None,
@@ -120,12 +125,13 @@ def simulate(
     ] = None,
     seed: Seed = None,
     engine: Annotated[
-        str, typer.Option(help="auto, compiled or virtual-machine.", rich_help_panel=RUN)
+        str, typer.Option(metavar="WORD", help="auto, compiled or virtual-machine.", rich_help_panel=RUN)
     ] = "auto",
     law: Annotated[
         str,
         typer.Option(
             "--controller",
+            metavar="WORD",
             help="own; or c: the exported C flies, compared with the own law and in float.",
             rich_help_panel=RUN,
         ),
@@ -133,13 +139,14 @@ def simulate(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the figure (.png), the time series (.npz) and, of record-v0, the gain files."
+            metavar="FOLDER",
+            help="Folder for the figure (.png), the time series (.npz) and, of record-v0, the gain files.",
         ),
     ] = None,
     log: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE",
+            metavar="LOG",
             help="Write what a bench would log of the first run: .csv, .npz, .mat, .parquet.",
         ),
     ] = None,
@@ -340,6 +347,7 @@ def motion(
     scenario: Annotated[
         list[str] | None,
         typer.Option(
+            metavar="SCENARIO",
             help="Simulate this too, a button for each of its runs, as faults. Repeatable.",
             autocompletion=scenarios,
         ),

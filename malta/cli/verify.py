@@ -49,7 +49,10 @@ def verify(
     change: Changes = None,
     uncertain: Uncertain = None,
     current_loops: Annotated[
-        str, typer.Option(help="Of the last stage: pi (controllers on the windings), or lag (first order).")
+        str,
+        typer.Option(
+            metavar="WORD", help="Of the last stage: pi (controllers on the windings), or lag (first order)."
+        ),
     ] = "pi",
     time: Annotated[
         float | None,
@@ -66,14 +69,15 @@ def verify(
         ),
     ] = None,
     certificate: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the proof of the margin, for `malta check`.")
+        Path | None,
+        typer.Option(metavar="CERTIFICATE", help="Write the proof of the margin, for `malta check`."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the figures (.png).")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder for the figures (.png).")] = None,
     design: DesignFile = None,
     identified: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE",
+            metavar="DATA",
             help="A data file of malta identify: its machine, its 95 % intervals as the uncertainty.",
         ),
     ] = None,
@@ -263,6 +267,7 @@ def _box_of(gains: Path, uncertain: list[str] | None, machine: Path | None) -> d
 def _print(file: Path, gains: Path | None, verdict: Verdict) -> None:
     """Print what is claimed, of what and where, and whether it holds."""
     from malta.report.tables.design import claim_share, claim_table, claim_text
+    from malta.report.tables.layout import COLOURS
 
     console, stated = make_console(), verdict.stated
     print_text(console, f"{claim_text(stated)}\n")
@@ -275,7 +280,9 @@ def _print(file: Path, gains: Path | None, verdict: Verdict) -> None:
     share = f"{claim_share(stated)} of the uncertainty"
     if gains is None:
         share += ", in the certificate's own box above, compared with no gain file"
-    print_line(console, f"{file}: stable in {share}{where}: {holds}")
+    print_line(
+        console, f"{file}: stable in {share}{where}: {holds}", COLOURS["holds" if verdict.ok else "fails"]
+    )
     for line in verdict.failures:
         print_note(shorten(f"{file}: {line}"))
 

@@ -13,7 +13,7 @@ from malta.model.signals import (
     lateral_outputs,
 )
 from malta.report.figures.drawing import Published, number
-from malta.report.tables.layout import Paragraph, add_row, new_table
+from malta.report.tables.layout import Paragraph, add_row, end_cell, new_table
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -184,7 +184,7 @@ def _worst_table(found: Summary, count: int) -> Table:
         add_row(
             table,
             f"{index}",
-            ends[int(runs.batch.verdict[row])],
+            end_cell(ends[int(runs.batch.verdict[row])], completed=runs.batch.verdict[row] == 0),
             f"{runs.batch.duration[row] * 1e3:.1f}",
             *(number(in_unit(float(runs.batch.deviation[row, g.columns].max()), g.fine), 3) for g in groups),
             " ".join(_deviation_text(plan, name, value) for name, value in values),

@@ -20,7 +20,7 @@ from malta.model.linearize import LinearModel
 from malta.model.signals import FINE
 from malta.proof.certificate.checked_file import double
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
-from malta.report.tables.layout import add_row, new_table
+from malta.report.tables.layout import COLOURS, add_row, new_table
 from malta.synthesis.requirements import Trade, requirements_for
 from malta.units import in_unit
 
@@ -318,9 +318,6 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
 
 
 # Tables of what was tuned, and of what is asked for.
-
-
-COLOURS = {"holds": "green", "undecided": "bold yellow", "fails": "bold red"}  # beside their words
 
 
 def requirements_table(requirements: Sequence[Outcome]) -> Table:

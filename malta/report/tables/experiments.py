@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -16,9 +17,11 @@ from rich.text import Text
 from malta.margins.loop_report import zone
 from malta.report.figures.drawing import Published
 from malta.report.tables.layout import (
+    COLOURS,
     INDENT,
     Paragraph,
     add_row,
+    end_cell,
     fold,
     merit_text,
     new_sheet,
@@ -134,7 +137,9 @@ def _cases_table(e: Experiment, published: Published | None) -> Table:
         table.columns[1].justify = "left"
     for case in e.cases:
         end, found = case.run.verdict, {merit.label: merit_text(merit) for merit in case.merits}
-        ends = [end.name, f"{end.time * 1e3:.1f}"] if ended else []
+        ends: list[str | Text] = []
+        if ended:
+            ends = [end_cell(end.name, completed=end.completed), f"{end.time * 1e3:.1f}"]
         add_row(table, case.label, *ends, *(found.get(label, "-") for label in labels))
     if published is not None and any(merit.published for merit in fullest):
         table.add_section()
@@ -152,7 +157,7 @@ def _transposed(e: Experiment, fullest: Sequence[Merit]) -> Table:
     table = new_table(e.question, "figure", *(case.label for case in e.cases))
     found = [{merit.label: merit_text(merit) for merit in case.merits} for case in e.cases]
     ends = [case.run.verdict for case in e.cases]
-    add_row(table, "verdict", *(end.name for end in ends))
+    add_row(table, "verdict", *(end_cell(end.name, completed=end.completed) for end in ends))
     add_row(table, "at [ms]", *(f"{end.time * 1e3:.1f}" for end in ends))
     for merit in fullest:
         add_row(table, merit.heading, *(values.get(merit.label, "-") for values in found))
@@ -165,7 +170,8 @@ def _list_of_merits(e: Experiment) -> Table:
     table.columns[1].justify = "left"
     for case in e.cases:
         end = case.run.verdict
-        add_row(table, case.label, "verdict", f"{end.name} at {end.time * 1e3:.1f} ms")
+        ended = end_cell(f"{end.name} at {end.time * 1e3:.1f} ms", completed=end.completed)
+        add_row(table, case.label, "verdict", ended)
         for merit in case.merits:
             add_row(table, "", merit.heading, merit_text(merit))
     return table
@@ -384,6 +390,15 @@ LEAST = 30  # letters of a claim that a line shows at least: a terminal with roo
 ELLIPSIS = "…"
 
 
+MEANINGS = {
+    "reproduced": "holds",
+    "kept": "holds",
+    "near": "undecided",
+    "partly": "undecided",
+    "differs": "fails",
+}  # of their words
+
+
 @dataclass(frozen=True)
 class ClaimLines:
     """A line for each claim: claim, published figure, that of each design, and the verdict in one word.
@@ -403,7 +418,10 @@ class ClaimLines:
         width = options.max_width
         yield Text("\n".join(fold(f"Published numbers and ours: {self.ledger.title}", width)))
         for designs in self._blocks(width):
-            yield Text("\n".join(["", *self._lines(designs, width)]))
+            shown = Text("\n".join(["", *self._lines(designs, width)]))
+            for word, meaning in MEANINGS.items():
+                shown.highlight_regex(re.compile(f"(?<= {{{GAP}}}){word}$", re.M), COLOURS[meaning])
+            yield shown
 
     def _columns(self, designs: Sequence[int]) -> list[list[str]]:
         """The texts of all columns but the claim's, each with its heading."""

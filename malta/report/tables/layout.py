@@ -254,6 +254,14 @@ def new_table(title: str, *columns: str) -> FoldingTable:
     return new_sheet(title, list(zip(columns, sides, strict=True)))
 
 
-def add_row(table: Table, *cells: str) -> None:
+COLOURS = {"holds": "green", "undecided": "bold yellow", "fails": "bold red"}  # of a verdict, beside its word
+
+
+def add_row(table: Table, *cells: str | Text) -> None:
     """Append a row; brackets in cells are text, not rich's markup."""
-    table.add_row(*map(Text, cells))
+    table.add_row(*(cell if isinstance(cell, Text) else Text(cell) for cell in cells))
+
+
+def end_cell(end: str, *, completed: bool) -> Text:
+    """How a run ended, in the colour of a verdict."""
+    return Text(end, style=COLOURS["holds" if completed else "fails"])
