@@ -30,7 +30,7 @@ def app(
         bool, typer.Option("--no-browser", help="Only print the address of the page.")
     ] = False,
     port: Annotated[
-        int, typer.Option(metavar="N", min=0, max=65535, help="Of 127.0.0.1; 0: any that is free.")
+        int, typer.Option(metavar="N", min=0, max=65535, help="Port of 127.0.0.1; 0: any that is free.")
     ] = 0,
     machine_file: MachineFile = None,
 ) -> None:

@@ -335,7 +335,9 @@ STUDY = "A study in place of plain runs"  # a panel of the help
 def campaign(
     ctx: typer.Context,
     gains: GainFileOrNone = None,
-    samples: Annotated[int, typer.Option(metavar="N", help="How many.", rich_help_panel=MACHINE)] = 10_000,
+    samples: Annotated[
+        int, typer.Option(metavar="N", help="How many machines.", rich_help_panel=MACHINE)
+    ] = 10_000,
     spread: Annotated[
         list[str] | None,
         typer.Option(
@@ -356,19 +358,24 @@ def campaign(
         str, typer.Option(metavar="WORD", help="latin-hypercube or sobol.", rich_help_panel=MACHINE)
     ] = "latin-hypercube",
     seed: Annotated[
-        int, typer.Option(metavar="N", help="Of machines and noise.", rich_help_panel=MACHINE)
+        int, typer.Option(metavar="N", help="Seed of machines and noise.", rich_help_panel=MACHINE)
     ] = 0,
     change: Changes = None,
     machine: MachineFile = None,
     scenario: Annotated[
         str | None,
         typer.Option(
-            metavar="SCENARIO", help=f"Their job: {SCENARIOS}", autocompletion=scenarios, rich_help_panel=RUN
+            metavar="SCENARIO",
+            help=f"What each machine does: {SCENARIOS}",
+            autocompletion=scenarios,
+            rich_help_panel=RUN,
         ),
     ] = None,
     case: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Of a scenario of several runs. [the first]", rich_help_panel=RUN),
+        typer.Option(
+            metavar="NAME", help="One case of a scenario that has several. [the first]", rich_help_panel=RUN
+        ),
     ] = None,
     option: OwnOptions = None,
     law: Annotated[

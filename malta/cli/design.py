@@ -299,7 +299,10 @@ def tune(
         bool, typer.Option("--check", help="Only judge the design as it stands in the file.")
     ] = False,
     generations: Annotated[
-        int, typer.Option(metavar="N", min=0, help="Of the global search; 0 starts from the file's numbers.")
+        int,
+        typer.Option(
+            metavar="N", min=0, help="Generations of the global search; 0 starts from the file's numbers."
+        ),
     ] = 8,
     front: Annotated[
         int,

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 def export(
     gains: GainFile,
     to: Annotated[str, typer.Option("--to", metavar="WORD", help="c: a folder of C99; fmu: one file.")] = "c",
-    precision: Annotated[str, typer.Option(metavar="WORD", help="float or double, of the C.")] = "double",
+    precision: Annotated[
+        str, typer.Option(metavar="WORD", help="Numbers of the C: float or double.")
+    ] = "double",
     until: Annotated[
         str | None,
         typer.Option(
@@ -41,7 +43,7 @@ def export(
         str | None,
         typer.Option(
             metavar="WORD",
-            help="Of an FMU: controller, supervised, machine, or loop of controller and machine. [controller]",
+            help="What an FMU has: controller, supervised, machine, or loop of controller and machine. [controller]",
         ),
     ] = None,
     fmi: Annotated[
@@ -187,8 +189,10 @@ def _require_known(
 def pil(
     gains: GainFile,
     port: Annotated[str, typer.Option(metavar="PORT", help="Of the serial line: /dev/ttyUSB0, COM3.")],
-    baud: Annotated[int, typer.Option(metavar="N", help="Its speed.")] = 115200,
-    timeout: Annotated[float, typer.Option(metavar="SECONDS", help="To wait for each answer [s].")] = 2.0,
+    baud: Annotated[int, typer.Option(metavar="N", help="Speed of the serial line, baud.")] = 115200,
+    timeout: Annotated[
+        float, typer.Option(metavar="SECONDS", help="How long to wait for each answer [s].")
+    ] = 2.0,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:

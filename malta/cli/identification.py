@@ -44,8 +44,8 @@ def identify(
             "--parameter",
             "-p",
             metavar="NAME",
-            help="To identify: of the machine, or of its sensors' errors. Repeatable. [those told to 50 %, but for "
-            "masses and lengths]",
+            help="To identify: of the machine, or of its sensors' errors. Repeatable. [those that the log "
+            "determines to 50 %, but for masses and lengths]",
         ),
     ] = None,
     known: Annotated[
@@ -146,12 +146,12 @@ def excite(
     motion: Annotated[
         str | None, typer.Option(metavar="QUANTITY", help="Largest motion of any output, as 20um.")
     ] = None,
-    period: Annotated[float, typer.Option(metavar="SECONDS", help="Of the multisine [s].")] = 1.0,
+    period: Annotated[float, typer.Option(metavar="SECONDS", help="Period of the multisine [s].")] = 1.0,
     periods: Annotated[
-        int, typer.Option(metavar="N", help="That are logged, after one in which the loop settles.")
+        int, typer.Option(metavar="N", help="Periods that are logged, after one in which the loop settles.")
     ] = 10,
     band: Annotated[str, typer.Option(metavar="LOW..HIGH", help="Lowest and highest line [Hz].")] = "2..400",
-    lines: Annotated[int, typer.Option(metavar="N", help="Of each input.")] = 12,
+    lines: Annotated[int, typer.Option(metavar="N", help="Lines of each input.")] = 12,
     parameters: Annotated[
         list[str] | None,
         typer.Option("--parameter", "-p", metavar="NAME", help="Whose accuracy is predicted. Repeatable."),

@@ -59,9 +59,9 @@ def measure(
         str | None, typer.Option(metavar="QUANTITY", help="Largest motion, as 20um.", rich_help_panel=PLAN)
     ] = None,
     band: Annotated[
-        str, typer.Option(metavar="LOW..HIGH", help="Of the lines [Hz].", rich_help_panel=PLAN)
+        str, typer.Option(metavar="LOW..HIGH", help="Lowest and highest line [Hz].", rich_help_panel=PLAN)
     ] = "2..400",
-    lines: Annotated[int, typer.Option(metavar="N", help="Of each input.", rich_help_panel=PLAN)] = 12,
+    lines: Annotated[int, typer.Option(metavar="N", help="Lines of each input.", rich_help_panel=PLAN)] = 12,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw it: a .png, .svg or .pdf file.")
     ] = None,

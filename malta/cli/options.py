@@ -39,7 +39,7 @@ GENERAL: Mapping[str, GeneralOption] = {
     ),
     "noise": GeneralOption(0.0, "of the sensors, in multiples"),
     "settle": GeneralOption(
-        0.0, "rest before the reference, of which no figure tells; yields of strokes have one"
+        0.0, "rest before the reference, which no figure counts; yields of strokes have one"
     ),
     "estimator": GeneralOption("steady-state", "steady-state, kalman (time-varying) or extended"),
     "quantize": GeneralOption(False, "sensors with the machine's resolution"),

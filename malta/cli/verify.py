@@ -51,7 +51,8 @@ def verify(
     current_loops: Annotated[
         str,
         typer.Option(
-            metavar="WORD", help="Of the last stage: pi (controllers on the windings), or lag (first order)."
+            metavar="WORD",
+            help="Current loops of the last stage: pi (controllers on the windings), or lag (first order).",
         ),
     ] = "pi",
     time: Annotated[
