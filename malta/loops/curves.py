@@ -254,7 +254,7 @@ def respond(loop: LinearLoop, w: FloatArray) -> Responses:
     p, m, u = len(loop.outputs), len(loop.inputs), len(loop.law.C)
     with np.errstate(all="ignore"):
         s = loop.frequencies(w)
-        whole, F = loop.plant.response(s), loop.law.response(s)
+        whole, F = (response(s) for response in loop.responses)
         P, P_w = whole[:, :p, :u], whole[:, :p, u:]
         L = -P @ F
         S = _inverse(np.eye(p) + L)

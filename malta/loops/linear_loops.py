@@ -12,6 +12,7 @@ lost their digits.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -227,6 +228,11 @@ class LinearLoop:
         z = 1 + T * found
         found = found[np.abs(z) > GONE]
         return np.asarray(np.log1p(T * found) / T)
+
+    @cached_property
+    def responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
+        """The functions of frequency of the plant and of the law, see `System.response`."""
+        return self.plant.response_function(), self.law.response_function()
 
     def unstable_poles(self, factors: FloatArray, at: Place) -> int:
         """How many poles grow with these factors of the loop gain.

@@ -8,13 +8,14 @@ p* ---(+)->| s+ = A s + B u  |--> v          u = p* - y, negative feedback
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from scipy import sparse
 from scipy.linalg import matrix_balance
 
 from malta.errors import InputError
@@ -190,19 +191,37 @@ class System(NamedTuple):
 
         NaN at a frequency that no double number tells from a pole.
         """
-        if not len(self.A):
-            return np.broadcast_to(self.D.astype(complex), (len(s), *self.D.shape))
-        A, B, C, _ = self.balanced
-        matrices = s[:, None, None] * np.eye(len(A)) - A
-        try:
-            found = np.linalg.solve(matrices, B.astype(complex))
-        except np.linalg.LinAlgError:  # a frequency on a pole: beside it
-            beside = matrices + 1e-9 * s[:, None, None] * np.eye(len(A))
-            found = np.full((len(s), *B.shape), np.nan, dtype=complex)
-            for k, one in enumerate(beside):
-                with suppress(np.linalg.LinAlgError):
-                    found[k] = np.linalg.solve(one, B)
-        return np.asarray(C @ found + self.D)
+        return self.response_function()(s)
+
+    def response_function(self) -> Callable[[ComplexArray], ComplexArray]:
+        """The function `response`, for several calls: what does not depend on the frequencies is computed once."""
+        A, B, C, D = self.balanced
+        label = sparse.csgraph.connected_components(A != 0, directed=False)[1] if len(A) else np.zeros(0)
+        parts = [
+            np.flatnonzero(label == k) for k in np.unique(label)
+        ]  # of states that nothing joins to the others
+
+        def response(s: ComplexArray) -> ComplexArray:
+            found = np.zeros((len(s), *B.shape), dtype=complex)
+            for i in parts:
+                found[:, i] = _resolvent(s, A[np.ix_(i, i)], B[i])
+            return np.asarray(C @ found + D)
+
+        return response
+
+
+def _resolvent(s: ComplexArray, A: FloatArray, B: FloatArray) -> ComplexArray:
+    """(s - A)^-1 B at each s; NaN at a frequency that no double number tells from a pole."""
+    matrices = s[:, None, None] * np.eye(len(A)) - A
+    try:
+        return np.asarray(np.linalg.solve(matrices, B.astype(complex)))
+    except np.linalg.LinAlgError:  # a frequency on a pole: beside it
+        beside = matrices + 1e-9 * s[:, None, None] * np.eye(len(A))
+        found = np.full((len(s), *B.shape), np.nan, dtype=complex)
+        for k, one in enumerate(beside):
+            with suppress(np.linalg.LinAlgError):
+                found[k] = np.linalg.solve(one, B)
+        return found
 
 
 def reference_names(c: Controller) -> list[str]:
