@@ -26,7 +26,7 @@ HEADERS = {
 
 
 def read_npz(data: bytes) -> dict[str, Any]:
-    """Read the arrays of an .npz archive by name.
+    """Read the arrays of an .npz archive by name; they are read-only.
 
     Raises ValueError for damage and for what numpy.savez does not write of such arrays: compressed or encrypted
     members, two of one name, objects, arrays of another size than their member.
@@ -70,7 +70,7 @@ def _array(content: bytes, name: str) -> Any:
     version = np.lib.format.read_magic(file)
     if version not in HEADERS:
         raise ValueError(f"{name} has the version {version} of its format")
-    shape, _, kind = HEADERS[version](file)
+    shape, columns_first, kind = HEADERS[version](file)
     left = len(content) - file.tell()
     if kind.hasobject:
         raise ValueError(f"{name} is an array of objects, which allow_pickle=False refuses")
@@ -79,5 +79,5 @@ def _array(content: bytes, name: str) -> Any:
     # An array of no bytes may have a long side: it must not become a long list of empty ones.
     if math.prod(shape) * kind.itemsize != left or max(shape, default=0) > len(content):
         raise ValueError(f"{name} declares {shape} entries of {kind.itemsize} bytes where {left} follow")
-    file.seek(0)
-    return np.lib.format.read_array(file, allow_pickle=False)
+    order: Any = "F" if columns_first else "C"
+    return np.ndarray(shape, kind, buffer=content, offset=file.tell(), order=order)

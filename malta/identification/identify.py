@@ -20,6 +20,7 @@ from malta.identification.prediction import (
     predict,
 )
 from malta.identification.response import (
+    STEP,
     ResponseModel,
     acting,
     candidates,
@@ -486,15 +487,17 @@ def _search(records: Sequence[_Record], begin: FloatArray) -> Found:
         pairs = zip(records, weights, strict=True)
         return [white_residuals(r.model, r.spectrum, r.at(theta), W) for r, W in pairs]
 
-    def residuals(moved: FloatArray) -> FloatArray:
+    def residuals(x: FloatArray) -> FloatArray:
         try:
-            e = np.sqrt(2) * np.concatenate([part.ravel() for part in white(start + scale * moved)])
+            e = np.sqrt(2) * np.concatenate([part.ravel() for part in white(start + scale * (x - 1))])
         except (np.linalg.LinAlgError, ValueError):
             return np.full(size, 1e6)
         return np.concatenate([e.real, e.imag])
 
-    found = least_squares(residuals, (begin - start) / scale, method="lm", x_scale="jac", xtol=1e-9)
-    theta = start + scale * found.x
+    # Parameters are counted from 1: differences for slopes are shares of them, well above rounding.
+    x = 1 + (begin - start) / scale
+    found = least_squares(residuals, x, method="lm", x_scale="jac", xtol=1e-9, diff_step=STEP)
+    theta = start + scale * (found.x - 1)
     parts, dof = white(theta), size - len(scale)
     chi2 = 2 * sum(float((np.abs(part) ** 2).sum()) for part in parts) / dof
     covariance = _covariance(np.asarray(found.jac), np.asarray(found.fun), max(1.0, chi2))

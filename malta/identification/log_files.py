@@ -303,18 +303,22 @@ SI_UNITS = ("m", "rad", "N", "N m", "A", "V", "1")
 
 def _in_si(table: FloatArray, headings: list[str], path: Path) -> tuple[FloatArray, tuple[Signal, ...]]:
     """A table in SI, and its signals."""
-    table, signals = np.array(table, dtype=float), []
-    for k, heading in enumerate(headings):
+    table, signals, factors = np.asarray(table, dtype=float), [], []
+    for heading in headings:
         name, unit = _parts(heading, path)
         si_unit = next((one for one in SI_UNITS if is_unit_of(unit, one)), None)
         if si_unit is None:
             raise InputError(path, heading, f"unit {unit!r}", "one of " + ", ".join(SI_UNITS))
-        table[:, k] *= to_si(1.0, unit, si_unit, path, name)
-        far = np.flatnonzero(np.abs(table[:, k]) >= MOST)
-        if len(far):
-            found = f"{table[far[0], k]:g} in sample {far[0] + 1}"
-            raise InputError(path, heading, found, "a reading, or nothing where it is missing")
+        factors.append(to_si(1.0, unit, si_unit, path, name))
         signals.append(Signal(name, si_unit))
+    if any(factor != 1 for factor in factors):
+        table = table * factors
+    ends = np.fmin.reduce(table, axis=None, initial=0), np.fmax.reduce(table, axis=None, initial=0)
+    if max(map(abs, ends)) >= MOST:
+        row, column = np.argwhere(np.abs(table) >= MOST)[0]
+        found = f"{table[row, column]:g} in sample {row + 1}"
+        raise InputError(path, headings[column], found, "a reading, or nothing where it is missing")
+    table.flags.writeable = False  # so that a log takes it as it is
     return table, tuple(signals)
 
 

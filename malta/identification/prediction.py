@@ -13,6 +13,7 @@ curvature, slows the search and does not move where it ends: sum of (de/dtheta)'
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,24 +23,22 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize
-from scipy.signal import lfilter
 
 from malta.errors import CheckError
 from malta.identification.response import ResponseModel, acting, axes_of, current_rate
 from malta.model.parameters import symbolic_names, twins_of
 from malta.model.plant import Plant, symbolic
-from malta.simulation.engine.compiled import library
-from malta.simulation.engine.engines import evaluate
+from malta.simulation.engine.sample_loop import Loop, loop_of
 from malta.simulation.period import runge_kutta
 from malta.synthesis.riccati import dare
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
 
-BLOCK = 1000  # samples in one call
-FLAGS = ("-std=gnu11", "-O2", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared")
+BLOCK = 1000  # samples that are summed up together
 PASSES = 8  # of the filter over the log, at most
 SETTLED = 0.05  # standard deviations: steps of all parameters that are smaller end the search
+FAR = 1.0  # standard deviations: after a larger step slopes are computed anew
 NORMAL = 1e12  # degrees of freedom with which Student's distribution is the normal one
 STUDENT = 4.0  # degrees of freedom against outliers
 SPAN = 7  # readings: a reading's neighbours
@@ -148,71 +147,90 @@ class _Shape(NamedTuple):
     """What the functions of a filter depend on, but for numbers."""
 
     plant: Plant
-    names: tuple[
-        str, ...
-    ]  # of the parameters whose slopes are written: all that act, so that one text serves
     currents: tuple[str, ...]
     sample_time: float
 
 
-@lru_cache(maxsize=8)
-def _chain(shape: _Shape) -> ca.Function:
-    """BLOCK samples of the filter, compiled where a C compiler works.
+class _Equations(NamedTuple):
+    """The machine in symbols: all states and parameters, and the currents at both ends of a sample."""
 
-    (x; i_k, i_k+1, y, whether it is there; numbers, errors of sensors, d, K, s, nu, rate), a column a sample ->
-    x, (e, w, slopes of accelerations and of readings in the parameters)
-    """
+    numbers: Any  # parameters, errors of the sensors, rate of the currents
+    named: dict[str, Any]  # symbols of parameters and errors
+    x: Any
+    ends: Any  # currents at the begin of the sample, and at its end
+    slope: Callable[[Any, int], Any]  # (states, half samples since its begin) -> x'
+    read: Any
+
+
+def _equations(shape: _Shape) -> _Equations:
     plant, par = shape.plant, shape.plant.parameters
-    n, p, m, Ts = len(plant.controlled), len(plant.outputs), len(shape.currents), shape.sample_time
+    n, m, Ts = len(plant.controlled), len(shape.currents), shape.sample_time
     value = {name: ca.SX.sym(name) for name in symbolic_names(par)}
     error = {s.name: ca.SX.sym(s.name) for s in plant.sensor_errors}
     twins = {name: value[twin] for name, twin in twins_of(par).items()}
     machine = plant.variant(symbolic(par, value | twins))
-    theta = ca.vertcat(*((value | error)[name] for name in shape.names))
-    x, i, after, y, there = (ca.SX.sym("signal", size) for size in (n, m, m, p, p))
-    d, K, s = ca.SX.sym("d", n // 2), ca.SX.sym("K", n, p), ca.SX.sym("s", p)
-    nu, rate = ca.SX.sym("nu"), ca.SX.sym("rate")
+    x, i, after, rate = (ca.SX.sym("signal", size) for size in (n, m, m, 1))
     axes, keep = [a.name for a in axes_of(plant)], list(plant.controlled)
+    # At half of a sample: 1/2 of a current that goes evenly, more of one that lags, 0 of one that is held.
+    middle = ca.if_else(rate < 0, 0, 1 / (1 + ca.exp(-rate * Ts / 2)))
+    shares = (0, middle, ca.if_else(rate < 0, 0, 1))
 
     def whole(own: Any) -> Any:
         state = ca.SX.zeros(len(plant.states))
         state[keep] = own
         return state
 
-    def slope(z: Any, share: Any) -> Any:
+    def slope(z: Any, halves: int) -> Any:
         flowing, state = ca.SX.zeros(len(axes)), whole(z)
-        flowing[[axes.index(name) for name in shape.currents]] = i + share * (after - i)
+        flowing[[axes.index(name) for name in shape.currents]] = i + shares[halves] * (after - i)
         force = machine.forces(state, flowing) if plant.windings is None else machine.drive.force(flowing)
-        return machine.f(state, force, machine.load(state))[keep] + ca.vertcat(ca.SX.zeros(n // 2), d)
+        return machine.f(state, force, machine.load(state))[keep]
 
-    # At half of a sample: 1/2 of a current that goes evenly, more of one that lags, 0 of one that is held.
-    middle = ca.if_else(rate < 0, 0, 1 / (1 + ca.exp(-rate * Ts / 2)))
-    shares = (0, middle, ca.if_else(rate < 0, 0, 1))
     read = machine.sense(whole(x), ca.vertcat(*error.values()))
-    e = y - read
+    numbers = ca.vertcat(*value.values(), *error.values(), rate)
+    return _Equations(numbers, value | error, x, ca.vertcat(i, after), slope, read)
+
+
+@lru_cache(maxsize=8)
+def _filter_loop(shape: _Shape) -> Loop:
+    """(x; i_k, i_k+1, y, whether it is there; numbers, d, K, s, nu) -> x, (e, w, better x) of each sample."""
+    q = _equations(shape)
+    n, p, half = q.x.numel(), q.read.numel(), q.x.numel() // 2
+    y, there, s, d = (ca.SX.sym("signal", size) for size in (p, p, p, half))
+    K, nu = ca.SX.sym("K", n, p), ca.SX.sym("nu")
+    e = y - q.read
     w = there * (nu + 1) / (nu + (e / s) ** 2)
-    better = x + K @ (w * e)
-    moved = runge_kutta(lambda z, halves: slope(z, shares[halves]), better, Ts, n // 2)
-    pushed = ca.jacobian(slope(x, middle)[n // 2 :], theta)
-    constants = ca.vertcat(*value.values(), *error.values(), d, ca.vec(K), s, nu, rate)
-    row = ca.vertcat(e, w, ca.vec(pushed), ca.vec(ca.jacobian(read, theta)))
-    one = ca.Function(
-        "one", [x, ca.vertcat(i, after, y, there), constants], ca.cse([ca.densify(moved), ca.densify(row)])
+    better = q.x + K @ (w * e)
+    constant = ca.vertcat(ca.SX.zeros(half), d)
+    moved = runge_kutta(lambda z, halves: q.slope(z, halves) + constant, better, shape.sample_time, half)
+    numbers = ca.vertcat(q.numbers, d, ca.vec(K), s, nu)
+    return loop_of(q.x, ca.vertcat(q.ends, y, there), numbers, moved, ca.vertcat(e, w, better))
+
+
+@lru_cache(maxsize=8)
+def _slope_loop(shape: _Shape, names: tuple[str, ...], count: int) -> Loop:
+    """Slopes of e in parameters by the modes of the linear filter: E = -Re(C V z) - read'.
+
+    (z of each parameter; i_k, i_k+1, better x; numbers, modes) -> z, slopes of e in the first parameter, the second ...
+
+    count : of the modes
+    """
+    q = _equations(shape)
+    n, p, half = q.x.numel(), q.read.numel(), q.x.numel() // 2
+    theta = ca.vertcat(*(q.named[name] for name in names))
+    pushed = ca.jacobian(q.slope(q.x, 1)[half:], theta)
+    read = ca.jacobian(q.read, theta)
+    z = ca.SX.sym("z", 2 * count, len(names))  # real parts, imaginary parts
+    values, seen = ca.SX.sym("values", 2 * count), ca.SX.sym("seen", p, 2 * count)
+    accelerated, corrected = ca.SX.sym("acc", 2 * count, half), ca.SX.sym("cor", 2 * count, p)
+    real, imaginary = ca.diag(values[:count]), ca.diag(values[count:])
+    turned = ca.vertcat(
+        real @ z[:count, :] - imaginary @ z[count:, :], imaginary @ z[:count, :] + real @ z[count:, :]
     )
-    chain = one.mapaccum("chain", BLOCK)
-    made = ca.CodeGenerator("chain")
-    made.add(chain)
-    compiled = library(made.dump(), 1, flags=FLAGS)
-    return chain if compiled is None else ca.external(chain.name(), compiled._name)
-
-
-class _Flight(NamedTuple):
-    """A run of the filter: innovations and weights, k x p, and slopes of accelerations and of readings."""
-
-    e: FloatArray
-    w: FloatArray
-    pushed: FloatArray  # k x parameters x positions
-    read: FloatArray  # k x parameters x p
+    after = turned + accelerated @ pushed - corrected @ read
+    modes = (values, ca.vec(accelerated), ca.vec(corrected), ca.vec(seen))
+    numbers = ca.vertcat(q.numbers, *modes)
+    return loop_of(ca.vec(z), ca.vertcat(q.ends, q.x), numbers, ca.vec(after), ca.vec(-seen @ z - read))
 
 
 class _Search(NamedTuple):
@@ -221,56 +239,58 @@ class _Search(NamedTuple):
     model: ResponseModel
     linear: _Linear
     i: FloatArray
+    after: FloatArray  # i one sample later
     y: FloatArray  # 0 where missing
     there: FloatArray
     nu: float
 
+    @property
+    def shape(self) -> _Shape:
+        return _Shape(self.model.plant, self.model.currents, self.model.sample_time)
 
-def _fly(s: _Search, theta: FloatArray, d: FloatArray, x: FloatArray) -> _Flight:
-    """Run the filter over the log from the state x."""
-    model, plant = s.model, s.model.plant
-    par, names = plant.parameters, model.names
-    own = dict(zip(names, theta.tolist(), strict=True))
+
+class _Flight(NamedTuple):
+    """A run of the filter: innovations and weights, k x p, and states after each correction, k x n."""
+
+    e: FloatArray
+    w: FloatArray
+    x: FloatArray
+
+
+def _numbers(model: ResponseModel, theta: FloatArray) -> FloatArray:
+    """The numbers of a machine, as `_Equations` has them."""
+    plant, par = model.plant, model.plant.parameters
+    own = dict(zip(model.names, theta.tolist(), strict=True))
     twins = twins_of(par)
     value = [own.get(n, own.get(twins.get(n, ""), float(getattr(par, n)))) for n in symbolic_names(par)]
     error = [own.get(signal.name, 0.0) for signal in plant.sensor_errors]
     rate = current_rate(plant)
-    numbers = np.concatenate(
-        [value, error, d, s.linear.K.T.ravel(), s.linear.s, [s.nu, rate if np.isfinite(rate) else -1.0]]
-    )
-    errors = tuple(signal.name for signal in plant.sensor_errors)
-    known = tuple(dict.fromkeys((*acting(plant), *errors, *names)))
-    chain = _chain(_Shape(plant, known, model.currents, model.sample_time))
-    places, p, half = [known.index(name) for name in names], len(plant.outputs), len(d)
-    chosen = np.arange(2 * p), *(2 * p + half * k + np.arange(half) for k in places)
-    of_readings = (2 * p + half * len(known) + p * k + np.arange(p) for k in places)
-    columns = np.concatenate([*chosen, *of_readings])
-    constants, rows = np.tile(numbers, (BLOCK, 1)), []
-    inputs = np.hstack([s.i, np.vstack([s.i[1:], s.i[-1:]]), s.y, s.there])
-    for first in range(0, len(inputs), BLOCK):
-        block = inputs[first : first + BLOCK]
-        count = len(block)
-        if count < BLOCK:
-            block = np.vstack([block, np.repeat(block[-1:], BLOCK - count, axis=0)])
-        states, row = evaluate(chain, x, block, constants)
-        x = states[-1]
-        rows.append(row[:count, columns])
-    row = np.vstack(rows)
-    if not np.isfinite(row).all():
+    return np.array([*value, *error, rate if np.isfinite(rate) else -1.0])
+
+
+def _fly(s: _Search, theta: FloatArray, d: FloatArray, x: FloatArray) -> _Flight:
+    """Run the filter over the log from the state x."""
+    p = s.y.shape[1]
+    numbers = np.concatenate([_numbers(s.model, theta), d, s.linear.K.T.ravel(), s.linear.s, [s.nu]])
+    rows = _filter_loop(s.shape)(x, (s.i, s.after, s.y, s.there), numbers)
+    if not np.isfinite(rows).all():
         raise FloatingPointError
-    c = len(names)
-    parts = np.split(row, np.cumsum([p, p, c * half]), axis=1)
-    return _Flight(parts[0], parts[1], parts[2].reshape(-1, c, half), parts[3].reshape(-1, c, p))
+    return _Flight(rows[:, :p], rows[:, p : 2 * p], rows[:, 2 * p :])
 
 
 class _Modes(NamedTuple):
     """The linear filter's states as modes: x = V z, z_k+1 = values z_k."""
 
     values: ComplexArray
-    V: ComplexArray
+    seen: ComplexArray  # by outputs
     inverse: ComplexArray
     accelerated: ComplexArray  # by accelerations
     corrected: ComplexArray  # by readings
+
+
+def following(table: FloatArray) -> FloatArray:
+    """The next row of each row; the last one follows itself."""
+    return np.concatenate([table[1:], table[-1:]])
 
 
 def _modes(s: _Search) -> _Modes:
@@ -283,40 +303,52 @@ def _modes(s: _Search) -> _Modes:
     G = np.vstack([Ts**2 / 2 * np.eye(n // 2), Ts * np.eye(n // 2)])
     inverse = inverse[upper]
     V = (V * np.where(values.imag > 0, 2.0, 1.0))[:, upper]
-    return _Modes(values[upper] + 0j, V + 0j, inverse + 0j, inverse @ G + 0j, inverse @ A @ K + 0j)
+    return _Modes(values[upper] + 0j, C @ V + 0j, inverse + 0j, inverse @ G + 0j, inverse @ A @ K + 0j)
 
 
-def _normal(s: _Search, flight: _Flight) -> tuple[FloatArray, FloatArray]:
-    """Sums of E' w E / s^2 and of E' w e / s^2 over the log, with the slopes E of e in parameters, constant
-    accelerations and the first state."""
-    modes, p, k = _modes(s), s.y.shape[1], len(s.y)
-    c, half, n = len(s.model.names), modes.accelerated.shape[1], modes.inverse.shape[1]
-    seen = s.linear.C @ modes.V
+def _slopes(s: _Search, modes: _Modes, theta: FloatArray, x: FloatArray) -> FloatArray:
+    """The slopes of e in the parameters along the states x, k x parameters x p."""
+    stacked = (np.concatenate([part.real, part.imag]) for part in (modes.values, modes.accelerated, modes.corrected))
+    seen = np.hstack([modes.seen.real, -modes.seen.imag])
+    numbers = np.concatenate([_numbers(s.model, theta), *(part.T.ravel() for part in (*stacked, seen))])
+    count, c = len(modes.values), len(theta)
+    loop = _slope_loop(s.shape, s.model.names, count)
+    return loop(np.zeros(2 * count * c), (s.i, s.after, x), numbers).reshape(len(x), c, -1)
+
+
+def _normal(s: _Search, modes: _Modes, flight: _Flight, E: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Sums of E' w E / s^2 and of E' w e / s^2 over the log, with the slopes of e in parameters, constant accelerations
+    and the first state.
+
+    Those in the last two are Re(values^k L) + settled. Powers of a block are computed once; L turns from block to block.
+
+    E : k x parameters x p, slopes in parameters
+    """
+    p, c, half, n = s.y.shape[1], E.shape[1], modes.accelerated.shape[1], modes.inverse.shape[1]
     constant = modes.accelerated / (1 - modes.values)[:, None]
-    left = np.hstack([constant, -modes.inverse])  # what powers of the modes add to `settled`
-    decaying = (seen.T[:, None, :] * left[:, :, None]).reshape(len(left), -1)
-    settled = -(seen @ constant).real.T
-    memory = np.zeros((c, len(modes.values)), dtype=complex)
+    settled = np.hstack([-(modes.seen @ constant).real, np.zeros((p, n))])[:, :, None]
+    left = np.hstack([constant, -modes.inverse]).T * modes.seen[:, None, :]  # p x (half + n) x modes
+    powers = modes.values ** np.arange(BLOCK)[:, None]
+    basis = np.hstack([powers.real, powers.imag, np.ones((BLOCK, 1))])
+    products = (basis[:, :, None] * basis[:, None, :]).reshape(BLOCK, -1)
     N, g = np.zeros((c + half + n,) * 2), np.zeros(c + half + n)
     weight = flight.w / s.linear.s**2
-    for first in range(0, k, 20 * BLOCK):
-        part = slice(first, min(first + 20 * BLOCK, k))
-        count = part.stop - first
-        E = np.empty((c + half + n, count, p))
-        for j in range(c):
-            u = modes.accelerated @ flight.pushed[part, j].T - modes.corrected @ flight.read[part, j].T
-            for row, value in enumerate(modes.values):
-                u[row], memory[j, row : row + 1] = lfilter(
-                    [0, 1], [1, -value], u[row], zi=memory[j, row : row + 1]
-                )
-            E[j] = -(seen @ u).real.T - flight.read[part, j]
-        powers = modes.values ** np.arange(first, part.stop)[:, None]
-        E[c:] = (powers @ decaying).real.reshape(count, half + n, p).transpose(1, 0, 2)
-        E[c : c + half] += settled[:, None, :]
-        flat = E.reshape(len(E), -1)
-        heavy = flat * weight[part].ravel()
-        N += heavy @ flat.T
-        g += heavy @ flight.e[part].ravel()
+    for first in range(0, len(E), BLOCK):
+        part = slice(first, first + BLOCK)
+        own, w = E[part], weight[part]
+        count, size = len(own), basis.shape[1]
+        turned = left * modes.values**first
+        L = np.concatenate([turned.real, -turned.imag, settled], axis=2)
+        heavy = (own * w[:, None, :]).reshape(count, -1)
+        mixed = (heavy.T @ basis[:count]).reshape(c, p, size)
+        told = (w.T @ products[:count]).reshape(p, size, size)
+        weighed = w * flight.e[part]
+        N[:c, :c] += np.tensordot(heavy.reshape(count, c, p), own, ([0, 2], [0, 2]))
+        N[:c, c:] += np.einsum("cpb,pjb->cj", mixed, L)
+        N[c:, c:] += (L @ told @ L.transpose(0, 2, 1)).sum(axis=0)
+        g[:c] += np.tensordot(own, weighed, ([0, 2], [0, 1]))
+        g[c:] += np.einsum("pjb,pb->j", L, weighed.T @ basis[:count])
+    N[c:, :c] = N[:c, c:].T
     return N, g
 
 
@@ -353,11 +385,11 @@ def predict(
     """
     there = np.isfinite(y).astype(float)
     linear = _filter(model, theta, noise, len(y) * model.sample_time)
-    s = _Search(model, linear, i, np.where(there > 0, y, 0.0), there, STUDENT if robust else NORMAL)
+    s = _Search(model, linear, i, following(i), np.where(there > 0, y, 0.0), there, STUDENT if robust else NORMAL)
     n, c = len(linear.A), len(theta)
     half, x = n // 2, np.array(model.place[list(model.plant.controlled)])
     d = np.zeros(half)
-    theta, covariance = np.array(theta), np.zeros((c, c))
+    theta, covariance, modes, moved = np.array(theta), np.zeros((c, c)), _modes(s), np.inf
     for _ in range(PASSES):
         try:
             flight = _fly(s, theta, d, x)
@@ -365,13 +397,16 @@ def predict(
             raise CheckError(
                 f"{source}: the filter does not follow the log: another machine than the model"
             ) from None
-        N, g = _normal(s, flight)
+        if moved > FAR:
+            E = _slopes(s, modes, theta, flight.x)
+        N, g = _normal(s, modes, flight, E)
         unit = np.sqrt(np.diag(N))
         step = -np.linalg.lstsq(N / np.outer(unit, unit), g / unit, rcond=1e-13)[0] / unit
         inverse = np.linalg.pinv(N / np.outer(unit, unit), rcond=1e-13) / np.outer(unit, unit)
         covariance = inverse[:c, :c]
         theta, d, x = theta + step[:c], d + step[c : c + half], x + step[c + half :]
-        if (np.abs(step[:c]) < SETTLED * np.sqrt(np.diag(covariance))).all():
+        moved = float((np.abs(step[:c]) / np.sqrt(np.diag(covariance))).max())
+        if moved < SETTLED:
             break
     return _result(s, theta, covariance, flight, noise)
 
