@@ -62,7 +62,9 @@ def squares(controller: Controller, log: Log) -> FloatArray:
     powers = e.reshape(-1, e.shape[2])[places]
     noise = noise_between_lines(model, model.start, spectrum.rate * bins, powers, samples)
     linear = prediction._filter(model, model.start, noise, len(y) * model.sample_time)
-    search = prediction._Search(model, linear, i, prediction.following(i), y, np.ones_like(y), prediction.NORMAL)
+    search = prediction._Search(
+        model, linear, i, prediction.following(i), y, np.ones_like(y), prediction.NORMAL
+    )
     n, half = len(linear.A), len(linear.A) // 2
     first = np.concatenate([np.zeros(half), np.array(model.place[list(plant.controlled)])])
     scale = np.concatenate([model.start, np.ones(half), 1e-6 * np.ones(n)])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import gammainccinv, gammaincinv
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
@@ -145,7 +145,7 @@ class Identified:
     @property
     def joint(self) -> float:
         """By how much the box of the intervals grows until it holds the 95 % ellipsoid of all parameters together."""
-        return float(np.sqrt(chi2_distribution.ppf(0.95, len(self.names))) / SIGMA)
+        return float(np.sqrt(2 * gammaincinv(len(self.names) / 2, 0.95)) / SIGMA)
 
     @property
     def differences(self) -> dict[str, float]:
@@ -496,7 +496,7 @@ def _search(records: Sequence[_Record], begin: FloatArray) -> Found:
 
     # Parameters are counted from 1: differences for slopes are shares of them, well above rounding.
     x = 1 + (begin - start) / scale
-    found = least_squares(residuals, x, method="lm", x_scale="jac", xtol=1e-9, diff_step=STEP)
+    found = least_squares(residuals, x, method="lm", x_scale="jac", xtol=1e-9, diff_step=[STEP])
     theta = start + scale * (found.x - 1)
     parts, dof = white(theta), size - len(scale)
     chi2 = 2 * sum(float((np.abs(part) ** 2).sum()) for part in parts) / dof
@@ -526,7 +526,7 @@ def _estimate(records: Sequence[_Record], log: Log, dropped: Mapping[str, float]
         covariance=covariance,
         held=held,
         chi2=chi2,
-        limit=float(SLACK * chi2_distribution.isf(LIKELY, dof) / dof),
+        limit=float(SLACK * 2 * gammainccinv(dof / 2, LIKELY) / dof),
         dof=dof,
         whiteness=whiteness_of(white, [r.spectrum for r in records]),
         distortion=float(np.mean([distortion_of(r.model, r.spectrum, r.at(theta)) for r in records])),

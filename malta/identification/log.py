@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-from scipy.signal import lfilter
 
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
@@ -265,6 +264,8 @@ def _lagging_currents(run: Trajectory) -> FloatArray:
     held = np.vstack([np.repeat(run.current[:1], delay, axis=0), run.current])[: len(run.current)]
     if not np.isfinite(actuator.crossover):
         return np.asarray(held)
+    from scipy.signal import lfilter  # half a second to import
+
     decay = float(np.exp(-actuator.crossover * Ts))
     first = decay * held[:1]
     return np.asarray(lfilter([0, 1 - decay], [1, -decay], held, axis=0, zi=first)[0])

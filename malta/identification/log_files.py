@@ -244,13 +244,7 @@ def _from_csv(content: bytes, path: Path) -> Decoded:
         raise InputError(path, "", "no line of headings", 'a line as "t [s],x1 [um],..."')
     names = [name.strip() for name in lines[first].split(",")]
     try:
-        rows = io.StringIO(text)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a file without rows, which is refused below
-            if re.search(r",\s*(,|$)", text, re.M):  # empty cells: missing readings
-                values = np.genfromtxt(rows, delimiter=",", skip_header=first + 1, ndmin=2)
-            else:
-                values = np.loadtxt(rows, delimiter=",", skiprows=first + 1, comments=None, ndmin=2)
+        values = _table(text, first + 1)
     except ValueError as error:
         raise InputError(path, "", f"a line that cannot be read ({str(error)[:80]})", "numbers") from error
     if not values.size:
@@ -258,6 +252,19 @@ def _from_csv(content: bytes, path: Path) -> Decoded:
     if values.shape[1] != len(names):
         raise InputError(path, "", f"{values.shape[-1]} cells in a line", f"{len(names)}, as headings")
     return _tabulated(head, names, values, path)
+
+
+def _table(text: str, skipped: int) -> FloatArray:
+    """The numbers of a text below `skipped` lines, NaN for an empty cell. Raises ValueError for what is no number."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a file without rows, which is refused later
+        try:
+            return np.loadtxt(io.StringIO(text), delimiter=",", skiprows=skipped, comments=None, ndmin=2)
+        except ValueError:
+            if not re.search(r",\s*(,|$)", text, re.M):
+                raise
+        # Cells are empty where readings are missing: a slower reader takes them.
+        return np.genfromtxt(io.StringIO(text), delimiter=",", skip_header=skipped, ndmin=2)
 
 
 def _tabulated(head: dict[str, Any], names: list[str], values: FloatArray, path: Path) -> Decoded:

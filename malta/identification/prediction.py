@@ -25,7 +25,7 @@ from scipy.ndimage import median_filter
 from scipy.optimize import minimize
 
 from malta.errors import CheckError
-from malta.identification.response import ResponseModel, acting, axes_of, current_rate
+from malta.identification.response import ResponseModel, axes_of, current_rate
 from malta.model.parameters import symbolic_names, twins_of
 from malta.model.plant import Plant, symbolic
 from malta.simulation.engine.sample_loop import Loop, loop_of
@@ -211,12 +211,12 @@ def _filter_loop(shape: _Shape) -> Loop:
 def _slope_loop(shape: _Shape, names: tuple[str, ...], count: int) -> Loop:
     """Slopes of e in parameters by the modes of the linear filter: E = -Re(C V z) - read'.
 
-    (z of each parameter; i_k, i_k+1, better x; numbers, modes) -> z, slopes of e in the first parameter, the second ...
+    (z of each parameter; i_k, i_k+1, better x; numbers, modes) -> z, slopes of each output's e
 
     count : of the modes
     """
     q = _equations(shape)
-    n, p, half = q.x.numel(), q.read.numel(), q.x.numel() // 2
+    p, half = q.read.numel(), q.x.numel() // 2
     theta = ca.vertcat(*(q.named[name] for name in names))
     pushed = ca.jacobian(q.slope(q.x, 1)[half:], theta)
     read = ca.jacobian(q.read, theta)
@@ -230,7 +230,7 @@ def _slope_loop(shape: _Shape, names: tuple[str, ...], count: int) -> Loop:
     after = turned + accelerated @ pushed - corrected @ read
     modes = (values, ca.vec(accelerated), ca.vec(corrected), ca.vec(seen))
     numbers = ca.vertcat(q.numbers, *modes)
-    return loop_of(ca.vec(z), ca.vertcat(q.ends, q.x), numbers, ca.vec(after), ca.vec(-seen @ z - read))
+    return loop_of(ca.vec(z), ca.vertcat(q.ends, q.x), numbers, ca.vec(after), ca.vec((-seen @ z - read).T))
 
 
 class _Search(NamedTuple):
@@ -307,47 +307,49 @@ def _modes(s: _Search) -> _Modes:
 
 
 def _slopes(s: _Search, modes: _Modes, theta: FloatArray, x: FloatArray) -> FloatArray:
-    """The slopes of e in the parameters along the states x, k x parameters x p."""
-    stacked = (np.concatenate([part.real, part.imag]) for part in (modes.values, modes.accelerated, modes.corrected))
+    """The slopes of e in the parameters along the states x, k x p x parameters."""
+    stacked = (
+        np.concatenate([part.real, part.imag]) for part in (modes.values, modes.accelerated, modes.corrected)
+    )
     seen = np.hstack([modes.seen.real, -modes.seen.imag])
     numbers = np.concatenate([_numbers(s.model, theta), *(part.T.ravel() for part in (*stacked, seen))])
     count, c = len(modes.values), len(theta)
     loop = _slope_loop(s.shape, s.model.names, count)
-    return loop(np.zeros(2 * count * c), (s.i, s.after, x), numbers).reshape(len(x), c, -1)
+    return loop(np.zeros(2 * count * c), (s.i, s.after, x), numbers).reshape(len(x), -1, c)
 
 
 def _normal(s: _Search, modes: _Modes, flight: _Flight, E: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Sums of E' w E / s^2 and of E' w e / s^2 over the log, with the slopes of e in parameters, constant accelerations
     and the first state.
 
-    Those in the last two are Re(values^k L) + settled. Powers of a block are computed once; L turns from block to block.
+    Those in the last two are Re(values^k L) + settled. Powers are computed once for a block; L turns from block to block.
 
-    E : k x parameters x p, slopes in parameters
+    E : k x p x parameters, slopes in parameters
     """
-    p, c, half, n = s.y.shape[1], E.shape[1], modes.accelerated.shape[1], modes.inverse.shape[1]
+    _, p, c = E.shape
+    half, n = modes.accelerated.shape[1], modes.inverse.shape[1]
     constant = modes.accelerated / (1 - modes.values)[:, None]
     settled = np.hstack([-(modes.seen @ constant).real, np.zeros((p, n))])[:, :, None]
     left = np.hstack([constant, -modes.inverse]).T * modes.seen[:, None, :]  # p x (half + n) x modes
     powers = modes.values ** np.arange(BLOCK)[:, None]
     basis = np.hstack([powers.real, powers.imag, np.ones((BLOCK, 1))])
+    size = basis.shape[1]
     products = (basis[:, :, None] * basis[:, None, :]).reshape(BLOCK, -1)
     N, g = np.zeros((c + half + n,) * 2), np.zeros(c + half + n)
-    weight = flight.w / s.linear.s**2
     for first in range(0, len(E), BLOCK):
         part = slice(first, first + BLOCK)
-        own, w = E[part], weight[part]
-        count, size = len(own), basis.shape[1]
+        w = flight.w[part] / s.linear.s**2
+        own, weighed = E[part], w * flight.e[part]
+        heavy, count = own * w[:, :, None], len(own)
         turned = left * modes.values**first
         L = np.concatenate([turned.real, -turned.imag, settled], axis=2)
-        heavy = (own * w[:, None, :]).reshape(count, -1)
-        mixed = (heavy.T @ basis[:count]).reshape(c, p, size)
+        mixed = (heavy.reshape(count, -1).T @ basis[:count]).reshape(p, c, size)
         told = (w.T @ products[:count]).reshape(p, size, size)
-        weighed = w * flight.e[part]
-        N[:c, :c] += np.tensordot(heavy.reshape(count, c, p), own, ([0, 2], [0, 2]))
-        N[:c, c:] += np.einsum("cpb,pjb->cj", mixed, L)
+        N[:c, :c] += heavy.reshape(-1, c).T @ own.reshape(-1, c)
+        N[:c, c:] += (mixed @ L.transpose(0, 2, 1)).sum(axis=0)
         N[c:, c:] += (L @ told @ L.transpose(0, 2, 1)).sum(axis=0)
-        g[:c] += np.tensordot(own, weighed, ([0, 2], [0, 1]))
-        g[c:] += np.einsum("pjb,pb->j", L, weighed.T @ basis[:count])
+        g[:c] += weighed.ravel() @ own.reshape(-1, c)
+        g[c:] += (L @ (weighed.T @ basis[:count])[:, :, None]).sum(axis=0)[:, 0]
     N[c:, :c] = N[:c, c:].T
     return N, g
 
@@ -385,7 +387,9 @@ def predict(
     """
     there = np.isfinite(y).astype(float)
     linear = _filter(model, theta, noise, len(y) * model.sample_time)
-    s = _Search(model, linear, i, following(i), np.where(there > 0, y, 0.0), there, STUDENT if robust else NORMAL)
+    s = _Search(
+        model, linear, i, following(i), np.where(there > 0, y, 0.0), there, STUDENT if robust else NORMAL
+    )
     n, c = len(linear.A), len(theta)
     half, x = n // 2, np.array(model.place[list(model.plant.controlled)])
     d = np.zeros(half)

@@ -249,20 +249,22 @@ class Residuals(NamedTuple):
 
     lines: ComplexArray
     between: ComplexArray  # lines x NEIGHBOURS x p
-    harmonics: ComplexArray
+    harmonics: ComplexArray  # those that were asked for
 
 
-def residuals_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Residuals:
-    """The residuals of parameters theta.
+def residuals_of(
+    model: ResponseModel, s: Spectrum, theta: FloatArray, harmonics: Sequence[int] | IntArray = ()
+) -> Residuals:
+    """The residuals of parameters theta; `harmonics` are bins beside the lines and those between them.
 
     What noise leaves in the states from the begin of the record to its end acts at all bins alike. It is fitted and
     taken off, as it would correlate the residuals of all lines.
     """
-    kinds = (s.lines, s.between.ravel(), s.harmonics)
+    kinds = (s.lines, s.between.ravel(), np.asarray(harmonics, dtype=int))
     bins = np.concatenate(kinds)
     G, T = model.responses(theta, s.rate * bins)
     e = s.outputs[bins] - np.einsum("kpm,km->kp", G, s.currents[bins])
-    fitted = len(bins) - len(s.harmonics)
+    fitted = len(bins) - len(harmonics)
     rows = (T[:fitted] * s.weight[:, None]).reshape(-1, T.shape[2])
     size = np.linalg.norm(rows, axis=0)
     rows = rows / np.where(size > 0, size, 1.0)
@@ -270,8 +272,8 @@ def residuals_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Residu
     normal, moments = (rows.conj().T @ rows).real, (rows.conj().T @ right).real
     c = np.linalg.lstsq(normal, moments, rcond=1e-12)[0] / np.where(size > 0, size, 1.0)
     e = e - T @ c
-    lines, between, harmonics = np.split(e, np.cumsum([len(kind) for kind in kinds])[:2])
-    return Residuals(lines, between.reshape(*s.between.shape, -1), harmonics)
+    lines, between, others = np.split(e, np.cumsum([len(kind) for kind in kinds])[:2])
+    return Residuals(lines, between.reshape(*s.between.shape, -1), others)
 
 
 def weights_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexArray:
@@ -293,7 +295,7 @@ def distortion_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> float
     """The mean power of e at harmonics that were not excited, over that of the noise; NaN where there are none."""
     if not len(s.harmonics):
         return float("nan")
-    e = residuals_of(model, s, theta)
+    e = residuals_of(model, s, theta, s.harmonics)
     C, _ = windowed_covariances(e.between)
     nearest = np.abs(s.lines - s.harmonics[:, None]).argmin(axis=1)
     solved = np.linalg.solve(C[nearest], e.harmonics[..., None])[..., 0]

@@ -18,6 +18,7 @@ from malta.firmware.step import started_state, step_of, zero_reference
 from malta.identification import ExcitationPlan, Identified, Log
 from malta.identification.data_file import read_identified, write_data
 from malta.identification.excite import model_at, predicted_spectra
+from malta.identification.prediction import Noise, predict
 from malta.identification.response import ResponseModel
 from malta.identification.spectra import spectrum_of, straightened
 from malta.machines.tubular.plant import plant as tubular
@@ -212,6 +213,30 @@ def test_estimates_at_the_lines_and_in_time_agree(found: Identified) -> None:
     assert found.in_time.rms == pytest.approx(np.ones(5), abs=0.15)
     apart = replace(found, in_time=replace(found.in_time, values=1.02 * found.in_time.values))
     assert "standard deviations apart, at most 3 is noise" in apart.refusal
+
+
+@pytest.mark.slow
+def test_digits_that_a_csv_lacks_move_nothing(log: Log, found: Identified) -> None:
+    """The search ends where the likelihood does, not where differences of it are lost in rounding."""
+    rounded = {group: np.round(log.columns[group], 12) for group in "yi"}
+    again = malta.identify(CONTROLLER, with_columns(log, **rounded), parameters=ASKED, in_time=False)
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.abs((again.values - found.values) / sigma).max() < 2e-3
+
+
+@pytest.mark.slow
+def test_prediction_errors_are_least_wherever_the_search_begins(log: Log, found: Identified) -> None:
+    assert found.in_time is not None
+    sigma = np.sqrt(np.diag(found.covariance))
+    y, i = log.columns["y"], log.columns["i"]
+    mean = y.mean(axis=0), i.mean(axis=0)
+    plant = malta.plant_of(CONTROLLER.parameters)
+    model = ResponseModel(plant, found.names, tuple(log.names("i")), *mean, log.sample_time)
+    noise = Noise(np.diff(y, axis=0).var(axis=0) / 2, found.in_time.process**2)
+    ends = [predict(model, found.values + off * sigma, noise, i, y) for off in (0.0, 3.0, -3.0)]
+    for end in ends[1:]:
+        assert np.abs((end.values - ends[0].values) / sigma).max() < 0.01
+        assert np.allclose(np.sqrt(np.diag(end.covariance)), np.sqrt(np.diag(ends[0].covariance)), rtol=1e-3)
 
 
 @pytest.mark.slow

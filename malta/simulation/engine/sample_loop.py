@@ -54,14 +54,13 @@ def loop_of(x: Any, given: Any, numbers: Any, after: Any, row: Any) -> Loop:
     compiled = library(made.dump() + DRIVER.format(**sizes), 1, flags=FLAGS)
     chain = one.mapaccum("chain", BLOCK) if compiled is None else None
 
-    def run(state: FloatArray, block: FloatArray, constants: FloatArray, rows: FloatArray) -> FloatArray:
+    def fill(state: FloatArray, block: FloatArray, constants: FloatArray, rows: FloatArray) -> None:
         if compiled is not None:
             addresses = map(address_of, (block, constants, state, rows))
             compiled.run(ctypes.c_long(len(rows)), *addresses)
-            return state
+            return
         states, found = evaluate(chain, state, block, np.tile(constants, (BLOCK, 1)))
-        rows[:] = found[: len(rows)]
-        return states[-1]
+        rows[:], state[:] = found[: len(rows)], states[-1]
 
     def loop(first: FloatArray, tables: Sequence[FloatArray], constants: FloatArray) -> FloatArray:
         state, constants = np.array(first, dtype=float), np.ascontiguousarray(constants, dtype=float)
@@ -70,7 +69,7 @@ def loop_of(x: Any, given: Any, numbers: Any, after: Any, row: Any) -> Loop:
         for k in range(0, len(rows), BLOCK):
             part = rows[k : k + BLOCK]
             np.concatenate([table[k : k + BLOCK] for table in tables], axis=1, out=block[: len(part)])
-            state = run(state, block, constants, part)
+            fill(state, block, constants, part)
         return rows
 
     return loop
