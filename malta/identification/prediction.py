@@ -322,7 +322,7 @@ def _normal(s: _Search, modes: _Modes, flight: _Flight, E: FloatArray) -> tuple[
     """Sums of E' w E / s^2 and of E' w e / s^2 over the log, with the slopes of e in parameters, constant accelerations
     and the first state.
 
-    Those in the last two are Re(values^k L) + settled. Powers are computed once for a block; L turns from block to block.
+    Those in the last two are Re(values^k L) + settled. A block has the powers of the first one; its L is turned.
 
     E : k x p x parameters, slopes in parameters
     """
