@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,6 +13,7 @@ from scipy.special import gammainccinv, gammaincinv
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
+from malta.identification.explanation import Explained, explained_at_lines, sentence_of
 from malta.identification.log import Log
 from malta.identification.prediction import (
     Predicted,
@@ -93,6 +94,8 @@ class Identified:
     dropped : parameters that this log does not tell by themselves, with their standard deviation as a share
     in_time : the same parameters from prediction errors in time; None where the machine's sensors lag, or its states
         are not (q, q')
+    explained : where chi2 is above its limit: what a change of each parameter that was taken as known would explain, as
+        shares of its value and of chi2
 
     >>> import dataclasses, malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -124,6 +127,7 @@ class Identified:
     by_output: Mapping[str, float]
     dropped: Mapping[str, float]
     in_time: Predicted | None = None
+    explained: Explained = field(default_factory=dict)
 
     @property
     def half_widths(self) -> FloatArray:
@@ -166,7 +170,7 @@ class Identified:
         if self.chi2 > self.limit:
             return (
                 f"chi2 / dof is {self.chi2:.3g}, at most {self.limit:.3g} is noise: the machine's model does not "
-                f"explain the log, {worst} least ({self.by_output[worst]:.3g})"
+                f"explain the log, {worst} least ({self.by_output[worst]:.3g}){sentence_of(self.explained)}"
             )
         if abs(self.whiteness) > WHITE:
             return (
@@ -517,6 +521,8 @@ def _estimate(records: Sequence[_Record], log: Log, dropped: Mapping[str, float]
         most_likely = plant_with(plant, dict(zip(model.names, theta.tolist(), strict=True)))
     except InputError as error:
         raise CheckError(f"{s.source}: what explains the log best is no machine ({error})") from error
+    limit = float(SLACK * 2 * gammainccinv(dof / 2, LIKELY) / dof)
+    parts = [(r.model, r.spectrum, r.at(theta)) for r in records]
     return Identified(
         log=log,
         plant=most_likely,
@@ -526,12 +532,13 @@ def _estimate(records: Sequence[_Record], log: Log, dropped: Mapping[str, float]
         covariance=covariance,
         held=held,
         chi2=chi2,
-        limit=float(SLACK * 2 * gammainccinv(dof / 2, LIKELY) / dof),
+        limit=limit,
         dof=dof,
         whiteness=whiteness_of(white, [r.spectrum for r in records]),
         distortion=float(np.mean([distortion_of(r.model, r.spectrum, r.at(theta)) for r in records])),
         by_output=dict(zip([o.name for o in plant.outputs], outputs, strict=True)),
         dropped=dropped,
+        explained=explained_at_lines(parts) if chi2 > limit else {},
     )
 
 

@@ -149,6 +149,7 @@ class _Shape(NamedTuple):
     plant: Plant
     currents: tuple[str, ...]
     sample_time: float
+    apart: tuple[str, ...]  # parameters that differ from their twins
 
 
 class _Equations(NamedTuple):
@@ -167,7 +168,7 @@ def _equations(shape: _Shape) -> _Equations:
     n, m, Ts = len(plant.controlled), len(shape.currents), shape.sample_time
     value = {name: ca.SX.sym(name) for name in symbolic_names(par)}
     error = {s.name: ca.SX.sym(s.name) for s in plant.sensor_errors}
-    twins = {name: value[twin] for name, twin in twins_of(par).items()}
+    twins = {name: value[twin] for name, twin in twins_of(par).items() if name not in shape.apart}
     machine = plant.variant(symbolic(par, value | twins))
     x, i, after, rate = (ca.SX.sym("signal", size) for size in (n, m, m, 1))
     axes, keep = [a.name for a in axes_of(plant)], list(plant.controlled)
@@ -246,7 +247,9 @@ class _Search(NamedTuple):
 
     @property
     def shape(self) -> _Shape:
-        return _Shape(self.model.plant, self.model.currents, self.model.sample_time)
+        model = self.model
+        apart = tuple(name for name in twins_of(model.plant.parameters) if name in model.names)
+        return _Shape(model.plant, model.currents, model.sample_time, apart)
 
 
 class _Flight(NamedTuple):

@@ -12,6 +12,7 @@ import numpy as np
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
+from malta.identification.explanation import FARTHEST, sentence_of
 from malta.identification.log import Log, reference_spline, require_same_law, sample_excitation
 from malta.identification.response import acting
 from malta.model.data import plant_of
@@ -45,7 +46,6 @@ BLOCK = 1000  # samples in one call
 LARGER = 1.2  # times the innovations of the gain file's own machine, beyond which the log's are refused
 ALIKE = 0.1  # by which autocorrelations of both may differ, and 6 standard deviations where that is more
 STEP = 0.01  # of a parameter, by which the machine is moved to see what that changes
-FARTHEST = 0.5  # of its value: a parameter that had to change by more explains nothing
 SEED = 1  # of the noise of the gain file's own machine: not that of a simulated log
 
 
@@ -100,7 +100,7 @@ class LawReplay:
             return (
                 f"{name} differs by {self.difference[name]:.2g} from the log: another law or other gains flew"
             )
-        return self.doubt + self._explanation
+        return self.doubt + sentence_of(self.explained)
 
     @property
     def doubt(self) -> str:
@@ -118,15 +118,6 @@ class LawReplay:
                 f"by {self.unlike[name]:.2g}, at most {self.allowed:.2g} is noise"
             )
         return ""
-
-    @property
-    def _explanation(self) -> str:
-        """The parameters that explain most of the innovations, in words."""
-        best = max((share for _, share in self.explained.values()), default=0.0)
-        parts = [f"{n} {100 * c:+.2g} %" for n, (c, share) in self.explained.items() if share > 0.9 * best]
-        if best < 0.5:
-            return "; no parameter by itself explains half of it" if self.explained else ""
-        return f"; {' or '.join(parts)} would explain {100 * best:.0f} % of it"
 
     @property
     def description(self) -> Description:

@@ -299,12 +299,12 @@ def acting(plant: Plant) -> tuple[str, ...]:
 
 
 def candidates(plant: Plant) -> tuple[str, ...]:
-    """The parameters that may be asked for where none are named: `acting` without masses and lengths.
+    """The parameters that may be asked for where none are named: `acting` without masses, lengths and pure numbers.
 
-    Those are weighed and measured; and without one of them only ratios are told.
+    Those are weighed, measured and counted, as turns are; and without one of them only ratios are told.
     """
     units = units_of_model(plant)
-    return tuple(name for name in acting(plant) if units[name] not in ("kg", "m"))
+    return tuple(name for name in acting(plant) if units[name] not in ("kg", "m", "1"))
 
 
 def information(slopes: ComplexArray, inputs: ComplexArray, variance: FloatArray) -> FloatArray:

@@ -148,6 +148,33 @@ def test_a_wrong_model_is_refused(log: Log, known: dict[str, float]) -> None:
     assert "does not explain the log" in found.refusal
 
 
+@pytest.mark.slow
+def test_a_refusal_names_the_parameter_that_explains_it(log: Log) -> None:
+    wrong = malta.identify(CONTROLLER, log, parameters=ASKED, known={"l_S": 0.09})
+    change, share = wrong.explained["l_S"]
+    assert abs(change - (CONTROLLER.parameters.l_S / 0.09 - 1)) < 0.005  # type: ignore[attr-defined]
+    assert share > 0.8
+    assert " or l_S +4" in wrong.refusal
+    late = with_columns(log, i=np.vstack([log.columns["i"][:1], log.columns["i"][:-1]]))
+    refused = malta.identify(CONTROLLER, late, parameters=["K_A", "K_B"])
+    assert refused.refusal.endswith("; no parameter by itself explains half of it")
+    assert max(abs(change) for change, _ in refused.explained.values()) < 0.5
+
+
+@pytest.mark.slow
+def test_a_parameter_that_differs_from_its_twin_is_found_where_it_is_named(plan: ExcitationPlan) -> None:
+    true = {"I_xx": 1.40e-3, "I_yy": 1.36e-3}
+    uneven = malta.identification.log_of(excited(plan, true))
+    asked = ["K_A", "K_B", "I_xx"]
+    alike = malta.identify(CONTROLLER, uneven, parameters=asked)
+    assert "; I_yy -" in alike.refusal
+    apart = malta.identify(CONTROLLER, uneven, parameters=[*asked, "I_yy"])
+    assert apart.refusal == ""
+    assert apart.in_time is not None
+    assert (np.abs(apart.values[2:] - list(true.values())) < 1.5 * apart.half_widths[2:]).all()
+    assert (np.abs(apart.in_time.values[2:] - list(true.values())) < 1.5 * apart.half_widths[2:]).all()
+
+
 def test_currents_that_are_a_sample_late_are_refused(log: Log) -> None:
     late = with_columns(log, i=np.roll(log.columns["i"], 1, axis=0))
     assert malta.identify(CONTROLLER, late, parameters=ASKED).chi2 > 10
@@ -430,6 +457,26 @@ def test_the_field_of_the_planar_motor_is_found() -> None:
     assert found.refusal == ""
     assert (np.abs(found.values - [1.15, 0.27, 0.53]) < 2.5 * found.half_widths).all()
     assert (found.half_widths / found.values < 1e-3).all()
+
+
+@pytest.mark.slow
+def test_coil_positions_of_the_planar_motor_are_found_where_they_are_named() -> None:
+    """Its field, each inertia, the coils' pitch and height: without a name of the pitch the refusal gives it."""
+    controller = malta.gains.read("design/gains/planar.json")
+    plant = malta.plant_of(controller.parameters)
+    plan = malta.excite(malta.loop(plant, controller), period=0.5, periods=4)
+    par: Any = controller.parameters
+    true = {"B_r": 1.1, "I_x": 0.25, "I_y": 0.28, "I_z": 0.55, "r_z": 0.011, "coil_pitch": 0.0946}
+    scenario = malta.Scenario.excited(plan.signal, plan.duration).replace(fidelity="force")
+    run = malta.simulate(malta.plant_of(replace(par, **true)), controller, scenario)
+    log = malta.identification.log_of(run)
+    found = malta.identify(controller, log, parameters=list(true), in_time=False)
+    assert found.refusal == ""
+    off = (found.values - list(true.values())) / found.half_widths
+    assert (np.abs(off) < 1.5).all()
+    assert found.half_widths[0] / found.values[0] < 2e-4
+    held = malta.identify(controller, log, parameters=list(true)[:-1])
+    assert held.refusal.split("; ")[1].startswith("coil_pitch +0.19 % would explain ")
 
 
 @pytest.mark.slow
