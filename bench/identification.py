@@ -21,9 +21,8 @@ from timing import Result, medians
 import malta
 from malta.identification import log_of, prediction
 from malta.identification.identify import identify
-from malta.identification.prediction import noise_between_lines
 from malta.identification.response import ResponseModel
-from malta.identification.spectra import readings, residuals_of, spectrum_of, straightened, whole
+from malta.identification.spectra import noise_of, readings, spectrum_of, straightened, whole
 
 if TYPE_CHECKING:
     from malta.identification.log import Log
@@ -56,11 +55,7 @@ def squares(controller: Controller, log: Log) -> FloatArray:
     spectrum = spectrum_of(log, y, i)
     mean = spectrum.outputs[0].real, spectrum.currents[0].real
     model = ResponseModel(plant, NAMES, tuple(log.names("i")), *mean, log.sample_time)
-    bins, places = np.unique(spectrum.between.ravel(), return_index=True)
-    e = residuals_of(model, straightened(model, spectrum, model.start), model.start).between
-    samples = round(2 * np.pi / (spectrum.rate * model.sample_time))
-    powers = e.reshape(-1, e.shape[2])[places]
-    noise = noise_between_lines(model, model.start, spectrum.rate * bins, powers, samples)
+    noise = noise_of(model, straightened(model, spectrum, model.start), model.start)
     linear = prediction._filter(model, model.start, noise, len(y) * model.sample_time)
     search = prediction._Search(
         model, linear, i, prediction.following(i), y, np.ones_like(y), prediction.NORMAL

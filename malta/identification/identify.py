@@ -17,7 +17,6 @@ from malta.identification.explanation import Explained, explained_at_lines, sent
 from malta.identification.log import Log
 from malta.identification.prediction import (
     Predicted,
-    noise_between_lines,
     predict,
 )
 from malta.identification.response import (
@@ -38,6 +37,7 @@ from malta.identification.spectra import (
     between_neighbours,
     distortion_of,
     in_axes,
+    noise_of,
     readings,
     require_closed_loop,
     require_log,
@@ -390,12 +390,7 @@ def _predicted(
     model: ResponseModel, s: Spectrum, found: Identified, i: FloatArray, y: FloatArray, *, robust: bool
 ) -> Predicted:
     """The estimate in time, from that at the lines on."""
-    bins, places = np.unique(s.between.ravel(), return_index=True)
-    e = residuals_of(model, straightened(model, s, found.values), found.values).between
-    samples = round(2 * np.pi / (s.rate * model.sample_time))
-    noise = noise_between_lines(
-        model, found.values, s.rate * bins, e.reshape(-1, e.shape[2])[places], samples
-    )
+    noise = noise_of(model, straightened(model, s, found.values), found.values)
     return predict(model, found.values, noise, i, y, source=s.source, robust=robust)
 
 

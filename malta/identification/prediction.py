@@ -92,10 +92,8 @@ def noise_between_lines(
     if len(w) > BINS:
         chosen = np.unique(np.linspace(0, len(w) - 1, BINS).round().astype(int))
         w, e = w[chosen], e[chosen]
-    A, _, C, _ = model.matrices(theta)
-    n = len(A) // 2
-    push = np.vstack([np.zeros((n, n)), np.eye(n)])
-    H = C @ np.linalg.solve(1j * w[:, None, None] * np.eye(2 * n) - A, push)
+    H = _from_accelerations(model, theta, w)
+    n = H.shape[2]
     size = (np.abs(e) ** 2).mean(axis=0)
     unit, H = e / np.sqrt(size), H / np.sqrt(size)[:, None]
     strength = (np.abs(H) ** 2).sum(axis=1).mean(axis=0)  # of each position
@@ -118,6 +116,23 @@ def noise_between_lines(
     start = np.concatenate([np.zeros(p), np.full(n, -6.0)])
     found = np.exp(minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds).x)
     return Noise(N * size * found[:p], N * found[p:] / strength)
+
+
+def _from_accelerations(model: ResponseModel, theta: FloatArray, w: FloatArray) -> ComplexArray:
+    """The response from accelerations to outputs, bins x p x positions."""
+    A, _, C, _ = model.matrices(theta)
+    n = len(A) // 2
+    push = np.vstack([np.zeros((n, n)), np.eye(n)])
+    return np.asarray(C @ np.linalg.solve(1j * w[:, None, None] * np.eye(2 * n) - A, push))
+
+
+def noise_covariances(model: ResponseModel, theta: FloatArray, noise: Noise, w: FloatArray) -> ComplexArray:
+    """The covariance R + H(w) Q H(w)^H of a noise at each bin, bins x p x p, but for a factor.
+
+    w : bins, rad/s
+    """
+    H = _from_accelerations(model, theta, w)
+    return np.asarray(np.diag(noise.sensors) + (H * noise.process) @ H.conj().transpose(0, 2, 1))
 
 
 class _Linear(NamedTuple):

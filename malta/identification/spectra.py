@@ -12,7 +12,12 @@ import numpy as np
 from malta.errors import CheckError
 from malta.firmware.signals import place_of_readings
 from malta.identification.log import Log, require_same_law
-from malta.identification.prediction import without_spikes
+from malta.identification.prediction import (
+    Noise,
+    noise_between_lines,
+    noise_covariances,
+    without_spikes,
+)
 from malta.identification.response import ResponseModel
 
 if TYPE_CHECKING:
@@ -276,14 +281,33 @@ def residuals_of(
     return Residuals(lines, between.reshape(*s.between.shape, -1), others)
 
 
+def noise_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Noise:
+    """The noise of sensors and process by what is between the lines."""
+    bins, places = np.unique(s.between.ravel(), return_index=True)
+    e = residuals_of(model, s, theta).between
+    samples = round(2 * np.pi / (s.rate * model.sample_time))
+    return noise_between_lines(model, theta, s.rate * bins, e.reshape(-1, e.shape[2])[places], samples)
+
+
 def weights_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexArray:
     """W at each line, so that W e has unit variance in every entry: the residuals between the lines are noise.
 
-    The inverse of a covariance that is estimated from n bins is too large by n / (n - p).
+    The inverse of a covariance that is estimated from n bins is too large by n / (n - p). Noise that peaks within a few
+    lines, as at a resonance of held currents, is divided by the shape of sensors' and process noise first.
     """
-    C, counts = windowed_covariances(residuals_of(model, s, theta).between)
+    e = residuals_of(model, s, theta).between
+    shape: ComplexArray = np.tile(np.eye(e.shape[2], dtype=complex), (len(s.lines), 1, 1))
+    if model.plant.second_order and model.plant.sensors is None:
+        noise = noise_of(model, s, theta)
+        at = np.column_stack([s.lines, s.between])  # lines x (1 + NEIGHBOURS)
+        factors = np.linalg.cholesky(noise_covariances(model, theta, noise, s.rate * at.ravel()))
+        shapes = np.linalg.inv(factors).reshape(*at.shape, *factors.shape[1:])
+        shape, e = shapes[:, 0], (shapes[:, 1:] @ e[..., None])[..., 0]
+    C, counts = windowed_covariances(e)
     p = C.shape[1]
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(C)) * np.sqrt((counts - p) / counts)[:, None, None])
+    return np.asarray(
+        np.linalg.inv(np.linalg.cholesky(C)) @ shape * np.sqrt((counts - p) / counts)[:, None, None]
+    )
 
 
 def white_residuals(model: ResponseModel, s: Spectrum, theta: FloatArray, W: ComplexArray) -> ComplexArray:
