@@ -19,7 +19,8 @@ FARTHEST = 0.5  # of its value: a parameter that would have to change by more ex
 ALONE = 1e-6  # of a slope: what is left of it beside those of the estimated parameters, if it acts by itself
 
 Explained = Mapping[str, tuple[float, float]]
-"""By parameter: the change that explains most, as a share of its value, and the share that it explains."""
+"""By parameter: the change that explains most, as a share of its value or of a sensor's gain, and the share that it
+explains."""
 
 
 def sentence_of(explained: Explained) -> str:
@@ -41,12 +42,10 @@ def explained_at_lines(parts: Sequence[tuple[ResponseModel, Spectrum, FloatArray
     parts : of each log: the machine, the spectrum without curvature, and the parameters that were found, SI
     """
     plant, names = parts[0][0].plant, parts[0][0].names
-    groups = [
-        acting(plant),
-        *((twin,) for twin in twins_of(plant.parameters)),
-    ]  # a twin alone leaves its own twin
+    gains = (error.name for error in plant.sensor_errors if error.unit == "1")
+    alone = ((twin,) for twin in twins_of(plant.parameters))  # a twin among others would not follow its twin
     found = {}
-    for group in groups:
+    for group in ((*acting(plant), *gains), *alone):
         others = [name for name in group if name not in names]
         if not others:
             continue
@@ -57,8 +56,8 @@ def explained_at_lines(parts: Sequence[tuple[ResponseModel, Spectrum, FloatArray
         beyond = float(r @ r) - (len(r) - len(names)) / 2
         for name, whole in zip(others, J[:, len(names) :].T, strict=True):
             u = whole - Q @ (Q.T @ whole)
-            alone = np.linalg.norm(u) > ALONE * np.linalg.norm(whole)
-            if alone and beyond > 0 and abs(a := -float(u @ r / (u @ u))) < FARTHEST:
+            acts = np.linalg.norm(u) > ALONE * np.linalg.norm(whole)
+            if acts and beyond > 0 and abs(a := -float(u @ r / (u @ u))) < FARTHEST:
                 found[name] = (a, min(1.0, a**2 * float(u @ u) / beyond))
     return found
 
@@ -70,12 +69,12 @@ def _slopes(
     W = weights_of(model, s, theta)
     par, twins = model.plant.parameters, twins_of(model.plant.parameters)
     own = dict(zip(model.names, theta.tolist(), strict=True))
-    taken = [own.get(twins.get(name, ""), float(getattr(par, name))) for name in others]
+    taken = [own.get(twins.get(name, ""), float(getattr(par, name, 0.0))) for name in others]
     whole, wide = np.array([*theta, *taken]), replace(model, names=(*model.names, *others))
 
     def white(at: FloatArray) -> FloatArray:
         e = white_residuals(wide, s, at, W).ravel()
         return np.concatenate([e.real, e.imag])
 
-    steps = STEP * np.diag(whole)
+    steps = STEP * np.diag(np.where(whole == 0, 1.0, whole))
     return white(whole), np.array([(white(whole + h) - white(whole - h)) / (2 * STEP) for h in steps]).T
