@@ -334,6 +334,10 @@ def test_errors_of_sensors_are_parameters_too(plan: ExcitationPlan) -> None:
     found = malta.identify(CONTROLLER, malta.identification.log_of(run), parameters=["K_A", "gain_x1"])
     assert found.refusal == ""
     assert found.values[1] == pytest.approx(0.02, abs=1e-3)
+    taken_as_right = malta.identify(CONTROLLER, found.log, parameters=["K_A"])
+    change, share = taken_as_right.explained["gain_x1"]
+    assert change == pytest.approx(0.02, abs=1e-3)
+    assert share > 0.9
 
 
 def test_the_data_file_keeps_intervals(found: Identified, tmp_path: Path) -> None:
