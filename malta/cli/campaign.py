@@ -350,12 +350,15 @@ def campaign(
         list[str] | None,
         typer.Option(
             metavar="NAME=VALUE",
-            help="How far sensors err: gain_x1=2%, offset_y2=5um, ...",
+            help="Errors of sensors: gain_x1=2%, offset_y2=5um.",
             rich_help_panel=MACHINE,
         ),
     ] = None,
     sampler: Annotated[
-        str, typer.Option(metavar="WORD", help="latin-hypercube or sobol.", rich_help_panel=MACHINE)
+        str,
+        typer.Option(
+            metavar="WORD", help="[latin-hypercube] or sobol.", show_default=False, rich_help_panel=MACHINE
+        ),
     ] = "latin-hypercube",
     seed: Annotated[
         int, typer.Option(metavar="N", help="Seed of machines and noise.", rich_help_panel=MACHINE)

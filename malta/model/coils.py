@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import linprog
+from scipy.linalg import null_space
+from scipy.optimize import linprog, nnls
 
 from malta.errors import CheckError, InputError
 from malta.model.plant import readonly
@@ -81,21 +82,17 @@ class Allocation:
             raise CheckError(
                 f"{CALLER}: the coils make {100 * reach:.3g} % of this force within their limits"
             )
-        c = len(most)
-        scale = max(
-            float(most[np.isfinite(most)].max(initial=0.0)), float(np.abs(self.gain @ wanted).max()), 1e-300
-        )
-        rows = self._rows
-        H, T = np.diag(self.resistance / self.resistance.max()), self.matrix / rows[:, None]
-        quiet = {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False}
-        solver = ca.conic(
-            "allocation", "qrqp", {"h": ca.DM(H).sparsity(), "a": ca.DM.ones(*T.shape).sparsity()}, quiet
-        )
-        target = wanted / rows / scale
-        found = solver(
-            h=ca.DM(H), g=np.zeros(c), a=T, lba=target, uba=target, lbx=-most / scale, ubx=most / scale
-        )
-        i = np.clip(np.array(found["x"]).ravel() * scale, -most, most)
+        # w = sqrt(R) i is the shortest that makes v, and z in the null space, of least length: Lawson and Hanson's LDP.
+        weight = 1 / np.sqrt(self.resistance / self.resistance.max())
+        least, null = self.gain @ wanted, null_space(self.matrix * weight / self._rows[:, None])
+        bounded = np.isfinite(most)
+        unit = max(float(np.abs(least).max()), float(most[bounded].max(initial=0.0)), 1e-300)
+        G = (weight[:, None] * null)[bounded]
+        room = np.concatenate([(most + least)[bounded], (most - least)[bounded]]) / unit
+        E = np.vstack([np.vstack([G, -G]).T, -room])
+        u, _ = nnls(E, np.eye(len(E))[-1])
+        r = E @ u - np.eye(len(E))[-1]
+        i: FloatArray = np.clip(least - unit * weight * (null @ r[:-1]) / r[-1], -most, most)
         self._require(i, wanted)
         return i
 
