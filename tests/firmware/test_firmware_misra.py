@@ -16,7 +16,7 @@ from malta.firmware.ring import ring_sources
 
 CHECKS = ("--addon=misra", "--enable=warning,style,performance,portability", "--std=c99", "--quiet")
 SECONDS = 600.0  # for a file, on a computer with much else to do
-DESIGNS = ("halbach_pid", "robust_observer", "tubular_pid", "planar")  # the kinds of laws and machines
+DESIGNS = ("halbach_pid", "robust_observer", "planar")  # the kinds of laws and machines
 GCC = "-D__GNUC__=12"  # one of the compilers that the guards tell apart; without it each is looked at in turn
 
 
