@@ -13,7 +13,6 @@ from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from malta.app.files import Edited
@@ -27,6 +26,7 @@ from malta.margins.verify import machine_report
 from malta.merits import Merit, figure
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
+from malta.model.plant import outputs_at
 from malta.proof.loss import RayBound, ray_bound
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.experiments.catalogue import cases_of, main_job, series_of, step_cases
@@ -106,7 +106,7 @@ def linear_run(loop: SampledLoop, controller: Controller, scenario: Scenario) ->
         raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
     t = np.arange(samples) * c.sample_time
     motion = motion_of(scenario, plant, c, t)
-    here = np.array(ca.DM(plant.h(ca.DM(plant.point(c.operating_point[0]).x), 0))).ravel()
+    here = outputs_at(plant, plant.point(c.operating_point[0]).x)
     r = _references(c, motion, here)
     closed, driven = loop.closed, r @ np.vstack([loop.Bd @ law.D_r, law.B_r]).T
     n, m = len(loop.Ad), len(c.forces)

@@ -198,12 +198,12 @@ class RoundingNoise(NamedTuple):
 def rounded(c: Controller) -> Controller:
     """The controller with the coefficients that single precision holds."""
 
-    def held(record: Any) -> dict[str, Any]:
+    def in_single(record: Any) -> dict[str, Any]:
         return {name: getattr(record, name).astype(np.float32).astype(float) for name in SCHEDULED}
 
     if c.schedule is None:
-        return replace(c, **held(c))
-    return replace(c, **held(c), schedule=replace(c.schedule, **held(c.schedule)))
+        return replace(c, **in_single(c))
+    return replace(c, **in_single(c), schedule=replace(c.schedule, **in_single(c.schedule)))
 
 
 def rounded_margin(c: Controller, uncertainty: dict[str, float]) -> Margin | None:

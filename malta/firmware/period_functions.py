@@ -41,7 +41,7 @@ from malta.synthesis.controller import (
     sum_errors,
     waiting,
 )
-from malta.synthesis.schedule import scheduled
+from malta.synthesis.schedule import interpolate
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -90,7 +90,7 @@ def sense(t: Target) -> Staged:
     reach = reading_ranges(t.believed)
     most = ca.DM(FAR * reach)
     with recorded_equations() as equations:
-        expected = scheduled(numbers(t), c.schedule, a["p"])["Cd"] @ a["xi_pred"]
+        expected = interpolate(numbers(t), c.schedule, a["p"])["Cd"] @ a["xi_pred"]
         if c.tracks == "errors":
             expected = a["p"]
         bounded = ca.fmax(ca.fmin(expected, most), -most)
@@ -166,7 +166,7 @@ def _decided_forces(
     """The law: the state after the sample, the outputs down to forces, and the place for which currents commutate."""
     c, plant = t.controller, t.believed
     p, dp = reference["p"], reference["dp"]
-    g = scheduled(numbers(t), c.schedule, p)
+    g = interpolate(numbers(t), c.schedule, p)
     note("reference_states", "q_ref = (q*, dq*), which is at rest at p", q_ref=state_reference(plant)(p, dp))
     v_ff = feedforward(t, p, dp, reference["ddp"])
     v_past, memory = recall(t, state.get("memory"), v_ff, p, dp)

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
-import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError
@@ -17,7 +16,7 @@ from malta.model.data import parameters_record, plant_of
 from malta.model.linear import LinearSystem, linear_machine
 from malta.model.machines import machine
 from malta.model.parameters import later_parameters, units_of
-from malta.model.plant import Plant, Signal
+from malta.model.plant import Plant, Signal, outputs_at
 from malta.synthesis.controller import (
     Commutation,
     Controller,
@@ -132,10 +131,11 @@ class _Layout(NamedTuple):
         m, p = len(plant.inputs), len(plant.outputs)
         g, coils = self.grid, len(plant.actuator.coils)
         in_positions, half, places = self.coordinates == "positions", n0 // 2, self.places
-        matrices = {"Ad": (n, n), "Bd": (n, m), "Cd": (p, n), "K": (m, n), "Ki": (m, p), "L": (n, p)}
+        sampled: dict[str, tuple[int, ...]] = {"Ad": (n, n), "Bd": (n, m), "Cd": (p, n)}
+        gains: dict[str, tuple[int, ...]] = {"K": (m, n), "Ki": (m, p), "L": (n, p)}
         return {
-            "model": {"A": (n0, n0), "B": (n0, m), "C": (p, n0), "Ad": (n, n), "Bd": (n, m), "Cd": (p, n)},
-            "gains": {"K": (m, n), "Ki": (m, p), "L": (n, p)},
+            "model": {"A": (n0, n0), "B": (n0, m), "C": (p, n0)} | sampled,
+            "gains": gains,
             "operating_point": {"x": (n0,), "u": (m,)},
             "feedforward": {
                 "inertia": (m,),
@@ -150,7 +150,7 @@ class _Layout(NamedTuple):
             "commutation": {"pull": (m, p)},
             "schedule": {
                 "places": (places,),
-                **{key: (places * rows, columns) for key, (rows, columns) in matrices.items()},
+                **{key: (places * rows, columns) for key, (rows, columns) in (sampled | gains).items()},
             },
             "noise": {
                 "process": (half if in_positions else m,),
@@ -232,7 +232,7 @@ def _schedule(file: GainFile, arrays: Arrays, layout: _Layout, path: str | Path)
     except InputError as error:
         raise InputError(path, "schedule.places", error.found, error.expected) from error
     x = plant.point(arrays["operating_point"]["x"]).x
-    here = made.at(float(ca.DM(plant.h(ca.DM(x), 0))[output]))
+    here = made.at(float(outputs_at(plant, x)[output]))
     for key, M in (arrays["model"] | arrays["gains"]).items():
         if key in here and not np.abs(M - here[key]).max() <= SAME * np.abs(M).max(initial=0.0):
             raise InputError(

@@ -18,6 +18,7 @@ from scipy.stats import t as student
 
 from malta.errors import CheckError, InputError
 from malta.model.equilibrium import trim
+from malta.model.plant import outputs_at
 
 if TYPE_CHECKING:
     from malta.identification.log import Log
@@ -309,7 +310,7 @@ def _holding_forces(plant: Plant) -> tuple[FloatArray, FloatArray]:
         at: dict[str, Any] = dict(zip(names, q.tolist(), strict=False))
         return np.asarray(trim(plant, **at).v, dtype=float)
 
-    zero = np.array(ca.DM(plant.h(ca.DM(plant.at().x), 0))).ravel()
+    zero = outputs_at(plant, plant.at().x)
     steps = STEP * np.eye(len(zero))
     return forces(zero), np.column_stack([(forces(zero + h) - forces(zero - h)) / (2 * STEP) for h in steps])
 

@@ -21,6 +21,7 @@ from malta.identification.response import (
     well_found,
 )
 from malta.model.equilibrium import trim
+from malta.model.plant import outputs_at
 from malta.simulation.excitation import Multisine, interleaved_multisine
 
 if TYPE_CHECKING:
@@ -152,7 +153,7 @@ def model_at(loop: Loop, names: Sequence[str]) -> ResponseModel:
     plant = loop.plant
     at = {name: value for name, value in loop.at.items() if value}
     point = trim(plant, **at)
-    y = np.array(ca.DM(plant.h(ca.DM(point.x), 0))).ravel()
+    y = outputs_at(plant, point.x)
     coils = ca.DM(plant.currents(ca.DM(y), ca.DM(point.v)))
     i = np.array(
         coils if plant.windings is None else ca.evalf(ca.densify(plant.drive.command(coils)))

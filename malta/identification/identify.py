@@ -390,7 +390,8 @@ def _predicted(
     model: ResponseModel, s: Spectrum, found: Identified, i: FloatArray, y: FloatArray, *, robust: bool
 ) -> Predicted:
     """The estimate in time, from that at the lines on."""
-    noise = noise_of(model, straightened(model, s, found.values), found.values)
+    plain = straightened(model, s, found.values)
+    noise = noise_of(model, plain, found.values, residuals_of(model, plain, found.values).between)
     return predict(model, found.values, noise, i, y, source=s.source, robust=robust)
 
 

@@ -306,7 +306,7 @@ class _Modes(NamedTuple):
     corrected: ComplexArray  # by readings
 
 
-def following(table: FloatArray) -> FloatArray:
+def next_rows(table: FloatArray) -> FloatArray:
     """The next row of each row; the last one follows itself."""
     return np.concatenate([table[1:], table[-1:]])
 
@@ -406,7 +406,7 @@ def predict(
     there = np.isfinite(y).astype(float)
     linear = _filter(model, theta, noise, len(y) * model.sample_time)
     s = _Search(
-        model, linear, i, following(i), np.where(there > 0, y, 0.0), there, STUDENT if robust else NORMAL
+        model, linear, i, next_rows(i), np.where(there > 0, y, 0.0), there, STUDENT if robust else NORMAL
     )
     n, c = len(linear.A), len(theta)
     half, x = n // 2, np.array(model.place[list(model.plant.controlled)])

@@ -17,6 +17,7 @@ from malta.identification.log import Log, reference_spline, require_same_law, sa
 from malta.identification.response import acting
 from malta.model.data import plant_of
 from malta.model.parameters import twins_of
+from malta.simulation.engine.sample_loop import Loop, loop_of
 from malta.simulation.inputs import Inputs, initial_values, sample_inputs
 from malta.simulation.layout import layout_of
 from malta.simulation.period import law_reference
@@ -34,7 +35,7 @@ from malta.synthesis.controller import (
     sum_errors,
     waiting,
 )
-from malta.synthesis.schedule import scheduled
+from malta.synthesis.schedule import interpolate
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
 SAME = 1e-6  # of a force's limit: commands that differ by less are the same, in files of nine digits too
 SETTLED = 0.5  # of a log, after which the start of the filter is forgotten
 LAGS = 20  # samples, over which innovations are tested
-BLOCK = 1000  # samples in one call
 LARGER = 1.2  # times the innovations of the gain file's own machine, beyond which the log's are refused
 ALIKE = 0.1  # by which autocorrelations of both may differ, and 6 standard deviations where that is more
 STEP = 0.01  # of a parameter, by which the machine is moved to see what that changes
@@ -286,30 +286,19 @@ def _inputs(controller: Controller, log: Log) -> tuple[Simulation, Inputs]:
 def _run(simulation: Simulation, inputs: Inputs, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Commands and innovations of the law on readings y."""
     plant, c, _, _ = simulation
-    p, n = len(plant.outputs), len(c.states)
+    p = len(plant.outputs)
     _, xi, _ = initial_values(simulation, inputs.given[0])
     z = y[:, plant.stroke_output] if plant.has_stroke else np.zeros(len(y))
     table = c.feedforward
     v0 = np.column_stack([np.interp(z, table.z_grid, column) for column in table.v0.T])
     state = np.concatenate([xi, np.zeros(2 * p)])
-    given = np.hstack([inputs.given, y, v0])
-    chain = _law_chain(simulation)
-    rows = []
-    for first in range(0, len(y), BLOCK):
-        block = given[first : first + BLOCK]
-        padded = np.vstack([block, np.repeat(block[-1:], BLOCK - len(block), axis=0)])
-        states, out = chain(state, padded.T)
-        state = np.array(states)[:, len(block) - 1]
-        rows.append(np.array(out)[:, : len(block)].T)
-    table_of_rows = np.vstack(rows)
-    if table_of_rows.shape[1] != len(c.forces) + p:
-        raise InputError("replay", "law", f"{n} states", "those of the gain file")
-    return table_of_rows[:, : len(c.forces)], table_of_rows[:, len(c.forces) :]
+    rows = _law_loop(simulation)(state, (inputs.given, y, v0), np.zeros(0))
+    return rows[:, : len(c.forces)], rows[:, len(c.forces) :]
 
 
 @lru_cache(maxsize=4)
-def _law_chain(simulation: Simulation) -> ca.Function:
-    """BLOCK samples of the law: (xi_pred, e, frozen; given, y, v0) -> states, (v, innovation)."""
+def _law_loop(simulation: Simulation) -> Loop:
+    """The law over samples: (xi_pred, e, frozen; given, y, v0) -> (v, innovation) of each."""
     plant, c, _, setup = simulation
     p, n, m = len(plant.outputs), len(c.states), len(c.forces)
     sizes = layout_of(plant, c, setup).given
@@ -317,7 +306,7 @@ def _law_chain(simulation: Simulation) -> ca.Function:
     given = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     y, v0 = ca.SX.sym("y", p), ca.SX.sym("v0", m)
     g = {name: ca.SX(value) for name, value in (gains_of(c) | {"rate": ca.DM(c.feedforward.rate)}).items()}
-    g = dict(scheduled(g, c.schedule, given["p_ref"]))
+    g = dict(interpolate(g, c.schedule, given["p_ref"]))
     xi_pred, e, frozen = state[:n], state[n : n + p], state[n + p :]
     taken = filtered(c.tracks, y, given["p_ref"])
     xi_hat = estimated(g, xi_pred, taken)
@@ -328,9 +317,5 @@ def _law_chain(simulation: Simulation) -> ca.Function:
     after, _ = look_ahead(g, after, y, given["dp_ref"])
     innovation = taken - g["Cd"] @ xi_pred
     inputs = ca.vertcat(*given.values(), y, v0)
-    step = ca.Function(
-        "step",
-        [state, inputs],
-        [ca.densify(ca.vertcat(after, sums, waiting(g, saturated))), ca.densify(ca.vertcat(v, innovation))],
-    )
-    return step.mapaccum("replay", BLOCK)
+    following = ca.vertcat(after, sums, waiting(g, saturated))
+    return loop_of(state, inputs, ca.SX(0, 1), following, ca.vertcat(v, innovation))

@@ -281,12 +281,12 @@ def residuals_of(
     return Residuals(lines, between.reshape(*s.between.shape, -1), others)
 
 
-def noise_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Noise:
-    """The noise of sensors and process by what is between the lines."""
+def noise_of(model: ResponseModel, s: Spectrum, theta: FloatArray, between: ComplexArray) -> Noise:
+    """The noise of sensors and process by the residuals between the lines, see `Residuals`."""
     bins, places = np.unique(s.between.ravel(), return_index=True)
-    e = residuals_of(model, s, theta).between
+    e = between.reshape(-1, between.shape[2])[places]
     samples = round(2 * np.pi / (s.rate * model.sample_time))
-    return noise_between_lines(model, theta, s.rate * bins, e.reshape(-1, e.shape[2])[places], samples)
+    return noise_between_lines(model, theta, s.rate * bins, e, samples)
 
 
 def weights_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexArray:
@@ -298,7 +298,7 @@ def weights_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexA
     e = residuals_of(model, s, theta).between
     shape: ComplexArray = np.tile(np.eye(e.shape[2], dtype=complex), (len(s.lines), 1, 1))
     if model.plant.second_order and model.plant.sensors is None:
-        noise = noise_of(model, s, theta)
+        noise = noise_of(model, s, theta, e)
         at = np.column_stack([s.lines, s.between])  # lines x (1 + NEIGHBOURS)
         factors = np.linalg.cholesky(noise_covariances(model, theta, noise, s.rate * at.ravel()))
         shapes = np.linalg.inv(factors).reshape(*at.shape, *factors.shape[1:])

@@ -23,7 +23,7 @@ from malta.errors import CheckError
 from malta.loops.classical import Nominal, remembered
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim
-from malta.model.families import traced
+from malta.model.families import trace
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import off_stroke, position_in, readonly
 from malta.model.sensors import whole_samples, with_lags
@@ -340,7 +340,7 @@ def machine_loop(
 def disturbance_map(model: LinearModel) -> FloatArray:
     """B_w of xi' = A xi + B v + B_w w: n states of the design model x disturbances."""
     plant, point = model.plant, model.operating_point
-    (found,) = traced(_disturbances, plant, None, point.loaded)(point.x, point.u)
+    (found,) = trace(_disturbances, plant, None, point.loaded)(point.x, point.u)
     return readonly(found[list(plant.controlled)])
 
 

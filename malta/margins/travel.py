@@ -14,16 +14,13 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
-import casadi as ca
-import numpy as np
-
 from malta.errors import InputError
 from malta.loops.classical import Nominal
 from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
 from malta.margins.scheduled_loops import cells_of
 from malta.model.data import plant_of
 from malta.model.parameters import units_of
-from malta.model.plant import off_stroke, position_at
+from malta.model.plant import off_stroke, outputs_at, position_at
 from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of
 from malta.proof.expressions import NotAnalytic
@@ -151,7 +148,7 @@ def own_position(
     """The position of the machine along its course (SI): the output of a schedule, the stroke, or the parameter."""
     if controller is not None and controller.schedule is not None:
         x = plant.point(controller.operating_point[0]).x
-        return float(np.array(ca.DM(plant.h(ca.DM(x), 0))).ravel()[controller.schedule.output])
+        return float(outputs_at(plant, x)[controller.schedule.output])
     if extent.stroke or not extent.course:
         return states.get(extent.stroke, 0.0)
     return float(getattr(plant.parameters, extent.course))

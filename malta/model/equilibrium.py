@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError
-from malta.model.families import Traced, traced
+from malta.model.families import Traced, trace
 from malta.model.plant import OperatingPoint, Plant
 
 if TYPE_CHECKING:
@@ -255,7 +255,7 @@ def _rates_of(plant: Plant, x: Any, u: Any, w: Any) -> Any:
 
 def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> FloatArray:
     """The inputs that hold the machine at rest, or that cancel its loads alone; one row for each row of states."""
-    left = traced(_rates_left, plant, None, loads_alone)
+    left = trace(_rates_left, plant, None, loads_alone)
     start = np.zeros((len(states), len(plant.inputs)))
     found = solve(_equations(left, states), [start], _scales(plant), STILL, SHARE)
     _require_solved(plant, found.left, "input", states)
@@ -285,8 +285,8 @@ def _commands(
 
     before : commands to start from, beside the inputs and shares of the limits
     """
-    made = traced(_made, plant, believed)
-    equations = _equations(traced(_effect_missed, plant, believed, loaded), np.hstack([states, inputs]))
+    made = trace(_made, plant, believed)
+    equations = _equations(trace(_effect_missed, plant, believed, loaded), np.hstack([states, inputs]))
     scales = _scales(plant)
     rough = np.where(inputs < 0, -1.0, 1.0) * scales
     starts = [

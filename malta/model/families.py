@@ -83,7 +83,7 @@ def register(plant: Plant, build: Callable[[Any], Plant]) -> None:
     _families[plant] = family
 
 
-def traced(recipe: Recipe, plant: Plant, believed: Plant | None = None, *options: Hashable) -> Traced:
+def trace(recipe: Recipe, plant: Plant, believed: Plant | None = None, *options: Hashable) -> Traced:
     """The function of a recipe for a machine, and for the machine that its controller believes in.
 
     recipe : called with the plants and the options; the same function object for what is the same

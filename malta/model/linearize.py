@@ -19,7 +19,7 @@ import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.model.equilibrium import chain, commanded
-from malta.model.families import traced
+from malta.model.families import trace
 from malta.model.plant import OperatingPoint, Plant, readonly
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
     if not np.isfinite(point.x).all() or not np.isfinite(point.u).all():
         raise CheckError(f"{plant.name}: a state or a `preload` is not finite: x = {point.x}, u = {point.u}")
     point = commanded(plant, point, believed)
-    derivatives = traced(_derivatives, plant, believed, point.loaded)
+    derivatives = trace(_derivatives, plant, believed, point.loaded)
     A, B, C, E, _, ratio = derivatives(point.x, point.u, point.v)
     keep = list(plant.controlled)
     A, B, C, E = A[np.ix_(keep, keep)], _without_rounding(B[keep]), C[:, keep], E[keep]

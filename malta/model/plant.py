@@ -418,6 +418,11 @@ def position_at(plant: Plant, x: ArrayLike) -> dict[str, float]:
     return ({plant.stroke: position_in(plant, x)} if plant.has_stroke else {}) | off_stroke(plant, x)
 
 
+def outputs_at(plant: Plant, x: ArrayLike) -> FloatArray:
+    """The outputs at rest at the states x, without sensors' errors."""
+    return np.array(ca.DM(plant.h(ca.DM(np.asarray(x, dtype=float)), 0)), dtype=float).ravel()
+
+
 def off_stroke(plant: Plant, x: ArrayLike) -> dict[str, float]:
     """The states by name that are not zero, without the stroke."""
     pairs = zip(plant.states, np.asarray(x).tolist(), strict=True)

@@ -14,7 +14,7 @@ from scipy.special import erf
 
 from malta.errors import InputError
 from malta.model.data import plant_of
-from malta.model.plant import Plant, off_stroke, position_in
+from malta.model.plant import Plant, off_stroke, outputs_at, position_in
 from malta.simulation import references
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.layout import electronics_of, layout_of, noise_scales
@@ -99,7 +99,7 @@ def motion_of(scenario: Scenario, plant: Plant, c: Controller, t: FloatArray) ->
     beside = off_stroke(believed, believed.point(c.operating_point[0]).x)
     if not beside:
         return motion
-    here, zero = (np.array(ca.DM(believed.h(ca.DM(believed.state(at)), 0))).ravel() for at in (beside, {}))
+    here, zero = (outputs_at(believed, believed.state(at)) for at in (beside, {}))
     return motion._replace(p=motion.p + (here - zero))
 
 

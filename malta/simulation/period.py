@@ -57,7 +57,7 @@ from malta.synthesis.controller import (
     sum_errors,
     waiting,
 )
-from malta.synthesis.schedule import scheduled
+from malta.synthesis.schedule import interpolate
 
 # Motion of the machine between two samples: one step of the classical Runge–Kutta method under held commands.
 
@@ -357,7 +357,7 @@ def _control_law(
     plant, c, s, g = loop
     machine, controller, given = signals
     C = _scheduled_C(c, y) if s.scheduled else None
-    g = scheduled(g, c.schedule, given["p_ref"])
+    g = interpolate(g, c.schedule, given["p_ref"])
     p_ref, v_ff = given["p_ref"], given["v_ff"]
     taken = filtered(c.tracks, y, p_ref)
     xi_hat = given["xi_hat"] if s.outside else estimated(g, controller["xi_pred"], taken, C)

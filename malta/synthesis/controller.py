@@ -55,8 +55,8 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.model.equations import note
-from malta.model.plant import Parameters, Plant, Signal, readonly
-from malta.synthesis.schedule import SCHEDULED, Schedule, scheduled
+from malta.model.plant import Parameters, Plant, Signal, outputs_at, readonly
+from malta.synthesis.schedule import SCHEDULED, Schedule, interpolate
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -473,7 +473,7 @@ def _symbolic_law(
     sizes = {"xi_pred": n, "e": p, "frozen": p, "y": p, "p_ref": p, "xi_ref": n, "v_ff": m, "v0": m}
     args = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     xi_pred, e, frozen, y, p_ref, *given = args.values()
-    g = scheduled(g, schedule, p_ref)
+    g = interpolate(g, schedule, p_ref)
     xi_hat = estimated(g, xi_pred, filtered(tracks, y, p_ref))
     e_next = sum_errors(g, e, frozen, y, p_ref)
     xi_pred_next, saturated, v = commanded(g, xi_hat, e_next, *given)
@@ -490,7 +490,7 @@ def law_at(c: Controller, plant: Plant, x: FloatArray) -> Controller:
     """The law that a controller has at rest at the states x of a plant: itself, or its schedule's matrices there."""
     if c.schedule is None:
         return c
-    return _fixed(c, float(ca.DM(plant.h(ca.DM(x), 0))[c.schedule.output]))
+    return _fixed(c, float(outputs_at(plant, x)[c.schedule.output]))
 
 
 @lru_cache(maxsize=64)  # records compare by identity: what is known of a fixed law is found again

@@ -19,7 +19,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.model.equations import note
-from malta.model.plant import readonly
+from malta.model.plant import outputs_at, readonly
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, OperatingPoint, Plant
@@ -89,7 +89,7 @@ class Schedule:
         return found
 
 
-def scheduled(g: Mapping[str, Any], schedule: Schedule | None, p_ref: Any) -> Mapping[str, Any]:
+def interpolate(g: Mapping[str, Any], schedule: Schedule | None, p_ref: Any) -> Mapping[str, Any]:
     """The numbers of a law at a reference p*: as they are, or with the matrices that its schedule has there.
 
     g : numbers by name, constants or symbols, see controller.gains_of
@@ -115,7 +115,7 @@ def point_at(plant: Plant, x: FloatArray, variable: str, place: float) -> Operat
     names = [s.name for s in plant.outputs]
     if variable not in names:
         raise InputError(plant.name, "schedule.variable", repr(variable), "an output: " + " ".join(names))
-    y = np.array(ca.DM(plant.h(ca.DM(x), 0)), dtype=float).ravel()
+    y = outputs_at(plant, x)
     y[names.index(variable)] = place
     q = np.array(ca.DM(plant.position_of(ca.DM(y))), dtype=float).ravel()
     return plant.point(np.concatenate([q, np.zeros(len(plant.controlled) - len(q))]))

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
+from malta.model.plant import outputs_at
 from malta.synthesis.controller import Controller
 from malta.synthesis.schedule import SCHEDULED, Schedule
 
@@ -73,7 +73,7 @@ def _output(c: Controller, variable: str) -> int:
 def _place(c: Controller, variable: str) -> float:
     """Where the output is at a law's operating point, SI."""
     plant = plant_of(c.parameters)
-    return float(ca.DM(plant.h(ca.DM(plant.point(c.operating_point[0]).x), 0))[_output(c, variable)])
+    return float(outputs_at(plant, plant.point(c.operating_point[0]).x)[_output(c, variable)])
 
 
 def _require_alike(base: Controller, law: Controller) -> None:

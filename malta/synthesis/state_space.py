@@ -21,7 +21,7 @@ from scipy.linalg import matrix_balance
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import OperatingPoint, Plant, Signal
+from malta.model.plant import OperatingPoint, Plant, Signal, outputs_at
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, linear_law
 from malta.synthesis.feedforward import machine_part
@@ -242,7 +242,7 @@ def set_point(c: Controller) -> FloatArray:
         plant = plant_of(c.parameters)
         y = ca.SX.sym("y", p)
         q = ca.densify(ca.jacobian(plant.position_of(y), y))
-        here = np.array(ca.DM(plant.h(ca.DM(plant.point(c.operating_point[0]).x), 0))).ravel()
+        here = outputs_at(plant, plant.point(c.operating_point[0]).x)
         X = np.array(ca.Function("X", [y], [q])(here))
         R[p : p + len(X)] = X
         v_ff, mechanical = R[p + n : p + n + m], len(c.A)

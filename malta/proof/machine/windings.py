@@ -24,9 +24,9 @@ import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.model.data import plant_of
-from malta.model.families import traced
+from malta.model.families import trace
 from malta.model.linearize import linearize
-from malta.model.plant import readonly
+from malta.model.plant import outputs_at, readonly
 from malta.proof.uncertain import Compensator, is_commutated
 from malta.synthesis.riccati import delay_inputs, sample
 
@@ -131,7 +131,7 @@ def current_control(controller: Controller, windings: Windings, point: Operating
 @lru_cache(maxsize=16)  # several parts of a loop need it; records compare by identity
 def axis_map(plant: Plant, point: OperatingPoint) -> FloatArray:
     """M: the slope of the commanded axis currents by the commanded forces, axes x forces."""
-    return readonly(traced(_axis_slope, plant)(point.x, _command(point))[0])
+    return readonly(trace(_axis_slope, plant)(point.x, _command(point))[0])
 
 
 def _axis_slope(plant: Plant, _believed: None) -> tuple[list[Any], list[Any]]:
@@ -148,7 +148,7 @@ def _command(point: OperatingPoint) -> FloatArray:
 
 def emf_slope(plant: Plant, x: FloatArray) -> FloatArray:
     """The slope of the induced voltages by the states, axes x states."""
-    return np.asarray(traced(_emf_slope, plant)(x)[0])
+    return np.asarray(trace(_emf_slope, plant)(x)[0])
 
 
 def _emf_slope(plant: Plant, _believed: None) -> tuple[list[Any], list[Any]]:
@@ -172,7 +172,7 @@ def _estimated(
     if c.tracks == "states":
         return estimated_rows(slope, c.L, c.Cd)
     y = ca.SX.sym("y", len(c.measurements))
-    here = np.array(ca.DM(believed.h(ca.DM(x), 0))).ravel()
+    here = outputs_at(believed, x)
     q = believed.position_of(y)
     P = np.array(ca.Function("P", [y], [ca.densify(ca.jacobian(q, y))])(here))
     direct = slope[:, : len(P)] @ P

@@ -145,6 +145,13 @@ def compiler() -> tuple[str, ...] | None:
     return None
 
 
+def _features() -> list[str]:
+    """Features of the first processor, as the system lists them; none where it does not."""
+    with suppress(OSError), Path("/proc/cpuinfo").open(encoding="utf-8") as lines:
+        return next((line.split() for line in lines if line.startswith("flags")), [])
+    return []
+
+
 @cache
 def _processor() -> str:
     """Model and features of the processor, on which `-march=native` depends."""
@@ -156,7 +163,7 @@ def _processor() -> str:
 
 # Doubles of one register of the processor, or two of them: more make text that is compiled for four times as long and
 # flies slower.
-LANES = 8 if "avx512dq" in _processor() else 4
+LANES = 8 if "avx512dq" in _features() else 4
 MOST_LANES = 8  # blocks of runs are multiples of it, whatever the processor
 
 

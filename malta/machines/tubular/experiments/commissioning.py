@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
@@ -24,7 +23,7 @@ from malta.machines.tubular.experiments.faults import (
 )
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE
-from malta.model.plant import Plant
+from malta.model.plant import Plant, outputs_at
 from malta.simulation import references
 from malta.simulation.experiments import (
     Case,
@@ -106,7 +105,7 @@ def supervised_faults(
     if not chosen:
         words = " ".join(sorted({word for one in wanted for word in one.label.split()}))
         raise InputError("simulate", "supervised-faults: only", repr(only), f"all, or one of {words}")
-    rest = tuple(np.array(ca.DM(plant.h(ca.DM(plant.at(**rest_on_bearing(plant)).x), 0))).ravel().tolist())
+    rest = tuple(outputs_at(plant, plant.at(**rest_on_bearing(plant)).x).tolist())
     flights: list[Flown] = []
     engines: dict[str, Any] = {"": "auto", WITH: supervised_engine(flights, Requests(take_over=rest))}
     cases: list[Case] = []

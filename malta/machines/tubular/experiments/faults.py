@@ -29,7 +29,7 @@ from malta.firmware.supervised import (
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE, delayed_stroke
 from malta.model.equilibrium import trim
-from malta.model.plant import Plant
+from malta.model.plant import Plant, outputs_at
 from malta.simulation import references
 from malta.simulation.experiments import (
     Case,
@@ -421,7 +421,7 @@ def _requests(plant: Plant, phase: Phase) -> Requests:
     """What is asked for in a phase."""
     if phase == "lift":
         return Requests()
-    rest = np.array(ca.DM(plant.h(ca.DM(plant.at(**rest_on_bearing(plant)).x), 0))).ravel()
+    rest = outputs_at(plant, plant.at(**rest_on_bearing(plant)).x)
     return Requests(land=PHASES[phase][2], take_over=tuple(rest.tolist()))
 
 

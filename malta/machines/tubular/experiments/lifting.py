@@ -14,7 +14,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.machines.tubular.experiments.strokes import delayed_stroke
 from malta.model.linearize import linearize
-from malta.model.plant import Plant
+from malta.model.plant import Plant, outputs_at
 from malta.simulation import references
 from malta.simulation.engine.batch import is_compiled, simulate_many
 from malta.simulation.experiments import (
@@ -70,7 +70,7 @@ def lift_cases(plant: Plant, controller: Controller, **options: Any) -> list[Pla
 
 def rise_reference(plant: Plant, start: Mapping[str, float], duration: float = 30e-3) -> Reference:
     """From the state `start` to the centre, a quintic of `duration` (s)."""
-    first = np.array(plant.h(ca.DM(plant.at(**start).x), 0)).ravel()
+    first = outputs_at(plant, plant.at(**start).x)
 
     def at(t: FloatArray) -> Motion:
         s, ds, dds = references.quintic(np.asarray(t) - duration / 2, duration / references.QUINTIC_DURATION)
