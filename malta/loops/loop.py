@@ -23,6 +23,7 @@ from malta.loops.sampled_loops import (
     machine_system,
     push_through,
 )
+from malta.model.families import with_parameters
 from malta.model.parameters import units_of
 from malta.model.plant import position_at
 from malta.processes import on_one_thread
@@ -219,7 +220,7 @@ def loop(
     for name in parameters or {}:
         if name not in known:
             raise InputError("loop", name, "an unknown parameter", "one of " + " ".join(known))
-    machine = plant.variant(replace(plant.parameters, **parameters)) if parameters else plant
+    machine = with_parameters(plant, replace(plant.parameters, **parameters)) if parameters else plant
     names = [s.name for s in controller.measurements]
     if names != [s.name for s in plant.outputs]:
         raise InputError("loop", "controller", f"one of {' '.join(names)}", f"one of the {plant.name}")

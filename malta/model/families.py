@@ -83,6 +83,16 @@ def register(plant: Plant, build: Callable[[Any], Plant]) -> None:
     _families[plant] = family
 
 
+def with_parameters(plant: Plant, parameters: Any) -> Plant:
+    """The machine of another record of parameters, in the family of this one where it has one."""
+    family = _families.get(plant)
+    if family is None:
+        return plant.variant(parameters)
+    made = family.build(parameters)
+    register(made, family.build)
+    return made
+
+
 def trace(recipe: Recipe, plant: Plant, believed: Plant | None = None, *options: Hashable) -> Traced:
     """The function of a recipe for a machine, and for the machine that its controller believes in.
 
