@@ -18,7 +18,7 @@ from timing import Result, medians, optional
 from malta import structured as own
 from malta.structured.loops import models_of_systems
 from malta.structured.search import Task, random_starts, rate_of, search
-from malta.synthesis.places import Structure, places_of
+from malta.synthesis.structure import Structure, places_of
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

@@ -22,8 +22,8 @@ from malta import structured
 from malta.structured.loops import to_plane
 from malta.structured.reduction import split_integrals, truncate
 from malta.synthesis.controller import linear_law
-from malta.synthesis.places import sample_law
 from malta.synthesis.state_space import System
+from malta.synthesis.structure import sample_law
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

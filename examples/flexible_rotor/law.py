@@ -15,8 +15,7 @@ import control
 import numpy as np
 
 import malta
-from malta.synthesis.places import Structure
-from malta.synthesis.structure import places_in
+from malta.synthesis.structure import Structure, places_in
 
 FILE = Path(__file__).resolve().parent / "design" / "flexible_rotor.toml"
 MICRO = 1e-6

@@ -24,7 +24,7 @@ from malta.campaigns.run import specified_bounds
 from malta.campaigns.store import simulate_machines
 from malta.campaigns.summary import UNBOUNDED, Bounds
 from malta.errors import InputError
-from malta.model.signals import outputs_of
+from malta.model.machines import outputs_of
 from malta.units import in_unit
 
 if TYPE_CHECKING:

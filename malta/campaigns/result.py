@@ -16,9 +16,9 @@ from malta.campaigns.store import Block, figure_shapes
 from malta.display import Description, display
 from malta.merits import Merit
 from malta.model.data import published_value
+from malta.model.machines import inputs_of, outputs_of, stroke_unit
 from malta.model.parameters import differences, units_of
 from malta.model.plant import readonly
-from malta.model.signals import inputs_of, outputs_of, stroke_unit
 from malta.simulation.engine.digest import Batch, verdicts
 from malta.simulation.experiments import setting
 from malta.units import in_unit

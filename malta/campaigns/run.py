@@ -33,7 +33,7 @@ from malta.campaigns.store import (
 from malta.errors import InputError
 from malta.files import file_exists, replace_files, watch_interrupts
 from malta.firmware.flight import engine_of_c
-from malta.model.signals import outputs_of
+from malta.model.machines import outputs_of
 from malta.simulation.engine import compiled
 from malta.simulation.engine.batch import record_run, replayed
 from malta.simulation.engine.engines import EngineChoice

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from malta.identification.data_file import IdentifiedData
     from malta.margins.loop_report import LoopReport
     from malta.proof.certificate.check import Verdict
-    from malta.proof.machine.windings import CurrentLoops
+    from malta.proof.windings import CurrentLoops
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 

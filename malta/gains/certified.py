@@ -28,12 +28,12 @@ from malta.proof.certificate.certificate import Origin, loops_of
 from malta.proof.certificate.checked_file import LONG, Claim, Document, Loop, Parameter, Places, double
 from malta.proof.certificate.checked_file import Origin as Named
 from malta.proof.expressions import NotAnalytic, exact
-from malta.proof.machine.windings import chosen_loops
+from malta.proof.windings import chosen_loops
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant
-    from malta.proof.machine.windings import CurrentLoops
     from malta.proof.margin import Ranges
+    from malta.proof.windings import CurrentLoops
     from malta.synthesis.controller import Controller
 
 

@@ -23,13 +23,13 @@ from malta.loops.sampled_loops import (
     machine_system,
     push_through,
 )
-from malta.model.families import with_parameters
+from malta.model.equilibrium import with_parameters
 from malta.model.parameters import units_of
 from malta.model.plant import position_at
 from malta.processes import on_one_thread
-from malta.proof.machine.windings import CurrentLoops, chosen_loops, left_out
 from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.robust import robust_margin
+from malta.proof.windings import CurrentLoops, chosen_loops, left_out
 from malta.synthesis.controller import law_at
 from malta.synthesis.riccati import eigenvalues
 

@@ -22,13 +22,13 @@ import numpy as np
 from malta.errors import CheckError
 from malta.loops.classical import Nominal, remembered
 from malta.model.data import plant_of
-from malta.model.equilibrium import trim
-from malta.model.families import trace
+from malta.model.equilibrium import trace, trim
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import off_stroke, position_in, readonly
 from malta.model.sensors import whole_samples, with_lags
-from malta.proof.machine.parametric_plants import of_plant
-from malta.proof.machine.windings import (
+from malta.proof.parametric_plants import of_plant
+from malta.proof.uncertain import Compensator, UncertainSystem, held_gain, is_commutated
+from malta.proof.windings import (
     CurrentControl,
     CurrentLoops,
     axis_map,
@@ -43,7 +43,6 @@ from malta.proof.machine.windings import (
     with_estimated_emf,
     with_windings,
 )
-from malta.proof.uncertain import Compensator, UncertainSystem, held_gain, is_commutated
 from malta.synthesis.controller import Controller, LinearLaw, law_at, linear_law, with_readings, with_slope
 from malta.synthesis.recovery import StepResponse, step_response
 from malta.synthesis.riccati import add_lags, delay_inputs, eigenvalues, sample

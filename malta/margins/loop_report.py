@@ -17,10 +17,10 @@ from malta.loops.sampled_loops import LAST
 from malta.loops.time_domain import Recovery, furthest, noise_of, recovery
 from malta.margins.travel import NOT_BETWEEN, NOWHERE, Extent
 from malta.merits import ROOTS, Merit, figure, in_groups
+from malta.model.machines import FINE
 from malta.model.parameters import box_words
-from malta.model.signals import FINE
-from malta.proof.machine.windings import left_out
 from malta.proof.margin import NOT_PROVEN
+from malta.proof.windings import left_out
 from malta.synthesis.requirements import Figure, judge_figure, ratio_of
 
 if TYPE_CHECKING:
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
     from malta.model.plant import ComplexArray, Plant
     from malta.proof.blocks.gain import Gain
-    from malta.proof.machine.windings import CurrentLoops
     from malta.proof.margin import Margin
+    from malta.proof.windings import CurrentLoops
     from malta.synthesis.controller import Controller
     from malta.synthesis.requirements import Noise, Verdict
 

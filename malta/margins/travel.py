@@ -24,9 +24,8 @@ from malta.model.plant import off_stroke, outputs_at, position_at
 from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of
 from malta.proof.expressions import NotAnalytic
-from malta.proof.machine.parametric_plants import LONGEST
-from malta.proof.machine.windings import CurrentLoops
 from malta.proof.margin import Margin, Progress, Ranges
+from malta.proof.parametric_plants import LONGEST
 from malta.proof.problem import OfSeveral
 from malta.proof.robust import (
     TOLERANCE,
@@ -42,6 +41,7 @@ from malta.proof.time_limit import TimeUp, time_limit
 from malta.proof.uncertain import Compensator, UncertainSystem, is_commutated, model_of
 from malta.proof.weak_coupling.held_currents import held_machine
 from malta.proof.weak_coupling.weak_coupling import HeldLoop
+from malta.proof.windings import CurrentLoops
 from malta.synthesis.schedule import point_at
 
 if TYPE_CHECKING:

@@ -24,10 +24,10 @@ from malta.model.data import plant_of
 from malta.processes import on_one_thread
 from malta.proof.box import box_of
 from malta.proof.groups import groups, loop_of
-from malta.proof.machine.windings import chosen_loops, current_control, force_modes, windings_of
 from malta.proof.margin import Ranges
 from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator, UncertainSystem, is_commutated
+from malta.proof.windings import chosen_loops, current_control, force_modes, windings_of
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant

@@ -52,12 +52,12 @@ from malta.model.linearize import LinearModel, linearize
 from malta.model.parameters import units_of
 from malta.model.plant import Plant, position_at
 from malta.processes import on_one_thread
-from malta.proof.machine.parametric_plants import of_plant
-from malta.proof.machine.windings import CurrentLoops, chosen_loops
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
+from malta.proof.parametric_plants import of_plant
 from malta.proof.responses import crossing, find_peaks
 from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator
+from malta.proof.windings import CurrentLoops, chosen_loops
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import gain_at_rest
 from malta.synthesis.lqg import integrals_of, kalman, lqi, lqr, weights_of

@@ -24,7 +24,7 @@ from pydantic import StrictStr
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, locate, shipped_path
 from malta.model.checks import check_numbers, line_of
-from malta.model.families import register
+from malta.model.equilibrium import register
 from malta.model.machines import file_of, machine, machine_names, name_of
 from malta.model.parameters import check_range
 from malta.model.plant import Plant

@@ -18,8 +18,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.model.equilibrium import chain, commanded
-from malta.model.families import trace
+from malta.model.equilibrium import chain, commanded, trace
 from malta.model.plant import OperatingPoint, Plant, readonly
 
 if TYPE_CHECKING:

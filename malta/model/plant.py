@@ -24,8 +24,8 @@ from malta.model.sensors import CasadiFn, Drive, Electronics, LateSensors, requi
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from malta.model.equations import Body
     from malta.model.linearize import InverseCheck
-    from malta.model.rigidbody import Body
 
     FloatArray = NDArray[np.floating[Any]]
     ComplexArray = NDArray[np.complexfloating[Any, Any]]

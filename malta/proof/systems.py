@@ -103,7 +103,7 @@ def uncertain(source: Any, names: Any, **options: Any) -> UncertainSystem:
     >>> system.names
     ('J', 'b')
     """
-    from malta.proof.machine.parametric_plants import of_plant
+    from malta.proof.parametric_plants import of_plant
 
     made = of_plant if isinstance(source, Plant) else from_source
     known = [q.name for q in inspect.signature(made).parameters.values() if q.kind is q.KEYWORD_ONLY]

@@ -15,8 +15,8 @@ import numpy as np
 from malta.display import Curves, Description, display, quantity
 from malta.files import replace_files
 from malta.merits import Merit, reported, reported_merits
+from malta.model.machines import FINE
 from malta.model.plant import Plant, Signal, readonly
-from malta.model.signals import FINE
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.inputs import Inputs
 from malta.simulation.layout import columns_of_row, electronics_of

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from malta.synthesis.elements import pid as pid
     from malta.synthesis.elements import states as states
     from malta.synthesis.elements import transfer as transfer
-    from malta.synthesis.places import Place as Place
+    from malta.synthesis.structure import Place as Place
     from malta.synthesis.tunable_lqg import lqg as lqg
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

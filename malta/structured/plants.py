@@ -20,16 +20,16 @@ from malta.model.linearize import linearize
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
 from malta.proof.blocks.gain import Gain, worst_case_gain
-from malta.proof.machine.windings import chosen_loops
 from malta.proof.margin import Margin, Ranges
 from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator, UncertainSystem
+from malta.proof.windings import chosen_loops
 from malta.structured.goals import Goal
 from malta.structured.loops import Model, model_of, models_of_systems
 from malta.synthesis.elements import CALLER
-from malta.synthesis.places import sample_law
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 from malta.synthesis.state_space import System, controller_of
+from malta.synthesis.structure import sample_law
 
 if TYPE_CHECKING:
     from malta.synthesis.controller import Controller

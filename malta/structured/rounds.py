@@ -26,8 +26,8 @@ from malta.structured.minimax import Look
 from malta.structured.plants import Machine, Systems, Uncertain, Values, target_of
 from malta.structured.search import ROOM, Task, contradiction, random_starts, rate_of, search
 from malta.synthesis.elements import CALLER
-from malta.synthesis.places import Structure, places_of, sample_law
 from malta.synthesis.state_space import System
+from malta.synthesis.structure import Structure, places_of, sample_law
 
 if TYPE_CHECKING:
     from malta.proof.blocks.gain import Gain

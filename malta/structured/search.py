@@ -14,7 +14,7 @@ from malta.structured.goals import Figure, Goal, stability
 from malta.structured.loops import ClosedLoop, Model
 from malta.structured.minimax import Effort, Look, Slope, by_x, minimize
 from malta.synthesis.elements import CALLER
-from malta.synthesis.places import Structure
+from malta.synthesis.structure import Structure
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

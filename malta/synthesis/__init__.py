@@ -11,9 +11,9 @@ if TYPE_CHECKING:
     from malta.synthesis.lqg import kalman as kalman
     from malta.synthesis.lqg import lqi as lqi
     from malta.synthesis.lqg import lqr as lqr
-    from malta.synthesis.scheduling import schedule_laws as schedule_laws
     from malta.synthesis.spec import Weights as Weights
     from malta.synthesis.state_space import controller_of as controller_of
-    from malta.synthesis.stiffness_bases import calibrate as calibrate
+    from malta.synthesis.synthesize import schedule_laws as schedule_laws
+    from malta.synthesis.tunable_lqg import calibrate as calibrate
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

@@ -28,8 +28,9 @@ from malta.loops.time_domain import covariance, noise_variance
 from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
 from malta.model.plant import position_in
-from malta.proof.machine.parametric_plants import of_plant
-from malta.proof.machine.windings import (
+from malta.proof.parametric_plants import of_plant
+from malta.proof.responses import crossing
+from malta.proof.windings import (
     Windings,
     emf_slope,
     estimated_rows,
@@ -38,7 +39,6 @@ from malta.proof.machine.windings import (
     with_estimated_emf,
     with_windings,
 )
-from malta.proof.responses import crossing
 from malta.synthesis.controller import linear_law_of
 from malta.synthesis.feedforward import current_loop_of, holding_gain, static_feedforward
 from malta.synthesis.filters import gain_at_rest

@@ -31,8 +31,8 @@ from malta.tuning.search import base_of, model_and_controller
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
-    from malta.proof.machine.windings import CurrentLoops
     from malta.proof.margin import Progress
+    from malta.proof.windings import CurrentLoops
     from malta.simulation.experiments import Experiment
     from malta.simulation.scenario import Scenario
     from malta.simulation.trajectory import Trajectory

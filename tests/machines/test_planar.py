@@ -26,8 +26,8 @@ from malta.machines.planar import plant as planar
 from malta.machines.planar.field import ODD_X, ODD_Y, Series
 from malta.model.data import published as read_published
 from malta.model.data import published_value
+from malta.model.equations import rotation
 from malta.model.plant import symbolic
-from malta.model.rigidbody import rotation
 from malta.simulation.engine.engines import translate
 from malta.simulation.references import QUINTIC_DURATION, quintic
 

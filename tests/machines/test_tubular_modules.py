@@ -23,8 +23,8 @@ from malta.machines.tubular.experiments.strokes import delayed_stroke
 from malta.machines.tubular.further_claims import WAIT, Figure13, carried_weight, figure_13, radial_deviation
 from malta.machines.tubular.plant import centre_of_gravity
 from malta.model.data import plant_of
+from malta.model.equations import rotation
 from malta.model.parameters import acting_names, differences, values_of
-from malta.model.rigidbody import rotation
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 

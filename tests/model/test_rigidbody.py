@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from malta.model.rigidbody import (
+from malta.model.equations import (
     EXACT,
     SMALL_ANGLE,
     Trig,

@@ -116,7 +116,7 @@ BESIDE_PARAMETERS = {
     "planar": {"commutation", "field", "plant"},
     "tubular": {"drive", "plant"},
 }
-BESIDE_PLANT = {"checks", "equilibrium", "families", "linearize", "parameters", "plant", "sensors"}
+BESIDE_PLANT = {"checks", "equations", "equilibrium", "linearize", "parameters", "plant", "sensors"}
 
 
 def circles(graph: dict[str, set[str]]) -> list[set[str]]:

@@ -27,7 +27,7 @@ from malta.proof.box import (
 )
 from malta.proof.certificate.certificate import certificate_of
 from malta.proof.expressions import POINTS, NotAnalytic, program
-from malta.proof.machine.parametric_plants import of_plant
+from malta.proof.parametric_plants import of_plant
 
 
 @dataclass(frozen=True)

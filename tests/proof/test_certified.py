@@ -23,7 +23,7 @@ from malta.margins import travel
 from malta.margins.travel import travel_loops
 from malta.proof.certificate import certificate, checked_file
 from malta.proof.certificate.check import Verdict, check
-from malta.proof.machine.windings import CurrentLoops
+from malta.proof.windings import CurrentLoops
 from malta.report.tables.design import claim_share
 
 pytestmark = pytest.mark.usefixtures("proven_once")

@@ -15,9 +15,15 @@ from scipy import linalg
 
 import malta
 from malta.proof.box import Box, box_of
-from malta.proof.multipliers.multipliers import Blocks, Multiplier, multiplier
+from malta.proof.multipliers.multipliers import (
+    Blocks,
+    Branch,
+    Multiplier,
+    excludes_zero,
+    multiplier,
+    response,
+)
 from malta.proof.multipliers.pencil import LEVELS, gains_of_level
-from malta.proof.multipliers.pencil_response import Branch, excludes_zero, response
 from malta.proof.multipliers.structured import Structured, rows_of
 from malta.proof.problem import OfLoop
 from malta.proof.robust import law_of, problem_of

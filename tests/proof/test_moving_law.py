@@ -11,10 +11,8 @@ from flint import arb
 from scipy import linalg
 
 import malta
-from malta.margins import schedule_rate
-from malta.margins.scheduled_loops import cells_of
-from malta.proof import moving_law
-from malta.proof.moving_law import rate_of_cells
+from malta.margins import schedule_rate, scheduled_loops
+from malta.margins.scheduled_loops import cells_of, rate_of_cells
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.rates import BITS, middle
 from malta.proof.systems import compensator_of
@@ -81,7 +79,7 @@ def test_the_enclosure_holds_the_loop_and_its_curvature(magnet: tuple[Any, Any])
     cells = cells_of(*magnet, (), "lag")
     assert not isinstance(cells, str)
     with precision(BITS):
-        loop = moving_law._LoopOfCells.of(cells)
+        loop = scheduled_loops._LoopOfCells.of(cells)
         for cell in loop.own:
             p, h = (cell.low + cell.high) / 2, 1e-5
             below, here, above = (middle(cell.at(p + d)) for d in (-h, 0.0, h))
@@ -104,7 +102,7 @@ def test_courses_as_fast_as_proven_decay(magnet: tuple[Any, Any]) -> None:
     cells = cells_of(*magnet, (), "lag")
     assert not isinstance(cells, str)
     T, rng, steps, p, way = magnet[1].sample_time, np.random.default_rng(2), 4, 0.0, bound.rate
-    functions = [moving_law._expressions(*cell[:2], None) for cell in cells]
+    functions = [scheduled_loops._expressions(*cell[:2], None) for cell in cells]
     n = functions[0][2]
     whole = np.eye(functions[0][0].size1_out(1))
     for _ in range(600):

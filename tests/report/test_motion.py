@@ -17,7 +17,7 @@ from PIL import Image
 
 import malta
 from malta.machines.tubular.plant import measured
-from malta.model.rigidbody import Body
+from malta.model.equations import Body
 from malta.report.page.motion import (
     VIEW,
     arrow_size,

@@ -16,7 +16,7 @@ import malta
 from malta import structured
 from malta.structured.loops import models_of_systems
 from malta.structured.search import Task, random_starts, rate_of, search
-from malta.synthesis.places import Structure, places_of
+from malta.synthesis.structure import Structure, places_of
 
 if TYPE_CHECKING:
     from malta.proof.uncertain import UncertainSystem

@@ -15,8 +15,8 @@ import malta
 from malta import structured
 from malta.structured.loops import ClosedLoop, Model, models_of_systems
 from malta.structured.norms import noise, peak_gain, peaks_of, response_at
-from malta.synthesis.places import Structure, places_of, sample_law
 from malta.synthesis.state_space import System
+from malta.synthesis.structure import Structure, places_of, sample_law
 
 GOALS = {
     "sensitivity": structured.sensitivity(2.0),

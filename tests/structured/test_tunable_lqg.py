@@ -13,7 +13,7 @@ import malta
 from malta import structured
 from malta.structured.loops import models_of_systems
 from malta.synthesis.lqg import integrals_of
-from malta.synthesis.places import Structure, places_of
+from malta.synthesis.structure import Structure, places_of
 
 BODY = [[0.0, 1.0], [100.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]]
 WEIGHTS = malta.weights(q=[1e6, 0], r=[1], w=[1e-2], v=[1e-12], q_i=[1e7])

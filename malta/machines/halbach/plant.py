@@ -37,13 +37,13 @@ from malta.machines.halbach.electronics import (
     motor_constant,
     phase_currents,
 )
+from malta.model.equations import Body, Resultant
 from malta.model.parameters import check_parameters, si
 from malta.model.plant import (
     Actuator,
     Plant,
     Signal,
 )
-from malta.model.rigidbody import Body, Resultant
 
 
 @dataclass(frozen=True)

@@ -27,12 +27,15 @@ from malta.machines.planar.field import (
     shape_of,
     simulation_model,
 )
-from malta.model.equations import Equation, note, recorded_equations, recording
+from malta.model.equations import (
+    Equation,
+    note,
+    recorded_equations,
+    recording,
+    rotation,
+)
 from malta.model.plant import (
     readonly,
-)
-from malta.model.rigidbody import (
-    rotation,
 )
 
 if TYPE_CHECKING:

@@ -35,20 +35,20 @@ from malta.machines.planar.field import (
     shape_of,
     simulation_model,
 )
-from malta.model.parameters import check_parameters, si
-from malta.model.plant import (
-    Actuator,
-    Plant,
-    Signal,
-    trace,
-)
-from malta.model.rigidbody import (
+from malta.model.equations import (
     Body,
     Resultant,
     acceleration,
     principal_angles,
     rotate,
     rotation,
+)
+from malta.model.parameters import check_parameters, si
+from malta.model.plant import (
+    Actuator,
+    Plant,
+    Signal,
+    trace,
 )
 
 

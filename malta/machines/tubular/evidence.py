@@ -21,7 +21,7 @@ from malta.margins.loop_report import LoopReport
 from malta.margins.verify import compensators
 from malta.model.data import published_value
 from malta.model.linearize import LinearModel, linearize
-from malta.proof.machine.parametric_plants import of_plant
+from malta.proof.parametric_plants import of_plant
 from malta.proof.robust import robust_margin
 from malta.report.ledger import (
     Chance,
@@ -40,7 +40,7 @@ from malta.synthesis.controller import Controller
 from malta.synthesis.lqg import lqr
 from malta.synthesis.riccati import add_integrals
 from malta.synthesis.spec import Spec
-from malta.synthesis.stiffness_bases import calibrate
+from malta.synthesis.tunable_lqg import calibrate
 
 if TYPE_CHECKING:
     from malta.campaigns.result import Rate

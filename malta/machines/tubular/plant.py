@@ -25,14 +25,7 @@ from malta.machines.tubular.drive import (
     levers,
     potential,
 )
-from malta.model.parameters import check_parameters, si
-from malta.model.plant import (
-    Actuator,
-    Plant,
-    Signal,
-    trace,
-)
-from malta.model.rigidbody import (
+from malta.model.equations import (
     EXACT,
     SMALL_ANGLE,
     Body,
@@ -43,6 +36,13 @@ from malta.model.rigidbody import (
     rate_map,
     rotate,
     rotation,
+)
+from malta.model.parameters import check_parameters, si
+from malta.model.plant import (
+    Actuator,
+    Plant,
+    Signal,
+    trace,
 )
 from malta.model.sensors import late_sensors
 

@@ -19,9 +19,15 @@ import numpy as np
 from scipy import linalg
 
 from malta.proof.groups import groups
-from malta.proof.multipliers.multipliers import Blocks, Multiplier, multiplier
+from malta.proof.multipliers.multipliers import (
+    Blocks,
+    Branch,
+    Multiplier,
+    excludes_zero,
+    multiplier,
+    response,
+)
 from malta.proof.multipliers.pencil import TERMS, Rows
-from malta.proof.multipliers.pencil_response import Branch, excludes_zero, response
 from malta.proof.polynomial.rational import TooLarge
 from malta.proof.problem import OfLoop, OfPolynomial, OfSeveral, Problem
 from malta.proof.time_limit import check_time

@@ -23,10 +23,10 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.files import replace_files
-from malta.model.machines import attribute_of
-from malta.model.signals import (
+from malta.model.machines import (
     KINDS,
     Group,
+    attribute_of,
     outputs_of,
 )
 from malta.report.figures.campaign import distributions_figure as distributions_figure

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.model.signals import lateral_outputs
+from malta.model.machines import lateral_outputs
 from malta.report.figures.drawing import (
     BOUND,
     CROSS,

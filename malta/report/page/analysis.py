@@ -18,9 +18,9 @@ from malta.margins.loop_report import BANDWIDTHS
 from malta.merits import in_groups
 from malta.model.data import plant_of
 from malta.model.linear import is_linear
+from malta.model.machines import FINE
 from malta.model.parameters import units_of
 from malta.model.plant import Signal
-from malta.model.signals import FINE
 from malta.report.figures.drawing import micro, number
 from malta.simulation.experiments import progress_of_part
 from malta.simulation.experiments.catalogue import experiment, main_job
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from malta.margins.loop_report import LoopReport
     from malta.merits import Merit
     from malta.model.plant import FloatArray, Parameters, Plant
-    from malta.proof.machine.windings import CurrentLoops
+    from malta.proof.windings import CurrentLoops
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec

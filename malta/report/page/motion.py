@@ -20,7 +20,7 @@ from malta.archives import read_npz
 from malta.display import micro, quantity
 from malta.errors import InputError
 from malta.files import read_file
-from malta.model.rigidbody import Body, rotation
+from malta.model.equations import Body, rotation
 
 if TYPE_CHECKING:
     from PIL import Image, ImageDraw, ImageFont
@@ -90,7 +90,7 @@ class Motion:
 def mesh_of(body: Body) -> Mesh:
     """The faces of a box or of a cylinder about z.
 
-    >>> from malta.model.rigidbody import Body
+    >>> from malta.model.equations import Body
     >>> len(mesh_of(Body("plate", "box", (1.0, 1.0, 0.1))).faces)
     6
     """

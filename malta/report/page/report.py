@@ -8,7 +8,7 @@ from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from malta.model.signals import FINE
+from malta.model.machines import FINE
 from malta.report.figures.drawing import MORE, STYLES, draw_line, finish_axes, micro, new_figure
 from malta.report.page.document import Front, Page, render
 from malta.report.page.sections import Item, Picture, Section, Sheet, distinct_channels, polish

@@ -19,8 +19,8 @@ from malta.display import RADIANS, frequency
 from malta.loops.time_domain import budget_of
 from malta.merits import four_digits
 from malta.model.data import published_figures
+from malta.model.machines import FINE
 from malta.model.plant import Signal
-from malta.model.signals import FINE
 from malta.report.figures.drawing import micro
 from malta.report.page.analysis import design_entries, display_unit, summary_sentences
 from malta.report.tables.campaign import box_text, campaign_tables, run_text

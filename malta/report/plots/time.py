@@ -10,7 +10,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.loops.time_domain import StepFigures, loop_steps, step_figures
-from malta.model.signals import FINE
+from malta.model.machines import FINE
 from malta.report.figures.drawing import draw_grid, micro, number
 from malta.report.plots.frequency import Channel, title_of
 from malta.report.plots.panels import (

@@ -17,7 +17,7 @@ from malta.loops.time_domain import SHARE, furthest
 from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, zone
 from malta.model.data import published_value
 from malta.model.linearize import LinearModel
-from malta.model.signals import FINE
+from malta.model.machines import FINE
 from malta.proof.certificate.checked_file import double
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
 from malta.report.tables.layout import COLOURS, add_row, new_table

@@ -10,8 +10,8 @@ from rich.table import Table
 
 from malta.display import RADIANS, frequency
 from malta.margins.loop_report import zone
+from malta.model.machines import axis_units
 from malta.model.parameters import box_words
-from malta.model.signals import axis_units
 from malta.proof.margin import NOT_PROVEN, unproven
 from malta.report.tables.design import (
     bandwidth_table,

@@ -37,8 +37,8 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.model.data import plant_of
+from malta.model.machines import FINE
 from malta.model.plant import Plant, Signal
-from malta.model.signals import FINE
 from malta.simulation import references
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import (

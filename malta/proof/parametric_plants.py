@@ -17,19 +17,12 @@ from malta.model.plant import Plant, position_in, readonly, symbolic
 from malta.model.sensors import LateSensors, with_lags
 from malta.proof.box import without_branches
 from malta.proof.expressions import NotAnalytic, program
-from malta.proof.machine.windings import Windings, with_windings
 from malta.proof.polynomial import rational
 from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge
 from malta.proof.polynomial.rational import symbolic as rational_functions
 from malta.proof.time_limit import check_time
-from malta.proof.uncertain import (
-    UncertainSystem,
-    describe,
-    is_commutated,
-    lower_limit,
-    model_of,
-    upper_limit,
-)
+from malta.proof.uncertain import UncertainSystem, describe, is_commutated, lower_limit, model_of, upper_limit
+from malta.proof.windings import Windings, with_windings
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

@@ -24,7 +24,7 @@ import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.model.data import plant_of
-from malta.model.families import trace
+from malta.model.equilibrium import trace
 from malta.model.linearize import linearize
 from malta.model.plant import outputs_at, readonly
 from malta.proof.uncertain import Compensator, is_commutated
@@ -33,6 +33,7 @@ from malta.synthesis.riccati import delay_inputs, sample
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, OperatingPoint, Plant
     from malta.synthesis.controller import Controller, CurrentLoop, LinearLaw
+
 
 CurrentLoops = Literal["lag", "pi"]
 EXACT = 1e-9  # of the largest entry: what a map onto the commanded axes may leave
