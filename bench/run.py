@@ -39,11 +39,11 @@ from structured import structured
 from timing import Result, medians, optional
 
 import malta
-from malta.machines.halbach.experiments.motions import steps_reference
+from malta.machines.halbach.experiments import steps_reference
 from malta.machines.planar import commutation, field
 from malta.machines.planar import plant as planar
-from malta.machines.planar.experiments.models import compile_function
-from malta.machines.planar.experiments.motions import CELLS
+from malta.machines.planar.experiments import compile_function
+from malta.machines.planar.motions import CELLS
 from malta.machines.tubular import plant as tubular
 from malta.model.data import published_value
 from malta.simulation.engine.engines import engine_of, library_of

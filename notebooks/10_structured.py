@@ -20,7 +20,7 @@ from scipy import linalg
 import malta
 from malta import structured
 from malta.structured.loops import to_plane
-from malta.structured.reduction import split_integrals, truncate
+from malta.structured.riccati import split_integrals, truncate
 from malta.synthesis.controller import linear_law
 from malta.synthesis.state_space import System
 from malta.synthesis.structure import sample_law

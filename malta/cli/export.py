@@ -161,8 +161,8 @@ def _require_known(
 ) -> None:
     """Raise InputError for an option with a value that there is not, or that the form does not have."""
     from malta.firmware.exports import Until
+    from malta.firmware.fmu import Part
     from malta.firmware.program import Precision
-    from malta.firmware.unit import Part
 
     for name, value, known in (
         ("--to", to, ("c", "fmu")),

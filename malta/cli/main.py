@@ -19,13 +19,12 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from malta.cli.app import app as live_page
+from malta.cli.bench import commission, measure
 from malta.cli.campaign import campaign
 from malta.cli.claims import claims, schema
-from malta.cli.commission import commission
 from malta.cli.design import design, new, tune
 from malta.cli.export import export, pil
 from malta.cli.identification import excite, identify, learn, log, replay
-from malta.cli.measure import measure
 from malta.cli.output import interruption, print_error, print_note, silence
 from malta.cli.report import compare, plot, report
 from malta.cli.simulate import motion, simulate

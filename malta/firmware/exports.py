@@ -24,7 +24,7 @@ from malta.firmware.export import (
     sources,
     stand_in_context,
 )
-from malta.firmware.fmu import build_fmu
+from malta.firmware.fmu import Part, build_fmu
 from malta.firmware.program import Precision
 from malta.firmware.report import report_text
 from malta.firmware.ring import ring_of, ring_sources
@@ -42,7 +42,6 @@ from malta.firmware.signals import (
 from malta.firmware.step import programs_of
 from malta.firmware.supervisor import MONITORS, STATES, TIMES, monitors_of
 from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
-from malta.firmware.unit import Part
 from malta.firmware.vectors import SAMPLES, Vector, record_vectors, trial_context
 from malta.gains.file import content_of, read
 from malta.model.data import plant_of

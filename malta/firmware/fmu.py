@@ -4,6 +4,12 @@ The archive has the sources, this computer's binary where there is a C compiler 
 model description with units and start values. The same gain file gives the same bytes: dates are fixed, and the token
 that ties binary and description together is the SHA-256 of the sources and the description. Python is not needed where
 an FMU runs.
+
+A unit of co-simulation: the controller, with its supervisor, its machine, or both, as variables and C without FMI.
+
+A step takes the inputs at its beginning and leaves the outputs at its end. A master that lets the controller step first
+hands its commands to the machine in the same sample, and the machine delays them (`late`). A master that lets both step
+at once adds a sample by itself: with a delay of one sample, `late` is 0 there.
 """
 
 from __future__ import annotations
@@ -11,24 +17,324 @@ from __future__ import annotations
 import hashlib
 import io
 import platform
+import re
 import struct
 import sys
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, replace
 from importlib.metadata import version
 from importlib.resources import files as resources
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 from xml.sax.saxutils import quoteattr
 
-from malta.errors import CheckError, InputError
-from malta.firmware.export import comment, render
+import casadi as ca
+import numpy as np
+
+from malta.errors import CheckError, InputError, on_one_line
+from malta.firmware.calibration import parameters_of
+from malta.firmware.ctext import c_name, c_number
+from malta.firmware.export import comment, render, sources
 from malta.firmware.flight import FLAGS
-from malta.firmware.signals import Target
-from malta.firmware.unit import Part, Unit, unit_of, unit_sources
+from malta.firmware.machine import (
+    Machine,
+    command_field,
+    machine_functions,
+    machine_sources,
+    noise_channels,
+    parameter_field,
+    reading_fields,
+    state_field,
+    wrench_fields,
+)
+from malta.firmware.signals import Field, Target, input_fields, output_fields, reference_fields
+from malta.firmware.supervisor import STATES
+from malta.firmware.supervisor_text import request_members, supervisor_sources
+from malta.model.plant import Signal
 from malta.processes import python_module
 from malta.simulation.engine.compiled import shared_library
+from malta.simulation.period import initial_state
 from malta.units import base_exponents, unit_factor
+
+Part = Literal["controller", "supervised", "machine", "loop"]
+PARTS: tuple[Part, ...] = get_args(Part)
+SWITCH = (0.0, 1.0)  # least and most of what is on or off
+COLD = Field("cold", (Signal("", "1"),), "1: starts without current, 0: with the currents that hold it")
+NOISE = Field("noise", (Signal("", "1"),), "of the sensors, in multiples of the machine's own")
+SEED = Field("seed", (Signal("", "1"),), "whole number, of the noise: that of simulations with this seed")
+FLYING = Field(
+    "flying", (Signal("", "1"),), "1: the machine flies at its reference at the start, 0: it rests"
+)
+LATE = Field("late", (Signal("", "1"),), "1: commands act a delay later, 0: at once")
+LARGEST = 1e30  # of a parameter without a limit
+MOST_NOISE, MOST_SEED = 1e6, 2.0**53
+_WORDS = ("valid ", "refused ", "limited ")  # before the names of signals that belong to others
+
+
+class Variable(NamedTuple):
+    """A variable of a unit; its place among the others is its value reference."""
+
+    name: str
+    causality: str
+    variability: str
+    unit: str
+    start: float | None
+    description: str
+    reference: int
+    least: float | None = None  # of a parameter that has a range
+    most: float | None = None
+
+    @property
+    def initial(self) -> str:
+        """How the variable begins; "" where its causality says it."""
+        return {"parameter": "exact", "output": "calculated", "local": "calculated"}.get(self.causality, "")
+
+    @property
+    def role(self) -> str:
+        """One letter for the C text: t time, i input, p parameter, q one that may change, o output or local."""
+        letters = {
+            "independent": "t",
+            "input": "i",
+            "parameter": "q" if self.variability == "tunable" else "p",
+        }
+        return letters.get(self.causality, "o")
+
+
+class Group(NamedTuple):
+    """A field as variables."""
+
+    field: Field
+    causality: str
+    variability: str
+    start: Any = None  # numbers, or one for all
+    least: Any = None  # of parameters, likewise
+    most: Any = None
+
+
+class Unit(NamedTuple):
+    """A part of the loop as a unit; the names begin the names of its C files."""
+
+    target: Target
+    part: Part
+    variables: tuple[Variable, ...]
+    at: dict[str, int]  # value reference of each group's first variable
+    name: str
+    machine: Machine | None  # None for a controller alone
+
+    @property
+    def has_controller(self) -> bool:
+        return self.part != "machine"
+
+    @property
+    def is_supervised(self) -> bool:
+        return self.part == "supervised"
+
+
+def unit_of(t: Target, part: Part) -> Unit:
+    """A unit and its variables. Raises InputError for an unknown part."""
+    if part not in PARTS:
+        raise InputError("export", "part", repr(part), "one of " + ", ".join(PARTS))
+    m = Machine(t) if part in ("machine", "loop") and not t.look_ups else None
+    if part in ("machine", "loop") and m is None:
+        found = f"a {t.believed.name} whose currents come from a table"
+        raise InputError("export", part, found, "the controller alone, or a coil model without a table")
+    variables = [Variable("time", "independent", "continuous", "s", None, "simulation time", 0)]
+    at: dict[str, int] = {}
+    for group in _groups(t, part, m):
+        at[group.field.name] = len(variables)
+        size = group.field.size
+        numbers = (np.broadcast_to(v, size) for v in (group.start, group.least, group.most))
+        for signal, label, *known in zip(group.field.signals, _labels(group.field), *numbers, strict=True):
+            start, least, most = (None if v is None else float(v) for v in known)
+            variables.append(
+                Variable(
+                    label,
+                    group.causality,
+                    group.variability,
+                    "" if signal.unit == "SI" else signal.unit,
+                    start,
+                    on_one_line(f"{group.field.meaning}{': ' if signal.name else ''}{signal.name}"),
+                    len(variables),
+                    least,
+                    most,
+                )
+            )
+    return Unit(t, part, tuple(variables), at, c_name(t.controller.name), m)
+
+
+def _groups(t: Target, part: Part, m: Machine | None) -> Iterator[Group]:
+    """The fields of a part in the order of their value references: inputs, parameters, outputs, what is inside."""
+    if part != "machine":
+        for f in reference_fields(t):
+            yield Group(f._replace(name=f"{f.name}_ref"), "input", "continuous", 0.0)
+    if part == "supervised":
+        yield Group(request_field(), "input", "discrete", 0.0)
+    if m is None:
+        for f in input_fields(t):
+            valid = f.name.endswith("_valid")
+            start = 1.0 if valid else t.believed.drive.link_voltage if f.name == "link" else 0.0
+            yield Group(f, "input", "discrete" if valid else "continuous", start)
+    elif part == "machine":
+        yield Group(command_field(t), "input", "discrete", _command_at_rest(m))
+    for f in wrench_fields(m) if m is not None else []:
+        yield Group(f, "input", "continuous", 0.0)
+    if part == "supervised":
+        yield Group(FLYING, "parameter", "fixed", 0.0, *SWITCH)
+        rest = Field("rest", t.controller.measurements, "readings of the machine where it lands, if it flies")
+        yield Group(rest, "parameter", "fixed", 0.0)
+    if m is not None:
+        yield from _machine_parameters(m, part)
+    for p in parameters_of(t):
+        yield Group(p.field, "parameter", "tunable", p.values, p.least, p.most)
+    if part != "machine":
+        for f in output_fields(t):
+            yield Group(f, "output", "discrete")
+    if part == "supervised":
+        yield Group(supervision_field(), "output", "discrete")
+    for f in reading_fields(m) if m is not None else []:
+        yield Group(f, "local" if f.name == "x" else "output", "continuous")
+
+
+def _machine_parameters(m: Machine, part: Part) -> Iterator[Group]:
+    """How a machine starts, with what noise, and what it is."""
+    if part == "machine":
+        yield Group(state_field(m, "x_start", "at the start"), "parameter", "fixed", _at_rest(m))
+        yield Group(COLD, "parameter", "fixed", 0.0, *SWITCH)
+        if m.setup.delay:
+            yield Group(LATE, "parameter", "fixed", 1.0, *SWITCH)
+    else:
+        meaning = "at the start, beyond what the reference gives"
+        yield Group(state_field(m, "offset", meaning), "parameter", "fixed", 0.0)
+    if noise_channels(m):
+        yield Group(NOISE, "parameter", "tunable", 0.0, 0.0, MOST_NOISE)
+        yield Group(SEED, "parameter", "fixed", 0.0, 0.0, MOST_SEED)
+    values = [getattr(m.plant.parameters, name) for name in m.parameters]
+    least, most = zip(*(_range(m, name) for name in m.parameters), strict=True)
+    yield Group(parameter_field(m), "parameter", "tunable", values, least, most)
+
+
+def _range(m: Machine, name: str) -> tuple[float, float]:
+    """The least and the largest value of a parameter that its record accepts."""
+    known = next(f.metadata for f in fields(m.plant.parameters) if f.name == name)
+    above, least, below = (known[key] for key in ("above", "at_least", "below"))
+    if above is not None:
+        least = np.finfo(float).tiny if above == 0 else np.nextafter(above, np.inf)
+    most = LARGEST if below is None else np.nextafter(below, -np.inf)
+    return float(-LARGEST if least is None else least), float(most)
+
+
+def request_field() -> Field:
+    """What a supervisor is asked for, beside its reference."""
+    members = [member for member in request_members() if member.kind == "int32_t"]
+    return Field("request", tuple(Signal(member.name, "1") for member in members), "request")
+
+
+def supervision_field() -> Field:
+    """What a supervisor says."""
+    words = ", ".join(f"{k} {state.lower()}" for k, state in enumerate(STATES))
+    names = ("state", "enable", "monitor", "reaction")
+    return Field("supervisor", tuple(Signal(name, "1") for name in names), f"states: {words}")
+
+
+def _labels(field: Field) -> list[str]:
+    """The names of a field's variables, as `y.z`; numbers as `y[1]` where names of signals do not serve."""
+    if field.size == 1 and not field.signals[0].name:
+        return [field.name]
+    labels = []
+    for s in field.signals:
+        text = s.name.rstrip("'").removesuffix("*")
+        for word in _WORDS:
+            text = text.removeprefix(word)
+        labels.append(re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_"))
+    if len(set(labels)) < len(labels) or any(not label or label[0].isdigit() for label in labels):
+        return [f"{field.name}[{k}]" for k in range(1, field.size + 1)]
+    return [f"{field.name}.{label}" for label in labels]
+
+
+def _at_rest(m: Machine) -> list[float]:
+    """The states that a reference of zero gives."""
+    place = machine_functions(m)["place"]
+    zeros = [ca.DM.zeros(place.size1_in(k)) for k in range(place.n_in())]
+    return [float(v) for v in np.array(place(*zeros)).ravel()]
+
+
+def _command_at_rest(m: Machine) -> list[float]:
+    """The commands that hold the machine there."""
+    plant, c = m.plant, m.target.controller
+    x = ca.DM(_at_rest(m))
+    z = float(x[plant.stroke_state]) if plant.has_stroke else 0.0
+    current = plant.currents(plant.h(x, 0), ca.DM(c.feedforward.at(z)))
+    whole = initial_state(plant, c, replace(m.setup, delay=1), x, ca.DM.zeros(len(c.states)), current)
+    held = command_field(m.target).size
+    return [float(v) for v in np.array(ca.evalf(whole[-held:])).ravel()]
+
+
+def unit_sources(u: Unit, sha256: str, token: str) -> dict[str, str]:
+    """The C files of a unit by name, without those of an interface. sha256 : of the gain file; token : of the unit"""
+    files: dict[str, str] = {}
+    if u.has_controller:
+        files |= sources(u.target, sha256, f"{u.name}_controller")
+    if u.is_supervised:
+        files |= supervisor_sources(u.target, f"{u.name}_controller")
+    if u.machine is not None:
+        more = ("place", "shift") if u.has_controller else ()
+        files |= machine_sources(u.machine, f"{u.name}_machine", ("begin", "substep", "read", *more))
+    context = _library_context(u, token)
+    return files | {f"unit.{end}": render(f"fmu_unit.{end}", context) for end in ("h", "c")}
+
+
+def _library_context(u: Unit, token: str) -> dict[str, Any]:
+    t, c, m = u.target, u.target.controller, u.machine
+    roles = "".join(v.role for v in u.variables)
+    starts = [c_number(v.start or 0.0, "double") for v in u.variables]
+    inputs = [f for f in input_fields(t) if f.size]
+
+    def places(fields: list[Field], suffix: str = "") -> list[dict[str, Any]]:
+        return [
+            {"field": f.name, "at": u.at.get(f.name + suffix, 0), "size": f.size, "name": f.name}
+            for f in fields
+            if f.size
+        ]
+
+    checked = [] if m is None else wrench_fields(m) + ([] if u.has_controller else [command_field(t)])
+    return {
+        "title": comment(c.name),
+        "version": version("malta"),
+        "name": f"{u.name}_controller",
+        "plant": f"{u.name}_machine",
+        "token": token,
+        "NAME": f"{u.name}_controller".upper(),
+        "controller": u.has_controller,
+        "supervised": u.is_supervised,
+        "tunable": t.tunable,
+        "tuned": places([p.field for p in parameters_of(t)]),
+        "default_record": f"{u.name}_controller_default_parameters",
+        "requests": [signal.name for signal in request_field().signals],
+        "supervision": [signal.name for signal in supervision_field().signals],
+        "limits": [(v.reference, v.least, v.most) for v in u.variables if v.least is not None],
+        "noises": 0 if m is None else noise_channels(m),
+        "rests": len(c.measurements),
+        "machine": m is not None,
+        "variables": u.variables,
+        "at": u.at,
+        "sample_time": c_number(c.sample_time, "double"),
+        "roles": [roles[k : k + 80] for k in range(0, len(roles), 80)],
+        "starts": ",\n".join("  " + ", ".join(starts[k : k + 8]) for k in range(0, len(starts), 8)),
+        "one": c_number(1.0, t.precision),
+        "reference": places(reference_fields(t), "_ref"),
+        "inputs": places(inputs),
+        "outputs": places(output_fields(t)),
+        "readings": [] if m is None else places(reading_fields(m)),
+        "checked": places(checked),
+        "states": len(t.believed.states),
+        "filtered": len(c.states),
+        "currents": sum(f.size for f in inputs if f.name == "i"),
+        "volts": 0 if m is None else m.sizes.controller.get("u_integral", 0),
+        "wrench": 0 if m is None else sum(f.size for f in wrench_fields(m)),
+        "delay": 0 if m is None else m.setup.delay,
+    } | ({} if m is None else {"at": u.at | {"command": u.at[command_field(t).name]}})
+
 
 # Binaries of an FMU for other computers than this one: which there are, and the cross compiler of ziglang.
 

@@ -19,7 +19,6 @@ from malta.firmware.calibration import FNV_FACTOR, FNV_START
 from malta.firmware.ctext import c_number
 from malta.firmware.export import FUSED, call_text, piece_records, readings_at_rest
 from malta.firmware.program import TYPES, Program, evaluate
-from malta.firmware.sensor_loss import expected_readings
 from malta.firmware.signals import (
     Target,
     input_fields,
@@ -40,6 +39,7 @@ from malta.firmware.supervisor import (
     State,
     absent_monitors,
     bounds_of,
+    expected_readings,
     monitors_of,
     reference_limits,
 )

@@ -22,7 +22,7 @@ from malta.identification.response import (
 )
 from malta.model.equilibrium import trim
 from malta.model.plant import outputs_at
-from malta.simulation.excitation import Multisine, interleaved_multisine
+from malta.simulation.inputs import Multisine, interleaved_multisine
 
 if TYPE_CHECKING:
     from malta.loops.loop import Loop

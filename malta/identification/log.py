@@ -14,7 +14,7 @@ from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.model.plant import Signal, readonly
 from malta.simulation.current_control import reading_errors
-from malta.simulation.excitation import Multisine
+from malta.simulation.inputs import Multisine
 from malta.simulation.layout import Loop
 from malta.simulation.simulate import prepare
 

@@ -17,7 +17,7 @@ from malta.identification.log import Log, reference_spline, require_same_law, sa
 from malta.identification.response import acting
 from malta.model.data import plant_of
 from malta.model.parameters import twins_of
-from malta.simulation.engine.sample_loop import Loop, loop_of
+from malta.simulation.engine.engines import Loop, loop_of
 from malta.simulation.inputs import Inputs, initial_values, sample_inputs
 from malta.simulation.layout import layout_of
 from malta.simulation.period import law_reference

@@ -9,6 +9,11 @@ A stabilizing K with |T_zw| < gamma exists exactly when X >= 0 and Y >= 0 solve
 with R = D1'D1 - diag(gamma^2, 0), D1 = [D11 D12], S = C1'D1 (Glover and Doyle, Systems & Control Letters 11 (1988);
 Zhou, Doyle and Glover, Robust and Optimal Control, theorem 17.1, whose letters these are). R is indefinite, which that
 of a regulator is not; so they are solved here, by an ordered Schur form of their Hamiltonian matrices.
+
+Laws of lower order: the states that matter least at input and output are left out, integrals are kept.
+
+Source: B. C. Moore, Principal component analysis in linear systems, IEEE Trans. Automat. Contr. 26(1), 1981; the bound
+of the error is that of D. F. Enns, CDC 1984, and K. Glover, Int. J. Control 39(6), 1984.
 """
 
 from __future__ import annotations
@@ -26,12 +31,14 @@ from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.processes import on_one_thread
 from malta.structured.norms import peak_gain
+from malta.synthesis.elements import CALLER
 from malta.synthesis.state_space import System
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
-CALLER = "h_infinity"
+
+H_INFINITY = "h_infinity"
 TOLERANCE = 1e-6  # relative, of the smallest gamma
 ABOVE = 1e-3  # relative: the law is that of a gamma so far above the smallest, where its numbers stay small
 RESIDUAL = 1e-6  # relative, of a Riccati equation
@@ -130,13 +137,13 @@ def h_infinity(plant: Any, outputs: int, inputs: int) -> Synthesized:
     p1, m1 = len(whole.D) - p2, whole.D.shape[1] - m2
     if min(p1, m1, p2, m2) < 1:
         found = f"{len(whole.D)} outputs and {whole.D.shape[1]} inputs"
-        raise InputError(CALLER, "plant", found, f"more than {p2} outputs and {m2} inputs")
+        raise InputError(H_INFINITY, "plant", found, f"more than {p2} outputs and {m2} inputs")
     own = whole.balanced
     problem, back = _normal(own, p2, m2)
     best = _smallest(problem)
     solved = _solve(problem, best * (1 + ABOVE))
     if solved is None:
-        raise CheckError(f"{CALLER}: the equations have no solution just above gamma = {best:.6g}")
+        raise CheckError(f"{H_INFINITY}: the equations have no solution just above gamma = {best:.6g}")
     law = back(_central(problem, solved))
     norm, w = _checked(own, law, p2, m2, solved.gamma)
     return Synthesized(law, best, norm, w, solved.coupling, solved.residual)
@@ -145,7 +152,7 @@ def h_infinity(plant: Any, outputs: int, inputs: int) -> Synthesized:
 def _system_of(plant: Any) -> System:
     """A, B, C and D of a continuous system. Raises InputError."""
     if getattr(plant, "dt", None) not in (None, 0):
-        raise InputError(CALLER, "plant", f"a sample time of {plant.dt} s", "a continuous system")
+        raise InputError(H_INFINITY, "plant", f"a sample time of {plant.dt} s", "a continuous system")
     given = (plant.A, plant.B, plant.C, plant.D) if hasattr(plant, "A") else plant
     try:
         found = System(*(np.atleast_2d(np.asarray(M, dtype=float)) for M in given))
@@ -156,7 +163,7 @@ def _system_of(plant: Any) -> System:
     except (TypeError, ValueError):
         fits = False
     if not fits or not all(np.isfinite(M).all() for M in found):
-        raise InputError(CALLER, "plant", "matrices that do not fit, or no numbers", "A, B, C and D")
+        raise InputError(H_INFINITY, "plant", "matrices that do not fit, or no numbers", "A, B, C and D")
     return found
 
 
@@ -171,13 +178,13 @@ def _normal(whole: System, p2: int, m2: int) -> tuple[_Problem, Callable[[System
     U, s, V = np.linalg.svd(D12)
     if p1 < m2 or not s.min() > RANK * max(s.max(), 1e-300):
         raise InputError(
-            CALLER, "D12", "an input u that z does not weigh at once", "a weight of every input u"
+            H_INFINITY, "D12", "an input u that z does not weigh at once", "a weight of every input u"
         )
     of_z, of_u = np.roll(U, -m2, axis=1).T, V.T / s  # of_z D12 of_u = [0; 1]
     U, s, V = np.linalg.svd(D21)
     if m1 < p2 or not s.min() > RANK * max(s.max(), 1e-300):
         raise InputError(
-            CALLER, "D21", "an output y that w does not reach at once", "noise of every output y"
+            H_INFINITY, "D21", "an output y that w does not reach at once", "noise of every output y"
         )
     of_w, of_y = np.roll(V.T, -p2, axis=1), (U / s).T  # of_y D21 of_w = [0 1]
     problem = _Problem(
@@ -255,7 +262,7 @@ def _smallest(p: _Problem) -> float:
         high *= 4
         if high > LARGEST:
             wanted = "a plant that u stabilizes and y shows, without zeros on the imaginary axis"
-            raise InputError(CALLER, "plant", f"no law up to gamma = {LARGEST:.0e}", wanted)
+            raise InputError(H_INFINITY, "plant", f"no law up to gamma = {LARGEST:.0e}", wanted)
     low = high / 4
     while low > 1e-12 and _solve(p, low) is not None:
         low, high = low / 4, low
@@ -293,7 +300,7 @@ def lower_loop(P: System, K: System, p2: int, m2: int) -> System:
     try:
         inner = np.linalg.inv(np.eye(m2) - K.D @ D22)
     except np.linalg.LinAlgError as error:
-        raise CheckError(f"{CALLER}: the loop has no solution at infinite frequency") from error
+        raise CheckError(f"{H_INFINITY}: the loop has no solution at infinite frequency") from error
     of_x, of_k, of_w = inner @ K.D @ C2, inner @ K.C, inner @ K.D @ D21
     return System(
         np.block([[A + B2 @ of_x, B2 @ of_k], [K.B @ (C2 + D22 @ of_x), K.A + K.B @ D22 @ of_k]]),
@@ -308,10 +315,10 @@ def _checked(P: System, K: System, p2: int, m2: int, gamma: float) -> tuple[floa
     closed = lower_loop(P, K, p2, m2)
     growth = float(np.linalg.eigvals(closed.A).real.max(initial=-math.inf))
     if not growth < 0:
-        raise CheckError(f"{CALLER}: the closed loop has a pole with Re = {growth:.3g} 1/s")
+        raise CheckError(f"{H_INFINITY}: the closed loop has a pole with Re = {growth:.3g} 1/s")
     norm, w = peak_gain(closed)
     if not norm <= gamma * (1 + 1e-4):
-        raise CheckError(f"{CALLER}: the closed loop has a peak of {norm:.6g}, gamma is {gamma:.6g}")
+        raise CheckError(f"{H_INFINITY}: the closed loop has a peak of {norm:.6g}, gamma is {gamma:.6g}")
     return norm, w
 
 
@@ -434,3 +441,52 @@ def shape_loop(plant: Any, before: Any = 1.0, after: Any = 1.0) -> Synthesized:
     whole = control.ss(system(before) * whole * system(after))
     coupling = float(np.abs(np.linalg.eigvals(X @ Z)).max(initial=0.0)) / (gamma**2 - 1)
     return Synthesized(System.of(whole), best, norm, w, coupling, max(x[1], z[1]))
+
+
+SLOW = 1.0  # rad/s: a pole below counts as an integral
+
+
+def split_integrals(law: System) -> tuple[System, System]:
+    """Split a continuous law into its integrals, with their poles at 0, and the rest, with D.
+
+    Poles below 1 rad/s count as integrals. The sum of both is the law, but for these poles.
+
+    >>> from malta.synthesis.state_space import System
+    >>> import numpy as np
+    >>> law = System(np.diag([0.0, -10.0]), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1)))
+    >>> integrals, rest = split_integrals(law)
+    >>> integrals.A.tolist(), rest.A.round(6).tolist()
+    ([[0.0]], [[-10.0]])
+    """
+    A, B, C, D = law.balanced
+    S, Z, k = linalg.schur(A, sort=lambda re, im: bool(np.hypot(re, im) < SLOW))
+    V = Z.copy()
+    V[:, k:] += Z[:, :k] @ linalg.solve_sylvester(S[:k, :k], -S[k:, k:], -S[:k, k:])
+    A, B, C = np.linalg.solve(V, A @ V), np.linalg.solve(V, B), C @ V
+    return System(0 * A[:k, :k], B[:k], C[:, :k], 0 * D), System(A[k:, k:], B[k:], C[:, k:], D)
+
+
+def truncate(law: System, order: int) -> System:
+    """Leave out states of a stable law, those of the smallest Hankel singular values sigma: balanced truncation.
+
+        |G - G_r| <= 2 (sigma_(order+1) + ... + sigma_n)
+
+    Raises InputError for an unstable law, and for an order that it does not have.
+
+    >>> from malta.synthesis.state_space import System
+    >>> import numpy as np
+    >>> law = System(np.diag([-1.0, -100.0]), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1)))
+    >>> truncate(law, 1).A.round(2).tolist()
+    [[-1.02]]
+    """
+    A, B, C, D = law
+    if not 0 <= order <= len(A):
+        raise InputError(CALLER, "order", str(order), f"0 to {len(A)}, of the law")
+    if len(A) and not np.linalg.eigvals(A).real.max() < 0:
+        raise InputError(CALLER, "law", "an unstable one", "a stable one: split off its integrals")
+    P = linalg.cholesky(linalg.solve_continuous_lyapunov(A, -B @ B.T), lower=True)
+    Q = linalg.cholesky(linalg.solve_continuous_lyapunov(A.T, -C.T @ C), lower=True)
+    U, sizes, V = linalg.svd(Q.T @ P)
+    left = (U[:, :order] / np.sqrt(sizes[:order])).T @ Q.T
+    right = P @ V[:order].T / np.sqrt(sizes[:order])
+    return System(left @ A @ right, left @ B, C @ right, D)

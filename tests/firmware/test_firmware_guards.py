@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from exported import HERE, PRECISIONS, require, run, run_test, target, texts, write_folder
 
+from malta.firmware.fmu import unit_of, unit_sources
 from malta.firmware.program import Precision
-from malta.firmware.unit import unit_of, unit_sources
 
 FUSED = re.compile(r"^\s+v(?:fn?m(?:add|sub)|fn?m[as]\.)", re.MULTILINE)  # of x86, and of Arm
 M7 = ("-mcpu=cortex-m7", "-mthumb", "-mfpu=fpv5-d16", "-mfloat-abi=hard")

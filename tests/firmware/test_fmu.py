@@ -21,13 +21,12 @@ import malta
 from malta.errors import InputError
 from malta.firmware import fmu as module
 from malta.firmware.flight import FLAGS
-from malta.firmware.fmu import build_fmu
+from malta.firmware.fmu import PARTS, Part, build_fmu, unit_of
 from malta.firmware.machine import Machine, command_field
 from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of
-from malta.firmware.supervised import NUMBERS, Flown, Requests, supervised_engine
 from malta.firmware.supervisor import MONITORS, STATES
-from malta.firmware.unit import PARTS, Part, unit_of
+from malta.firmware.supervisor_text import NUMBERS, Flown, Requests, supervised_engine
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.simulation import references
 from malta.simulation.engine.compiled import compiler

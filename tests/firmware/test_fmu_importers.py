@@ -20,7 +20,7 @@ from libcosimpy.CosimObserver import CosimObserver
 from libcosimpy.CosimSlave import CosimLocalSlave
 from test_fmu import Unit, content, target
 
-from malta.firmware.unit import PARTS, Part
+from malta.firmware.fmu import PARTS, Part
 
 SAMPLES = 60
 

@@ -18,14 +18,12 @@ from test_firmware import WARNINGS
 
 import malta
 from malta.errors import InputError
-from malta.firmware import supervised
+from malta.firmware import supervisor_text
 from malta.firmware.export import phase_currents, sources
 from malta.firmware.flight import call, compile_controller, new_state, view
 from malta.firmware.program import Precision
 from malta.firmware.report import UNWATCHED, watch_lines, watch_table
-from malta.firmware.sensor_loss import expected_readings, gains_without, prediction_correction
 from malta.firmware.signals import Target, fidelity_of
-from malta.firmware.supervised import NUMBERS, compile_supervised
 from malta.firmware.supervisor import (
     FLYING,
     LONG,
@@ -36,11 +34,21 @@ from malta.firmware.supervisor import (
     TRANSITIONS,
     State,
     bounds_of,
+    expected_readings,
+    gains_without,
     monitors_of,
+    prediction_correction,
     reference_limits,
     touch_bounds,
 )
-from malta.firmware.supervisor_text import _NUMBERS, monitor_lines, supervisor_members, supervisor_sources
+from malta.firmware.supervisor_text import (
+    _NUMBERS,
+    NUMBERS,
+    compile_supervised,
+    monitor_lines,
+    supervisor_members,
+    supervisor_sources,
+)
 from malta.machines.tubular.experiments.faults import SOFT
 from malta.simulation.engine.compiled import compiler
 
@@ -848,7 +856,7 @@ def test_every_cell_of_the_table_of_monitors_has_a_reaction_or_a_reason(name: st
 
 
 def test_it_says_so_where_there_is_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervised, "compiler", lambda: None)
+    monkeypatch.setattr(supervisor_text, "compiler", lambda: None)
     c = TARGETS["robust"].controller
     with pytest.raises(InputError, match="expected a C compiler: cc"):
         malta.experiment("commissioning", malta.plant_of(c.parameters), c)

@@ -22,7 +22,7 @@ from malta.identification.prediction import Noise, predict
 from malta.identification.response import ResponseModel
 from malta.identification.spectra import spectrum_of, straightened
 from malta.machines.tubular.plant import plant as tubular
-from malta.simulation.excitation import interleaved_multisine
+from malta.simulation.inputs import interleaved_multisine
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant

@@ -27,8 +27,8 @@ from malta.machines.halbach import electronics as motor
 from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.electronics import IDEAL, Options
 from malta.machines.halbach.evidence import Evidence, open_loop_dip, rise_of_dip
-from malta.machines.halbach.experiments.motions import steps_reference
-from malta.machines.halbach.experiments.open_loop import (
+from malta.machines.halbach.experiments import steps_reference
+from malta.machines.halbach.open_loop import (
     FAULTS,
     LAWS,
     fit_servo,

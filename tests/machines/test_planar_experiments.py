@@ -16,12 +16,11 @@ from scipy.integrate import solve_ivp
 
 import malta
 from malta.machines.planar import claims as claims
-from malta.machines.planar import commutation, field
+from malta.machines.planar import commutation, field, motions
 from malta.machines.planar import experiments as experiments
+from malta.machines.planar import experiments as timings
+from malta.machines.planar import motions as jumps
 from malta.machines.planar import plant as planar
-from malta.machines.planar.experiments import models, motions
-from malta.machines.planar.experiments import models as timings
-from malta.machines.planar.experiments import motions as jumps
 from malta.margins.loop_report import LoopReport
 from malta.model.data import published as read_published
 from malta.model.data import published_value
@@ -333,7 +332,7 @@ def test_errors_of_the_models(flown: dict[str, Experiment], paper: dict[str, Any
 def test_amplitudes_and_step_of_the_table(flown: dict[str, Experiment]) -> None:
     """12.40 and 24.70 N; tau_n / 10 errs by 0.155 N, and four times less with every halving."""
     e = flown["errors"]
-    found, n = merits(e), models.NODES
+    found, n = merits(e), experiments.NODES
     assert found["F_x, amplitude"] == pytest.approx(12.39, abs=0.1)
     assert found["F_z, amplitude"] == pytest.approx(24.7, abs=0.1)
     assert found["fitted C of the analytical model"] == pytest.approx(1.138, abs=1e-3)
@@ -351,7 +350,7 @@ def test_coils_further_apart_have_the_torques_that_the_paper_prints(paper: dict[
     """22/3 tau_n: 1.615, 1.615 and 1.604 N m at 3 A, 4, 5 and 13 % below; the arm of F_z is half the pitch, 65 mm."""
     par: Any = malta.read("data/planar.toml", preset="pitch_22_3")
     x, y = np.meshgrid(*[np.linspace(0, 2 * par.tau_n, 141)] * 2, indexing="ij")
-    found = np.abs(models.coil_wrench(par, field.exact_model(par), 3.0, x, y)).max(axis=(0, 1))
+    found = np.abs(experiments.coil_wrench(par, field.exact_model(par), 3.0, x, y)).max(axis=(0, 1))
     assert found[3:] == pytest.approx([1.6152, 1.6152, 1.6041], abs=1e-3)
     printed = [published_value(paper, f"model.amplitude.{name}") for name in ("F_z", "T_x")]
     assert printed[1] / printed[0] == pytest.approx(par.coil_pitch / 2, rel=0.01)
@@ -366,7 +365,9 @@ def test_a_coil_off_the_centre_has_arms(lqg: Design) -> None:
     column = commutation.wrench_matrix(par, model, centre)[
         :, 10
     ]  # the third of the third row: half a pitch along both
-    np.testing.assert_allclose(models.coil_wrench(par, model, 2.0, x, y)[0], 2 * column, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        experiments.coil_wrench(par, model, 2.0, x, y)[0], 2 * column, rtol=0, atol=1e-11
+    )
 
 
 # --- Delay and time ---

@@ -14,10 +14,9 @@ from test_unusual_exports import passes
 import malta
 from malta.errors import CheckError, InputError
 from malta.firmware.flight import view
-from malta.firmware.sensor_loss import prediction_correction
 from malta.firmware.signals import Target
-from malta.firmware.supervised import Flown, Interference, Requests, supervised_engine
-from malta.firmware.supervisor import STATES
+from malta.firmware.supervisor import STATES, prediction_correction
+from malta.firmware.supervisor_text import Flown, Interference, Requests, supervised_engine
 from malta.margins.verify import controller_poles
 from malta.synthesis.controller import law
 from malta.synthesis.pid import pid

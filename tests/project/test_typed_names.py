@@ -15,11 +15,10 @@ from malta.campaigns.limits import EVENTS, merits_of
 from malta.campaigns.plan import SAMPLERS, Law
 from malta.campaigns.run import campaign
 from malta.cli import main as cli
-from malta.cli.documents.published import ALL_SCHEMAS
+from malta.cli.claims import ALL_SCHEMAS
 from malta.cli.options import GENERAL
 from malta.cli.report import KINDS
-from malta.firmware.fmu import PLATFORMS, platforms_named
-from malta.firmware.unit import PARTS
+from malta.firmware.fmu import PARTS, PLATFORMS, platforms_named
 from malta.model.machines import machine, machine_names
 from malta.model.parameters import units_of
 from malta.simulation.engine.engines import EngineChoice

@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from malta.simulation.engine import sample_loop
-from malta.simulation.engine.sample_loop import BLOCK, Loop, loop_of
+from malta.simulation.engine import engines
+from malta.simulation.engine.engines import SAMPLES_AT_ONCE, Loop, loop_of
 
 
 def damped() -> Loop:
@@ -18,12 +18,12 @@ def damped() -> Loop:
 
 
 @pytest.mark.parametrize("compiles", [True, False])
-@pytest.mark.parametrize("samples", [1, BLOCK, 2 * BLOCK + 7])
+@pytest.mark.parametrize("samples", [1, SAMPLES_AT_ONCE, 2 * SAMPLES_AT_ONCE + 7])
 def test_rows_are_those_of_a_plain_loop(
     samples: int, compiles: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not compiles:
-        monkeypatch.setattr(sample_loop, "library", lambda *_, **__: None)
+        monkeypatch.setattr(engines, "library", lambda *_, **__: None)
     u = np.random.default_rng(0).standard_normal((samples, 2))
     x, rows = np.array([0.1, -0.2]), []
     for one in u:

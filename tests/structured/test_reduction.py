@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import linalg
 
 import malta
-from malta.structured.reduction import split_integrals, truncate
+from malta.structured.riccati import split_integrals, truncate
 from malta.synthesis.state_space import System
 
 

@@ -30,7 +30,7 @@ from malta.machines.halbach.evidence import (
     samples_of_range,
 )
 from malta.machines.halbach.evidence import evidence as evidence
-from malta.machines.halbach.experiments.open_loop import FAULTS, LAWS, positions_at_rest
+from malta.machines.halbach.open_loop import FAULTS, LAWS, positions_at_rest
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import read
 from malta.report.ledger import (

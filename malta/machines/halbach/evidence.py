@@ -11,8 +11,8 @@ import numpy as np
 
 from malta.machines.halbach import electronics
 from malta.machines.halbach import electronics as motor
-from malta.machines.halbach.experiments.motions import COUNT, PAUSE, STEP, responses
-from malta.machines.halbach.experiments.open_loop import (
+from malta.machines.halbach.experiments import COUNT, PAUSE, STEP, responses
+from malta.machines.halbach.open_loop import (
     LAWS,
     MOVE,
     move_reference,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.machines.halbach.experiments.motions import BEFORE, PAUSE, responses
-from malta.machines.halbach.experiments.open_loop import (
+from malta.machines.halbach.experiments import BEFORE, PAUSE, responses
+from malta.machines.halbach.open_loop import (
     AFTER,
     CALM,
     FAULTS,

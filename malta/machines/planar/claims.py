@@ -27,7 +27,7 @@ from malta.machines.planar.evidence import (
     symmetric_deviation,
 )
 from malta.machines.planar.evidence import evidence as evidence
-from malta.machines.planar.experiments.motions import AHEAD, DESIGNED, LINEAR, SOFT
+from malta.machines.planar.motions import AHEAD, DESIGNED, LINEAR, SOFT
 from malta.report.ledger import (
     ZONE_NOTE,
     Row,

@@ -12,8 +12,8 @@ import numpy as np
 from malta.machines.planar import commutation
 from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
-from malta.machines.planar.experiments.models import CURRENT, coil_wrench
-from malta.machines.planar.experiments.motions import SOFT, jump, steps_ahead
+from malta.machines.planar.experiments import CURRENT, coil_wrench
+from malta.machines.planar.motions import SOFT, jump, steps_ahead
 from malta.margins.loop_report import LoopReport
 from malta.model.data import published_value
 from malta.report.ledger import (

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from malta.simulation.scenario import ESTIMATORS, Scenario
-from malta.simulation.start_up import fits_kalman_filter
+from malta.simulation.simulate import fits_kalman_filter
 from malta.simulation.trajectory import stroke_figures
 from malta.synthesis.requirements import (
     SEEDS,

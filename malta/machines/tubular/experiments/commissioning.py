@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
-from malta.firmware.supervised import NUMBERS, Flown, Requests, require_compiler, supervised_engine
 from malta.firmware.supervisor import FLYING, State
+from malta.firmware.supervisor_text import NUMBERS, Flown, Requests, require_compiler, supervised_engine
 from malta.machines.tubular.experiments.faults import (
     AT,
     SOFT,

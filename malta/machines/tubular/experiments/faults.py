@@ -18,7 +18,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.firmware.flight import view
-from malta.firmware.supervised import (
+from malta.firmware.supervisor_text import (
     NUMBERS,
     Flown,
     Interference,

@@ -30,7 +30,7 @@ from malta.simulation.experiments import (
 from malta.simulation.experiments.bounds import reach, recoverable
 from malta.simulation.references import Motion, Reference
 from malta.simulation.scenario import ESTIMATORS, Scenario
-from malta.simulation.start_up import fits_kalman_filter
+from malta.simulation.simulate import fits_kalman_filter
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 

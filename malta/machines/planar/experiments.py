@@ -1,4 +1,15 @@
-"""Errors of the planar motor's coil models."""
+"""The experiments on the planar motor.
+
+step     the paper's steps in z and y, Figs 9 to 12, as quintics, with each coil model in the controller
+jump     the same as the paper commands them, jumps that saturate, with gains that settle
+errors   errors of the coil models against the exact wrench, Figs 7, 8 and 13
+delay    filters with the sample of computation in their model, and without
+timing   K(p) and its pseudo-inverse within the control period, Table 2
+
+The coil models are the controller's; the simulated machine always has the exact wrench of the field.
+
+Errors of the planar motor's coil models.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +26,21 @@ import numpy as np
 from malta.errors import InputError
 from malta.machines.planar import commutation, field
 from malta.machines.planar import plant as planar
-from malta.machines.planar.experiments.motions import CELLS, FORCES, PLACE, parameters_of, with_coil_model
+from malta.machines.planar.motions import (
+    CELLS,
+    FORCES,
+    PLACE,
+    delay,
+    jump,
+    parameters_of,
+    step,
+    step_cases,
+    with_coil_model,
+)
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.engine import compiled as engine
-from malta.simulation.experiments import (
-    Experiment,
-    Merit,
-    PlannedRun,
-    Progress,
-    fly,
-    fly_all,
-    scenario_of,
-)
+from malta.simulation.experiments import Experiment, Merit, PlannedRun, Progress, fly, fly_all, scenario_of
 from malta.simulation.layout import numbers_of
 from malta.simulation.period import period_of
 from malta.simulation.scenario import Scenario, setup_of
@@ -256,3 +269,36 @@ double timed(const double **given, int n, double *result, int calls) {
   return ((b.tv_sec - a.tv_sec) + 1e-9 * (b.tv_nsec - a.tv_nsec)) / calls;
 }
 """
+
+
+EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
+    "step": step,
+    "jump": jump,
+    "errors": errors,
+    "delay": delay,
+    "timing": timing,
+}
+CASES: dict[str, Callable[..., list[PlannedRun]]] = {
+    "step": step_cases
+}  # with the controller's own coil model
+FINDINGS = ("delay",)
+WORDS = {
+    "stroke": "y",
+    "m": "x and z",
+    "rad": "angles",
+    "thrust": "F_y",
+    "N": "F_x and F_z",
+    "N m": "torques",
+}
+OPTION_UNITS = {"place": "m", "gap": "m", "lift": "m", "distance": "m", "rate": "1/s", "current": "A"}
+
+
+def check(name: str, option: str, value: Any) -> None:
+    """Raise InputError for a number outside the range of an option. `steps_reference` checks positions."""
+    numbers = value if isinstance(value, tuple | list) else (value,)
+    if option == "rate" and not 0 <= value <= 1000:
+        raise InputError("simulate", f"{name}: rate", repr(value), "0 to 1000 1/s")
+    if option in ("cells", "speeds", "current") and not all(math.isfinite(v) and v > 0 for v in numbers):
+        raise InputError("simulate", f"{name}: {option}", repr(value), "finite, above 0")
+    if option == "cells" and value != int(value):
+        raise InputError("simulate", f"{name}: cells", repr(value), "a whole number")
