@@ -7,7 +7,8 @@ import io
 import math
 import re
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 LINES = 10  # of text, the title's included
 COLUMNS = 80
+FEW = 6  # numbers that stand in a row each
 PREFIXES = {-4: "p", -3: "n", -2: "u", -1: "m", 0: "", 1: "k", 2: "M", 3: "G"}
 PREFIXED = ("m", "rad", "s", "N", "A", "V", "W", "Hz", "N m")
 
@@ -64,28 +66,68 @@ class Description(NamedTuple):
         return f"<div><p><b>{html.escape(self.title)}</b></p><table>{rows}</table>{picture}</div>"
 
 
-class Described(Protocol):
-    """A record that can say what it is."""
-
-    @property
-    def description(self) -> Description: ...
-
-
-T = TypeVar("T", bound=Described)
+T = TypeVar("T")
 
 
 def display(record: type[T]) -> type[T]:
-    """Let a record print as its description: `repr` in a terminal, a table in a notebook. A decorator of classes."""
+    """Let a record print as its description: `repr` in a terminal, a table in a notebook. A decorator of classes.
+
+    A record without a `description` shows its fields.
+
+    >>> from dataclasses import dataclass
+    >>> @display
+    ... @dataclass(frozen=True)
+    ... class Ball:
+    ...     mass: float  # kg
+    ...     gaps: tuple[float, ...]  # m
+    >>> Ball(0.02, (4e-3, 8e-3))
+    Ball
+      mass  0.02
+      gaps  0.004, 0.008
+    """
 
     def text(self: T) -> str:
-        return str(self.description)
+        return str(_description(self))
 
     def table(self: T) -> str:
-        return self.description.html
+        return _description(self).html
 
     record.__repr__ = text  # type: ignore[assignment,method-assign]
     record._repr_html_ = table  # type: ignore[attr-defined]
     return record
+
+
+def _description(record: Any) -> Description:
+    """What a record says of itself; else its fields, but for those that have their defaults."""
+    own = getattr(record, "description", None)
+    if isinstance(own, Description):
+        return own
+    usual = getattr(record, "_field_defaults", None)
+    if usual is None:
+        usual = {name: field.default for name, field in record.__dataclass_fields__.items()}
+    names = getattr(record, "_fields", usual)
+    values = ((name, getattr(record, name)) for name in names)
+    rows = tuple((name, _brief(value)) for name, value in values if value is not usual.get(name, values))
+    return Description(type(record).__name__, rows)
+
+
+def _brief(value: Any) -> str:
+    """A value in a line: numbers with four digits, few of them each, many by their shape and range, records by kind."""
+    if isinstance(value, float | complex):
+        return f"{value:.4g}"
+    if isinstance(value, str | int | Path) or value is None:
+        return str(value)
+    if hasattr(value, "tolist") and hasattr(value, "shape"):
+        if value.ndim == 1 and value.size <= FEW:
+            return ", ".join(map(_brief, value.tolist())) or "none"
+        ends = f", {value.min():.4g} to {value.max():.4g}" if value.size and value.dtype.kind in "fiu" else ""
+        return " x ".join(map(str, value.shape)) + ends
+    if isinstance(value, Mapping):
+        return (", ".join(value) or "none") if len(value) <= FEW else f"{len(value)} entries"
+    if isinstance(value, tuple | list) and not hasattr(value, "_fields"):
+        plain = len(value) <= FEW and all(isinstance(entry, float | int | str | complex) for entry in value)
+        return (", ".join(map(_brief, value)) or "none") if plain else f"{len(value)} entries"
+    return str(getattr(value, "name", "") or type(value).__name__)
 
 
 def quantity(value: float, unit: str) -> str:

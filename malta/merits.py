@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, fields
 from typing import Any, Literal, NamedTuple
 
-from malta.display import RADIANS, frequency, micro, number
+from malta.display import RADIANS, display, frequency, micro, number
 from malta.units import distinct, identifier, in_unit
 
 Better = Literal["high", "low", ""]  # "": neither
@@ -64,6 +64,7 @@ MEANINGS: dict[str, Meaning] = {
 GROUPS = tuple(dict.fromkeys(meaning.group for meaning in MEANINGS.values()))
 
 
+@display
 class Merit(NamedTuple):
     """A figure of merit.
 

@@ -23,6 +23,7 @@ from malta.campaigns.result import Campaign, Finding, figures_of
 from malta.campaigns.run import specified_bounds
 from malta.campaigns.store import simulate_machines
 from malta.campaigns.summary import UNBOUNDED, Bounds
+from malta.display import display
 from malta.errors import InputError
 from malta.model.machines import outputs_of
 from malta.units import in_unit
@@ -35,6 +36,7 @@ EVENTS = ("touchdown", "published", "specification")  # limits without a bound o
 BELOW = float(np.nextafter(1, 0))  # the largest severity of a run within its limit
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Limit:
     """A limit on the runs of a campaign."""

@@ -10,8 +10,8 @@ import hashlib
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from importlib.metadata import version
 from importlib.resources import files
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from malta.display import display
 from malta.errors import InputError
 from malta.files import read_file
 from malta.firmware.program import Precision
@@ -27,7 +28,7 @@ from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import decode
 from malta.model.data import plant_of
 from malta.model.machines import part_of
-from malta.model.parameters import differences, shape_parameters, twins_of, units_of, values_of
+from malta.model.parameters import differences, fingerprint, shape_parameters, twins_of, units_of, values_of
 from malta.model.plant import Plant, readonly
 from malta.simulation.engine.batch import functions_text
 from malta.simulation.experiments import PlannedRun
@@ -156,55 +157,6 @@ PACKAGES = (
 )  # whose modules decide a run
 
 
-def fingerprint(record: Any) -> str:
-    """sha256 of every number, name and tuple in a record: equal for a gain file's .json, .npz and .mat.
-
-    Each part is hashed with its kind and its size, so that two records of different structure never give the same
-    bytes: ((1, 2), (3,)) and ((1,), (2, 3)) differ.
-    """
-    marks = hashlib.sha256()
-    for part in _parts(record):
-        marks.update(part)
-    return marks.hexdigest()
-
-
-def _parts(value: Any) -> Iterator[bytes]:
-    """The bytes of a value: its kind, its size, then its content."""
-    if isinstance(value, np.ndarray | np.generic | float | int):
-        yield f"number {np.shape(value)}:".encode()
-        # Files do not store the sign of a zero: + 0.0 drops it.
-        yield (np.asarray(value, dtype="<f8") + 0.0).tobytes()
-    elif is_dataclass(value):
-        # A field that came later is left out at its default: older gain files do not mention it.
-        kept = [
-            f.name
-            for f in fields(value)
-            if not (f.metadata.get("later") and _is_usual(f, getattr(value, f.name)))
-        ]
-        yield f"record {len(kept)}:".encode()
-        for name in kept:
-            yield from _parts(name)
-            yield from _parts(getattr(value, name))
-    elif isinstance(value, Mapping):
-        yield f"table {len(value)}:".encode()
-        for name in sorted(value):
-            yield from _parts(name)
-            yield from _parts(value[name])
-    elif isinstance(value, tuple | list):
-        yield f"list {len(value)}:".encode()
-        for entry in value:
-            yield from _parts(entry)
-    else:
-        text = repr(value).encode()
-        yield f"text {len(text)}:".encode() + text
-
-
-def _is_usual(f: Field[Any], value: Any) -> bool:
-    """Whether a field has its default."""
-    usual: Any = f.default if f.default_factory is MISSING else f.default_factory()
-    return np.array_equal(value, usual) if isinstance(value, np.ndarray) else bool(value == usual)
-
-
 @lru_cache(maxsize=8)
 def revision_of(plant: Plant, controller: Controller, scenario: Scenario) -> dict[str, str]:
     """The revision of engine and law that decides the runs of a scenario: three hashes, each sha256.
@@ -274,6 +226,7 @@ PRECISIONS: dict[Law, Precision] = {"c": "double", "c-float": "float"}
 DRAWING = 2  # how samplers make points of a seed, see plan.py; a folder of another version has other machines
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Plan:
     """The plan of a campaign: a controller, a scenario, and the box from which the machines are drawn.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from malta.display import display
 from malta.proof.responses import find_peaks, responses
 from malta.proof.uncertain import Compensator, UncertainSystem, instability
 
@@ -85,6 +86,7 @@ class Disk:
         return float(2 * np.arctan(self.size / 2))
 
 
+@display
 class Classical(NamedTuple):
     """The classical margins of one loop, or the worst of several loops."""
 

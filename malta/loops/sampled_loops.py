@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.display import display
 from malta.errors import CheckError
 from malta.loops.classical import Nominal, remembered
 from malta.model.data import plant_of
@@ -141,6 +142,7 @@ ROUNDING = 1e-9  # of the largest entry
 DELAYED = 1e-6  # |z| below which a pole is one of pure delay
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class SampledLoop:
     """Sampled machine x+ = Ad x + Bd v, y = Cd x, closed by the linear control law v = F y."""

@@ -61,6 +61,7 @@ FIRST = (
 )  # kinds that a reader looks for
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Poles:
     """Poles in rad/s; of sampled systems ln(lambda) / Ts, without the poles of pure delay."""

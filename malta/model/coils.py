@@ -20,6 +20,7 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.optimize import linprog, nnls
 
+from malta.display import display
 from malta.errors import CheckError, InputError
 from malta.model.plant import readonly
 
@@ -33,6 +34,7 @@ WORST = 1e8  # condition of T that is taken for full rank, its rows scaled
 ACCURACY = 1e-7  # of forces that a program found, relative
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Allocation:
     """The currents of c coils for m forces, of `malta.model.allocation`.

@@ -429,6 +429,7 @@ def off_stroke(plant: Plant, x: ArrayLike) -> dict[str, float]:
     return {s.name: value for s, value in pairs if value and s.name != plant.stroke}
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class OperatingPoint:
     """A state and inputs to linearize at.

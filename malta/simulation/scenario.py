@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from malta.display import display
 from malta.errors import InputError
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
@@ -68,6 +69,7 @@ class Fault(NamedTuple):
     size: float = 0.0
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Scenario:
     """A reference for a machine, with start, disturbances, noise, faults and the fidelity of the simulation.

@@ -275,6 +275,7 @@ def label_rows(
     )
 
 
+@display
 @dataclass(frozen=True)
 class StrokeFigures:
     """Figures of a stroke, as papers publish them. SI."""

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from malta.display import display
 from malta.errors import InputError
 from malta.structured.loops import ClosedLoop
 from malta.structured.norms import Channels, Pole, gain_slope, noise, peaks_of, response_at
@@ -41,6 +42,7 @@ class Figure(NamedTuple):
     slope: FloatArray
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Goal:
     """A goal of a search.

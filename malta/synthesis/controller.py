@@ -53,6 +53,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.display import display
 from malta.errors import InputError
 from malta.model.equations import note
 from malta.model.plant import Parameters, Plant, Signal, outputs_at, readonly
@@ -143,6 +144,7 @@ class Limits:
             object.__setattr__(self, name, readonly(getattr(self, name)))
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Noise:
     """Variances that the filter was designed for: white over a sample."""

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from malta.display import display
 from malta.errors import InputError
 from malta.model.equations import note
 from malta.model.plant import outputs_at, readonly
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 SCHEDULED = ("Ad", "Bd", "Cd", "K", "Ki", "L")
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Schedule:
     """The matrices of a law at rising places of the reference of an output; g places.

@@ -8,7 +8,6 @@ one sample. All numbers are in SI units.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ import numpy as np
 from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.model.data import plant_of
-from malta.model.parameters import box_words
+from malta.model.parameters import box_words, fingerprint
 from malta.model.plant import Plant, Signal, readonly
 from malta.units import to_si
 
@@ -38,6 +37,7 @@ Place = Literal["measured", "predicted"]
 Law = Literal["LQG", "PID", "structure"]
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Weights:
     """Dimensionless weights of a cost with their bases, and the noise of one sample; n states, m inputs, p outputs.
@@ -218,6 +218,7 @@ class StructuredGoal(NamedTuple):
     arguments: Mapping[str, Any]
 
 
+@display
 @dataclass(frozen=True)
 class StructuredLaw:
     """A law of named elements, and its goals.
@@ -395,8 +396,7 @@ class Spec:
             if name not in known:
                 raise InputError(self.path, name, "a field that a design lacks", "one of " + " ".join(known))
         law = self._law_with(numbers, "numbers") if numbers else self.law
-        change = repr((self.sha256, sorted((numbers or {}).items()), sorted(fields.items())))
-        own = hashlib.sha256(change.encode()).hexdigest()
+        own = fingerprint((self.sha256, numbers or {}, fields))
         return replace(self, **({"law": law, "sha256": own} | fields))
 
     def _law_with(self, numbers: Mapping[str, float], field: str) -> Weights | Pid | StructuredLaw:

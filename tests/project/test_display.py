@@ -45,6 +45,14 @@ RESULTS: dict[str, tuple[Callable[[malta.Spec, malta.synthesis.Controller], Any]
     "curves": (lambda s, c: malta.loops.loop_curves(s.plant, c), "largest |S|  1.57"),
     "margins": (lambda s, c: malta.verify(malta.linearize(s.plant, s.plant.at()), c), "delay margin, smallest [µs]"),
     "margin": (lambda s, c: malta.loop(s.plant, c).margin({"m": 0.2}), "proven 3"),
+    "sampled": (lambda s, c: malta.loop(s.plant, c).sampled, "sample_time  0.0002"),
+    "classical": (lambda s, c: malta.loop(s.plant, c).classical, "delay  y"),
+    "poles": (lambda s, c: malta.verify(malta.linearize(s.plant, s.plant.at()), c).poles, "regulator"),
+    "weights": (lambda s, _: s.weights, "r_base            "),
+    "scenario": (lambda *_: malta.Scenario.stroke(10e-3, noise=1.0), "noise      1"),
+    "point": (lambda s, _: s.plant.at(), "x       0, 0"),
+    "noise": (lambda _, c: c.noise, "sensor   "),
+    "plan": (lambda _, c: _plan(c), "spread         m"),
     "recovery": (lambda s, c: malta.loops.recovery(s.plant, c, {"push": {"w": 0.01}})[0], "y  moves"),
     "stages": (lambda s, c: malta.verify(s.plant, c, {"m": 0.2}, stages=True), "proven 3"),
     "run": (lambda s, c: malta.experiment("disturbance", s.plant, c, size=0.1, **SHORT).run, "completed at 20 ms"),
@@ -79,7 +87,9 @@ def test_a_result_prints_itself_in_ten_lines(
     assert all(len(line) <= COLUMNS for line in text.splitlines())
     assert "array(" not in text
     table = ElementTree.fromstring(re.findall("<table>.*</table>", result._repr_html_(), re.DOTALL)[0])
-    assert [row[0].text or "" for row in table] == [label for label, _ in result.description.rows]
+    own = getattr(result, "description", None)
+    labels = [row[0].text or "" for row in table]
+    assert labels == [label for label, _ in own.rows] if own else len(labels) >= len(text.splitlines()) - 1
 
 
 def test_the_flagship_stays_within_ten_lines() -> None:

@@ -14,12 +14,12 @@ from conftest import ROOT, refusal
 
 import malta
 from malta import gains
-from malta.campaigns.plan import fingerprint
 from malta.gains.encodings import content_sha256
 from malta.gains.file import document
 from malta.loops.sampled_loops import machine_law, machine_loop
 from malta.machines.planar import motions
 from malta.model.data import plant_of
+from malta.model.parameters import fingerprint
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Commutation, linear_law

@@ -18,10 +18,11 @@ from conftest import Run, refusal
 import malta
 from malta.campaigns import plan as identity
 from malta.campaigns.dask import simulate_at_worker, task_of
-from malta.campaigns.plan import Plan, fingerprint, planned_run, revision_of
+from malta.campaigns.plan import Plan, planned_run, revision_of
 from malta.campaigns.result import Campaign
 from malta.campaigns.run import campaign
 from malta.campaigns.store import MANIFEST, block_name, read_plan, seal
+from malta.model.parameters import fingerprint
 from malta.simulation.engine.digest import Batch
 
 if TYPE_CHECKING:

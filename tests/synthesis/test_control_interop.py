@@ -17,9 +17,9 @@ from conftest import refusal
 from scipy import linalg
 
 import malta
-from malta.campaigns.plan import fingerprint
 from malta.gains import encodings
 from malta.loops.sampled_loops import machine_loop
+from malta.model.parameters import fingerprint
 from malta.simulation.experiments.catalogue import jump
 from malta.synthesis import filters, lqg, riccati
 

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.display import display
 from malta.errors import InputError
 from malta.proof.uncertain import Compensator, UncertainSystem, describe, is_number
 
@@ -161,6 +162,7 @@ Channels = int | tuple[int, ...]
 MOST = 4  # blocks: 2^4 polynomials
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Dynamic:
     """Unmodelled dynamics: Delta stable, of largest singular value `|Delta(jw)| <= |W(jw)|` in the modelled set.
