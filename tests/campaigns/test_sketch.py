@@ -36,7 +36,7 @@ def _content(sketch: Sketch) -> Any:
     )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(deadline=None)
 @given(
     sign=st.sampled_from([1.0, -1.0]),
     magnitudes=st.lists(st.floats(1e-300, 1e300), min_size=1, max_size=200),
@@ -55,7 +55,7 @@ def test_quantiles_are_within_the_accuracy_of_those_of_numpy(
     assert (found[0], found[-1]) == (values.min(), values.max())
 
 
-@settings(max_examples=100, deadline=None)
+@settings(deadline=None)
 @given(parts=st.lists(st.lists(finite, max_size=40), min_size=1, max_size=8), seed=st.integers(0, 99))
 def test_order_and_grouping_of_merges_change_no_bit(parts: list[list[float]], seed: int) -> None:
     """One after another, in another order, in pairs of pairs, and all values at once."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
@@ -336,7 +336,6 @@ def test_current_loop_has_its_phase_margin(par: Parameters, mean_of: int) -> Non
 WINDING = st.floats(0.6, 1.6)
 
 
-@settings(max_examples=300)
 @given(winding=st.tuples(WINDING, WINDING, WINDING), x=PLACE)
 def test_unequal_windings_lower_the_force_more_under_position_control(
     winding: tuple[float, float, float], x: float

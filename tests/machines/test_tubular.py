@@ -442,7 +442,7 @@ def _changed(par: tubular.Parameters, name: str, value: Any) -> tubular.Paramete
     return replace(par, **changes)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None)
 @given(
     f=st.sampled_from(FIELDS),
     value=st.one_of(
@@ -459,7 +459,7 @@ def test_a_parameter_is_a_finite_number(par: tubular.Parameters, f: Any, value: 
     assert caught.value.field == f.name
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None)
 @given(
     f=st.sampled_from([f for f in FIELDS if f.name not in SIGNED]),
     value=st.floats(max_value=0, exclude_max=True, allow_infinity=False),
