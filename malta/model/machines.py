@@ -8,7 +8,8 @@ A machine is a Python module with `Parameters` and `plant(par) -> Plant`. It com
 A gain file names a machine, never a path, so reading one never runs code that the user did not name.
 
 Optional parts are found beside the model: EXPERIMENTS, FIGURES, CLAIMS, REQUIREMENTS, WORDS and other names are those
-of the module itself, or of the modules `experiments`, `figures`, `claims`, `requirements` beside it.
+of the module itself, or of the modules `experiments`, `figures`, `claims`, `requirements` beside it; claims may stand
+in the folder `paper`, with what they are computed from.
 
 Groups of a machine's signals for figures and tables: one unit each, named by the WORDS of its experiments.
 """
@@ -131,13 +132,14 @@ def part_of(part: Part, name: str) -> ModuleType | None:
         return None
     module = machine(name)
     folder = module.__name__ if hasattr(module, "__path__") else module.__name__.rpartition(".")[0]
-    target = f"{folder}.{part}"
-    try:
-        return import_module(target)
-    except ModuleNotFoundError as error:
-        if error.name not in (target, folder):  # a module that the part imports
-            raise
-        return None
+    paper = f"{folder}.paper"
+    for target in (f"{paper}.{part}", f"{folder}.{part}") if part == "claims" else (f"{folder}.{part}",):
+        try:
+            return import_module(target)
+        except ModuleNotFoundError as error:
+            if error.name not in (target, folder, paper):  # a module that the part imports
+                raise
+    return None
 
 
 def attribute_of(plant: Plant, part: Part, name: str, default: Any = None) -> Any:

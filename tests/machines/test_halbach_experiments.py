@@ -21,12 +21,10 @@ from conftest import ROOT, Run
 from scipy.linalg import expm, solve_discrete_lyapunov
 
 import malta
-from malta.machines.halbach import claims as claims
 from malta.machines.halbach import electronics
 from malta.machines.halbach import electronics as motor
 from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.electronics import IDEAL, Options
-from malta.machines.halbach.evidence import Evidence, open_loop_dip, rise_of_dip
 from malta.machines.halbach.experiments import steps_reference
 from malta.machines.halbach.open_loop import (
     FAULTS,
@@ -37,6 +35,8 @@ from malta.machines.halbach.open_loop import (
     positions_at_rest,
     servo_step,
 )
+from malta.machines.halbach.paper import claims as claims
+from malta.machines.halbach.paper.evidence import Evidence, open_loop_dip, rise_of_dip
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import published_value
 from malta.model.plant import Plant

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 import malta
-from malta.machines.halbach import claims, electronics, evidence
+from malta.machines.halbach import electronics
 from malta.machines.halbach import electronics as motor
 from malta.machines.halbach.electronics import DEAD_ENDS, IDEAL, IQ_BITS, Options
+from malta.machines.halbach.paper import claims, evidence
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import plant_of, published_value
 from malta.simulation.scenario import Scenario

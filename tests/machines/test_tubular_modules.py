@@ -20,7 +20,13 @@ from malta.gains.encodings import content_sha256
 from malta.machines.tubular import plant as tubular
 from malta.machines.tubular.drive import SIDES, attraction, potential
 from malta.machines.tubular.experiments.strokes import delayed_stroke
-from malta.machines.tubular.further_claims import WAIT, Figure13, carried_weight, figure_13, radial_deviation
+from malta.machines.tubular.paper.further_claims import (
+    WAIT,
+    Figure13,
+    carried_weight,
+    figure_13,
+    radial_deviation,
+)
 from malta.machines.tubular.plant import centre_of_gravity
 from malta.model.data import plant_of
 from malta.model.equations import rotation

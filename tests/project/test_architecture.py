@@ -183,7 +183,14 @@ def test_a_machine_is_a_folder() -> None:
     ]
     assert [path.name for path in folders] == ["halbach", "planar", "tubular"]
     for folder in folders:
-        assert {"experiments", "figures", "claims"} <= {path.stem for path in folder.iterdir()}
+        assert {"experiments", "figures", "paper"} <= {path.stem for path in folder.iterdir()}
+        assert (folder / "paper" / "claims.py").is_file()
+
+
+def test_what_designs_loads_no_replication() -> None:
+    for path in SOURCES:
+        if path.parent.name != "paper":
+            assert not [module for module in imports(path) if ".paper" in module]
 
 
 def test_every_name_of_the_contents_page_is_there() -> None:

@@ -19,17 +19,17 @@ from scipy.linalg import expm
 import malta
 from malta import references
 from malta.loops.sampled_loops import machine_loop
-from malta.machines.tubular import claims as tubular
-from malta.machines.tubular import evidence as tubular_evidence
-from malta.machines.tubular import further_claims
-from malta.machines.tubular.evidence import (
+from malta.machines.tubular.experiments.disturbances import RESTING
+from malta.machines.tubular.paper import claims as tubular
+from malta.machines.tubular.paper import evidence as tubular_evidence
+from malta.machines.tubular.paper import further_claims
+from malta.machines.tubular.paper.evidence import (
     EXPERIMENT_NAMES,
     SEEDS,
     Evidence,
     is_solved_for_ratio,
     mean_of_seeds,
 )
-from malta.machines.tubular.experiments.disturbances import RESTING
 from malta.model.data import plant_of, published_value
 from malta.report import ledger as claims
 from malta.report.ledger import Claim, Ledger, Row

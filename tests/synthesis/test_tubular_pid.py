@@ -12,9 +12,9 @@ from conftest import ROOT, Run, one_sentence, refusal
 
 import malta
 from malta.loops.sampled_loops import machine_loop
-from malta.machines.tubular import claims as tubular
-from malta.machines.tubular.evidence import axial_deviation, axis_coupling, load_deviation, noise_forces
-from malta.machines.tubular.evidence import evidence as evidence_of
+from malta.machines.tubular.paper import claims as tubular
+from malta.machines.tubular.paper.evidence import axial_deviation, axis_coupling, load_deviation, noise_forces
+from malta.machines.tubular.paper.evidence import evidence as evidence_of
 from malta.margins.loop_report import Outcome
 from malta.report import ledger as claims
 from malta.report.ledger import Row
@@ -40,7 +40,7 @@ from malta.tuning.verify import SynthesizedDesign, judge
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from malta.machines.tubular.evidence import Evidence
+    from malta.machines.tubular.paper.evidence import Evidence
     from malta.model.linearize import LinearModel
     from malta.synthesis.spec import Spec
 
@@ -72,7 +72,7 @@ def design(spec: Spec) -> SynthesizedDesign:
 @pytest.fixture(scope="module")
 def found(spec: Spec, published: dict[str, Any]) -> Evidence:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("malta.machines.tubular.evidence.MACHINES", 64)
+        patch.setattr("malta.machines.tubular.paper.evidence.MACHINES", 64)
         return evidence_of(spec, published)
 
 

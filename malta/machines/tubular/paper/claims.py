@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 
-from malta.machines.tubular.evidence import (
+from malta.machines.tubular.experiments.strokes import SETTLE
+from malta.machines.tubular.paper.evidence import (
     FEW,
     FEWER,
     IMPLIED_RATIO,
@@ -31,18 +32,10 @@ from malta.machines.tubular.evidence import (
     true_radial,
     yield_share,
 )
-from malta.machines.tubular.evidence import evidence as evidence
-from malta.machines.tubular.experiments.strokes import SETTLE
-from malta.machines.tubular.further_claims import BRAKE, CAPTURE, MEANS, RULE_OF_THUMB, TAUGHT
-from malta.machines.tubular.further_claims import ROWS as FIGURE_13
-from malta.report.ledger import (
-    ZONE_NOTE,
-    Row,
-    bandwidth,
-    machine_share,
-    merit,
-    peak_sensitivity,
-)
+from malta.machines.tubular.paper.evidence import evidence as evidence
+from malta.machines.tubular.paper.further_claims import BRAKE, CAPTURE, MEANS, RULE_OF_THUMB, TAUGHT
+from malta.machines.tubular.paper.further_claims import ROWS as FIGURE_13
+from malta.report.ledger import ZONE_NOTE, Row, bandwidth, machine_share, merit, peak_sensitivity
 
 SOURCE = "S. Miric et al., IEEE Trans. Ind. Electron. 68(1), 2021"
 REPRODUCING = ("table2", "calibrated")

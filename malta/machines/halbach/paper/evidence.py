@@ -12,13 +12,7 @@ import numpy as np
 from malta.machines.halbach import electronics
 from malta.machines.halbach import electronics as motor
 from malta.machines.halbach.experiments import COUNT, PAUSE, STEP, responses
-from malta.machines.halbach.open_loop import (
-    LAWS,
-    MOVE,
-    move_reference,
-    positions_at_rest,
-    sound_moves,
-)
+from malta.machines.halbach.open_loop import LAWS, MOVE, move_reference, positions_at_rest, sound_moves
 from malta.machines.halbach.plant import Parameters
 from malta.margins.loop_report import LoopReport
 from malta.model.data import published_value
@@ -31,6 +25,7 @@ from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant
+
 
 DEAD_FORCE = 14.45  # N, between the largest with fine steps everywhere, 14.42 N, and the supply's 14.46 N
 EXPERIMENT_NAMES = ("step", "stairs", "ramp", "force", "budget", "identify")

@@ -23,11 +23,7 @@ from malta.model.data import published_value
 from malta.model.linearize import LinearModel, linearize
 from malta.proof.parametric_plants import of_plant
 from malta.proof.robust import robust_margin
-from malta.report.ledger import (
-    Chance,
-    proven_share,
-    run_design,
-)
+from malta.report.ledger import Chance, proven_share, run_design
 from malta.simulation.current_control import link_voltage, open_loop_gain
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.experiments import Experiment, Progress
@@ -45,6 +41,7 @@ from malta.synthesis.tunable_lqg import calibrate
 if TYPE_CHECKING:
     from malta.campaigns.result import Rate
     from malta.model.plant import FloatArray, Plant
+
 
 EXPERIMENT_NAMES = ("stroke", "hold", "tilt", "thermal")
 MACHINES, FEW = 1_000, 200  # of the yields, with and without a C compiler

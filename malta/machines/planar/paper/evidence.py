@@ -16,11 +16,7 @@ from malta.machines.planar.experiments import CURRENT, coil_wrench
 from malta.machines.planar.motions import SOFT, jump, steps_ahead
 from malta.margins.loop_report import LoopReport
 from malta.model.data import published_value
-from malta.report.ledger import (
-    case_merit,
-    merit,
-    run_design,
-)
+from malta.report.ledger import case_merit, merit, run_design
 from malta.simulation.experiments import Experiment, Progress
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
@@ -28,6 +24,7 @@ from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
+
 
 EXPERIMENT_NAMES = ("step", "jump", "errors", "timing", "delay")
 SLOWER = (

@@ -14,8 +14,8 @@ from malta.campaigns.run import main_plan, replay
 from malta.errors import CheckError, InputError
 from malta.identification.learn import learn
 from malta.identification.log import log_of
-from malta.machines.tubular.evidence import Evidence, link_rise, mean_at_rest
 from malta.machines.tubular.experiments.strokes import delayed_stroke, stroke_merits
+from malta.machines.tubular.paper.evidence import Evidence, link_rise, mean_at_rest
 from malta.model.data import plant_of, published_figures, published_value
 from malta.report.ledger import Chance, Row, bandwidth
 from malta.simulation.engine.compiled import compiler

@@ -7,7 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from malta.machines.planar.evidence import (
+from malta.machines.planar.motions import AHEAD, DESIGNED, LINEAR, SOFT
+from malta.machines.planar.paper.evidence import (
     angles_at_rest,
     coil_torque,
     coils_width,
@@ -26,16 +27,8 @@ from malta.machines.planar.evidence import (
     slower_torque,
     symmetric_deviation,
 )
-from malta.machines.planar.evidence import evidence as evidence
-from malta.machines.planar.motions import AHEAD, DESIGNED, LINEAR, SOFT
-from malta.report.ledger import (
-    ZONE_NOTE,
-    Row,
-    case_merit,
-    machine_share,
-    merit,
-    peak_sensitivity,
-)
+from malta.machines.planar.paper.evidence import evidence as evidence
+from malta.report.ledger import ZONE_NOTE, Row, case_merit, machine_share, merit, peak_sensitivity
 
 SOURCE = "F. Xing et al., 2017"
 REPRODUCING = ("planar_pid",)

@@ -12,7 +12,8 @@ import numpy as np
 from malta.files import shipped_path
 from malta.machines.halbach import electronics
 from malta.machines.halbach.electronics import MEAN_OF
-from malta.machines.halbach.evidence import (
+from malta.machines.halbach.open_loop import FAULTS, LAWS, positions_at_rest
+from malta.machines.halbach.paper.evidence import (
     DEAD_FORCE,
     bits_of_mean,
     current_for_step,
@@ -29,17 +30,10 @@ from malta.machines.halbach.evidence import (
     sampled_pole,
     samples_of_range,
 )
-from malta.machines.halbach.evidence import evidence as evidence
-from malta.machines.halbach.open_loop import FAULTS, LAWS, positions_at_rest
+from malta.machines.halbach.paper.evidence import evidence as evidence
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import read
-from malta.report.ledger import (
-    Row,
-    case_merit,
-    machine_share,
-    merit,
-    peak_sensitivity,
-)
+from malta.report.ledger import Row, case_merit, machine_share, merit, peak_sensitivity
 
 SOURCE = "L. C. Díaz-Pérez et al., Actuators 7(4), 2018"
 REPRODUCING = ("halbach_pid",)

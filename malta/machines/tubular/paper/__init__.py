@@ -1,0 +1,1 @@
+"""What the paper on MALTA publishes, beside our figures; nothing that designs loads it."""
