@@ -23,7 +23,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import malta
-from malta.cli.claims import ALL_SCHEMAS, MODELS
+from malta.cli.documents.published import ALL_SCHEMAS, MODELS
 from malta.cli.main import app as program
 from malta.files import json_text
 from malta.schemas import change_nodes, without_null

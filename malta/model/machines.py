@@ -29,11 +29,13 @@ from importlib.metadata import entry_points
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from malta.errors import InputError
 from malta.files import file_exists, read_file
-from malta.model.plant import Plant, Signal
+
+if TYPE_CHECKING:
+    from malta.model.plant import Plant, Signal
 
 
 class _File(NamedTuple):

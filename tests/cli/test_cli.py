@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 import malta
 from malta import gains
+from malta.__main__ import HELP
 from malta.cli import main as cli
 from malta.cli.main import renew
 from malta.cli.options import GENERAL, design_files, read_options
@@ -675,6 +676,14 @@ def test_every_scenario_takes_general_options(plant: Plant, text: str, value: ob
     for wrong in (text, f"{text.partition('=')[0]}="):
         with pytest.raises(InputError):
             read_options([text, wrong], "hold", plant)
+
+
+def test_the_help_of_the_file_is_the_help_of_the_commands() -> None:
+    """No library that reads arguments is imported for it."""
+    program = "import sys, malta.__main__ as m; m.main(); assert 'typer' not in sys.modules"
+    for arguments in (["-m", "malta", "--help", "--help"], ["-c", program, "--help"]):
+        run = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=True)
+        assert HELP.read_text(encoding="ascii") == run.stdout, f"malta --help --help > {HELP}"
 
 
 @pytest.mark.parametrize("command", [c.__name__ for group in cli.GROUPS.values() for c in group])

@@ -15,7 +15,7 @@ from malta.campaigns.limits import EVENTS, merits_of
 from malta.campaigns.plan import SAMPLERS, Law
 from malta.campaigns.run import campaign
 from malta.cli import main as cli
-from malta.cli.claims import ALL_SCHEMAS
+from malta.cli.documents.published import ALL_SCHEMAS
 from malta.cli.options import GENERAL
 from malta.cli.report import KINDS
 from malta.firmware.fmu import PARTS, PLATFORMS, platforms_named

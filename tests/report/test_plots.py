@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 import malta
 from malta import report
-from malta.cli.claims import output_schema
+from malta.cli.documents.published import output_schema
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.locus import root_locus
 from malta.margins.margin_map import margin_map_of
