@@ -396,7 +396,7 @@ def _fly(
     done = substeps_until(first, substeps)
     begin_substep = done
     lost = 0
-    _call_all_valid(inputs)
+    call_valid(inputs)
     for k, row in enumerate(given):
         states[k] = held_state
         read, _ = (x.ravel() for x in evaluate(f.machine.sense, held_state, row, noise[k], np.empty(0)))
@@ -430,8 +430,8 @@ def _fly(
     return held_state, rows
 
 
-def _call_all_valid(inputs: Any) -> None:
-    """No sensor calls its reading invalid."""
+def call_valid(inputs: Any) -> None:
+    """No sensor calls its reading invalid: faults of the sample before are over."""
     for name in ("y_valid", "i_valid"):
         if hasattr(inputs, name):
             view(inputs, name)[:] = 1

@@ -24,6 +24,7 @@ from malta.firmware.flight import (
     REALS,
     Native,
     Step,
+    call_valid,
     compile_controller,
     compile_files,
     engine_of_c,
@@ -486,7 +487,7 @@ def supervised_engine(
             request.land = int(t >= requests.land)
             request.missed = missed
             if faults:
-                _call_valid(inputs)
+                call_valid(inputs)
                 faults.before(t, inputs, request)
             step(*(ctypes.byref(r) for r in (supervisor, state, inputs, request, outputs)))
             if faults and supervisor.enable:  # gates that are off obey no command
@@ -528,7 +529,7 @@ def unsupervised_engine(
             if on and not was_on:
                 start(ctypes.byref(state))
             was_on = on
-            _call_valid(inputs)
+            call_valid(inputs)
             faults.before(t, inputs, None)
             step(*(ctypes.byref(r) for r in (state, inputs, outputs)))
             if on:
@@ -547,10 +548,3 @@ def _copy(native: Native, reference: Any) -> Any:
     found = native.Reference()
     ctypes.pointer(found)[0] = reference
     return found
-
-
-def _call_valid(inputs: Any) -> None:
-    """No sensor calls its reading invalid: the faults of the sample before are over."""
-    for name in ("y_valid", "i_valid"):
-        if hasattr(inputs, name):
-            view(inputs, name)[:] = 1

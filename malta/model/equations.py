@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -31,6 +31,8 @@ from malta.errors import CheckError
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
+
+T = TypeVar("T")
 
 
 class Equation(NamedTuple):
@@ -54,12 +56,19 @@ def recorded_equations() -> Iterator[list[Equation]]:
     >>> found[0].text
     'y = 2 x'
     """
-    found: list[Equation] = []
-    token = _recorded.set(found)
+    with _collected(_recorded) as found:
+        yield found
+
+
+@contextmanager
+def _collected(variable: ContextVar[list[T] | None]) -> Iterator[list[T]]:
+    """A new list in the variable, until the end of the block."""
+    found: list[T] = []
+    token = variable.set(found)
     try:
         yield found
     finally:
-        _recorded.reset(token)
+        variable.reset(token)
 
 
 def recording() -> bool:
@@ -90,18 +99,14 @@ class LookUp(NamedTuple):
     values: Any  # symbols that stand for what is read there
 
 
-_look_ups: ContextVar[list[LookUp] | None] = ContextVar("_recorded", default=None)
+_look_ups: ContextVar[list[LookUp] | None] = ContextVar("_look_ups", default=None)
 
 
 @contextmanager
 def recorded_look_ups() -> Iterator[list[LookUp]]:
     """Within, SX expressions may read tables; each reading is put into the list."""
-    found: list[LookUp] = []
-    token = _look_ups.set(found)
-    try:
+    with _collected(_look_ups) as found:
         yield found
-    finally:
-        _look_ups.reset(token)
 
 
 def look_up(nodes: FloatArray, u: Any, v: Any) -> Any:
