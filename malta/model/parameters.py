@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, Field, field, fields, is_dataclass
+from dataclasses import MISSING, Field, field, fields, is_dataclass, replace
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from malta.errors import InputError
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters
+
+T = TypeVar("T")
 
 
 def si(
@@ -188,6 +190,15 @@ def check_range(f: Field[Any], value: object, where: str | Path, name: str) -> N
     if not (math.isfinite(number) and inside and (below is None or number < below)):
         found = f"{number} {unit}" if real else repr(value)
         raise InputError(where, name, found, f"a finite number{low}{high} in {unit}")
+
+
+def replace_fields(record: T, where: str, fields: Mapping[str, Any]) -> T:
+    """A frozen record with other fields. Raises InputError, named after `where`, for a field that it lacks."""
+    known = getattr(record, "__dataclass_fields__", {})
+    for name in fields:
+        if name not in known:
+            raise InputError(where, name, "a field that it lacks", "one of " + " ".join(known))
+    return replace(record, **fields)  # type: ignore[type-var]
 
 
 def fingerprint(record: Any) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from malta.display import display
 from malta.errors import InputError
-from malta.model.parameters import units_of
+from malta.model.parameters import replace_fields, units_of
 from malta.model.plant import Plant
 from malta.model.sensors import require_short, split_dead_time
 from malta.simulation import references
@@ -155,11 +155,7 @@ class Scenario:
         >>> malta.Scenario.stroke(10e-3).replace(noise=1.0, seed=3).seed
         3
         """
-        for name in fields:
-            if name not in self.__dataclass_fields__:
-                expected = "one of " + " ".join(self.__dataclass_fields__)
-                raise InputError(f"scenario {self.name}", name, "a field that a scenario lacks", expected)
-        return replace(self, **fields)
+        return replace_fields(self, f"scenario {self.name}", fields)
 
     def __post_init__(self) -> None:
         where = f"scenario {self.name}"

@@ -20,7 +20,7 @@ import numpy as np
 from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.model.data import plant_of
-from malta.model.parameters import box_words, fingerprint
+from malta.model.parameters import box_words, fingerprint, replace_fields
 from malta.model.plant import Plant, Signal, readonly
 from malta.units import to_si
 
@@ -129,6 +129,16 @@ class Weights:
             )
         if not (np.abs(value) < 1).all():
             raise InputError("Weights", "correlation", str(value.tolist()), "numbers between -1 and 1")
+
+    def replace(self, **fields: Any) -> Weights:
+        """Return the weights with other fields, by name. Raises InputError for an unknown one, and as Weights does.
+
+        >>> import malta
+        >>> weights = malta.read_design("examples/ball/design/ball.toml").weights
+        >>> weights.replace(r_base=[0.5]).R.tolist()
+        [[4.0]]
+        """
+        return replace_fields(self, "Weights", fields)
 
     @property
     def Q(self) -> FloatArray:

@@ -42,6 +42,19 @@ def test_what_a_design_cannot_be_is_a_sentence(numbers: Any, fields: Any, words:
         malta.read_design(BALL).replace(numbers, **fields)
 
 
+def test_weights_with_one_other_field() -> None:
+    """Every digit counts in the hash of a design, not those that numpy prints."""
+    spec = malta.read_design(BALL)
+    base = spec.weights.q_base
+    near = spec.weights.replace(q_base=base * (1 + 1e-12))
+    assert near.q_base.tolist() != base.tolist()
+    assert near.r_base.tolist() == spec.weights.r_base.tolist()
+    assert len({spec.replace(law=law).sha256 for law in (spec.weights, near, near.replace())}) == 2
+    for fields in ({"nothing": 1}, {"q_base": [math.nan, 1.0]}):
+        with pytest.raises(malta.InputError, match=next(iter(fields))):
+            spec.weights.replace(**fields)
+
+
 def test_a_scenario_with_other_fields() -> None:
     stroke = malta.Scenario.stroke(10e-3)
     assert stroke.replace(noise=1.0, seed=3).duration == stroke.duration
