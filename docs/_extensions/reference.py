@@ -26,7 +26,7 @@ import malta
 from malta.cli.documents.published import ALL_SCHEMAS, MODELS
 from malta.cli.main import app as program
 from malta.files import json_text
-from malta.schemas import change_nodes, without_null
+from malta.schemas.files import change_nodes, without_null
 from malta.synthesis.design_tables import specification_record
 from malta.synthesis.requirements import GENERIC, requirements_for
 

@@ -131,7 +131,11 @@ class Weights:
             raise InputError("Weights", "correlation", str(value.tolist()), "numbers between -1 and 1")
 
     def replace(self, **fields: Any) -> Weights:
-        """Return the weights with other fields, by name. Raises InputError for an unknown one, and as Weights does.
+        """Return the weights with other fields.
+
+        fields : of this record, by name
+
+        Raises InputError for an unknown field, and as Weights does.
 
         >>> import malta
         >>> weights = malta.read_design("examples/ball/design/ball.toml").weights

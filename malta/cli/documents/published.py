@@ -35,7 +35,8 @@ from malta.cli.documents.others import (
 )
 from malta.cli.documents.plots import PlotOutput
 from malta.errors import InputError
-from malta.schemas import DRAFT, SCHEMAS
+from malta.schemas import SCHEMAS
+from malta.schemas.files import DRAFT
 
 MODELS: dict[str, type[Part]] = {
     "design-output": DesignOutput,
