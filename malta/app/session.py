@@ -88,7 +88,7 @@ class Session:
         self._slopes: tuple[Handle, View, dict[str, tuple[float, ...]]] | None = (
             None  # of the handle that is pulled
         )
-        self._ray: int | None = None
+        self._ray: tuple[int, float] | None = None  # of the last eigenvalue margin, and that margin
         self._slow_margin = False
         self._traced: Parameters | None = None  # of the machine whose margin was traced last
         self._timer: threading.Timer | None = None
@@ -360,8 +360,9 @@ class Session:
             self._traced = problem.plant.parameters
             self._slow_margin |= not first and time.perf_counter() - began > 4 * SLOW
         if document["margin"] is not None:
-            self._ray = document["margin"].get("ray", self._ray)
-            self._lost = document["margin"].get("upper") or self._lost
+            ray, upper = document["margin"].get("ray"), document["margin"].get("upper")
+            self._ray = self._ray if ray is None or upper is None else (ray, upper)
+            self._lost = upper or self._lost
         return document, problem
 
     def _supersede(self) -> int:

@@ -215,6 +215,7 @@ RAYS_TO_CORNERS = 5  # parameters up to which every corner has a ray; of more, a
 FARTHEST = 20.0  # multiples of the box
 LEVELS = (0.125, 0.25, 0.5, 0.75, 1.0)  # shares of a ray at which a first loss of stability is looked for
 RESOLVED = 2.0**-13  # of a ray, to which a loss of stability is narrowed down
+BESIDE = 0.02  # of the margin of a neighbouring design: how near that of a design is expected
 RAY_ROUNDS = 8  # of corrections by other rays
 
 
@@ -250,13 +251,13 @@ def ray_bound(
     loops: Sequence[tuple[UncertainSystem, Compensator]],
     ranges: Mapping[str, float],
     over: Mapping[str, tuple[float, float]],
-    first: int | None = None,
+    first: tuple[int, float] | None = None,
 ) -> RayBound:
     """Bound a margin from above by eigenvalues along rays: some hundred of them, in a fraction of a tenth of a second.
 
     loops, over : as `travel.travel_loops` returns them
     ranges : relative half range of each parameter, by name
-    first : the ray that bounded a neighbouring design, which is then tried first
+    first : the ray that bounded a neighbouring design, which is then tried first, and its margin
 
     Example: `ray_bound(*travel_loops(plant, controller, ("m",)), {"m": 0.2})` with over as the third argument
     """
@@ -265,9 +266,9 @@ def ray_bound(
     if any((rays.unstable(np.zeros(1), [0]) >= 0).any() for rays in sets):
         return RayBound(0.0, {}, None, None)
     best, found = math.inf, None
-    if first is not None and first < len(owner):
-        best = _leave(sets, owner[first])
-        found = first if best < math.inf else None
+    if first is not None and first[0] < len(owner):
+        best = _leave(sets, owner[first[0]], near=first[1])
+        found = first[0] if best < math.inf else None
     if found is None:
         best, found = _first_level(sets, owner)
     for _ in range(RAY_ROUNDS if found is not None else 0):
@@ -317,14 +318,24 @@ def _corners(count: int) -> FloatArray:
     return np.random.default_rng(0).choice([1.0, -1.0], (2**RAYS_TO_CORNERS, count))
 
 
-def _leave(sets: Sequence[_Rays], which: tuple[int, int], unstable_at: float = math.inf) -> float:
-    """Where a ray leaves stability, the nearest unstable t that was seen; infinite where it is stable at its end."""
-    rays, ray = sets[which[0]], [which[1]]
-    end = min(float(rays.end[which[1]]), unstable_at)
-    if rays.unstable(np.array([end]), ray)[0] < 0:
+def _leave(
+    sets: Sequence[_Rays], which: tuple[int, int], unstable_at: float = math.inf, near: float = math.nan
+) -> float:
+    """Where a ray leaves stability, the nearest unstable t that was seen; infinite where it is stable at its end.
+
+    near : where it may be, which is looked at first
+    """
+    rays, ray = sets[which[0]], which[1]
+    end = min(float(rays.end[ray]), unstable_at)
+    about = np.array([near * (1 - BESIDE), near * (1 + BESIDE)])
+    if about[1] < end and (rays.unstable(about, [ray, ray]) >= 0).tolist() == [False, True]:
+        low, high = about.tolist()
+    elif rays.unstable(np.array([end]), [ray])[0] < 0:
         return math.inf
+    else:
+        low, high = 0.0, end
     return _first_unstable(
-        lambda t: float(rays.unstable(np.array([t]), ray)[0]), 0.0, end, RESOLVED * end
+        lambda t: float(rays.unstable(np.array([t]), [ray])[0]), low, high, RESOLVED * end
     )
 
 

@@ -109,7 +109,8 @@ def test_eigenvalue_margin_lies_just_above_the_proven_one(design: Path) -> None:
     proven = travel_margin(spec.plant, controller, spec.uncertainty)
     assert proven.lower is not None
     assert proven.lower <= bound.upper <= 1.001 * proven.lower + 1e-3
-    again = ray_bound(loops, spec.uncertainty, over, bound.ray)
+    assert bound.ray is not None
+    again = ray_bound(loops, spec.uncertainty, over, (bound.ray, bound.upper))
     assert again.upper == pytest.approx(bound.upper, rel=2e-3)
 
 
