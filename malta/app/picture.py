@@ -227,12 +227,9 @@ def _design_model(plant: Plant, at: tuple[tuple[str, float], ...]) -> LinearMode
     return linearize(plant, plant.at(**dict(at)))
 
 
-def picture(
-    problem: Problem, view: View, first: tuple[int, float] | None = None, *, margin: bool = True
-) -> dict[str, Any]:
+def picture(problem: Problem, view: View, *, margin: bool = True) -> dict[str, Any]:
     """Compute the document that the page draws.
 
-    first : the ray of the last eigenvalue margin, and that margin
     margin : whether the eigenvalue margin is asked for
 
     Raises CheckError where no input holds the machine.
@@ -246,7 +243,7 @@ def picture(
             "frequency": _frequency(problem.curves),
             "run": (run := run_document(problem, view)),
             "load": (load := _load(problem, view)),
-            "margin": _margin(problem, first) if margin else None,
+            "margin": eigenvalue_margin(problem) if margin else None,
             "figures": _figures(problem, run, load),
         }
 
@@ -322,12 +319,12 @@ def _load(problem: Problem, view: View) -> dict[str, Any] | None:
     names = [s.name for s in problem.plant.disturbances]
     if not names or not problem.report.stable:
         return None
-    answer, one, k = _answer(problem, view)
+    one, k = _answer(problem, view)
     settled = one.within(0.02)
     ends = settled[np.isfinite(settled)]
     end = max(1.3 * float(ends.max(initial=0.0)), 20 * problem.controller.sample_time)
-    t = np.linspace(0.0, min(end, float(answer.t[-1])), LOAD_POINTS)
-    y = np.array([np.interp(t, answer.t, row) for row in one.y[..., 0].T])
+    t = np.linspace(0.0, min(end, float(one.t[-1])), LOAD_POINTS)
+    y = np.array([np.interp(t, one.t, row) for row in one.y[..., 0].T])
     return {
         "name": names[k],
         "t": round_values(t),
@@ -336,21 +333,23 @@ def _load(problem: Problem, view: View) -> dict[str, Any] | None:
     }
 
 
-def _answer(problem: Problem, view: View) -> tuple[StepResponse, StepResponse, int]:
-    """Answers of the loop to all loads, to a unit of the chosen one, and which that is."""
+def _answer(problem: Problem, view: View) -> tuple[StepResponse, int]:
+    """The answer of the loop to a unit of the chosen load, and which that is."""
     names = [s.name for s in problem.plant.disturbances]
     k = names.index(view.load) if view.load in names else 0
-    answer = problem.loop.sampled.answer()
-    return answer, answer.of(np.eye(len(names))[k]), k
+    return problem.loop.sampled.answer(k), k
 
 
 def largest_moved(problem: Problem, view: View) -> FloatArray | None:
     """How far the chosen load moves each output at most; None without loads from outside."""
-    return _answer(problem, view)[1].largest[:, 0] if problem.plant.disturbances else None
+    return _answer(problem, view)[0].largest[:, 0] if problem.plant.disturbances else None
 
 
-def _margin(problem: Problem, first: tuple[int, float] | None) -> dict[str, Any] | None:
-    """The eigenvalue margin, an upper bound; None without an uncertainty, or where the model is none of parameters."""
+def eigenvalue_margin(problem: Problem, first: tuple[int, float] | None = None) -> dict[str, Any] | None:
+    """The eigenvalue margin, an upper bound; None without an uncertainty, or where the model is none of parameters.
+
+    first : the ray of the last eigenvalue margin, and that margin
+    """
     box = problem.spec.uncertainty
     if not box:
         return None

@@ -190,11 +190,11 @@ class SampledLoop:
         """The sensitivity S = (I + L)^-1 at the sensors, k x p x p; it also takes noise to the outputs."""
         return np.asarray(np.linalg.inv(np.eye(len(self.Cd)) + self.loop_gain(w)))
 
-    def answer(self) -> StepResponse:
-        """The true outputs after a unit step of every disturbance. Raises CheckError for an unstable loop."""
+    def answer(self, load: int | None = None) -> StepResponse:
+        """The true outputs after a unit step of every disturbance, or of one. Raises CheckError for an unstable loop."""
         assert self.pushed is not None
-        k = len(self.control.A)
-        g = np.vstack([self.pushed, np.zeros((k, self.pushed.shape[1]))])
+        k, pushed = len(self.control.A), self.pushed if load is None else self.pushed[:, [load]]
+        g = np.vstack([pushed, np.zeros((k, pushed.shape[1]))])
         C = np.hstack([self.outputs, np.zeros((len(self.Cd), k))])
         return step_response(self.closed, g, C, self.sample_time)
 
