@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 import casadi as ca
 import numpy as np
 
-from malta.model.checks import check_symbols
+from malta.model.checks import check_equations, check_signals, check_symbols
 from malta.model.parameters import acting_names
 from malta.model.plant import Plant
 
@@ -73,14 +73,45 @@ def register(plant: Plant, build: Callable[[Any], Plant]) -> None:
     """
     if plant.tabulated:  # its table holds numbers, and symbols raise an error there
         return
-    record: Any = plant.parameters
-    names = tuple(acting_names(record))
-    others = (f.name for f in fields(record) if f.name not in (*names, "preset"))
-    family = _Family(build, type(record), names, tuple((name, getattr(record, name)) for name in others))
+    family = _family_of(plant, build)
     if family not in _checked:
         check_symbols(plant)
         _checked.append(family)
     _families[plant] = family
+
+
+def is_checked(plant: Plant, build: Callable[[Any], Plant]) -> bool:
+    """Whether a plant of the same family, whose functions have the same sizes, was registered before."""
+    return not plant.tabulated and _family_of(plant, build) in _checked
+
+
+def check_values(plant: Plant) -> None:
+    """`checks.check_numbers` of a registered plant whose family is checked: its functions, where one is not finite."""
+    check_signals(plant)
+    sizes = [len(getattr(plant, key)) for key in ("states", "inputs", "disturbances", "outputs")]
+    at = [np.zeros(size) for size in (*sizes, len(plant.actuator.coils))]
+    if not all(np.isfinite(found).all() for found in trace(_functions, plant)(*at)):
+        check_equations(plant)
+
+
+def _functions(plant: Plant, _believed: None) -> tuple[Expressions, Expressions]:
+    """(x, u, w, y, i) -> all functions of a plant."""
+    sizes = {key: len(getattr(plant, key)) for key in ("states", "inputs", "disturbances", "outputs")}
+    x, u, w, y, i = (
+        ca.SX.sym(name, size)
+        for name, size in zip("xuwyi", (*sizes.values(), len(plant.actuator.coils)), strict=True)
+    )
+    found = (
+        plant.f(x, u, w), plant.h(x, u), plant.load(x), plant.currents(y, u), plant.forces(x, i), plant.contact(x),
+    )  # fmt: skip
+    return [x, u, w, y, i], [ca.densify(ca.SX(one)) for one in found]
+
+
+def _family_of(plant: Plant, build: Callable[[Any], Plant]) -> _Family:
+    record: Any = plant.parameters
+    names = tuple(acting_names(record))
+    others = (f.name for f in fields(record) if f.name not in (*names, "preset"))
+    return _Family(build, type(record), names, tuple((name, getattr(record, name)) for name in others))
 
 
 def with_parameters(plant: Plant, parameters: Any) -> Plant:
