@@ -182,7 +182,12 @@ class SampledLoop:
     def _responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
         """P and F as functions of (z - 1) / T: in differences slow poles keep their digits."""
         c, T = self.control, self.sample_time
-        P = System((self.Ad - np.eye(len(self.Ad))) / T, self.Bd / T, self.Cd, np.zeros((len(self.Cd), self.Bd.shape[1])))
+        P = System(
+            (self.Ad - np.eye(len(self.Ad))) / T,
+            self.Bd / T,
+            self.Cd,
+            np.zeros((len(self.Cd), self.Bd.shape[1])),
+        )
         F = System((c.A - np.eye(len(c.A))) / T, c.B_y / T, c.C, c.D_y)
         return P.response_function(), F.response_function()
 
@@ -191,7 +196,7 @@ class SampledLoop:
         return np.asarray(np.linalg.inv(np.eye(len(self.Cd)) + self.loop_gain(w)))
 
     def answer(self, load: int | None = None) -> StepResponse:
-        """The true outputs after a unit step of every disturbance, or of one. Raises CheckError for an unstable loop."""
+        """The true outputs after a unit step of each disturbance, or of one. Raises CheckError for an unstable loop."""
         assert self.pushed is not None
         k, pushed = len(self.control.A), self.pushed if load is None else self.pushed[:, [load]]
         g = np.vstack([pushed, np.zeros((k, pushed.shape[1]))])

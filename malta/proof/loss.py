@@ -334,9 +334,7 @@ def _leave(
         return math.inf
     else:
         low, high = 0.0, end
-    return _first_unstable(
-        lambda t: float(rays.unstable(np.array([t]), [ray])[0]), low, high, RESOLVED * end
-    )
+    return _first_unstable(lambda t: float(rays.unstable(np.array([t]), [ray])[0]), low, high, RESOLVED * end)
 
 
 def _first_level(sets: Sequence[_Rays], owner: Sequence[tuple[int, int]]) -> tuple[float, int | None]:

@@ -159,9 +159,16 @@ def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: 
     return _solution_of(B.shape, A.tobytes(), B.tobytes(), Q.tobytes(), what, discrete)
 
 
-@lru_cache(maxsize=64)  # a slider moves one weight: the equations of other axes, and the filter's, are the same
+@lru_cache(
+    maxsize=64
+)  # a slider moves one weight: the equations of other axes, and the filter's, are the same
 def _solution_of(
-    shape: tuple[int, int], a: bytes, b: bytes, q: bytes, what: str, discrete: bool  # noqa: FBT001
+    shape: tuple[int, int],
+    a: bytes,
+    b: bytes,
+    q: bytes,
+    what: str,
+    discrete: bool,
 ) -> _Found:
     A, B, Q = (np.frombuffer(entries).reshape(shape[0], -1) for entries in (a, b, q))
     candidates: list[_Found] = []
