@@ -1,7 +1,7 @@
 // The tables beside the charts: requirements as lights, figures of pinned designs, and what differs.
 
 import { element } from "./controls.js";
-import { digits, floored, percent, printedUnit, quantity } from "./numbers.js";
+import { digits, floored, hertz, percent, printedUnit, quantity } from "./numbers.js";
 
 const SIGNS = { true: ["✓", "met"], false: ["✗", "not met"], null: ["…", "not known yet"] };
 
@@ -18,6 +18,8 @@ function marginLight(asked, state) {
 const wordsOf = (name) => [name.split(" ")[0].replaceAll("_", " "), ...name.split(" ").slice(1)].join(" ");
 
 const boundText = (asked, value) => (asked.switch ? (value ? "yes" : "no") : asked.name === "margin" ? percent(value) : quantity(value, asked.unit, 3));
+const isFrequency = (name, unit) => unit === "rad/s" && /bandwidth|crossover|pole/.test(name); // not the speed of a turn
+const foundText = (asked, value) => (isFrequency(asked.name, asked.unit) ? hertz(value, 3) : boundText(asked, value));
 
 // Failures first, then what is not known yet. A value of the last design stays, grey and without a verdict, until the new one comes.
 export function requirementRows(description, state) {
@@ -29,7 +31,7 @@ export function requirementRows(description, state) {
   const rank = ({ found }) => (found.holds === false ? 0 : 1);
   return judged.sort((one, other) => rank(one) - rank(other)).map(({ asked, found }) => {
     const [sign, words] = SIGNS[found.holds ?? null];
-    const value = found.found === null || found.found === undefined ? (found.holds === false ? "none" : "") : boundText(asked, found.found);
+    const value = found.found === null || found.found === undefined ? (found.holds === false ? "none" : "") : foundText(asked, found.found);
     const bound = asked.switch ? "" : `${asked.at_least ? "≥" : "≤"} ${boundText(asked, asked.asked)}`;
     return element("tr", { class: `light ${found.holds ?? "open"}${found.old ? " old" : ""}`, title: found.how ?? "" },
       element("td", { class: "sign", role: "img", "aria-label": words }, sign),
@@ -54,7 +56,7 @@ const near = (a, b) => Math.abs(a - b) <= 1e-4 * Math.max(Math.abs(a), Math.abs(
 
 function figureRows(figures, proof, margin) {
   const upper = proof?.upper ?? margin?.upper;
-  const rows = figures.map((one) => ({ ...one, text: quantity(one.value, one.unit, 4) }));
+  const rows = figures.map((one) => ({ ...one, text: isFrequency(one.label, one.unit) && one.value !== null ? hertz(one.value) : quantity(one.value, one.unit, 4) }));
   if (upper !== undefined && upper !== null) rows.unshift({ label: "margin, eigenvalues", value: upper, better: 1, text: `≤ ${percent(upper)}`, note: "upper bound" });
   if (proof?.lower !== undefined && proof?.lower !== null) rows.unshift({ label: "margin, proven", value: proof.lower, better: 1, text: percent(floored(proof.lower)), note: proof.reason });
   return rows;
