@@ -204,10 +204,8 @@ class System(NamedTuple):
         parts = [_Part(A[np.ix_(i, i)], B[i], C[:, i]) for i in states]
 
         def response(s: ComplexArray) -> ComplexArray:
-            found = np.zeros((len(s), *D.shape), dtype=complex) + D
-            for part in parts:
-                found += part.response(s)
-            return found
+            through = np.tile(D.astype(complex), (len(s), 1, 1))
+            return np.asarray(sum((part.response(s) for part in parts), through))
 
         return response
 
@@ -232,17 +230,17 @@ class _Part:
 
     def response(self, s: ComplexArray) -> ComplexArray:
         """At each s; NaN at a frequency that no double number tells from a pole."""
-        found = np.zeros((len(s), len(self.C), self.B.shape[1]), dtype=complex)
         used = np.flatnonzero(self.B.any(axis=0))
+        solved = np.empty((len(s), len(self.C), len(used)), dtype=complex)
         fast = np.zeros(len(s), dtype=bool)
         if len(s) >= MANY:
             fast = np.abs(s) > SLOW * np.linalg.norm(self.A)
             fast &= np.abs(s[:, None] - np.diag(self.schur[0])).min(axis=1) > 0
-            found[np.ix_(fast, range(len(self.C)), used)] = self._substituted(s[fast], used)
+            solved[fast] = self._substituted(s[fast], used)
         if not fast.all():
-            slow = np.flatnonzero(~fast)
-            solved = self.C @ _resolvent(s[slow], self.A, self.B[:, used])
-            found[np.ix_(slow, range(len(self.C)), used)] = solved
+            solved[~fast] = self.C @ _resolvent(s[~fast], self.A, self.B[:, used])
+        found = np.zeros((len(s), len(self.C), self.B.shape[1]), dtype=complex)
+        found[:, :, used] = solved
         return found
 
     def _substituted(self, s: ComplexArray, used: Any) -> ComplexArray:

@@ -367,6 +367,19 @@ def test_gain_files_go_through_the_checks_of_malta_design(tmp_path: Path) -> Non
     assert not (tmp_path / "design/gains/wild.json").exists()
 
 
+def test_an_eigenvalue_margin_that_would_make_an_answer_late_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = Client(BALL, tmp_path)
+    mass = client.session.files.fields["machine.m"].value
+    assert isinstance(mass, float)
+    for number, (room, given) in enumerate([(0.0, False), (float("inf"), True), (0.0, False)]):
+        monkeypatch.setattr("malta.app.session.SLOW", room)
+        found = client.ask("evaluate", number=number, values={"machine.m": mass * (1 + 1e-3 * number)})
+        assert found["stable"]
+        assert (found["margin"] is not None) == given
+
+
 def test_a_session_keeps_nothing_of_the_machines_that_it_leaves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
