@@ -19,7 +19,8 @@ const wordsOf = (name) => [name.split(" ")[0].replaceAll("_", " "), ...name.spli
 
 const boundText = (asked, value) => (asked.switch ? (value ? "yes" : "no") : asked.name === "margin" ? percent(value) : quantity(value, asked.unit, 3));
 const isFrequency = (name, unit) => unit === "rad/s" && /bandwidth|crossover|pole/.test(name); // not the speed of a turn
-const foundText = (asked, value) => (isFrequency(asked.name, asked.unit) ? hertz(value, 3) : boundText(asked, value));
+// Hz stand below rad/s: beside them they would push the bound out of a narrow panel.
+const inHertz = (asked, value) => (typeof value === "number" && isFrequency(asked.name, asked.unit) ? [element("br", {}), element("small", { class: "soft" }, quantity(value / (2 * Math.PI), "Hz"))] : []);
 
 // Failures first, then what is not known yet. A value of the last design stays, grey and without a verdict, until the new one comes.
 export function requirementRows(description, state) {
@@ -31,11 +32,11 @@ export function requirementRows(description, state) {
   const rank = ({ found }) => (found.holds === false ? 0 : 1);
   return judged.sort((one, other) => rank(one) - rank(other)).map(({ asked, found }) => {
     const [sign, words] = SIGNS[found.holds ?? null];
-    const value = found.found === null || found.found === undefined ? (found.holds === false ? "none" : "") : foundText(asked, found.found);
+    const value = found.found === null || found.found === undefined ? (found.holds === false ? "none" : "") : boundText(asked, found.found);
     const bound = asked.switch ? "" : `${asked.at_least ? "≥" : "≤"} ${boundText(asked, asked.asked)}`;
     return element("tr", { class: `light ${found.holds ?? "open"}${found.old ? " old" : ""}`, title: found.how ?? "" },
       element("td", { class: "sign", role: "img", "aria-label": words }, sign),
-      element("td", {}, wordsOf(asked.name)), element("td", { class: "number" }, value), element("td", { class: "number soft" }, bound));
+      element("td", {}, wordsOf(asked.name)), element("td", { class: "number" }, value, ...inHertz(asked, found.found)), element("td", { class: "number soft" }, bound));
   });
 }
 
@@ -54,9 +55,10 @@ export function countLights(description, state) {
 
 const near = (a, b) => Math.abs(a - b) <= 1e-4 * Math.max(Math.abs(a), Math.abs(b));
 
-function figureRows(figures, proof, margin) {
+// A single column has room for Hz beside rad/s.
+function figureRows(figures, proof, margin, alone = false) {
   const upper = proof?.upper ?? margin?.upper;
-  const rows = figures.map((one) => ({ ...one, text: isFrequency(one.label, one.unit) && one.value !== null ? hertz(one.value) : quantity(one.value, one.unit, 4) }));
+  const rows = figures.map((one) => ({ ...one, text: alone && isFrequency(one.label, one.unit) && one.value !== null ? hertz(one.value) : quantity(one.value, one.unit, 4) }));
   if (upper !== undefined && upper !== null) rows.unshift({ label: "margin, eigenvalues", value: upper, better: 1, text: `≤ ${percent(upper)}`, note: "upper bound" });
   if (proof?.lower !== undefined && proof?.lower !== null) rows.unshift({ label: "margin, proven", value: proof.lower, better: 1, text: percent(floored(proof.lower)), note: proof.reason });
   return rows;
@@ -64,7 +66,7 @@ function figureRows(figures, proof, margin) {
 
 // Figures of the design and of the pinned ones, the better of two marked.
 export function figureTable(state) {
-  const columns = [{ name: "now", rows: figureRows(state.picture.figures, state.proof, state.picture.margin) }];
+  const columns = [{ name: "now", rows: figureRows(state.picture.figures, state.proof, state.picture.margin, !state.pins.length && !state.candidates.length) }];
   for (const pin of [...state.pins, ...state.candidates]) columns.push({ name: pin.name, rows: figureRows(pin.picture.figures, pin.proof, pin.picture.margin) });
   const labels = [...new Set(columns.flatMap((column) => column.rows.map((row) => row.label)))];
   const head = element("tr", {}, element("th", {}, ""), ...columns.map((column) => element("th", { scope: "col", class: "number" }, column.name)));
