@@ -6,7 +6,7 @@
 # of its margin, a simulation with noise and limits, campaigns, gain files. `malta new NAME` writes such a module, with
 # its data, designs, tests and a notebook; this page walks through that folder.
 #
-# **Question:** what has to be written down of a machine, and what does malta make of it?
+# **Question:** what has to be written down about a machine, and what does malta compute from it?
 
 # %%
 import os
@@ -31,8 +31,8 @@ print(
 # %% [markdown]
 # ## The equations
 # A steel sphere hovers between two electromagnets. The upper one pulls with the square of its current over the square
-# of its gap, the lower one pulls back. `forces(x, i)` says so; `f` is Newton's law for the sum; `h` is the sensor.
-# Nothing is linearized by hand.
+# of its gap, the lower one pulls back. `forces(x, i)` has both forces; `f` is Newton's law for their sum; `h` is the
+# sensor. Nothing is linearized by hand.
 
 # %%
 text = Path("ball.py").read_text(encoding="utf-8")
@@ -66,8 +66,9 @@ assert np.isclose(model.A[1, 0] * par.m, k_s, rtol=1e-12)
 
 # %% [markdown]
 # ## The controller
-# `design/ball.toml` holds weights on bases that mean something (Bryson's rule), noise as standard deviations of a
-# sample, and how far parameters vary. The filter knows of the dead time; integrals take off constant loads.
+# `design/ball.toml` holds weights on bases, the deviations that are acceptable (Bryson's rule), noise as standard
+# deviations of a sample, and how far parameters vary. The filter's model has the dead time; integrals cancel constant
+# loads.
 
 # %%
 spec = malta.read_design("design/ball.toml")
@@ -78,9 +79,9 @@ print(margins)
 
 # %% [markdown]
 # ## The proof
-# The margin counts in multiples of the box: how far all uncertain parameters may go at once. `lower` is proven for
-# every combination and every frequency, `upper` is a machine that is lost. Between them nothing is known; here nothing
-# is left between them.
+# The margin is the factor by which the box of uncertain parameters may grow, all parameters at once, before a loop is
+# unstable. `lower` is proven for every combination and every frequency; at `upper` one machine, the witness, is
+# unstable. Between both bounds nothing is known; here they agree.
 
 # %%
 robust = margins.robust
@@ -94,8 +95,8 @@ assert robust.lower > 0.999 * robust.upper
 
 # %% [markdown]
 # ## The flight
-# The nonlinear machine with its limits, dead time and noise, and the same controller. A machine without experiments of
-# its own has three: `hold`, `step`, `disturbance`. Its own go into EXPERIMENTS, beside `plant`.
+# The same controller now runs on the nonlinear machine with its limits, dead time and noise. Every machine has three
+# experiments: `hold`, `step`, `disturbance`. A list EXPERIMENTS beside `plant` adds a machine's own.
 
 # %%
 push = malta.experiment("disturbance", ball, controller, size=0.1)
@@ -114,7 +115,7 @@ assert end < 0.1 * furthest
 
 # %% [markdown]
 # ## PID beside it
-# The same machine and the same questions, by another design file.
+# Another design file gives the same machine a PID; the questions are the same.
 
 # %%
 pid = malta.read_design("design/ball_pid.toml")
@@ -128,8 +129,9 @@ assert judged.stable
 
 # %% [markdown]
 # ## The gain file
-# All that a digital implementation needs. It names the machine, never a path: whoever reads it says where the machine
-# is, so that reading a file runs no code that nobody asked for. On the command line that is `--machine ball.py`.
+# A gain file is all that a digital implementation needs. It names the machine, but no path: the reader of the file says
+# where the machine's module is, so that reading a file runs no code that nobody named. On the command line,
+# `--machine ball.py` names the module.
 
 # %%
 malta.gains.write(controller, margins, "ball.json")
@@ -139,5 +141,6 @@ print("L =", again.L.round(4).tolist(), " K =", again.K.round(4).tolist())
 
 # %% [markdown]
 # ## What next
-# Replace the equations in a folder of `malta new`, then its numbers, and run `malta design` after each step: it says in
-# one sentence what does not fit. `examples/rotor` is a machine of four degrees of freedom that was made this way.
+# Replace first the equations in a folder of `malta new`, then its numbers, and run `malta design` after each change:
+# it says in one sentence what does not fit. `examples/rotor` is a machine of four degrees of freedom that was made
+# this way.

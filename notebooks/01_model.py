@@ -94,6 +94,7 @@ figure.savefig("build/01_model.png", dpi=120)
 
 # %% [markdown]
 # ## Judgement
-# Table I is reproduced to every digit with 2 K_A / m = 218.92^2; with Table IV as printed the radial poles are 215.12,
-# which neither rounding nor discretization explains. Over the whole travel the poles move by 5 %, so one controller
-# designed at the centre is a fair start; what that costs in margin is a question for verification, not for belief.
+# Table I is reproduced to every digit with 2 K_A / m = 218.92^2 (K_A attraction of a module, N/m; m mass, kg). With
+# Table IV as printed the radial poles are 215.12 rad/s, which neither rounding nor discretization explains. Over the
+# whole travel the poles move by 5 %, so one controller designed at the centre is a fair start; what that costs in
+# margin is a question for verification, not for belief.

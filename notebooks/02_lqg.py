@@ -45,9 +45,10 @@ model = malta.linearize(plant, plant.at(z=0.0))
 
 # %% [markdown]
 # ## Design
-# For each mode, K1 = k + sqrt(k^2 + q/r). As plain SI numbers the weights are nothing beside the attraction, and the
-# stiffness ratio K1/k is that of the regulator of zero weight, 2. On bases of micrometres the same weights mean
-# something.
+# For each mode the gain on the position is K1 = k + sqrt(k^2 + q/r): k is the attraction over the mass, q and r are
+# the weights of position and input. Taken as plain SI numbers, the printed weights are negligible beside the
+# attraction, and the stiffness ratio K1/k is 2, that of a regulator of zero weight. On bases of micrometres the same
+# weights raise it.
 
 # %%
 w_n = {}
@@ -109,10 +110,10 @@ assert off_L < 1e-9
 
 # %% [markdown]
 # ## Check: stability and sensitivity
-# The LQR's margin is one of full state feedback; with its own slow observer the plain SI design peaks in zone D of
-# ISO 14839-3. On the machine it gets worse in z: a newton from outside moves the axis further than its travel, and the
-# loop stands against a cogging slope that v0(z) has to cancel through delay and current loops. The calibrated design
-# stays in zone A on the machine.
+# The margin of an LQR holds for full state feedback. With its slow observer, the design of plain SI weights has a
+# peak of |S| in zone D of ISO 14839-3. On the machine the axis z is worse: a load of 1 N moves it farther than its
+# travel, since the loop is softer than the cogging, whose slope v0(z) cancels only through delay and current loops.
+# The calibrated design stays in zone A on the machine.
 
 # %%
 par: Any = plant.parameters
@@ -171,8 +172,8 @@ for name, controller in controllers.items():
 
 # %% [markdown]
 # ## Judgement
-# Both designs meet the published stroke, because feedforward does that work. What separates them is everything else:
-# read as plain SI, Table II leaves an axial loop that yields to a newton beyond its stops, radial integrators that
+# Both designs meet the published stroke, because the feedforward makes the stroke. They differ in everything else:
+# read as plain SI, Table II gives an axial loop that a load of 1 N pushes beyond its stops, radial integrators that
 # settle in minutes and a sensitivity peak in zone D. With the stiffness ratio of 4 that the claimed margin needs, the
 # LQR's natural frequency comes out near the claimed bandwidth: the two claims agree with each other, not with the
 # printed numbers.

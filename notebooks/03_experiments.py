@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Experiments: the paper's Figs 12 to 16 beside ours
 #
-# The gain files fly on the whole drive: exact mover, PI current loops on the windings, half-bridges at 45 V,
-# sensors with noise and 1 µm steps. Source: Miric et al., Sec. V and VI.
+# The controllers run on a simulation of the whole drive: exact mover, PI current loops on the windings, half-bridges
+# at 45 V, sensors with noise and 1 µm steps. Source: Miric et al., Sec. V and VI.
 #
 # **Question:** which of the published measurements does this machine show, and where does it differ?
 
@@ -80,8 +80,8 @@ for e in rests.values():
     assert (true < 0.5 * measured).all()
 
 # %% [markdown]
-# **Judgement.** The measured statistics are those of Table III because the sensors' noise was chosen such that they
-# are; what the table cannot say, and the simulation can, is how still the mover really stands:
+# **Judgement.** The measured statistics are those of Table III because the sensors' noise was chosen for that. The
+# simulation also shows what the table cannot: how still the mover really stands:
 
 # %%
 for key, e in rests.items():
@@ -104,7 +104,8 @@ for e in drifts.values():
     assert left < 2e-6 < 60e-6 < raw
 
 # %% [markdown]
-# **Judgement.** The concept holds. What is left is the lag of the outer loop, which shrinks with the speed, and noise.
+# **Judgement.** The concept holds. The remaining error is the lag of the outer loop, which shrinks with the speed, and
+# noise.
 
 # %%
 for key, e in drifts.items():
@@ -130,9 +131,9 @@ for key, e in tilts.items():
 
 # %% [markdown]
 # **Judgement.** With the control law as printed the state feedback pulls a mover that the attraction pulls too: it
-# goes to K1 / (K1 - k) of what is asked, and the integrals take it back only in part. Neither set of printed weights
-# keeps 4 µm so. The law's own feedforward, which the paper keeps for "known radial disturbances", mends it: the
-# attraction at the reference is known.
+# goes to K1 / (K1 - k) of its reference, and the integrals correct this only in part. Neither set of printed weights
+# keeps the error within 4 µm this way. The law's own feedforward, which the paper keeps for "known radial
+# disturbances", corrects it, since the attraction at the reference is known.
 
 # %%
 for key, e in tilts.items():
@@ -144,7 +145,7 @@ for key, e in tilts.items():
 
 # %% [markdown]
 # ## Lift-off, payload, faults
-# Not shown in the paper, or only in words.
+# The paper does not show these experiments, or describes them only in words.
 
 # %%
 others: dict[str, dict[str, malta.simulation.Experiment]] = {}
@@ -156,10 +157,10 @@ for name in ("lift-off", "payload", "faults"):
         print(f"{key}, {e}")
 
 # %% [markdown]
-# **Judgement.** Every estimator lifts the mover; a filter that knows it lies on its bearing needs somewhat more current
-# than statics ask for. 0.2 kg are dropped by the printed weights as plain SI numbers; the other designs carry them, not
-# as precisely as the empty stroke. Struck where the stroke accelerates most, all survive lost samples and control
-# steps. A stuck radial sensor and a link at a tenth of its voltage end in the touchdown bearing:
+# **Judgement.** Every estimator lifts the mover; a filter that knows it lies on its bearing needs somewhat more
+# current than statics ask for. The design of plain SI weights drops a payload of 0.2 kg; the other designs carry it,
+# less precisely than the empty stroke. All designs survive lost samples and control steps where the stroke
+# accelerates most. A stuck radial sensor and a link at a tenth of its voltage end in the touchdown bearing:
 
 # %%
 for key in controllers:
@@ -204,9 +205,9 @@ print(f"rise {fastest * 1e3:.1f} ms against {sigmoid * 1e3:.1f} ms of the sigmoi
 assert fastest < 0.85 * sigmoid
 
 # %% [markdown]
-# **Summary.** Every bound of Figs 12 and 13 is met; Table III is as noisy as the noise that is put in; with the printed
-# weights Fig. 16 needs the attraction fed forward; the payload and the 300 % need other bases than SI units, and the
-# payload costs precision. The whole ledger, computed: `malta claims`.
+# **Summary.** Every bound of Figs 12 and 13 is met. The noise of Table III is that of the simulated sensors. With the
+# printed weights Fig. 16 needs a feedforward of the attraction. The payload and the margin of 300 % need other bases
+# than SI units, and the payload costs precision. `malta claims` computes all claims of the paper.
 
 # %%
 fig, ax = plt.subplots()

@@ -5,7 +5,7 @@
 # that measures every state is not what runs on the machine: there are an observer, current loops, a hold and a sample
 # of delay.
 #
-# **Question:** what is left of the margin on the machine, and what does it take to have it back?
+# **Question:** how much of the margin is left on the machine, and which design has all of it?
 
 # %%
 import os
@@ -34,8 +34,9 @@ plant = malta.plant_of(controllers["robust"].parameters)
 
 # %% [markdown]
 # ## The chain
-# From full state feedback to the sampled loop. Every bar is proven: no set of parameters inside destabilizes, at any
-# frequency. Every red mark is a set of parameters that does, by the eigenvalues of the loop.
+# The stages lead from full state feedback to the sampled loop. Every bar is proven: no set of parameters inside it
+# makes the loop unstable, at any frequency. Every red mark is a set of parameters that does, by the eigenvalues of
+# the loop.
 
 # %%
 found = {
@@ -61,15 +62,16 @@ assert machine["robust"].lower >= 3.5
 # **Judgement.** The claimed 300 % is that of full state feedback with a gain four times as stiff as the attraction
 # pulls (`calibrated`). The observer takes half of it, and with the printed noise (`table2`) it takes all but a third
 # of the box. Current loops, hold and delay cost little after that. `robust` has a fast observer for the bearings and
-# a slow one for the noisy axial sensor. It was tuned for first-order lags in place of the current controllers, with
-# which it keeps more than the claim (`sampled`); with the PI controllers that run (`machine`) it keeps a little less
-# than that. The margins are without the loads; |S| of the last stage is with them, and shows that the axial loop of
-# `table2` is softer than the cogging that v0(z) cancels.
+# a slow one for the noisy axial sensor. It was tuned with first-order lags in place of the current controllers, and
+# keeps more than the claim with these lags (`sampled`); with the PI controllers of the machine (`machine`) its margin
+# is a little smaller. Margins are without the loads; |S| of the last stage is with them, and shows that the axial
+# loop of `table2` is softer than the cogging that v0(z) cancels.
 
 # %% [markdown]
 # ## A witness flies
-# What the eigenvalues say, the nonlinear machine should show: just inside the boundary a small step dies out, just
-# beyond it grows. Simulated with the current controllers of the gain file, as the proof has them, without loads.
+# The nonlinear machine should agree with the eigenvalues: just inside the boundary of stability the answer to a small
+# step dies out, just beyond the boundary it grows. The simulation has the current controllers of the gain file, as
+# the proof does, and no loads.
 
 # %%
 nominal: Any = plant.parameters
@@ -92,8 +94,9 @@ for name in ("calibrated", "robust"):
 
 # %% [markdown]
 # ## Machines by the hundred
-# A proof holds for the linear loop. What do machines do that are drawn from ever larger boxes and fly the stroke, with
-# gravity, cogging, saturation, sensor noise? The share that completes it, over the size of the box:
+# A proof holds for the linear loop. Here nonlinear machines, with gravity, cogging, saturation and sensor noise, are
+# drawn from larger and larger boxes, and each makes the stroke. The figure shows the share of completed strokes over
+# the size of the box:
 
 # %%
 SIZES = np.array([0.25, 0.5, 1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5])
@@ -131,7 +134,7 @@ for name, completed in yields.items():
 
 # %% [markdown]
 # ## The worst machines
-# The ones that come closest to the touchdown bearings, in the modelled box.
+# These machines of the modelled box come closest to the touchdown bearings.
 
 # %%
 plan = malta.campaigns.Plan(
@@ -157,8 +160,8 @@ display(
 
 # %% [markdown]
 # ## What it costs
-# More margin costs force noise. `malta tune` draws the front: the least noise at each margin, everything else as
-# specified (design/figures/robust_front.svg).
+# A larger margin costs force noise. `malta tune` computes the front of both: the least noise at each margin, with all
+# other requirements met (design/figures/robust_front.svg).
 
 # %%
 front = Path("design/figures/robust_front.md").read_text(encoding="utf-8")
@@ -170,8 +173,9 @@ margin, noise = margin[least], noise[least]  # the others have less motion
 assert len(margin) > 5
 
 # %% [markdown]
-# **Judgement.** The front bends: up to there every percent of margin costs little, beyond it force noise grows fast.
-# The shipped design (*) stands above the front: the noise that it is allowed carries loads.
+# **Judgement.** The front has a bend: below it every percent of margin costs little noise, above it the noise grows
+# fast. The shipped design (*) lies above the front: it uses the noise that its requirements allow, to carry loads
+# better.
 
 # %%
 order = np.argsort(margin)

@@ -27,7 +27,7 @@ Path("build").mkdir(exist_ok=True)
 
 # %% [markdown]
 # ## Parameters
-# As printed; what the paper is silent on is marked as assumed in the data file.
+# The parameters are those of the paper; those that it does not print are marked as assumed in the data file.
 
 # %%
 par = malta.read("data/halbach.toml")
@@ -47,8 +47,8 @@ assert abs(F.max() - 1) < 1e-3
 
 # %% [markdown]
 # ## Dead zones
-# Phase voltages come in steps of 5.9 mV, and in the open loop the motor stands where the angle of its voltages says.
-# References within a dead zone make the same duty cycles.
+# Phase voltages have steps of 5.9 mV, and in the open loop the angle of these voltages decides where the motor stands.
+# All references within a dead zone give the same duty cycles.
 
 # %%
 places = electronics.resting_positions(par, 10e-6 * np.arange(5), par.F_z, "plain")
@@ -60,8 +60,8 @@ assert abs(zones["plain"] - 15.3e-6) < 0.03 * 15.3e-6
 assert abs(zones["fine"] - 69e-9) < 0.03 * 69e-9
 
 # %% [markdown]
-# **Judgement.** 15 µm and the dead second stair are the paper's. Its 700 nm with high-resolution PWM are ten times
-# too large: the motion goes as the step of the voltage, and so do the dead zones above.
+# **Judgement.** The dead zone of 15 µm and the second stair without a motion agree with the paper. Its 700 nm with
+# high-resolution PWM are ten times too large: motion and dead zone are proportional to the step of the voltage.
 
 # %%
 steps = [float(electronics.pwm_step(par, pwm)) for pwm in ("plain", "fine")]
@@ -72,8 +72,9 @@ assert abs(steps[0] / steps[1] / (zones["plain"] / zones["fine"]) - 1) < 0.05
 
 # %% [markdown]
 # ## The held angle
-# Between two readings the Park angle stands still, and so do the currents: the motor hangs on a spring k F_z. That is
-# another plant than a mass with friction, which a design without vertical force would be made for.
+# Between two readings the Park angle stands still, and so do the currents: they hold the motor like a spring of
+# stiffness k F_z (k wave number, 1/m; F_z vertical force, N). Without vertical force the plant would be a mass with
+# friction.
 
 # %%
 poles = {}
@@ -100,7 +101,7 @@ for name, controller in controllers.items():
 
 # %% [markdown]
 # ## Steps with every source of error
-# 20 steps of 100 µm there and back, as jumps and as quintics, and 22 s of rest.
+# The references are 20 steps of 100 µm, forward and back, as jumps and as quintic polynomials, and then 22 s of rest.
 
 # %%
 for name, controller in controllers.items():
@@ -133,9 +134,10 @@ for law in ("open loop", "position control", "vector control"):
 assert abs(force.cases[0].merits[1].value + 0.503) < 1e-3
 
 # %% [markdown]
-# **Judgement.** Vector control keeps the force, as the paper says. Its steady -18 % in the open loop and +7 % under
-# position control do not follow from its motor law: all three end where they began. Unequal windings are the one
-# fault here that vector control takes out, and they move both others the same way.
+# **Judgement.** Vector control keeps the vertical force, as the paper says. The paper's steady changes of -18 % in
+# the open loop and +7 % under position control do not follow from its motor law: in all three modes the force returns
+# to its first value. Vector control compensates unequal windings alone of the faults here; they shift the force in
+# both other modes in the same direction.
 
 # %% [markdown]
 # ## What keeps it from standing still
@@ -152,9 +154,9 @@ assert rms["PWM"] < 0.01
 print(f"the laser makes {rms['laser'] / rms['current noise']:.3f} of the current sensors' motion")
 
 # %% [markdown]
-# **Summary.** Noise of the current sensors decides, and the rolling mean leaves it: within the current loops what
-# counts is its density, not its rms. The laser is a few percent of it, the PWM nothing. The whole ledger, computed:
-# `malta claims design/halbach_pid.toml`.
+# **Summary.** The noise of the current sensors decides how still the motor stands. A rolling mean does not reduce it:
+# within the bandwidth of the current loops the density of the noise counts, not its rms. The laser adds a few
+# percent, the PWM nothing. `malta claims design/halbach_pid.toml` computes all claims of the paper.
 
 # %%
 fig, ax = plt.subplots()

@@ -29,7 +29,7 @@ Path("build").mkdir(exist_ok=True)
 
 # %% [markdown]
 # ## Parameters
-# Table 1 is printed; corner radius, remanence, coil pitch and arm are not, and every one of them is marked as ours.
+# Table 1 is printed. Corner radius, remanence, coil pitch and lever arm are not: the data file marks each as assumed.
 
 # %%
 par = malta.read("data/planar.toml")
@@ -75,7 +75,8 @@ assert np.abs(errors["fitted"][..., :3]).max() < 0.08
 assert np.abs(errors["table"][..., :3]).max() < 0.025
 
 # %% [markdown]
-# Fitted, the fundamental alone misses 0.04 N of 12: the paper's 0.83 N is an amplitude 7 % off, which fitting mends.
+# A fitted fundamental alone has an error of 0.04 N of 12 N. The paper's error of 0.83 N comes from an amplitude that
+# is 7 % off; fitting removes it.
 
 # %%
 figure, panels = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
@@ -156,8 +157,8 @@ for case in e.cases:
 
 # %% [markdown]
 # ## The delay
-# The loop computes for a whole sample. A filter that does not know of it does as well at the designed speed, and
-# circles at twice that.
+# The loop computes for a whole sample. A filter whose model lacks this delay does as well at the designed speed of
+# the loop; at twice that speed the mover circles about its place.
 
 # %%
 late = malta.experiment("delay", plant, controllers["planar"], speeds=(1.0, 2.0), engine="virtual machine")
@@ -167,11 +168,11 @@ print(late)
 assert left_at_rest["with, 2 x"] < 1e-9 < 30e-6 < left_at_rest["without, 2 x"]
 
 # %% [markdown]
-# **Judgement.** The paper is right that the table beats its formulas, and not for the reason it gives: fitted, the
-# fundamental misses less than half a percent, and what moves the mover is the torque of rectangles that overlap at the
-# corners. The exact series needs 22 harmonics and less time than the table, see `malta simulate
-# design/gains/planar.json --scenario timing`. What is left with the exact model no coil model mends: currents that were
-# right for where the mover was 200 us ago. Every printed number beside ours: `malta claims design/planar_pid.toml`.
+# **Judgement.** The paper's table is better than its formulas, but for another reason than the paper gives: the
+# fitted fundamental is less than half a percent off, and the mover is moved by the torque of coil rectangles that
+# overlap at the corners. The exact series needs 22 harmonics and less time than the table, see `malta simulate
+# design/gains/planar.json --scenario timing`. No coil model removes the rest: the currents are those for the position
+# of 200 us ago. `malta claims design/planar_pid.toml` prints every number of the paper beside that of malta.
 
 # %%
 shares = [np.abs(errors["fitted"][..., k]).max() / largest[k] for k in (0, 2)]

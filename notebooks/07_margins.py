@@ -152,12 +152,14 @@ edge = (np.abs(e1) <= both.lower) & (np.abs(e2) <= both.lower)
 assert stable[edge].all()
 
 # %% [markdown]
-# **Judgement.** Margins of one loop at a time say nothing here. The box is as large as the region allows, and small.
+# **Judgement.** Margins of one loop at a time say nothing here: the box, as large as the stable region allows, is
+# small.
 
 # %% [markdown]
 # ## Doyle's regulator
-# "There are none": an LQG regulator of x' = [[1, 1], [0, 1]] x + [0, 1] u with weights q on (x1 + x2) and noise of the
-# same size. Both gains are 2 + sqrt(4 + q); the input gain may grow by the inverse of their product, 1 % at q = 60.
+# An LQG has no guaranteed margin. The example is the LQG regulator of x' = [[1, 1], [0, 1]] x + [0, 1] u with weights
+# q on (x1 + x2) and noise of the same size. Both gains are 2 + sqrt(4 + q); the input gain may grow by the inverse of
+# their product, 1 % at q = 60.
 
 # %%
 A, B, C = np.array([[1.0, 1], [0, 1]]), np.array([[0.0], [1]]), np.array([[1.0, 0]])
@@ -184,7 +186,8 @@ axes.legend(frameon=False)
 figure.savefig("build/07_doyle.png", dpi=120)
 
 # %% [markdown]
-# **Judgement.** Optimal for its weights, and as fragile as one likes. The proof follows the formula to its rounding.
+# **Judgement.** The regulator is optimal for its weights, and its margin becomes as small as one likes. The proof
+# agrees with the formula to the formula's rounding.
 
 # %% [markdown]
 # ## An island
@@ -266,8 +269,8 @@ figure.savefig("build/07_dynamics.png", dpi=120)
 assert peak.lower * (1 - 1e-3) <= envelope.max() <= peak.upper
 
 # %% [markdown]
-# **Judgement.** Both pages are right. Parameters and dynamics are one question: the box grows, and with it the disc
-# of Δ.
+# **Judgement.** Both pages are right. Parameters and dynamics have one common margin: the box and the disc of Δ grow
+# together.
 
 # %% [markdown]
 # ## A bus, and a frequency in disguise

@@ -49,9 +49,9 @@ if can_build:
     assert said.stdout.splitlines()[-1].startswith("pass: 4 vectors")
 
 # %% [markdown]
-# **Judgement.** The recorded vectors hold a stroke, saturation, readings that are none, and lift-off; then faults make
-# every monitor of the supervisor act, in each state in which it watches, and all transitions are taken. The checksum is
-# of every bit of the outputs and the state after each sample; it is the same on x86, a Cortex-A9 and a Cortex-M4F.
+# **Judgement.** The recorded test vectors have a stroke, saturation, invalid readings and lift-off; then faults make
+# every monitor of the supervisor act, in each state in which it watches, and all transitions are taken. The checksum
+# is of every bit of the outputs and the state after each sample; it is the same on x86, a Cortex-A9 and a Cortex-M4F.
 
 # %% [markdown]
 # ## It flies
@@ -87,7 +87,8 @@ if can_build:
 
 # %% [markdown]
 # ## What single precision does
-# The margin is proven again with the coefficients that 24 bits hold. Sums of errors keep what rounding takes from them.
+# The margin is proven again with the coefficients rounded to 24 bits. Sums of errors keep their rounding errors
+# beside them.
 
 # %%
 margin = rounded_margin(c, dict.fromkeys(("m", "K_A", "K_D", "K_B"), 0.2))

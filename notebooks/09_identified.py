@@ -1,8 +1,8 @@
 # %% [markdown]
 # # A machine that nobody knows: identify, prove, learn, measure, compare
 #
-# A lab switches a machine on, and its parameters are not those of the data file. This page does not look at the true
-# ones until its last cell: all that it has is the gain file, and what a bench would log.
+# A lab switches a machine on whose parameters are not those of the data file. This page does not use the true
+# parameters before its last cell: it has only the gain file, and the signals that a bench would log.
 #
 # **Question:** do the intervals, the margin and the measured sensitivity tell the truth?
 
@@ -36,7 +36,7 @@ hidden = believed.variant(replace(controller.parameters, **values, I_yy=values["
 
 # %% [markdown]
 # ## Excite and identify
-# What the log will tell is known before it is flown; the parameters follow from measured currents.
+# The widths of the intervals are predicted before the run; the parameters follow from measured currents.
 
 # %%
 plan = malta.excite(loop, motion=40e-6, periods=4)
@@ -53,7 +53,8 @@ display(Markdown(f"**Judgement.** {plan.duration:g} s of motion below 40 µm tel
 
 # %% [markdown]
 # ## Prove
-# The margin is counted in half intervals about the identified machine; a box `joint` times as wide has all parameters.
+# The margin is given in multiples of the intervals' half widths about the identified machine; a box `joint` times as
+# wide holds all parameters at once with 95 %.
 
 # %%
 shares = found.half_widths / found.values
@@ -70,7 +71,7 @@ display(
 
 # %% [markdown]
 # ## Learn
-# One stroke with the gain file as it is, one with the force constant that the first one told.
+# The first stroke uses the gain file as it is; the second uses the force constant learned from the first.
 
 # %%
 stroke = malta.Scenario.stroke(10e-3, noise=1.0, quantize=True)
@@ -88,8 +89,9 @@ display(
 
 # %% [markdown]
 # ## Measure
-# The same log has the loop: sensitivity at every sensor with 95 % bands, beside the identified machine's. The gain
-# file's own prediction is refused, since its machine is another one; the identified one explains what was measured.
+# The same log gives the sensitivity at every sensor with 95 % bands, beside that of the identified machine. The
+# measurement contradicts the prediction of the gain file, which is of another machine, and agrees with that of the
+# identified one.
 
 # %%
 joint = {name: found.joint * share for name, share in zip(names, shares.tolist(), strict=True)}

@@ -17,6 +17,7 @@ import numpy as np
 
 from malta.app.files import Edited
 from malta.errors import CheckError, InputError
+from malta.loops.classical import phase_and_delay
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.loop import Loop, loop_of_model
 from malta.margins.loop_report import BANDWIDTHS, LoopReport, pole_figures, zone
@@ -110,15 +111,37 @@ def linear_run(loop: SampledLoop, controller: Controller, scenario: Scenario) ->
     r = _references(c, motion, here)
     closed, driven = loop.closed, r @ np.vstack([loop.Bd @ law.D_r, law.B_r]).T
     n, m = len(loop.Ad), len(c.forces)
-    X = np.empty((samples, len(closed)))
     with np.errstate(all="ignore"):  # an unstable loop runs away
-        state = _at_rest(closed, driven[0])
-        for k in range(samples):
-            X[k] = state
-            state = closed @ state + driven[k]
+        X = _follow(closed, driven)
         p = here + X[:, :n] @ loop.outputs.T
         v = X @ np.hstack([law.D_y @ loop.Cd, law.C])[:m].T + r @ law.D_r[:m].T
     return LinearRun(t, motion.p, p, v)
+
+
+BLOCK = 32  # samples that are stepped through at once
+
+
+def _follow(closed: FloatArray, driven: FloatArray) -> FloatArray:
+    """X+ = M X + d from rest, one row a sample.
+
+    The states within a block are those from zero, all blocks at once, and what its first state grows to.
+    """
+    samples, n = driven.shape
+    blocks = -(-samples // BLOCK)
+    d = np.zeros((blocks, BLOCK, n))
+    d.reshape(-1, n)[:samples] = driven
+    powers, X = [np.eye(n)], np.zeros((blocks, BLOCK, n))
+    for k in range(1, BLOCK):
+        powers.append(closed @ powers[-1])
+        X[:, k] = X[:, k - 1] @ closed.T + d[:, k - 1]
+    whole, across = closed @ powers[-1], X[:, -1] @ closed.T + d[:, -1]
+    first = np.empty((blocks, n))
+    state = _at_rest(closed, driven[0])
+    for k in range(blocks):
+        first[k] = state
+        state = whole @ state + across[k]
+    X += (first @ np.concatenate(powers).T).reshape(X.shape)
+    return np.asarray(X.reshape(-1, n)[:samples])
 
 
 def _at_rest(closed: FloatArray, driven: FloatArray) -> FloatArray:
@@ -204,10 +227,9 @@ def _design_model(plant: Plant, at: tuple[tuple[str, float], ...]) -> LinearMode
     return linearize(plant, plant.at(**dict(at)))
 
 
-def picture(problem: Problem, view: View, first: int | None = None, *, margin: bool = True) -> dict[str, Any]:
+def picture(problem: Problem, view: View, *, margin: bool = True) -> dict[str, Any]:
     """Compute the document that the page draws.
 
-    first : the ray of the last eigenvalue margin, see margins.rays
     margin : whether the eigenvalue margin is asked for
 
     Raises CheckError where no input holds the machine.
@@ -221,7 +243,7 @@ def picture(problem: Problem, view: View, first: int | None = None, *, margin: b
             "frequency": _frequency(problem.curves),
             "run": (run := run_document(problem, view)),
             "load": (load := _load(problem, view)),
-            "margin": _margin(problem, first) if margin else None,
+            "margin": eigenvalue_margin(problem) if margin else None,
             "figures": _figures(problem, run, load),
         }
 
@@ -297,12 +319,12 @@ def _load(problem: Problem, view: View) -> dict[str, Any] | None:
     names = [s.name for s in problem.plant.disturbances]
     if not names or not problem.report.stable:
         return None
-    answer, one, k = _answer(problem, view)
+    one, k = _answer(problem, view)
     settled = one.within(0.02)
     ends = settled[np.isfinite(settled)]
     end = max(1.3 * float(ends.max(initial=0.0)), 20 * problem.controller.sample_time)
-    t = np.linspace(0.0, min(end, float(answer.t[-1])), LOAD_POINTS)
-    y = np.array([np.interp(t, answer.t, row) for row in one.y[..., 0].T])
+    t = np.linspace(0.0, min(end, float(one.t[-1])), LOAD_POINTS)
+    y = np.array([np.interp(t, one.t, row) for row in one.y[..., 0].T])
     return {
         "name": names[k],
         "t": round_values(t),
@@ -311,21 +333,23 @@ def _load(problem: Problem, view: View) -> dict[str, Any] | None:
     }
 
 
-def _answer(problem: Problem, view: View) -> tuple[StepResponse, StepResponse, int]:
-    """Answers of the loop to all loads, to a unit of the chosen one, and which that is."""
+def _answer(problem: Problem, view: View) -> tuple[StepResponse, int]:
+    """The answer of the loop to a unit of the chosen load, and which that is."""
     names = [s.name for s in problem.plant.disturbances]
     k = names.index(view.load) if view.load in names else 0
-    answer = problem.loop.sampled.answer()
-    return answer, answer.of(np.eye(len(names))[k]), k
+    return problem.loop.sampled.answer(k), k
 
 
 def largest_moved(problem: Problem, view: View) -> FloatArray | None:
     """How far the chosen load moves each output at most; None without loads from outside."""
-    return _answer(problem, view)[1].largest[:, 0] if problem.plant.disturbances else None
+    return _answer(problem, view)[0].largest[:, 0] if problem.plant.disturbances else None
 
 
-def _margin(problem: Problem, first: int | None) -> dict[str, Any] | None:
-    """The eigenvalue margin, an upper bound; None without an uncertainty, or where the model is none of parameters."""
+def eigenvalue_margin(problem: Problem, first: tuple[int, float] | None = None) -> dict[str, Any] | None:
+    """The eigenvalue margin, an upper bound; None without an uncertainty, or where the model is none of parameters.
+
+    first : the ray of the last eigenvalue margin, and that margin
+    """
     box = problem.spec.uncertainty
     if not box:
         return None
@@ -430,8 +454,10 @@ def _loop_merits(problem: Problem) -> list[Merit]:
     known = {one.key: one for one in found}
     peak, sensors = known["peak_sensitivity"], [one for one in found if one.kind == "peak_s_of"]
     worst = max(sensors, key=lambda one: one.value)
-    delay = min(problem.curves.margins, key=lambda m: m.delay)
-    phase = min(problem.curves.margins, key=lambda m: m.phase)
+    turns = [phase_and_delay(crossings) for crossings in problem.curves.crossings[0]]
+    names = [s.name for s in problem.curves.channels()]
+    phase, phase_at = min(zip((turn[0] for turn in turns), names, strict=True))
+    delay, delay_at = min(zip((turn[2] for turn in turns), names, strict=True))
     alone = "smallest of the sensors, the others closed"
     noise = {kind: [one.value for one in found if one.kind == kind] for kind in ("motion", "command")}
     return [
@@ -440,8 +466,8 @@ def _loop_merits(problem: Problem) -> list[Merit]:
             known[f"bandwidth_{key}"]._replace(note=BANDWIDTHS[key])
             for key in ("sigma_max_T", "crossover_max")
         ),
-        figure("phase_margin", "", "phase margin", phase.phase, note=f"{phase.channel}, {alone}"),
-        figure("delay_margin", "", "delay margin", delay.delay, "s", note=f"{delay.channel}, {alone}"),
+        figure("phase_margin", "", "phase margin", phase, note=f"{phase_at}, {alone}"),
+        figure("delay_margin", "", "delay margin", delay, "s", note=f"{delay_at}, {alone}"),
         *_worst_by_unit("motion", "motion at rest, rms", noise["motion"], problem.plant.outputs),
         *_worst_by_unit("command", "command noise, rms", noise["command"], problem.plant.inputs),
     ]

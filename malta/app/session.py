@@ -31,6 +31,7 @@ from malta.app.followers import Worker, describe_error
 from malta.app.picture import (
     Problem,
     View,
+    eigenvalue_margin,
     picture,
     poles_document,
     run_names,
@@ -47,7 +48,9 @@ if TYPE_CHECKING:
 
 
 QUIET = 0.25  # s, after the last move until its proof begins
-SLOW = 0.06  # s: an eigenvalue margin that takes longer for a new machine follows in the background
+SLOW = (
+    0.08  # s of processor time: an eigenvalue margin after which an answer would have taken more follows it
+)
 LONGEST_WAIT = 20.0  # s, of a question for news
 KEPT = 1000  # news of one version
 
@@ -88,8 +91,8 @@ class Session:
         self._slopes: tuple[Handle, View, dict[str, tuple[float, ...]]] | None = (
             None  # of the handle that is pulled
         )
-        self._ray: int | None = None
-        self._slow_margin = False
+        self._ray: tuple[int, float] | None = None  # of the last eigenvalue margin, and that margin
+        self._margin_takes = dict[bool, float]()  # s of processor time: of a new machine, of the same
         self._traced: Parameters | None = None  # of the machine whose margin was traced last
         self._timer: threading.Timer | None = None
         self._searched = -1  # the serial of the newest search
@@ -283,7 +286,7 @@ class Session:
             self.files, self.edit, self._followed = files, Edit(), None
             self._base += 1
             self._ray = self._traced = self._plane = self._slopes = None
-            self._slow_margin = False
+            self._margin_takes = {}
             self._supersede()
             return {"open": self.open({})}
 
@@ -349,19 +352,21 @@ class Session:
     # --- what follows ---
 
     def _picture(self, edit: Edit, view: View) -> tuple[Document, Problem]:
-        """The picture of an edit; the eigenvalue margin is left to the background where tracing a machine is slow."""
+        """The picture of an edit; an eigenvalue margin that would make the answer late is left to the background."""
+        began = time.thread_time()
         problem = solve(self.files.apply(edit))
-        new = problem.plant.parameters != self._traced
-        wanted = not (new and self._slow_margin)
-        began = time.perf_counter()
-        document = picture(problem, view, self._ray, margin=wanted)
-        if new and wanted:
-            first = self._traced is None
-            self._traced = problem.plant.parameters
-            self._slow_margin |= not first and time.perf_counter() - began > 4 * SLOW
+        document = picture(problem, view, margin=False)
+        machine = problem.plant.parameters
+        new, spent = machine != self._traced, time.thread_time() - began
+        if problem.spec.uncertainty and spent + self._margin_takes.get(new, 0.0) <= SLOW:
+            document["margin"] = eigenvalue_margin(problem, self._ray)
+            if self._traced is not None:  # the first one traces the machine
+                self._margin_takes[new] = time.thread_time() - began - spent
+            self._traced = machine
         if document["margin"] is not None:
-            self._ray = document["margin"].get("ray", self._ray)
-            self._lost = document["margin"].get("upper") or self._lost
+            ray, upper = document["margin"].get("ray"), document["margin"].get("upper")
+            self._ray = self._ray if ray is None or upper is None else (ray, upper)
+            self._lost = upper or self._lost
         return document, problem
 
     def _supersede(self) -> int:

@@ -24,6 +24,7 @@ from malta.errors import CheckError, InputError
 from malta.loops.classical import (
     ChannelMargins,
     Crossing,
+    See,
     Seen,
     find_crossings,
     find_tops,
@@ -159,6 +160,11 @@ class LoopCurves:
         return LoopCurves(self.loop, _merge(self.responses, respond(self.loop, more)))
 
     @cached_property
+    def crossings(self) -> tuple[list[list[Crossing]], list[list[Crossing]]]:
+        """The gain and the phase crossings of each channel at the sensors, the others closed."""
+        return find_crossings(*_seen(self, "sensors"))
+
+    @cached_property
     def margins(self) -> tuple[ChannelMargins, ...]:
         """The margins of each channel at the sensors, the others closed."""
         return _margins(self, "sensors")
@@ -256,8 +262,7 @@ def respond(loop: LinearLoop, w: FloatArray) -> Responses:
         s = loop.frequencies(w)
         whole, F = (response(s) for response in loop.responses)
         P, P_w = whole[:, :p, :u], whole[:, :p, u:]
-        L = -P @ F
-        S = _inverse(np.eye(p) + L)
+        L, S = _at_sensors(loop, whole, F)
         P_m = P[..., :m]
         if u > m:  # held currents hang on readings: at the forces that is part of the machine
             P_m = np.linalg.solve(np.eye(p) - P[..., m:] @ F[:, m:], P_m)
@@ -266,6 +271,13 @@ def respond(loop: LinearLoop, w: FloatArray) -> Responses:
         read = S @ P_w
         compliance = read if len(loop.plant.C) == p else whole[:, p:, u:] + whole[:, p:, :u] @ F @ read
         return Responses(w, L, S, L @ S, L_m, S_m, L_m @ S_m, S @ P[..., :m], F[:, :m] @ S, compliance)
+
+
+def _at_sensors(loop: LinearLoop, whole: ComplexArray, F: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """L and S at the sensors, from the responses of the plant with its loads and of the law."""
+    p = len(loop.outputs)
+    L = np.asarray(-whole[:, :p, : len(loop.law.C)] @ F)
+    return L, _inverse(np.eye(p) + L)
 
 
 def _inverse(M: ComplexArray) -> ComplexArray:
@@ -340,18 +352,9 @@ def _grid(loop: LinearLoop) -> FloatArray:
 
 def _margins(curves: LoopCurves, at: Place) -> tuple[ChannelMargins, ...]:
     """The margins of each channel: crossings and peaks between the frequencies of the grid, and at its ends."""
-    loop = curves.loop
-
-    def see(w: FloatArray) -> Seen:
-        found = respond(loop, w)
-        return Seen(w, found.alone(at), _diagonal(found.cut(at)[1]))
-
-    r = curves.responses
-    seen = Seen(r.w, r.alone(at), _diagonal(r.cut(at)[1]))
-    if loop.sample_time is not None and r.w[-1] > 0.999999 * curves.nyquist:
-        seen.loop[-1] = seen.loop[-1].real
-    gain, phase = find_crossings(see, seen)
-    ends = _ends(see, r.w, continuous=loop.sample_time is None)
+    loop, (see, seen) = curves.loop, _seen(curves, at)
+    gain, phase = curves.crossings if at == "sensors" else find_crossings(see, seen)
+    ends = _ends(see, curves.w, continuous=loop.sample_time is None)
     half, half_at = find_tops(see, seen, lambda found: np.abs(found.S - 0.5))
     peak, peak_at = find_tops(see, seen, lambda found: np.abs(found.S))
     growing = int((loop.closed_poles.real >= 0).sum())
@@ -365,6 +368,24 @@ def _margins(curves: LoopCurves, at: Place) -> tuple[ChannelMargins, ...]:
             margins_of_channel(signal.name, crossings, tops, (loop.unstable_poles(factors, at), growing))
         )
     return tuple(made)
+
+
+def _seen(curves: LoopCurves, at: Place) -> tuple[See, Seen]:
+    """What the channels see of the loop: at any frequencies, and at those of the grid."""
+    loop, r = curves.loop, curves.responses
+
+    def see(w: FloatArray) -> Seen:
+        if at == "forces":
+            found = respond(loop, w)
+            return Seen(w, found.alone(at), _diagonal(found.S_forces))
+        with np.errstate(all="ignore"):
+            L, S = _at_sensors(loop, *(response(loop.frequencies(w)) for response in loop.responses))
+            return Seen(w, _diagonal(L @ S) / _diagonal(S), _diagonal(S))
+
+    seen = Seen(r.w, r.alone(at), _diagonal(r.cut(at)[1]))
+    if loop.sample_time is not None and r.w[-1] > 0.999999 * curves.nyquist:
+        seen.loop[-1] = seen.loop[-1].real
+    return see, seen
 
 
 def _ends(see: Any, w: FloatArray, *, continuous: bool) -> list[list[Crossing]]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
@@ -47,9 +47,10 @@ from malta.proof.windings import (
 from malta.synthesis.controller import Controller, LinearLaw, law_at, linear_law, with_readings, with_slope
 from malta.synthesis.recovery import StepResponse, step_response
 from malta.synthesis.riccati import add_lags, delay_inputs, eigenvalues, sample
+from malta.synthesis.state_space import System
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from malta.model.plant import ComplexArray, FloatArray, OperatingPoint, Plant
 
@@ -174,21 +175,32 @@ class SampledLoop:
 
     def loop_gain(self, w: FloatArray) -> ComplexArray:
         """The loop gain at the sensors, L = -P F, at the frequencies w (rad/s): k x p x p."""
-        z = np.exp(1j * np.asarray(w) * self.sample_time)[:, None, None]
-        P = self.Cd @ np.linalg.solve(z * np.eye(len(self.Ad)) - self.Ad, self.Bd)
-        c = self.control
-        F = c.C @ np.linalg.solve(z * np.eye(len(c.A)) - c.A, c.B_y) + c.D_y
+        s = np.expm1(1j * np.asarray(w) * self.sample_time) / self.sample_time
+        P, F = (response(s) for response in self._responses)
         return np.asarray(-P @ F)
+
+    @cached_property
+    def _responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
+        """P and F as functions of (z - 1) / T: in differences slow poles keep their digits."""
+        c, T = self.control, self.sample_time
+        P = System(
+            (self.Ad - np.eye(len(self.Ad))) / T,
+            self.Bd / T,
+            self.Cd,
+            np.zeros((len(self.Cd), self.Bd.shape[1])),
+        )
+        F = System((c.A - np.eye(len(c.A))) / T, c.B_y / T, c.C, c.D_y)
+        return P.response_function(), F.response_function()
 
     def sensitivity(self, w: FloatArray) -> ComplexArray:
         """The sensitivity S = (I + L)^-1 at the sensors, k x p x p; it also takes noise to the outputs."""
         return np.asarray(np.linalg.inv(np.eye(len(self.Cd)) + self.loop_gain(w)))
 
-    def answer(self) -> StepResponse:
-        """The true outputs after a unit step of every disturbance. Raises CheckError for an unstable loop."""
+    def answer(self, load: int | None = None) -> StepResponse:
+        """The true outputs after a unit step of each disturbance, or of one. Raises CheckError for an unstable loop."""
         assert self.pushed is not None
-        k = len(self.control.A)
-        g = np.vstack([self.pushed, np.zeros((k, self.pushed.shape[1]))])
+        k, pushed = len(self.control.A), self.pushed if load is None else self.pushed[:, [load]]
+        g = np.vstack([pushed, np.zeros((k, pushed.shape[1]))])
         C = np.hstack([self.outputs, np.zeros((len(self.Cd), k))])
         return step_response(self.closed, g, C, self.sample_time)
 

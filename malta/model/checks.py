@@ -132,8 +132,8 @@ def check_equations(plant: Plant) -> None:
         "contact": (lambda: plant.contact(x), len(plant.contacts), "contacts"),
     }
     for name, question in asked.items():
-        _check_size(plant, name, *question)
-        _check_expression(plant, name, question[0](), (x, u, w, y, i))
+        found = _check_size(plant, name, *question)
+        _check_expression(plant, name, found, (x, u, w, y, i))
     half, states = plant.coordinates, len(plant.controlled)
     if not half and plant.position_of is _identity and states == 2 * len(plant.outputs):
         found = "rates of the first half of the states that are not the second half"
@@ -143,7 +143,8 @@ def check_equations(plant: Plant) -> None:
     _check_size(plant, "position_of", lambda: plant.position_of(y), size, of)
 
 
-def _check_size(plant: Plant, name: str, evaluate: Callable[[], Any], size: int, of: str) -> None:
+def _check_size(plant: Plant, name: str, evaluate: Callable[[], Any], size: int, of: str) -> Any:
+    """What a function returns. Raises InputError unless it has so many entries."""
     try:
         found = evaluate()
         entries = ca.vertcat(found).numel()
@@ -154,6 +155,7 @@ def _check_size(plant: Plant, name: str, evaluate: Callable[[], Any], size: int,
         raise InputError(plant.name, name, kind, "a vector of CasADi, as ca.vertcat(...) makes it")
     if entries != size:
         raise InputError(plant.name, name, f"{entries} entries", f"{size}, one for each of the {of}")
+    return found
 
 
 def _check_expression(plant: Plant, name: str, expression: Any, arguments: Sequence[Any]) -> None:

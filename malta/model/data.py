@@ -24,7 +24,7 @@ from pydantic import StrictStr
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, locate, shipped_path
 from malta.model.checks import check_numbers, line_of
-from malta.model.equilibrium import register
+from malta.model.equilibrium import check_values, is_checked, register
 from malta.model.machines import file_of, machine, machine_names, name_of
 from malta.model.parameters import check_range
 from malta.model.plant import Plant
@@ -192,8 +192,12 @@ def _plant_of(parameters: Any) -> Plant:
         )
     if file_of(name) is not None and plant.name != name:
         raise InputError(f"{name}.py", "plant: name", repr(plant.name), f"{name!r}, as the file is called")
-    check_numbers(plant)
+    checked = is_checked(plant, build)
+    if not checked:
+        check_numbers(plant)
     register(plant, build)
+    if checked:
+        check_values(plant)
     return plant
 
 

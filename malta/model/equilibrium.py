@@ -26,7 +26,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError
-from malta.model.checks import check_symbols
+from malta.model.checks import check_equations, check_signals, check_symbols
 from malta.model.parameters import acting_names
 from malta.model.plant import OperatingPoint, Plant
 
@@ -88,14 +88,45 @@ def register(plant: Plant, build: Callable[[Any], Plant]) -> None:
     """
     if plant.tabulated:  # its table holds numbers, and symbols raise an error there
         return
-    record: Any = plant.parameters
-    names = tuple(acting_names(record))
-    others = (f.name for f in fields(record) if f.name not in (*names, "preset"))
-    family = _Family(build, type(record), names, tuple((name, getattr(record, name)) for name in others))
+    family = _family_of(plant, build)
     if family not in _checked:
         check_symbols(plant)
         _checked.append(family)
     _families[plant] = family
+
+
+def is_checked(plant: Plant, build: Callable[[Any], Plant]) -> bool:
+    """Whether a plant of the same family, whose functions have the same sizes, was registered before."""
+    return not plant.tabulated and _family_of(plant, build) in _checked
+
+
+def check_values(plant: Plant) -> None:
+    """`checks.check_numbers` of a registered plant whose family is checked: its functions, where one is not finite."""
+    check_signals(plant)
+    sizes = [len(getattr(plant, key)) for key in ("states", "inputs", "disturbances", "outputs")]
+    at = [np.zeros(size) for size in (*sizes, len(plant.actuator.coils))]
+    if not all(np.isfinite(found).all() for found in trace(_functions, plant)(*at)):
+        check_equations(plant)
+
+
+def _functions(plant: Plant, _believed: None) -> tuple[Expressions, Expressions]:
+    """(x, u, w, y, i) -> all functions of a plant."""
+    sizes = {key: len(getattr(plant, key)) for key in ("states", "inputs", "disturbances", "outputs")}
+    x, u, w, y, i = (
+        ca.SX.sym(name, size)
+        for name, size in zip("xuwyi", (*sizes.values(), len(plant.actuator.coils)), strict=True)
+    )
+    found = (
+        plant.f(x, u, w), plant.h(x, u), plant.load(x), plant.currents(y, u), plant.forces(x, i), plant.contact(x),
+    )  # fmt: skip
+    return [x, u, w, y, i], [ca.densify(ca.SX(one)) for one in found]
+
+
+def _family_of(plant: Plant, build: Callable[[Any], Plant]) -> _Family:
+    record: Any = plant.parameters
+    names = tuple(acting_names(record))
+    others = (f.name for f in fields(record) if f.name not in (*names, "preset"))
+    return _Family(build, type(record), names, tuple((name, getattr(record, name)) for name in others))
 
 
 def with_parameters(plant: Plant, parameters: Any) -> Plant:
@@ -207,17 +238,32 @@ def _descend(
         active &= (np.abs(r) > ROUNDING * np.where(np.isfinite(terms), terms, 0.0)).any(axis=1)
         if not active.any():
             break
-        weights = np.zeros_like(sizes)
+        weights = _weights(sizes)
         steps = np.zeros_like(v)
-        for k in np.flatnonzero(active):
-            floor = np.maximum(sizes[k], 1e-13 * sizes[k].max(initial=0.0))
-            weights[k] = np.divide(1.0, floor, out=np.zeros_like(floor), where=floor > 0)
-            weights[k, sizes[k] == 0] = 0.0
-            weighted = weights[k][:, None] * J[k] * scales
-            steps[k] = scales * np.linalg.lstsq(weighted, weights[k] * r[k], rcond=None)[0]
+        steps[active] = scales * _least_squares(
+            weights[active, :, None] * J[active] * scales, weights[active] * r[active]
+        )
         v, r, J, moved = _search(equations, (v, r, J), steps, weights, active)
         active &= moved & r.any(axis=1)
     return v, r, J
+
+
+def _weights(sizes: FloatArray) -> FloatArray:
+    """What makes the residuals of each row alike; zero for those that no unknown changes."""
+    floor = np.maximum(sizes, 1e-13 * sizes.max(axis=1, keepdims=True, initial=0.0))
+    weights = np.divide(1.0, floor, out=np.zeros_like(floor), where=floor > 0)
+    return np.where(sizes == 0, 0.0, weights)
+
+
+def _least_squares(A: FloatArray, b: FloatArray) -> FloatArray:
+    """The smallest x of k equations A x = b, in the least-squares sense, as `numpy.linalg.lstsq` finds each.
+
+    A : k x r x n, b : k x r
+    """
+    U, size, Vt = np.linalg.svd(A, full_matrices=False)
+    kept = size > np.finfo(float).eps * max(A.shape[1:]) * size.max(axis=1, keepdims=True, initial=0.0)
+    along = np.divide((b[:, None] @ U)[:, 0], size, out=np.zeros_like(size), where=kept)
+    return np.asarray((along[:, None] @ Vt)[:, 0])
 
 
 def _search(
@@ -365,10 +411,14 @@ def _rates_of(plant: Plant, x: Any, u: Any, w: Any) -> Any:
 def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> FloatArray:
     """The inputs that hold the machine at rest, or that cancel its loads alone; one row for each row of states."""
     left = trace(_rates_left, plant, None, loads_alone)
-    start = np.zeros((len(states), len(plant.inputs)))
-    found = solve(_equations(left, states), [start], _scales(plant), STILL, SHARE)
-    _require_solved(plant, found.left, "input", states)
-    return found.values
+    depends = np.unique(np.concatenate([left.function.jac_sparsity(k, 0).get_triplet()[1] for k in (0, 1)]))
+    _, first, same = np.unique(
+        states[:, depends.astype(int)], axis=0, return_index=True, return_inverse=True
+    )  # a load that is the same along the stroke is balanced once
+    start = np.zeros((len(first), len(plant.inputs)))
+    found = solve(_equations(left, states[first]), [start], _scales(plant), STILL, SHARE)
+    _require_solved(plant, found.left, "input", states[first])
+    return found.values[same]
 
 
 def _rates_left(plant: Plant, _believed: None, loads_alone: bool) -> tuple[list[Any], list[Any]]:
@@ -395,8 +445,14 @@ def _commands(
     before : commands to start from, beside the inputs and shares of the limits
     """
     made = trace(_made, plant, believed)
+    sizes = np.maximum(np.abs(inputs), scales := _scales(plant))
+
+    def near(acting: FloatArray) -> Any:
+        return np.abs(acting - inputs) <= 1e-12 * sizes
+
+    if loaded and not before and near(made.each(states, inputs)[0].T).all():
+        return inputs, inputs  # the currents of a command make just what it commands
     equations = _equations(trace(_effect_missed, plant, believed, loaded), np.hstack([states, inputs]))
-    scales = _scales(plant)
     rough = np.where(inputs < 0, -1.0, 1.0) * scales
     starts = [
         *before,
@@ -408,8 +464,7 @@ def _commands(
     found = solve(equations, starts, scales, STILL, SHARE)
     _require_solved(plant, found.left, "command", states, inputs if not loaded else None)
     acting = made.each(states, found.values)[0].T
-    near = np.abs(acting - inputs) <= 1e-12 * np.maximum(np.abs(inputs), scales)
-    return found.values, np.where(near, inputs, acting)
+    return found.values, np.where(near(acting), inputs, acting)
 
 
 def _made(plant: Plant, believed: Plant | None) -> tuple[list[Any], list[Any]]:

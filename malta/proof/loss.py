@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -179,21 +179,29 @@ def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float, proven:
         return math.inf
     k = int(bad.argmax())
     low, high = (float(grid[k - 1]) if k else 0.0), float(grid[k])
-    width = NARROW * (high - low)
-
-    def rate(t: float) -> float:
-        nonlocal high
-        found = float(rates(np.array([t]))[0])
-        high = min(high, t) if found >= 0 else high
-        return found if math.isfinite(found) else math.copysign(1.0, found)
-
     if is_late():
         return high
+    return _first_unstable(lambda t: float(rates(np.array([t]))[0]), low, high, NARROW * (high - low))
+
+
+def _first_unstable(rate: Callable[[float], float], low: float, high: float, width: float) -> float:
+    """The least t that was seen with rate(t) >= 0, between a stable `low` and an unstable `high`; Brent's method.
+
+    width : to which it is narrowed down
+    """
     from scipy import optimize  # which takes a while to read
 
+    seen = high
+
+    def looked(t: float) -> float:
+        nonlocal seen
+        found = rate(t)
+        seen = min(seen, t) if found >= 0 else seen
+        return found if math.isfinite(found) else math.copysign(1.0, found)
+
     with suppress(ValueError):  # it is unstable at the lower end, too
-        optimize.brentq(rate, low, high, xtol=width, maxiter=60, disp=False)
-    return high
+        optimize.brentq(looked, low, high, xtol=width, maxiter=60, disp=False)
+    return seen
 
 
 # A quick upper bound of a robust margin: eigenvalues of the loop along rays from the nominal parameters.
@@ -206,7 +214,8 @@ def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float, proven:
 RAYS_TO_CORNERS = 5  # parameters up to which every corner has a ray; of more, as many corners are drawn
 FARTHEST = 20.0  # multiples of the box
 LEVELS = (0.125, 0.25, 0.5, 0.75, 1.0)  # shares of a ray at which a first loss of stability is looked for
-HALVINGS = 12
+RESOLVED = 2.0**-13  # of a ray, to which a loss of stability is narrowed down
+BESIDE = 0.02  # of the margin of a neighbouring design: how near that of a design is expected
 RAY_ROUNDS = 8  # of corrections by other rays
 
 
@@ -242,13 +251,13 @@ def ray_bound(
     loops: Sequence[tuple[UncertainSystem, Compensator]],
     ranges: Mapping[str, float],
     over: Mapping[str, tuple[float, float]],
-    first: int | None = None,
+    first: tuple[int, float] | None = None,
 ) -> RayBound:
     """Bound a margin from above by eigenvalues along rays: some hundred of them, in a fraction of a tenth of a second.
 
     loops, over : as `travel.travel_loops` returns them
     ranges : relative half range of each parameter, by name
-    first : the ray that bounded a neighbouring design, which is then tried first
+    first : the ray that bounded a neighbouring design, which is then tried first, and its margin
 
     Example: `ray_bound(*travel_loops(plant, controller, ("m",)), {"m": 0.2})` with over as the third argument
     """
@@ -257,9 +266,9 @@ def ray_bound(
     if any((rays.unstable(np.zeros(1), [0]) >= 0).any() for rays in sets):
         return RayBound(0.0, {}, None, None)
     best, found = math.inf, None
-    if first is not None and first < len(owner):
-        best = _leave(sets, owner[first])
-        found = first if best < math.inf else None
+    if first is not None and first[0] < len(owner):
+        best = _leave(sets, owner[first[0]], near=first[1])
+        found = first[0] if best < math.inf else None
     if found is None:
         best, found = _first_level(sets, owner)
     for _ in range(RAY_ROUNDS if found is not None else 0):
@@ -309,16 +318,23 @@ def _corners(count: int) -> FloatArray:
     return np.random.default_rng(0).choice([1.0, -1.0], (2**RAYS_TO_CORNERS, count))
 
 
-def _leave(sets: Sequence[_Rays], which: tuple[int, int], unstable_at: float = math.inf) -> float:
-    """Where a ray leaves stability, by halving; infinite where it is stable at its end."""
-    rays, ray = sets[which[0]], [which[1]]
-    low, high = 0.0, min(float(rays.end[which[1]]), unstable_at)
-    if rays.unstable(np.array([high]), ray)[0] < 0:
+def _leave(
+    sets: Sequence[_Rays], which: tuple[int, int], unstable_at: float = math.inf, near: float = math.nan
+) -> float:
+    """Where a ray leaves stability, the nearest unstable t that was seen; infinite where it is stable at its end.
+
+    near : where it may be, which is looked at first
+    """
+    rays, ray = sets[which[0]], which[1]
+    end = min(float(rays.end[ray]), unstable_at)
+    about = np.array([near * (1 - BESIDE), near * (1 + BESIDE)])
+    if about[1] < end and (rays.unstable(about, [ray, ray]) >= 0).tolist() == [False, True]:
+        low, high = about.tolist()
+    elif rays.unstable(np.array([end]), [ray])[0] < 0:
         return math.inf
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        low, high = (low, middle) if rays.unstable(np.array([middle]), ray)[0] >= 0 else (middle, high)
-    return high
+    else:
+        low, high = 0.0, end
+    return _first_unstable(lambda t: float(rays.unstable(np.array([t]), [ray])[0]), low, high, RESOLVED * end)
 
 
 def _first_level(sets: Sequence[_Rays], owner: Sequence[tuple[int, int]]) -> tuple[float, int | None]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
+from scipy import sparse
 
 from malta.errors import InputError
 from malta.model.linearize import jacobians, linearize
@@ -294,12 +295,20 @@ def instability(
 
     groups : states that close loops by themselves; none: the whole loop
     """
-    poles = _poles(system, c, p, groups) if groups else np.linalg.eigvals(closed_loop(system, c, p))
+    poles = _poles(system, c, p, groups) if groups else _eigenvalues(closed_loop(system, c, p))
     if c.sample_time is not None:
         T = c.sample_time
         grown = (2 * T * poles.real + T**2 * np.abs(poles) ** 2).max(axis=1)  # |lambda|^2 - 1
         return np.asarray(np.log1p(np.maximum(grown, -1 + 1e-15)) / (2 * T))
     return np.asarray(poles.real.max(axis=1))
+
+
+def _eigenvalues(matrices: FloatArray) -> ComplexArray:
+    """The eigenvalues of k matrices of one structure: of each set of states that act on each other by itself."""
+    joined = (matrices != 0).any(axis=0)
+    count, label = sparse.csgraph.connected_components(joined, connection="strong")
+    sets = [np.flatnonzero(label == k) for k in range(count)]
+    return np.concatenate([np.linalg.eigvals(matrices[:, i[:, None], i]) for i in sets], axis=1)
 
 
 def critical_frequency(system: UncertainSystem, c: Compensator, p: FloatArray) -> float:

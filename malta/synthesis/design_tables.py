@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -257,12 +258,18 @@ def specification_table(requirements: Iterable[Requirement], given: Mapping[str,
 
     Raises InputError for an unknown key, another kind of value, or a number out of range.
     """
-    whole = create_model(
-        "DesignFile", __base__=Record, specification=(specification_record(requirements), ...)
-    )
-    checked: Any = validate(whole, {"specification": given}, path)
+    checked: Any = validate(_specification_document(tuple(requirements)), {"specification": given}, path)
     found: Record = checked.specification
     return found
+
+
+@lru_cache(
+    maxsize=16
+)  # pydantic takes longer to make it than to check with it; requirements compare by identity
+def _specification_document(requirements: tuple[Requirement, ...]) -> type[Record]:
+    return create_model(
+        "DesignFile", __base__=Record, specification=(specification_record(requirements), ...)
+    )
 
 
 def specification_record(requirements: Iterable[Requirement]) -> type[Record]:

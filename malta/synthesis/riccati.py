@@ -16,6 +16,7 @@ noise: X then has a diagonal of ones.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -155,6 +156,21 @@ def _by_parts(
 
 def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: bool) -> _Found:
     """The first solution that is as good as rounding allows, or else the best; R is the identity."""
+    return _solution_of(B.shape, A.tobytes(), B.tobytes(), Q.tobytes(), what, discrete)
+
+
+@lru_cache(
+    maxsize=64
+)  # a slider moves one weight: the equations of other axes, and the filter's, are the same
+def _solution_of(
+    shape: tuple[int, int],
+    a: bytes,
+    b: bytes,
+    q: bytes,
+    what: str,
+    discrete: bool,
+) -> _Found:
+    A, B, Q = (np.frombuffer(entries).reshape(shape[0], -1) for entries in (a, b, q))
     candidates: list[_Found] = []
     failures: list[Exception] = []
     balanced = _balance(A - discrete * np.eye(len(A)), B @ B.T, Q)

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy import sparse
+from scipy import linalg, sparse
 from scipy.linalg import matrix_balance
 
 from malta.errors import InputError
@@ -197,17 +198,59 @@ class System(NamedTuple):
         """The function `response`, for several calls: what does not depend on the frequencies is computed once."""
         A, B, C, D = self.balanced
         label = sparse.csgraph.connected_components(A != 0, directed=False)[1] if len(A) else np.zeros(0)
-        parts = [
+        states = [
             np.flatnonzero(label == k) for k in np.unique(label)
-        ]  # of states that nothing joins to the others
+        ]  # sets of states that nothing joins to each other
+        parts = [_Part(A[np.ix_(i, i)], B[i], C[:, i]) for i in states]
 
         def response(s: ComplexArray) -> ComplexArray:
-            found = np.zeros((len(s), *B.shape), dtype=complex)
-            for i in parts:
-                found[:, i] = _resolvent(s, A[np.ix_(i, i)], B[i])
-            return np.asarray(C @ found + D)
+            through = np.tile(D.astype(complex), (len(s), 1, 1))
+            return np.asarray(sum((part.response(s) for part in parts), through))
 
         return response
+
+
+MANY = 32  # frequencies from which on a Schur form is worth its time
+SLOW = 1e-6  # of the norm of A: frequencies below it, where the Schur form has lost digits of slow poles
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """C (s - A)^-1 B of states that are joined."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+
+    @cached_property
+    def schur(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """T, Z^H B and C Z of A = Z T Z^H, T upper triangular."""
+        T, Z = linalg.schur(self.A, output="complex")
+        return T, Z.conj().T @ self.B, self.C @ Z
+
+    def response(self, s: ComplexArray) -> ComplexArray:
+        """At each s; NaN at a frequency that no double number tells from a pole."""
+        used = np.flatnonzero(self.B.any(axis=0))
+        solved = np.empty((len(s), len(self.C), len(used)), dtype=complex)
+        fast = np.zeros(len(s), dtype=bool)
+        if len(s) >= MANY:
+            fast = np.abs(s) > SLOW * np.linalg.norm(self.A)
+            fast &= np.abs(s[:, None] - np.diag(self.schur[0])).min(axis=1) > 0
+            solved[fast] = self._substituted(s[fast], used)
+        if not fast.all():
+            solved[~fast] = self.C @ _resolvent(s[~fast], self.A, self.B[:, used])
+        found = np.zeros((len(s), len(self.C), self.B.shape[1]), dtype=complex)
+        found[:, :, used] = solved
+        return found
+
+    def _substituted(self, s: ComplexArray, used: Any) -> ComplexArray:
+        """C Z (s - T)^-1 Z^H B of some inputs, from the last row of T upwards, all frequencies at once."""
+        T, B, C = self.schur
+        X = np.empty((len(T), len(used), len(s)), dtype=complex)
+        for i in range(len(T) - 1, -1, -1):
+            later = T[i, i + 1 :] @ X[i + 1 :].reshape(len(T) - i - 1, X[0].size)
+            X[i] = (B[i, used, None] + later.reshape(X[0].shape)) / (s - T[i, i])
+        return np.asarray(np.tensordot(C, X, 1).transpose(2, 0, 1))
 
 
 def _resolvent(s: ComplexArray, A: FloatArray, B: FloatArray) -> ComplexArray:

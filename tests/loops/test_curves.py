@@ -100,6 +100,16 @@ def test_a_gain_without_states_is_a_loop(gain: float, dt: float) -> None:
     assert figures.settling == 0
 
 
+def test_many_frequencies_have_the_responses_of_each_alone() -> None:
+    """By a Schur form, and by a solution at each: two ways, of a plant with integrators beside fast poles."""
+    A = np.diag([0.0, -1e4, -3.0, 0.0]) + np.diag([1.0, 50.0, 0.0], 1) + np.diag([0.0, -20.0, 0.0], -1)
+    plant = linear_loop(control.ss(A, np.eye(4)[:, :2], np.eye(4)[1:3], np.zeros((2, 2)))).plant
+    at = 1j * np.geomspace(1e-6, 1e6, 100)
+    alone = np.concatenate([plant.response(at[[k]]) for k in range(len(at))])
+    np.testing.assert_allclose(plant.response(at), alone, rtol=1e-9, atol=1e-12 * np.abs(alone).max())
+    assert linear_loop(control.ss([], [], [], [[2.0]])).plant.response(at).shape == (100, 1, 1)
+
+
 def test_a_pole_that_no_number_tells_from_the_frequency_is_no_error() -> None:
     found = linear_loop(control.ss([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], [[0]])).plant.response(
         np.zeros(2, dtype=complex)

@@ -68,3 +68,11 @@ def test_a_slope_that_numbers_alone_have_is_traced_for_the_numbers(tmp_path: Pat
         [0.0, 1.0],
         [0.0, 0.0],
     ]  # of sqrt(e q) 0/0 where e is an input
+
+
+def test_numbers_of_a_known_machine_that_make_a_function_of_none_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "root.py").write_text(ROOT.replace("ca.sqrt(par.e * x[0])", "x[0] * ca.sqrt(par.e - 1)"))
+    module = malta.model.machines.machine(tmp_path / "root.py")
+    assert malta.plant_of(module.Parameters(m=1.0, e=2.0)).name == "root"
+    with pytest.raises(malta.InputError, match="root: f: found NaN"):
+        malta.plant_of(module.Parameters(m=1.0, e=0.5))

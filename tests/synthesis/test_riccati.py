@@ -349,6 +349,25 @@ def test_units_do_not_matter(
     assert gain(dare, Ad, Bd, 1.0) == pytest.approx(Kd, abs=1e-7 * np.abs(Kd).max())
 
 
+def test_an_equation_that_was_solved_is_remembered() -> None:
+    """A weight of another axis leaves it; its own weight does not."""
+    A, B = np.kron(np.eye(2), PENDULUM), np.kron(np.eye(2), PUSH)
+    known = riccati._solution_of.cache_info
+    care(A, B, np.diag([1, 0.011, 1, 0.012]), 1e-3 * np.eye(2))
+    before = known()
+    found = care(A, B, np.diag([1, 0.011, 1, 0.013]), 1e-3 * np.eye(2))
+    assert (known().hits - before.hits, known().misses - before.misses) == (1, 1)
+    alone = care(PENDULUM, PUSH, np.diag([1, 0.011]), 1e-3 * np.eye(1))
+    assert np.array_equal(found.K[:1, :2], alone.K)
+
+
+@pytest.fixture
+def solved_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No solution is remembered: parts of the solver are replaced."""
+    monkeypatch.setattr(riccati, "_solution_of", riccati._solution_of.__wrapped__)
+
+
+@pytest.mark.usefixtures("solved_anew")
 @pytest.mark.parametrize(("way", "solve"), [("_hamiltonian", care), ("_symplectic", dare)])
 def test_what_the_solver_leaves_is_refined(
     way: str, solve: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
@@ -365,6 +384,7 @@ def test_what_the_solver_leaves_is_refined(
         assert pytest.approx(right.K, rel=1e-11) == K
 
 
+@pytest.mark.usefixtures("solved_anew")
 def test_a_gain_that_does_not_stabilize_is_not_refined(monkeypatch: pytest.MonkeyPatch) -> None:
     """X = 0 leaves the pendulum standing: care says so, dare finds X by doubling. So it does when scipy refuses."""
     Q, R = np.diag([1, 0.01]), np.array([[1e-3]])

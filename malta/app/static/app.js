@@ -5,7 +5,7 @@ import { createChart } from "./chart.js";
 import { createPanel, dropDown, element } from "./controls.js";
 import { exportChart } from "./export.js";
 import { color, loadView, mapView, nyquistView, poleView, runView, sensitivityView, timeGroups } from "./figures.js";
-import { digits, floored, percent, quantity } from "./numbers.js";
+import { digits, floored, hertz, percent, quantity } from "./numbers.js";
 import { countLights, differenceTable, figureTable, howToAsk, requirementRows } from "./tables.js";
 import { createTuner } from "./tuning.js";
 
@@ -182,7 +182,7 @@ export async function mount(root, transport) {
 
   function pullText({ kind, signal }, { what, found, asked, reached, numbers, at_end }) {
     const unit = { crossover: "rad/s", phase: "rad", peak: "1" }[kind] ?? state.description.outputs.find((one) => one.name === signal).unit;
-    const text = (value) => (kind === "phase" ? `${digits((180 / Math.PI) * value, 3)}°` : kind === "crossover" ? `${digits(value, 4)} rad/s` : quantity(value, unit));
+    const text = (value) => (kind === "phase" ? `${digits((180 / Math.PI) * value, 3)}°` : kind === "crossover" ? hertz(value) : quantity(value, unit));
     const by = numbers.join(" and ");
     if (reached) return `${what}: ${text(found)}, by ${by}`;
     return `${what}: ${text(asked)} cannot be reached with ${by}${at_end.length ? `: ${at_end.join(" and ")} at the end of the slider` : " alone"}; the nearest is ${text(found)}`;
@@ -398,7 +398,7 @@ export async function mount(root, transport) {
     if (!Object.keys(state.description.parameters).length) return ["open", "✓ stable", "no uncertainty in the file, so no margin"];
     if (state.moving) return ["open", `… ${found}`, "of the last design"];
     if (!proof) return ["open", `✓ stable  ${found}`, "not proven yet: the proof follows"];
-    const lost = proof.upper === null || proof.upper === undefined ? "" : `lost at ${percent(proof.upper)}${proof.frequency === null ? "" : `, ${digits(proof.frequency, 4)} rad/s`}`;
+    const lost = proof.upper === null || proof.upper === undefined ? "" : `lost at ${percent(proof.upper)}${proof.frequency === null ? "" : `, ${hertz(proof.frequency)}`}`;
     if (proof.lower === null || proof.lower === undefined) return ["unknown", "nothing proven", [proof.reason, found].filter(Boolean).join("; ")];
     return ["proven", `✓ proven ${percent(floored(proof.lower))}`, [lost, proof.reason].filter(Boolean).join("; ")];
   }

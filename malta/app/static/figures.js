@@ -1,11 +1,10 @@
 // What the charts show: documents of the session as views of chart.js.
 
 import { rangeOf } from "./chart.js";
-import { decibels, digits, floored, percent, printedUnit, quantity, scaleFor } from "./numbers.js";
+import { decibels, digits, floored, hertz, percent, printedUnit, quantity, scaleFor } from "./numbers.js";
 
 const DASHES = ["", "7 3", "2 3", "8 3 2 3", "", "7 3", "2 3", "8 3 2 3"];
 export const color = (k) => `var(--c${k % 8})`;
-const hertz = (w) => `${digits(w, 4)} rad/s (${quantity(w / (2 * Math.PI), "Hz")})`;
 
 function signalLines(names, rows, xs, hidden, { ghost = false, dashed = null } = {}) {
   return names.map((name, k) => ({

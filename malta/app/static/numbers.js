@@ -37,6 +37,9 @@ export function quantity(value, unit, count = 3) {
   return `${digits(value / scale.factor, count)} ${scale.unit}`.trim();
 }
 
+// A frequency, in rad/s and in Hz.
+export const hertz = (w, count = 4) => `${digits(w, count)} rad/s (${quantity(w / (2 * Math.PI), "Hz", Math.min(count, 3))})`;
+
 export const percent = (share) => (share === null || share === undefined ? "–" : `${digits(100 * share, 4)} %`);
 
 // A proven share to four digits, never above itself.

@@ -1,7 +1,7 @@
 // The tables beside the charts: requirements as lights, figures of pinned designs, and what differs.
 
 import { element } from "./controls.js";
-import { digits, floored, percent, printedUnit, quantity } from "./numbers.js";
+import { digits, floored, hertz, percent, printedUnit, quantity } from "./numbers.js";
 
 const SIGNS = { true: ["✓", "met"], false: ["✗", "not met"], null: ["…", "not known yet"] };
 
@@ -18,6 +18,9 @@ function marginLight(asked, state) {
 const wordsOf = (name) => [name.split(" ")[0].replaceAll("_", " "), ...name.split(" ").slice(1)].join(" ");
 
 const boundText = (asked, value) => (asked.switch ? (value ? "yes" : "no") : asked.name === "margin" ? percent(value) : quantity(value, asked.unit, 3));
+const isFrequency = (name, unit) => unit === "rad/s" && /bandwidth|crossover|pole/.test(name); // not the speed of a turn
+// Hz stand below rad/s: beside them they would push the bound out of a narrow panel.
+const inHertz = (asked, value) => (typeof value === "number" && isFrequency(asked.name, asked.unit) ? [element("br", {}), element("small", { class: "soft" }, quantity(value / (2 * Math.PI), "Hz"))] : []);
 
 // Failures first, then what is not known yet. A value of the last design stays, grey and without a verdict, until the new one comes.
 export function requirementRows(description, state) {
@@ -33,7 +36,7 @@ export function requirementRows(description, state) {
     const bound = asked.switch ? "" : `${asked.at_least ? "≥" : "≤"} ${boundText(asked, asked.asked)}`;
     return element("tr", { class: `light ${found.holds ?? "open"}${found.old ? " old" : ""}`, title: found.how ?? "" },
       element("td", { class: "sign", role: "img", "aria-label": words }, sign),
-      element("td", {}, wordsOf(asked.name)), element("td", { class: "number" }, value), element("td", { class: "number soft" }, bound));
+      element("td", {}, wordsOf(asked.name)), element("td", { class: "number" }, value, ...inHertz(asked, found.found)), element("td", { class: "number soft" }, bound));
   });
 }
 
@@ -52,9 +55,10 @@ export function countLights(description, state) {
 
 const near = (a, b) => Math.abs(a - b) <= 1e-4 * Math.max(Math.abs(a), Math.abs(b));
 
-function figureRows(figures, proof, margin) {
+// A single column has room for Hz beside rad/s.
+function figureRows(figures, proof, margin, alone = false) {
   const upper = proof?.upper ?? margin?.upper;
-  const rows = figures.map((one) => ({ ...one, text: quantity(one.value, one.unit, 4) }));
+  const rows = figures.map((one) => ({ ...one, text: alone && isFrequency(one.label, one.unit) && one.value !== null ? hertz(one.value) : quantity(one.value, one.unit, 4) }));
   if (upper !== undefined && upper !== null) rows.unshift({ label: "margin, eigenvalues", value: upper, better: 1, text: `≤ ${percent(upper)}`, note: "upper bound" });
   if (proof?.lower !== undefined && proof?.lower !== null) rows.unshift({ label: "margin, proven", value: proof.lower, better: 1, text: percent(floored(proof.lower)), note: proof.reason });
   return rows;
@@ -62,7 +66,7 @@ function figureRows(figures, proof, margin) {
 
 // Figures of the design and of the pinned ones, the better of two marked.
 export function figureTable(state) {
-  const columns = [{ name: "now", rows: figureRows(state.picture.figures, state.proof, state.picture.margin) }];
+  const columns = [{ name: "now", rows: figureRows(state.picture.figures, state.proof, state.picture.margin, !state.pins.length && !state.candidates.length) }];
   for (const pin of [...state.pins, ...state.candidates]) columns.push({ name: pin.name, rows: figureRows(pin.picture.figures, pin.proof, pin.picture.margin) });
   const labels = [...new Set(columns.flatMap((column) => column.rows.map((row) => row.label)))];
   const head = element("tr", {}, element("th", {}, ""), ...columns.map((column) => element("th", { scope: "col", class: "number" }, column.name)));

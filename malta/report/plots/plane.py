@@ -66,8 +66,12 @@ def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float
     everything = np.concatenate(drawn)
     times = [curves.loop.sample_time for curves in loops.values()]
     reaches = _reaches(everything, times, _reach(loops) if reach is None else reach)
-    told = "" if len(loops) == 1 else "marks of the legend: closed loop"
-    sheet, reaches = _plane_sheet((f"{title_of(loops)}: poles and zeros", told), loops, axes, reaches)
+    outside = int((np.abs(everything) > 1.001 * reaches[0]).sum())
+    told = ["marks of the legend: closed loop"] * (len(loops) > 1)
+    told += [f"{outside} faster {'pole' if outside == 1 else 'poles'} outside"] * (outside > 0)
+    sheet, reaches = _plane_sheet(
+        (f"{title_of(loops)}: poles and zeros", "; ".join(told)), loops, axes, reaches
+    )
     for (panel,), size in zip(sheet.panels, reaches, strict=True):
         window = Window.about(everything, size)
         slowest = np.abs(everything[np.abs(everything) > SLOWEST * size]).min(initial=size)

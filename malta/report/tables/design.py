@@ -59,7 +59,7 @@ def poles_table(model: LinearModel, published: Published | None) -> Table:
     if np.any(model.A[n:, n:]):
         table = new_table("Open-loop poles [rad/s]", "of", "poles")
         poles = np.linalg.eigvals(model.A).astype(complex)
-        add_row(table, "ours", _pole_text(np.where(np.abs(poles) < 1e-9 * np.abs(poles).max(), 0, poles)))
+        add_row(table, "machine", _pole_text(np.where(np.abs(poles) < 1e-9 * np.abs(poles).max(), 0, poles)))
         return table
     names, squares = _modes(model)
     table = new_table("Open-loop poles [rad/s]", "mode", *names)
