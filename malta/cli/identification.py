@@ -395,8 +395,8 @@ def _learn_from(
 ) -> None:
     """Learn from the log of one stroke."""
     from malta.identification.learn import learn as learn_thrust
-    from malta.identification.learn import next_stroke
     from malta.identification.log_files import read_log
+    from malta.identification.strokes import next_stroke
     from malta.model.data import plant_of
 
     read = read_log(log)
@@ -459,7 +459,7 @@ def _learn_strokes(
 ) -> None:
     """Fly strokes on the simulated machine, each taught by those before."""
     from malta.identification.convergence import contraction
-    from malta.identification.learn import learn_strokes
+    from malta.identification.strokes import learn_strokes
     from malta.model.data import plant_of, published_figures
     from malta.report.tables.experiments import strokes_table
 
@@ -480,7 +480,7 @@ def _learn_strokes(
     print_text(
         console,
         f"the next stroke would be sent up to {abs(found.thrust).max():.3g} N beside the law's thrust, and without "
-        f"noise of the sensors its largest axial error would be {1e6 * found.repeatable:.3g} um",
+        f"noise of the sensors its largest axial error would be {1e6 * found.without_noise[-1]:.3g} um",
     )
     if shrinks is not None:
         print_text(console, _proven_contraction(shrinks))

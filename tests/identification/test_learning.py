@@ -10,8 +10,8 @@ import pytest
 from scipy.linalg import toeplitz
 
 import malta
-from malta.identification.learn import ThrustPatterns, thrust_patterns
 from malta.identification.measure import cut_loop, machines_of
+from malta.identification.strokes import ThrustPatterns, thrust_patterns
 from malta.loops.loop import Loop
 from malta.synthesis.feedforward import static_feedforward
 
