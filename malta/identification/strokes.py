@@ -4,17 +4,18 @@ The error of stroke j in its patterns is c_j = x_j + n_j: what repeats, x_j, and
 the feedback, n_j. The next stroke is sent what corrects A_j c_j, so that with M = T(p) / T_0, the machine's response
 over the gain file's,
 
-    x_(j+1) = x_j - M A_j (x_j + n_j),     A_j = a_j W,     W = diag(w_k),     0 <= w_k <= 1,     0 <= a_j <= 0.8
+    x_(j+1) = x_j - M A_j (x_j + n_j),     A_j = diag(a_k),     0 <= a_k <= 0.8
 
-- a_j is the gain of a Kalman filter over strokes with one number: it makes the expected sum of w_k x_k^2 least for
-  M = 1. As a_j = 0 leaves that sum as it is, it never grows: E x_k^2 = (1 - a w_k)^2 P_k + a^2 w_k^2 N_k with the
-  variance P_k of what repeats, and N_k of the noise.
-- W is fixed once, by the first log whose error is more than noise: w_k = P_k / (P_k + N_k) (Wiener).
-- What is proven of all machines of a box: where `contraction` is below 1, the sum of w_k x_k^2 grows from no stroke to
-  the next one for any such W and a_j, without noise. With D = W^(1/2), D x_(j+1) = (I - a D M D) D x_j, and as
-  |w - 0.8 M w|^2 <= c^2 |w|^2 says 0.8 |M w|^2 + (1 - c^2) |w|^2 / 0.8 <= w'(M + M')w,
+- a_k = P_k / (P_k + N_k) is the gain of a Kalman filter over strokes for each pattern, at most 0.8 and at most that of
+  the stroke before, with the variances P_k of what repeats and N_k of the noise. For M = 1 it leaves (1 - a_k)^2 P_k +
+  a_k^2 N_k <= P_k: the expected square of no pattern grows.
+- What is proven of all machines of a box: where `contraction` is c <= 1, the sum of a_k x_k^2 grows from no stroke to
+  the next one, without noise, whatever the gains are. For D = (A / 0.8)^(1/2) and w = D x, D x_(j+1) =
+  (I - 0.8 D M D) D x_j, and as |w - 0.8 M w|^2 <= c^2 |w|^2 says w'(M + M')w >= 0.8 |M w|^2 + (1 - c^2) |w|^2 / 0.8,
 
-      |(I - a D M D) x|^2 <= |x|^2 - a w'(M + M')w + a^2 |M w|^2 <= |x|^2 - (a / 0.8) (1 - c^2) |w|^2,     w = D x
+      |(I - 0.8 D M D) x|^2 <= |x|^2 - 0.8 w'(M + M')w + 0.64 |M w|^2 <= |x|^2 - (1 - c^2) |w|^2
+
+  Gains that do not rise do not raise this sum either. With a_k = 0.8 throughout, errors shrink by c.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ class NextStroke:
     error : m, rms of the error of the last stroke
     patterns : how many patterns of its error rose above the noise
     noise : m, standard deviation of the readings' own noise, as the log shows it
-    weights : w_k of each pattern; zeros where no log's error was more than noise
+    gains : a_k of each pattern; 0.8 where no log's error was more than noise
     left : m2, variance that is expected of each pattern of the next stroke's error
     """
 
@@ -116,7 +117,7 @@ class NextStroke:
     error: float
     patterns: int
     noise: float
-    weights: FloatArray
+    gains: FloatArray
     left: FloatArray
 
 
@@ -128,12 +129,12 @@ def next_stroke(
 ) -> NextStroke:
     """What the next stroke is sent beside the law's thrust, from the log of the one before.
 
-        d_(j+1) = d_j + a_j B (H B)^+ U W U' e_j
+        d_(j+1) = d_j + B (H B)^+ U A_j U' e_j
 
     with the error e of the readings, the thrust d that was sent (the log's excitation), patterns B and the linear
     loop's response H (lifted form of iterative learning; Bristow, Tharayil, Alleyne, IEEE Control Systems 26(3), 2006).
-    W and a_j are those of a Kalman filter over strokes, as on top of this module, with the noise that the log shows
-    where no pattern of thrust can move the mover. The filter of the law has to know d as sent, as
+    A_j has the gains of a Kalman filter over strokes, as on top of this module, with the noise that the log shows where
+    no pattern of thrust can move the mover. The filter of the law has to know d as sent, as
     `Scenario(excitation=...)` has it.
 
     controller : the gain file that flew
@@ -169,21 +170,23 @@ def next_stroke(
     seen = found.U.T @ e
     beside = float(((e - found.U @ seen) ** 2).sum())
     variance = max(beside, 1e-300) / (len(e) * found.white - float(found.noise.sum()))
-    noise, none = variance * found.noise, np.zeros(len(seen))
-    expected, weights = (none, none) if before is None else (before.left, before.weights)
-    gains, weights, left = correction(seen, noise, expected, weights)
+    noise = variance * found.noise
+    expected, most = (0 * noise, np.full(len(seen), FORCE)) if before is None else (before.left, before.gains)
+    gains, left = correction(seen, noise, expected, most)
     more = found.B @ (found.V @ (gains * seen / found.s))
     above = int((np.abs(seen) > CHANCE * np.sqrt(noise)).sum())
     size = float(np.sqrt((e**2).mean()))
-    return NextStroke(sent + more, size, above, float(np.sqrt(variance)), weights, left)
+    return NextStroke(
+        sent + more, size, above, float(np.sqrt(variance)), gains if gains.any() else most, left
+    )
 
 
 def correction(
-    seen: FloatArray, noise: FloatArray, expected: FloatArray, weights: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Gains a w_k of the patterns, their weights w_k, and the variance that a correction is expected to leave.
+    seen: FloatArray, noise: FloatArray, expected: FloatArray, most: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Gains a_k of the patterns, and the variance that a correction by them is expected to leave.
 
-        a = min(0.8, sum of w_k^2 P_k / sum of w_k^3 (P_k + N_k))
+        a_k = min(P_k / (P_k + N_k), a_k of the stroke before)
 
     P is what was expected, until the squares of what is seen, over P + N, sum to more than chance: then it is what
     they show, c^2 - N, made to fall with k by least squares, as thrust moves later patterns less.
@@ -191,17 +194,13 @@ def correction(
     seen : c, m, the patterns of an error
     noise : N, m2, their variance by noise
     expected : P, m2, before this stroke; zeros: nothing is expected
-    weights : zeros: not fixed yet
+    most : the gains before
     """
     count = len(seen)
     if (seen**2 / (expected + noise)).sum() > count + CHANCE * np.sqrt(2 * count):
         expected = np.maximum(isotonic_regression(seen**2 - noise, increasing=False).x, 0)
-        if not weights.any():
-            weights = expected / (expected + noise)
-    most = float((weights**3 * (expected + noise)).sum())
-    share = min(FORCE, float((weights**2 * expected).sum()) / most) if most else 0.0
-    gains = share * weights
-    return gains, weights, (1 - gains) ** 2 * expected + gains**2 * noise
+    gains = np.minimum(expected / (expected + noise), most)
+    return gains, (1 - gains) ** 2 * expected + gains**2 * noise
 
 
 def own_thrust(controller: Controller, flown: Scenario, patterns: ThrustPatterns) -> FloatArray:
@@ -304,8 +303,8 @@ def learn_strokes(
         after = next_stroke(law, log_of(run), patterns, after)
         thrust, counts = after.thrust, [*counts, after.patterns]
     quiet.append(_fly(plant, law, still, thrust))
-    sizes = [tuple(stroke_figures(run).axial_error for run in runs) for runs in (errors, quiet)]
-    return LearnedStrokes(*sizes, tuple(counts), thrust, law)
+    flown, still_left = (tuple(stroke_figures(run).axial_error for run in runs) for runs in (errors, quiet))
+    return LearnedStrokes(flown, still_left, tuple(counts), thrust, law)
 
 
 def _fly(plant: Plant, law: Controller, flown: Scenario, thrust: FloatArray | None) -> Trajectory:
