@@ -83,8 +83,8 @@ def identify(
     Example:  malta identify design/gains/robust.json log.npz -o found.toml
     """
     from malta.identification.data_file import write_data
+    from malta.identification.identify import GROUPS, weigh
     from malta.identification.identify import identify as identify_parameters
-    from malta.identification.identify import weigh
     from malta.identification.log_files import read_log
     from malta.identification.response import units_of_model
     from malta.model.data import plant_of
@@ -101,11 +101,11 @@ def identify(
         raise InputError("--robust", "", "two logs", "one log: two are estimated at the lines alone")
     with working(f"identifying from {log}"):
         if loaded is not None:
-            logs = read_log(log), read_log(loaded)
+            logs = read_log(log, GROUPS), read_log(loaded, GROUPS)
             found = weigh(controller, *logs, more, parameters=parameters or (), known=values)
         else:
             found = identify_parameters(
-                controller, read_log(log), parameters=parameters or (), known=values, robust=robust
+                controller, read_log(log, GROUPS), parameters=parameters or (), known=values, robust=robust
             )
     files = []
     if out is not None and not found.refusal:
