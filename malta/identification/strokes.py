@@ -33,6 +33,7 @@ from malta.errors import CheckError, InputError
 from malta.identification.learn import learn
 from malta.identification.log import Log, log_of, require_same_law, sample_excitation
 from malta.identification.measure import cut_loop
+from malta.identification.replay import reference_motion
 from malta.loops.loop import Loop, loop
 from malta.model.data import plant_of
 from malta.simulation.scenario import Scenario
@@ -218,6 +219,15 @@ def own_thrust(controller: Controller, flown: Scenario, patterns: ThrustPatterns
         e = (log.table("reference", [plant.stroke]) - log.table("y", [plant.stroke]))[:, 0]
         thrust = thrust + FORCE * patterns.B @ (patterns.V @ (patterns.U.T @ e / patterns.s))
     return thrust
+
+
+def first_thrust(controller: Controller, log: Log) -> FloatArray:
+    """`own_thrust` of a law for the reference of a log, N: what the first stroke under this law is sent beside it."""
+    plant = plant_of(controller.parameters)
+    motion = reference_motion(log, [s.name for s in plant.outputs], controller.sample_time)
+    flown = Scenario("stroke", log.samples * controller.sample_time, lambda _: motion)
+    reference = log.table("reference", [plant.stroke])[:, 0]
+    return own_thrust(controller, flown, thrust_patterns(loop(plant, controller), reference))
 
 
 @display

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from conftest import Run
 from scipy.linalg import toeplitz
 
 import malta
+from malta.identification.log import sample_excitation
 from malta.identification.measure import cut_loop, machines_of
 from malta.identification.strokes import ThrustPatterns, correction, thrust_patterns
 from malta.loops.loop import Loop
@@ -88,6 +91,32 @@ def test_no_stroke_is_expected_to_be_worse_than_the_one_before() -> None:
         fell = errors[:, :-1] - errors[:, 1:]
         assert (fell.mean(axis=0) > -2 * fell.std(axis=0) / np.sqrt(len(fell))).all()
         assert errors[:, 5].mean() < 0.7 * errors[:, 1].mean()
+
+
+@pytest.mark.slow
+def test_logs_of_a_bench_teach_as_the_simulated_strokes_do(run: Run, tmp_path: Path) -> None:
+    """learn --out --next, a stroke, and learn --before --next: the errors of learn_strokes, from files."""
+    machine = changed({"m": 0.3, "K_D": 6.2, "F_c": 0.8})
+    gains, law = Path("design/gains/robust.json"), CONTROLLER
+    scenario, files = malta.Scenario.stroke(10e-3, noise=1.0, quantize=True, settle=0.3), [tmp_path / "1.npz"]
+    flown = malta.simulate(machine, law, scenario)
+    sent, errors = tmp_path / "d.csv", [malta.simulation.stroke_figures(flown).axial_error]
+    malta.identification.write_log(malta.identification.log_of(flown), files[0])
+    assert run("learn", gains, files[0], "--out", tmp_path, "--next", sent).code == 0
+    gains, law = tmp_path / "robust_learned.json", malta.gains.read(tmp_path / "robust_learned.json")
+    for k in (2, 3):
+        thrust = np.loadtxt(sent, delimiter=",", skiprows=1)[:, 1]
+        excitation = sample_excitation(law.sample_time, machine, thrust)
+        flown = malta.simulate(machine, law, scenario.replace(seed=k, excitation=excitation))
+        errors.append(malta.simulation.stroke_figures(flown).axial_error)
+        log = malta.identification.write_log(malta.identification.log_of(flown), tmp_path / f"{k}.npz")
+        before = [text for file in files[1:] for text in ("--before", file)]
+        assert run("learn", gains, log, *before, "--next", sent).code == 0
+        files.append(log)
+    assert errors[0] > 300e-6
+    assert 20e-6 < errors[1] < 70e-6  # cogging alone: what the model knows was sent
+    assert errors[2] < 11e-6
+    assert run("learn", gains, log, "--before", files[1]).code == 2
 
 
 @pytest.mark.slow
