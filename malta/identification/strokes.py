@@ -208,16 +208,25 @@ def own_thrust(controller: Controller, flown: Scenario, patterns: ThrustPatterns
     """The thrust beside the law's that the gain file's own machine needs to follow a stroke, N, at its samples.
 
     It is learned from strokes of the model without noise, and makes up for the delay and the current loops: a lab's
-    machine need not teach what the model knows.
+    machine need not teach what the model knows. Raises CheckError where the first correction does not shrink its error:
+    then no machine learns from stroke to stroke by this response.
     """
     plant, Ts = plant_of(controller.parameters), controller.sample_time
     thrust: FloatArray = np.zeros(len(patterns.B))
+    errors: list[float] = []
     for _ in range(ROUNDS):
         sent = sample_excitation(Ts, plant, thrust)
         run = simulate(plant, controller, flown.replace(noise=0.0, quantize=False, excitation=sent))
         log = log_of(run)
         e = (log.table("reference", [plant.stroke]) - log.table("y", [plant.stroke]))[:, 0]
-        thrust = thrust + FORCE * patterns.B @ (patterns.V @ (patterns.U.T @ e / patterns.s))
+        seen = patterns.U.T @ e
+        errors.append(float(np.linalg.norm(seen)) / len(e) ** 0.5)
+        if len(errors) == 2 and not errors[1] < errors[0]:
+            grown = f"{1e6 * errors[0]:.3g} to {1e6 * errors[1]:.3g} um rms"
+            raise CheckError(
+                f"{controller.name}: an error of its own machine grows from {grown} as it learns"
+            )
+        thrust = thrust + FORCE * patterns.B @ (patterns.V @ (seen / patterns.s))
     return thrust
 
 

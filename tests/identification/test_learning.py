@@ -245,6 +245,14 @@ def moved_patterns(patterns: ThrustPatterns, machine: Loop) -> FloatArray:
     return np.asarray(patterns.U.T @ H @ patterns.B @ (patterns.V / patterns.s))
 
 
+@pytest.mark.slow
+def test_a_law_whose_strokes_do_not_converge_is_refused() -> None:
+    """The integrals of table2 are too slow for an inverse within one stroke."""
+    table2 = malta.gains.read("design/gains/table2.json")
+    with pytest.raises(malta.CheckError, match="its own machine grows from"):
+        malta.identification.learn_strokes(malta.plant_of(table2.parameters), table2, strokes=2)
+
+
 def test_what_the_next_stroke_is_sent_needs_a_stroke_of_this_law() -> None:
     run = malta.simulate(changed({}), CONTROLLER, malta.Scenario.stroke(10e-3, noise=1.0))
     log = malta.identification.log_of(run)
