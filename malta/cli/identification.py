@@ -83,8 +83,8 @@ def identify(
     Example:  malta identify design/gains/robust.json log.npz -o found.toml
     """
     from malta.identification.data_file import write_data
+    from malta.identification.identify import GROUPS, weigh
     from malta.identification.identify import identify as identify_parameters
-    from malta.identification.identify import weigh
     from malta.identification.log_files import read_log
     from malta.identification.response import units_of_model
     from malta.model.data import plant_of
@@ -101,11 +101,11 @@ def identify(
         raise InputError("--robust", "", "two logs", "one log: two are estimated at the lines alone")
     with working(f"identifying from {log}"):
         if loaded is not None:
-            logs = read_log(log), read_log(loaded)
+            logs = read_log(log, GROUPS), read_log(loaded, GROUPS)
             found = weigh(controller, *logs, more, parameters=parameters or (), known=values)
         else:
             found = identify_parameters(
-                controller, read_log(log), parameters=parameters or (), known=values, robust=robust
+                controller, read_log(log, GROUPS), parameters=parameters or (), known=values, robust=robust
             )
     files = []
     if out is not None and not found.refusal:
@@ -338,6 +338,13 @@ def learn(
             "--next", metavar="FILE", help="Write the thrust that the next stroke is sent too (.csv)."
         ),
     ] = None,
+    before: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="LOG",
+            help="A stroke before, under the same gain file, oldest first: --next weighs by it too.",
+        ),
+    ] = None,
     v0: Annotated[
         bool, typer.Option("--v0", help="Learn v0(z), what holds the machine, from the log of a slow stroke.")
     ] = False,
@@ -359,10 +366,10 @@ def learn(
 
     The new gain file commutates with the learned force constant, and its filter predicts with it: the next stroke needs
     no feedback to correct the thrust. With --next the thrust over time that was missing is written, which the next
-    stroke is sent beside the law's. With --v0 the log is of a slow stroke, and the thrust that holds the machine along
-    it, against cogging and other loads, goes into the table v0(z) of the new gain file. --strokes learns the constant
-    and the thrust over time on the simulated machine, with --set as another one, and
-    proves by how much errors shrink over the box of the gain file.
+    stroke is sent beside the law's; with --out too, that which the new gain file's own machine needs. With --v0 the log
+    is of a slow stroke, and the thrust that holds the machine along it, against cogging and other loads, goes into the
+    table v0(z) of the new gain file. --strokes learns the constant and the thrust over time on the simulated machine,
+    with --set as another one, and proves by how much errors shrink over the box of the gain file.
 
     \b
     Example:  malta learn design/gains/robust.json build/stroke.npz --out build
@@ -373,6 +380,8 @@ def learn(
     if v0 and (strokes or parameter or following):
         other = "--strokes" if strokes else "--next" if following else "--parameter"
         raise InputError("learn", "--v0", f"--v0 and {other}", "one of them")
+    if before and not following:
+        raise InputError("learn", "--before", "--before alone", "--before LOG --next FILE")
     if (log is None) == (strokes == 0):
         raise InputError("learn", "LOG", "a log and --strokes" if log else "nothing", "a log, or --strokes N")
     if strokes:
@@ -380,31 +389,36 @@ def learn(
     elif log is not None and v0:
         _learn_v0(gains, controller, log, out, as_json=as_json)
     elif log is not None:
-        _learn_from(gains, controller, log, parameter, following, out, as_json=as_json)
+        logs = [*(before or ()), log]
+        _learn_from(gains, controller, logs, parameter, following, out, as_json=as_json)
 
 
 def _learn_from(
     gains: Path,
     controller: Controller,
-    log: Path,
+    logs: list[Path],
     parameter: str,
     following: Path | None,
     out: Path | None,
     *,
     as_json: bool,
 ) -> None:
-    """Learn from the log of one stroke."""
+    """Learn from the log of a stroke, the last one."""
     from malta.identification.learn import learn as learn_thrust
-    from malta.identification.learn import next_stroke
     from malta.identification.log_files import read_log
+    from malta.identification.strokes import first_thrust, next_stroke
     from malta.model.data import plant_of
 
+    *earlier, log = logs
     read = read_log(log)
     found = learn_thrust(controller, read, parameter=parameter)
     files = [] if out is None else verify_and_write(found.controller, gains, out)
     if following is not None:
-        plant, after = plant_of(controller.parameters), next_stroke(controller, read)
-        sent = plant.inputs[plant.thrust_input :][:1], after.thrust[:, None]
+        plant, after = plant_of(controller.parameters), None
+        for one in (*map(read_log, earlier), read):
+            after = next_stroke(controller, one, before=after)
+        thrust = after.thrust if after is not None and out is None else first_thrust(found.controller, read)
+        sent = plant.inputs[plant.thrust_input :][:1], thrust[:, None]
         files.append(_write_forces(following, controller.sample_time, *sent))
     if as_json:
         from malta.cli.documents.others import learn_output
@@ -415,11 +429,12 @@ def _learn_from(
     half = 1.96 * found.deviation
     print_text(console, f"{log}: the stroke took {found.factor:.4f} +- {half:.4f} times the thrust expected")
     print_text(console, f"{found.parameter}: {found.before:.5g} -> {found.after:.5g}, as the law believes it")
-    if following is not None:
+    if following is not None and after is not None:
         print_text(
             console,
             f"the error, {1e6 * after.error:.3g} um rms, has {after.patterns} patterns above the noise of "
-            f"{1e6 * after.noise:.3g} um: the next stroke is sent up to {abs(after.thrust).max():.3g} N too",
+            f"{1e6 * after.noise:.3g} um: the next stroke is sent up to {abs(thrust).max():.3g} N too"
+            + (f", which the machine of {found.controller.name} needs by itself" if out else ""),
         )
     print_written(console, files)
 
@@ -459,7 +474,7 @@ def _learn_strokes(
 ) -> None:
     """Fly strokes on the simulated machine, each taught by those before."""
     from malta.identification.convergence import contraction
-    from malta.identification.learn import learn_strokes
+    from malta.identification.strokes import learn_strokes
     from malta.model.data import plant_of, published_figures
     from malta.report.tables.experiments import strokes_table
 
@@ -480,7 +495,7 @@ def _learn_strokes(
     print_text(
         console,
         f"the next stroke would be sent up to {abs(found.thrust).max():.3g} N beside the law's thrust, and without "
-        f"noise of the sensors its largest axial error would be {1e6 * found.repeatable:.3g} um",
+        f"noise of the sensors its largest axial error would be {1e6 * found.without_noise[-1]:.3g} um",
     )
     if shrinks is not None:
         print_text(console, _proven_contraction(shrinks))
@@ -492,7 +507,9 @@ def _proven_contraction(found: Gain) -> str:
     if found.upper is None:
         return f"that errors shrink over the box is not proven: {found.reason}"
     at = ", ".join(f"{name} = {value:.4g}" for name, value in found.witness.items())
-    left = f"at most {100 * found.upper:.3g} % of an error that thrust can make is left by the next stroke"
+    left = f"a gain of 0.8 leaves at most {100 * found.upper:.3g} % of an error that thrust can make"
+    if found.upper <= 1:
+        left += ", and smaller gains of some patterns let the error, weighted by them, not grow"
     verdict = f"proven over the box: {left}" if found.upper < 1 else "errors may grow within the box"
     return (
         f"{verdict}; found: {100 * found.lower:.3g} % at {found.frequency / (2 * math.pi):.3g} Hz with {at}. Not "

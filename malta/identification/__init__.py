@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from malta.identification.identify import Identified as Identified
     from malta.identification.identify import weigh as weigh
     from malta.identification.learn import Learned as Learned
-    from malta.identification.learn import LearnedStrokes as LearnedStrokes
-    from malta.identification.learn import learn_strokes as learn_strokes
-    from malta.identification.learn import next_stroke as next_stroke
     from malta.identification.log import Log as Log
     from malta.identification.log import log_of as log_of
     from malta.identification.log_files import write_log as write_log
@@ -26,5 +23,8 @@ if TYPE_CHECKING:
     from malta.identification.measure import MeasurementPlan as MeasurementPlan
     from malta.identification.replay import LawReplay as LawReplay
     from malta.identification.replay import replay_law as replay_law
+    from malta.identification.strokes import LearnedStrokes as LearnedStrokes
+    from malta.identification.strokes import learn_strokes as learn_strokes
+    from malta.identification.strokes import next_stroke as next_stroke
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

@@ -34,7 +34,7 @@ import numpy as np
 from scipy import linalg, signal
 
 from malta.errors import InputError
-from malta.identification.learn import FORCE
+from malta.identification.strokes import FORCE
 from malta.loops.loop import loop
 from malta.model.data import plant_of
 from malta.proof.blocks.gain import Gain, worst_case_gain

@@ -60,6 +60,7 @@ if TYPE_CHECKING:
 
     IntArray = NDArray[np.integer[Any]]
 
+GROUPS = ("y", "v", "i", "excitation")  # of a log, which are used
 SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
 LOST = 1.0  # of its value: a combination of parameters that is found worse is not found
 LIKELY = 1e-6  # probability below which chi2 refuses the model

@@ -6,8 +6,9 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
+from functools import partial
 from hashlib import sha256
 from importlib import import_module
 from pathlib import Path
@@ -131,7 +132,7 @@ def _from_parquet(content: bytes, path: Path) -> Decoded:
     head = {name: text[0] for name, text in words.items() if text}
     if not columns:
         raise InputError(path, "", "no columns", "t [s], x1 [m], ...")
-    return _tabulated(head, [name.strip() for name in read.column_names], np.column_stack(columns), path)
+    return _tabulated(head, [name.strip() for name in read.column_names], columns, path)
 
 
 def _to_csv(log: Log) -> bytes:
@@ -174,12 +175,13 @@ def _to_mat(log: Log) -> bytes:
     return bytes(buffer.getvalue())
 
 
-def read_log(path: str | Path) -> Log:
+def read_log(path: str | Path, groups: Collection[str] = tuple(GROUPS)) -> Log:
     """Read a log: a .csv, .npz, .mat or .parquet of malta, or a .csv of another program with headings "name [unit]".
 
     A .dump is the memory of the ring buffer of exported C, `malta export --log`.
 
     path : the file. Units are converted to SI; a cell that is empty or nan is a missing reading.
+    groups : of its columns that are read, as ("y", "i"): of large files some take less time than all
 
     Returns a Log. Signals of headings without a prefix are found by their unit when the log is used: positions and
     angles are measured outputs, forces and torques commands, currents and voltages those of the axes.
@@ -199,12 +201,18 @@ def read_log(path: str | Path) -> Log:
     path = Path(path)
     _require_suffix(path, ".dump")
     content = read_file(path, "log", Path.read_bytes, LARGEST)
-    decoders = {".csv": _from_csv, ".npz": _from_npz, ".mat": _from_mat, ".dump": decode_dump}
+    decoders: dict[str, Callable[[bytes, Path], Decoded]]
+    decoders = {
+        ".csv": partial(_from_csv, groups=groups),
+        ".npz": _from_npz,
+        ".mat": _from_mat,
+        ".dump": decode_dump,
+    }
     head, t, tables, headings = decoders.get(path.suffix, _from_parquet)(content, path)
     if len(t) < 2 or not ((np.diff(t) > 0).all() and np.abs(t).max() < MOST):
         raise InputError(path, "t", "times that do not rise", "the times of the samples, in order")
     columns, signals = {}, {}
-    for group in tables:
+    for group in [name for name in tables if name in groups]:
         columns[group], signals[group] = _in_si(tables[group], headings[group], path)
     if "y" not in columns:
         raise InputError(path, "y", "no measured outputs", "columns of positions, as x1 [m]")
@@ -230,57 +238,114 @@ Decoded = tuple[dict[str, Any], "FloatArray", dict[str, "FloatArray"], dict[str,
 """What a file holds: its head, t, and by group a table and its headings."""
 
 
-def _from_csv(content: bytes, path: Path) -> Decoded:
+def _from_csv(content: bytes, path: Path, groups: Collection[str]) -> Decoded:
     """The head, times, tables and headings of a .csv."""
     try:
-        text = content.decode("utf-8-sig")
+        head, names, begin = _csv_head(content)
     except UnicodeDecodeError as error:
         raise InputError(path, "", "bytes that are no text", "UTF-8") from error
-    lines = text.split("\n", 40)
-    comments = [line[1:].split() for line in lines if line.startswith("#")]
-    head: dict[str, Any] = {words[0]: words[1] for words in comments if len(words) > 1}
-    first = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), None)
-    if first is None:
+    if not names:
         raise InputError(path, "", "no line of headings", 'a line as "t [s],x1 [um],..."')
-    names = [name.strip() for name in lines[first].split(",")]
+    _require_times(names, path)
+    used = [k for k, name in enumerate(names) if k == 0 or _group_of(name, path) in groups]
+    columns = _fast_columns(memoryview(content)[begin:], len(names), used)
     try:
-        values = _table(text, first + 1)
+        if columns is None:
+            columns = _columns(content, begin, len(names), used)
+    except UnicodeDecodeError as error:
+        raise InputError(path, "", "bytes that are no text", "UTF-8") from error
     except ValueError as error:
         raise InputError(path, "", f"a line that cannot be read ({str(error)[:80]})", "numbers") from error
-    if not values.size:
+    if not columns or not len(columns[0]):
         raise InputError(path, "", "headings alone", "a line of numbers for each sample")
-    if values.shape[1] != len(names):
-        raise InputError(path, "", f"{values.shape[-1]} cells in a line", f"{len(names)}, as headings")
-    return _tabulated(head, names, values, path)
+    if len(columns) != len(used):
+        raise InputError(path, "", f"{len(columns)} cells in a line", f"{len(names)}, as headings")
+    return _tabulated(head, [names[k] for k in used], columns, path)
 
 
-def _table(text: str, skipped: int) -> FloatArray:
-    """The numbers of a text below `skipped` lines, NaN for an empty cell. Raises ValueError for what is no number."""
+def _csv_head(content: bytes) -> tuple[dict[str, Any], list[str], int]:
+    """The comments of a .csv as a head, its headings, and the byte where its rows begin."""
+    lines, head = io.BytesIO(content), dict[str, Any]()
+    while line := lines.readline():
+        text = line.decode("utf-8-sig").strip()
+        if text.startswith("#"):
+            words = text[1:].split()
+            head |= {words[0]: words[1]} if len(words) > 1 else {}
+        elif text:
+            return head, [name.strip() for name in text.split(",")], lines.tell()
+    return head, [], len(content)
+
+
+def _fast_columns(rows: memoryview, count: int, used: list[int]) -> list[FloatArray] | None:
+    """Columns of a .csv's rows by pyarrow, whose doubles are those of numpy to the bit; NaN for an empty cell.
+
+    None without pyarrow, and for what pyarrow does not take: numpy reads that, or says what is wrong.
+    """
+    try:
+        arrow, csv = import_module("pyarrow"), import_module("pyarrow.csv")
+    except ImportError:
+        return None
+    names = [str(k) for k in range(count)]
+    wanted = [names[k] for k in used]
+    try:
+        read = csv.read_csv(
+            arrow.BufferReader(arrow.py_buffer(rows)),
+            read_options=csv.ReadOptions(column_names=names, use_threads=False),
+            parse_options=csv.ParseOptions(quote_char=False),
+            convert_options=csv.ConvertOptions(
+                column_types=dict.fromkeys(wanted, arrow.float64()),
+                null_values=[""],
+                include_columns=wanted,
+            ),
+        )
+    except arrow.ArrowException:
+        return None
+    return [np.asarray(column.to_numpy(), dtype=float) for column in read.columns]
+
+
+def _columns(content: bytes, begin: int, count: int, used: list[int]) -> list[FloatArray]:
+    """Columns of a .csv from a byte on, NaN for an empty cell. Raises ValueError for what is no number."""
+
+    def rows() -> io.TextIOWrapper:
+        data = io.BytesIO(content)
+        data.seek(begin)
+        return io.TextIOWrapper(data, "utf-8")
+
+    only: Any = (
+        used if len(used) < count else None
+    )  # where all are read, their number in each line is checked
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a file without rows, which is refused later
         try:
-            return np.loadtxt(io.StringIO(text), delimiter=",", skiprows=skipped, comments=None, ndmin=2)
+            table = np.loadtxt(rows(), delimiter=",", comments=None, ndmin=2, usecols=only)
         except ValueError:
-            if not re.search(r",\s*(,|$)", text, re.M):
+            if not re.search(rb",\s*(,|$)", content, re.M):
                 raise
-        # Cells are empty where readings are missing: a slower reader takes them.
-        return np.genfromtxt(io.StringIO(text), delimiter=",", skip_header=skipped, ndmin=2)
+            # Cells are empty where readings are missing: a slower reader takes them.
+            table = np.genfromtxt(rows(), delimiter=",", ndmin=2, usecols=only)
+    if only and content.count(b",", begin) != (count - 1) * len(table):
+        raise ValueError("lines of different length")
+    return list(table.T)
 
 
-def _tabulated(head: dict[str, Any], names: list[str], values: FloatArray, path: Path) -> Decoded:
+def _tabulated(head: dict[str, Any], names: list[str], columns: list[FloatArray], path: Path) -> Decoded:
     """The tables of a file that is one table, whose first column is t."""
-    if not names[0].startswith("t ") and names[0] != "t":
-        raise InputError(path, names[0], "the first column", "t [s]")
+    _require_times(names, path)
     places: dict[str, list[int]] = {}
     for k, name in enumerate(names[1:], start=1):
         group = _group_of(name, path)
         places.setdefault(group, []).append(k)
     scale = to_si(1.0, _parts(names[0], path)[1], "s", path, "t")
-    tables = {group: values[:, found] for group, found in places.items()}
+    tables = {group: np.column_stack([columns[k] for k in found]) for group, found in places.items()}
     headings = {
         group: [names[k].removeprefix(GROUPS[group]) for k in found] for group, found in places.items()
     }
-    return head, values[:, 0] * scale, tables, headings
+    return head, columns[0] * scale, tables, headings
+
+
+def _require_times(names: list[str], path: Path) -> None:
+    if not names[0].startswith("t ") and names[0] != "t":
+        raise InputError(path, names[0], "the first column", "t [s]")
 
 
 def _group_of(heading: str, path: Path) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -265,16 +265,22 @@ def _explained(
     return found
 
 
-def _inputs(controller: Controller, log: Log) -> tuple[Simulation, Inputs]:
-    """What the law was given at every sample, from the reference and the excitation of a log."""
-    plant, Ts = plant_of(controller.parameters), controller.sample_time
-    names = [s.name for s in plant.outputs]
-    spline = reference_spline(log, names, Ts)
-    sent = log.columns.get("excitation", np.zeros((log.samples, 0)))
+def reference_motion(log: Log, names: list[str], sample_time: float) -> Callable[[Any], Motion]:
+    """The reference of a log as a motion of time, s, with its derivatives; raises as `reference_spline`."""
+    spline = reference_spline(log, names, sample_time)
 
     def motion(t: Any) -> Motion:
         return Motion(spline(t), spline(t, 1), spline(t, 2))
 
+    return motion
+
+
+def _inputs(controller: Controller, log: Log) -> tuple[Simulation, Inputs]:
+    """What the law was given at every sample, from the reference and the excitation of a log."""
+    plant, Ts = plant_of(controller.parameters), controller.sample_time
+    names = [s.name for s in plant.outputs]
+    motion = reference_motion(log, names, Ts)
+    sent = log.columns.get("excitation", np.zeros((log.samples, 0)))
     t = Ts * np.arange(log.samples)
     given = motion(t)._replace(p=log.table("reference", names))
     excitation = sample_excitation(Ts, plant, sent) if sent.any() else None

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from conftest import Run
 from scipy.linalg import toeplitz
 
 import malta
-from malta.identification.learn import ThrustPatterns, thrust_patterns
+from malta.identification.log import sample_excitation
 from malta.identification.measure import cut_loop, machines_of
+from malta.identification.strokes import ThrustPatterns, correction, thrust_patterns
 from malta.loops.loop import Loop
 from malta.synthesis.feedforward import static_feedforward
 
 if TYPE_CHECKING:
-    from malta.model.plant import Plant
+    from malta.model.plant import FloatArray, Plant
 
 CONTROLLER = malta.gains.read("design/gains/robust.json")
 
@@ -40,19 +43,98 @@ def test_one_stroke_teaches_the_thrust(K_D: float) -> None:
 
 
 def test_strokes_teach_the_next_one_what_is_missing() -> None:
-    """A machine with other mass, thrust and cogging: with noise from 0.4 mm to what the noise moves, in six strokes."""
+    """A machine with other mass, thrust and cogging: in five noisy strokes from 0.4 mm to what the noise moves."""
     machine = changed({"m": 0.3, "K_D": 6.2, "F_c": 0.8})
-    found = malta.identification.learn_strokes(machine, CONTROLLER, strokes=6)
+    found = malta.identification.learn_strokes(machine, CONTROLLER, strokes=5)
     first, second, *taught = 1e6 * np.array(found.axial_error)
-    assert (first > 300, 40 < second < 80, taught[0] < 0.5 * second, taught[-1] < 10) == (True,) * 4
-    assert found.repeatable < 7e-6
+    assert (first > 300, 20 < second < 60, taught[0] < 0.4 * second, taught[-1] < 10) == (True,) * 4
     assert found.patterns[0] == 0
-    assert found.patterns[1] > 2 * found.patterns[5]
+    assert found.patterns[1] > 2 * found.patterns[4]
+    # Flown again without noise: what repeats falls to what the noise moves, 5 um.
+    assert found.without_noise[0] == pytest.approx(found.axial_error[0], rel=0.01)
+    assert max(found.without_noise[2:]) < 7e-6
     # Without noise no stroke is worse than the one before.
     still = malta.identification.learn_strokes(machine, CONTROLLER, strokes=5, noise=0.0)
     assert (np.diff(still.axial_error) < 1e-9).all()
+    assert still.without_noise[:5] == still.axial_error
+    assert still.axial_error[4] < 1.5e-6
     with pytest.raises(malta.InputError, match="expected 1 or more"):
         malta.identification.learn_strokes(machine, CONTROLLER, strokes=0)
+
+
+@pytest.mark.slow
+def test_what_the_model_misses_is_sent_first() -> None:
+    """The gain file's own machine lags by 46 um behind delay and current loops; of that nothing is left to teach."""
+    found = malta.identification.learn_strokes(changed({}), CONTROLLER, strokes=2)
+    assert found.axial_error[0] > 40e-6
+    assert found.without_noise[1] < 3e-6  # the force constant was learned from a noisy stroke
+    assert found.axial_error[1] < 10e-6
+
+
+@pytest.mark.slow
+def test_no_stroke_is_expected_to_be_worse_than_the_one_before() -> None:
+    """300 times six strokes of the model's own machine, with noise: the mean error falls, whatever was missing."""
+    patterns, _ = stroke_patterns()
+    noise, random = (15.6e-6) ** 2 * patterns.noise, np.random.default_rng(2)
+    size = np.exp(-np.arange(len(noise)) / 4)
+    for missing in (1e-3, 1e-4, 2e-5):
+        errors = np.zeros((300, 6))
+        for row in errors:
+            x, left, most = missing * size * random.normal(size=len(noise)), 0 * noise, 0 * noise + 0.8
+            for k in range(6):
+                seen = x + np.sqrt(noise) * random.normal(size=len(noise))
+                gains, left = correction(seen, noise, left, most)
+                assert (gains <= most).all()
+                most = gains if gains.any() else most
+                row[k] = x @ x
+                x = x - gains * seen
+        fell = errors[:, :-1] - errors[:, 1:]
+        assert (fell.mean(axis=0) > -2 * fell.std(axis=0) / np.sqrt(len(fell))).all()
+        assert errors[:, 5].mean() < 0.7 * errors[:, 1].mean()
+
+
+@pytest.mark.slow
+def test_logs_of_a_bench_teach_as_the_simulated_strokes_do(run: Run, tmp_path: Path) -> None:
+    """learn --out --next, a stroke, and learn --before --next: the errors of learn_strokes, from files."""
+    machine = changed({"m": 0.3, "K_D": 6.2, "F_c": 0.8})
+    gains, law = Path("design/gains/robust.json"), CONTROLLER
+    scenario, files = malta.Scenario.stroke(10e-3, noise=1.0, quantize=True, settle=0.3), [tmp_path / "1.npz"]
+    flown = malta.simulate(machine, law, scenario)
+    sent, errors = tmp_path / "d.csv", [malta.simulation.stroke_figures(flown).axial_error]
+    malta.identification.write_log(malta.identification.log_of(flown), files[0])
+    assert run("learn", gains, files[0], "--out", tmp_path, "--next", sent).code == 0
+    gains, law = tmp_path / "robust_learned.json", malta.gains.read(tmp_path / "robust_learned.json")
+    for k in (2, 3):
+        thrust = np.loadtxt(sent, delimiter=",", skiprows=1)[:, 1]
+        excitation = sample_excitation(law.sample_time, machine, thrust)
+        flown = malta.simulate(machine, law, scenario.replace(seed=k, excitation=excitation))
+        errors.append(malta.simulation.stroke_figures(flown).axial_error)
+        log = malta.identification.write_log(malta.identification.log_of(flown), tmp_path / f"{k}.npz")
+        before = [text for file in files[1:] for text in ("--before", file)]
+        assert run("learn", gains, log, *before, "--next", sent).code == 0
+        files.append(log)
+    assert errors[0] > 300e-6
+    assert 20e-6 < errors[1] < 70e-6  # cogging alone: what the model knows was sent
+    assert errors[2] < 11e-6
+    assert run("learn", gains, log, "--before", files[1]).code == 2
+
+
+@pytest.mark.slow
+def test_gains_of_patterns_keep_the_contraction_that_is_proven() -> None:
+    """The sum of a_k x_k^2 does not grow for machines whose error contracts under a gain of 0.8."""
+    patterns, believed = stroke_patterns()
+    random = np.random.default_rng(3)
+    norms = []
+    for one in machines_of(believed, {"K_D": 0.3, "m": 0.2}, 0, samples=0):
+        M = moved_patterns(patterns, one)
+        c = np.linalg.norm(np.eye(len(M)) - 0.8 * M, 2)
+        for _ in range(2):
+            D = np.diag(np.sqrt(random.uniform(0.001, 0.8, len(M))))
+            norms.append((c, np.linalg.norm(np.eye(len(M)) - D @ M @ D, 2)))
+    below = [left for c, left in norms if c < 1]
+    assert len(below) >= 6
+    assert max(below) <= 1
+    assert max(c for c, _ in norms) > 1
 
 
 def test_a_slow_stroke_teaches_the_table_that_holds_the_machine() -> None:
@@ -149,14 +231,26 @@ def stroke_patterns() -> tuple[ThrustPatterns, Loop]:
 
 def lifted_norm(patterns: ThrustPatterns, machine: Loop) -> float:
     """The 2-norm of U' (1 - 0.8 H B (H_0 B)^+) U: on the samples of one log."""
+    return float(np.linalg.norm(np.eye(len(patterns.s)) - 0.8 * moved_patterns(patterns, machine), 2))
+
+
+def moved_patterns(patterns: ThrustPatterns, machine: Loop) -> FloatArray:
+    """U' H B (H_0 B)^+ U: how a machine moves in the patterns that move the gain file's machine by one each."""
     cut = machine.plant.stroke_output, machine.plant.thrust_input
     N, Ts = len(patterns.B), machine.sample_time
     w = 2 * np.pi * np.fft.rfftfreq(2 * N, Ts)
     G = np.zeros(len(w), dtype=complex)
     G[1:-1] = cut_loop(machine, w[1:-1]).G[:, *cut]
     H = toeplitz(np.fft.irfft(G, 2 * N)[:N], np.zeros(N))
-    moved = patterns.U.T @ H @ patterns.B @ (patterns.V / patterns.s)
-    return float(np.linalg.norm(np.eye(len(patterns.s)) - 0.8 * moved, 2))
+    return np.asarray(patterns.U.T @ H @ patterns.B @ (patterns.V / patterns.s))
+
+
+@pytest.mark.slow
+def test_a_law_whose_strokes_do_not_converge_is_refused() -> None:
+    """The integrals of table2 are too slow for an inverse within one stroke."""
+    table2 = malta.gains.read("design/gains/table2.json")
+    with pytest.raises(malta.CheckError, match="its own machine grows from"):
+        malta.identification.learn_strokes(malta.plant_of(table2.parameters), table2, strokes=2)
 
 
 def test_what_the_next_stroke_is_sent_needs_a_stroke_of_this_law() -> None:

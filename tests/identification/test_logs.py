@@ -12,6 +12,7 @@ import pytest
 from conftest import Run
 
 import malta
+from malta.identification import log_files
 from malta.identification.spectra import in_axes
 from malta.report.figures.runs import log_figure
 
@@ -65,6 +66,33 @@ def test_csv_of_other_programs(tmp_path: Path) -> None:
     assert found.columns["i"][0, 0] == pytest.approx(3e-3)
     assert found.columns["reference"][2, 0] == pytest.approx(1e-3)
     assert found.survey.missing == {"x1": 1}
+
+
+def test_columns_that_are_not_asked_for_are_not_read(log: malta.identification.Log, tmp_path: Path) -> None:
+    for suffix in (".csv", ".npz"):
+        path = malta.identification.write_log(log, tmp_path / f"log{suffix}")
+        every, few = malta.read_log(path), malta.read_log(path, ("y", "i"))
+        assert list(few.columns) == ["y", "i"]
+        assert all(np.array_equal(few.columns[group], every.columns[group]) for group in ("y", "i"))
+        assert (few.period, few.sha256, few.signals["i"]) == (every.period, every.sha256, every.signals["i"])
+    text = "t [s],x1 [m],fx [N]\n0,1,2\n1,2\n2,1,4\n"
+    (tmp_path / "short.csv").write_text(text)
+    with pytest.raises(malta.InputError, match="a line that cannot be read"):
+        malta.read_log(tmp_path / "short.csv", ("y",))
+
+
+def test_pyarrow_reads_the_doubles_of_numpy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pyarrow", reason="pyarrow reads a .csv faster")
+    random = np.random.default_rng(1)
+    cells = random.normal(size=(500, 4)) * 10.0 ** random.integers(-12, 3, (500, 4))
+    rows = [f"{k},{a:.17g},{b:.9g},{c!r},{d:.3f}" for k, (a, b, c, d) in enumerate(cells.tolist())]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["t [s],x [m],y [um],f [N],i [A]", *rows, "500,,-0.0,nan,4.9e-324", ""]))
+    by_arrow = malta.read_log(path)
+    monkeypatch.setattr(log_files, "_fast_columns", lambda *_: None)
+    by_numpy = malta.read_log(path)
+    for group, table in by_arrow.columns.items():
+        assert np.array_equal(table, by_numpy.columns[group], equal_nan=True)
 
 
 @pytest.mark.parametrize(

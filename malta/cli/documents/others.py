@@ -21,10 +21,11 @@ if TYPE_CHECKING:
     from malta.identification.excite import ExcitationPlan
     from malta.identification.holding import LearnedV0
     from malta.identification.identify import Identified
-    from malta.identification.learn import Learned, LearnedStrokes
+    from malta.identification.learn import Learned
     from malta.identification.log import Log
     from malta.identification.measure import Curve, Measurement, MeasurementPlan
     from malta.identification.replay import LawReplay
+    from malta.identification.strokes import LearnedStrokes
     from malta.proof.blocks.gain import Gain
     from malta.proof.certificate.checked_file import Claim
     from malta.report.ledger import Ledger
@@ -322,6 +323,7 @@ class LearnedStrokesOutput(Part):
     version: Literal[1] = 1
     gains: str
     axial_error_m: list[float] = Field(description="the largest true error of each stroke")
+    without_noise_m: list[float] = Field(description="the same of each stroke flown again without noise")
     patterns: list[int] = Field(description="of each stroke: patterns of its error that rose above the noise")
     largest_thrust_N: float = Field(description="that the next stroke would be sent beside the law's")
     repeatable_error_m: float = Field(description="the largest axial error of the next stroke without noise")
@@ -532,9 +534,10 @@ def learned_strokes_output(
     return LearnedStrokesOutput(
         gains=str(gains),
         axial_error_m=list(found.axial_error),
+        without_noise_m=list(found.without_noise[:-1]),
         patterns=list(found.patterns),
         largest_thrust_N=float(abs(found.thrust).max()),
-        repeatable_error_m=found.repeatable,
+        repeatable_error_m=found.without_noise[-1],
         contraction=None if shrinks is None else shrinks.upper,
         files=list(map(str, files)),
     )

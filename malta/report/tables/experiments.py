@@ -37,11 +37,11 @@ if TYPE_CHECKING:
     from malta.identification.commission import Commissioning, Finding, Step
     from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
-    from malta.identification.learn import LearnedStrokes
     from malta.identification.log import Log
     from malta.identification.measure import Measurement, MeasurementPlan
     from malta.identification.prediction import Predicted
     from malta.identification.replay import LawReplay
+    from malta.identification.strokes import LearnedStrokes
     from malta.merits import Merit
     from malta.model.plant import Plant
     from malta.report.ledger import Claim, Ledger
@@ -291,10 +291,11 @@ def quality_table(found: Identified) -> Table:
 
 def strokes_table(found: LearnedStrokes) -> Table:
     """The error of each stroke, and what it taught."""
-    table = new_table("Stroke by stroke", "stroke", "largest axial error [um]", "patterns above the noise")
+    errors = "largest axial error [um]", "without noise [um]"
+    table = new_table("Stroke by stroke", "stroke", *errors, "patterns above the noise")
     for k, (error, count) in enumerate(zip(found.axial_error, found.patterns, strict=True)):
         taught = "the force constant" if k == 0 else str(count)
-        add_row(table, str(k + 1), f"{1e6 * error:.3g}", taught)
+        add_row(table, str(k + 1), f"{1e6 * error:.3g}", f"{1e6 * found.without_noise[k]:.3g}", taught)
     return table
 
 
