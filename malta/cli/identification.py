@@ -441,7 +441,7 @@ def _learn_from(
 
 def _learn_v0(gains: Path, controller: Controller, log: Path, out: Path | None, *, as_json: bool) -> None:
     """Learn v0(z) of the thrust from the log of a slow stroke."""
-    from malta.identification.holding import learn_v0
+    from malta.identification.learn import learn_v0
     from malta.identification.log_files import read_log
     from malta.model.data import plant_of
 

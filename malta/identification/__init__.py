@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from malta.identification.dump import ExactReplay as ExactReplay
     from malta.identification.dump import replay_dump as replay_dump
     from malta.identification.excite import ExcitationPlan as ExcitationPlan
-    from malta.identification.holding import LearnedV0 as LearnedV0
-    from malta.identification.holding import learn_v0 as learn_v0
     from malta.identification.identify import Identified as Identified
     from malta.identification.identify import weigh as weigh
     from malta.identification.learn import Learned as Learned
+    from malta.identification.learn import LearnedV0 as LearnedV0
+    from malta.identification.learn import learn_v0 as learn_v0
     from malta.identification.log import Log as Log
     from malta.identification.log import log_of as log_of
     from malta.identification.log_files import write_log as write_log

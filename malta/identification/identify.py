@@ -13,7 +13,6 @@ from scipy.special import gammainccinv, gammaincinv
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.explanation import Explained, explained_at_lines, sentence_of
 from malta.identification.log import Log
 from malta.identification.prediction import (
     Predicted,
@@ -33,15 +32,18 @@ from malta.identification.response import (
 )
 from malta.identification.spectra import (
     SIGMA,
+    Explained,
     Spectrum,
     between_neighbours,
     distortion_of,
+    explained_at_lines,
     in_axes,
     noise_of,
     readings,
     require_closed_loop,
     require_log,
     residuals_of,
+    sentence_of,
     spectrum_of,
     straightened,
     weights_of,

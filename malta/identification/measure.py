@@ -22,8 +22,7 @@ from scipy.stats import norm
 from malta.display import Curves, Description, display
 from malta.errors import InputError
 from malta.identification.excite import LONGEST, ExcitationPlan, excite
-from malta.identification.lines import Columns, Line, columns_of, lines_of
-from malta.identification.spectra import FEWEST, SIGMA
+from malta.identification.spectra import FEWEST, SIGMA, Columns, Line, columns_of, lines_of
 from malta.loops.classical import Disk, disk_sizes
 from malta.loops.loop import Loop, loop
 from malta.margins.loop_report import zone

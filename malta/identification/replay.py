@@ -12,9 +12,9 @@ import numpy as np
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.explanation import FARTHEST, sentence_of
 from malta.identification.log import Log, reference_spline, require_same_law, sample_excitation
 from malta.identification.response import acting
+from malta.identification.spectra import FARTHEST, sentence_of
 from malta.model.data import plant_of
 from malta.model.parameters import twins_of
 from malta.simulation.engine.engines import Loop, loop_of

@@ -16,8 +16,8 @@ from figure_checks import defects
 import malta
 from malta.identification import ExcitationPlan, Log, Measurement
 from malta.identification import measure as measuring
-from malta.identification.lines import interpolate_columns
 from malta.identification.measure import cut_loop
+from malta.identification.spectra import interpolate_columns
 from malta.report.figures.runs import measured_figure
 
 if TYPE_CHECKING:

@@ -19,9 +19,8 @@ if TYPE_CHECKING:
     from malta.identification.commission import Commissioning
     from malta.identification.dump import ExactReplay
     from malta.identification.excite import ExcitationPlan
-    from malta.identification.holding import LearnedV0
     from malta.identification.identify import Identified
-    from malta.identification.learn import Learned
+    from malta.identification.learn import Learned, LearnedV0
     from malta.identification.log import Log
     from malta.identification.measure import Curve, Measurement, MeasurementPlan
     from malta.identification.replay import LawReplay
