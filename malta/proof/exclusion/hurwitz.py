@@ -32,7 +32,8 @@ from malta.proof.problem import hurwitz
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
     from malta.proof.box import Box
-    from malta.proof.problem import Polynomial, Problem
+    from malta.proof.polynomial.enclosure import Polynomial
+    from malta.proof.problem import Problem
 
 
 BITS = 640  # of balls: Bernstein coefficients of degree d lose about 2 d of them

@@ -35,7 +35,7 @@ from malta.proof.exclusion.exclusion import CellBounds, growth_over, on_boxes
 from malta.proof.expressions import NotAnalytic
 from malta.proof.polynomial.enclosure import Unproven
 from malta.proof.polynomial.family import Family, scale_of
-from malta.proof.problem import Problem, physical
+from malta.proof.problem import Problem, Traits, physical
 from malta.proof.weak_coupling.axes import Axes, axes_of, members_of, state_matrix, stiff_axes
 from malta.proof.weak_coupling.held_currents import Bounds, HeldMachine, dominating_solution
 
@@ -200,6 +200,14 @@ class HeldLoop:
             found.append(axes_of(self.machine, self.law, axes, own))
         return tuple(found)
 
+    @property
+    def traits(self) -> Traits:
+        return Traits(enclose=self.enclose)
+
+    @property
+    def loops(self) -> tuple[None]:
+        return (None,)
+
     def instability(self, rows: FloatArray) -> FloatArray:
         return self.places.instability(rows)
 
@@ -209,18 +217,14 @@ class HeldLoop:
     def physical(self, x: float) -> float:
         return physical(x, self.T)
 
-    def parts(self, p: Sequence[Any]) -> list[tuple[Any, tuple[Any, ...]]]:
-        del p
+    def parts(self, p: Sequence[Any], *, neglect: bool = True) -> list[tuple[Any, tuple[Any, ...]]]:
+        del p, neglect
         return [(g, ()) for g in self.groups]
 
     def enclose(self, box: Box, reach: float) -> list[Part]:
-        """The groups with their coupling over box(reach). Raises Unproven when it cannot be bounded."""
+        """The groups with their coupling over box(reach). Raises NotAnalytic or Unproven when it has no bounds."""
         sides = box.sides(reach)
-        try:
-            whole = self._bounds(sides)
-        except NotAnalytic as error:
-            raise Unproven(f"the matrices have no value on the box: {error}") from error
-        known = dict[bytes, Coupling]()
+        whole, known = self._bounds(sides), dict[bytes, Coupling]()
 
         def coupling(inside: FloatArray) -> Coupling:
             """Over a part of the box; over the whole where nothing better is known."""
