@@ -36,8 +36,7 @@ from scipy import linalg
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import si, units_of
-from malta.model.plant import Plant, readonly
-from malta.model.sensors import whole_samples
+from malta.model.plant import Plant, readonly, whole_samples
 from malta.processes import on_one_thread
 from malta.proof.expressions import BALLS, NotAnalytic, Program, program
 from malta.proof.parametric_plants import of_plant

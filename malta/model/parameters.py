@@ -6,7 +6,7 @@ import math
 from dataclasses import MISSING, Field, field, fields
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from malta.display import quantity
 from malta.errors import InputError
@@ -14,7 +14,16 @@ from malta.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from malta.model.plant import Parameters
+
+class Parameters(Protocol):
+    """A frozen dataclass whose physical fields are declared with `parameters.si(unit)`."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def __hash__(self) -> int: ...
+
+    @property
+    def preset(self) -> str: ...
 
 
 def si(
