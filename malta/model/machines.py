@@ -100,10 +100,14 @@ def module_of(parameters: Any) -> ModuleType:
     folder = own.__name__.rpartition(".")[0]
     if hasattr(own, "plant") or not folder:
         return own
-    beside = sys.modules[folder]
+    beside = sys.modules.get(folder)
+    if beside is not None and callable(getattr(beside, "plant", None)):
+        return beside
     try:
-        return beside if callable(getattr(beside, "plant", None)) else import_module(f"{folder}.plant")
-    except ModuleNotFoundError:
+        return import_module(f"{folder}.plant")
+    except ModuleNotFoundError as error:
+        if error.name not in (f"{folder}.plant", folder):  # a module that `plant` imports
+            raise
         return own
 
 
