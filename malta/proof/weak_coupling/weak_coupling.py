@@ -73,7 +73,9 @@ class Coupling:
     weights: FloatArray
     T: float
 
-    def acting(self, g: Axes, N: FloatArray, off: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def onto_group(
+        self, g: Axes, N: FloatArray, off: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The coupling to a group: M0^-1 e in rows of q, q' and a; bounds by coefficients; errors of the first.
 
         N, off : adjugates, K x states x states x nodes, and bounds of their errors
@@ -121,7 +123,7 @@ class _CoupledGroup:
         """The polynomial with bounds by coefficients; M0^-1 e as a family; its rows x inputs x nodes."""
         f = self.plain
         _, _, N, off = self.group.over(self.sides)
-        main, more, off = self.coupling(self.sides).acting(self.group, N, off)
+        main, more, off = self.coupling(self.sides).onto_group(self.group, N, off)
         K, rows, inputs, nodes = main.shape
         beside = Family((rows * inputs, *f.shape), main.reshape(K, -1), off, f.exponents, f.scale)
         return replace(f, radius=f.radius + more), beside, (rows, inputs, nodes)
