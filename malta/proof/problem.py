@@ -339,8 +339,8 @@ def physical(x: float, T: float | None) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class OfCoefficients:
-    """A polynomial in s (or z) whose coefficients, lowest first, are a program of p."""
+class CoefficientPolynomial:
+    """A problem whose polynomial in s (or z) has coefficients, lowest first, that are a program of p."""
 
     program: Program
     names: tuple[str, ...]
@@ -403,12 +403,12 @@ class OfCoefficients:
         }
 
     @cached_property
-    def companion(self) -> UncertainLoop | None:
+    def loops(self) -> tuple[UncertainLoop | None]:
         """A loop with this polynomial, linear in p; None where there is no short one."""
         if not self.exact:
-            return None
+            return (None,)
         a = [self._scaled[i].to_dict() if i in self._scaled else {} for i in range(self.count)]
-        return companion(self.names, a, 1.0 if self.discrete else None)
+        return (companion(self.names, a, 1.0 if self.discrete else None),)
 
     def values(self, v: Sequence[Any]) -> list[Any]:
         """The coefficients as they are given."""
@@ -441,35 +441,19 @@ class OfCoefficients:
         del moves, sides
         return None
 
-
-def _about_one(a: list[Any]) -> list[Any]:
-    """The coefficients of g = z - 1 from those of z."""
-    return [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), 0 * a[0]) for j in range(len(a))]
-
-
-@dataclass(frozen=True, eq=False)
-class OfPolynomial:
-    """A given characteristic polynomial."""
-
-    polynomial: OfCoefficients
-
     @property
     def traits(self) -> Traits:
         return Traits(is_cheap=True)
 
-    @property
-    def loops(self) -> tuple[UncertainLoop | None, ...]:
-        return (self.polynomial.companion,)
-
     def parts(
         self, p: Sequence[Any], *, neglect: bool = True
-    ) -> list[tuple[OfCoefficients, tuple[Any, ...]]]:
+    ) -> list[tuple[CoefficientPolynomial, tuple[Any, ...]]]:
         del p, neglect
-        return [(self.polynomial, ())]
+        return [(self, ())]
 
     def _roots(self, p: FloatArray) -> Any:
         """The roots, computed on a scale that the coefficients determine."""
-        a = [binary(x) for x in self.polynomial.values([exact(x) for x in p.tolist()])]
+        a = [binary(x) for x in self.values([exact(x) for x in p.tolist()])]
         logs = {k: math.log2(abs(m)) + e for k, (m, _, e) in enumerate(a) if m}
         if not logs:  # zero, whatever s
             return np.ones(1)
@@ -487,18 +471,23 @@ class OfPolynomial:
         found = []
         for row in np.atleast_2d(rows):
             roots = self._roots(row)
-            sizes = np.abs(roots) - 1 if self.polynomial.discrete else roots.real
+            sizes = np.abs(roots) - 1 if self.discrete else roots.real
             found.append(float(sizes.max(initial=-math.inf)))
         return np.array(found)
 
     def critical_frequency(self, p: FloatArray) -> float:
         roots = self._roots(p)
-        if self.polynomial.discrete:
+        if self.discrete:
             return float(abs(np.angle(roots[np.abs(roots).argmax()])))
         return float(abs(roots[roots.real.argmax()].imag))
 
     def physical(self, x: float) -> float:
-        return physical(x, 1.0 if self.polynomial.discrete else None)
+        return physical(x, 1.0 if self.discrete else None)
+
+
+def _about_one(a: list[Any]) -> list[Any]:
+    """The coefficients of g = z - 1 from those of z."""
+    return [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), 0 * a[0]) for j in range(len(a))]
 
 
 def hurwitz(a: Sequence[Any]) -> bool | None:

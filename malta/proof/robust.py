@@ -32,7 +32,7 @@ from malta.proof.groups import A, B, C, E, UncertainLoop, loop_of
 from malta.proof.loss import first_loss, loss_beside
 from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.polynomial.rational import Ratio, Symbolic
-from malta.proof.problem import OfCoefficients, OfLoop, OfPolynomial, OfSeveral, Problem
+from malta.proof.problem import CoefficientPolynomial, OfLoop, OfSeveral, Problem
 from malta.proof.search import Question, search
 from malta.proof.systems import compensator_of, polynomial_system
 from malta.proof.uncertain import (
@@ -434,7 +434,7 @@ def margin_of_polynomial(
     values = _middles({**by_name(caller, "box", box, '{"k": (1, 2)}'), **outside}, nominal)
     names = tuple(values)
     function, _ = polynomial_system(coefficients, names)
-    problem = OfPolynomial(OfCoefficients(program(function), names, discrete))
+    problem = CoefficientPolynomial(program(function), names, discrete)
     where = box_of(names, np.array(list(values.values())), (), box, outside, caller=caller)
     return margin_of(problem, where, effort)
 

@@ -264,7 +264,9 @@ class Search:
         """The open cell of smallest t."""
         if not len(self.cells):
             return None
-        k = int(self.smallest.argmin())
+        return self._cell(int(self.smallest.argmin()))
+
+    def _cell(self, k: int) -> Cell:
         b, lo, hi = self.cells[k]
         return Cell(int(b), (float(lo), float(hi)), self.boxes[k], float(self.smallest[k]))
 
@@ -273,9 +275,7 @@ class Search:
         stuck = (self.depth >= STUCK) & (self.smallest < self.target)
         if not stuck.any():
             return None
-        k = int(np.lexsort((-self.depth, np.where(stuck, self.smallest, np.inf)))[0])
-        b, lo, hi = self.cells[k]
-        return Cell(int(b), (float(lo), float(hi)), self.boxes[k], float(self.smallest[k]))
+        return self._cell(int(np.lexsort((-self.depth, np.where(stuck, self.smallest, np.inf)))[0]))
 
 
 def start(family: Family, growth: Growth, target: float, until: float = np.inf) -> Search:

@@ -357,7 +357,10 @@ class Cell(NamedTuple):
 
 @dataclass(eq=False)
 class Signs:
-    """The functions of all groups, and the cells that are left. `lower`: all are positive on every smaller box(t)."""
+    """The functions of all groups, and the cells that are left. `lower`: all are positive on every smaller box(t).
+
+    It changes in place: time that is up may end any step of it, and what was found before then stands.
+    """
 
     reach: Any  # the box that the functions cover
     upper: float = math.inf

@@ -40,7 +40,7 @@ HOPE = 0.4  # of what the first place took, at least, the others take
 
 
 class Polynomial(Protocol):
-    """A characteristic polynomial: `Characteristic`, or the `OfCoefficients` of a problem."""
+    """A characteristic polynomial: `Characteristic`, or `CoefficientPolynomial`."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
