@@ -24,9 +24,9 @@ from malta.firmware.cost import CLOCK, FLAGS, PROCESSORS, Processor, cost_on
 from malta.firmware.ctext import c_name, c_number, function_text, signature
 from malta.firmware.export import sources
 from malta.firmware.period_functions import decide_function, named_function, sense_function
-from malta.firmware.program import Precision, evaluate, lower, program_of
+from malta.firmware.program import Precision, build_program, evaluate, lower
 from malta.firmware.signals import Target, input_fields, reference_fields, state_fields
-from malta.firmware.step import look_up, programs_of, started_state, step_of
+from malta.firmware.step import look_up, programs_of, started_state, step_function
 from malta.firmware.vectors import record_vectors
 from malta.synthesis.controller import commanded, estimated, gains_of
 
@@ -111,7 +111,7 @@ def period_ways(t: Target) -> dict[str, Way]:
 
 def own(f: ca.Function, precision: Precision) -> Way:
     """As malta exports it."""
-    p = program_of(lower(f, precision))
+    p = build_program(lower(f, precision))
     head = f"#include <stdbool.h>\ntypedef {precision} own_real;\n"
     given = [f"{f.name()}_{name}" for name, size in (*p.arguments, *p.results) if size]
     body = function_text(p, "own", precision)
@@ -284,7 +284,7 @@ def readings(t: Target) -> dict[str, Any]:
         dict(zip((field.name for field in fields), np.split(row, ends), strict=True))
         for row in vector.readings
     ]
-    state, step = started_state(t, rows[0]), step_of(t)
+    state, step = started_state(t, rows[0]), step_function(t)
     for row in rows[:29]:
         state, _ = step(state, row, row)
     none = {field.name: np.zeros(0) for field in state_fields(t) if not field.size}

@@ -159,7 +159,7 @@ def four_digits(value: float) -> str:
     return number(rounded) if PLAIN[0] <= abs(value) < PLAIN[1] or not value else f"{rounded:g}"
 
 
-def best_of(figures: Sequence[Merit | None]) -> tuple[bool, ...]:
+def find_best(figures: Sequence[Merit | None]) -> tuple[bool, ...]:
     """Which designs are better than some other: those that share the best value, none where all are as good.
 
     Values that are written with the same digits are as good as each other.

@@ -27,7 +27,7 @@ from malta.firmware.program import Precision
 from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import decode
 from malta.model.data import plant_of
-from malta.model.machines import part_of
+from malta.model.machines import module_of, part_of
 from malta.model.parameters import differences, fingerprint, shape_parameters, twins_of, units_of, values_of
 from malta.model.plant import Plant, readonly
 from malta.simulation.engine.batch import functions_text
@@ -165,9 +165,9 @@ def revision_of(plant: Plant, controller: Controller, scenario: Scenario) -> dic
     machine : of the modules of the machine's model and of its experiments
     law : of the functions of a control period as the engine compiles them: machine, controller and digest
     """
-    model = type(plant.parameters).__module__
+    record, model = type(plant.parameters).__module__, module_of(plant.parameters).__name__
     part = part_of("experiments", plant.name)
-    modules = dict.fromkeys([model] if part is None else [model, part.__name__])
+    modules = dict.fromkeys([model, record] if part is None else [model, record, part.__name__])
     return {
         "engine": _engine_sha256(),
         "machine": _sha256(part for name in modules for part in _module_parts(name)),

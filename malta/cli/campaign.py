@@ -20,7 +20,7 @@ from malta.cli.options import (
     OwnOptions,
     Yes,
     change_machine,
-    design_of,
+    find_design,
     print_scenarios,
     read_assignments,
     read_controller,
@@ -101,7 +101,7 @@ def show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: S
     gains = noted_gains(folder) if gains is None else gains
     controller = read_controller(gains, options.machine)
     published = published_figures(plant_of(controller.parameters).name)
-    bounds = Bounds(published, design_of(gains, controller, options.design))
+    bounds = Bounds(published, find_design(gains, controller, options.design))
     with progress_bar("status") as progress:
         found = status_of(folder, controller, bounds, progress)
     if options.as_json:
@@ -157,7 +157,7 @@ class Setting(NamedTuple):
     yes: bool  # to work of any length
 
 
-def study_of(name: str | None, limit: str | None, keep: str | None, cluster: str | None) -> Study | None:
+def choose_study(name: str | None, limit: str | None, keep: str | None, cluster: str | None) -> Study | None:
     """The study that the options ask for; None for a plain campaign.
 
     Raises InputError for an unknown study, for a cluster, and for an invalid limit or yield, and one without its study.
@@ -467,7 +467,7 @@ def campaign(
         raise typer.Exit
     scenario = scenario or main_job(plant)
     published = published_figures(plant.name)
-    asked = study_of(study, limit, keep, cluster)
+    asked = choose_study(study, limit, keep, cluster)
     options = {"noise": 1.0} | read_options(option, scenario, plant)
     if study != "rare":
         options = settling(scenario, plant) | options
@@ -484,7 +484,7 @@ def campaign(
         options,
         cast("Law", law),
     )
-    bounds = Bounds(published, design_of(gains, controller, design))
+    bounds = Bounds(published, find_design(gains, controller, design))
     folder = out or Path("build") / "campaigns" / f"{controller.name}_{scenario}_{plan.identity[:8]}"
     if asked is not None:
         run_study(asked, Setting(gains, plan, bounds, folder, workers, as_json, yes))

@@ -436,7 +436,7 @@ def verify_and_write(controller: Controller, gains: Path, folder: Path) -> list[
     return paths
 
 
-def design_of(gains: Path, controller: Controller, named: Path | None) -> Spec | None:
+def find_design(gains: Path, controller: Controller, named: Path | None) -> Spec | None:
     """The design of a gain file: the file that was named, else NAME.toml beside its folder; None where there is none.
 
     Raises InputError for a named file that is no design of the machine.

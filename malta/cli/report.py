@@ -20,7 +20,7 @@ from malta.cli.options import (
     MachineFile,
     Uncertain,
     change_machine,
-    design_of,
+    find_design,
     read_assignments,
     read_controller,
     read_uncertainty,
@@ -134,7 +134,7 @@ def read_subject(
     from malta.report.page.report import subject_of
 
     parameters = change_machine(controller.parameters, change)
-    spec = design_of(gains, controller, design)
+    spec = find_design(gains, controller, design)
     subject = subject_of(gains, parameters=parameters, spec=spec, changes=change or ())
     if not uncertain:
         return subject

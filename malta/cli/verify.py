@@ -17,7 +17,7 @@ from malta.cli.options import (
     MachineFile,
     Uncertain,
     change_machine,
-    design_of,
+    find_design,
     read_controller,
     read_uncertainty,
 )
@@ -110,7 +110,7 @@ def verify(
     published = published_figures(plant.name)
     box = measured.shares if measured else read_uncertainty(gains, uncertain, plant.parameters, published)
     _require_options(time, certificate, proof=not no_proof)
-    spec = design_of(gains, controller, design)
+    spec = find_design(gains, controller, design)
     try:
         with margin_progress("margins") as (progress, bounds):
             found = verify_loop(

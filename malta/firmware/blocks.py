@@ -13,7 +13,15 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
-from malta.firmware.program import Block, Precision, Program, lower, program_of, reached, without_unused
+from malta.firmware.program import (
+    Block,
+    Precision,
+    Program,
+    build_program,
+    dependencies,
+    lower,
+    without_unused,
+)
 from malta.model.equations import Equation
 
 LONGEST = 140  # operations of a function, with results that it only copies
@@ -85,9 +93,9 @@ def staged_function(
 
 def staged_program(s: Staged, precision: Precision) -> Program:
     """The program of a staged function. Its blocks hand on only what its own results take."""
-    p, own = program_of(lower(s.whole, precision)), s.plain.n_out()
+    p, own = build_program(lower(s.whole, precision)), s.plain.n_out()
     outputs = tuple(o for o in p.outputs if o[0] < own)
-    needed = reached(p.operations, [k for *_, k in outputs])
+    needed = dependencies(p.operations, [k for *_, k in outputs])
     more = tuple(o for o in p.outputs if o[0] >= own and o[2] in needed)
     taken = {p.results[i][0] for i, *_ in (*outputs, *more)}
     blocks = tuple(block for block in s.blocks if taken & set(block.results))

@@ -20,7 +20,7 @@ from malta.firmware.export import sources
 from malta.firmware.program import TRUTHS, TYPES
 from malta.firmware.ring import ring_sources
 from malta.firmware.signals import Target
-from malta.firmware.step import programs_of, started_state, step_of, zero_reference
+from malta.firmware.step import programs_of, started_state, step_function, zero_reference
 from malta.firmware.supervisor_text import supervisor_sources
 from malta.model.plant import position_in
 from malta.simulation import references
@@ -228,7 +228,7 @@ def rounding_noise(t: Target) -> RoundingNoise:
     forces = {}
     for precision in ("double", "float"):
         own = replace(t, precision=precision)
-        step, reference = step_of(own), zero_reference(own)
+        step, reference = step_function(own), zero_reference(own)
         real = TYPES[own.precision]
         state = started_state(own, reference)
         rows = []

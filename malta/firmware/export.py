@@ -25,7 +25,7 @@ from malta.firmware.ctext import (
     member_place,
 )
 from malta.firmware.period_functions import table_size
-from malta.firmware.program import TYPES, Precision, Program, lower, program_of
+from malta.firmware.program import TYPES, Precision, Program, build_program, lower
 from malta.firmware.signals import (
     Field,
     Target,
@@ -67,7 +67,7 @@ def sources(t: Target, sha256: str, name: str = "", *, loops: bool = True) -> di
     programs = programs_of(t)
     if not loops:
         programs = {key: unrolled(p) for key, p in programs.items()}
-    context = context_of(t, programs, name, sha256)
+    context = template_context(t, programs, name, sha256)
     return {
         f"{name}.h": render("controller.h", context),
         f"{name}.c": render("controller.c", context),
@@ -96,7 +96,7 @@ def _environment() -> jinja2.Environment:
     )
 
 
-def context_of(t: Target, programs: Mapping[str, Program], name: str, sha256: str) -> dict[str, Any]:
+def template_context(t: Target, programs: Mapping[str, Program], name: str, sha256: str) -> dict[str, Any]:
     """What the templates of a controller are filled with."""
     c, plant = t.controller, t.believed
     return {
@@ -389,7 +389,7 @@ def stand_in_context(t: Target, name: str) -> dict[str, Any]:
         found["reached"] = ", ".join(c_number(float(v), t.precision) for v in reached.ravel())
     if not t.driven:
         return found
-    program = program_of(lower(phase_currents(t), t.precision))
+    program = build_program(lower(phase_currents(t), t.precision))
     return found | {
         "phases": function_text(program, name, t.precision, static=True),
         "stand_in_root": any(o.op == "SQRT" for o in program.operations),

@@ -18,11 +18,11 @@ from malta.firmware.ctext import c_name, c_number
 from malta.firmware.export import (
     RISES,
     comment,
-    context_of,
     example_stroke,
     render,
     sources,
     stand_in_context,
+    template_context,
 )
 from malta.firmware.fmu import Part, build_fmu
 from malta.firmware.program import Precision
@@ -195,7 +195,7 @@ def folder_files(
     name = c_name(t.controller.name)
     files = sources(t, sha256, name) | supervisor_sources(t, name) | ring_sources(t, sha256, name)
     c_files = [file for file in files if file.endswith(".c")]
-    context = context_of(t, programs_of(t), name, sha256) | {
+    context = template_context(t, programs_of(t), name, sha256) | {
         "objects": " ".join(file.removesuffix(".c") + ".o" for file in c_files),
         "c_files": " ".join(c_files),
         "driven": t.driven,

@@ -25,7 +25,7 @@ import numpy as np
 from malta.firmware.ctext import c_number, function_text, signature
 from malta.firmware.export import call_text, comment, number_rows, render, root_context
 from malta.firmware.period_functions import named_function, symbols
-from malta.firmware.program import Program, lower, program_of
+from malta.firmware.program import Program, build_program, lower
 from malta.firmware.signals import Field, Target, current_readings, output_fields
 from malta.model.parameters import acting_names, twins_of, units_of
 from malta.model.plant import Plant, Signal, symbolic
@@ -195,7 +195,7 @@ def _varying(m: Machine) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
 
 def machine_programs(m: Machine) -> dict[str, Program]:
     """The programs of the functions, by name."""
-    return {name: program_of(lower(f, "double")) for name, f in machine_functions(m).items()}
+    return {name: build_program(lower(f, "double")) for name, f in machine_functions(m).items()}
 
 
 def _place(m: Machine) -> ca.Function:

@@ -37,9 +37,9 @@ from malta.synthesis.controller import (
     estimated,
     filtered,
     freeze_moving,
+    frozen_axes,
     look_ahead,
     sum_errors,
-    waiting,
 )
 from malta.synthesis.schedule import interpolate
 
@@ -181,7 +181,7 @@ def _decided_forces(
     xi_pred, place = look_ahead(g, sums.predict(xi_pred, xi_hat), y, dp)
     ahead = "" if c.commutation is None else " + Bd lead pull dp"
     note("predict", f"xi_pred = Ad xi_hat + Bd (v - v0){ahead}", xi_pred=xi_pred, **sums.rest("xi_rest"))
-    waits, square = waiting(g, saturated), len(c.forces) == len(c.measurements)
+    waits, square = frozen_axes(g, saturated), len(c.forces) == len(c.measurements)
     meaning = "frozen = saturated" if square else "frozen: a force of its column of Ki is saturated"
     note("wait", meaning, frozen=waits)
     after = {"xi_pred": xi_pred, "e": e, "frozen": waits}

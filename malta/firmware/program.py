@@ -341,7 +341,7 @@ class Program(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def program_of(f: ca.Function) -> Program:
+def build_program(f: ca.Function) -> Program:
     """The program of a lowered SX function. Raises CheckError for what `lower` would replace."""
     known: dict[Operation, int] = {}
     operations: list[Operation] = []
@@ -395,7 +395,7 @@ def _shorter(operations: list[Operation], name: str, operands: tuple[int, ...]) 
     return None
 
 
-def reached(operations: Sequence[Operation], wanted: Iterable[int]) -> set[int]:
+def dependencies(operations: Sequence[Operation], wanted: Iterable[int]) -> set[int]:
     """The wanted operations and all on which they depend."""
     needed, waiting = set[int](), list(wanted)
     while waiting:
@@ -408,7 +408,7 @@ def reached(operations: Sequence[Operation], wanted: Iterable[int]) -> set[int]:
 
 def without_unused(p: Program) -> Program:
     """The program without operations on which no result depends."""
-    needed = reached(p.operations, [k for *_, k in p.outputs])
+    needed = dependencies(p.operations, [k for *_, k in p.outputs])
     number = {k: n for n, k in enumerate(sorted(needed))}
     operations = tuple(
         p.operations[k]._replace(operands=tuple(number[a] for a in p.operations[k].operands)) for k in number

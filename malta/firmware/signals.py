@@ -133,7 +133,7 @@ def state_fields(t: Target) -> list[Field]:
     fields = [
         Field("xi_pred", c.states, "what the filter expects of the states at the next sample"),
         Field("e", errors, "sums of the errors p* - y"),
-        Field("frozen", named("waits ", c.measurements, "1"), "1 where the sum of errors waits"),
+        Field("frozen", signals_after("waits ", c.measurements, "1"), "1 where the sum of errors waits"),
     ]
     if t.compensated:
         fields.append(Field("e_rest", errors, "what rounding took from the sums of errors"))
@@ -150,7 +150,11 @@ def state_fields(t: Target) -> list[Field]:
         volts = tuple(Signal(s.name.replace("i_", "u_"), "V") for s in drive.axes)
         fields.append(Field("u_integral", volts, "integrals of the current loops"))
         fields.append(
-            Field("u_limited", named("limited ", drive.axes, "1"), "1 where a half-bridge was at its limit")
+            Field(
+                "u_limited",
+                signals_after("limited ", drive.axes, "1"),
+                "1 where a half-bridge was at its limit",
+            )
         )
         if t.compensated:
             fields.append(Field("u_rest", volts, "what rounding took from the integrals"))
@@ -163,7 +167,7 @@ def reference_fields(t: Target) -> list[Field]:
     """The reference of a sample."""
     outputs = t.controller.measurements
     return [
-        Field("p", named("", outputs, "", "*"), "reference"),
+        Field("p", signals_after("", outputs, "", "*"), "reference"),
         Field("dp", tuple(Signal(f"{s.name}*'", f"{s.unit}/s") for s in outputs), "its rate"),
         Field("ddp", tuple(Signal(f"{s.name}*''", f"{s.unit}/s^2") for s in outputs), "its acceleration"),
     ]
@@ -174,19 +178,21 @@ def input_fields(t: Target) -> list[Field]:
     outputs = t.controller.measurements
     fields = [
         Field("y", outputs, "measured outputs"),
-        Field("y_valid", named("valid ", outputs, "1"), "1 where a reading may be used, else 0"),
+        Field("y_valid", signals_after("valid ", outputs, "1"), "1 where a reading may be used, else 0"),
     ]
     if t.driven:
         fields += [
             Field("i", current_readings(t), "measured currents"),
             Field(
-                "i_valid", named("valid ", current_readings(t), "1"), "1 where a reading may be used, else 0"
+                "i_valid",
+                signals_after("valid ", current_readings(t), "1"),
+                "1 where a reading may be used, else 0",
             ),
             Field("link", (Signal("V_link", "V"),), "measured voltage of the DC link"),
         ]
     if t.excited:
         meaning = "forces beside those of the law, which the filter knows as sent"
-        fields.append(Field("excitation", named("exc ", t.controller.forces, ""), meaning))
+        fields.append(Field("excitation", signals_after("exc ", t.controller.forces, ""), meaning))
     return fields
 
 
@@ -196,10 +202,10 @@ def output_fields(t: Target) -> list[Field]:
     outputs = c.measurements
     fields = [
         Field("y_used", outputs, "readings, or what the filter expected in place of refused ones"),
-        Field("refused", named("refused ", outputs, "1"), "1 where a reading was refused"),
+        Field("refused", signals_after("refused ", outputs, "1"), "1 where a reading was refused"),
         Field("xi_hat", c.states, "estimated states"),
         Field("v", c.forces, "commanded forces, within their limits"),
-        Field("saturated", named("limited ", c.forces, "1"), "1 where a force is at its limit"),
+        Field("saturated", signals_after("limited ", c.forces, "1"), "1 where a force is at its limit"),
         Field("current", plant.actuator.coils, "commanded currents"),
         Field("met", (Signal("current limit", "1"),), "1 where a current is at its limit"),
     ]
@@ -226,7 +232,7 @@ def current_readings(t: Target) -> tuple[Signal, ...]:
     return t.believed.drive.phases if t.fidelity == "phase" else t.believed.drive.axes
 
 
-def named(before: str, signals: tuple[Signal, ...], unit: str, after: str = "") -> tuple[Signal, ...]:
+def signals_after(before: str, signals: tuple[Signal, ...], unit: str, after: str = "") -> tuple[Signal, ...]:
     """Signals named after others; unit "": their own."""
     return tuple(Signal(f"{before}{s.name}{after}", unit or s.unit) for s in signals)
 
@@ -245,7 +251,7 @@ def used_clearances(plant: Plant) -> Callable[[int, float], FloatArray]:
     x = ca.SX.sym("x", len(plant.states))
     contact = ca.Function("contact", [x], [ca.densify(ca.vertcat(plant.contact(x), 0))])
 
-    def used(k: int, reading: float) -> FloatArray:
+    def share_used(k: int, reading: float) -> FloatArray:
         p = np.zeros(len(plant.outputs))
         p[k] = reading
         q = np.array(plant.position_of(ca.DM(p))).ravel()
@@ -253,7 +259,7 @@ def used_clearances(plant: Plant) -> Callable[[int, float], FloatArray]:
         state[list(plant.controlled)[: len(q)]] = q
         return np.array(contact(state)).ravel()[: len(plant.contacts)]
 
-    return used
+    return share_used
 
 
 @lru_cache(maxsize=16)
@@ -263,10 +269,10 @@ def reading_ranges(plant: Plant) -> FloatArray:
     Of an output that meets nothing: 1 m, or 1 of its unit; UNBOUNDED for a machine that has no contacts at all, as a
     motor that turns. Beyond, a reading is refused.
     """
-    used, sizes = used_clearances(plant), 10.0 ** np.arange(-7, 0.01, 0.05)
+    share_used, sizes = used_clearances(plant), 10.0 ** np.arange(-7, 0.01, 0.05)
     ranges, nowhere = [], 1.0 if plant.contacts else UNBOUNDED
     for k, _ in enumerate(plant.outputs):
-        reach = next((size for size in sizes if used(k, size).max(initial=0.0) >= 1), math.inf)
+        reach = next((size for size in sizes if share_used(k, size).max(initial=0.0) >= 1), math.inf)
         if plant.has_stroke and k == plant.stroke_output and plant.travel:
             reach = max(plant.travel, reach if math.isfinite(reach) else 0.0)
         ranges.append(2 * reach if math.isfinite(reach) else nowhere)

@@ -272,7 +272,7 @@ def started_state(t: Target, reference: Mapping[str, Any]) -> Vectors:
     return {name.removesuffix("_next"): value for name, value in found.items() if value.size}
 
 
-def step_of(t: Target) -> Step:
+def step_function(t: Target) -> Step:
     """(state, reference, readings) -> (state, outputs): one step, by the names of signals.py."""
     sense, decide = programs_of(t)["sense"], programs_of(t)["decide"]
     none = {f.name: np.zeros(0) for f in state_fields(t) if not f.size}

@@ -466,18 +466,18 @@ def touch_bounds(plant: Plant) -> FloatArray:
     bounds = np.where(np.array(plant.cushioned, dtype=bool), TOUCH, 1.0)
     shares = used_clearances(plant)
 
-    def used(k: int, reading: float) -> float:
+    def share_used(k: int, reading: float) -> float:
         return float((shares(k, reading) / bounds).max(initial=0.0))
 
     found = []
     for k, most in enumerate(reading_ranges(plant)):
         low, high = 0.0, float(most)
-        if max(used(k, high), used(k, -high)) < 1 or used(k, 0.0) >= 1:
+        if max(share_used(k, high), share_used(k, -high)) < 1 or share_used(k, 0.0) >= 1:
             found.append(math.inf)
             continue
         for _ in range(40):
             middle = (low + high) / 2
-            if max(used(k, middle), used(k, -middle)) < 1:
+            if max(share_used(k, middle), share_used(k, -middle)) < 1:
                 low = middle
             else:
                 high = middle

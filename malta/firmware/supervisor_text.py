@@ -31,7 +31,7 @@ from malta.firmware.flight import (
     record_type,
     view,
 )
-from malta.firmware.program import Precision, Program, lower, program_of
+from malta.firmware.program import Precision, Program, build_program, lower
 from malta.firmware.signals import Target, current_readings, input_fields, output_fields
 from malta.firmware.supervisor import (
     FLYING,
@@ -249,11 +249,11 @@ def _filters(t: Target, name: str) -> dict[str, Any]:
     p, places = len(c.measurements), gains.places
     programs: dict[str, Program] = {}
     if t.driven:
-        programs["deviation"] = program_of(lower(current_deviations(t), t.precision))
+        programs["deviation"] = build_program(lower(current_deviations(t), t.precision))
     if c.tracks == "states":
-        programs["expectation"] = program_of(lower(expected_readings(t), t.precision))
+        programs["expectation"] = build_program(lower(expected_readings(t), t.precision))
     if gains.L:
-        programs["correction"] = program_of(lower(prediction_correction(t), t.precision))
+        programs["correction"] = build_program(lower(prediction_correction(t), t.precision))
     missing, blocks = np.zeros((len(places), len(c.states), p)), []
     for k in range(p):
         of = [f"    {{\n{_matrix(L, t)}\n    }}" for L in gains.L.get(k, missing)]

@@ -27,7 +27,7 @@ from malta.firmware.signals import (
     reference_fields,
     state_fields,
 )
-from malta.firmware.step import first_state, programs_of, started_state, step_of, zero_reference
+from malta.firmware.step import first_state, programs_of, started_state, step_function, zero_reference
 from malta.firmware.supervisor import (
     JUMP,
     LONG,
@@ -137,7 +137,7 @@ def _damage(t: Target, flight: dict[str, FloatArray]) -> dict[str, FloatArray]:
 
 def _answered(t: Target, name: str, flight: dict[str, FloatArray], *, warm: bool) -> Vector:
     """A vector with the controller's answers."""
-    real, step = TYPES[t.precision], step_of(t)
+    real, step = TYPES[t.precision], step_function(t)
     order = [*(f.name for f in reference_fields(t)), *(f.name for f in input_fields(t))]
     rows = {key: np.asarray(flight[key], dtype=real) for key in order}
     first = {key: rows[key][0] for key in zero_reference(t)}

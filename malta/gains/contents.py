@@ -161,7 +161,7 @@ class _Layout(NamedTuple):
         }
 
 
-def controller_of(file: GainFile, path: str | Path) -> Controller:
+def build_controller(file: GainFile, path: str | Path) -> Controller:
     """The controller in a gain file.
 
     Raises InputError, naming file and field, for an unknown machine, parameters or signals that the machine does not

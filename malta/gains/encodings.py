@@ -335,7 +335,7 @@ def to_mat(content: Mapping[str, Any]) -> bytes:
     from scipy.io import savemat
 
     buffer: Any = io.BytesIO()  # any: scipy's stubs know only file names
-    savemat(buffer, cells_of(columns_of(content)), long_field_names=True, oned_as="row")
+    savemat(buffer, matlab_cells(columns_of(content)), long_field_names=True, oned_as="row")
     body = bytes(buffer.getvalue())[MAT_HEADER:]
     return mat_header(body) + body
 
@@ -374,10 +374,10 @@ def flat_entries(tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def cells_of(value: Any) -> Any:
+def matlab_cells(value: Any) -> Any:
     """Lists of text as MATLAB cell arrays, lists of numbers as arrays."""
     if isinstance(value, Mapping):
-        return {key: cells_of(entry) for key, entry in value.items()}
+        return {key: matlab_cells(entry) for key, entry in value.items()}
     if isinstance(value, list):
         return np.array(value, dtype=object if isinstance(value[0], str) else float)
     return np.zeros((0, 0)) if value is None else value

@@ -41,7 +41,7 @@ import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.files import locate, replace_files, require_plain_name
-from malta.gains.contents import LINEAR, controller_of, linear_table, signal_tables
+from malta.gains.contents import LINEAR, build_controller, linear_table, signal_tables
 from malta.gains.encodings import SUFFIXES as SUFFIXES
 from malta.gains.encodings import content_sha256, decode, encode
 from malta.gains.schema import GainFile
@@ -231,7 +231,7 @@ def read(path: str | Path) -> Controller:
     """
     path = locate(path)
     file, _ = content_of(path)
-    controller = controller_of(file, path)
+    controller = build_controller(file, path)
     try:
         with np.errstate(all="ignore"):
             unstable = unstable_gain(controller)

@@ -30,10 +30,10 @@ from malta.synthesis.controller import (
     estimated,
     filtered,
     freeze_moving,
+    frozen_axes,
     gains_of,
     look_ahead,
     sum_errors,
-    waiting,
 )
 from malta.synthesis.schedule import interpolate
 
@@ -323,5 +323,5 @@ def _law_loop(simulation: Simulation) -> Loop:
     after, _ = look_ahead(g, after, y, given["dp_ref"])
     innovation = taken - g["Cd"] @ xi_pred
     inputs = ca.vertcat(*given.values(), y, v0)
-    following = ca.vertcat(after, sums, waiting(g, saturated))
+    following = ca.vertcat(after, sums, frozen_axes(g, saturated))
     return loop_of(state, inputs, ca.SX(0, 1), following, ca.vertcat(v, innovation))

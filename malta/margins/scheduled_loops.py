@@ -36,8 +36,7 @@ from scipy import linalg
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import si, units_of
-from malta.model.plant import Plant, readonly
-from malta.model.sensors import whole_samples
+from malta.model.plant import Plant, readonly, whole_samples
 from malta.processes import on_one_thread
 from malta.proof.expressions import BALLS, NotAnalytic, Program, program
 from malta.proof.parametric_plants import of_plant
@@ -278,7 +277,7 @@ class Cell(NamedTuple):
 
 
 @lru_cache(maxsize=8)  # several margins need the same loops; records compare by identity
-def cells_of(
+def loops_between_places(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops
 ) -> list[Cell] | str:
     """The loops between the places of a controller's schedule, in parameters by name; or why there are none."""
@@ -427,7 +426,7 @@ def schedule_rate(plant: Plant, controller: Controller, *, time: float = 60.0) -
     schedule = controller.schedule
     if schedule is None:
         raise InputError("schedule_rate", controller.name, "a law of one set of matrices", "a scheduled law")
-    cells = cells_of(plant, controller, (), "lag")
+    cells = loops_between_places(plant, controller, (), "lag")
     if isinstance(cells, str):
         low, high = schedule.places[[0, -1]].tolist()
         return RateBound(schedule.variable, low, high, None, None, 0, 0.0, cells)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from malta.errors import InputError
 from malta.loops.classical import Nominal
 from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
-from malta.margins.scheduled_loops import cells_of
+from malta.margins.scheduled_loops import loops_between_places
 from malta.model.data import plant_of
 from malta.model.parameters import units_of
 from malta.model.plant import off_stroke, outputs_at, position_at
@@ -234,7 +234,7 @@ def _scheduled_margin(
     found, why = list[Margin](), ""
     try:
         with time_limit(until):
-            cells = cells_of(plant, controller, (*ranges, *over), current_loops)
+            cells = loops_between_places(plant, controller, (*ranges, *over), current_loops)
     except TimeUp:
         cells = "time was up before the model was written out"
     for cell in [] if isinstance(cells, str) else cells:

@@ -54,7 +54,7 @@ from malta.model.plant import Plant, position_at
 from malta.processes import on_one_thread
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.parametric_plants import of_plant
-from malta.proof.responses import crossing, find_peaks
+from malta.proof.responses import crossing_frequency, find_peaks
 from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator
 from malta.proof.windings import CurrentLoops, chosen_loops
@@ -194,9 +194,11 @@ def bandwidths_of(
     T = _singular_values(np.eye(len(machine.Cd)) - S)
     half = np.sqrt(0.5)
     return {
-        "sigma_max_T": crossing(w, T[:, 0], half, last=True),
-        "sigma_min_T": crossing(w, T[:, min(L.shape[1], len(controller.forces)) - 1], half, last=False),
-        "crossover_max": crossing(w, _singular_values(L)[:, 0], 1.0, last=True),
+        "sigma_max_T": crossing_frequency(w, T[:, 0], half, last=True),
+        "sigma_min_T": crossing_frequency(
+            w, T[:, min(L.shape[1], len(controller.forces)) - 1], half, last=False
+        ),
+        "crossover_max": crossing_frequency(w, _singular_values(L)[:, 0], 1.0, last=True),
         **natural,
     }
 

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from malta.model.coils import Allocation as Allocation
     from malta.model.coils import allocation as allocation
     from malta.model.data import published as published
-    from malta.model.linearize import InverseCheck as InverseCheck
     from malta.model.linearize import LinearModel as LinearModel
     from malta.model.plant import OperatingPoint as OperatingPoint
+    from malta.model.signals import InverseCheck as InverseCheck
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

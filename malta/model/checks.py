@@ -1,4 +1,4 @@
-"""The defaults of a plant's optional fields, and checks that its fields fit each other."""
+"""Checks that the fields of a plant fit each other."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import re
 import sysconfig
 import traceback
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,41 +17,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.files import PACKAGE
 from malta.model.parameters import symbolic_names
-
-if TYPE_CHECKING:
-    from malta.model.plant import Plant
-
-DEFAULT: Any = None  # stands for a function that follows from the other fields
-
-
-def defaults(plant: Plant) -> dict[str, Any]:
-    """The defaults of a plant's optional fields, by name."""
-    m, p, w = len(plant.inputs), len(plant.outputs), len(plant.disturbances)
-    actuator = plant.actuator
-    constants, limit = actuator.force_constant, actuator.current_limit
-    return {
-        "load": partial(_zeros, w),
-        "position_of": _identity,
-        "preload": lambda x: plant.forces(x, plant.currents(plant.h(x, ca.DM.zeros(m)), ca.DM.zeros(m))),
-        "currents": lambda _, v: v / ca.vertcat(*constants),
-        "forces": lambda _, i: ca.vertcat(*constants) * i,
-        "limited": lambda i: ca.fmax(ca.fmin(i, limit), -limit),
-        "contact": partial(_zeros, 0),
-        "cushioned": (False,) * len(plant.contacts),
-        "bearing": partial(_zeros, w),
-        "sense": lambda x, _: plant.h(x, 0),
-        "noise": (0.0,) * p,
-        "resolution": (0.0,) * p,
-        "inertia": (0.0,) * m,
-    }
-
-
-def _zeros(size: int, x: Any) -> Any:
-    return type(x).zeros(size) if isinstance(x, ca.SX | ca.MX | ca.DM) else ca.DM.zeros(size)
-
-
-def _identity(y: Any) -> Any:
-    return y
+from malta.model.plant import Plant, same, symbolic
 
 
 def check_signals(plant: Plant) -> None:
@@ -135,7 +100,7 @@ def check_equations(plant: Plant) -> None:
         found = _check_size(plant, name, *question)
         _check_expression(plant, name, found, (x, u, w, y, i))
     half, states = plant.coordinates, len(plant.controlled)
-    if not half and plant.position_of is _identity and states == 2 * len(plant.outputs):
+    if not half and plant.position_of is same and states == 2 * len(plant.outputs):
         found = "rates of the first half of the states that are not the second half"
         expected = "f = (q', q'') for states (q, q'), or a `position_of` that gives all states at rest"
         raise InputError(plant.name, "f", found, expected)
@@ -224,8 +189,6 @@ def check_symbols(plant: Plant) -> None:
 
 def _fault_with_symbols(plant: Plant, names: Sequence[str]) -> str:
     """The name of a plant's function that fails or returns NaN when these parameters are symbols; "" for none."""
-    from malta.model.plant import symbolic  # which imports this module
-
     symbols = {name: ca.SX.sym(name) for name in names}
     values = [getattr(plant.parameters, name) for name in names]
     try:

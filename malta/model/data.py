@@ -10,7 +10,6 @@ here.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from functools import lru_cache
@@ -25,7 +24,7 @@ from malta.errors import CheckError, InputError
 from malta.files import file_exists, locate, shipped_path
 from malta.model.checks import check_numbers, line_of
 from malta.model.equilibrium import check_values, is_checked, register
-from malta.model.machines import file_of, machine, machine_names, name_of
+from malta.model.machines import file_of, machine, machine_names, module_of, name_of
 from malta.model.parameters import check_range
 from malta.model.plant import Plant
 from malta.tables import Finite, Quantity, Record, entry, load_toml, validate
@@ -174,7 +173,7 @@ def plant_of(parameters: Parameters) -> Plant:
 
 @lru_cache(maxsize=64)  # records are immutable, and building a plant is slow
 def _plant_of(parameters: Any) -> Plant:
-    module = sys.modules[type(parameters).__module__]
+    module = module_of(parameters)
     build: Callable[[Any], Plant] | None = getattr(module, "plant", None)
     if build is None:
         raise InputError(module.__name__, "plant", "nothing", "a function of Parameters -> Plant beside them")

@@ -30,7 +30,7 @@ import numpy as np
 from malta.errors import CheckError
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.model.signals import FloatArray
 
 T = TypeVar("T")
 

@@ -31,7 +31,7 @@ from malta.model.parameters import acting_names
 from malta.model.plant import OperatingPoint, Plant
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.model.signals import FloatArray
 
     Equations = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 

@@ -94,6 +94,26 @@ def name_of(module: ModuleType) -> str:
     return module.__name__.rpartition(".")[2]
 
 
+def module_of(parameters: Any) -> ModuleType:
+    """The module of the machine whose record of parameters this is: that of the record, or one beside it.
+
+    A record may stand in a module of its own, `parameters`, beside a file or beside the `plant` of a folder.
+    """
+    own = sys.modules[type(parameters).__module__]
+    folder = own.__name__.rpartition(".")[0]
+    if hasattr(own, "plant") or not folder:
+        return own
+    beside = sys.modules.get(folder)
+    if beside is not None and callable(getattr(beside, "plant", None)):
+        return beside
+    try:
+        return import_module(f"{folder}.plant")
+    except ModuleNotFoundError as error:
+        if error.name not in (f"{folder}.plant", folder):  # a module that `plant` imports
+            raise
+        return own
+
+
 def machine_names() -> list[str]:
     """The names of all machines: of installed packages and of files loaded so far."""
     return sorted({*_installed(), *_files})
@@ -146,8 +166,8 @@ def part_of(part: Part, name: str) -> ModuleType | None:
 
 def attribute_of(plant: Plant, part: Part, name: str, default: Any = None) -> Any:
     """The value of an optional name, from the module of the plant or of the part; else `default`."""
-    model = sys.modules.get(type(plant.parameters).__module__)
-    if model is not None and hasattr(model, name):
+    model = module_of(plant.parameters)
+    if hasattr(model, name):
         return getattr(model, name)
     return getattr(part_of(part, plant.name), name, default)
 

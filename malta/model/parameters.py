@@ -8,15 +8,24 @@ from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, field, fields, is_dataclass, replace
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
 from malta.display import quantity
 from malta.errors import InputError
 
-if TYPE_CHECKING:
-    from malta.model.plant import Parameters
+
+class Parameters(Protocol):
+    """A frozen dataclass whose physical fields are declared with `parameters.si(unit)`."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def __hash__(self) -> int: ...
+
+    @property
+    def preset(self) -> str: ...
+
 
 T = TypeVar("T")
 

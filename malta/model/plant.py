@@ -10,51 +10,29 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
 from malta.display import Description, display, quantity
 from malta.errors import InputError
-from malta.model.checks import DEFAULT, defaults
-from malta.model.sensors import CasadiFn, Drive, Electronics, LateSensors, require_short
+from malta.model.parameters import Parameters as Parameters
+from malta.model.sensors import Drive, Electronics, LateSensors, require_short, split_dead_time
+from malta.model.signals import CasadiFn
+from malta.model.signals import Signal as Signal
+from malta.model.signals import readonly as readonly
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
     from malta.model.equations import Body
-    from malta.model.linearize import InverseCheck
+    from malta.model.signals import ComplexArray as ComplexArray
+    from malta.model.signals import FloatArray as FloatArray
+    from malta.model.signals import InverseCheck
 
-    FloatArray = NDArray[np.floating[Any]]
-    ComplexArray = NDArray[np.complexfloating[Any, Any]]
-
-
-class Parameters(Protocol):
-    """A frozen dataclass whose physical fields are declared with `parameters.si(unit)`."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    def __hash__(self) -> int: ...
-
-    @property
-    def preset(self) -> str: ...
-
-
-class Signal(NamedTuple):
-    """A named scalar with its SI unit.
-
-    name : as it stands in files and figures
-    unit : SI, "1" for a pure number
-
-    >>> import malta
-    >>> malta.Signal("z", "m")
-    Signal(name='z', unit='m')
-    """
-
-    name: str
-    unit: str
+DEFAULT: Any = None  # stands for a function that follows from the other fields
 
 
 @dataclass(frozen=True)
@@ -209,7 +187,7 @@ class Plant:
     bodies: Callable[[], Sequence[Body]] | None = None
 
     def __post_init__(self) -> None:
-        for name, value in defaults(self).items():
+        for name, value in _defaults(self).items():
             given = getattr(self, name)
             if given is DEFAULT or given == ():
                 object.__setattr__(self, name, value)
@@ -362,7 +340,7 @@ class Plant:
         ball: `currents` is not the inverse of `forces` along q
           q in -0.002 .. 0.002 m: at -0.002 the currents of f = -3.6 N make -11.02 N, 103 % of its limit apart
         """
-        from malta.model.linearize import check_inverse  # which imports this module
+        from malta.model.linearize import check_inverse  # which linearizes plants
 
         return check_inverse(self)
 
@@ -406,6 +384,52 @@ class Plant:
         )
         rows += [("limits", ", ".join(limits)), ("current limit", quantity(self.actuator.current_limit, "A"))]
         return Description(f"Plant {self.name!r}, preset {self.parameters.preset!r}", tuple(rows))
+
+
+def _defaults(plant: Plant) -> dict[str, Any]:
+    """The defaults of a plant's optional fields, by name."""
+    m, p, w = len(plant.inputs), len(plant.outputs), len(plant.disturbances)
+    actuator = plant.actuator
+    constants, limit = actuator.force_constant, actuator.current_limit
+    return {
+        "load": partial(_zeros, w),
+        "position_of": same,
+        "preload": lambda x: plant.forces(x, plant.currents(plant.h(x, ca.DM.zeros(m)), ca.DM.zeros(m))),
+        "currents": lambda _, v: v / ca.vertcat(*constants),
+        "forces": lambda _, i: ca.vertcat(*constants) * i,
+        "limited": lambda i: ca.fmax(ca.fmin(i, limit), -limit),
+        "contact": partial(_zeros, 0),
+        "cushioned": (False,) * len(plant.contacts),
+        "bearing": partial(_zeros, w),
+        "sense": lambda x, _: plant.h(x, 0),
+        "noise": (0.0,) * p,
+        "resolution": (0.0,) * p,
+        "inertia": (0.0,) * m,
+    }
+
+
+def _zeros(size: int, x: Any) -> Any:
+    return type(x).zeros(size) if isinstance(x, ca.SX | ca.MX | ca.DM) else ca.DM.zeros(size)
+
+
+def same(y: Any) -> Any:
+    """The default of `position_of`: the outputs are the positions."""
+    return y
+
+
+def whole_samples(plant: Plant, Ts: float) -> int:
+    """The dead time of a plant's sensors in samples, as a linear loop has it.
+
+    Raises InputError for a dead time that is not a whole number of samples.
+    """
+    if plant.sensors is None:
+        return 0
+    whole, rest = split_dead_time(plant.sensors.dead_time, Ts)
+    if rest:
+        found = f"{plant.sensors.dead_time * 1e6:g} us of dead time of its sensors"
+        expected = f"whole samples of {Ts * 1e6:g} us in a linear loop; simulations take any"
+        raise InputError(plant.name, "sensors", found, expected)
+    return whole
 
 
 def position_in(plant: Plant, x: ArrayLike) -> float:
@@ -457,15 +481,6 @@ class OperatingPoint:
         object.__setattr__(self, "u", readonly(self.u))
         if self.v is not None:
             object.__setattr__(self, "v", readonly(self.v))
-
-
-def readonly(array: ArrayLike) -> FloatArray:
-    """A read-only copy as floats; a read-only array of floats is returned unchanged."""
-    if isinstance(array, np.ndarray) and array.dtype == float and not array.flags.writeable:
-        return array
-    copy = np.array(array, dtype=float)
-    copy.flags.writeable = False
-    return copy
 
 
 def trace(name: str, arguments: list[Any], expression: Any) -> CasadiFn:

@@ -8,7 +8,7 @@ the machine, and the dead time where it is whole samples: a delay of all reading
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ import casadi as ca
 from malta.errors import InputError
 
 if TYPE_CHECKING:
-    from malta.model.plant import Plant, Signal
+    from malta.model.signals import CasadiFn, Signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,21 +77,6 @@ def split_dead_time(dead_time: float, Ts: float) -> tuple[int, float]:
     return whole, rest if rest > 1e-9 * Ts else 0.0
 
 
-def whole_samples(plant: Plant, Ts: float) -> int:
-    """The dead time of a plant's sensors in samples, as a linear loop has it.
-
-    Raises InputError for a dead time that is not a whole number of samples.
-    """
-    if plant.sensors is None:
-        return 0
-    whole, rest = split_dead_time(plant.sensors.dead_time, Ts)
-    if rest:
-        found = f"{plant.sensors.dead_time * 1e6:g} us of dead time of its sensors"
-        expected = f"whole samples of {Ts * 1e6:g} us in a linear loop; simulations take any"
-        raise InputError(plant.name, "sensors", found, expected)
-    return whole
-
-
 def with_lags(sensors: LateSensors | None, A: Any, B: Any, C: Any) -> tuple[Any, Any, Any]:
     """A, B and C (CasADi) of a system whose outputs are read behind lags; the readings s are states after x."""
     late = [] if sensors is None else sensors.lagging
@@ -108,9 +93,6 @@ def with_lags(sensors: LateSensors | None, A: Any, B: Any, C: Any) -> tuple[Any,
 
 
 # The windings behind a machine's inputs, and the electronics that run their current loops.
-
-
-CasadiFn = Callable[..., Any]  # takes and returns casadi SX, MX or DM
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.proof.exclusion.exclusion import CellBounds, Growth
-from malta.proof.polynomial.enclosure import TooWide, Unproven
+from malta.proof.polynomial.enclosure import Polynomial, TooWide, Unproven
 from malta.proof.polynomial.family import Family
-from malta.proof.problem import Polynomial
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

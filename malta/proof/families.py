@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -12,11 +11,10 @@ from malta.proof.box_parts import Part, cut, merge_twins
 from malta.proof.exclusion.exclusion import growth_over
 from malta.proof.expressions import NotAnalytic, exact
 from malta.proof.polynomial.characteristic import pair
-from malta.proof.polynomial.enclosure import Unproven, over_box, precision
+from malta.proof.polynomial.enclosure import Polynomial, Unproven, over_box, precision
 from malta.proof.polynomial.family import Family
-from malta.proof.problem import OfLoop, OfSeveral, Polynomial, Problem, hurwitz
+from malta.proof.problem import Problem, hurwitz
 from malta.proof.time_limit import TimeUp, time_limit
-from malta.proof.weak_coupling.weak_coupling import HeldLoop
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -39,8 +37,8 @@ def parts_over(problem: Problem, box: Box, reach: float, last: float) -> list[Pa
     parts: list[Part] = []
     try:
         with time_limit(last):
-            if isinstance(problem, HeldLoop):
-                return problem.enclose(box, reach)
+            if (enclose := problem.traits.enclose) is not None:
+                return enclose(box, reach)
             for polynomial, moves in problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
                 parts += _parts_of(polynomial, box, sides, moves, last)
     except NotAnalytic as error:
@@ -76,7 +74,7 @@ def is_nominal_stable(problem: Problem, box: Box) -> bool:
 
     No coupling is neglected: over a box that is proven, other couplings may be than at the nominal values.
     """
-    for f, _ in _undivided(problem).parts([arb(x) for x in box.nominal.tolist()]):
+    for f, _ in problem.parts([arb(x) for x in box.nominal.tolist()], neglect=False):
         bits, stable = 160, None
         while stable is None and bits <= MOST_BITS:
             with precision(bits):
@@ -87,10 +85,3 @@ def is_nominal_stable(problem: Problem, box: Box) -> bool:
         if not stable:
             return False
     return True
-
-
-def _undivided(problem: Problem) -> Problem:
-    """The problem with all couplings of its loops."""
-    if isinstance(problem, OfSeveral):
-        return OfSeveral(tuple(_undivided(one) for one in problem.problems))
-    return replace(problem, neglect=False) if isinstance(problem, OfLoop) else problem

@@ -12,17 +12,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.errors import CheckError
+from malta.proof.exclusion.witness import gradients
 from malta.proof.expressions import NotAnalytic
 from malta.proof.time_limit import is_late
 from malta.proof.uncertain import Compensator, UncertainSystem, critical_frequency, instability
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
-
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
     from malta.proof.box import Box
+    from malta.proof.box_parts import Part
+    from malta.proof.exclusion.witness import Zero
     from malta.proof.problem import Problem
 
     Loss = tuple[float, float | None, FloatArray | None]  # t, w, p
@@ -181,10 +180,10 @@ def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float, proven:
     low, high = (float(grid[k - 1]) if k else 0.0), float(grid[k])
     if is_late():
         return high
-    return _first_unstable(lambda t: float(rates(np.array([t]))[0]), low, high, NARROW * (high - low))
+    return _narrow_loss(lambda t: float(rates(np.array([t]))[0]), low, high, NARROW * (high - low))
 
 
-def _first_unstable(rate: Callable[[float], float], low: float, high: float, width: float) -> float:
+def _narrow_loss(rate: Callable[[float], float], low: float, high: float, width: float) -> float:
     """The least t that was seen with rate(t) >= 0, between a stable `low` and an unstable `high`; Brent's method.
 
     width : to which it is narrowed down
@@ -334,7 +333,7 @@ def _leave(
         return math.inf
     else:
         low, high = 0.0, end
-    return _first_unstable(lambda t: float(rays.unstable(np.array([t]), [ray])[0]), low, high, RESOLVED * end)
+    return _narrow_loss(lambda t: float(rays.unstable(np.array([t]), [ray])[0]), low, high, RESOLVED * end)
 
 
 def _first_level(sets: Sequence[_Rays], owner: Sequence[tuple[int, int]]) -> tuple[float, int | None]:
@@ -354,3 +353,63 @@ def _most_unstable(sets: Sequence[_Rays], owner: Sequence[tuple[int, int]], t: f
     )
     worst = int(grown.argmax())
     return worst if len(owner) and grown[worst] >= 0 else None
+
+
+# Witnesses confirmed by the poles of the loop, and the share of each parameter in them.
+
+
+BISECTIONS = 16  # of the way to a witness
+COARSE = 1e-5  # how far beyond a zero, relative, the poles may become unstable without a bisection
+
+
+def confirm(problem: Problem, box: Box, zero: Zero, part: Part) -> Loss | None:
+    """The t, frequency and p just beyond a zero at which the poles are unstable; None where they stay stable."""
+    p = part.growth.parameters(zero.u)
+    w = problem.physical(zero.frequency(part.family))
+    stable = 1.0
+    for share in 1 + 10.0 ** np.arange(-9, -0.9, 0.5):
+        there = box.stretch(p, share)
+        if _is_unstable(problem, there):
+            if problem.traits.is_bounded:  # the zero is that of uncoupled axes
+                p = corner_of(problem, box, there)
+                there = box.stretch(p, _first_unstable(problem, box, p, 0.95, 1.0))
+                return float(box.margin(there)), w, there
+            if share > 1 + COARSE:  # a double zero, which is found to the root of rounding
+                share = _first_unstable(problem, box, p, stable, float(share))
+                there = box.stretch(p, share)
+            return float(zero.t * share), w, there
+        stable = float(share)
+    return None
+
+
+def _first_unstable(problem: Problem, box: Box, p: FloatArray, low: float, high: float) -> float:
+    """The share of the way to p, between low and high, from which on the loop is unstable: bisected."""
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if _is_unstable(problem, box.stretch(p, middle)) else (middle, high)
+    return high
+
+
+def _is_unstable(problem: Problem, p: FloatArray) -> bool:
+    """Whether the poles at p are unstable; False where the loop has no poles there."""
+    try:
+        return bool(problem.instability(p[None])[0] > 0)
+    except (CheckError, np.linalg.LinAlgError):
+        return False
+
+
+def contributions(zero: Zero, part: Part, names: tuple[str, ...]) -> dict[str, float]:
+    """The share of each parameter in reaching the boundary: d ln(margin) = -sum of share x d ln(range).
+
+    Along f(jw, p) = 0 the margin moves by Im(conj(f_w) f_p dp); at the witness all parameters pull the same way.
+    """
+    g = part.growth
+    p = g.parameters(zero.u)
+    moved = np.where(g.grows, p - g.nominal, 0)
+    by_u, by_x = gradients(part.family, zero)
+    slope = g.slopes(zero.u)
+    pulls = by_u / np.where(slope == 0, 1, slope) * moved
+    size = pulls.real if zero.x == 0 else (np.conj(by_x) * pulls).imag
+    total = size.sum()
+    used = [i for i in range(len(p)) if abs(moved[i]) > 1e-9 * abs(p[i]) and size[i] != 0]
+    return {names[i]: float(size[i] / total) for i in used} if total else {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -36,6 +36,9 @@ from malta.proof.uncertain import closed_loop as closed_matrices
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
+    from malta.proof.box import Box
+    from malta.proof.box_parts import Part
+    from malta.proof.polynomial.enclosure import Polynomial
 
 
 # A polynomial with coefficients in p as a loop in which every parameter enters linearly, for multipliers.
@@ -154,31 +157,44 @@ SHORT = 300  # operations of matrices whose exact expressions take no time
 FEW_ROWS = 2  # of parameters, at which the poles of the whole loop take less time than those of its groups
 
 
-class Polynomial(Protocol):
-    """A characteristic polynomial: `Characteristic`, or `OfCoefficients`."""
+@dataclass(frozen=True, eq=False)
+class Traits:
+    """What the search of a margin takes into account of a problem.
+
+    approximate : why its matrices are no exact functions of p, so that nothing is proven of them; "" where they are
+    is_cheap : whether cells of its polynomials take little time
+    is_held : whether families take long, as those of loops under a hold
+    enclose : the families over box(t) where couplings between groups are bounded, and no part of their polynomials
+    """
+
+    approximate: str = ""
+    is_cheap: bool = False
+    is_held: bool = False
+    enclose: Callable[[Box, float], list[Part]] | None = None
 
     @property
-    def names(self) -> tuple[str, ...]: ...
-    @property
-    def exact(self) -> bool: ...
-    @property
-    def foreign(self) -> tuple[str, ...]: ...
-    @property
-    def inverted(self) -> tuple[bool, ...]: ...
-    @property
-    def degrees(self) -> tuple[int | None, ...]: ...
-    def at(self, v: Sequence[Any]) -> list[Any]: ...
-    def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]: ...
-    def coupling_bounds(
-        self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
-    ) -> list[tuple[float, int]] | None: ...
+    def is_bounded(self) -> bool:
+        """Whether the polynomials are those of uncoupled groups."""
+        return self.enclose is not None
 
 
 class Problem(Protocol):
-    """The interface of a problem that has a margin."""
+    """The interface of a problem that has a margin: all that a search asks."""
 
-    def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
-        """The characteristic polynomials over real balls p, each with bounds of the effect of neglected couplings."""
+    @property
+    def traits(self) -> Traits: ...
+
+    @property
+    def loops(self) -> tuple[UncertainLoop | None, ...]:
+        """The loops whose pencils multipliers take; None for one that has no pencil."""
+
+    def parts(
+        self, p: Sequence[Any], *, neglect: bool = True
+    ) -> Sequence[tuple[Polynomial, tuple[Any, ...]]]:
+        """The characteristic polynomials over real balls p, each with bounds of the effect of neglected couplings.
+
+        neglect : whether couplings of the size of rounding are taken as zero and bounded
+        """
 
     def instability(self, rows: FloatArray) -> FloatArray:
         """The distance of the worst root beyond the boundary at rows of parameters, in floating point."""
@@ -197,17 +213,24 @@ class OfLoop:
     loop: UncertainLoop
     names: tuple[str, ...]
     known: dict[Any, Characteristic] = field(default_factory=dict)
-    neglect: bool = True  # whether couplings of the size of rounding are taken as zero and bounded
+
+    @property
+    def traits(self) -> Traits:
+        return Traits(self.loop.system.approximate, is_held=self.loop.sampled)
+
+    @property
+    def loops(self) -> tuple[UncertainLoop | None, ...]:
+        return (self.loop,)
 
     @cached_property
     def couplings(self) -> Couplings | None:
-        if self.loop.symbolic is None or not self.neglect:
-            return None
-        return Couplings(self.loop, self.loop.symbolic)
+        return None if self.loop.symbolic is None else Couplings(self.loop, self.loop.symbolic)
 
-    def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
-        found: list[tuple[Polynomial, tuple[Any, ...]]] = []
-        for part in loop_parts(self.loop, self.couplings, p):
+    def parts(
+        self, p: Sequence[Any], *, neglect: bool = True
+    ) -> list[tuple[Characteristic, tuple[Any, ...]]]:
+        found = []
+        for part in loop_parts(self.loop, self.couplings if neglect else None, p):
             key = (part.group.states, part.group.own)
             if key not in self.known:
                 self.known[key] = Characteristic(self.loop, part.group, self.names)
@@ -286,8 +309,16 @@ class OfSeveral:
 
     problems: tuple[Problem, ...]
 
-    def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
-        return [part for problem in self.problems for part in problem.parts(p)]
+    @property
+    def traits(self) -> Traits:
+        return Traits(next(filter(None, (problem.traits.approximate for problem in self.problems)), ""))
+
+    @property
+    def loops(self) -> tuple[UncertainLoop | None, ...]:
+        return tuple(loop for problem in self.problems for loop in problem.loops)
+
+    def parts(self, p: Sequence[Any], *, neglect: bool = True) -> list[tuple[Polynomial, tuple[Any, ...]]]:
+        return [part for problem in self.problems for part in problem.parts(p, neglect=neglect)]
 
     def instability(self, rows: FloatArray) -> FloatArray:
         return np.asarray(np.max([problem.instability(rows) for problem in self.problems], axis=0))
@@ -302,21 +333,14 @@ class OfSeveral:
         return self.problems[0].physical(x)
 
 
-def approximation(problem: Problem) -> str:
-    """Why a problem's matrices are no exact functions of p, so that nothing is proven of them; "" where they are."""
-    if isinstance(problem, OfSeveral):
-        return next(filter(None, map(approximation, problem.problems)), "")
-    return problem.loop.system.approximate if isinstance(problem, OfLoop) else ""
-
-
 def physical(x: float, T: float | None) -> float:
     """v = j x -> rad/s."""
     return x if T is None else 2 * math.atan(x) / T
 
 
 @dataclass(frozen=True, eq=False)
-class OfCoefficients:
-    """A polynomial in s (or z) whose coefficients, lowest first, are a program of p."""
+class CoefficientPolynomial:
+    """A problem whose polynomial in s (or z) has coefficients, lowest first, that are a program of p."""
 
     program: Program
     names: tuple[str, ...]
@@ -379,12 +403,12 @@ class OfCoefficients:
         }
 
     @cached_property
-    def companion(self) -> UncertainLoop | None:
+    def loops(self) -> tuple[UncertainLoop | None]:
         """A loop with this polynomial, linear in p; None where there is no short one."""
         if not self.exact:
-            return None
+            return (None,)
         a = [self._scaled[i].to_dict() if i in self._scaled else {} for i in range(self.count)]
-        return companion(self.names, a, 1.0 if self.discrete else None)
+        return (companion(self.names, a, 1.0 if self.discrete else None),)
 
     def values(self, v: Sequence[Any]) -> list[Any]:
         """The coefficients as they are given."""
@@ -417,25 +441,19 @@ class OfCoefficients:
         del moves, sides
         return None
 
+    @property
+    def traits(self) -> Traits:
+        return Traits(is_cheap=True)
 
-def _about_one(a: list[Any]) -> list[Any]:
-    """The coefficients of g = z - 1 from those of z."""
-    return [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), 0 * a[0]) for j in range(len(a))]
-
-
-@dataclass(frozen=True, eq=False)
-class OfPolynomial:
-    """A given characteristic polynomial."""
-
-    polynomial: OfCoefficients
-
-    def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
-        del p
-        return [(self.polynomial, ())]
+    def parts(
+        self, p: Sequence[Any], *, neglect: bool = True
+    ) -> list[tuple[CoefficientPolynomial, tuple[Any, ...]]]:
+        del p, neglect
+        return [(self, ())]
 
     def _roots(self, p: FloatArray) -> Any:
         """The roots, computed on a scale that the coefficients determine."""
-        a = [binary(x) for x in self._values([exact(x) for x in p.tolist()])]
+        a = [binary(x) for x in self.values([exact(x) for x in p.tolist()])]
         logs = {k: math.log2(abs(m)) + e for k, (m, _, e) in enumerate(a) if m}
         if not logs:  # zero, whatever s
             return np.ones(1)
@@ -449,25 +467,27 @@ class OfPolynomial:
         ]
         return np.roots(scaled[::-1]) * 2.0**step
 
-    def _values(self, v: list[Any]) -> list[Any]:
-        return self.polynomial.values(v)
-
     def instability(self, rows: FloatArray) -> FloatArray:
         found = []
         for row in np.atleast_2d(rows):
             roots = self._roots(row)
-            sizes = np.abs(roots) - 1 if self.polynomial.discrete else roots.real
+            sizes = np.abs(roots) - 1 if self.discrete else roots.real
             found.append(float(sizes.max(initial=-math.inf)))
         return np.array(found)
 
     def critical_frequency(self, p: FloatArray) -> float:
         roots = self._roots(p)
-        if self.polynomial.discrete:
+        if self.discrete:
             return float(abs(np.angle(roots[np.abs(roots).argmax()])))
         return float(abs(roots[roots.real.argmax()].imag))
 
     def physical(self, x: float) -> float:
-        return physical(x, 1.0 if self.polynomial.discrete else None)
+        return physical(x, 1.0 if self.discrete else None)
+
+
+def _about_one(a: list[Any]) -> list[Any]:
+    """The coefficients of g = z - 1 from those of z."""
+    return [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), 0 * a[0]) for j in range(len(a))]
 
 
 def hurwitz(a: Sequence[Any]) -> bool | None:

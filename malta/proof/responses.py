@@ -119,7 +119,7 @@ def find_peaks(
     return values.max(axis=1), around[rows, values.argmax(axis=1)]
 
 
-def crossing(w: FloatArray, size: FloatArray, level: float, *, last: bool = False) -> float:
+def crossing_frequency(w: FloatArray, size: FloatArray, level: float, *, last: bool = False) -> float:
     """The frequency at which `size` falls below `level` for the first or the last time, rad/s.
 
     It is interpolated on a log-log line between grid points: 0 when `size` never reaches the level, the last entry of

@@ -17,7 +17,7 @@ import time as clock
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -32,15 +32,8 @@ from malta.proof.groups import A, B, C, E, UncertainLoop, loop_of
 from malta.proof.loss import first_loss, loss_beside
 from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.polynomial.rational import Ratio, Symbolic
-from malta.proof.problem import (
-    OfCoefficients,
-    OfLoop,
-    OfPolynomial,
-    OfSeveral,
-    Problem,
-    approximation,
-)
-from malta.proof.search import Job
+from malta.proof.problem import CoefficientPolynomial, OfLoop, OfSeveral, Problem
+from malta.proof.search import Question, search
 from malta.proof.systems import compensator_of, polynomial_system
 from malta.proof.uncertain import (
     Compensator,
@@ -258,9 +251,6 @@ def _program(matrices: list[dict[tuple[int, int], Ratio]], old: Program) -> Prog
     return Program(tuple(steps), tuple(entries), old.shapes, old.inputs)
 
 
-if TYPE_CHECKING:
-    pass
-
 TOLERANCE = 9e-4  # relative distance between the proven bound and the witness
 MOST_CELLS = 300_000
 LONGEST = 120.0  # s, default time of a search
@@ -444,7 +434,7 @@ def margin_of_polynomial(
     values = _middles({**by_name(caller, "box", box, '{"k": (1, 2)}'), **outside}, nominal)
     names = tuple(values)
     function, _ = polynomial_system(coefficients, names)
-    problem = OfPolynomial(OfCoefficients(program(function), names, discrete))
+    problem = CoefficientPolynomial(program(function), names, discrete)
     where = box_of(names, np.array(list(values.values())), (), box, outside, caller=caller)
     return margin_of(problem, where, effort)
 
@@ -507,18 +497,11 @@ def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
             where = dict(zip(box.names, places[k + int(unstable.argmax())].tolist(), strict=True))
             spent = clock.monotonic() - begun
             return Margin(0.0, 0.0, None, where, {}, {}, (), spent, "the nominal loop is unstable")
-    if why := approximation(problem):
+    if why := problem.traits.approximate:
         upper, frequency, witness = first_loss(problem, box, box.limit)
         found = None if witness is None else dict(zip(box.names, witness.tolist(), strict=True))
         return Margin(None, upper, frequency, found, {}, {}, (), clock.monotonic() - begun, why)
-    job = Job(
-        problem,
-        box,
-        effort.tolerance or TOLERANCE,
-        effort.tolerance is not None,
-        until,
-        effort.most_cells,
-        effort.progress,
-    )
+    tolerance, fixed = effort.tolerance or TOLERANCE, effort.tolerance is not None
+    question = Question(problem, box, tolerance, fixed, begun, until, effort.most_cells, effort.progress)
     with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
-        return job.margin(begun)
+        return search(question)

@@ -53,9 +53,9 @@ from malta.synthesis.controller import (
     estimated,
     filtered,
     freeze_moving,
+    frozen_axes,
     look_ahead,
     sum_errors,
-    waiting,
 )
 from malta.synthesis.schedule import interpolate
 
@@ -371,7 +371,7 @@ def _control_law(
     if s.open_loop:
         v, saturated = v_ff + v0, 0 * saturated  # open loop: no limit of the feedback is reached
     xi_pred, place = look_ahead(g, xi_pred, p_ref if s.open_loop else y, given["dp_ref"])
-    after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": waiting(g, saturated)}
+    after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": frozen_axes(g, saturated)}
     # The controller commutates with the machine of its gain file. The simulated machine limits the currents, and the
     # gain file does: the smaller limit counts.
     wanted = believed.currents(place, v)

@@ -428,7 +428,7 @@ def commanded(
     return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), saturated, v
 
 
-def waiting(g: Mapping[str, Any], saturated: Any) -> Any:
+def frozen_axes(g: Mapping[str, Any], saturated: Any) -> Any:
     """The axes that saturated, of p outputs, from those of m forces: see the head of this module."""
     m, p = g["Ki"].shape
     if m == p:
@@ -482,7 +482,7 @@ def _symbolic_law(
     return args, {
         "xi_pred_next": xi_pred_next,
         "e_next": e_next,
-        "frozen_next": waiting(g, saturated),
+        "frozen_next": frozen_axes(g, saturated),
         "v": v,
         "xi_hat": xi_hat,
     }

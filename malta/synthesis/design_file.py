@@ -41,7 +41,7 @@ from malta.synthesis.recovery import (
     RecoveryBound,
     bases,
     numbers,
-    ordered,
+    order_entries,
     positive,
     recovery_bounds,
     variances,
@@ -318,7 +318,7 @@ def _weights(content: DesignFile, plant: Plant, path: Path) -> Weights:
                 path, "noise.correlation", "this table", 'it with coordinates = "positions" alone'
             )
         given["correlation"] = np.array(
-            ordered(noise.correlation, forces, path, "noise.correlation", "positions"), dtype=float
+            order_entries(noise.correlation, forces, path, "noise.correlation", "positions"), dtype=float
         )
     return Weights(
         q=numbers(q.state, states, path, "weights.state", "states"),
@@ -353,7 +353,7 @@ def _pid(table: PidTable, plant: Plant, path: Path) -> Pid:
         given = getattr(table, name)
         if given is None:
             continue
-        entries = ordered(given, signals, path, f"pid.{name}", "axes" if table.axes else "inputs")
+        entries = order_entries(given, signals, path, f"pid.{name}", "axes" if table.axes else "inputs")
         gains[name] = np.array(
             [
                 to_si(q.value, q.unit, s.unit, path, f"pid.{name}.{s.name}")

@@ -20,7 +20,7 @@ from malta.synthesis.controller import (
     Feedforward,
     Limits,
 )
-from malta.synthesis.filters import held
+from malta.synthesis.filters import between_samples
 from malta.synthesis.riccati import sample
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def feedforward(model: LinearModel, Ts: float, delay: int = 0, lead: float = 0.0
     if not model.E.any():
         return static
     model.plant.require_second_order("held currents")
-    still = held(model)
+    still = between_samples(model)
     Ad, Bd = sample(still.A, model.B, Ts)
     back = np.linalg.inv(model.C[:, :half])
     moved = np.vstack([Ts * back, np.zeros_like(back)]) + Bd @ still.H * (Ts * delay - lead)
@@ -146,7 +146,7 @@ def commutate_ahead(controller: Controller, model: LinearModel) -> Controller:
     return replace(
         controller,
         feedforward=replace(old, speed=new.speed, rate=new.rate if predicts else old.rate),
-        commutation=Commutation(lead, held(model).H),
+        commutation=Commutation(lead, between_samples(model).H),
     )
 
 

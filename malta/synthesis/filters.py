@@ -73,7 +73,7 @@ class Held(NamedTuple):
     H: FloatArray  # m x p, N/m
 
 
-def held(model: Linear) -> Held:
+def between_samples(model: Linear) -> Held:
     """What a linear model is between samples; E is in the reach of the inputs."""
     if not model.E.any():
         return Held(model.A, np.zeros((model.B.shape[1], len(model.C))))
@@ -92,7 +92,7 @@ def gain_at_rest(K: FloatArray, n: int, known: int) -> FloatArray:
 
 def sampled_model(model: Linear, Ts: float, delay: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Ad, Bd, Cd under held currents, with the forces of the last `delay` samples as states."""
-    still = held(model)
+    still = between_samples(model)
     Ad, Bd = delay_inputs(*sample(still.A, model.B, Ts), delay)
     n, pull = len(model.A), still.H @ model.C
     if delay:
@@ -153,7 +153,7 @@ def sampled_filter(model: Linear, weights: Weights, Ts: float, delay: int, *, in
     integrated : process noise is white within a sample; otherwise held over it
     """
     n, m, p = len(model.A), model.B.shape[1], len(model.C)
-    V, C, still = np.diag(weights.sensor_variance), model.C, held(model)
+    V, C, still = np.diag(weights.sensor_variance), model.C, between_samples(model)
     G = noise_input(model.B, weights.coordinates)
     Ad, Bd = sample(still.A, model.B, Ts)
     Gd = Bd if weights.coordinates == "signals" else sample(still.A, G, Ts)[1]

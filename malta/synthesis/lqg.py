@@ -45,7 +45,7 @@ from malta.synthesis.feedforward import machine_part
 from malta.synthesis.filters import (
     Gains,
     Linear,
-    held,
+    between_samples,
     positions_from,
     sampled_filter,
     sampled_model,
@@ -120,7 +120,7 @@ def obstacle(model: LinearModel, weights: Weights, Ts: float) -> str:
 
     Ts : sample time, s
     """
-    A = held(model).A
+    A = between_samples(model).A
     states = [s.name for s in model.plant.design_states]
     reason = out_of_reach(A, model.B, model.C, states)
     if reason:
@@ -299,7 +299,7 @@ def gains(
     L = sampled_filter(model, weights, Ts, known, integrated=integrated)
     if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d; v takes d off, as forces under way have
         p, pushed = len(Cd), np.zeros((len(Ad), m))
-        pushed[:n] = sample(held(model).A, model.B, Ts)[1]
+        pushed[:n] = sample(between_samples(model).A, model.B, Ts)[1]
         Ad = np.block([[Ad, pushed], [np.zeros((m, len(Ad))), np.eye(m)]])
         Bd, Cd = np.vstack([Bd, np.zeros((m, m))]), np.hstack([Cd, np.zeros((p, m))])
         K = np.hstack([K, np.eye(m) + K[:, n:].reshape(m, known, m).sum(axis=1)])
@@ -502,7 +502,7 @@ def _sampled_regulator(
     beside the oldest stored force, Van Loan's integral with R = 0, is positive semidefinite. What acts is v + H y.
     """
     n, m, p, d = len(model.A), model.B.shape[1], len(model.C), delay
-    still, commanded = held(model), weights.R * Ts
+    still, commanded = between_samples(model), weights.R * Ts
     if integrated:
         Q, N, R = sample_cost(still.A, model.B, weights.Q, weights.R, Ts)
     else:

@@ -133,7 +133,7 @@ def _ahead(out: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
 # Numbers of a design file by the names of signals -> arrays in SI units, in the order of the signals.
 
 
-def ordered(
+def order_entries(
     entries: Mapping[str, Any], signals: Sequence[Signal], where: Path, field: str, what: str
 ) -> list[Any]:
     """The entries in the order of the signals, one for each."""
@@ -162,7 +162,7 @@ def numbers(
     *,
     above: bool = False,
 ) -> FloatArray:
-    values = ordered(entries, signals, where, field, what)
+    values = order_entries(entries, signals, where, field, what)
     for signal, value in zip(signals, values, strict=True):
         if value < 0 or (above and value == 0):
             wanted = "a number above 0" if above else "a number of at least 0"
@@ -181,7 +181,7 @@ def bases(
             positive(
                 to_si(q.value, q.unit, s.unit, where, f"{field}.{s.name}"), where, f"{field}.{s.name}", s.unit
             )
-            for q, s in zip(ordered(entries, signals, where, field, what), signals, strict=True)
+            for q, s in zip(order_entries(entries, signals, where, field, what), signals, strict=True)
         ]
     )
 
@@ -191,7 +191,7 @@ def variances(
 ) -> FloatArray:
     """Variances: given as such (unit squared), or as standard deviations (the signal's unit)."""
     variances = []
-    for q, s in zip(ordered(entries, signals, where, field, what), signals, strict=True):
+    for q, s in zip(order_entries(entries, signals, where, field, what), signals, strict=True):
         name = f"{field}.{s.name}"
         squared = f"({s.unit})^2"
         if is_unit_of(q.unit, s.unit):

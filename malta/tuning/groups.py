@@ -29,7 +29,7 @@ from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
 from malta.model.plant import position_in
 from malta.proof.parametric_plants import of_plant
-from malta.proof.responses import crossing
+from malta.proof.responses import crossing_frequency
 from malta.proof.windings import (
     Windings,
     emf_slope,
@@ -546,10 +546,10 @@ def _response(
     half = n // 2
     stiffness = group.model.B[half:] @ gain_at_rest(g.K, n, known) - group.model.A[half:, :half]
     w_n = math.sqrt(max(float(np.linalg.eigvals(stiffness).real.min()), 0.0))
-    bandwidth = min(crossing(group.w, T[:, -1], math.sqrt(0.5)), w_n)
+    bandwidth = min(crossing_frequency(group.w, T[:, -1], math.sqrt(0.5)), w_n)
     if alone:
         L = np.linalg.svd(group.response @ F, compute_uv=False)
-        bandwidth = min(bandwidth, crossing(group.w, L[:, 0], 1.0, last=True))
+        bandwidth = min(bandwidth, crossing_frequency(group.w, L[:, 0], 1.0, last=True))
     return float(np.abs(np.einsum("kii->ki", S)).max()), bandwidth
 
 

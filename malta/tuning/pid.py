@@ -33,7 +33,7 @@ from malta.model.data import plant_of
 from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
 from malta.model.plant import position_at, position_in
-from malta.proof.responses import crossing
+from malta.proof.responses import crossing_frequency
 from malta.proof.windings import emf_slope, estimated_rows, windings_of, with_estimated_emf
 from malta.synthesis.controller import linear_law_of, with_readings
 from malta.synthesis.pid import Axes, axes_of, law_of_outputs, pid_gains
@@ -276,7 +276,7 @@ def loop_figures(spec: Spec, part: Part, loop: SampledLoop) -> dict[str, float]:
         T = np.linalg.svd(np.eye(len(own)) - np.linalg.inv(np.eye(len(own)) + L), compute_uv=False)
         gain = np.linalg.svd(L, compute_uv=False)
         found["bandwidth"] = min(
-            crossing(w, T[:, -1], math.sqrt(0.5)), crossing(w, gain[:, 0], 1.0, last=True)
+            crossing_frequency(w, T[:, -1], math.sqrt(0.5)), crossing_frequency(w, gain[:, 0], 1.0, last=True)
         )
     return found
 

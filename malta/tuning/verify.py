@@ -138,7 +138,7 @@ def judge(
     return tuple(outcomes)
 
 
-def unflown(spec: Spec) -> list[str]:
+def entries_without_flights(spec: Spec) -> list[str]:
     """List the entries of a specification that are measured on the linear loop, without flights of the machine."""
     known = requirements_for(spec.plant)
     return [name for name in spec.specification if base_of(name) in known and not known[base_of(name)].flown]
@@ -292,7 +292,11 @@ def with_requirements(found: LoopReport, spec: Spec | None, *, proof: bool, flig
     if spec is None:
         return found
     spec = replace(spec, parameters=found.plant.parameters)
-    names = [*spec.specification] if flights else [n for n in unflown(spec) if proof or n != "margin"]
+    names = (
+        [*spec.specification]
+        if flights
+        else [n for n in entries_without_flights(spec) if proof or n != "margin"]
+    )
     same = found.current_loops == LAST and dict(found.uncertainty) == dict(spec.uncertainty)
     known = "margin" not in names or (same and found.robust is not None)
     try:

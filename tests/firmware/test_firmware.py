@@ -27,7 +27,7 @@ from malta.firmware.flight import (
 from malta.firmware.fmu import build_fmu
 from malta.firmware.program import Precision, evaluate
 from malta.firmware.signals import Target, reading_ranges, reference_fields, state_fields
-from malta.firmware.step import look_up, programs_of, started_state, step_of, zero_reference
+from malta.firmware.step import look_up, programs_of, started_state, step_function, zero_reference
 from malta.simulation.engine.compiled import compiler
 
 WARNINGS = (
@@ -64,7 +64,7 @@ def test_steps_compute_the_bits_of_their_expressions(name: str, precision: Preci
     """The whole state and all outputs, sample after sample, with readings that are none among them."""
     t = target(name, precision)
     native, rng, reach = compile_controller(t), np.random.default_rng(4), reading_ranges(t.believed)
-    model = step_of(t)
+    model = step_function(t)
     state, given, out = new_state(native), native.Inputs(), native.Outputs()
     reference = {f.name: np.zeros(f.size) for f in reference_fields(t)}
     for k in range(12):
@@ -87,7 +87,7 @@ def test_steps_compute_the_bits_of_their_expressions(name: str, precision: Preci
 def test_the_pieces_make_the_step(name: str) -> None:
     """Called one after the other as a firmware may do, in double precision: the bits of a step."""
     t = target(name, "double")
-    c, rng, step = t.controller, np.random.default_rng(5), step_of(t)
+    c, rng, step = t.controller, np.random.default_rng(5), step_function(t)
     programs = programs_of(t)
 
     def piece(of: str, **given: Any) -> dict[str, Any]:

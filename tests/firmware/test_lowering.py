@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import malta
-from malta.firmware.program import Precision, Program, evaluate, lower, program_of
+from malta.firmware.program import Precision, Program, build_program, evaluate, lower
 
 X, Y = ca.SX.sym("x"), ca.SX.sym("y")
 ALL = ca.Function(
@@ -22,7 +22,7 @@ FARTHEST = {"double": 1e5, "float": 1e3}
 
 
 def program(f: ca.Function, precision: Precision) -> Program:
-    return program_of(lower(f, precision))
+    return build_program(lower(f, precision))
 
 
 @pytest.mark.parametrize("precision", ["double", "float"])
@@ -47,7 +47,9 @@ def test_errors_of_elementary_functions(precision: Precision) -> None:
 @given(st.floats(-1e5, 1e5), st.floats(-1e3, 1e3))
 def test_casadi_computes_the_same_bits(x: float, y: float) -> None:
     f = lower(ALL, "double")
-    assert np.array_equal(np.array(f(x, y)).ravel(), evaluate(program_of(f), {"x": x, "y": y}, "double")["r"])
+    assert np.array_equal(
+        np.array(f(x, y)).ravel(), evaluate(build_program(f), {"x": x, "y": y}, "double")["r"]
+    )
 
 
 def test_sines_of_shifted_angles_are_two_evaluations() -> None:

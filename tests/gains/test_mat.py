@@ -83,7 +83,7 @@ def test_every_gain_file_is_read_as_scipy_reads_it(
     """As committed, and saved anew by scipy with other options: the same document as in the .json."""
     _assert_same(path.read_bytes())
     content = encodings.decode(path.with_suffix(".json"))
-    cells = encodings.cells_of(encodings.columns_of(content))
+    cells = encodings.matlab_cells(encodings.columns_of(content))
     data = _signed(_saved(cells, **options))
     _assert_same(data)
     again = tmp_path / path.name
@@ -362,7 +362,7 @@ EDITS: dict[str, Callable[[bytes, int], Iterator[bytes]]] = {
 
 def _compressed_copy() -> bytes:
     content = encodings.decode(SMALL.with_suffix(".json"))
-    return _saved(encodings.cells_of(encodings.columns_of(content)), do_compression=True)
+    return _saved(encodings.matlab_cells(encodings.columns_of(content)), do_compression=True)
 
 
 def _given(data: bytes, *_: Any) -> bytes:

@@ -14,7 +14,7 @@ from conftest import Run
 
 import malta
 from malta.firmware.signals import Target
-from malta.firmware.step import started_state, step_of, zero_reference
+from malta.firmware.step import started_state, step_function, zero_reference
 from malta.identification import ExcitationPlan, Identified, Log
 from malta.identification.data_file import read_identified, write_data
 from malta.identification.excite import model_at, predicted_spectra
@@ -413,7 +413,7 @@ def test_exported_laws_take_an_excitation(plan: ExcitationPlan) -> None:
 
 def test_an_excitation_that_is_no_force_is_none() -> None:
     t = Target(CONTROLLER, fidelity="force", excited=True)
-    step, reference, p = step_of(t), zero_reference(t), len(CONTROLLER.measurements)
+    step, reference, p = step_function(t), zero_reference(t), len(CONTROLLER.measurements)
     limit = np.array(CONTROLLER.limits.force)
 
     def forces(excitation: Any) -> Any:

@@ -20,7 +20,7 @@ from malta.gains.encodings import content_sha256
 from malta.machines.halbach import electronics
 from malta.machines.halbach import electronics as motor
 from malta.machines.halbach import plant as halbach
-from malta.machines.halbach.plant import Parameters
+from malta.machines.halbach.parameters import GAP, Parameters
 from malta.model.data import published_value
 from malta.model.parameters import values_of
 from malta.synthesis.filters import sampled_model
@@ -115,7 +115,7 @@ def test_currents_make_the_forces_they_are_made_for(x: float, F_x: float, F_z: f
 
 def test_motor_constant_at_another_air_gap(par: Parameters, printed: dict[str, Any]) -> None:
     """(2): A e^(-k z_0). Nothing changes at the printed gap, 0.1 mm more takes 2.09 % and 0.499 mm more a tenth."""
-    assert par.z_0 == motor.GAP == pytest.approx(published_value(printed, "motor.air_gap"), rel=1e-12)
+    assert par.z_0 == GAP == pytest.approx(published_value(printed, "motor.air_gap"), rel=1e-12)
     assert float(motor.motor_constant(par)) == par.A
     at = {
         gap: float(motor.motor_constant(replace(par, z_0=gap))) / par.A

@@ -33,7 +33,7 @@ from malta.synthesis.requirements import (
     reached_with_every_seed,
 )
 from malta.tuning.search import model_and_controller
-from malta.tuning.verify import SynthesizedDesign, judge, outcomes_of, unflown
+from malta.tuning.verify import SynthesizedDesign, entries_without_flights, judge, outcomes_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -99,7 +99,7 @@ def test_verify_judges_what_no_flight_measures(run: Run) -> None:
     """The figures are those of `malta tune --check`; the margin of the proof that is printed is not proven again."""
     spec = malta.read_design(ROOT / "design" / "robust.toml")
     flown = {"tracking_error", "radial_deviation", "tilt_deviation", "payload", "lift_off"}
-    names = unflown(spec)
+    names = entries_without_flights(spec)
     assert set(names) == set(spec.specification) - flown
     names.remove("margin")
     rows = {one.name: one for one in judge(spec, names=names)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 import shutil
 import sys
@@ -228,3 +229,34 @@ def test_the_text_of_a_machine_goes_to_a_worker(folder: Path) -> None:
     module = machines.load_sources("lev", text)
     assert module.plant.__module__ == name
     assert machines.sources_of("tubular") == {}
+
+
+def test_parameters_may_stand_in_a_module_beside_the_plant(folder: Path) -> None:
+    """As those of malta's own machines do, which need no module but that of the record to be found."""
+    text = (folder / "lev.py").read_text(encoding="utf-8")
+    start, end = text.index("@dataclass"), text.index("\n\n\ndef plant")
+    imports = "from dataclasses import dataclass\n\nfrom malta import check_parameters, si\n\n\n"
+    (folder / "parameters.py").write_text(imports + text[start:end], encoding="utf-8")
+    moved = text[:start] + "from .parameters import Parameters" + text[end:]
+    (folder / "lev.py").write_text(moved, encoding="utf-8")
+    module = malta.machine(folder / "lev.py")
+    record = pickle.loads(pickle.dumps(malta.read("lev.toml")))
+    assert type(record).__module__ == f"{module.__name__}.parameters"
+    assert machines.module_of(record) is module
+    assert malta.plant_of(record).name == "lev"
+    sources = machines.sources_of("lev")
+    forget()
+    assert machines.load_sources("lev", sources).Parameters.__module__ == type(record).__module__
+
+
+@pytest.mark.parametrize("name", ["tubular", "halbach", "planar"])
+def test_the_plant_of_a_record_is_found_where_nothing_else_is_loaded(name: str) -> None:
+    """As in a worker process, to which pickle brings a record alone."""
+    module = malta.machine(name)
+    record = malta.read(f"data/{name}.toml")
+    assert module.__name__ != type(record).__module__
+    del sys.modules[module.__name__]
+    try:
+        assert machines.module_of(record).__name__ == module.__name__
+    finally:
+        sys.modules[module.__name__] = module

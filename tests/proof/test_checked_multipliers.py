@@ -21,8 +21,7 @@ from malta.proof.multipliers.structured import Proof, Shown, worst
 @cache
 def proven(n: int, T: float | None, target: float = 1.0) -> Proof:
     s = asked(chain(n, T))
-    s.until = time.monotonic() + 30
-    s.raise_bound(target)
+    s.raise_bound(target, time.monotonic() + 30)
     assert s.lower >= 0.5 * target
     assert s.proof().layers[-1].t == s.lower
     return s.proof()

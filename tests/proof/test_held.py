@@ -28,7 +28,7 @@ from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller, linear_law
-from malta.synthesis.filters import held, sampled_model
+from malta.synthesis.filters import between_samples, sampled_model
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
 from malta.synthesis.riccati import sample
@@ -118,7 +118,7 @@ def test_simulation_and_linear_loop_agree(delay: int) -> None:
     state = np.zeros(len(exact.closed))
     state[0] = state[n] = 1e-9  # where it is, and where the observer takes it to be
     state[2:n] = [0.0, 1e-9] * (1 + delay)  # no force, and currents that were commutated for it
-    state[n + 2 : n + 2 + delay] = held(model).H.item() * 1e-9  # which it knows
+    state[n + 2 : n + 2 + delay] = between_samples(model).H.item() * 1e-9  # which it knows
     seen = []
     for _ in range(len(run.t)):
         seen.append(state[0])
@@ -475,7 +475,7 @@ def test_disturbances_by_hand() -> None:
     """Filter and regulator of a mass on a spring, once more with scipy: the augmented Riccati equation."""
     c, model = _controller("halbach", 0), _model("halbach")
     w = _weights("halbach")
-    still = held(model)
+    still = between_samples(model)
     Ad, Bd = sample(still.A, model.B, 55e-3)
     Ad = Ad + Bd @ still.H @ model.C
     A = np.block([[Ad, Bd], [np.zeros((1, 2)), np.eye(1)]])

@@ -72,7 +72,7 @@ def asked(loop: Loop, share: float = 0.1) -> Structured:
     assert isinstance(problem, OfLoop)
     rows = rows_of(problem)
     assert rows is not None
-    return Structured(rows, box, math.inf)
+    return Structured(rows, box)
 
 
 def stable_within(loop: Loop, box: Box, t: float, count: int = 2000) -> bool:
@@ -268,8 +268,7 @@ def test_a_proof_goes_on_where_time_ended_it() -> None:
     whole, parts = asked(loop), asked(loop)
     assert whole.raise_bound(3.0) == 3.0
     for k in range(40):
-        parts.until = clock.monotonic() + 0.02 * 1.3**k
-        if parts.raise_bound(3.0) == 3.0:
+        if parts.raise_bound(3.0, clock.monotonic() + 0.02 * 1.3**k) == 3.0:
             break
     assert parts.lower == 3.0
     assert stable_within(loop, parts.box, 3.0)
@@ -280,10 +279,9 @@ def test_no_box_is_proven_that_holds_an_unstable_loop() -> None:
     loop = chain(3, None)
     m = malta.robust_margin(*loop, ranges(loop[0]), time=2)
     s = asked(loop)
-    s.until = clock.monotonic() + 1
     assert m.lower is not None
     assert m.lower <= m.upper
-    assert s.raise_bound(1.2 * m.upper) < m.upper
+    assert s.raise_bound(1.2 * m.upper, clock.monotonic() + 1) < m.upper
 
 
 def test_parts_of_a_box_without_a_pencil_are_given_up(monkeypatch: pytest.MonkeyPatch) -> None:

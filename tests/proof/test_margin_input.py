@@ -20,7 +20,7 @@ from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.proof.box import box_of
 from malta.proof.expressions import program
-from malta.proof.problem import OfCoefficients, OfPolynomial
+from malta.proof.problem import CoefficientPolynomial
 from malta.proof.robust import common_margin
 from malta.proof.uncertain import UncertainSystem
 
@@ -111,7 +111,7 @@ def test_what_overflows_at_the_ends_of_an_interval_is_not_proven() -> None:
 def test_roots_of_coefficients_beyond_floating_point() -> None:
     p = ca.SX.sym("p")
     f = ca.Function("f", [p], [ca.vertcat(p**3, p**3, p**3)])
-    problem = OfPolynomial(OfCoefficients(program(f), ("p",), False))
+    problem = CoefficientPolynomial(program(f), ("p",), False)
     assert problem.instability(np.array([[1e120]]))[0] == pytest.approx(-0.5)
     assert problem.instability(np.array([[0.0]]))[0] > 0  # nothing is left of it
 

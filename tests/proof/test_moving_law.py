@@ -12,7 +12,7 @@ from scipy import linalg
 
 import malta
 from malta.margins import schedule_rate, scheduled_loops
-from malta.margins.scheduled_loops import cells_of, rate_of_cells
+from malta.margins.scheduled_loops import loops_between_places, rate_of_cells
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.rates import BITS, middle
 from malta.proof.systems import compensator_of
@@ -76,7 +76,7 @@ def magnet() -> tuple[Any, Any]:
 @pytest.mark.slow
 def test_the_enclosure_holds_the_loop_and_its_curvature(magnet: tuple[Any, Any]) -> None:
     """Phi at a place beside the machine's own loop; Phi'' on an interval beside differences of Phi."""
-    cells = cells_of(*magnet, (), "lag")
+    cells = loops_between_places(*magnet, (), "lag")
     assert not isinstance(cells, str)
     with precision(BITS):
         loop = scheduled_loops._LoopOfCells.of(cells)
@@ -99,7 +99,7 @@ def test_courses_as_fast_as_proven_decay(magnet: tuple[Any, Any]) -> None:
     bound = schedule_rate(*magnet)
     assert bound.rate is not None
     assert bound.rate > 3e-3  # m/s, what the design file lets references do
-    cells = cells_of(*magnet, (), "lag")
+    cells = loops_between_places(*magnet, (), "lag")
     assert not isinstance(cells, str)
     T, rng, steps, p, way = magnet[1].sample_time, np.random.default_rng(2), 4, 0.0, bound.rate
     functions = [scheduled_loops._expressions(*cell[:2], None) for cell in cells]

@@ -21,7 +21,7 @@ from test_report_page import HOSTILE, STRANGE, cart_controller
 
 from malta.cli.documents.loops import compare_output
 from malta.margins.verify import linear_report
-from malta.merits import MEANINGS, Merit, best_of, figure, four_digits
+from malta.merits import MEANINGS, Merit, figure, find_best, four_digits
 from malta.report.page.analysis import Subject
 from malta.report.page.comparison import Comparison, Row, compare, comparison_tables, names_of
 from malta.report.page.report import comparison_page
@@ -141,13 +141,13 @@ def score(value: float, kind: str = "peak_s") -> Merit:
 
 def test_the_best_is_better_in_digits_that_are_shown() -> None:
     low, nan = [score(1.5), score(2.0), score(1.5)], score(float("nan"))
-    assert best_of(low) == (True, False, True)
-    assert best_of([score(1.5), score(1.5000001)]) == (False, False)
-    assert best_of([nan, score(1.5)]) == (False, False)
-    assert best_of([nan, score(1.5), score(2.5), None]) == (False, True, False, False)
-    assert best_of([score(1.0, "disk"), score(2.0, "disk")]) == (False, True)
-    assert best_of([score(1.0, "natural"), score(2.0, "natural")]) == (False, False)
-    assert best_of([score(float("inf"), "delay_margin"), score(2.0, "delay_margin")]) == (True, False)
+    assert find_best(low) == (True, False, True)
+    assert find_best([score(1.5), score(1.5000001)]) == (False, False)
+    assert find_best([nan, score(1.5)]) == (False, False)
+    assert find_best([nan, score(1.5), score(2.5), None]) == (False, True, False, False)
+    assert find_best([score(1.0, "disk"), score(2.0, "disk")]) == (False, True)
+    assert find_best([score(1.0, "natural"), score(2.0, "natural")]) == (False, False)
+    assert find_best([score(float("inf"), "delay_margin"), score(2.0, "delay_margin")]) == (True, False)
     assert {one.better for one in MEANINGS.values()} == {"high", "low", ""}
     assert (four_digits(0.0), four_digits(1.99996), four_digits(-4.7e-7)) == ("0", "2.000", "-4.7e-07")
 

@@ -26,7 +26,7 @@ from malta.report.page.motion import (
     mesh_of,
     motion_gif,
     motion_page,
-    placed,
+    place_points,
     read_motion,
 )
 from malta.simulation.trajectory import save
@@ -79,7 +79,7 @@ def test_points_of_the_mover_are_where_the_sensors_see_them(stroke: Motion) -> N
     pose = np.array([2e-4, -1e-4, 0.0, 1e-3, -2e-3, 0.3])
     ends = mesh_of(stroke.bodies[-1])._replace(points=np.array([[0, 0, -par.l_S], [0, 0, par.l_S]]))
     seen = np.array(measured(par, np.append(pose, np.zeros(6)))).ravel()
-    found = placed(ends, pose)
+    found = place_points(ends, pose)
     assert found[:, :2].ravel().tolist() == pytest.approx(seen[:4].tolist(), abs=2e-8)
 
 
@@ -98,7 +98,7 @@ def test_small_motion_is_magnified_and_the_stroke_is_not(stroke: Motion) -> None
     assert stroke.small[mover].tolist() == [True, True, False, True, True, True]
     assert not stroke.small[:mover].any()
     mesh, frames = mesh_of(stroke.bodies[mover]), range(0, len(stroke.t), 4)
-    seen = np.array([placed(mesh, magnify(stroke, k, mover, stroke.factor))[:, :2] for k in frames])
+    seen = np.array([place_points(mesh, magnify(stroke, k, mover, stroke.factor))[:, :2] for k in frames])
     narrow = min(stroke.bodies[mover].size)
     assert 0.02 * narrow < np.abs(seen - seen.mean(axis=0)).max() <= 0.25 * narrow
     axial = [magnify(stroke, k, mover, stroke.factor)[2] for k in (0, -1)]

@@ -18,7 +18,7 @@ from malta.simulation.experiments import Experiment
 from malta.simulation.experiments.recording import (
     ForceLog,
     columns_of_log,
-    log_of,
+    force_log,
     read_log,
     record,
     slow_stroke,
@@ -87,7 +87,7 @@ def test_the_simulated_record_is_the_machines_statics() -> None:
     displaced = malta.plant_of(replace(controller.parameters, phi_c=0.5))
     reference = partial(slow_stroke, way=3.0)
     run = malta.simulate(displaced, controller, Scenario("slow", 6.0, reference, noise=1.0, quantize=True))
-    found = record(log_of(run), displaced)
+    found = record(force_log(run), displaced)
     truth = static_feedforward(displaced)
     off = np.abs(found.v0 - np.array([truth.at(float(z)) for z in found.z_grid])).max(axis=0)
     assert off[4] < 0.05
@@ -107,7 +107,7 @@ def test_observed_disturbances_record_as_well() -> None:
     heavier = malta.plant_of(replace(spec.parameters, m=0.40))
     run = malta.simulate(heavier, observing, Scenario("slow", 6.0, partial(slow_stroke, way=3.0)))
     assert run.verdict.completed
-    found = record(log_of(run), heavier)
+    found = record(force_log(run), heavier)
     truth = static_feedforward(heavier)
     off = np.abs(found.v0 - np.array([truth.at(float(z)) for z in found.z_grid]))
     assert off[:, :4].max() < 0.03
@@ -132,7 +132,7 @@ def test_a_log_reads_as_it_was_written(plant: Plant, tmp_path: Path) -> None:
 def test_a_saved_run_is_a_log(plant: Plant, tmp_path: Path) -> None:
     run = malta.simulate(plant, malta.gains.read(ROBUST), Scenario.stroke(noise=1.0))
     found = read_log(save(run, tmp_path / "run.npz"), plant)
-    for one, other in zip(found[1:], log_of(run)[1:], strict=True):
+    for one, other in zip(found[1:], force_log(run)[1:], strict=True):
         assert np.array_equal(one, other)
 
 
@@ -249,7 +249,7 @@ def test_the_gain_file_holds_the_recorded_v0(run: Run, recorded: Experiment, tmp
 
 def test_a_second_record_keeps_the_name(recorded: Experiment) -> None:
     assert recorded.controller is not None
-    table: Any = record(log_of(recorded.cases[0].run), recorded.run.plant)
+    table: Any = record(force_log(recorded.cases[0].run), recorded.run.plant)
     again = with_recorded(recorded.controller, table)
     assert again.name == recorded.controller.name
     values: FloatArray = again.feedforward.v0

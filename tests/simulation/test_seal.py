@@ -298,9 +298,10 @@ def test_model_and_experiments_are_in_the_revision(plan: Plan, monkeypatch: pyte
         arguments = (plan.plant, plan.controller, planned_run(plan).scenario)
         found.append(revision_of.__wrapped__(*arguments)["machine"])
     assert found[0] != found[1]
-    assert names[:2] == ["malta.machines.tubular.plant", "malta.machines.tubular.experiments"]
+    own = "malta.machines.tubular"
+    assert names[:3] == [f"{own}.plant", f"{own}.parameters", f"{own}.experiments"]
     monkeypatch.undo()
-    assert len(identity._module_parts(names[1])) > len(identity._module_parts(names[0])) == 2
+    assert len(identity._module_parts(names[2])) > len(identity._module_parts(names[0])) == 2
 
 
 def test_a_worker_of_another_revision_is_refused(plan: Plan) -> None:

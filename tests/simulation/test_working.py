@@ -26,7 +26,7 @@ from malta.simulation.engine.engines import (
     translate,
 )
 from malta.simulation.engine.instructions import Counts
-from malta.simulation.engine.integration_state import Identities, conserved, linear_parts
+from malta.simulation.engine.integration_state import Identities, find_conserved, linear_parts
 from malta.simulation.layout import ending_columns, numbers_of, with_symbols
 from malta.simulation.period import Period, columns_of
 from malta.simulation.scenario import Scenario, setup_of
@@ -89,12 +89,12 @@ def _symbolic(design: Design) -> tuple[Any, Any, Any, Any]:
 def test_spin_of_a_round_mover_is_conserved(designs: dict[str, Design]) -> None:
     """gamma' + sin(beta) alpha' is what no force of the machine changes; a torque about the axis does."""
     rate, x, _, _ = _symbolic(designs["table2"])
-    ((k, j, s),) = conserved(x, rate)
+    ((k, j, s),) = find_conserved(x, rate)
     assert (k, j) == (SPIN, 9)
     assert ca.is_equal(s, ca.sin(x[4]), 2)
     torque = ca.SX.sym("torque")
-    assert conserved(x, rate + torque * ca.DM([0] * 11 + [1])) == []
-    assert conserved(x, rate + 1e-30 * x[11] * ca.DM([0] * 11 + [1])) == []
+    assert find_conserved(x, rate + torque * ca.DM([0] * 11 + [1])) == []
+    assert find_conserved(x, rate + 1e-30 * x[11] * ca.DM([0] * 11 + [1])) == []
 
 
 def test_what_is_almost_conserved_is_not() -> None:
@@ -108,10 +108,10 @@ def test_what_is_almost_conserved_is_not() -> None:
     ):
         push = u * ca.cosh(x[1])
         rate = ca.vertcat(x[2], x[3], push, -wave * push - last * x[2])
-        assert len(conserved(x, rate)) == count
+        assert len(find_conserved(x, rate)) == count
     # s may depend on positions only
     rate = ca.vertcat(x[2], x[3], u, -x[3] * u)
-    assert conserved(x, rate) == []
+    assert find_conserved(x, rate) == []
 
 
 def test_polynomials_are_compared_exactly() -> None:

@@ -16,7 +16,7 @@ from malta.firmware.signals import Target
 from malta.gains.certified import origin_of
 from malta.gains.encodings import content_sha256, encode
 from malta.loops.sampled_loops import machine_system
-from malta.margins.scheduled_loops import cells_of
+from malta.margins.scheduled_loops import loops_between_places
 from malta.margins.travel import travel_margin, worst_sensitivities
 from malta.proof.uncertain import instability
 from malta.simulation.references import Motion
@@ -112,7 +112,7 @@ def test_the_engines_and_the_c_code_fly_the_same(spec: Any, controller: Controll
 def test_the_loop_between_places_is_that_of_the_law_there(spec: Any, controller: Controller) -> None:
     """The system and the law of the proof, closed by hand, beside the machine's own loop, at random places."""
     plant, rng = spec.plant, np.random.default_rng(4)
-    cells = cells_of(plant, controller, ("R", "m"), "lag")
+    cells = loops_between_places(plant, controller, ("R", "m"), "lag")
     assert not isinstance(cells, str)
     for system, F, (low, high) in cells:
         for r in rng.uniform(low, high, 3):
@@ -276,7 +276,7 @@ def test_a_pid_is_scheduled_by_its_gains_alone() -> None:
         for one, model in zip((spec.replace({"pid.Kp.f": 6e3}), spec), models, strict=True)
     ]
     found = malta.synthesis.schedule_laws(laws, "y")
-    cells = cells_of(plant, found, ("m",), "lag")
+    cells = loops_between_places(plant, found, ("m",), "lag")
     assert not isinstance(cells, str)
     ((system, F, _),) = cells
     assert F.D.shape == (2, 2)

@@ -13,10 +13,10 @@ from malta.cli.documents.loops import (
     Number,
     Part,
     ShareOfRuns,
+    as_key,
     loop_fields,
     merits_of,
     with_keys,
-    words_of,
 )
 from malta.units import distinct, identifier
 
@@ -301,7 +301,7 @@ def tolerance_fields(found: Tolerances) -> dict[str, Any]:
         "wanted": found.wanted,
         "today": ShareOfRuns.of(found.today),
         "spreads": {
-            words_of(spread.name): SpreadPart.of(
+            as_key(spread.name): SpreadPart.of(
                 spread, spread=spread_of(found, spread), at_least=spread.factor == spread.widest
             )
             for spread in found.spreads
@@ -321,7 +321,7 @@ def _run_part(found: Summary, runs: Runs, row: int) -> RunPart:
 
     plant, batch = found.plan.plant, runs.batch
     outputs = [identifier(signal.name, signal.unit) for signal in plant.outputs]
-    contacts = distinct(map(words_of, plant.contacts))
+    contacts = distinct(map(as_key, plant.contacts))
     return RunPart(
         run=int(runs.index[row]),
         end=verdicts(plant)[int(batch.verdict[row])],

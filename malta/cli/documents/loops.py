@@ -96,14 +96,14 @@ def merits_of(merits: Iterable[Merit]) -> dict[str, Number]:
     return {name: merit.value for name, merit in by_identifier(merits).items()}
 
 
-def words_of(label: str) -> str:
+def as_key(label: str) -> str:
     """A label as a key: `+ current loops` is current_loops."""
     return "_".join(re.findall(r"\w+", label))
 
 
 def with_keys(table: Mapping[str, Any]) -> dict[str, Any]:
     """A table whose keys are labels, with keys that are identifiers."""
-    return dict(zip(distinct(map(words_of, table)), table.values(), strict=True))
+    return dict(zip(distinct(map(as_key, table)), table.values(), strict=True))
 
 
 Poles = list[tuple[float, float]]

@@ -13,13 +13,14 @@ import numpy as np
 from scipy.special import ndtr
 
 from malta.errors import InputError
+from malta.machines.halbach.parameters import GAP
 from malta.model.equations import note
 from malta.model.plant import Signal
 from malta.model.sensors import Electronics
 from malta.simulation.period import runge_kutta
 
 if TYPE_CHECKING:
-    from malta.machines.halbach.plant import Parameters
+    from malta.machines.halbach.parameters import Parameters
     from malta.model.plant import FloatArray
 
 
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 
 
 PHASES = (0.0, 2 * math.pi / 3, -2 * math.pi / 3)  # electrical angles of a, b, c
-# m, air gap at which A and K_e stand: Sec. 2.3. NOTE: the paper does not say at which gap A was measured; it has one.
-GAP = 0.4e-3
 COS, SIN = ca.DM([math.cos(p) for p in PHASES]), ca.DM([math.sin(p) for p in PHASES])
 
 

@@ -39,7 +39,7 @@ from malta.model.plant import (
 )
 
 if TYPE_CHECKING:
-    from malta.machines.planar.plant import Parameters
+    from malta.machines.planar.parameters import Parameters
     from malta.model.plant import FloatArray
 
 

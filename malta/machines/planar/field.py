@@ -21,16 +21,16 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
+from malta.machines.planar.parameters import COIL_ORDER
 from malta.model.equations import look_up, note
 from malta.model.plant import readonly
 
 if TYPE_CHECKING:
-    from malta.machines.planar.plant import Parameters
+    from malta.machines.planar.parameters import Parameters
     from malta.model.plant import FloatArray
 
 
 ORDER = 60  # of the field: the last harmonic has decayed to 2e-5 at z = 1 mm
-COIL_ORDER = 16  # of the wrench: the mean over a coil makes higher ones negligible; see test_planar.py
 # Harmonic orders in x and y are `sin` (1) or `cos` (0) in the coil's position: mirroring the coil at x = 0 turns the
 # signs of F_x, T_y and T_z, mirroring it at y = 0 those of F_y, T_x and T_z.
 ODD_X = (1, 0, 0, 0, 1, 1)

@@ -13,7 +13,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.machines.planar import commutation
 from malta.machines.planar import plant as planar
-from malta.machines.planar.field import COIL_ORDER
+from malta.machines.planar.parameters import COIL_ORDER
 from malta.model.linearize import linearize
 from malta.model.plant import Plant
 from malta.simulation import references

@@ -20,7 +20,7 @@ from malta.model.sensors import CurrentSensors, Drive
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from malta.machines.tubular.plant import Parameters
+    from malta.machines.tubular.parameters import Parameters
 
 
 # Windings: the two-directional dq transformation, and position sensing by Hall sensors.

@@ -9,7 +9,6 @@ a mover out of balance are those of drive.py and plant.py.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -25,6 +24,7 @@ from malta.machines.tubular.drive import (
     levers,
     potential,
 )
+from malta.machines.tubular.parameters import Parameters as Parameters
 from malta.model.equations import (
     EXACT,
     SMALL_ANGLE,
@@ -37,7 +37,6 @@ from malta.model.equations import (
     rotate,
     rotation,
 )
-from malta.model.parameters import check_parameters, si
 from malta.model.plant import (
     Actuator,
     Plant,
@@ -67,68 +66,6 @@ def centre_of_gravity(par: Parameters, q_r: Any, trig: Trig = EXACT) -> Any:
 def second_derivative(r: Any, q: Any, dq: Any, ddq: Any) -> Any:
     """r'' of an expression r of q; q and dq are CasADi SX symbols."""
     return ca.jtimes(ca.jtimes(r, q, dq), q, dq) + ca.jtimes(r, q, ddq)
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """Physical parameters, SI. data/tubular.toml has the source of each."""
-
-    m: float = si("kg", above=0)  # mover with magnets
-    I_xx: float = si("kg m^2", above=0)  # moments of inertia in frame R
-    I_yy: float = si("kg m^2", above=0, twin="I_xx")
-    I_zz: float = si("kg m^2", above=0)
-    K_A: float = si("N/m", at_least=0)  # attraction per module (a negative stiffness)
-    K_B: float = si("N/A", above=0)  # bearing force per module
-    K_D: float = si("N/A", above=0)  # drive force per module
-    l_B: float = si("m", above=0)  # origin to bearing plane
-    l_S: float = si("m", above=0)  # origin to sensor plane
-    L_p: float = si("m", above=0)  # pole size
-    g: float = si("m/s^2", at_least=0)
-    F_c: float = si("N", at_least=0)  # cogging amplitude
-    phi_c: float = si("rad")  # cogging phase
-    R: float = si("ohm", above=0)  # phase winding
-    L: float = si("H", above=0)
-    Psi: float = si("Wb", above=0)  # flux linkage
-    K_ind: float = si("V s/m", above=0)  # induced voltage
-    V_dc: float = si("V", above=0)  # DC link
-    C_dc: float = si("F", above=0)
-    V_max: float = si("V", above=0)  # phase-voltage limit
-    I_max: float = si("A", above=0)  # current limit per dq axis
-    f_pwm: float = si("Hz", above=0)
-    T_cc: float = si("s", above=0)  # period of the current controllers
-    w_cc: float = si("rad/s", above=0)  # crossover of the current loops
-    pm_cc: float = si("rad", above=0)  # phase margin of the current loops
-    T_d: float = si("s", at_least=0, shapes=True)  # dead time of computation and hold
-    z_max: float = si("m", above=0)  # axial travel, either way
-    r_max: float = si("m", above=0)  # radial travel, either way: touchdown
-    s_r: float = si("m", at_least=0)  # radial sensors' noise, rms of a sample and of the four
-    s_z: float = si("m", at_least=0)  # axial sensor noise, rms of a sample
-    dp: float = si("m", at_least=0)  # radial sensor resolution
-    k_t: float = si("N/m", above=0)  # touchdown bearing, each
-    d_t: float = si("N s/m", at_least=0)
-    R_dc: float = si("ohm", above=0)  # supply and cable in front of the DC link
-    f_clk: float = si("Hz", above=0)  # clock of the pulse-width modulators
-    t_dead: float = si("s", at_least=0)  # dead time of the half-bridges
-    dK_A: float = si("1", above=-1, below=1, default=0)  # K_A (1 - dK_A) of module 1, K_A (1 + dK_A) of 2
-    dK_B: float = si("1", above=-1, below=1, default=0)  # the same of K_B
-    kappa: float = si("1", at_least=0, default=0)  # growth of K_A up to touchdown, over K_A
-    e_x: float = si("m", default=0)  # magnetic centre, as the sensors see it
-    e_y: float = si("m", default=0)
-    c_x: float = si("m", default=0)  # centre of gravity off the mover's axis, in frame R
-    c_y: float = si("m", default=0)
-    s_i: float = si("A", at_least=0, default=0)  # noise of a current sensor, rms of a sample
-    d_i: float = si("A", default=0)  # offset of each current sensor, with signs of drive.py
-    q_i: float = si("A", at_least=0, default=0)  # steps of a current sensor
-    tau_s: float = si("s", at_least=0, default=0)  # lag of the radial sensors and their demodulation
-    T_s: float = si("s", at_least=0, shapes=True, default=0)  # dead time of all position sensors
-    n_x1: float = si("1", at_least=0, default=1)  # noise of a radial sensor, over s_r
-    n_y1: float = si("1", at_least=0, default=1)
-    n_x2: float = si("1", at_least=0, default=1)
-    n_y2: float = si("1", at_least=0, default=1)
-    preset: str = "custom"
-
-    def __post_init__(self) -> None:
-        check_parameters(self, "tubular.Parameters")
 
 
 POSITIONS = tuple(Signal(n, "m") for n in "xyz") + tuple(Signal(n, "rad") for n in ("alpha", "beta", "gamma"))

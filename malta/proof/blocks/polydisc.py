@@ -42,7 +42,8 @@ from malta.proof.polynomial.family import Family, align, combine
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
-    from malta.proof.problem import OfLoop, Polynomial
+    from malta.proof.polynomial.enclosure import Polynomial
+    from malta.proof.problem import OfLoop
 
 
 # The characteristic polynomials of a loop with complex blocks, over a box of parameters.
@@ -99,7 +100,7 @@ def parts_of(
         disc = arb(0, max(b.unit, r) * (1 + 1e-9)) if known else arb(0, b.unit)
         for i in pins:
             p[i] = acb(disc, disc)
-    groups = (problem if known else replace(problem, neglect=False)).parts(p)
+    groups = problem.parts(p, neglect=known)
     found: list[Part] = []
     owners = _owners([f for f, _ in groups], blocks)
     for (f, moves), acting in zip(groups, owners, strict=True):
@@ -264,7 +265,7 @@ def _level(part: Part, level: int, target: float, sizes: Sequence[Size], until: 
     while not search.finished:
         if search.count > MOST_CELLS or clock.monotonic() > until:
             return False, search.count
-        advance(search)
+        search = advance(search)
     return True, search.count
 
 

@@ -459,7 +459,7 @@ def _cells(
     while not search.finished:
         if search.count > MOST_CELLS or search.blocked < search.target:
             raise CheckError(f"no certificate: not proven within {search.count} cells")
-        advance(search)
+        search = advance(search)
     cells, boxes, c = search.excluded(len(v))
     return [
         [int(branch), a, b, own, z.real, z.imag]

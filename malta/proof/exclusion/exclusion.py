@@ -9,7 +9,7 @@ them, so that `lower`, the smallest t of a cell that is still open, only grows: 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
@@ -225,7 +225,7 @@ class CellBounds(NamedTuple):
     )
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Search:
     """Open and finished cells of one family. `lower`: zero is excluded on every box(t) with t below it."""
 
@@ -243,7 +243,7 @@ class Search:
     hasty: bool = False  # whether few cells are cut several times at once
     # the smallest t of a cell that no splitting frees of zero, as the radius is larger than f
     blocked: float = np.inf
-    done: list[tuple[FloatArray, FloatArray, ComplexArray]] = field(default_factory=list)
+    done: tuple[tuple[FloatArray, FloatArray, ComplexArray], ...] = ()
 
     @property
     def lower(self) -> float:
@@ -264,7 +264,9 @@ class Search:
         """The open cell of smallest t."""
         if not len(self.cells):
             return None
-        k = int(self.smallest.argmin())
+        return self._cell(int(self.smallest.argmin()))
+
+    def _cell(self, k: int) -> Cell:
         b, lo, hi = self.cells[k]
         return Cell(int(b), (float(lo), float(hi)), self.boxes[k], float(self.smallest[k]))
 
@@ -273,9 +275,7 @@ class Search:
         stuck = (self.depth >= STUCK) & (self.smallest < self.target)
         if not stuck.any():
             return None
-        k = int(np.lexsort((-self.depth, np.where(stuck, self.smallest, np.inf)))[0])
-        b, lo, hi = self.cells[k]
-        return Cell(int(b), (float(lo), float(hi)), self.boxes[k], float(self.smallest[k]))
+        return self._cell(int(np.lexsort((-self.depth, np.where(stuck, self.smallest, np.inf)))[0]))
 
 
 def start(family: Family, growth: Growth, target: float, until: float = np.inf) -> Search:
@@ -286,32 +286,32 @@ def start(family: Family, growth: Growth, target: float, until: float = np.inf) 
     return Search(family, growth, cells, boxes, growth.smallest(boxes), zero, target)
 
 
-def advance(s: Search) -> None:
-    """Take a batch of open cells of the smallest t: exclude zero from them, or split them."""
+def advance(s: Search) -> Search:
+    """The search after a batch of open cells of the smallest t: zero is excluded from them, or they are split."""
     batch = s.smallest < s.target
     if not batch.any():
-        return
+        return s
     most = max(16, min(BATCH, 4_000_000 // max(1, s.family.values.shape[1] * 8)))
     if batch.sum() > most:
         order = np.argpartition(s.smallest, most)
         batch = np.zeros(len(s.cells), dtype=bool)
         batch[order[:most]] = True
     cells, boxes, depth = s.cells[batch], s.boxes[batch], s.depth[batch]
-    s.cells, s.boxes, s.smallest, s.depth = (
-        s.cells[~batch],
-        s.boxes[~batch],
-        s.smallest[~batch],
-        s.depth[~batch],
-    )
-    s.count += len(cells)
     found = _expanded(s, cells, boxes)
     terms, radius = found.terms, found.radius
     c = half_plane([*terms, found.discs], radius)
     if found.sure is not None:
         c = np.where(c == 0, found.sure, c)
     good = c != 0
-    if good.any():
-        s.done.append((cells[good], boxes[good], c[good]))
+    s = replace(
+        s,
+        cells=s.cells[~batch],
+        boxes=s.boxes[~batch],
+        smallest=s.smallest[~batch],
+        depth=s.depth[~batch],
+        count=s.count + len(cells),
+        done=(*s.done, (cells[good], boxes[good], c[good])) if good.any() else s.done,
+    )
     bad = ~good
     if bad.any():
         narrow = cells[:, 2] - cells[:, 1] < NARROW * cells[:, 2]  # the radius is not the expansion's
@@ -319,10 +319,11 @@ def advance(s: Search) -> None:
         hopeless = bad & (
             narrow & (spread < HOPELESS * radius) | (spread < HOPELESS * found.discs.real.max(axis=1))
         )
-        s.blocked = min(s.blocked, float(s.growth.smallest(boxes[hopeless]).min(initial=np.inf)))
+        blocked = min(s.blocked, float(s.growth.smallest(boxes[hopeless]).min(initial=np.inf)))
         moves = [m[bad] for m in found.moves]
         kept = CellBounds([t[bad] for t in terms], radius[bad], found.lasting[bad], found.discs[bad], moves)
-        _split(s, cells[bad], boxes[bad], depth[bad], kept)
+        s = _split(replace(s, blocked=blocked), cells[bad], boxes[bad], depth[bad], kept)
+    return s
 
 
 def _spread(terms: list[ComplexArray]) -> FloatArray:
@@ -385,7 +386,7 @@ def _split(
     boxes: FloatArray,
     depth: FloatArray,
     found: CellBounds,
-) -> None:
+) -> Search:
     """Split each cell in two across the axis that moves f most: frequency, a parameter or a further axis."""
     shape, terms, radius = s.family.shape, found.terms, found.radius
     count = terms[0].shape[1]
@@ -419,9 +420,13 @@ def _split(
             halves.append((c, b))
         cells, boxes = (np.vstack(pair) for pair in zip(*halves, strict=True))
         sizes, depth = np.hstack([sizes, sizes]), np.tile(depth + 1, 2)
-    s.cells, s.boxes = np.vstack([s.cells, cells]), np.vstack([s.boxes, boxes])
-    s.smallest = np.concatenate([s.smallest, s.growth.smallest(boxes)])
-    s.depth = np.concatenate([s.depth, depth])
+    return replace(
+        s,
+        cells=np.vstack([s.cells, cells]),
+        boxes=np.vstack([s.boxes, boxes]),
+        smallest=np.concatenate([s.smallest, s.growth.smallest(boxes)]),
+        depth=np.concatenate([s.depth, depth]),
+    )
 
 
 def _rounds(count: int) -> int:

@@ -32,7 +32,8 @@ from malta.proof.problem import hurwitz
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
     from malta.proof.box import Box
-    from malta.proof.problem import Polynomial, Problem
+    from malta.proof.polynomial.enclosure import Polynomial
+    from malta.proof.problem import Problem
 
 
 BITS = 640  # of balls: Bernstein coefficients of degree d lose about 2 d of them
@@ -356,7 +357,10 @@ class Cell(NamedTuple):
 
 @dataclass(eq=False)
 class Signs:
-    """The functions of all groups, and the cells that are left. `lower`: all are positive on every smaller box(t)."""
+    """The functions of all groups, and the cells that are left. `lower`: all are positive on every smaller box(t).
+
+    It changes in place: time that is up may end any step of it, and what was found before then stands.
+    """
 
     reach: Any  # the box that the functions cover
     upper: float = math.inf

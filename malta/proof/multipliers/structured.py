@@ -29,7 +29,6 @@ from malta.proof.multipliers.multipliers import (
 )
 from malta.proof.multipliers.pencil import TERMS, Rows
 from malta.proof.polynomial.rational import TooLarge
-from malta.proof.problem import OfLoop, OfPolynomial, OfSeveral, Problem
 from malta.proof.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -37,7 +36,9 @@ if TYPE_CHECKING:
 
     from malta.model.plant import FloatArray
     from malta.proof.box import Box
+    from malta.proof.groups import UncertainLoop
     from malta.proof.multipliers.pencil import Pencil
+    from malta.proof.problem import Problem
 
 NEAR = 0.98  # beta up to which splitting frequency is expected to do
 NARROWEST = 1e-9  # of an interval of frequency, relative; of a part of a box, in sides of box(1)
@@ -126,13 +127,14 @@ class Step(NamedTuple):
 
 @dataclass(eq=False)
 class Structured:
-    """The groups of loops, and the largest t for which box(t) is proven as stable as the nominal values."""
+    """The groups of loops, and the largest t for which box(t) is proven as stable as the nominal values.
+
+    It changes in place: time that is up may end any step of it, and what was proven before then stands.
+    """
 
     rows: list[Rows]
     box: Box
-    until: float
     most: int = 1_000_000  # cells
-    report: Callable[[float], None] | None = None  # of each t that is proven
     lower: float = 0.0
     count: int = 0
     layers: list[Layer] = field(default_factory=list, repr=False)
@@ -144,26 +146,30 @@ class Structured:
     _open: tuple[float, list[Cell]] | None = None
     _branches: dict[Any, tuple[Pencil | None, dict[Any, Branch]]] = field(default_factory=dict, repr=False)
 
-    def late(self, until: float = math.inf) -> bool:
-        return clock.monotonic() > min(until, self.until) or self.count >= self.most
+    def _is_late(self, until: float) -> bool:
+        return clock.monotonic() > until or self.count >= self.most
 
-    def raise_bound(self, target: float) -> float:
+    def raise_bound(
+        self, target: float, until: float = math.inf, report: Callable[[float], object] = lambda _: None
+    ) -> float:
         """Prove box(target), or smaller boxes when that takes too long; a further call continues the work.
+
+        until : time.monotonic() at which it ends; report : called with each t that is proven
 
         Raises TimeUp within a time_limit.
         """
         if not self.lower:
-            self._order = self._prove_whole(target)
+            self._order = self._prove_whole(target, until, report)
         t, begun = self._next(target), self._open
-        while self.lower < t and (t == target or t > LAST_STEP * self.lower) and not self.late():
+        while self.lower < t and (t == target or t > LAST_STEP * self.lower) and not self._is_late(until):
             if begun is not None and self.lower < begun[0] <= target:
                 t, cells = begun
             else:
                 cells = self._begin(self._order or self.cover(t), t)
             begun, now = None, clock.monotonic()
-            found = self._prove(cells, now + PATIENCE * (self.until - now), self._shown[t], split=True)
+            found = self._prove(cells, now + PATIENCE * (until - now), self._shown[t], split=True)
             if found.cell is None:
-                self._raise_to(t)
+                self._raise_to(t, report)
                 t = self._next(target)
             elif not self.lower:
                 break
@@ -179,12 +185,11 @@ class Structured:
             return target / 64
         return target if target <= NOT_FAR * self.lower else FIRST_STEP * self.lower
 
-    def _raise_to(self, t: float) -> None:
+    def _raise_to(self, t: float, report: Callable[[float], object]) -> None:
         if t > self.lower:
             self.lower = t
             self.layers.append(Layer(t, tuple(self._shown.pop(t))))
-        if self.report is not None:
-            self.report(self.lower)
+        report(self.lower)
 
     def proof(self) -> Proof:
         """What shows that box(lower) is stable when the nominal loop is."""
@@ -197,25 +202,25 @@ class Structured:
         sides = self.box.sides(t)
         return [replace(cell, sides=sides) for cell in cells]
 
-    def _prove_whole(self, target: float) -> list[Cell]:
+    def _prove_whole(self, target: float, until: float, report: Callable[[float], object]) -> list[Cell]:
         """Prove the largest box possible without a cut, and return the cells of all frequencies, the hardest first."""
-        t, (beta, cells) = target, self._survey(target)
-        while not cells and not self.late() and t > SMALLEST * target:
+        t, (beta, cells) = target, self._survey(target, until)
+        while not cells and not self._is_late(until) and t > SMALLEST * target:
             t /= 2
-            beta, cells = self._survey(t)
+            beta, cells = self._survey(t, until)
         t *= min(1.0, 0.95 / max(beta, 1e-9)) if math.isfinite(beta) else 0.1
         now = clock.monotonic()
-        last = now + 0.7 * (self.until - now)
-        while cells and not self.late(last) and t > SMALLEST * target:
+        last = now + 0.7 * (until - now)
+        while cells and not self._is_late(last) and t > SMALLEST * target:
             found = self._prove(self._begin(cells, t), last, self._shown[t], split=False)
             if found.cell is None:
-                self._raise_to(t)
+                self._raise_to(t, report)
                 break
             cells = _first(cells, found.cell)
             t *= min(0.9, max(0.9 / found.beta, 0.6))
         return cells
 
-    def _survey(self, t: float) -> tuple[float, list[Cell]]:
+    def _survey(self, t: float, until: float) -> tuple[float, list[Cell]]:
         """The largest beta on box(t) at a grid of frequencies, and the cells by falling beta; none: t is too large."""
         found, near = [], None
         for cell in self.cover(t):
@@ -226,7 +231,7 @@ class Structured:
                     return math.inf, []
                 at = math.sqrt(part.low * part.high) if part.low else part.high / 2
                 r, beta = response(own, at, at), math.inf
-                if r is not None and own.channels[0].blocks.real and not self.late():
+                if r is not None and own.channels[0].blocks.real and not self._is_late(until):
                     try:
                         # slopes alone: higher terms are slow, and matter in large boxes only
                         blocks = Blocks(own.channels[0].blocks.real)
@@ -246,7 +251,7 @@ class Structured:
         inner = self.box.sides(self.lower) if self.lower else None
         while todo:
             cell = todo.pop()
-            if self.late(last):
+            if self._is_late(last):
                 return Attempt(math.inf, cell, [cell, *reversed(todo)])
             if inner is not None and split and _within(cell.sides, inner):
                 shown.append(Shown(replace(cell, near=None), None))
@@ -404,12 +409,12 @@ def intervals(rows: Rows, nominal: FloatArray) -> list[tuple[int, float, float]]
 
 def rows_of(problem: Problem) -> list[Rows] | None:
     """The rows of all groups of the loops; None when they are too large or no rational functions of p."""
-    if isinstance(problem, OfSeveral):
-        parts = [rows_of(part) for part in problem.problems]
-        return None if any(part is None for part in parts) else [r for part in parts for r in part or []]
-    if not isinstance(problem, OfLoop | OfPolynomial):
-        return None
-    loop = problem.loop if isinstance(problem, OfLoop) else problem.polynomial.companion
+    found = [_rows_of(loop) for loop in problem.loops]
+    return None if None in found else [rows for several in found for rows in several or ()]
+
+
+def _rows_of(loop: UncertainLoop | None) -> list[Rows] | None:
+    """The rows of one loop's groups."""
     if (
         loop is None
         or loop.symbolic is None

@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from flint import acb, arb, ctx, fmpq
 
@@ -24,7 +24,6 @@ from malta.proof.time_limit import check_time
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
-    from malta.proof.problem import Polynomial
 
 MOST_NODES = 20_000  # places of exact coefficients, at most
 MOST_BALLS = 6000  # places where they take an exponential
@@ -38,6 +37,26 @@ MIDDLE = RADII.index(2.0**12)  # where the search of discs begins
 BITS = 128  # of ball arithmetic, in which numbers of up to 128 bits take the least time
 MOST_BITS = 640  # beyond which a coefficient is taken as the ball that it is
 HOPE = 0.4  # of what the first place took, at least, the others take
+
+
+class Polynomial(Protocol):
+    """A characteristic polynomial: `Characteristic`, or `CoefficientPolynomial`."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def exact(self) -> bool: ...
+    @property
+    def foreign(self) -> tuple[str, ...]: ...
+    @property
+    def inverted(self) -> tuple[bool, ...]: ...
+    @property
+    def degrees(self) -> tuple[int | None, ...]: ...
+    def at(self, v: Sequence[Any]) -> list[Any]: ...
+    def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]: ...
+    def coupling_bounds(
+        self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
+    ) -> list[tuple[float, int]] | None: ...
 
 
 class Unproven(Exception):

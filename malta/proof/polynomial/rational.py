@@ -200,11 +200,11 @@ def expand_matrices(function: ca.Function, nominal: FloatArray) -> tuple[Symboli
     above = [positive.get((k, 0), zero) for k in range(resolved.shapes[-1][0])]
     roots = dict(zip(_roots(s), above[conditions:], strict=True))
 
-    def turned(r: Ratio) -> Ratio:
+    def replace_roots(r: Ratio) -> Ratio:
         return _replace_squares(s, _replace_cosines(s, r, circles), roots)
 
-    tables = [drop_rounding(s, {at: turned(r) for at, r in t.items()}, scales) for t in matrices]
-    return s, tables, [turned(r) for r in above]
+    tables = [drop_rounding(s, {at: replace_roots(r) for at, r in t.items()}, scales) for t in matrices]
+    return s, tables, [replace_roots(r) for r in above]
 
 
 def _roots(s: Symbolic) -> list[int]:

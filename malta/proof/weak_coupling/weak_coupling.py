@@ -35,7 +35,7 @@ from malta.proof.exclusion.exclusion import CellBounds, growth_over, on_boxes
 from malta.proof.expressions import NotAnalytic
 from malta.proof.polynomial.enclosure import Unproven
 from malta.proof.polynomial.family import Family, scale_of
-from malta.proof.problem import Problem, physical
+from malta.proof.problem import Problem, Traits, physical
 from malta.proof.weak_coupling.axes import Axes, axes_of, members_of, state_matrix, stiff_axes
 from malta.proof.weak_coupling.held_currents import Bounds, HeldMachine, dominating_solution
 
@@ -73,7 +73,9 @@ class Coupling:
     weights: FloatArray
     T: float
 
-    def acting(self, g: Axes, N: FloatArray, off: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def onto_group(
+        self, g: Axes, N: FloatArray, off: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The coupling to a group: M0^-1 e in rows of q, q' and a; bounds by coefficients; errors of the first.
 
         N, off : adjugates, K x states x states x nodes, and bounds of their errors
@@ -121,7 +123,7 @@ class _CoupledGroup:
         """The polynomial with bounds by coefficients; M0^-1 e as a family; its rows x inputs x nodes."""
         f = self.plain
         _, _, N, off = self.group.over(self.sides)
-        main, more, off = self.coupling(self.sides).acting(self.group, N, off)
+        main, more, off = self.coupling(self.sides).onto_group(self.group, N, off)
         K, rows, inputs, nodes = main.shape
         beside = Family((rows * inputs, *f.shape), main.reshape(K, -1), off, f.exponents, f.scale)
         return replace(f, radius=f.radius + more), beside, (rows, inputs, nodes)
@@ -200,6 +202,14 @@ class HeldLoop:
             found.append(axes_of(self.machine, self.law, axes, own))
         return tuple(found)
 
+    @property
+    def traits(self) -> Traits:
+        return Traits(enclose=self.enclose)
+
+    @property
+    def loops(self) -> tuple[None]:
+        return (None,)
+
     def instability(self, rows: FloatArray) -> FloatArray:
         return self.places.instability(rows)
 
@@ -209,18 +219,14 @@ class HeldLoop:
     def physical(self, x: float) -> float:
         return physical(x, self.T)
 
-    def parts(self, p: Sequence[Any]) -> list[tuple[Any, tuple[Any, ...]]]:
-        del p
+    def parts(self, p: Sequence[Any], *, neglect: bool = True) -> list[tuple[Any, tuple[Any, ...]]]:
+        del p, neglect
         return [(g, ()) for g in self.groups]
 
     def enclose(self, box: Box, reach: float) -> list[Part]:
-        """The groups with their coupling over box(reach). Raises Unproven when it cannot be bounded."""
+        """The groups with their coupling over box(reach). Raises NotAnalytic or Unproven when it has no bounds."""
         sides = box.sides(reach)
-        try:
-            whole = self._bounds(sides)
-        except NotAnalytic as error:
-            raise Unproven(f"the matrices have no value on the box: {error}") from error
-        known = dict[bytes, Coupling]()
+        whole, known = self._bounds(sides), dict[bytes, Coupling]()
 
         def coupling(inside: FloatArray) -> Coupling:
             """Over a part of the box; over the whole where nothing better is known."""

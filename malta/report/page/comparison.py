@@ -13,7 +13,7 @@ from rich.console import Group
 from rich.text import Text
 
 from malta.errors import InputError
-from malta.merits import Merit, best_of, by_identifier
+from malta.merits import Merit, by_identifier, find_best
 from malta.report.page.analysis import GROUPS, Entry, design_entries, display_unit
 from malta.report.tables.layout import Paragraph, new_table
 from malta.report.verdict import Stair, staircase, verdict_lines
@@ -139,7 +139,7 @@ class Comparison:
             known = [score for score in scores if score is not None]
             if any(score.unit != first.unit for score in known) or not self._is_shown(first):
                 continue
-            best = best_of(scores) if self._is_judged(first) else tuple(False for _ in scores)
+            best = find_best(scores) if self._is_judged(first) else tuple(False for _ in scores)
             rows.append(Row(first.meaning.group, key, first.heading, scores, best))
         order = list(dict.fromkeys(row.group for row in rows))
         return tuple(sorted(rows, key=lambda row: order.index(row.group)))

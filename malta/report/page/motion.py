@@ -251,7 +251,7 @@ def _magnified(bodies: Sequence[Body], poses: FloatArray) -> tuple[FloatArray, f
     return small, max(step * power for step in (1, 2, 5) if step * power <= max(shown, 1.0))
 
 
-def placed(mesh: Mesh, pose: FloatArray) -> FloatArray:
+def place_points(mesh: Mesh, pose: FloatArray) -> FloatArray:
     """The points of a body in the frame of the stator, n x 3."""
     return np.asarray(mesh.points @ np.array(ca.DM(rotation(pose[3:]))) + pose[:3])
 
@@ -281,7 +281,7 @@ def motion_gif(found: Motion, *, size: tuple[int, int] = (520, 320), frames: int
 
     meshes = [mesh_of(body) for body in found.bodies]
     view = camera(found.up, *VIEW)
-    ends = np.vstack([placed(mesh, magnify(found, k, n, found.factor)) @ view.T
+    ends = np.vstack([place_points(mesh, magnify(found, k, n, found.factor)) @ view.T
                       for n, mesh in enumerate(meshes) for k in (0, len(found.t) // 2, len(found.t) - 1)])  # fmt: skip
     shown = np.unique(np.linspace(0, len(found.t) - 1, frames).astype(int))
     pictures = [_draw_frame(found, int(k), meshes, view, ends, size) for k in shown]
@@ -383,7 +383,7 @@ def _draw_frame(
     middle = np.array([big[0] / 2, 0.47 * big[1]])
     polygons = []
     for n, (body, mesh) in enumerate(zip(found.bodies, meshes, strict=True)):
-        points = placed(mesh, magnify(found, k, n, found.factor)) @ view.T
+        points = place_points(mesh, magnify(found, k, n, found.factor)) @ view.T
         flat = middle + scale * (points[:, :2] - (low + high)[:2] / 2) * [1, -1]
         for face in mesh.faces:
             a, b, c = points[list(face[:3])]

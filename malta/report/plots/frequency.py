@@ -19,9 +19,9 @@ from malta.report.plots.panels import (
     decibels,
     draw_level,
     finish_frequency,
-    having,
     head_of,
     loops_of,
+    loops_with_channel,
     margins_text,
     mark,
     new_sheet,
@@ -78,7 +78,7 @@ def bode(
     sheet = new_sheet(title, loops, len(chosen), axes, stacked=2, height=1.75)
     for (name, _), (upper, lower) in zip(chosen, sheet.panels, strict=True):
         lines, shown = [], []
-        for loop, curves, k, margins in having(loops, name, at):
+        for loop, curves, k, margins in loops_with_channel(loops, name, at):
             gain, style = curves.responses.alone(at)[:, k], styles[loop]
             phase = phase_of(curves.w, gain, margins)
             upper.plot(curves.w, decibels(gain), **style)
@@ -254,7 +254,7 @@ def sensitivity_curves(
     sheet = new_sheet(title, loops, len(chosen), axes, stacked=2, height=1.75)
     for (name, _), (upper, lower) in zip(chosen, sheet.panels, strict=True):
         lines, shown = [], []
-        for loop, curves, k, margins in having(loops, name, at):
+        for loop, curves, k, margins in loops_with_channel(loops, name, at):
             style, (_, S, T) = styles[loop], curves.responses.cut(at)
             upper.plot(curves.w, np.abs(S[:, k, k]), **style)
             lower.plot(curves.w, np.abs(T[:, k, k]), **style)
@@ -316,7 +316,7 @@ def gang_of_four(source: Any, controller: Any = None, *, channel: Channel = None
     for row, (name, unit) in enumerate(chosen):
         panels = [panel for (panel,) in sheet.panels[4 * row : 4 * row + 4]]
         shown, force = [], ""
-        for loop, curves, k, _ in having(loops, name, "sensors"):
+        for loop, curves, k, _ in loops_with_channel(loops, name, "sensors"):
             r = curves.responses
             j = min(k, len(curves.loop.inputs) - 1)
             force = curves.loop.inputs[j].unit

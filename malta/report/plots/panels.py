@@ -74,7 +74,7 @@ def chosen_channels(
     return [(name, known[name]) for name in dict.fromkeys(names)]
 
 
-def having(
+def loops_with_channel(
     loops: Mapping[str, LoopCurves], channel: str, at: Place
 ) -> Iterable[tuple[str, LoopCurves, int, ChannelMargins]]:
     """The loops that have a channel: name, curves, the channel's index and its margins."""

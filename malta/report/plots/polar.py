@@ -15,8 +15,8 @@ from malta.report.plots.panels import (
     PLACES,
     chosen_channels,
     decibels,
-    having,
     loops_of,
+    loops_with_channel,
     margins_text,
     mark,
     new_sheet,
@@ -68,7 +68,7 @@ def nyquist(
     title = f"{title_of(loops)}: Nyquist plot {PLACES[at]}", f"{ALONE}; N turns about −1, P unstable poles"
     sheet = new_sheet(title, loops, len(chosen), axes, height=3.3)
     for (name, _), (panel,) in zip(chosen, sheet.panels, strict=True):
-        found = list(having(loops, name, at))
+        found = list(loops_with_channel(loops, name, at))
         window = _window([margins for *_, margins in found])
         _draw_circles(panel)
         lines = []
@@ -186,7 +186,7 @@ def nichols(
     sheet = new_sheet(title, loops, len(chosen), axes, height=3.3)
     for (name, _), (panel,) in zip(chosen, sheet.panels, strict=True):
         lines, phases = [], []
-        for loop, curves, k, margins in having(loops, name, at):
+        for loop, curves, k, margins in loops_with_channel(loops, name, at):
             gain, style = curves.responses.alone(at)[:, k], styles[loop]
             phase, size = phase_of(curves.w, gain, margins), decibels(gain)
             shown = (size > HEIGHTS[0]) & (size < HEIGHTS[1])

@@ -17,8 +17,8 @@ from malta.report.plots.panels import (
     chosen_channels,
     draw_level,
     finish_frequency,
-    having,
     loops_of,
+    loops_with_channel,
     mark,
     new_sheet,
     plain,
@@ -74,7 +74,7 @@ def step(source: Any, controller: Any = None, *, channel: Channel = None, axes: 
     )
     sheet = new_sheet(title, loops, len(chosen), axes, height=2.3)
     for (name, unit), (panel,) in zip(chosen, sheet.panels, strict=True):
-        rows = [(loop, answers[loop], k, k) for loop, _, k, _ in having(loops, name, "sensors")]
+        rows = [(loop, answers[loop], k, k) for loop, _, k, _ in loops_with_channel(loops, name, "sensors")]
         figures = [step_figures(answer, k, column) for _, answer, k, column in rows]
         window = _window(rows, figures)
         lines = []

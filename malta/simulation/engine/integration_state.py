@@ -5,7 +5,7 @@
 It is another set of coordinates of the same motion, in which a step takes fewer operations:
 
 - A rate that belongs to a conserved quantity G = x_k + s(q) x_j is not integrated: x_k = G - s(q) x_j. G is proven to
-  be constant, whatever its value (expressions.conserved); a torque from outside leaves the rate among the others.
+  be constant, whatever its value (find_conserved); a torque from outside leaves the rate among the others.
 - Forces enter the motion as a few linear combinations of the coils' currents. Currents follow their commands as
   first-order lags, so the combinations do, and no step needs the currents themselves.
 """
@@ -112,7 +112,7 @@ def _checked(p: Polynomial) -> Polynomial:
     return p
 
 
-def conserved(x: Any, rate: Any) -> list[Conserved]:
+def find_conserved(x: Any, rate: Any) -> list[Conserved]:
     """Conserved quantities x_k + s(q) x_j of x' = rate with x = (q, q'), for rates x_k and x_j.
 
     The candidates are products s x_j' in the sum that x_k' is; each one is proven by differentiating it. The angular
@@ -264,7 +264,7 @@ def with_working_state(p: Period, plant: Plant, c: Controller, s: Setup) -> Peri
     parts, names, slope = linear_parts(rate, i, theta)
     if parts.numel() > i.numel():
         parts, names, slope = i, i, rate
-    at = Coordinates(x.numel() // 2, conserved(x, rate))
+    at = Coordinates(x.numel() // 2, find_conserved(x, rate))
     held, jitter = ca.SX.sym("held", i.numel()), ca.SX.sym("jitter", 0)
     decay = half_step_decay(plant.actuator.crossover, h)
 

@@ -187,7 +187,7 @@ class ForceLog(NamedTuple):
     v: FloatArray  # N or N m, k x m, commanded forces
 
 
-def log_of(run: Trajectory) -> ForceLog:
+def force_log(run: Trajectory) -> ForceLog:
     """The log of a simulated run of a machine with a stroke."""
     return ForceLog(run.scenario.name, run.t, run.y[:, run.plant.stroke_output], run.v)
 

@@ -31,7 +31,7 @@ from malta.simulation.experiments import (
 from malta.simulation.experiments.recording import (
     ForceLog,
     Recorded,
-    log_of,
+    force_log,
     read_log,
     record,
     require_integral_action,
@@ -332,7 +332,7 @@ def _recorded_from(run: Trajectory, *, required: bool) -> Recorded | None:
     if not run.verdict.completed:
         return None
     try:
-        return record(log_of(run), run.plant)
+        return record(force_log(run), run.plant)
     except InputError as error:
         if required:
             raise CheckError(f"the slow stroke gives no v0: {error}") from error

@@ -93,9 +93,9 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
         published_value(published, "dc_link.speed"),
         published_value(published, "thermal.length") * published_value(published, "thermal.strain"),
         published,
-        strokes_of(controller, spec, published, machines=machines, settle=True),
-        strokes_of(controller, spec, published, machines=round(FEWER * machines), settle=False),
-        strokes_of(
+        fly_strokes(controller, spec, published, machines=machines, settle=True),
+        fly_strokes(controller, spec, published, machines=round(FEWER * machines), settle=False),
+        fly_strokes(
             with_inertia(controller, PUSH), spec, published, machines=round(FEWER * machines), settle=True
         ),
         rests_of_seeds(plant, controller, range(SEEDS)),
@@ -117,7 +117,7 @@ def with_inertia(controller: Controller, factor: float) -> Controller:
     return replace(controller, feedforward=replace(old, inertia=factor * np.asarray(old.inertia)))
 
 
-def strokes_of(
+def fly_strokes(
     controller: Controller, spec: Spec, published: Mapping[str, Any], *, machines: int, settle: bool
 ) -> Strokes:
     """The strokes of machines drawn from the design's uncertainty, after a rest or from the first sample on."""
