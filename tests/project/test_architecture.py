@@ -129,6 +129,12 @@ def test_no_type_comes_from_a_module_that_imports_this_one() -> None:
     assert circles(graph) == []
 
 
+def test_nobody_asks_of_which_class_a_problem_is() -> None:
+    """A proof asks `Problem`: its traits, its loops, its polynomials."""
+    asked = re.compile(r"isinstance\([^)]*\b(OfLoop|OfSeveral|CoefficientPolynomial|HeldLoop)\b")
+    assert [module_of(path) for path in SOURCES if asked.search(path.read_text(encoding="utf-8"))] == []
+
+
 def test_machines_know_nothing_of_each_other() -> None:
     for path in SOURCES:
         own = module_of(path).split(".")[2:3] if package_of(module_of(path)) == "machines" else []
