@@ -49,7 +49,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.model.plant import Actuator as Actuator
     from malta.model.plant import Plant as Plant
     from malta.model.plant import Signal as Signal
-    from malta.model.sensors import LateSensors as LateSensors
+    from malta.model.signals import LateSensors as LateSensors
     from malta.proof.blocks.gain import dynamic_margin as dynamic_margin
     from malta.proof.blocks.gain import worst_case_gain as worst_case_gain
     from malta.proof.robust import robust_margin as robust_margin

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 import malta
-from malta.model.sensors import late_sensors
+from malta.model.signals import late_sensors
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -22,7 +22,7 @@ from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names, twins_of
 from malta.model.plant import Plant, symbolic
-from malta.model.sensors import with_lags
+from malta.model.signals import with_lags
 from malta.simulation.engine.engines import evaluate
 
 if TYPE_CHECKING:

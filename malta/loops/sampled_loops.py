@@ -26,7 +26,7 @@ from malta.model.data import plant_of
 from malta.model.equilibrium import trace, trim
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import off_stroke, position_in, readonly, whole_samples
-from malta.model.sensors import with_lags
+from malta.model.signals import with_lags
 from malta.proof.parametric_plants import of_plant
 from malta.proof.uncertain import Compensator, UncertainSystem, held_gain, is_commutated
 from malta.proof.windings import (

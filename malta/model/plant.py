@@ -19,8 +19,7 @@ import numpy as np
 from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.model.parameters import Parameters as Parameters
-from malta.model.sensors import Drive, Electronics, LateSensors, require_short, split_dead_time
-from malta.model.signals import CasadiFn
+from malta.model.signals import CasadiFn, Drive, Electronics, LateSensors, require_short, split_dead_time
 from malta.model.signals import Signal as Signal
 from malta.model.signals import readonly as readonly
 

@@ -14,7 +14,7 @@ from malta.errors import InputError
 from malta.model.equilibrium import commanded
 from malta.model.parameters import shape_parameters, twins_of, units_of
 from malta.model.plant import Plant, position_in, readonly, symbolic
-from malta.model.sensors import LateSensors, with_lags
+from malta.model.signals import LateSensors, with_lags
 from malta.proof.box import without_branches
 from malta.proof.expressions import NotAnalytic, program
 from malta.proof.polynomial import rational

@@ -41,7 +41,7 @@ if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that dr
     from malta.report.plots import sensitivity_curves as sensitivity_curves
     from malta.report.plots import sigma as sigma
     from malta.report.plots import step as step
-    from malta.report.plots.margin_map import margin_map as margin_map
+    from malta.report.plots.polar import margin_map as margin_map
     from malta.report.tables.campaign import box_text as box_text
     from malta.report.tables.campaign import campaign_tables as campaign_tables
     from malta.report.tables.campaign import rare_event_sentence as rare_event_sentence

@@ -12,7 +12,7 @@ import numpy as np
 from malta.model.data import plant_of
 from malta.model.equations import note
 from malta.model.plant import Actuator
-from malta.model.sensors import Drive
+from malta.model.signals import Drive
 from malta.simulation.layout import Loop, Setup, Signals
 from malta.synthesis.controller import Add
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from malta.model.parameters import acting_names, twins_of
 from malta.model.plant import Plant, symbolic
-from malta.model.sensors import Electronics
+from malta.model.signals import Electronics
 from malta.synthesis.controller import Controller, CurrentLoop, gains_of
 from malta.synthesis.schedule import SCHEDULED
 

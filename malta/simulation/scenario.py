@@ -14,7 +14,7 @@ from malta.display import display
 from malta.errors import InputError
 from malta.model.parameters import replace_fields, units_of
 from malta.model.plant import Plant
-from malta.model.sensors import require_short, split_dead_time
+from malta.model.signals import require_short, split_dead_time
 from malta.simulation import references
 from malta.simulation.layout import FIDELITIES, Fidelity, Setup, electronics_of, fidelities
 from malta.simulation.references import Profile, Reference

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from test_app import BALL, Client, copied, dying_worker
 
-from malta.app import explore
+from malta.app import worker
 from malta.app.files import Edit, fingerprint, open_design
 from malta.app.picture import View, crossovers, solve
 from malta.app.pull import choose_numbers
@@ -147,15 +147,15 @@ def test_every_shipped_design_has_sliders(path: Path) -> None:
 # --- searches ---
 
 
-def searching(path: Path, **values: Any) -> explore.Search:
+def searching(path: Path, **values: Any) -> worker.Search:
     files = open_design(path)
-    return explore.Search(files, files.apply(files.edit(values)), View(), lambda _share: None)
+    return worker.Search(files, files.apply(files.edit(values)), View(), lambda _share: None)
 
 
 @pytest.mark.slow
 def test_candidates_come_nearer_to_what_is_asked_one_after_the_other() -> None:
     weak = {"bases.state.q": 400.0, "noise.process.f": 0.03}
-    found = list(islice(explore.candidates(searching(BALL, **weak)), 2))
+    found = list(islice(worker.candidates(searching(BALL, **weak)), 2))
     ratios = [one["ratio"] for one in found]
     assert ratios == sorted(ratios, reverse=True)
     files = open_design(BALL)
@@ -171,7 +171,7 @@ def test_candidates_come_nearer_to_what_is_asked_one_after_the_other() -> None:
 @pytest.mark.parametrize("name", ["halbach_pid", "ball"])
 def test_the_margins_of_a_front_are_proven_and_below_those_of_eigenvalues(name: str) -> None:
     path = BALL if name == "ball" else shipped_path("design", f"{name}.toml")
-    files, points = open_design(path), list(explore.front(searching(path)))
+    files, points = open_design(path), list(worker.front(searching(path)))
     assert len(points) >= 2
     own = {key: value for key, value in points[0]["values"].items() if files.fields[key].value != value}
     assert own == {}  # the first is the design of the page
@@ -186,8 +186,8 @@ def test_the_margins_of_a_front_are_proven_and_below_those_of_eigenvalues(name: 
 @pytest.mark.parametrize(
     ("path", "task", "says"),
     [
-        (shipped_path("design", "planar.toml"), explore.candidates, "a table of what the design shall reach"),
-        (shipped_path("design", "planar.toml"), explore.front, "specification.margin: found nothing"),
+        (shipped_path("design", "planar.toml"), worker.candidates, "a table of what the design shall reach"),
+        (shipped_path("design", "planar.toml"), worker.front, "specification.margin: found nothing"),
     ],
 )
 def test_a_search_without_a_goal_is_one_sentence(path: Path, task: Any, says: str) -> None:
@@ -198,9 +198,9 @@ def test_a_search_without_a_goal_is_one_sentence(path: Path, task: Any, says: st
 def test_a_machine_that_differs_is_not_tuned_for() -> None:
     files = open_design(BALL)
     edited = files.apply(files.edit({"machine.m": 120.0}, redesign=False))
-    search = explore.Search(files, edited, View(), lambda _share: None)
+    search = worker.Search(files, edited, View(), lambda _share: None)
     with pytest.raises(InputError, match="a design for the machine's numbers"):
-        next(explore.candidates(search))
+        next(worker.candidates(search))
 
 
 def message(task: str, path: Path) -> dict[str, Any]:

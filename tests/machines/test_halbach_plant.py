@@ -20,7 +20,7 @@ from malta.machines.halbach.electronics import IDEAL, REAL, Options
 from malta.machines.halbach.plant import Parameters
 from malta.model.parameters import shape_parameters
 from malta.model.plant import Plant, symbolic
-from malta.model.sensors import Electronics
+from malta.model.signals import Electronics
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

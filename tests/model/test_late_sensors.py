@@ -22,7 +22,7 @@ from malta.loops.time_domain import recovery
 from malta.margins.travel import travel_margin
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
-from malta.model.sensors import LateSensors, split_dead_time, with_lags
+from malta.model.signals import LateSensors, split_dead_time, with_lags
 from malta.proof.uncertain import instability
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate

@@ -12,8 +12,8 @@ import pytest
 from conftest import ROOT, Run, one_sentence, refusal
 
 import malta
-from malta.app.explore import searched_spec
 from malta.app.files import Edit, open_design
+from malta.app.worker import searched_spec
 from malta.report.page.analysis import design_entries
 from malta.report.page.report import subject_of
 from malta.structured.design import design_goals, structured_text, tune_design

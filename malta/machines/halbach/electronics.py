@@ -16,7 +16,7 @@ from malta.errors import InputError
 from malta.machines.halbach.parameters import GAP
 from malta.model.equations import note
 from malta.model.plant import Signal
-from malta.model.sensors import Electronics
+from malta.model.signals import Electronics
 from malta.simulation.period import runge_kutta
 
 if TYPE_CHECKING:

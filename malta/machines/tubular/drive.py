@@ -15,7 +15,7 @@ import casadi as ca
 
 from malta.model.equations import note
 from malta.model.plant import Signal
-from malta.model.sensors import CurrentSensors, Drive
+from malta.model.signals import CurrentSensors, Drive
 
 if TYPE_CHECKING:
     from collections.abc import Callable

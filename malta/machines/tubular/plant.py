@@ -43,7 +43,7 @@ from malta.model.plant import (
     Signal,
     trace,
 )
-from malta.model.sensors import late_sensors
+from malta.model.signals import late_sensors
 
 # The mover's centre of gravity off its axis, by c = (c_x, c_y, 0) in frame R.
 #

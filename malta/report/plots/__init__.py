@@ -4,9 +4,9 @@ from malta.report.plots.frequency import bode as bode
 from malta.report.plots.frequency import gang_of_four as gang_of_four
 from malta.report.plots.frequency import sensitivity_curves as sensitivity_curves
 from malta.report.plots.frequency import sigma as sigma
-from malta.report.plots.margin_map import margin_map as margin_map
 from malta.report.plots.plane import pzmap as pzmap
 from malta.report.plots.plane import root_locus as root_locus
+from malta.report.plots.polar import margin_map as margin_map
 from malta.report.plots.polar import nichols as nichols
 from malta.report.plots.polar import nyquist as nyquist
 from malta.report.plots.time import load_response as load_response
