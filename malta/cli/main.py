@@ -94,7 +94,9 @@ def _name_of(argument: Any) -> str:
 
 
 def renew(args: list[str]) -> list[str]:
-    """Arguments in which replaced options are what replaces them; each one is noted. Raises InputError for two studies.
+    """Arguments in which replaced options are what replaces them; each one is noted.
+
+    Raises InputError for two studies, and for strokes that learn, which are of another command.
 
     >>> renew(["gains.json", "--seed", "3"])
     ['gains.json', '--seed', '3']
@@ -104,6 +106,8 @@ def renew(args: list[str]) -> list[str]:
     studies = [word for word in args if word.partition("=")[0] in (*STUDIES, "--study")]
     if len(studies) > 1:
         raise InputError("malta campaign", "", " and ".join(studies), "one study")
+    if any(word.partition("=")[0] == "--strokes" for word in args):
+        raise InputError("malta simulate", "--strokes", "strokes that learn", "malta learn GAINS --strokes N")
     while rest:
         word = rest.pop(0)
         option, sign, value = word.partition("=")

@@ -637,6 +637,8 @@ def test_options_of_the_version_before_become_what_replaces_them(capsys: pytest.
     assert said[0] == "malta: --distance goes with the next version: write --option distance=5mm"
     assert len(said) == 4
     assert renew(["g.json", "--sobol", "--json"]) == ["g.json", "--study", "sensitivity", "--json"]
+    with pytest.raises(InputError, match="malta learn GAINS --strokes N"):
+        renew(["g.json", "--strokes", "3"])
 
 
 OLD = {
