@@ -342,7 +342,7 @@ def learn(
         list[Path] | None,
         typer.Option(
             metavar="LOG",
-            help="A stroke before, under the same gain file, oldest first: --next weighs by it too.",
+            help="Log of an earlier stroke under the same gain file, oldest first: --next weighs by it too.",
         ),
     ] = None,
     v0: Annotated[
