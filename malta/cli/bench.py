@@ -1,5 +1,7 @@
-"""`malta commission`: the checklist of the first day, on the simulated machine or from a bench's logs.
+"""`malta measure` and `malta commission`: what a bench shows of the machine and its loop.
+
 `malta measure`: the loop as it is measured, with bands, beside what is predicted; or the plan to measure it.
+`malta commission`: the checklist of the first day, on the simulated machine or from a bench's logs.
 """
 
 from __future__ import annotations

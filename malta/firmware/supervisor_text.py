@@ -1,5 +1,6 @@
-"""The supervisor of supervisor.py as C: <name>_supervisor.h and .c, and the fields of its records.
-The exported controller with its supervisor, compiled on this computer: tests, and flights in the simulation.
+"""The supervisor of supervisor.py as C, and that C compiled: <name>_supervisor.h and .c.
+
+What is compiled on this computer is tested and flies in the simulation, beside the exported controller.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""What one stroke teaches about the next one: the thrust that a command makes.
-What holds the machine along a part of its stroke, from the log of a slow stroke: v0(z) of the thrust.
+"""What one stroke teaches about the next one: the thrust that a command makes, and what holds the machine on its way.
+
+v0(z), the thrust that holds it along a part of its stroke, is learned from the log of a slow stroke.
 """
 
 from __future__ import annotations

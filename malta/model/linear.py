@@ -2,7 +2,7 @@
 
     A = A0 + sum of p_i A_i + F(p), and B, C likewise      parameters p by name; none where all entries are known
 
-F has formulas of p, as "-b / J" (formulas.py), for entries that an uncertain system has in its parameters.
+F has formulas of p, as "-b / J", for entries that an uncertain system has in its parameters.
 
 Such a machine is designed for, verified, simulated and flown in campaigns as any other. Its currents are its inputs, d
 are its disturbances. Its gain file carries the matrices, so that reading the file back needs no module.

@@ -1,10 +1,8 @@
 """Signals of a machine and the sensors that read them: records that stand below a plant.
 
-Signals of a machine, arrays of their values, and whether commanded ones are those that its currents make.
+Arrays of values, and whether commanded ones are those that currents make. This module imports none of a model's.
 
-What a plant is made of stands below it: this module imports none of a model's.
-
-Sensors that read late: a first-order lag of each output, and a dead time of all of them.
+Sensors that read late have a first-order lag of each output, and a dead time of all of them:
 
     lag s' = p - s,     y(t) = s(t - dead_time)
 

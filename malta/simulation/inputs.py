@@ -1,5 +1,6 @@
 """Inputs of every sample of a scenario: reference, feedforward, disturbances, faults and noise; and the first state.
-Multisines: periodic excitations whose lines belong to one axis each, so that all axes are excited at once.
+
+Excitations are multisines: periodic, with lines that belong to one axis each, so that all axes are excited at once.
 """
 
 from __future__ import annotations

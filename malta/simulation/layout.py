@@ -51,7 +51,7 @@ class Setup:
     scheduled: bool = False  # the filter uses C at the measured z
     real_pwm: bool = False  # duty cycles with a resolution, dead time
     turning: bool = False  # current controllers in axes that turn with the forces, eq. (18) as printed
-    outside: bool = False  # a Kalman filter of start_up.py makes the estimate
+    outside: bool = False  # a Kalman filter of filterpy makes the estimate
     anticipated: bool = False  # forces beside v0 counter a disturbance that is known in advance
     open_loop: bool = False  # feedforward alone, commutated for the reference
     lagging: bool = False  # sensors with a lag

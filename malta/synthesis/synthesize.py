@@ -1,6 +1,4 @@
-"""The controller that a design file asks for: an LQG, a PID, or a law of a given structure.
-One scheduled law of several that are designed at places along an output.
-"""
+"""The controller that a design file asks for: an LQG, a PID, a law of a given structure; or several as one."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Plots of the loop gain in the plane: Nyquist and Nichols, with the margins drawn in.
-The margin map as a figure: the proven box in the plane of two parameters, and the boundary of stability.
+"""Plots in a plane: Nyquist and Nichols of the loop gain with the margins drawn in, and the margin map.
+
+The margin map shows the proven box in the plane of two parameters, and the boundary of stability.
 """
 
 from __future__ import annotations

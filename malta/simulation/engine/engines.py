@@ -1,6 +1,4 @@
-"""Engines that run control periods of one machine: compiled C, or CasADi's virtual machine where no compiler works.
-A recursion over the samples of a log: compiled C, or CasADi's virtual machine where no compiler works.
-"""
+"""Engines of control periods and of recursions over a log: compiled C, or CasADi's virtual machine without one."""
 
 from __future__ import annotations
 
