@@ -2,7 +2,7 @@
 
 layout, current_control, period          one control period of machine and controller as CasADi functions
 scenario, references, readings, inputs   the reference, and everything that disturbs the machine
-simulate, trajectory, start_up           one machine, its time series, and its observer at the start
+simulate, trajectory                     one machine, its time series, and its observer at the start
 engine                                   the period as C or in CasADi, on one machine or on thousands
 experiments                              scenarios with figures of merit, the fastest stroke among them
 """
