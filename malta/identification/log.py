@@ -86,9 +86,8 @@ class Log:
         known = self.names(group)
         for name in names:
             if name not in known:
-                raise InputError(
-                    self.source, GROUPS[group] + name, "no such column", f"one of {group}: {' '.join(known)}"
-                )
+                wanted = f"one of {group}: {' '.join(known)}" if known else f"a log with its {group}"
+                raise InputError(self.source, GROUPS[group] + name, "no such column", wanted)
         return np.asarray(self.columns[group][:, [known.index(name) for name in names]])
 
     @cached_property
