@@ -33,6 +33,7 @@ BLOCK = re.compile(
     re.MULTILINE | re.DOTALL,
 )
 COMMAND = re.compile(r"^\$ ((?:.*\\\n)*.*)\n?", re.MULTILINE)
+PROGRESS = re.compile(r"malta: .+: (.+, )?[\d.]+ (s|min|h|days)(,.+ left)?")  # a line of how far a command is
 NUMBER = re.compile(r"[-+±]*\d[\d,]*\.?\d*(?:e[-+]?\d+)?")
 
 
@@ -47,6 +48,11 @@ class Example(NamedTuple):
     def agrees(self) -> bool:
         """Whether the page shows what came out."""
         return agrees(self.shown, self.found)
+
+
+def without_progress(text: str) -> str:
+    """What a command says on standard error, but for lines of how far it is: a loaded computer gets some."""
+    return "".join(f"{line}\n" for line in text.splitlines() if not PROGRESS.fullmatch(line))
 
 
 def agrees(shown: str, found: str) -> bool:
@@ -133,7 +139,9 @@ def run_console(block: str, state: Path, titles: Sequence[str] = ("",)) -> list[
             env=environment, capture_output=True, text=True, timeout=600, check=False,
         )  # fmt: skip
         os.chdir(place.read_text(encoding="utf-8").rstrip("\n"))
-        found = (done.stdout + (done.stderr if done.returncode else "")).replace(f"{ROOT}/", "")
+        found = (done.stdout + (without_progress(done.stderr) if done.returncode else "")).replace(
+            f"{ROOT}/", ""
+        )
         lines = [line.rstrip() for line in found.splitlines()]
         tidy = "\n".join(_only(lines, titles)).strip("\n")
         examples.append(Example(command[0].rstrip("\n"), block[command.end() : after].strip("\n"), tidy))

@@ -319,14 +319,6 @@ def design(request: pytest.FixtureRequest, designs: dict[str, Design]) -> Design
 QUANTITY = re.compile(r"[-+±]*\d[\w.+-]*(?: (?:%|[munk]?(?:m|s|N|A|V|J|Hz|rad|kg|g))(?![\w/]))?")
 
 
-PROGRESS = re.compile(r"malta: .+: (.+, )?[\d.]+ (s|min|h|days)(,.+ left)?")  # a line of how far a command is
-
-
-def without_progress(text: str) -> str:
-    """What a command says on standard error, but for lines of how far it is: a loaded computer gets some."""
-    return "".join(f"{line}\n" for line in text.splitlines() if not PROGRESS.fullmatch(line))
-
-
 def printed(renderable: object, width: int = 100) -> str:
     """As a terminal of some columns shows it: no line is longer, and nothing is cut off."""
     stream = io.StringIO()

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Run, without_progress
+from conftest import Run
+from page_examples import without_progress
 from typer.testing import CliRunner
 
 from malta.cli import main as cli

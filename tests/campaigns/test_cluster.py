@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pytest
-from conftest import one_sentence, without_progress
+from conftest import one_sentence
+from page_examples import without_progress
 
 import malta
 from malta.campaigns import dask as cluster

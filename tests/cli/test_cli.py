@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Run, numbers, one_sentence, without_progress
+from conftest import Run, numbers, one_sentence
+from page_examples import without_progress
 from typer.testing import CliRunner
 
 import malta

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 import typer
-from conftest import PROGRESS, ROOT, Run
+from conftest import ROOT, Run
+from page_examples import PROGRESS
 
 from malta.cli import output
 from malta.files import noting_files, replace_files

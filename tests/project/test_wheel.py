@@ -14,7 +14,8 @@ from typing import Any
 from urllib.request import urlopen
 
 import pytest
-from conftest import ROOT, without_progress
+from conftest import ROOT
+from page_examples import without_progress
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = (ROOT / "docs" / "howto" / "commands.md").read_text(encoding="utf-8")
