@@ -106,9 +106,9 @@ def _description(record: Any) -> Description:
     if usual is None:
         usual = {name: field.default for name, field in record.__dataclass_fields__.items()}
     names = getattr(record, "_fields", usual)
-    values = ((name, getattr(record, name)) for name in names)
-    rows = tuple((name, _brief(value)) for name, value in values if value is not usual.get(name, values))
-    return Description(type(record).__name__, rows)
+    values = {name: getattr(record, name) for name in names}
+    told = {name: value for name, value in values.items() if name not in usual or value is not usual[name]}
+    return Description(type(record).__name__, tuple((name, _brief(value)) for name, value in told.items()))
 
 
 def _brief(value: Any) -> str:

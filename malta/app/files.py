@@ -7,13 +7,12 @@ synthesis.design_file. What the page shows is thus what `malta design` makes of 
 from __future__ import annotations
 
 import copy
-import json
 import os
 import re
 import subprocess
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -25,6 +24,7 @@ from malta.errors import CheckError, InputError
 from malta.files import file_exists, replace_files
 from malta.gains import SUFFIXES
 from malta.model.parameters import check_range
+from malta.model.parameters import fingerprint as record_fingerprint
 from malta.processes import environment, python_module
 from malta.synthesis.design_file import resolve_published, spec_of
 from malta.synthesis.spec import integral_signals
@@ -169,12 +169,8 @@ def fingerprint(spec: Spec, truth: Parameters) -> str:
 
     spec, truth : as in `Edited`
     """
-    numbers = asdict(spec) | {"path": "", "machine_file": ""}
-    return json.dumps([numbers, asdict(truth), type(truth).__module__], default=_plain, sort_keys=True)
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if hasattr(value, "tolist") else str(value)
+    nowhere = replace(spec, path=Path(), machine_file=Path())
+    return record_fingerprint((nowhere, truth, type(truth).__module__))
 
 
 def edited_content(files: DesignFiles, edit: Edit) -> dict[str, Any]:

@@ -48,9 +48,7 @@ if TYPE_CHECKING:
 
 
 QUIET = 0.25  # s, after the last move until its proof begins
-SLOW = (
-    0.08  # s of processor time: an eigenvalue margin after which an answer would have taken more follows it
-)
+SLOW = 0.08  # s of processor time of an answer: an eigenvalue margin that would take it beyond follows later
 LONGEST_WAIT = 20.0  # s, of a question for news
 KEPT = 1000  # news of one version
 

@@ -311,9 +311,8 @@ def _columns(content: bytes, begin: int, count: int, used: list[int]) -> list[Fl
         data.seek(begin)
         return io.TextIOWrapper(data, "utf-8")
 
-    only: Any = (
-        used if len(used) < count else None
-    )  # where all are read, their number in each line is checked
+    # Where all are read, their number in each line is checked.
+    only: Any = used if len(used) < count else None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a file without rows, which is refused later
         try:

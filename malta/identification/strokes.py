@@ -310,15 +310,16 @@ def learn_strokes(
     scenario = Scenario.stroke(distance, noise=noise, quantize=noise > 0, settle=0.3)
     still = scenario.replace(noise=0.0, quantize=False)
     first = _fly(plant, controller, scenario.replace(seed=seed), None)
-    errors, quiet, counts = [first], [_fly(plant, controller, still, None)], [0]
-    law = learn(controller, log_of(first)).controller
-    reference = log_of(first).table("reference", [plant.stroke])[:, 0]
+    errors, quiet, counts = [first], [_fly(plant, controller, still, None) if noise else first], [0]
+    log = log_of(first)
+    law = learn(controller, log).controller
+    reference = log.table("reference", [plant.stroke])[:, 0]
     patterns = thrust_patterns(loop(plant_of(law.parameters), law), reference)
     thrust, after = own_thrust(law, scenario, patterns), None
     for k in range(1, strokes):
         run = _fly(plant, law, scenario.replace(seed=seed + k), thrust)
         errors.append(run)
-        quiet.append(_fly(plant, law, still, thrust))
+        quiet.append(_fly(plant, law, still, thrust) if noise else run)
         after = next_stroke(law, log_of(run), patterns, after)
         thrust, counts = after.thrust, [*counts, after.patterns]
     quiet.append(_fly(plant, law, still, thrust))

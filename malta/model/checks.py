@@ -17,7 +17,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.files import PACKAGE
 from malta.model.parameters import symbolic_names
-from malta.model.plant import Plant, same, symbolic
+from malta.model.plant import Plant, outputs_themselves, symbolic
 
 
 def check_signals(plant: Plant) -> None:
@@ -100,7 +100,7 @@ def check_equations(plant: Plant) -> None:
         found = _check_size(plant, name, *question)
         _check_expression(plant, name, found, (x, u, w, y, i))
     half, states = plant.coordinates, len(plant.controlled)
-    if not half and plant.position_of is same and states == 2 * len(plant.outputs):
+    if not half and plant.position_of is outputs_themselves and states == 2 * len(plant.outputs):
         found = "rates of the first half of the states that are not the second half"
         expected = "f = (q', q'') for states (q, q'), or a `position_of` that gives all states at rest"
         raise InputError(plant.name, "f", found, expected)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, field, fields, is_dataclass, replace
 from numbers import Real
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
@@ -27,7 +27,10 @@ class Parameters(Protocol):
     def preset(self) -> str: ...
 
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Record = TypeVar("Record", bound="DataclassInstance")
 
 
 def si(
@@ -201,13 +204,13 @@ def check_range(f: Field[Any], value: object, where: str | Path, name: str) -> N
         raise InputError(where, name, found, f"a finite number{low}{high} in {unit}")
 
 
-def replace_fields(record: T, where: str, fields: Mapping[str, Any]) -> T:
+def replace_fields(record: Record, where: str, fields: Mapping[str, Any]) -> Record:
     """A frozen record with other fields. Raises InputError, named after `where`, for a field that it lacks."""
-    known = getattr(record, "__dataclass_fields__", {})
+    known = record.__dataclass_fields__
     for name in fields:
         if name not in known:
             raise InputError(where, name, "a field that it lacks", "one of " + " ".join(known))
-    return replace(record, **fields)  # type: ignore[type-var]
+    return replace(record, **fields)
 
 
 def fingerprint(record: Any) -> str:

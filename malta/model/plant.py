@@ -392,7 +392,7 @@ def _defaults(plant: Plant) -> dict[str, Any]:
     constants, limit = actuator.force_constant, actuator.current_limit
     return {
         "load": partial(_zeros, w),
-        "position_of": same,
+        "position_of": outputs_themselves,
         "preload": lambda x: plant.forces(x, plant.currents(plant.h(x, ca.DM.zeros(m)), ca.DM.zeros(m))),
         "currents": lambda _, v: v / ca.vertcat(*constants),
         "forces": lambda _, i: ca.vertcat(*constants) * i,
@@ -411,7 +411,7 @@ def _zeros(size: int, x: Any) -> Any:
     return type(x).zeros(size) if isinstance(x, ca.SX | ca.MX | ca.DM) else ca.DM.zeros(size)
 
 
-def same(y: Any) -> Any:
+def outputs_themselves(y: Any) -> Any:
     """The default of `position_of`: the outputs are the positions."""
     return y
 

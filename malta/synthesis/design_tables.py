@@ -263,9 +263,8 @@ def specification_table(requirements: Iterable[Requirement], given: Mapping[str,
     return found
 
 
-@lru_cache(
-    maxsize=16
-)  # pydantic takes longer to make it than to check with it; requirements compare by identity
+# pydantic takes longer to make it than to check with it; requirements compare by identity.
+@lru_cache(maxsize=16)
 def _specification_document(requirements: tuple[Requirement, ...]) -> type[Record]:
     return create_model(
         "DesignFile", __base__=Record, specification=(specification_record(requirements), ...)

@@ -159,9 +159,8 @@ def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: 
     return _solution_of(B.shape, A.tobytes(), B.tobytes(), Q.tobytes(), what, discrete)
 
 
-@lru_cache(
-    maxsize=64
-)  # a slider moves one weight: the equations of other axes, and the filter's, are the same
+# A slider moves one weight: the equations of other axes, and the filter's, are the same.
+@lru_cache(maxsize=64)
 def _solution_of(
     shape: tuple[int, int],
     a: bytes,

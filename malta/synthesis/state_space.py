@@ -201,7 +201,7 @@ class System(NamedTuple):
         states = [
             np.flatnonzero(label == k) for k in np.unique(label)
         ]  # sets of states that nothing joins to each other
-        parts = [_Part(A[np.ix_(i, i)], B[i], C[:, i]) for i in states]
+        parts = [_JoinedStates(A[np.ix_(i, i)], B[i], C[:, i]) for i in states]
 
         def response(s: ComplexArray) -> ComplexArray:
             through = np.tile(D.astype(complex), (len(s), 1, 1))
@@ -215,7 +215,7 @@ SLOW = 1e-6  # of the norm of A: frequencies below it, where the Schur form has 
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class _JoinedStates:
     """C (s - A)^-1 B of states that are joined."""
 
     A: FloatArray
