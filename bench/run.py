@@ -72,7 +72,7 @@ def whole_process(runs: int) -> list[Result]:
     return [Result("design table2, whole process", ours, "its imports alone", bare, "at least 0.67")]
 
 
-def workload(name: str) -> tuple[malta.Plant, Workload]:
+def workload(name: str) -> tuple[malta.model.Plant, Workload]:
     """0.1 s of the stroke with a design's gains: 2000 samples of four Runge–Kutta steps, forces as first-order lags."""
     controller = malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
     par = controller.parameters
@@ -182,7 +182,7 @@ def many(runs: int) -> list[Result]:
     work = nominal._replace(factors=factors, noise=1.0)
     changes = {name: getattr(work.par, name) * factors[:, k] for k, name in enumerate(names)}
     scenario = replace(SCENARIO, noise=1.0)
-    found = malta.simulate_many(plant, work.controller, scenario, changes)
+    found = malta.simulation.simulate_many(plant, work.controller, scenario, changes)
     modules = optional(*dict.fromkeys(peer.module for peer in PEERS))
     peers = [peer for peer in PEERS if peer.module in modules]
 
@@ -196,7 +196,7 @@ def many(runs: int) -> list[Result]:
             assert np.abs(ratio - 1).max() < 1e-9, f"{peer.name} and malta differ: {np.abs(ratio - 1).max()}"
         assert abs(np.median(ratio) - 1) < 0.01, f"{peer.name} and malta differ: {np.median(ratio)}"
     ours, *theirs = medians(
-        lambda: malta.simulate_many(plant, work.controller, scenario, changes),
+        lambda: malta.simulation.simulate_many(plant, work.controller, scenario, changes),
         *calls,
         runs=runs,
         what=f"{MACHINES} machines",
@@ -251,7 +251,9 @@ def campaigns(runs: int) -> list[Result]:
     ]
 
 
-def joblib_loop(plant: malta.Plant, work: Workload, names: Sequence[str]) -> Callable[[], object] | None:
+def joblib_loop(
+    plant: malta.model.Plant, work: Workload, names: Sequence[str]
+) -> Callable[[], object] | None:
     """LOOPED different machines in python-control, on all cores; None without joblib."""
     if not optional("joblib"):
         return None

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from malta.contents import contents
 
 if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
+    from malta import app as app
     from malta import campaigns as campaigns
     from malta import firmware as firmware
     from malta import gains as gains
@@ -25,7 +26,6 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta import simulation as simulation
     from malta import structured as structured
     from malta import synthesis as synthesis
-    from malta.app.server import app_widget as app_widget
     from malta.campaigns.run import campaign as campaign
     from malta.errors import CheckError as CheckError
     from malta.errors import InputError as InputError
@@ -34,9 +34,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.identification.excite import excite as excite
     from malta.identification.identify import identify as identify
     from malta.identification.learn import learn as learn
-    from malta.identification.log_files import read_log as read_log
     from malta.identification.measure import measure as measure
-    from malta.identification.measure import plan_measurement as plan_measurement
     from malta.loops.loop import loop as loop
     from malta.model.data import plant_of as plant_of
     from malta.model.data import read as read
@@ -44,42 +42,37 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.model.linear import linear_machine as linear_machine
     from malta.model.linearize import linearize as linearize
     from malta.model.machines import machine as machine
-    from malta.model.parameters import check_parameters as check_parameters
-    from malta.model.parameters import si as si
-    from malta.model.plant import Actuator as Actuator
-    from malta.model.plant import Plant as Plant
-    from malta.model.plant import Signal as Signal
-    from malta.model.signals import LateSensors as LateSensors
     from malta.proof.blocks.gain import dynamic_margin as dynamic_margin
     from malta.proof.blocks.gain import worst_case_gain as worst_case_gain
     from malta.proof.robust import robust_margin as robust_margin
     from malta.proof.systems import uncertain as uncertain
     from malta.report.ledger import ledger as ledger
     from malta.simulation import references as references
-    from malta.simulation.engine.batch import simulate_many as simulate_many
     from malta.simulation.experiments.catalogue import experiment as experiment
     from malta.simulation.scenario import Scenario as Scenario
     from malta.simulation.simulate import simulate as simulate
     from malta.synthesis.design_file import read_design as read_design
     from malta.synthesis.lqg import lqg as lqg
-    from malta.synthesis.lqg import weights as weights
     from malta.synthesis.spec import Spec as Spec
     from malta.synthesis.synthesize import synthesize as synthesize
     from malta.tuning.tune import tune as tune
     from malta.tuning.verify import verify as verify
-    from malta.units import in_unit as in_unit
 
 # Names that go with the next minor version, and what to write for them.
 _NOW_OF = {
-    "model": "InverseCheck LinearModel OperatingPoint published",
-    "synthesis": "Controller Weights calibrate controller_of kalman lqi lqr",
+    "app": "app_widget",
+    "model": "Actuator InverseCheck LateSensors LinearModel OperatingPoint Plant Signal check_parameters in_unit"
+    " published si",
+    "synthesis": "Controller Weights calibrate controller_of kalman lqi lqr weights",
     "proof": "Compensator Dynamic Gain Margin UncertainSystem margin_of_polynomial",
     "loops": "Loop LoopCurves LoopSystems Recovery loop_curves loop_systems recovery",
     "margins": "LoopReport",
     "campaigns": "Campaign Plan Summary limit_of rare_event sensitivity summarize tolerances",
     "firmware": "Replay engine_of_c replay_on_target",
-    "identification": "ExcitationPlan Identified LawReplay Learned Log log_of replay_law write_log",
-    "simulation": "Batch Experiment Fault Multisine Trajectory fastest_stroke replayed stroke_figures",
+    "identification": "ExcitationPlan Identified LawReplay Learned Log log_of plan_measurement read_log replay_law"
+    " write_log",
+    "simulation": "Batch Experiment Fault Multisine Trajectory fastest_stroke replayed simulate_many"
+    " stroke_figures",
 }
 _OLD = {
     **{name: f"malta.{package}.{name}" for package, names in _NOW_OF.items() for name in names.split()},

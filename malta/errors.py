@@ -98,7 +98,7 @@ class CheckError(ArithmeticError):
     >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [0]], [[1, 0]])  # B = 0
     >>> model = malta.linearize(cart, cart.at())
     >>> try:
-    ...     malta.synthesis.lqr(model, malta.weights([1, 1], [1], [1], [1]))
+    ...     malta.synthesis.lqr(model, malta.synthesis.weights([1, 1], [1], [1], [1]))
     ... except malta.CheckError as error:
     ...     print(str(error).partition(" (")[0])
     LQR: no stabilizing solution

@@ -226,7 +226,7 @@ def in_unit(value: float, unit: str) -> float:
     Raises InputError for an unknown unit.
 
     >>> import malta
-    >>> round(malta.in_unit(16.2e-3, "ms"), 9)
+    >>> round(malta.model.in_unit(16.2e-3, "ms"), 9)
     16.2
     """
     return value / unit_factor(unit, "unit")

@@ -111,7 +111,9 @@ for name, controller in controllers.items():
             for k, share in BOX.items()
         }
         scenario = malta.Scenario.stroke(noise=1.0)
-        shares.append(float(malta.simulate_many(plant, controller, scenario, changes).completed.mean()))
+        shares.append(
+            float(malta.simulation.simulate_many(plant, controller, scenario, changes).completed.mean())
+        )
     yields[name] = np.array(shares)
 
 figure, axes = plt.subplots(figsize=(7.5, 4), layout="constrained")

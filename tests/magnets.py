@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 class Bench:
     """A mass before a magnet, with knobs for how wrong its currents are."""
 
-    m: float = malta.si("kg", above=0)
-    C: float = malta.si("N m^2/A^2", above=0)
-    g0: float = malta.si("m", above=0)
-    bias: float = malta.si("A", at_least=0)
-    k: float = malta.si("N/m")  # spring, negative: a permanent magnet
-    preload: float = malta.si("N")
-    I_max: float = malta.si("A", above=0)
-    lag: float = malta.si("s", at_least=0, shapes=True)  # of the sensors
-    dead_time: float = malta.si("s", at_least=0, shapes=True)  # from measurement to force
+    m: float = malta.model.si("kg", above=0)
+    C: float = malta.model.si("N m^2/A^2", above=0)
+    g0: float = malta.model.si("m", above=0)
+    bias: float = malta.model.si("A", at_least=0)
+    k: float = malta.model.si("N/m")  # spring, negative: a permanent magnet
+    preload: float = malta.model.si("N")
+    I_max: float = malta.model.si("A", above=0)
+    lag: float = malta.model.si("s", at_least=0, shapes=True)  # of the sensors
+    dead_time: float = malta.model.si("s", at_least=0, shapes=True)  # from measurement to force
     kind: str = "knows"
     preset: str = "custom"
 
@@ -50,14 +50,14 @@ def bench(par: Any) -> Plant:
             return ca.sqrt(v / par.C) * par.g0 - par.bias
         return v / slope
 
-    return malta.Plant(
+    return malta.model.Plant(
         name=f"bench that {par.kind}",
         parameters=par,
         variant=bench,
-        states=(malta.Signal("x", "m"), malta.Signal("x_dot", "m/s")),
-        inputs=(malta.Signal("f", "N"),),
-        outputs=(malta.Signal("y", "m"),),
-        disturbances=(malta.Signal("w", "N"),),
+        states=(malta.model.Signal("x", "m"), malta.model.Signal("x_dot", "m/s")),
+        inputs=(malta.model.Signal("f", "N"),),
+        outputs=(malta.model.Signal("y", "m"),),
+        disturbances=(malta.model.Signal("w", "N"),),
         f=lambda x, u, w: ca.vertcat(x[1], (u + w - par.k * x[0]) / par.m),
         h=lambda x, _: x[0],
         load=lambda _: -9.81 * par.m,
@@ -65,8 +65,8 @@ def bench(par: Any) -> Plant:
         currents=currents,
         forces=lambda x, i: par.C * (par.bias + i) ** 2 / (par.g0 - x[0]) ** 2,
         sensors=late_sensors((par.lag,), 0.0),
-        actuator=malta.Actuator(
-            (malta.Signal("i", "A"),), (), par.I_max, force_limit=(40.0,), dead_time=par.dead_time
+        actuator=malta.model.Actuator(
+            (malta.model.Signal("i", "A"),), (), par.I_max, force_limit=(40.0,), dead_time=par.dead_time
         ),
     )
 
@@ -82,24 +82,25 @@ def two_coils(par: Any) -> Plant:
         return (ca.DM(share) + 40 * x[0] * ca.DM([[0, 1, 0], [2, 0, 1]])) @ (par.C * 1e5 * (i + 0.3 * i**2))
 
     right = np.linalg.pinv(np.array(share))
-    return malta.Plant(
+    return malta.model.Plant(
         name="three coils",
         parameters=par,
         variant=two_coils,
         states=tuple(
-            malta.Signal(n, u) for n, u in (("z", "m"), ("a", "rad"), ("z_dot", "m/s"), ("a_dot", "rad/s"))
+            malta.model.Signal(n, u)
+            for n, u in (("z", "m"), ("a", "rad"), ("z_dot", "m/s"), ("a_dot", "rad/s"))
         ),
-        inputs=(malta.Signal("f", "N"), malta.Signal("t", "N m")),
-        outputs=(malta.Signal("p", "m"), malta.Signal("b", "rad")),
-        disturbances=(malta.Signal("w", "N"),),
+        inputs=(malta.model.Signal("f", "N"), malta.model.Signal("t", "N m")),
+        outputs=(malta.model.Signal("p", "m"), malta.model.Signal("b", "rad")),
+        disturbances=(malta.model.Signal("w", "N"),),
         f=lambda x, u, w: ca.vertcat(x[2:], (u[0] + w) / par.m - par.k * x[0], (u[1] + 0.02 * x[1]) / 1e-3),
         h=lambda x, _: x[:2],
         load=lambda _: -9.81 * par.m,
         preload=lambda _: ca.DM([par.preload, 0.1]),
         currents=lambda y, v: ca.DM(right) @ v / (par.C * 1e5) * (1 + 10 * y[0]),
         forces=forces,
-        actuator=malta.Actuator(
-            tuple(malta.Signal(f"i{k}", "A") for k in range(3)),
+        actuator=malta.model.Actuator(
+            tuple(malta.model.Signal(f"i{k}", "A") for k in range(3)),
             (),
             current_limit=60.0,
             force_limit=(40.0, 20.0),

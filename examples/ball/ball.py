@@ -11,7 +11,7 @@ from typing import Any
 
 import casadi as ca
 
-from malta import Actuator, Plant, Signal, check_parameters, si
+from malta.model import Actuator, Plant, Signal, check_parameters, si
 
 
 @dataclass(frozen=True)

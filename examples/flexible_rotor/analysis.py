@@ -16,7 +16,8 @@ import malta
 from . import flexible_rotor
 
 if TYPE_CHECKING:
-    from malta import Controller, Plant
+    from malta.model import Plant
+    from malta.synthesis import Controller
 
 LIMITS = tomllib.loads((Path(__file__).parent / "source" / "limits.toml").read_text(encoding="utf-8"))
 ISO_14839_2 = {name: one["value"] / 100 for name, one in LIMITS["zones"].items()}  # of the clearance

@@ -27,8 +27,9 @@ from malta.simulation.experiments import catalogue as generic
 from . import analysis, flexible_rotor
 
 if TYPE_CHECKING:
-    from malta import Controller, Plant
+    from malta.model import Plant
     from malta.simulation.trajectory import Trajectory
+    from malta.synthesis import Controller
 
 SPEEDS = (100.0, 250.0, 418.0)  # rad/s
 SETTLING, TURNS = 0.3, 8  # s, and revolutions after it of which amplitudes are read

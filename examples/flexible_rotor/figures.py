@@ -15,7 +15,8 @@ from malta.report.figures.inline import InlineFigure
 from . import analysis, flexible_rotor
 
 if TYPE_CHECKING:
-    from malta import Controller, Plant
+    from malta.model import Plant
+    from malta.synthesis import Controller
 
 STYLES = malta.report.STYLES
 RPM = 30 / math.pi

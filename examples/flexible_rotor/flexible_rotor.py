@@ -33,7 +33,8 @@ import casadi as ca
 import numpy as np
 from scipy import linalg
 
-from malta import Actuator, InputError, Plant, Signal, check_parameters, si
+from malta import InputError
+from malta.model import Actuator, Plant, Signal, check_parameters, si
 
 FILE = Path(__file__).resolve().parent / "matrices.csv"
 NODE = 0.1  # m, between two nodes of matrices.csv

@@ -26,12 +26,12 @@ def design() -> Any:
     return malta.read_design(FILE)
 
 
-def controller(plant: malta.Plant) -> malta.Controller:
+def controller(plant: malta.model.Plant) -> malta.Controller:
     """The law as it runs."""
     return malta.synthesize(design(), malta.linearize(plant, plant.at()))
 
 
-def continuous(plant: malta.Plant) -> Any:
+def continuous(plant: malta.model.Plant) -> Any:
     """The law before it is sampled."""
     structure = Structure(places_in(design().structure, malta.linearize(plant, plant.at())))
     return structure.system(np.zeros(len(structure.parameters)))

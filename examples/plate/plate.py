@@ -13,8 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from malta import Actuator, Plant, Signal, check_parameters, si
-from malta.model import Allocation, allocation
+from malta.model import Actuator, Allocation, Plant, Signal, allocation, check_parameters, si
 
 CORNERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))  # of the coils, in a and b
 SENSORS = ((1, 0), (-1, 0), (0, 1))  # of the sensors, in a and b

@@ -32,7 +32,8 @@ from typing import Any
 
 import casadi as ca
 
-from malta import Actuator, InputError, Plant, Signal, check_parameters, si
+from malta import InputError
+from malta.model import Actuator, Plant, Signal, check_parameters, si
 
 MU_0 = 4e-7 * math.pi  # V s/(A m)
 

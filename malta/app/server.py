@@ -206,7 +206,7 @@ def app_widget(design: str | Path | Spec, *, folder: str | Path = ".", height: i
     `pip install 'malta[notebooks]'`. Raises InputError as `malta.read_design`, and where anywidget is missing.
 
     >>> import malta
-    >>> widget = malta.app_widget("design/halbach_pid.toml")
+    >>> widget = malta.app.app_widget("design/halbach_pid.toml")
     >>> widget.session.files.fields["pid.Kp.F_x"].unit
     'N/m'
     >>> widget.close()

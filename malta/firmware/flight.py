@@ -185,7 +185,7 @@ def engine_of_c(
     precision : of the C, "double" or "float"
     step_of : makes what runs at every sample of a run, for the controller's state; by default the controller's own step
 
-    Returns a function for the argument `engine` of `malta.simulate` and `malta.simulate_many`.
+    Returns a function for the argument `engine` of `malta.simulate` and `malta.simulation.simulate_many`.
 
     Raises InputError without a C compiler, and for what the export does not have: another estimator, C at the measured
     position, axes that turn, forces known in advance, an open loop.

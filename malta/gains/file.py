@@ -180,7 +180,7 @@ def write(controller: Controller, margins: LoopReport, *paths: str | Path) -> No
     >>> A, B, C = [[0, 1], [400, 0]], [[0], [2]], [[1, 0]]
     >>> cart = malta.linear_machine(A, B, C, name="cart")
     >>> model = malta.linearize(cart, cart.at())
-    >>> weights = malta.weights([1e6, 0], [1], [1e-2], [1e-12])
+    >>> weights = malta.synthesis.weights([1e6, 0], [1], [1e-2], [1e-12])
     >>> controller = malta.lqg(model, weights, Ts=1e-3)
     >>> margins = malta.verify(model, controller)
     >>> malta.gains.write(controller, margins, "build/cart.json", "build/cart.mat")

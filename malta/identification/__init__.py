@@ -18,9 +18,11 @@ if TYPE_CHECKING:
     from malta.identification.learn import learn_v0 as learn_v0
     from malta.identification.log import Log as Log
     from malta.identification.log import log_of as log_of
+    from malta.identification.log_files import read_log as read_log
     from malta.identification.log_files import write_log as write_log
     from malta.identification.measure import Measurement as Measurement
     from malta.identification.measure import MeasurementPlan as MeasurementPlan
+    from malta.identification.measure import plan_measurement as plan_measurement
     from malta.identification.replay import LawReplay as LawReplay
     from malta.identification.replay import replay_law as replay_law
     from malta.identification.strokes import LearnedStrokes as LearnedStrokes

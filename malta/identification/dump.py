@@ -130,7 +130,7 @@ def _order(member: Mapping[str, int], block: int, blocks: int, path: Path) -> An
 
 @np.errstate(over="ignore", invalid="ignore")  # of damaged bytes; what is no reading is refused
 def decode_dump(content: bytes, path: Path) -> Any:
-    """Head, times, tables and headings of a dump, as `malta.read_log` has them of every file.
+    """Head, times, tables and headings of a dump, as `malta.identification.read_log` has them of every file.
 
     Readings that are called invalid are missing; voltages are duty cycles or shares of the link times its voltage;
     while gates are off forces are zero.

@@ -195,7 +195,7 @@ def read_log(path: str | Path, groups: Collection[str] = tuple(GROUPS)) -> Log:
     >>> file = malta.identification.write_log(
     ...     malta.identification.log_of(run), "build/stand.csv"
     ... )
-    >>> malta.read_log(file).samples
+    >>> malta.identification.read_log(file).samples
     2000
     """
     path = Path(path)

@@ -251,7 +251,7 @@ class MeasurementPlan:
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> loop = malta.loop(malta.plant_of(controller.parameters), controller)
-    >>> plan = malta.plan_measurement(loop, width=0.02)
+    >>> plan = malta.identification.plan_measurement(loop, width=0.02)
     >>> 30 < plan.excitations[0].periods < 60, bool(plan.worst < 0.02)
     (True, True)
     """
@@ -308,7 +308,7 @@ def plan_measurement(
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> loop = malta.loop(malta.plant_of(controller.parameters), controller)
-    >>> plan = malta.plan_measurement(loop, separate=True, motion=10e-6, periods=4)
+    >>> plan = malta.identification.plan_measurement(loop, separate=True, motion=10e-6, periods=4)
     >>> len(plan.excitations), plan.duration
     (5, 25.0)
     """

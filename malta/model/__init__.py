@@ -11,7 +11,14 @@ if TYPE_CHECKING:
     from malta.model.coils import allocation as allocation
     from malta.model.data import published as published
     from malta.model.linearize import LinearModel as LinearModel
+    from malta.model.parameters import check_parameters as check_parameters
+    from malta.model.parameters import si as si
+    from malta.model.plant import Actuator as Actuator
     from malta.model.plant import OperatingPoint as OperatingPoint
+    from malta.model.plant import Plant as Plant
+    from malta.model.plant import Signal as Signal
     from malta.model.signals import InverseCheck as InverseCheck
+    from malta.model.signals import LateSensors as LateSensors
+    from malta.units import in_unit as in_unit
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

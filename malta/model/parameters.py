@@ -60,8 +60,8 @@ def si(
     >>> from dataclasses import dataclass
     >>> @dataclass(frozen=True)
     ... class Parameters:
-    ...     m: float = malta.si("kg", above=0)  # sphere
-    ...     C: float = malta.si("N m^2/A^2", above=0)  # constant of each magnet
+    ...     m: float = malta.model.si("kg", above=0)  # sphere
+    ...     C: float = malta.model.si("N m^2/A^2", above=0)  # constant of each magnet
     ...     preset: str = "custom"
     >>> Parameters(m=0.1, C=2e-5)
     Parameters(m=0.1, C=2e-05, preset='custom')
@@ -159,7 +159,7 @@ def box_words(box: Mapping[str, float], parameters: Parameters | None = None) ->
 def check_parameters(record: Parameters, where: str | Path = "parameters") -> None:
     """Check every physical field of a record: call it in `__post_init__` of a machine's Parameters.
 
-    record : a frozen dataclass whose fields are declared with `malta.si`
+    record : a frozen dataclass whose fields are declared with `malta.model.si`
     where : what an error names
 
     Raises InputError for NaN, infinity and values out of range.
@@ -168,10 +168,10 @@ def check_parameters(record: Parameters, where: str | Path = "parameters") -> No
     >>> from dataclasses import dataclass
     >>> @dataclass(frozen=True)
     ... class Parameters:
-    ...     m: float = malta.si("kg", above=0)
+    ...     m: float = malta.model.si("kg", above=0)
     ...     preset: str = "custom"
-    >>> malta.check_parameters(Parameters(m=0.1), "cart.Parameters")
-    >>> malta.check_parameters(Parameters(m=-1.0), "cart.Parameters")
+    >>> malta.model.check_parameters(Parameters(m=0.1), "cart.Parameters")
+    >>> malta.model.check_parameters(Parameters(m=-1.0), "cart.Parameters")
     Traceback (most recent call last):
         ...
     malta.errors.InputError: cart.Parameters: m: found -1.0 kg, expected a finite number above 0 in kg

@@ -55,8 +55,8 @@ class Actuator:
     dead_time : s, from measurement to force
 
     >>> import malta
-    >>> current = malta.Signal("i", "A")
-    >>> coil = malta.Actuator((current,), (38.0,), current_limit=3.0, dead_time=100e-6)
+    >>> current = malta.model.Signal("i", "A")
+    >>> coil = malta.model.Actuator((current,), (38.0,), current_limit=3.0, dead_time=100e-6)
     >>> coil.force_limit, coil.delay(Ts=50e-6)  # N; samples
     ((114.0,), 2)
     """
@@ -129,7 +129,7 @@ class Plant:
     bearing : x -> w of the touchdown bearings; zero without contact
     sense : (x, sensor errors) -> y without noise; default: h
     sensor_errors : systematic errors of the sensors
-    sensors : `malta.LateSensors`, lags and dead time of the sensors; None: they read at once
+    sensors : `malta.model.LateSensors`, lags and dead time of the sensors; None: they read at once
     noise : of each sensor, rms of a sample, in the unit of the output; default: zero
     uniform : whether the noise is uniform; else normal
     resolution : of each sensor, in the unit of the output; 0: not quantized

@@ -40,7 +40,7 @@ class Signal(NamedTuple):
     unit : SI, "1" for a pure number
 
     >>> import malta
-    >>> malta.Signal("z", "m")
+    >>> malta.model.Signal("z", "m")
     Signal(name='z', unit='m')
     """
 
@@ -129,9 +129,9 @@ class LateSensors:
     >>> import malta
     >>> from dataclasses import replace
     >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
-    >>> weights = malta.weights(q=[1e4, 0], r=[1], w=[1], v=[1e-8])
+    >>> weights = malta.synthesis.weights(q=[1e4, 0], r=[1], w=[1], v=[1e-8])
     >>> law = malta.lqg(malta.linearize(cart, cart.at()), weights, Ts=1e-3)
-    >>> late = replace(cart, sensors=malta.LateSensors((2e-3,), dead_time=1e-3))
+    >>> late = replace(cart, sensors=malta.model.LateSensors((2e-3,), dead_time=1e-3))
     >>> margins = [malta.loop(one, law).classical.delay["y1"] for one in (cart, late)]
     >>> [f"{1e3 * margin:.1f} ms" for margin in margins]
     ['68.0 ms', '65.1 ms']

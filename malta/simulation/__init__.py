@@ -15,6 +15,7 @@ from malta.contents import contents
 
 if TYPE_CHECKING:
     from malta.simulation.engine.batch import replayed as replayed
+    from malta.simulation.engine.batch import simulate_many as simulate_many
     from malta.simulation.engine.digest import Batch as Batch
     from malta.simulation.experiments import Experiment as Experiment
     from malta.simulation.experiments.time_optimal import fastest_stroke as fastest_stroke

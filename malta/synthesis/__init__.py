@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from malta.synthesis.lqg import kalman as kalman
     from malta.synthesis.lqg import lqi as lqi
     from malta.synthesis.lqg import lqr as lqr
+    from malta.synthesis.lqg import weights as weights
     from malta.synthesis.spec import Weights as Weights
     from malta.synthesis.state_space import controller_of as controller_of
     from malta.synthesis.synthesize import schedule_laws as schedule_laws

@@ -130,7 +130,7 @@ def kalman(model: Linear, weights: Weights) -> FloatArray:
     >>> import malta
     >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
     >>> model = malta.linearize(cart, cart.at())
-    >>> weights = malta.weights(q=[1, 1], r=[1], w=[1e-2], v=[1e-6])
+    >>> weights = malta.synthesis.weights(q=[1, 1], r=[1], w=[1e-2], v=[1e-6])
     >>> malta.synthesis.kalman(model, weights).round(6).tolist()
     [[14.142136], [100.0]]
     """

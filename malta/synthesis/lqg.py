@@ -191,7 +191,7 @@ def lqr(model: Linear, weights: Weights) -> FloatArray:
 
     >>> import malta
     >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
-    >>> weights = malta.weights(q=[16, 0], r=[1], w=[1], v=[1])
+    >>> weights = malta.synthesis.weights(q=[16, 0], r=[1], w=[1], v=[1])
     >>> K = malta.synthesis.lqr(malta.linearize(cart, cart.at()), weights)
     >>> K.round(6).tolist()  # w_n = 2 rad/s: K1 = w_n^2, K2 = sqrt(2) w_n
     [[4.0, 2.828427]]
@@ -218,7 +218,7 @@ def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
 
     >>> import malta
     >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
-    >>> weights = malta.weights([1, 0], [1], [1], [1], q_i=[4])
+    >>> weights = malta.synthesis.weights([1, 0], [1], [1], [1], q_i=[4])
     >>> K, Ki = malta.synthesis.lqi(malta.linearize(cart, cart.at()), weights)
     >>> K.round(3).tolist(), Ki.round(3).tolist()
     ([[3.375, 2.598]], [[2.0]])
@@ -341,7 +341,7 @@ def lqg(
     >>> A, B, C = [[0, 1], [400, 0]], [[0], [2]], [[1, 0]]
     >>> cart = malta.linear_machine(A, B, C, name="cart", states=["z [m]", "v [m/s]"])
     >>> model = malta.linearize(cart, cart.at())
-    >>> weights = malta.weights(q=[1e6, 0], r=[1], w=[1e-2], v=[1e-12], q_i=[1e7])
+    >>> weights = malta.synthesis.weights(q=[1e6, 0], r=[1], w=[1e-2], v=[1e-12], q_i=[1e7])
     >>> controller = malta.lqg(model, weights, Ts=1e-3)
     >>> malta.verify(model, controller).stable, [f"{k:.3g}" for k in controller.K[0]]
     (True, ['1.29e+03', '35.8'])
@@ -441,7 +441,7 @@ def weights(
     Raises InputError for a matrix that is not diagonal, and for values below 0.
 
     >>> import malta
-    >>> malta.weights([1e8, 1e4], [1], [1e-2], [1e-12]).Q.tolist()
+    >>> malta.synthesis.weights([1e8, 1e4], [1], [1e-2], [1e-12]).Q.tolist()
     [[100000000.0, 0.0], [0.0, 10000.0]]
     """
     of_states, of_inputs, forces, sensors = (

@@ -120,7 +120,7 @@ def lqg(name: str, model: Any, weights: Weights, *, bounds: Bounds | None = None
 
     name : of the element
     model : that the law is designed for: a LinearModel, a continuous control.StateSpace without D, or A, B and C
-    weights : from `malta.weights` or of a design, at which a search starts: state_i is q_base / sqrt(q)
+    weights : from `malta.synthesis.weights` or of a design, at which a search starts: state_i is q_base / sqrt(q)
     bounds : (low, high) of some of the parameters
 
     Raises InputError for weights of other sizes, for modes that are not stable and that no input moves or no output
@@ -129,7 +129,7 @@ def lqg(name: str, model: Any, weights: Weights, *, bounds: Bounds | None = None
     >>> import malta
     >>> from malta import structured
     >>> body = [[0, 1], [100, 0]], [[0], [1]], [[1, 0]]
-    >>> weights = malta.weights(q=[1e6, 0], r=[1], w=[1e-2], v=[1e-12])
+    >>> weights = malta.synthesis.weights(q=[1e6, 0], r=[1], w=[1e-2], v=[1e-12])
     >>> law = structured.lqg("lqg", body, weights)
     >>> law.order, {key: f"{value:g}" for key, value in law.values.items()}
     (2, {'lqg.state.x0': '0.001', 'lqg.input.u0': '1', 'lqg.process.u0': '0.1', 'lqg.sensor.y0': '1e-06'})

@@ -519,7 +519,7 @@ def test_the_bundle_of_the_widget_draws_the_page(browser: Any, tmp_path: Path) -
 def test_a_widget_answers_messages_and_is_told_the_proof(tmp_path: Path) -> None:
     pytest.importorskip("anywidget")
     design = copied(tmp_path)
-    widget = malta.app_widget(malta.read_design(design), folder=tmp_path)
+    widget = malta.app.app_widget(malta.read_design(design), folder=tmp_path)
     sent: list[dict[str, Any]] = []
     widget.send = sent.append
     try:
@@ -542,7 +542,7 @@ def test_a_notebook_shows_the_widget(tmp_path: Path) -> None:
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     design = copied(tmp_path)
     cell = nbformat.v4.new_code_cell(
-        f"import malta\nw = malta.app_widget({str(design)!r}, folder={str(tmp_path)!r})\nw"
+        f"import malta\nw = malta.app.app_widget({str(design)!r}, folder={str(tmp_path)!r})\nw"
     )
     ended = nbformat.v4.new_code_cell("w.close()")
     notebook = nbformat.v4.new_notebook(cells=[cell, ended])

@@ -31,7 +31,7 @@ def example() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def plant(example: Any) -> malta.Plant:
+def plant(example: Any) -> malta.model.Plant:
     assert example
     return malta.plant_of(malta.read(FOLDER / "flexible_rotor.toml"))
 
@@ -96,7 +96,7 @@ def test_amplification_and_separation_margins_are_those_of_API_617(example: Any)
     assert [analysis.zone(share) for share in (0.2, 0.35, 0.45, 0.6)] == ["A", "B", "C", "D"]
 
 
-def test_the_law_levitates_in_zone_A(example: Any, plant: malta.Plant) -> None:
+def test_the_law_levitates_in_zone_A(example: Any, plant: malta.model.Plant) -> None:
     law, analysis = example("law"), example("analysis")
     par: Any = plant.parameters
     controller, w = law.controller(plant), np.geomspace(10, 3e4, 200)
@@ -110,7 +110,7 @@ def test_the_law_levitates_in_zone_A(example: Any, plant: malta.Plant) -> None:
 
 
 @pytest.mark.slow
-def test_the_flown_unbalance_is_that_of_the_linear_loop(example: Any, plant: malta.Plant) -> None:
+def test_the_flown_unbalance_is_that_of_the_linear_loop(example: Any, plant: malta.model.Plant) -> None:
     """The nonlinear magnets at full speed; the figure of the experiment has the points beside the curves."""
     found = malta.experiment("unbalance", plant, example("law").controller(plant), speeds=(418.0,))
     flown, linear = (
@@ -139,7 +139,7 @@ def test_the_design_file_holds_its_goals_at_rest_and_at_full_speed(example: Any)
 
 
 @pytest.mark.slow
-def test_every_course_of_the_speed_is_proven(example: Any, plant: malta.Plant) -> None:
+def test_every_course_of_the_speed_is_proven(example: Any, plant: malta.model.Plant) -> None:
     law = example("law")
     par: Any = plant.parameters
     ((system, compensator),), _ = travel_loops(plant, law.controller(plant), ("Omega",))
@@ -150,7 +150,9 @@ def test_every_course_of_the_speed_is_proven(example: Any, plant: malta.Plant) -
 
 
 @pytest.mark.slow
-def test_the_rest_is_below_its_weight_at_every_frequency_and_speed(example: Any, plant: malta.Plant) -> None:
+def test_the_rest_is_below_its_weight_at_every_frequency_and_speed(
+    example: Any, plant: malta.model.Plant
+) -> None:
     law, analysis, rotor = example("law"), example("analysis"), example("flexible_rotor")
     par: Any = plant.parameters
     assert analysis.bound_rest(par, law.rest_weight()).share < 1
@@ -162,7 +164,7 @@ def test_the_rest_is_below_its_weight_at_every_frequency_and_speed(example: Any,
 
 
 @pytest.mark.slow
-def test_force_constants_may_be_off_at_every_speed(example: Any, plant: malta.Plant) -> None:
+def test_force_constants_may_be_off_at_every_speed(example: Any, plant: malta.model.Plant) -> None:
     par: Any = plant.parameters
     whole = example("law").continuous(plant)
     law = malta.proof.Compensator(whole.A, -whole.B, whole.C, -whole.D, lag=1 / par.T_d)

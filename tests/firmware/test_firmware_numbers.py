@@ -202,7 +202,7 @@ def test_a_motor_turns_on_beyond_one_radian() -> None:
     plant = malta.linear_machine(
         A, [[0], [0], [30]], [[1, 0, 0]], limit=50.0, noise=1e-4, outputs=["phi [rad]"]
     )
-    w = malta.weights([10, 1, 0], [1], [1], [1e-6], q_i=[10])
+    w = malta.synthesis.weights([10, 1, 0], [1], [1], [1e-6], q_i=[10])
     c = malta.lqg(malta.linearize(plant, plant.at()), w, 1e-3, name="motor")
 
     def turned(_: Any) -> Any:

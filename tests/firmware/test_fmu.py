@@ -137,7 +137,7 @@ def scenario(t: Target, **options: Any) -> malta.Scenario:
     return malta.Scenario("hold", 0.02, references.hold, fidelity=t.fidelity, **options)
 
 
-def silent(t: Target) -> malta.Plant:
+def silent(t: Target) -> malta.model.Plant:
     """The machine without noise of its electronics."""
     par: Any = t.believed.parameters
     return t.believed.variant(replace(par, s_adc=0.0)) if t.has_set_points else t.believed

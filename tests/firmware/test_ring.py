@@ -109,7 +109,7 @@ def test_a_dump_is_the_flight_and_is_computed_again_to_the_bit(
     found = replay_dump(controller("halbach"), path)
     assert (found.first, found.same, found.restarts) == (None, found.samples, 0)
     assert max(found.difference.values()) == 0.0
-    log = malta.read_log(path)
+    log = malta.identification.read_log(path)
     rows, block = ring.ring.rows, ring.ring.block
     assert (rows, block) == (90, 10)
     kept = (
@@ -140,7 +140,7 @@ def test_it_stops_so_many_samples_after_a_trigger(ring: Ring, cause: str, tmp_pa
     assert dump.cause == cause
     assert dump.trigger == len(dump.rows) - 6
     assert dump.rows["reference.p"][dump.trigger, 0] == np.float32(1e-4 * np.sin(0.1 * at))
-    log = malta.read_log(dumped(ring, tmp_path))
+    log = malta.identification.read_log(dumped(ring, tmp_path))
     assert np.flatnonzero(log.columns["flags"][:, log.names("flags").index("trigger")]) == [dump.trigger]
     assert replay_dump(controller("halbach"), tmp_path / "ring.dump").first is None
 
@@ -157,7 +157,7 @@ def test_samples_with_gates_off_are_not_computed_again(ring: Ring, tmp_path: Pat
     path = dumped(ring, tmp_path)
     found = replay_dump(controller("halbach"), path)
     assert (found.samples, found.same) == (80 - 15 - 2, 63)
-    log = malta.read_log(path)
+    log = malta.identification.read_log(path)
     off = log.columns["flags"][:, log.names("flags").index("off")]
     assert np.flatnonzero(off).tolist() == list(range(33, 48))
     assert not log.columns["v"][off == 1].any()
@@ -196,7 +196,7 @@ def test_a_dump_of_a_processor_with_the_other_order_of_bytes(ring: Ring, tmp_pat
     other.write_bytes(content[:8] + swapped[0] + parts[1] + swapped[1])
     found = replay_dump(controller("halbach"), other)
     assert (found.samples, found.first) == (80, None)
-    log, own = malta.read_log(other), malta.read_log(dumped(ring, tmp_path))
+    log, own = malta.identification.read_log(other), malta.identification.read_log(dumped(ring, tmp_path))
     assert (log.columns["v"] == own.columns["v"]).all()
 
 
@@ -222,7 +222,7 @@ def test_what_is_no_dump_is_refused_with_one_sentence(ring: Ring, tmp_path: Path
     for says, content in cases.items():
         path.write_bytes(content)
         with pytest.raises(malta.InputError, match=says) as error:
-            malta.read_log(path)
+            malta.identification.read_log(path)
         assert "\n" not in str(error.value)
     said = run("log", path)
     assert (said.code, "Traceback" in said.err) == (2, False)
@@ -270,7 +270,7 @@ def test_a_minute_with_the_simulated_machine_is_computed_again() -> None:
     path = Path("build/minute.dump")
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(rings[-1].memory.raw)
-    found, log = replay_dump(c, path), malta.read_log(path)
+    found, log = replay_dump(c, path), malta.identification.read_log(path)
     assert found.samples * c.sample_time >= 60
     assert (found.first, found.difference) == (None, {"F_x": 0.0})
     assert (log.columns["v"] == run.v[-log.samples :]).all()

@@ -508,7 +508,7 @@ def test_one_sensor_less_where_the_model_has_a_delay(delay: int) -> None:
     """Of two masses with a spring: each sensor sees both. Stored forces have rows of zeros, which scale nothing."""
     A = [[0, 0, 1, 0], [0, 0, 0, 1], [50, 50, 0, 0], [50, 50, 0, 0]]
     plant = malta.linear_machine(A, np.eye(4)[:, 2:], np.eye(4)[:2], noise=1e-6, limit=10.0)
-    w = malta.weights(q=[1, 1, 1, 1], r=[1, 1], w=[1, 1], v=[1e-6, 1e-6])
+    w = malta.synthesis.weights(q=[1, 1, 1, 1], r=[1, 1], w=[1, 1], v=[1e-6, 1e-6])
     c = malta.lqg(malta.linearize(plant, plant.at()), w, 1e-3, delay=delay)
     assert len(c.states) == 4 + 2 * delay
     with np.errstate(all="raise"):

@@ -43,7 +43,7 @@ def cart(z: str = "z", v: str = "v", u: str = "u") -> tuple[Any, Any]:
         nominal={"k": 1.0}, terms={"k": [[[0, 0], [1, 0]]]}, noise=1e-6, limit=10.0,
     )  # fmt: skip
     model = malta.linearize(plant, plant.at())
-    weights = malta.weights([10, 1], [1], [1e-2], [1e-8], q_i=[10])
+    weights = malta.synthesis.weights([10, 1], [1], [1e-2], [1e-8], q_i=[10])
     return model, malta.lqg(model, weights, 1e-3, name="cart")
 
 

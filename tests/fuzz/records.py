@@ -295,7 +295,7 @@ def read_dump_file(case: Case, folder: Path) -> Ended | None:
         path.write_bytes(cut(_dump_bytes(ring, edited(tree, case.edits)), case.cuts))
     except Exception:  # numpy does not write every array
         return None
-    ended = observe(lambda: malta.read_log(path), folder, [str(path)])
+    ended = observe(lambda: malta.identification.read_log(path), folder, [str(path)])
     if ended.code == 0 and not np.isfinite(ended.value.t).all():
         raise Defect("times that are not finite were read")
     return observe(line("log", str(path)), folder, [str(path)]) if ended.code == 0 else ended

@@ -107,7 +107,9 @@ def test_a_machine_whose_name_leads_to_another_folder_is_refused(tmp_path: Path,
     """Published figures are looked for by the name of a machine."""
     plant = malta.linear_machine([[0, 1], [100, -1]], [[0], [2]], [[1, 0]], name="my cart (2.1)")
     model = malta.linearize(plant, plant.at())
-    controller = malta.lqg(model, malta.weights([10, 1], [1], [1e-2], [1e-8], q_i=[10]), 1e-3, name="my LQG")
+    controller = malta.lqg(
+        model, malta.synthesis.weights([10, 1], [1], [1e-2], [1e-8], q_i=[10]), 1e-3, name="my LQG"
+    )
     document = gains.document(controller, malta.verify(model, controller))
     document["plant"]["preset"] = name
     path = tmp_path / "mine.json"

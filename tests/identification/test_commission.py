@@ -52,7 +52,7 @@ def holds(found: Estimate, truth: float, times: float = 1.5) -> bool:
 
 def a_log(t: Any, **columns: tuple[list[str], Any]) -> malta.identification.Log:
     signals = {
-        g: tuple(malta.Signal(n, "m" if g == "y" else "N") for n in names)
+        g: tuple(malta.model.Signal(n, "m" if g == "y" else "N") for n in names)
         for g, (names, _) in columns.items()
     }
     return malta.identification.Log(

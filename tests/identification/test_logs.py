@@ -32,7 +32,7 @@ def log() -> malta.identification.Log:
 def test_a_log_is_read_as_it_was_written(log: malta.identification.Log, suffix: str, tmp_path: Path) -> None:
     if suffix == ".parquet":
         pytest.importorskip("pyarrow", reason="pyarrow writes and reads Parquet files")
-    found = malta.read_log(malta.identification.write_log(log, tmp_path / f"log{suffix}"))
+    found = malta.identification.read_log(malta.identification.write_log(log, tmp_path / f"log{suffix}"))
     assert (found.machine, found.controller, found.sample_time) == ("tubular", "robust", 50e-6)
     assert len(found.sha256) == 64
     for group in ("y", "v", "i", "u", "reference", "excitation", "flags"):
@@ -60,7 +60,7 @@ def test_currents_are_those_that_the_sensors_read() -> None:
 def test_csv_of_other_programs(tmp_path: Path) -> None:
     text = "t [ms],x1 [um],fx [N],i_a [mA],ref.x1 [mm]\n0,1,2,3,0\n0.05,,2,3,0\n0.10,3,2,3,1\n"
     (tmp_path / "other.csv").write_text(text)
-    found = malta.read_log(tmp_path / "other.csv")
+    found = malta.identification.read_log(tmp_path / "other.csv")
     assert found.t.tolist() == pytest.approx([0, 50e-6, 100e-6])
     assert found.columns["y"][[0, 2], 0].tolist() == pytest.approx([1e-6, 3e-6])
     assert found.columns["i"][0, 0] == pytest.approx(3e-3)
@@ -71,14 +71,14 @@ def test_csv_of_other_programs(tmp_path: Path) -> None:
 def test_columns_that_are_not_asked_for_are_not_read(log: malta.identification.Log, tmp_path: Path) -> None:
     for suffix in (".csv", ".npz"):
         path = malta.identification.write_log(log, tmp_path / f"log{suffix}")
-        every, few = malta.read_log(path), malta.read_log(path, ("y", "i"))
+        every, few = malta.identification.read_log(path), malta.identification.read_log(path, ("y", "i"))
         assert list(few.columns) == ["y", "i"]
         assert all(np.array_equal(few.columns[group], every.columns[group]) for group in ("y", "i"))
         assert (few.period, few.sha256, few.signals["i"]) == (every.period, every.sha256, every.signals["i"])
     text = "t [s],x1 [m],fx [N]\n0,1,2\n1,2\n2,1,4\n"
     (tmp_path / "short.csv").write_text(text)
     with pytest.raises(malta.InputError, match="a line that cannot be read"):
-        malta.read_log(tmp_path / "short.csv", ("y",))
+        malta.identification.read_log(tmp_path / "short.csv", ("y",))
 
 
 def test_pyarrow_reads_the_doubles_of_numpy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,9 +88,9 @@ def test_pyarrow_reads_the_doubles_of_numpy(tmp_path: Path, monkeypatch: pytest.
     rows = [f"{k},{a:.17g},{b:.9g},{c!r},{d:.3f}" for k, (a, b, c, d) in enumerate(cells.tolist())]
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["t [s],x [m],y [um],f [N],i [A]", *rows, "500,,-0.0,nan,4.9e-324", ""]))
-    by_arrow = malta.read_log(path)
+    by_arrow = malta.identification.read_log(path)
     monkeypatch.setattr(log_files, "_fast_columns", lambda *_: None)
-    by_numpy = malta.read_log(path)
+    by_numpy = malta.identification.read_log(path)
     for group, table in by_arrow.columns.items():
         assert np.array_equal(table, by_numpy.columns[group], equal_nan=True)
 
@@ -115,11 +115,11 @@ def test_pyarrow_reads_the_doubles_of_numpy(tmp_path: Path, monkeypatch: pytest.
 def test_what_is_no_log_is_refused(text: str, found: str, tmp_path: Path) -> None:
     (tmp_path / "bad.csv").write_text(text)
     with pytest.raises(malta.InputError, match=found):
-        malta.read_log(tmp_path / "bad.csv")
+        malta.identification.read_log(tmp_path / "bad.csv")
     for suffix in (".npz", ".mat", ".parquet", ".txt"):
         (tmp_path / f"bad{suffix}").write_bytes(b"no archive")
         with pytest.raises(malta.InputError):
-            malta.read_log(tmp_path / f"bad{suffix}")
+            malta.identification.read_log(tmp_path / f"bad{suffix}")
 
 
 def test_arrays_that_are_no_log_are_refused(tmp_path: Path) -> None:
@@ -128,9 +128,9 @@ def test_arrays_that_are_no_log_are_refused(tmp_path: Path) -> None:
     for t in (np.arange(2) * 1j, np.zeros((2, 1)), np.array(["0", "1"])):
         np.savez(path, t=t, **good)
         with pytest.raises(malta.InputError, match="t: found an array of"):
-            malta.read_log(path)
+            malta.identification.read_log(path)
     np.savez(path, t=np.arange(2.0), period=np.zeros(0), **good)
-    assert malta.read_log(path).period == 0
+    assert malta.identification.read_log(path).period == 0
 
 
 def test_a_log_of_few_samples_or_of_zeros_is_answered(log: malta.identification.Log) -> None:

@@ -101,18 +101,18 @@ def test_disk_margins_are_those_of_the_machine_at_the_lines(found: Measurement) 
 
 
 def test_the_plan_expects_the_bands_that_are_found(plan: ExcitationPlan) -> None:
-    expected = malta.plan_measurement(LOOP, **SHORT)
+    expected = malta.identification.plan_measurement(LOOP, **SHORT)
     nominal = malta.measure(CONTROLLER, flown(plan, {}))
     ratio = 1.96 * nominal.S.deviation[:, :4] / expected.half_width[:, :4]
     assert 0.8 < np.median(ratio) < 1.6  # the steps of a sensor are no noise altogether
     assert expected.coherence["x1"].min() > 0.99
-    finer = malta.plan_measurement(LOOP, width=expected.worst / 2, **SHORT)
+    finer = malta.identification.plan_measurement(LOOP, width=expected.worst / 2, **SHORT)
     assert finer.excitations[0].periods == 16
     assert finer.worst == pytest.approx(expected.worst / 2)
     with pytest.raises(malta.InputError, match="samples for it, expected at most"):
-        malta.plan_measurement(LOOP, width=1e-6, **SHORT)
+        malta.identification.plan_measurement(LOOP, width=1e-6, **SHORT)
     with pytest.raises(malta.InputError, match="width: found -1, expected a share above 0"):
-        malta.plan_measurement(LOOP, width=-1.0)
+        malta.identification.plan_measurement(LOOP, width=-1.0)
 
 
 def test_the_verdict_is_of_the_tube(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -124,7 +124,7 @@ def bench_loop(name: str, delay: int, lag: float, wrong: float) -> tuple[Plant, 
     )
     believed = make(replace(par, C=par.C * wrong, g0=par.g0 * (2 - wrong)))
     p = len(believed.outputs)
-    weights = malta.weights(
+    weights = malta.synthesis.weights(
         [1e8] * p + [1e4] * p, [1.0] * p, [1e-2] * p, [1e-12] * p, q_i=[1e9 * (lag == 0)] * p
     )
     return make(par), malta.lqg(malta.linearize(believed, believed.at(**at)), weights, Ts, delay=delay), at

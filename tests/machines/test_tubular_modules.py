@@ -341,7 +341,7 @@ def test_a_campaign_draws_modules_that_differ(controller: Any) -> None:
     assert abs(drawn.changes["dK_A"]).max() <= 0.05
     assert np.ptp(drawn.changes["e_y"]) > 3e-5
     scenario = planned_run(plan).scenario
-    batch = malta.simulate_many(plan.plant, controller, scenario, drawn.changes)
+    batch = malta.simulation.simulate_many(plan.plant, controller, scenario, drawn.changes)
     for k in (0, 7):
         own: Any = {name: float(values[k]) for name, values in drawn.changes.items()}
         run = simulate(plant_of(replace(controller.parameters, **own)), controller, replace(scenario, run=k))
@@ -352,7 +352,7 @@ def test_a_campaign_draws_modules_that_differ(controller: Any) -> None:
 
 
 def test_a_campaign_of_nothing_but_defaults_runs(controller: Any) -> None:
-    batch = malta.simulate_many(
+    batch = malta.simulation.simulate_many(
         plant_of(controller.parameters),
         controller,
         Scenario.stroke(1e-2, fidelity="force"),

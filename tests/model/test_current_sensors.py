@@ -110,7 +110,7 @@ def test_lanes_draw_the_noise_of_one_run_alone(controller: Any) -> None:
     plant, scenario = plant_of(par), Scenario("hold", 0.02, malta.references.hold, noise=1.0, fidelity="dq")
     changes = {"m": np.linspace(0.35, 0.37, 9)}
     assert len(noise_scales(plant, setup_of(plant, controller, scenario))) == 5 + 18
-    batch = malta.simulate_many(plant, controller, scenario, changes)
+    batch = malta.simulation.simulate_many(plant, controller, scenario, changes)
     for k in (0, 8):
         own = simulate(plant_of(replace(par, m=float(changes["m"][k]))), controller, replace(scenario, run=k))
         np.testing.assert_allclose(abs(own.p - own.reference).max(axis=0), batch.deviation[k], rtol=1e-9)

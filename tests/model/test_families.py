@@ -51,11 +51,11 @@ class Parameters:
 
 def plant(par):
     x = ("q", "m"), ("q_dot", "m/s")
-    return malta.Plant(
-        name="root", parameters=par, states=tuple(malta.Signal(*s) for s in x),
-        inputs=(malta.Signal("f", "N"),), outputs=(malta.Signal("q", "m"),),
+    return malta.model.Plant(
+        name="root", parameters=par, states=tuple(malta.model.Signal(*s) for s in x),
+        inputs=(malta.model.Signal("f", "N"),), outputs=(malta.model.Signal("q", "m"),),
         f=lambda x, u, w: ca.vertcat(x[1], (u[0] + ca.sqrt(par.e * x[0])) / par.m), h=lambda x, u: x[:1],
-        actuator=malta.Actuator((malta.Signal("i", "A"),), (1.0,), current_limit=1.0), variant=plant,
+        actuator=malta.model.Actuator((malta.model.Signal("i", "A"),), (1.0,), current_limit=1.0), variant=plant,
     )
 """
 

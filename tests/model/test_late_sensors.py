@@ -109,7 +109,7 @@ def test_no_lag_is_the_limit(controller: Any, fidelity: Any) -> None:
 def test_lanes_of_different_lags_are_the_runs_alone(controller: Any) -> None:
     lags = np.array([0.0, 1e-5, 2e-5, 5e-5, 1e-4])
     scenario = Scenario("hold", 0.02, malta.references.hold, noise=1.0, fidelity="force")
-    batch = malta.simulate_many(late(controller, T_s=2e-5), controller, scenario, {"tau_s": lags})
+    batch = malta.simulation.simulate_many(late(controller, T_s=2e-5), controller, scenario, {"tau_s": lags})
     for k, lag in enumerate(lags.tolist()):
         own = simulate(late(controller, T_s=2e-5, tau_s=lag), controller, replace(scenario, run=k))
         np.testing.assert_allclose(abs(own.p).max(axis=0), batch.deviation[k], rtol=1e-7)

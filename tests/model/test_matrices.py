@@ -55,7 +55,9 @@ def motor() -> Plant:
 def driven(motor: Plant) -> Controller:
     """Its LQG with an integral."""
     model = malta.linearize(motor, motor.at())
-    return malta.lqg(model, malta.weights([10, 1, 0], [1], [1e-2], [1e-8], q_i=[10]), 1e-3, name="driven")
+    return malta.lqg(
+        model, malta.synthesis.weights([10, 1, 0], [1], [1e-2], [1e-8], q_i=[10]), 1e-3, name="driven"
+    )
 
 
 def test_design_margin_and_gain_file_in_five_lines(tmp_path: Path) -> None:
@@ -64,7 +66,7 @@ def test_design_margin_and_gain_file_in_five_lines(tmp_path: Path) -> None:
         [[0, 1], [100, 0]], [[0], [1]], [[1, 0]], nominal={"k": 0}, terms={"k": [[[0, 0], [1, 0]]]}
     )
     model = malta.linearize(plant, plant.at())
-    controller = malta.lqg(model, malta.weights([1e4, 1], [1], [1], [1e-8]), Ts=1e-3)
+    controller = malta.lqg(model, malta.synthesis.weights([1e4, 1], [1], [1], [1e-8]), Ts=1e-3)
     margin = malta.robust_margin(*machine_system(plant, controller, ["k"], {}), {"k": (-50, 50)})
     malta.gains.write(controller, malta.verify(model, controller), tmp_path / "plain.json")
 
@@ -129,7 +131,7 @@ def test_a_gain_file_brings_the_machine_along(
 def test_any_number_is_a_nominal_value(value: Any, tmp_path: Path) -> None:
     plant = malta.linear_machine([[0]], [[1]], [[1]], nominal={"k": value}, terms={"k": [[[1]]]})
     model = malta.linearize(plant, plant.at())
-    controller = malta.lqg(model, malta.weights([1], [1], [1], [1]), 0.01)
+    controller = malta.lqg(model, malta.synthesis.weights([1], [1], [1], [1]), 0.01)
     malta.gains.write(controller, malta.verify(model, controller), tmp_path / "k.json")
     assert malta.gains.read(tmp_path / "k.json").parameters == plant.parameters
 
@@ -189,7 +191,9 @@ def test_machines_of_the_same_names_share_no_functions(motor: Plant, driven: Con
 def test_one_state_is_enough(engine: Any) -> None:
     """x' = x + u, a column of one entry everywhere."""
     plant = malta.linear_machine([[1]], [[1]], [[1]])
-    controller = malta.lqg(malta.linearize(plant, plant.at()), malta.weights([1], [1], [1], [1e-6]), 0.01)
+    controller = malta.lqg(
+        malta.linearize(plant, plant.at()), malta.synthesis.weights([1], [1], [1], [1e-6]), 0.01
+    )
     scenario = malta.Scenario("let go", 1.0, malta.references.hold, start={"x1": 1.0}, fidelity="force")
     run = malta.simulate(plant, controller, scenario, engine=engine)
     expected = [1.0]
@@ -356,7 +360,7 @@ def test_an_uncertain_system_is_a_machine(suffix: str, tmp_path: Path) -> None:
     (A,), (B,), _ = system.at(system.nominal)
     assert np.array_equal(model.A, A)
     assert np.array_equal(model.B, B)
-    law = malta.lqg(model, malta.weights([1e6, 0], [1], [1e-2], [1e-12]), Ts=1e-3, name="geared")
+    law = malta.lqg(model, malta.synthesis.weights([1e6, 0], [1], [1e-2], [1e-12]), Ts=1e-3, name="geared")
     report = malta.verify(model, law, {"J": 0.2, "b": 0.2, "k": 0.3})
     assert report.robust is not None
     malta.gains.write(law, report, tmp_path / f"geared{suffix}")
@@ -380,7 +384,7 @@ def test_an_uncertain_system_is_a_machine(suffix: str, tmp_path: Path) -> None:
 def test_a_campaign_varies_what_formulas_have() -> None:
     machine = malta.linear_machine(malta.uncertain(geared, {"J": 2e-3, "b": 0.1, "k": 5.0}), name="geared")
     model = malta.linearize(machine, machine.at())
-    law = malta.lqg(model, malta.weights([1e6, 0], [1], [1e-2], [1e-12]), Ts=1e-3)
+    law = malta.lqg(model, malta.synthesis.weights([1e6, 0], [1], [1e-2], [1e-12]), Ts=1e-3)
     found = malta.campaign(malta.campaigns.Plan(law, "step", {"J": 0.2}, samples=12, options={"time": 0.05}))
     values = dict(zip(found.names, found.values[3], strict=True))
     other = malta.linear_machine(malta.uncertain(geared, {"b": 0.1, "k": 5.0} | values), name="geared")

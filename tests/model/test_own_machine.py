@@ -235,7 +235,7 @@ def test_parameters_may_stand_in_a_module_beside_the_plant(folder: Path) -> None
     """As those of malta's own machines do, which need no module but that of the record to be found."""
     text = (folder / "lev.py").read_text(encoding="utf-8")
     start, end = text.index("@dataclass"), text.index("\n\n\ndef plant")
-    imports = "from dataclasses import dataclass\n\nfrom malta import check_parameters, si\n\n\n"
+    imports = "from dataclasses import dataclass\n\nfrom malta.model import check_parameters, si\n\n\n"
     (folder / "parameters.py").write_text(imports + text[start:end], encoding="utf-8")
     moved = text[:start] + "from .parameters import Parameters" + text[end:]
     (folder / "lev.py").write_text(moved, encoding="utf-8")

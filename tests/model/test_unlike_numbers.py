@@ -88,7 +88,7 @@ def designed(name: str, **changes: Any) -> tuple[Plant, Controller]:
     make, weights, Ts, _ = CASES[name]
     plant = make()
     model = malta.linearize(plant, plant.at())
-    return plant, malta.lqg(model, malta.weights(**(weights | changes)), Ts)
+    return plant, malta.lqg(model, malta.synthesis.weights(**(weights | changes)), Ts)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -130,7 +130,7 @@ def test_integrals_and_filter_are_those_of_python_control() -> None:
     import control
 
     plant = cart_pole()
-    model, w = malta.linearize(plant, plant.at()), malta.weights(**CART)
+    model, w = malta.linearize(plant, plant.at()), malta.synthesis.weights(**CART)
     K, Ki = malta.synthesis.lqi(model, w)
     Q = np.diag([10, 1, 0, 0, 3])
     wanted = control.lqr(model.A, model.B, Q, w.R, integral_action=model.C[:1])[0]
@@ -144,7 +144,7 @@ def test_integrals_and_filter_are_those_of_python_control() -> None:
 def test_two_equal_sensors_are_one_of_half_the_variance() -> None:
     _, c = designed("pair")
     one = malta.linear_machine([[0, 1], [900, 0]], [[0], [2]], [[1, 0]])
-    weights = malta.weights(q=[1e8, 1e4], r=[1], w=[1e-2], v=[0.5e-12], q_i=[1e10])
+    weights = malta.synthesis.weights(q=[1e8, 1e4], r=[1], w=[1e-2], v=[0.5e-12], q_i=[1e10])
     single = malta.lqg(malta.linearize(one, one.at()), weights, 1e-3)
     assert c.L.sum(axis=1) == pytest.approx(single.L[:, 0], rel=1e-9)
     assert pytest.approx(single.K, rel=1e-9) == c.K

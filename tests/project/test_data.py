@@ -252,7 +252,7 @@ def test_text_that_is_no_product_of_units_is_refused_at_once(unit: str) -> None:
     ):
         to_si(1.0, unit, "s", "file.toml", "name")
     with pytest.raises(malta.InputError, match=r"^data: unit: found '.{1,50}, expected a unit$"):
-        malta.in_unit(1.0, unit)
+        malta.model.in_unit(1.0, unit)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 FOLDERS = ("data", "design", "examples")  # that examples read
 # The examples that take longest, compilers included; the others together take some two seconds of processor time.
 SLOW = {
-    "malta.app_widget",
+    "malta.app.app_widget",
     "malta.firmware.engine_of_c",
     "malta.export_c",
     "malta.export_fmu",

@@ -34,7 +34,7 @@ GAIN_FILES = [
 LARGE_GAIN_FILES = sorted({*(ROOT / "design" / "gains").glob("*.*")} - {*GAIN_FILES})
 
 
-def faults(name: str, content: Any, plant: malta.Plant | None = None) -> list[str]:
+def faults(name: str, content: Any, plant: malta.model.Plant | None = None) -> list[str]:
     found = Draft202012Validator(schema(name, plant)).iter_errors(content)
     return [f"{error.json_path}: {error.message[:200]}" for error in found]
 

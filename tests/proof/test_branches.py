@@ -13,8 +13,8 @@ import pytest
 from flint import arb
 
 import malta
-from malta import Actuator, Plant, Signal, si
 from malta.errors import InputError
+from malta.model import Actuator, Plant, Signal, si
 from malta.proof.box import (
     ENDS,
     FAR,

@@ -82,7 +82,7 @@ def test_the_checks_find_what_is_wrong(spoil: Callable[[Axes], object], said: li
 
 
 @cache
-def machine(name: str) -> tuple[malta.Plant, malta.synthesis.Controller, Any]:
+def machine(name: str) -> tuple[malta.model.Plant, malta.synthesis.Controller, Any]:
     """The plant and the controller of a shipped gain file, and what its paper prints."""
     c = malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
     plant = malta.plant_of(c.parameters)

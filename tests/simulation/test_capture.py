@@ -82,7 +82,7 @@ def test_runs_of_a_batch_begin_where_they_are_told_to() -> None:
     plant = malta.plant_of(controller.parameters)
     starts = {"x": np.array([0.0, 1e-4, -5e-4, 3e-4]), "alpha": np.array([0.0, 0.0, 1e-4, 7e-3])}
     scenario = Scenario("hold", 0.02, references.hold)
-    batch = malta.simulate_many(plant, controller, scenario, {}, starts=starts)
+    batch = malta.simulation.simulate_many(plant, controller, scenario, {}, starts=starts)
     for k, (x, alpha) in enumerate(zip(*starts.values(), strict=True)):
         one = Scenario("hold", 0.02, references.hold, start={"x": x, "alpha": alpha})
         run = malta.simulate(plant, controller, one)
@@ -93,9 +93,9 @@ def test_runs_of_a_batch_begin_where_they_are_told_to() -> None:
             assert batch.last[k] == pytest.approx(error[-1], rel=1e-4, abs=1e-12)
     assert batch.completed.tolist() == [1, 1, 1, 0]  # the last start is beyond the clearance
     with pytest.raises(malta.InputError, match="changes"):
-        malta.simulate_many(plant, controller, scenario, {"m": np.ones(3)}, starts=starts)
+        malta.simulation.simulate_many(plant, controller, scenario, {"m": np.ones(3)}, starts=starts)
     with pytest.raises(malta.InputError, match="an unknown state"):
-        malta.simulate_many(plant, controller, scenario, {}, starts={"xx": np.zeros(3)})
+        malta.simulation.simulate_many(plant, controller, scenario, {}, starts={"xx": np.zeros(3)})
 
 
 # The experiment

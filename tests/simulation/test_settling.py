@@ -81,7 +81,7 @@ def test_figures_of_many_machines_are_of_the_stroke_alone(bearing: bool) -> None
     plant, controller = _machine(TABLE2)
     scenario = malta.Scenario.stroke(settle=0.2, noise=1.0, bearing=bearing)
     pull = {"K_A": np.array([1.0, 1.1, 1.2, 1.3]) * plant.parameters.K_A}  # type: ignore[attr-defined]
-    batch: Batch = malta.simulate_many(plant, controller, scenario, pull)
+    batch: Batch = malta.simulation.simulate_many(plant, controller, scenario, pull)
     assert batch.completed[0] == 1
     assert batch.duration.min() < 0 < batch.duration.max() == 0.1
     for k in range(len(pull["K_A"])):
@@ -97,7 +97,7 @@ def test_noise_of_parts_and_recordings_go_on_across_the_beginning() -> None:
     plant, controller = _machine(TABLE2)
     scenario = malta.Scenario.stroke(duration=0.03, rise=4e-3, settle=REST, noise=1.0)
     changes, parts = {"m": np.full(2, 0.36)}, np.array([[5, 9, 2], [1, 1, 1]])
-    batch = malta.simulate_many(plant, controller, scenario, changes, noise=parts)
+    batch = malta.simulation.simulate_many(plant, controller, scenario, changes, noise=parts)
     run = malta.simulate(plant, controller, replace(scenario, run=(5, 9, 2)))
     np.testing.assert_allclose(batch.deviation[0], np.abs(run.p - run.reference).max(axis=0), rtol=1e-6)
     recorded = record_run(plant, controller, scenario, changes, 0, noise=parts)
@@ -111,7 +111,7 @@ def test_a_rest_takes_off_what_v0_does_not_know() -> None:
     plant, controller = _machine()
     masses = {"m": np.array([1.2 * plant.mass])}
     at_once, settled = (
-        malta.simulate_many(plant, controller, malta.Scenario.stroke(settle=rest), masses)
+        malta.simulation.simulate_many(plant, controller, malta.Scenario.stroke(settle=rest), masses)
         .deviation[0, :4]
         .max()
         for rest in (0.0, 0.3)

@@ -72,7 +72,7 @@ def test_the_sampled_law_is_the_lqg_of_its_sizes(tmp_path: Path) -> None:
     """(x / state)^2 + (s / integral)^2 + (u / input)^2, by Tustin's rule: its response in s is the continuous one."""
     spec = malta.read_design(written(tmp_path))
     model, c = model_and_controller(spec)
-    weights = malta.weights([1e8, 0], [4], [0.01], [4e-12], q_i=[1 / 5e-6**2])
+    weights = malta.synthesis.weights([1e8, 0], [4], [0.01], [4e-12], q_i=[1 / 5e-6**2])
     (K, Ki), L = malta.synthesis.lqi(model, weights), malta.synthesis.kalman(model, weights)
     law, z = linear_law(c), np.exp(1j * 300 * spec.sample_time)
     found = -(law.C @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B_y) + law.D_y)

@@ -12,11 +12,12 @@ from conftest import ROOT
 import malta
 from malta import structured
 from malta.structured.loops import models_of_systems
+from malta.synthesis import weights
 from malta.synthesis.lqg import integrals_of
 from malta.synthesis.structure import Structure, places_of
 
 BODY = [[0.0, 1.0], [100.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]]
-WEIGHTS = malta.weights(q=[1e6, 0], r=[1], w=[1e-2], v=[1e-12], q_i=[1e7])
+WEIGHTS = weights(q=[1e6, 0], r=[1], w=[1e-2], v=[1e-12], q_i=[1e7])
 
 
 def structure_of(law: structured.Element) -> Structure:
@@ -40,7 +41,7 @@ def test_gains_are_those_of_the_lqg_with_the_same_weights() -> None:
 
 def test_poles_of_the_loop_are_those_of_the_regulator_and_of_the_filter() -> None:
     A, B, C = (np.array(M) for M in BODY)
-    law = structured.lqg("lqg", BODY, malta.weights([1e6, 0], [1], [1e-2], [1e-6], q_i=[1e7]))
+    law = structured.lqg("lqg", BODY, weights([1e6, 0], [1], [1e-2], [1e-6], q_i=[1e7]))
     closed = control.feedback(control.ss(A, B, C, 0) * control.ss(*law.system), 1).poles()
     whole = np.block([[A, np.zeros((2, 1))], [-C, 0]])
     _, _, regulator = control.lqr(whole, np.vstack([B, [[0]]]), np.diag([1e6, 0, 1e7]), 1)
@@ -57,7 +58,7 @@ def test_slopes_are_those_of_differences(n: int, m: int, p: int) -> None:
     model = rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.normal(size=(p, n))
     q, r, w, v = (10 ** rng.uniform(-1, 1, size=k) for k in (n, m, m, p))
     q[0] = 0.0
-    law = structured.lqg("lqg", model, malta.weights(q, r, w, v, q_i=np.eye(p)[0] if m > 1 else None))
+    law = structured.lqg("lqg", model, weights(q, r, w, v, q_i=np.eye(p)[0] if m > 1 else None))
     if m == 1:
         law = structured.lead("lead", 3.0, 30.0) * law
     structure = structure_of(law)
@@ -81,7 +82,7 @@ def test_parameters_are_sizes_and_a_weight_of_zero_has_none() -> None:
         }
     )
     changed = law.at({"lqg.state.x0": 2e-3}).system
-    own = structured.lqg("own", BODY, malta.weights([2.5e5, 0], [1], [1e-2], [1e-12], q_i=[1e7])).system
+    own = structured.lqg("own", BODY, weights([2.5e5, 0], [1], [1e-2], [1e-12], q_i=[1e7])).system
     np.testing.assert_allclose(changed.C, own.C, rtol=1e-12)
     assert np.exp(structure_of(law).bounds[2]) == pytest.approx([0.5, 2.0])
 
@@ -101,7 +102,7 @@ def test_weights_are_found_that_hold_a_peak_and_a_noise() -> None:
     """From weights whose loop peaks at 2.2: goals on |S| and noise of the force hold, and the law is still an LQG."""
     plant = control.c2d(control.ss(*BODY, 0), 1e-3)
     (model,) = models_of_systems(plant)
-    start = structured.lqg("lqg", BODY, malta.weights([1e4, 0], [1], [1e-2], [1e-8]))
+    start = structured.lqg("lqg", BODY, weights([1e4, 0], [1], [1e-2], [1e-8]))
     goals = [
         structured.sensitivity(1.6),
         structured.soft(structured.noise_limit({f"reference {model.outputs[0]}": 1e-6}, "force", 1e-3)),
@@ -109,24 +110,24 @@ def test_weights_are_found_that_hold_a_peak_and_a_noise() -> None:
     found = structured.tune(plant, start, goals, starts=1)
     assert found.reached["sensitivity 1.6"] == pytest.approx(1.0, abs=6e-3)
     one = [found.values[f"lqg.{key}"] for key in ("state.x0", "input.u0", "process.u0", "sensor.y0")]
-    weights = malta.weights([one[0] ** -2, 0], [one[1] ** -2], [one[2] ** 2], [one[3] ** 2])
+    asked = weights([one[0] ** -2, 0], [one[1] ** -2], [one[2] ** 2], [one[3] ** 2])
     cart = malta.linear_machine(*BODY)
     lqg = malta.linearize(cart, cart.at())
-    np.testing.assert_allclose(found.law.C, malta.synthesis.lqr(lqg, weights), rtol=1e-9)
-    np.testing.assert_allclose(found.law.B, malta.synthesis.kalman(lqg, weights), rtol=1e-9)
+    np.testing.assert_allclose(found.law.C, malta.synthesis.lqr(lqg, asked), rtol=1e-9)
+    np.testing.assert_allclose(found.law.B, malta.synthesis.kalman(lqg, asked), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
     ("model", "weights", "words"),
     [
-        (BODY, malta.weights([1, 1, 1], [1], [1], [1]), r"lqg\.q.*3 entries"),
-        (BODY, malta.weights([1, 1], [1, 1], [1], [1]), r"lqg\.r.*2 entries"),
-        (BODY, malta.weights([1, 1], [1], [1], [1, 1]), r"lqg\.q_i|sensor_variance"),
-        (([[0, 1], [100, 0]], [[0], [0]], [[1, 0]]), malta.weights([1, 1], [1], [1], [1]), "no force moves the mode"),
-        (([[0, 1], [100, 0]], [[0], [1]], [[0, 0]]), malta.weights([1, 1], [1], [1], [1]), "no sensor sees the mode"),
-        (([[0, 1], [0, 0]], [[0], [1]], [[1, 0]]), malta.weights([0, 0], [1], [1], [1]), "LQR: .*weights whose LQG"),
-        (control.tf([1, 1], [1, 2]), malta.weights([1], [1], [1], [1]), "without D"),
-        (([[0, 1]], [[1]], [[1]]), malta.weights([1], [1], [1], [1]), "matrices that fit"),
+        (BODY, weights([1, 1, 1], [1], [1], [1]), r"lqg\.q.*3 entries"),
+        (BODY, weights([1, 1], [1, 1], [1], [1]), r"lqg\.r.*2 entries"),
+        (BODY, weights([1, 1], [1], [1], [1, 1]), r"lqg\.q_i|sensor_variance"),
+        (([[0, 1], [100, 0]], [[0], [0]], [[1, 0]]), weights([1, 1], [1], [1], [1]), "no force moves the mode"),
+        (([[0, 1], [100, 0]], [[0], [1]], [[0, 0]]), weights([1, 1], [1], [1], [1]), "no sensor sees the mode"),
+        (([[0, 1], [0, 0]], [[0], [1]], [[1, 0]]), weights([0, 0], [1], [1], [1]), "LQR: .*weights whose LQG"),
+        (control.tf([1, 1], [1, 2]), weights([1], [1], [1], [1]), "without D"),
+        (([[0, 1]], [[1]], [[1]]), weights([1], [1], [1], [1]), "matrices that fit"),
     ],
 )  # fmt: skip
 def test_what_has_no_lqg_is_refused_in_one_sentence(
@@ -141,6 +142,6 @@ def test_weights_of_positions_and_observed_disturbances_are_refused() -> None:
     spec = malta.read_design(ROOT / "design" / "robust.toml")
     with pytest.raises(malta.InputError, match="found positions, expected weights of signals"):
         structured.lqg("lqg", malta.linearize(spec.plant, spec.plant.at()), spec.weights)
-    drifting = replace(malta.weights([1, 1], [1], [1], [1]), drift_variance=np.ones(1))
+    drifting = replace(weights([1, 1], [1], [1], [1]), drift_variance=np.ones(1))
     with pytest.raises(malta.InputError, match="found a drift"):
         structured.lqg("lqg", BODY, drifting)

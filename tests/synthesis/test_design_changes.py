@@ -50,7 +50,10 @@ def test_more_inertia_is_fed_forward() -> None:
     np.testing.assert_allclose(second.feedforward.inertia, 1.8 * first.feedforward.inertia, rtol=1e-12)
     par: Any = plain.parameters
     machines = {"m": par.m * np.array([1.0, 1.2]), "K_D": par.K_D * np.array([1.0, 0.85])}
-    found = [malta.simulate_many(plain.plant, c, malta.Scenario.stroke(), machines) for c in (first, second)]
+    found = [
+        malta.simulation.simulate_many(plain.plant, c, malta.Scenario.stroke(), machines)
+        for c in (first, second)
+    ]
     assert 0.7 * found[0].overshoot[1] > found[1].overshoot[1]
     assert found[0].overshoot[1] > 0.015 > found[1].overshoot[1]
     assert found[0].deviation[0, 4] < 0.1e-3 < found[1].deviation[0, 4] < 0.3e-3

@@ -50,7 +50,7 @@ def _along(low: float, high: float) -> malta.Scenario:
     return malta.Scenario("along", 0.35, lambda _: course, noise=1.0, fidelity="force", settle=0.1)
 
 
-def _rest(plant: malta.Plant, place: float) -> dict[str, Any]:
+def _rest(plant: malta.model.Plant, place: float) -> dict[str, Any]:
     x = point_at(plant, np.zeros(len(plant.states)), "y", place).x
     return dict(zip([s.name for s in plant.states], x.tolist(), strict=True))
 

@@ -159,7 +159,7 @@ def simulate_many(
     >>> plant = malta.plant_of(controller.parameters)
     >>> masses = {"m": np.linspace(0.3, 0.4, 3)}
     >>> stroke = malta.Scenario.stroke(10e-3)
-    >>> batch = malta.simulate_many(plant, controller, stroke, masses, workers=1)
+    >>> batch = malta.simulation.simulate_many(plant, controller, stroke, masses, workers=1)
     >>> [f"{1e3 * rise:.1f} ms" for rise in batch.rise]
     ['14.5 ms', '15.6 ms', '16.5 ms']
     """
@@ -316,14 +316,14 @@ def replayed(
     first: int = 0,
     sensor_errors: Mapping[str, FloatArray] | None = None,
 ) -> tuple[Plant, Scenario]:
-    """Return machine and scenario of one run of `malta.simulate_many`, to simulate it again in full.
+    """Return machine and scenario of one run of `malta.simulation.simulate_many`, to simulate it again in full.
 
-    plant : as in `malta.simulate_many`
-    scenario : as in `malta.simulate_many`
-    changes : as in `malta.simulate_many`
+    plant : as in `malta.simulation.simulate_many`
+    scenario : as in `malta.simulation.simulate_many`
+    changes : as in `malta.simulation.simulate_many`
     index : of the run
     first : index of the run with which changes and sensor_errors begin
-    sensor_errors : as in `malta.simulate_many`
+    sensor_errors : as in `malta.simulation.simulate_many`
 
     Returns the plant with the run's parameters, and the scenario with its noise and its errors of the sensors.
 
@@ -332,7 +332,7 @@ def replayed(
     >>> plant = malta.plant_of(controller.parameters)
     >>> hold = malta.Scenario("hold", 5e-3, malta.references.hold, noise=1.0)
     >>> masses = {"m": [0.3, 0.4]}
-    >>> batch = malta.simulate_many(plant, controller, hold, masses, workers=1)
+    >>> batch = malta.simulation.simulate_many(plant, controller, hold, masses, workers=1)
     >>> machine, scenario = malta.simulation.replayed(plant, hold, masses, index=1)
     >>> run = malta.simulate(machine, controller, scenario)
     >>> bool(abs(run.v).max() > 0.999 * batch.force[1].max())

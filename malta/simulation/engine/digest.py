@@ -44,7 +44,7 @@ class Batch:
     >>> plant = malta.plant_of(controller.parameters)
     >>> hold = malta.Scenario("hold", 5e-3, malta.references.hold, start={"x": 20e-6})
     >>> masses = {"m": [0.3, 0.4]}
-    >>> batch = malta.simulate_many(plant, controller, hold, masses, workers=1)
+    >>> batch = malta.simulation.simulate_many(plant, controller, hold, masses, workers=1)
     >>> batch.completed.tolist(), batch.deviation.shape, batch.force.shape
     ([1.0, 1.0], (2, 5), (2, 5))
     """
