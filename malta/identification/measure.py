@@ -308,7 +308,8 @@ def plan_measurement(
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> loop = malta.loop(malta.plant_of(controller.parameters), controller)
-    >>> plan = malta.identification.plan_measurement(loop, separate=True, motion=10e-6, periods=4)
+    >>> plan_measurement = malta.identification.plan_measurement
+    >>> plan = plan_measurement(loop, separate=True, motion=10e-6, periods=4)
     >>> len(plan.excitations), plan.duration
     (5, 25.0)
     """

@@ -341,7 +341,8 @@ def lqg(
     >>> A, B, C = [[0, 1], [400, 0]], [[0], [2]], [[1, 0]]
     >>> cart = malta.linear_machine(A, B, C, name="cart", states=["z [m]", "v [m/s]"])
     >>> model = malta.linearize(cart, cart.at())
-    >>> weights = malta.synthesis.weights(q=[1e6, 0], r=[1], w=[1e-2], v=[1e-12], q_i=[1e7])
+    >>> given = {"q": [1e6, 0], "r": [1], "w": [1e-2], "v": [1e-12], "q_i": [1e7]}
+    >>> weights = malta.synthesis.weights(**given)
     >>> controller = malta.lqg(model, weights, Ts=1e-3)
     >>> malta.verify(model, controller).stable, [f"{k:.3g}" for k in controller.K[0]]
     (True, ['1.29e+03', '35.8'])

@@ -265,7 +265,8 @@ def comparison_page(found: Comparison, progress: Callable[[float], None] | None 
     >>> A, B, C = [[0, 1], [100, 0]], [[0], [1]], [[1, 0]]
     >>> plant = malta.linear_machine(A, B, C, name="compared")
     >>> model = malta.linearize(plant, plant.at())
-    >>> chosen = [malta.synthesis.weights(q=[q, 1], r=[1], w=[1], v=[1e-8]) for q in (1e2, 1e4)]
+    >>> weights = malta.synthesis.weights
+    >>> chosen = [weights(q=[q, 1], r=[1], w=[1], v=[1e-8]) for q in (1e2, 1e4)]
     >>> designs = [malta.lqg(model, one, Ts=1e-3) for one in chosen]
     >>> found = malta.report.compare_gains(*designs, proof=False)
     >>> b"What differs in the designs" in malta.report.comparison_page(found).content

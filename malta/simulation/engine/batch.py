@@ -159,7 +159,8 @@ def simulate_many(
     >>> plant = malta.plant_of(controller.parameters)
     >>> masses = {"m": np.linspace(0.3, 0.4, 3)}
     >>> stroke = malta.Scenario.stroke(10e-3)
-    >>> batch = malta.simulation.simulate_many(plant, controller, stroke, masses, workers=1)
+    >>> simulate_many = malta.simulation.simulate_many
+    >>> batch = simulate_many(plant, controller, stroke, masses, workers=1)
     >>> [f"{1e3 * rise:.1f} ms" for rise in batch.rise]
     ['14.5 ms', '15.6 ms', '16.5 ms']
     """
