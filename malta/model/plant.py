@@ -56,7 +56,7 @@ class Actuator:
 
     >>> import malta
     >>> current = malta.model.Signal("i", "A")
-    >>> coil = malta.model.Actuator((current,), (38.0,), current_limit=3.0, dead_time=100e-6)
+    >>> coil = malta.model.Actuator((current,), (38.0,), current_limit=3, dead_time=1e-4)
     >>> coil.force_limit, coil.delay(Ts=50e-6)  # N; samples
     ((114.0,), 2)
     """
