@@ -142,11 +142,11 @@ def corner(p: float) -> Severity:
 
 @pytest.mark.slow
 def test_intervals_keep_what_they_promise() -> None:
-    """Of 95 %, over 200 estimates of the smallest effort; the probability is off by less than its own interval."""
+    """Of 95 %, over 100 estimates of the smallest effort; the probability is off by less than its own interval."""
     covered = {}
     for p in (1e-2, 1e-3, 1e-5):
         for state, dimensions in ((line, 10), (union, 2), (corner, 2)):
-            found = estimates(state(p), dimensions, 200)
+            found = estimates(state(p), dimensions, 100)
             low, high = np.array([one.interval() for one in found]).T
             covered[p, state.__name__] = float(np.mean((low <= p) & (p <= high)))
             assert (

@@ -15,7 +15,6 @@ from malta.firmware.program import Precision
 FUSED = re.compile(r"^\s+v(?:fn?m(?:add|sub)|fn?m[as]\.)", re.MULTILINE)  # of x86, and of Arm
 M7 = ("-mcpu=cortex-m7", "-mthumb", "-mfpu=fpv5-d16", "-mfloat-abi=hard")
 COMPILERS = {"x86": ("gcc", "-mfma"), "Cortex-M7": ("arm-none-eabi-gcc", *M7)}
-OTHERS = ("halbach_late", "halbach_pid", "calibrated", "robust_observer", "planar", "planar_pid")
 GNU = ("-std=gnu11", "-O3", "-ffp-contract=fast")
 TELLS = """#include "halbach_supervisor.h"
 #include <stdio.h>
@@ -70,8 +69,8 @@ def write_files(files: dict[str, str], folder: Path) -> list[Path]:
     ("name", "precision"),
     [
         ("halbach", "float"),
-        *(pytest.param(n, "double", marks=pytest.mark.slow) for n in ("halbach", "robust", "tubular_pid")),
-        *(pytest.param(n, "float", marks=pytest.mark.slow) for n in OTHERS),
+        pytest.param("robust", "double", marks=pytest.mark.slow),
+        pytest.param("planar_pid", "float", marks=pytest.mark.slow),
     ],
 )
 def test_no_object_asks_for_a_function_of_libm(name: str, precision: Precision, tmp_path: Path) -> None:

@@ -162,7 +162,6 @@ FLIGHTS = [
             ("robust", None, 3),
             ("robust", "dq", 2),
             ("tubular_pid", None, 2),
-            ("planar", None, 3),
         )
     ),
 ]
@@ -477,7 +476,6 @@ def test_fmpy_simulates_a_stroke(fmi: int, tmp_path: Path) -> None:
         pytest.param("halbach", "phase", 2, marks=pytest.mark.slow),
         pytest.param("robust", "dq", 3, marks=pytest.mark.slow),
         pytest.param("tubular_pid", "force", 2, marks=pytest.mark.slow),
-        pytest.param("planar", "force", 3, marks=pytest.mark.slow),
     ],
 )
 def test_validation_finds_nothing(
@@ -658,8 +656,7 @@ def test_no_reading_poisons_the_controller(instance: Callable[..., Unit]) -> Non
 
 
 @pytest.mark.slow
-@BOTH
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize(("part", "fmi"), [("controller", 2), ("machine", 2), ("loop", 3), ("supervised", 3)])
 def test_no_compiler_warns_and_fmpy_builds_the_binary_anew(part: Part, fmi: int, tmp_path: Path) -> None:
     from fmpy.build import build_platform_binary
 

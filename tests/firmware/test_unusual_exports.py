@@ -25,7 +25,6 @@ DESIGNS = {
     "planar, PID": "design/planar_pid.toml",
     "planar": "design/planar.toml",
 }
-SHIPPED = ("tubular_pid", "halbach_pid", "halbach_late")
 SLOW = ("four axes", "four axes, PID", "planar", "planar, PID")
 
 
@@ -44,9 +43,12 @@ def passes(t: Target, folder: Path) -> None:
     assert "pass: " in done.stdout
 
 
-@pytest.mark.parametrize("precision", ["double", "float"])
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in DESIGNS]
+    ("name", "precision"),
+    [
+        pytest.param(name, precision, marks=pytest.mark.slow) if name in SLOW else (name, precision)
+        for name, precision in zip(DESIGNS, ("double", "float") * 3, strict=True)
+    ],
 )
 def test_a_designed_machine_passes_its_own_test(name: str, precision: Precision, tmp_path: Path) -> None:
     spec = malta.read_design(ROOT / DESIGNS[name])
@@ -55,8 +57,9 @@ def test_a_designed_machine_passes_its_own_test(name: str, precision: Precision,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", ["double", "float"])
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize(
+    ("name", "precision"), [("tubular_pid", "float"), ("halbach_pid", "double"), ("halbach_late", "float")]
+)
 def test_every_depth_of_an_export_passes_its_own_test(
     name: str, precision: Precision, tmp_path: Path
 ) -> None:

@@ -219,7 +219,9 @@ def test_a_loop_of_another_machine_is_refused() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", TUBULAR + OTHERS)
+@pytest.mark.parametrize(
+    "name", ["robust", "robust_observer", "tubular_pid", "halbach", "halbach_pid", "planar_pid"]
+)
 def test_witnesses_fly(name: str) -> None:
     """The nonlinear machine without loads, towards the parameters of its loss: at 0.97 it comes to rest, at 1.03 it
     leaves. Deviations so small that nothing saturates, as long as the linear loop takes to tell."""
@@ -253,13 +255,10 @@ def test_the_derivative_of_the_flight_anywhere_in_box_and_travel(name: str) -> N
     plant, c = shipped(name)
     names, rng = BOXES[plant.name], np.random.default_rng(7)
     nominal = np.array([getattr(plant.parameters, n) for n in names])
-    count = 4 if plant.name == "planar" else 20
-    for share in (-0.93, -0.41, 0.0, 0.37, 0.88):
+    places = rng.uniform(-1, 1, 1 if plant.name == "planar" else 3)
+    for share, spread in zip(places, rng.uniform(-1, 1, (len(places), len(names))), strict=True):
         check_machine_loop(plant, c, share)
-    for k, spread in enumerate(rng.uniform(-1, 1, (count, len(names)))):
-        check_proven_loop(
-            plant, c, names, nominal * (1 + 0.2 * spread), (-0.93, -0.41, 0.0, 0.37, 0.88)[k % 5]
-        )
+        check_proven_loop(plant, c, names, nominal * (1 + 0.2 * spread), share)
 
 
 @pytest.mark.slow

@@ -206,7 +206,7 @@ def compare_verdicts(design: Path, gains: Path) -> None:
 
 
 SMALL = ("halbach_pid", "planar_pid")
-LARGE = ("robust", "robust_observer", "tubular_pid")
+LARGE = ("robust_observer", "tubular_pid")
 
 
 @pytest.mark.parametrize(

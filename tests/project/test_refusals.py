@@ -241,15 +241,10 @@ def _put_everywhere(name: str, value: float, arrays: dict[str, Any]) -> None:
     ("change", "damaged"),
     [
         (partial(_end_all, np.nan), False),
-        pytest.param(partial(_end_all, np.inf), False, marks=pytest.mark.slow),
-        pytest.param(partial(_end_all, 1e308), False, marks=pytest.mark.slow),
-        pytest.param(partial(_put_everywhere, "deviation", 0.0), False, marks=pytest.mark.slow),
-        pytest.param(partial(_put_everywhere, "deviation", 5e-324), False, marks=pytest.mark.slow),
-        *(
-            pytest.param(partial(_put_everywhere, name, value), True, marks=pytest.mark.slow)
-            for name in ("deviation", "force", "overshoot", "contact")
-            for value in (1e30, 1e308)
-        ),
+        (partial(_end_all, 1e308), False),
+        (partial(_put_everywhere, "deviation", 5e-324), False),
+        (partial(_put_everywhere, "deviation", 1e308), True),
+        (partial(_put_everywhere, "contact", 1e30), True),
     ],
 )
 def test_whatever_a_run_can_leave_is_drawn(

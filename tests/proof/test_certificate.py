@@ -539,7 +539,7 @@ def test_a_long_proof_says_where_it_is(run: Run, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["robust", "tubular_pid", "halbach_late", "halbach_pid"])
+@pytest.mark.parametrize("name", ["robust", "halbach_late", "halbach_pid"])
 def test_shipped_designs(tmp_path: Path, name: str) -> None:
     path, content = shipped(name, tmp_path)
     own = {p["name"]: 0.2 for p in content["claim"]["parameters"] if p["down"]}
@@ -549,15 +549,12 @@ def test_shipped_designs(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["planar", "planar_pid"])
-def test_designs_whose_rounding_couples_all_states(tmp_path: Path, name: str) -> None:
-    gains = ROOT / "design" / "gains" / f"{name}.json"
+def test_a_design_whose_rounding_couples_all_states(tmp_path: Path) -> None:
+    gains = ROOT / "design" / "gains" / "planar_pid.json"
     controller = malta.gains.read(gains)
     plant = malta.plant_of(controller.parameters)
-    ranges = malta.read_design(ROOT / "design" / f"{name}.toml").uncertainty
-    margin = malta.proof.Margin(
-        3.2, math.inf, None, None, {}, {}, (), 0.0
-    )  # below what `verify` proves, 3.6 and 3.9
+    ranges = malta.read_design(ROOT / "design" / "planar_pid.toml").uncertainty
+    margin = malta.proof.Margin(3.2, math.inf, None, None, {}, {}, (), 0.0)  # below what `verify` proves, 3.9
     places, over = travel_loops(plant, controller, tuple(ranges))
     origin = origin_of(gains, plant, controller, "lag", len(places))
     found = check(certificate.write(tmp_path / "c.json", places, ranges, over, margin, origin), gains)

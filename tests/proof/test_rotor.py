@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import runpy
 import shutil
 import subprocess
 import sys
@@ -13,11 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
-import matplotlib
 import numpy as np
 import pytest
 from conftest import ROOT, printed
-from matplotlib import pyplot
 
 import malta
 from malta import report
@@ -346,15 +343,6 @@ def test_the_margin_of_all_parameters_agrees_with_eigenvalues(
     nominal = {name: getattr(par, name) for name in box}
     places, _ = travel_loops(plant, controller, tuple(box))
     agree(places[0], margin, nominal, box, np.linspace(0, par.Omega_max, 21))
-
-
-@pytest.mark.slow
-def test_the_notebook_runs(rotor: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert rotor
-    monkeypatch.chdir(FOLDER)
-    matplotlib.use("Agg")
-    runpy.run_path(str(FOLDER / "notebook.py"), run_name="__main__")
-    pyplot.close("all")
 
 
 @pytest.mark.slow

@@ -177,7 +177,7 @@ def test_the_page_of_a_comparison(carts: Comparison, tmp_path: Path, browser: An
 
 @pytest.mark.slow
 def test_shipped_designs_beside_each_other(run: Run, tmp_path: Path) -> None:
-    files = [GAINS / f"{name}.json" for name in ("robust", "tubular_pid")]
+    files = [GAINS / f"{name}.json" for name in ("halbach", "halbach_pid")]
     found = json.loads(run("compare", *files, "--json", "--out", tmp_path / "page.html").out)
     read_page((tmp_path / "page.html").read_text(encoding="utf-8"))
     figures = {one["key"]: one for one in found["figures"]}
@@ -188,18 +188,18 @@ def test_shipped_designs_beside_each_other(run: Run, tmp_path: Path) -> None:
         )
         peak = stored["peak_sensitivity"]["sigma_max"]
         assert figures["peak_sensitivity_sigma_max"]["values"][k] == pytest.approx(peak, rel=1e-4)
-    assert figures["margin_proven_share"]["best"] == ["robust"]
+    assert figures["margin_proven_share"]["best"] == ["halbach"]
     assert {"law_kind", "gains_norm_of_K"} <= set(found["differences"])
 
 
 @pytest.mark.slow
 def test_different_machines_are_compared_in_what_they_share(run: Run) -> None:
-    said = run("compare", GAINS / "robust.json", GAINS / "halbach.json", "--no-proof", "--json")
+    said = run("compare", GAINS / "planar_pid.json", GAINS / "halbach.json", "--no-proof", "--json")
     found = json.loads(said.out)
     keys = {one["key"] for one in found["figures"]}
     assert {"stable", "disk_margin_forces", "peak_sensitivity"} <= keys
     assert not any(key.startswith(("motion", "load", "stroke", "requirement")) for key in keys)
-    assert any("machines differ (tubular, halbach)" in remark for remark in found["remarks"])
+    assert any("machines differ (planar, halbach)" in remark for remark in found["remarks"])
 
 
 @pytest.mark.slow

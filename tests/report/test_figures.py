@@ -191,7 +191,7 @@ def test_nothing_is_wrong_with_the_figures_of_a_campaign(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("proven_once")
-@pytest.mark.parametrize("name", ["table2", "halbach", "planar"])
+@pytest.mark.parametrize("name", ["table2", "halbach"])
 def test_nothing_is_wrong_with_the_figures_of_margins_and_loads(name: str) -> None:
     plant, c, _ = machine(name)
     box = read_shares(ROOT / "design" / "gains" / f"{name}.json", [], plant.parameters, None)

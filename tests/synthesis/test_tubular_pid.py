@@ -72,7 +72,7 @@ def design(spec: Spec) -> SynthesizedDesign:
 @pytest.fixture(scope="module")
 def found(spec: Spec, published: dict[str, Any]) -> Evidence:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("malta.machines.tubular.paper.evidence.MACHINES", 64)
+        patch.setattr("malta.machines.tubular.paper.evidence.MACHINES", 16)
         return evidence_of(spec, published)
 
 
