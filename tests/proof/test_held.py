@@ -372,14 +372,8 @@ def test_coil_positions_make_waves_and_get_an_answer_in_time() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "box",
-    [
-        {"m": 0.2, "B_r": 0.2},
-        pytest.param({"m": 0.2, "I_x": 0.2, "I_z": 0.2, "B_r": 0.2, "r_z": 0.1}, marks=pytest.mark.slow),
-    ],
-)
-def test_mass_inertia_and_field_of_the_planar_motor_are_proven(box: dict[str, float]) -> None:
+def test_mass_inertia_and_field_of_the_planar_motor_are_proven() -> None:
+    box = {"m": 0.2, "I_x": 0.2, "I_z": 0.2, "B_r": 0.2, "r_z": 0.1}
     plant, c = _plant("planar"), _controller("planar", 1)
     system, law = machine_system(plant, c, list(box), {"y": 0.0})
     found = malta.robust_margin(system, law, box)

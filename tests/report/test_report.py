@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from conftest import DESIGNS, assert_folds, printed
+from figure_checks import defects
 from rich.console import Console
 
 import malta
@@ -216,6 +217,7 @@ def test_every_experiment_has_a_figure_that_says_what_drew_it(
 ) -> None:
     figure, content = pictured("calibrated", name)
     assert content == drawn(report.experiment_figure(flown("calibrated", name), published), tmp_path)
+    assert defects(figure) == []
     fidelity = "dq and phase" if name == "faults" else "dq"  # an open phase is none of dq
     assert figure.get_suptitle().startswith(f"calibrated, fidelity {fidelity}: ")
     for axes in figure.axes:

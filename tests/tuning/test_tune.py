@@ -376,16 +376,15 @@ def test_other_shipped_designs_hold_all_that_is_asked_for(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_poor_start_finds_its_way(spec: Spec) -> None:
-    """From the middle of every range, where the loop has a margin of a third of what is asked for, or none."""
-    middle = [math.sqrt(v.low * v.high) for v in spec.search]
+def test_a_poor_start_finds_its_way(spec: Spec, small: Spec) -> None:
+    """From the middle of every range of the axial loop, with all that is asked for but what is flown."""
     flown = ("tracking_error", "radial_deviation", "payload", "lift_off")
     asked = {name: bound for name, bound in spec.specification.items() if name not in flown}
-    poor = replace(spec.vary(middle), delays=(0,), specification=asked)
-    found = tuned(poor, effort=Effort(generations=15, polish=30, front=0))
-    # All at once is at the edge of what can be had: a search from elsewhere ends within some percent of it.
+    middle = [math.sqrt(v.low * v.high) for v in small.search]
+    poor = replace(small.vary(middle), specification=asked)
+    found = tuned(poor, effort=Effort(generations=4, polish=10, front=0))
     ratios = {(r.name, r.how): r.ratio for r in found.requirements}
-    assert max(ratios.values()) < 1.06, max(ratios, key=ratios.__getitem__)
+    assert max(ratios.values()) <= 1, max(ratios, key=ratios.__getitem__)
 
 
 @pytest.mark.slow
