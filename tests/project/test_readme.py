@@ -26,7 +26,7 @@ DESIGNS = {
 OBSERVED = ("robust_observer",)  # a table of its own on the page of its machine
 PAGES = {name: (ROOT / "docs" / "claims" / f"{name}.md").read_text(encoding="utf-8") for name in DESIGNS}
 DRAWN = "machines ±20 %"  # rows of machines drawn at random: shares, and deviations
-FEW = 240  # machines in the fast test
+FEW, LEARNERS = 240, 8  # machines here, and those that fly twice
 TIMED = "K(p) and pseudo-inverse"  # rows that are measured on the computer that computes them
 # Rows of a limit cycle's size: the last bit of the arithmetic decides which part of it the samples meet (92 to 109).
 CYCLES = "three times as fast, filter without"
@@ -90,6 +90,7 @@ def test_the_table_of_claims_is_computed(
 ) -> None:
     """Yields, of MACHINES on the pages, are computed of FEW: they lie within the interval of these."""
     monkeypatch.setattr("malta.machines.tubular.paper.evidence.MACHINES", FEW)
+    monkeypatch.setattr("malta.machines.tubular.paper.further_claims.LEARNERS", LEARNERS)
     specs = [malta.read_design(f"design/{name}.toml") for name in designs]
     ledger = malta.ledger(specs, malta.model.published(f"data/{machine}.toml"))
     found, shown = _cells(ledger.markdown()), _shown(ledger.title, designs)
@@ -102,6 +103,7 @@ def test_the_table_of_claims_is_computed(
         numbers = [[_number(cell) for cell in row[1:-1]] for row in (shown[subject], cells)]
         if subject.startswith(DRAWN):
             count = round(FEWER * FEW) if "no rest before" in subject or "fed forward" in subject else FEW
+            count = LEARNERS if "first stroke" in subject or "second stroke" in subject else count
             within = partial(_is_of_sample, count) if "[%]" in subject else _is_as_large
             assert [within(*pair) for pair in zip(*numbers, strict=True)] == [True] * len(numbers[0])
             continue

@@ -38,6 +38,7 @@ from malta.tuning.search import model_and_controller
 from malta.tuning.verify import SynthesizedDesign, judge
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from malta.machines.tubular.paper.evidence import Evidence
@@ -70,10 +71,11 @@ def design(spec: Spec) -> SynthesizedDesign:
 
 
 @pytest.fixture(scope="module")
-def found(spec: Spec, published: dict[str, Any]) -> Evidence:
+def found(spec: Spec, published: dict[str, Any]) -> Iterator[Evidence]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("malta.machines.tubular.paper.evidence.MACHINES", 16)
-        return evidence_of(spec, published)
+        patch.setattr("malta.machines.tubular.paper.further_claims.LEARNERS", 2)
+        yield evidence_of(spec, published)
 
 
 def terms_of(spec: Spec) -> Pid:
