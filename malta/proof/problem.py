@@ -28,6 +28,7 @@ from malta.proof.polynomial.characteristic import (
     pair,
 )
 from malta.proof.polynomial.closed_loop import Couplings, closed_loop, driven_group, loop_parts
+from malta.proof.polynomial.enclosure import precision
 from malta.proof.polynomial.family import binary
 from malta.proof.polynomial.rational import Symbolic, TooLarge, symbolic
 from malta.proof.time_limit import TimeUp
@@ -37,7 +38,7 @@ from malta.proof.uncertain import closed_loop as closed_matrices
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
     from malta.proof.box import Box
-    from malta.proof.box_parts import Part
+    from malta.proof.exclusion import Part
     from malta.proof.polynomial.enclosure import Polynomial
 
 
@@ -488,6 +489,27 @@ class CoefficientPolynomial:
 def _about_one(a: list[Any]) -> list[Any]:
     """The coefficients of g = z - 1 from those of z."""
     return [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), 0 * a[0]) for j in range(len(a))]
+
+
+MOST_BITS = 5120  # of the ball arithmetic in which Routh's scheme is tried
+
+
+def is_nominal_stable(problem: Problem, box: Box) -> bool:
+    """Whether the nominal loop is proven stable, by Routh's scheme in exact numbers or balls.
+
+    No coupling is neglected: over a box that is proven, other couplings may be than at the nominal values.
+    """
+    for f, _ in problem.parts([arb(x) for x in box.nominal.tolist()], neglect=False):
+        bits, stable = 160, None
+        while stable is None and bits <= MOST_BITS:
+            with precision(bits):
+                v = [exact(x) for x in box.nominal.tolist()]
+                v = [1 / x if inverted else x for x, inverted in zip(v, f.inverted, strict=True)]
+                stable = hurwitz(f.at(v))
+            bits *= 2
+        if not stable:
+            return False
+    return True
 
 
 def hurwitz(a: Sequence[Any]) -> bool | None:

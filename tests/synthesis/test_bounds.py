@@ -21,9 +21,9 @@ from tampering import claiming
 import malta
 from malta.margins.loop_report import Stage
 from malta.margins.travel import smallest_margin
+from malta.proof import exclusion
 from malta.proof.box import below
 from malta.proof.certificate import certificate, check, checked_file, checked_loop
-from malta.proof.exclusion import exclusion
 from malta.proof.groups import loop_of
 from malta.proof.margin import Margin
 from malta.proof.polynomial import characteristic as degrees

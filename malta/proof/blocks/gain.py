@@ -19,7 +19,7 @@ import numpy as np
 from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.processes import on_one_thread
-from malta.proof.blocks.blocks import (
+from malta.proof.blocks import (
     At,
     Block,
     Channels,
@@ -45,16 +45,14 @@ from malta.proof.blocks.transfer import (
     transfer,
 )
 from malta.proof.box import Box, box_of, within_branches
-from malta.proof.families import is_nominal_stable
 from malta.proof.groups import loop_of
 from malta.proof.loss import first_loss
 from malta.proof.margin import Margin, unproven
 from malta.proof.polynomial.enclosure import Unproven
-from malta.proof.problem import OfLoop
-from malta.proof.responses import responses
+from malta.proof.problem import OfLoop, is_nominal_stable
 from malta.proof.robust import deadline, law_of, problem_of
 from malta.proof.time_limit import TimeUp, time_limit
-from malta.proof.uncertain import Compensator, UncertainSystem, positive
+from malta.proof.uncertain import Compensator, UncertainSystem, positive, responses
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray

@@ -26,18 +26,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from flint import acb, arb
 
-from malta.proof.blocks.blocks import Block, Expanded
+from malta.proof.blocks import Block, Expanded
 from malta.proof.box import Box
-from malta.proof.box_parts import PATCHES, cut
-from malta.proof.exclusion.exclusion import (
+from malta.proof.exclusion import (
+    PATCHES,
     CellBounds,
     Growth,
     advance,
+    cut,
     growth_over,
     on_boxes,
     start,
 )
-from malta.proof.families import family_over
+from malta.proof.polynomial.enclosure import family_over
 from malta.proof.polynomial.family import Family, align, combine
 
 if TYPE_CHECKING:

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.model.plant import readonly
-from malta.proof.blocks.blocks import Block
-from malta.proof.responses import Responses
+from malta.proof.blocks import Block
+from malta.proof.uncertain import Responses
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from malta.proof.box_parts import cut
+from malta.proof.exclusion import cut
 from malta.proof.expressions import NotAnalytic, exact
 from malta.proof.polynomial.characteristic import pair
 from malta.proof.polynomial.enclosure import Disc, TooWide, Unproven, discs_of, ends_of, precision
