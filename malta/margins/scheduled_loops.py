@@ -41,7 +41,18 @@ from malta.processes import on_one_thread
 from malta.proof.expressions import BALLS, NotAnalytic, Program, program
 from malta.proof.parametric_plants import of_plant
 from malta.proof.polynomial.enclosure import precision
-from malta.proof.rates import BITS, CellOfLoop, Changes, Norms, RateBound, ball, middle, rate_bound, spectral
+from malta.proof.rates import (
+    BITS,
+    CellOfLoop,
+    Changes,
+    Norms,
+    RateBound,
+    add_on_top,
+    ball,
+    middle,
+    rate_bound,
+    spectral,
+)
 from malta.proof.uncertain import Compensator, UncertainSystem
 from malta.proof.windings import CurrentLoops, chosen_loops
 
@@ -112,7 +123,7 @@ class _Cell:
     def at(self, p: float) -> Any:
         """Phi in balls."""
         M, _, _, L, _, _, R, _, _ = self.every(arb(p))
-        return _on_top(L, (M * arb(self.T)).exp() * R, self.n)
+        return add_on_top(L, (M * arb(self.T)).exp() * R, self.n)
 
     def bent(self, p: Any) -> tuple[Any, Any]:
         """Phi'' and R over a ball p."""
@@ -125,7 +136,7 @@ class _Cell:
                     whole[row * k + i][(row + at) * k : (row + at + 1) * k] = line
         top = (arb_mat(whole) * arb(self.T)).exp().tolist()[:k]
         E, E1, half = (arb_mat([line[at * k : (at + 1) * k] for line in top]) for at in range(3))
-        return _on_top(L2, half * R * arb(2) + E1 * R1 * arb(2) + E * R2, self.n), R
+        return add_on_top(L2, half * R * arb(2) + E1 * R1 * arb(2) + E * R2, self.n), R
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,14 +226,6 @@ class _MovingNorms:
 def _between(a: float, b: float) -> Any:
     """A ball with all numbers between a and b."""
     return arb((a + b) / 2, (b - a) / 2 * (1 + 1e-9) + 1e-300)
-
-
-def _on_top(L: Any, rows: Any, n: int) -> Any:
-    """L with the first n of other rows added to its own."""
-    own, top = L.tolist(), rows.tolist()[:n]
-    return arb_mat(
-        [[a + b for a, b in zip(*pair, strict=True)] for pair in zip(own, top, strict=False)] + own[n:]
-    )
 
 
 def _expressions(

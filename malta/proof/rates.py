@@ -115,12 +115,7 @@ class _Loop:
     def at(self, p: float) -> Any:
         """Phi in balls."""
         M = self.M[0] + self.M[1] * arb(p)
-        top = ((M * arb(self.T)).exp() * self.R).tolist()[: self.n]
-        rows = self.L.tolist()
-        return arb_mat(
-            [[a + b for a, b in zip(*pair, strict=True)] for pair in zip(rows, top, strict=False)]
-            + rows[self.n :]
-        )
+        return add_on_top(self.L, (M * arb(self.T)).exp() * self.R, self.n)
 
 
 class CellOfLoop(NamedTuple):
@@ -301,6 +296,14 @@ def _closed(A: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray, law: Co
 
 def ball(M: FloatArray) -> Any:
     return arb_mat(len(M), M.shape[1], [arb(float(x)) for x in M.ravel()])
+
+
+def add_on_top(L: Any, rows: Any, n: int) -> Any:
+    """L with the first n of other rows added to its own."""
+    own, top = L.tolist(), rows.tolist()[:n]
+    return arb_mat(
+        [[a + b for a, b in zip(*pair, strict=True)] for pair in zip(own, top, strict=False)] + own[n:]
+    )
 
 
 def _put(rows: list[list[Any]], i: int, j: int, M: Any) -> None:

@@ -18,6 +18,7 @@ from scipy import sparse
 
 from malta.errors import InputError
 from malta.model.linearize import jacobians, linearize
+from malta.model.parameters import twins_of
 from malta.model.plant import Plant, symbolic
 from malta.proof.time_limit import check_time
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
@@ -174,6 +175,13 @@ def held_gain(plant: Plant, states: Mapping[str, float]) -> FloatArray:
     return np.asarray(np.linalg.lstsq(model.B, model.E, rcond=None)[0])
 
 
+def in_symbols(plant: Plant, symbols: Mapping[str, Any]) -> Plant:
+    """The plant with symbols for some parameters; twins share a symbol."""
+    twins = {name: symbols[twin] for name, twin in twins_of(plant.parameters).items() if twin in symbols}
+    machine: Plant = plant.variant(symbolic(plant.parameters, {**twins, **symbols}))
+    return machine
+
+
 @lru_cache(maxsize=16)  # plants compare by identity, and are built once for their parameters
 def model_of(
     plant: Plant, believed: Plant, names: tuple[str, ...], at: tuple[tuple[str, float], ...] = ()
@@ -184,13 +192,9 @@ def model_of(
 
     Its outputs are those of `jacobians` on the controlled states (A, B, C, E, forces, their ratio) and the preload.
     """
-    from malta.model.parameters import twins_of
-
-    par = plant.parameters
     p, z, v = ca.SX.sym("p", len(names)), ca.SX.sym("z"), ca.SX.sym("v", len(plant.inputs))
     own = dict(zip(names, ca.vertsplit(p), strict=True)) if names else {}
-    own = {name: own[twin] for name, twin in twins_of(par).items() if twin in own} | own
-    machine: Plant = plant.variant(symbolic(par, own))
+    machine = in_symbols(plant, own)
     x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
     point = ca.SX(plant.state(dict(at)))
     if plant.has_stroke:
@@ -213,18 +217,12 @@ def is_commutated(plant: Plant) -> bool:
     return bool(ca.which_depends(plant.currents(y, v), y, 1, True) != [False] * len(plant.actuator.coils))
 
 
-def lower_limit(declared: Mapping[str, Any]) -> float:
-    """The exclusive lower limit of a declared parameter; for `at_least` the float just below."""
-    above, least = declared.get("above"), declared.get("at_least")
+def limits_of(declared: Mapping[str, Any]) -> tuple[float, float]:
+    """The exclusive limits of a declared parameter; for `at_least` the float just below."""
+    above, least, below = (declared.get(key) for key in ("above", "at_least", "below"))
     found = [] if above is None else [float(above)]
     found += [] if least is None else [math.nextafter(float(least), -math.inf)]
-    return max(found, default=-math.inf)
-
-
-def upper_limit(declared: Mapping[str, Any]) -> float:
-    """The exclusive upper limit of a declared parameter."""
-    below = declared.get("below")
-    return math.inf if below is None else float(below)
+    return max(found, default=-math.inf), math.inf if below is None else float(below)
 
 
 def difference_form(c: Compensator) -> tuple[FloatArray, FloatArray]:
@@ -314,10 +312,16 @@ def _eigenvalues(matrices: FloatArray) -> ComplexArray:
 def critical_frequency(system: UncertainSystem, c: Compensator, p: FloatArray) -> float:
     """The frequency of the worst pole at one row of parameters, rad/s."""
     (poles,) = np.linalg.eigvals(closed_loop(system, c, p))
-    if c.sample_time is None:
+    T = c.sample_time
+    return worst_frequency(poles if T is None else T * poles, T)
+
+
+def worst_frequency(poles: ComplexArray, T: float | None) -> float:
+    """The frequency of the worst of some poles, rad/s; of sampled loops these are z - 1."""
+    if T is None:
         return float(abs(poles[poles.real.argmax()].imag))
-    z = 1 + c.sample_time * poles
-    return float(abs(np.angle(z[np.abs(z).argmax()])) / c.sample_time)
+    z = 1 + poles
+    return float(abs(np.angle(z[np.abs(z).argmax()])) / T)
 
 
 # Frequency responses of a loop's parts, and the peaks and crossings of what is computed from them.

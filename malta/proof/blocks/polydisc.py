@@ -93,7 +93,7 @@ def parts_of(
         math.isfinite(r) and (b.kind != "feedback" or r < 1) for (b, _), r in zip(blocks, most, strict=True)
     )
     p: list[Any] = [arb(low).union(arb(high)) for low, high in sides.tolist()]
-    p += [arb(0)] * (len(problem.names) - len(p))
+    p += [arb(0)] * (len(problem.loop.system.names) - len(p))
     grown = 1.0
     for (b, pins), r in zip(blocks, most, strict=True):
         if b.kind == "feedback" and known:  # the gain is 1 / (1 - delta), and f times 1 - delta

@@ -41,8 +41,6 @@ LARGEST = 14  # degree in s
 MOST_PLACES = 4000  # at which a_k, or H, is evaluated
 HIGHEST = 40  # degree of an interpolation along one parameter
 TAIL = -70.0  # log2 of what an interpolation may leave out, relative to each coefficient
-SNAP = 1e-4  # of a range: parameters nearer to zero than that are tried at zero
-FEW_PARTS = 16  # of a box
 
 
 class Tensor(NamedTuple):

@@ -58,11 +58,6 @@ def _slope(degree: int, u: float) -> FloatArray:
     return np.asarray(degree * (np.append(0.0, low) - np.append(low, 0.0)))
 
 
-def rows_at(f: Family, branch: int, x: FloatArray) -> ComplexArray:
-    """Weights of a_k in f(x) at points of a branch, on a scale of each point's own: points x K."""
-    return rows_and_slopes(f, branch, x)[0]
-
-
 def rows_and_slopes(f: Family, branch: int, x: Any) -> tuple[ComplexArray, ComplexArray]:
     """Weights of a_k in f(x) and in x f'(x) at points x of a branch, scaled alike: points x K each."""
     n = f.degree
