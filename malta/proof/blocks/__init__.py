@@ -134,7 +134,9 @@ def weight_of(weight: Any, where: str) -> Weight:
             raise InputError(where, "weight", describe(weight), expected)
         return Weight(np.array([float(weight)]), np.ones(1))
     if type(weight).__name__ == "StateSpace":
-        weight = _transfer_function(weight)
+        import control
+
+        weight = control.ss2tf(weight)
     try:
         single = np.shape(weight.num)[:2] == (1, 1) or (len(weight.num), len(weight.num[0])) == (1, 1)
         num, den = (np.asarray(c[0][0], dtype=float) for c in (weight.num, weight.den))
@@ -149,12 +151,6 @@ def weight_of(weight: Any, where: str) -> Weight:
     if not (known and stable and continuous and len(num) <= len(den)):
         raise InputError(where, "weight", "not stable, not proper or discrete", "a stable, proper one in s")
     return Weight(np.concatenate([np.zeros(len(den) - len(num)), num])[::-1], den[::-1])
-
-
-def _transfer_function(weight: Any) -> Any:
-    import control
-
-    return control.ss2tf(weight)
 
 
 At = Literal["sensors", "forces"]
