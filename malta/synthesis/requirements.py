@@ -302,12 +302,9 @@ def _noise_at_rest(
     return Requirement(name, measure, laws=("LQG", "PID"), estimate=estimate, trade=kind, **fields)
 
 
-def worst_merit(experiment: Any, merit: int = 0) -> float:
-    """Take the largest of a figure of merit over an experiment's cases; infinite where the experiment failed.
-
-    merit : the index of the figure among each case's
-    """
-    worst = max(case.merits[merit].value for case in experiment.cases)
+def worst_merit(experiment: Any) -> float:
+    """Take the largest of the first figure of merit over an experiment's cases; infinite where it failed."""
+    worst = max(case.merits[0].value for case in experiment.cases)
     return math.inf if experiment.failed else float(worst)
 
 

@@ -243,7 +243,8 @@ class Characteristic:
         Raises NotAnalytic when the matrices have no value there.
         """
         p = [1 / x if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
-        a = self._map_to_v(self._coefficients(p, fmpq_mat if self.exact else arb_mat))
+        a = self._coefficients(p, fmpq_mat if self.exact else arb_mat)
+        a = map_bilinear(a) if self.discrete else a
         if not self.exact:
             return a
         scale = _multiplier(self.loop, self.group, p)
@@ -292,9 +293,6 @@ class Characteristic:
         if not (self.exact or (self.loop.program.rational and self.loop.program.short)):
             return program.run([arb(x) for x in p], POINTS)
         return program.run(p, EXACT)
-
-    def _map_to_v(self, a: list[Any]) -> list[Any]:
-        return map_bilinear(a) if self.discrete else a
 
     # bounds
 

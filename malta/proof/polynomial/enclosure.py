@@ -112,7 +112,9 @@ def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until:
         for i, side in enumerate(plan)
     ]
     points = values_within(f, list(itertools.product(*grid)), until)
-    tails = add_bounds(_sum_tails(plan), f.coupling_bounds(moves, _real(sides)))
+    tails = add_bounds(
+        _sum_tails(plan), f.coupling_bounds(moves, [(arb(a), arb(b)) for a, b in sides.tolist()])
+    )
     return family([s.degree + 1 for s in plan], [s.chebyshev for s in plan], points, tails)
 
 
@@ -130,10 +132,6 @@ def family_over(f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: 
             known.pop(next(iter(known)))
         known[key] = family
     return known[key]
-
-
-def _real(sides: FloatArray) -> list[tuple[Any, Any]]:
-    return [(arb(a), arb(b)) for a, b in sides.tolist()]
 
 
 def add_bounds(

@@ -342,7 +342,7 @@ class Minors:
                 if sizes.beta[R, T]:
                     weight = _sum(weight, [arb(sizes.beta[R, T]) * x for x in self._absolute_kappa[T, S]])
             if weight:
-                result = _sum(result, _product(pi, weight))
+                result = _sum(result, list((arb_poly(pi) * arb_poly(weight)).coeffs()) if pi else [])
         return result
 
     @cached_property
@@ -472,10 +472,6 @@ def _bounds(a: FloatArray, sides: list[tuple[FloatArray, FloatArray]]) -> list[l
     k = len(sides[0][1])
     m = np.array([np.block([[a, b], [c, np.zeros((k, k))]]) for b, c in sides])
     return all_bounds(m, np.where(np.arange(m.shape[1]) < len(a), 1.0, 0.0))
-
-
-def _product(one: list[Any], two: list[Any]) -> list[Any]:
-    return list((arb_poly(one) * arb_poly(two)).coeffs()) if one and two else []
 
 
 def _sum(one: list[Any], two: list[Any]) -> list[Any]:

@@ -210,18 +210,14 @@ def expand_matrices(function: ca.Function, nominal: FloatArray) -> tuple[Symboli
     scales = np.concatenate([nominal, np.ones(len(s.atoms))])
     circles, zero = _circles(s), Ratio(s.context.constant(0))
     above = [positive.get((k, 0), zero) for k in range(resolved.shapes[-1][0])]
-    roots = dict(zip(_roots(s), above[conditions:], strict=True))
+    found = [s.inputs + k for k, step in enumerate(s.atoms) if s.program.steps[step][0] == "sqrt"]
+    roots = dict(zip(found, above[conditions:], strict=True))
 
     def replace_roots(r: Ratio) -> Ratio:
         return replace_squares(s, _replace_cosines(s, r, circles), roots)
 
     tables = [drop_rounding(s, {at: replace_roots(r) for at, r in t.items()}, scales) for t in matrices]
     return s, tables, [replace_roots(r) for r in above]
-
-
-def _roots(s: Symbolic) -> list[int]:
-    """The variables that are square roots."""
-    return [s.inputs + k for k, step in enumerate(s.atoms) if s.program.steps[step][0] == "sqrt"]
 
 
 def replace_squares(s: Symbolic, r: Ratio, roots: Mapping[int, Ratio]) -> Ratio:

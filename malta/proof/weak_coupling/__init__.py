@@ -83,8 +83,8 @@ class Coupling:
         members, axes, T = members_of(g, n), list(g.axes), self.T
         d = self.weights[members][:, None]
         by_state = (self.rest @ self.weights)[members] * SAFE / d
-        through = _response_to_moves(N, r, T, 2)
-        loose = _response_to_moves(off, r, T, 2)
+        through = _response_to_moves(N, r, T)
+        loose = _response_to_moves(off, r, T)
         own = self.forces(axes, self.weights) / d
         scaled, loose = through * own[..., None], loose * own * SAFE
         beyond = ((np.abs(N).max(axis=3) + off) * by_state).sum(axis=2)
@@ -99,10 +99,10 @@ class Coupling:
         return np.concatenate([(M @ weights)[list(axes)] for M in (self.W, self.V)]) * SAFE
 
 
-def _response_to_moves(N: FloatArray, r: int, T: float, axis: int) -> FloatArray:
+def _response_to_moves(N: FloatArray, r: int, T: float) -> FloatArray:
     """The response to forces on the axes and to moves of their positions, from the response N to moves of states."""
-    q, rate = np.take(N, range(r), axis=axis), np.take(N, range(r, 2 * r), axis=axis)
-    return np.concatenate([q * (T**2 / 2) + rate * T, q], axis=axis)
+    q, rate = N[:, :, :r], N[:, :, r : 2 * r]
+    return np.concatenate([q * (T**2 / 2) + rate * T, q], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,7 +343,7 @@ class HeldLoop:
         angles = np.abs(np.angle(poles[np.abs(poles) > 0.3]))
         z = np.exp(1j * np.concatenate([np.geomspace(1e-3, 1, SWEEP) * np.pi, angles]))
         G = np.linalg.inv(z[:, None, None] * np.eye(len(A)) - A)
-        return np.abs(_response_to_moves(G, r, self.T, 2)), np.abs(G)
+        return np.abs(_response_to_moves(G, r, self.T)), np.abs(G)
 
 
 def _perron_of(M: FloatArray) -> tuple[FloatArray, float]:
