@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from malta.proof.responses import responses
-from malta.proof.uncertain import Compensator, UncertainSystem, instability
+from malta.proof.uncertain import Compensator, UncertainSystem, instability, responses
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray

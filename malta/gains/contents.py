@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -180,7 +180,7 @@ def build_controller(file: GainFile, path: str | Path) -> Controller:
         raise InputError(path, "noise", "null" if file.noise is None else "some", "null where cost is null")
     arrays, unlimited = _arrays(file, layout, path)
     _check_values(arrays, path)
-    errors = _tracks_errors(file)
+    errors, p = _tracks_errors(file), len(layout.plant.outputs)
     if errors:
         _check_error_law(file, arrays, path)
     fields: dict[str, Any] = dict(
@@ -199,9 +199,9 @@ def build_controller(file: GainFile, path: str | Path) -> Controller:
         current_loop=None if file.current_loop is None else CurrentLoop(**file.current_loop.model_dump()),
         limits=Limits(**(unlimited | arrays["limits"])),
         tracks="errors" if errors else "states",
-        pause=_of_outputs(file, layout.plant, path, "pause"),
-        braking=_of_outputs(file, layout.plant, path, "braking"),
-        references=_references(file, layout.plant, path),
+        pause=_law_entry(file, "pause", (p,), path, "rates"),
+        braking=_law_entry(file, "braking", (p,), path, "errors"),
+        references=_law_entry(file, "references", (3, p), path, "limits"),
         commutation=None
         if file.commutation is None
         else Commutation(file.commutation.lead, **arrays["commutation"]),
@@ -241,28 +241,14 @@ def _schedule(file: GainFile, arrays: Arrays, layout: _Layout, path: str | Path)
     return made
 
 
-def _of_outputs(
-    file: GainFile, plant: Plant, path: str | Path, name: Literal["pause", "braking"]
-) -> FloatArray:
-    """A number of at least 0 for each output, as the rates above which sums wait; none where the file has none."""
+def _law_entry(file: GainFile, name: str, shape: tuple[int, ...], path: str | Path, what: str) -> FloatArray:
+    """An entry of the table law whose numbers are not below 0, `what` in a message; empty where the file has none."""
     given = None if file.law is None else getattr(file.law, name)
     if given is None:
-        return np.zeros(0)
-    found = _array(given, (len(plant.outputs),), path, f"law.{name}")
+        return np.zeros((0,) * len(shape))
+    found = _array(given, shape, path, f"law.{name}")
     if (found < 0).any():
-        expected = "rates of at least 0" if name == "pause" else "errors of at least 0"
-        raise InputError(path, f"law.{name}", str(found.tolist()), expected)
-    return found
-
-
-def _references(file: GainFile, plant: Plant, path: str | Path) -> FloatArray:
-    """Limits of references, 3 x p; none where the file has none."""
-    given = None if file.law is None else file.law.references
-    if given is None:
-        return np.zeros((0, 0))
-    found = _array(given, (3, len(plant.outputs)), path, "law.references")
-    if (found < 0).any():
-        raise InputError(path, "law.references", str(found.tolist()), "limits of at least 0")
+        raise InputError(path, f"law.{name}", str(found.tolist()), f"{what} of at least 0")
     return found
 
 

@@ -89,14 +89,10 @@ def document(controller: Controller, margins: LoopReport) -> dict[str, Any]:
         require_plain_name(c.parameters.preset, "gain file", "plant.preset")
     in_positions = c.cost is not None and c.cost.coordinates == "positions"
     ahead = c.commutation is not None
-    extended = linear or c.tracks == "errors" or not c.feedforward.rate.size or bool(c.lagging) or ahead
-    extended = extended or in_positions or bool(c.feedforward.position.size) or bool(c.pause.size)
-    extended = extended or bool(c.braking.size)
-    extended = extended or bool(c.references.size) or c.schedule is not None
     law: dict[str, Any] = {"tracks": c.tracks} | ({"coordinates": "positions"} if in_positions else {})
-    law |= {"pause": c.pause} if c.pause.size else {}
-    law |= {"braking": c.braking} if c.braking.size else {}
-    law |= {"references": c.references} if c.references.size else {}
+    law |= {key: getattr(c, key) for key in ("pause", "braking", "references") if getattr(c, key).size}
+    extended = linear or ahead or c.tracks == "errors" or c.schedule is not None or bool(c.lagging)
+    extended = extended or len(law) > 1 or not c.feedforward.rate.size or bool(c.feedforward.position.size)
     tables: dict[str, Any] = {
         "schema": SCHEMA,
         "version": 2 if extended else 1,

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from malta.display import display
-from malta.proof.responses import find_peaks, responses
-from malta.proof.uncertain import Compensator, UncertainSystem, instability
+from malta.proof.uncertain import Compensator, UncertainSystem, find_peaks, instability, responses
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray

@@ -228,20 +228,18 @@ def loop(
     return _remembered(machine, controller, tuple(position_at(plant, x).items()), current_loops)
 
 
-def loop_of_model(model: LinearModel, controller: Controller, current_loops: CurrentLoops = LAST) -> Loop:
+def loop_of_model(model: LinearModel, controller: Controller) -> Loop:
     """The loop of a linear model's machine at the model's operating point."""
     at = position_at(model.plant, model.operating_point.x)
-    return _remembered(model.plant, controller, tuple(at.items()), current_loops)
+    return _remembered(model.plant, controller, tuple(at.items()))
 
 
-def loop_along(
-    plant: Plant, controller: Controller, position: float | None = None, current_loops: CurrentLoops = LAST
-) -> Loop:
+def loop_along(plant: Plant, controller: Controller, position: float | None = None) -> Loop:
     """The loop at a position of the stroke, m; None: at the controller's operating point."""
     at = position_at(plant, plant.point(controller.operating_point[0]).x)
     if position is not None and plant.has_stroke:
         at[plant.stroke] = position
-    return _remembered(plant, controller, tuple(at.items()), current_loops)
+    return _remembered(plant, controller, tuple(at.items()))
 
 
 def loop_from(source: Plant | Loop, controller: Controller | None, position: float | None = None) -> Loop:
@@ -256,6 +254,9 @@ def loop_from(source: Plant | Loop, controller: Controller | None, position: flo
 
 @lru_cache(maxsize=32)  # what is asked of a loop is computed once; plants and controllers compare by identity
 def _remembered(
-    plant: Plant, controller: Controller, at: tuple[tuple[str, float], ...], current_loops: CurrentLoops
+    plant: Plant,
+    controller: Controller,
+    at: tuple[tuple[str, float], ...],
+    current_loops: CurrentLoops = LAST,
 ) -> Loop:
     return Loop(plant, law_at(controller, plant, plant.state(dict(at))), dict(at), current_loops)

@@ -28,7 +28,7 @@ from malta.loops.loop import Loop, loop_along, loop_from
 from malta.loops.sampled_loops import SampledLoop
 from malta.model.plant import position_in
 from malta.processes import on_one_thread
-from malta.proof.responses import find_peaks
+from malta.proof.uncertain import find_peaks
 from malta.synthesis.recovery import StepResponse, step_response
 from malta.synthesis.requirements import Noise
 from malta.synthesis.riccati import sample

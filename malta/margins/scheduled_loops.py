@@ -24,7 +24,7 @@ import math
 import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, make_dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -41,7 +41,18 @@ from malta.processes import on_one_thread
 from malta.proof.expressions import BALLS, NotAnalytic, Program, program
 from malta.proof.parametric_plants import of_plant
 from malta.proof.polynomial.enclosure import precision
-from malta.proof.rates import BITS, CellOfLoop, Changes, Norms, RateBound, ball, middle, rate_bound, spectral
+from malta.proof.rates import (
+    BITS,
+    CellOfLoop,
+    Changes,
+    MovingLoop,
+    RateBound,
+    add_on_top,
+    ball,
+    middle,
+    rate_bound,
+    spectral,
+)
 from malta.proof.uncertain import Compensator, UncertainSystem
 from malta.proof.windings import CurrentLoops, chosen_loops
 
@@ -81,7 +92,10 @@ def rate_of_cells(
     name, low, high = cells[0][0].names[0], cells[0][2][0], cells[-1][2][1]
     with precision(BITS):
         try:
-            return rate_bound(_LoopOfCells.of(cells), name, begun, time)
+            own = _cells_of(cells)
+            along = tuple(CellOfLoop(cell.at, cell.low, cell.high) for cell in own)
+            loop = MovingLoop(along, partial(_MovingNorms, own), own[0].T)
+            return rate_bound(loop, name, begun, time)
         except NotAnalytic as error:
             spent, why = clock.monotonic() - begun, f"no enclosure: {error}"
             return RateBound(name, low, high, None, None, 0, spent, why)
@@ -112,7 +126,7 @@ class _Cell:
     def at(self, p: float) -> Any:
         """Phi in balls."""
         M, _, _, L, _, _, R, _, _ = self.every(arb(p))
-        return _on_top(L, (M * arb(self.T)).exp() * R, self.n)
+        return add_on_top(L, (M * arb(self.T)).exp() * R, self.n)
 
     def bent(self, p: Any) -> tuple[Any, Any]:
         """Phi'' and R over a ball p."""
@@ -125,52 +139,30 @@ class _Cell:
                     whole[row * k + i][(row + at) * k : (row + at + 1) * k] = line
         top = (arb_mat(whole) * arb(self.T)).exp().tolist()[:k]
         E, E1, half = (arb_mat([line[at * k : (at + 1) * k] for line in top]) for at in range(3))
-        return _on_top(L2, half * R * arb(2) + E1 * R1 * arb(2) + E * R2, self.n), R
+        return add_on_top(L2, half * R * arb(2) + E1 * R1 * arb(2) + E * R2, self.n), R
 
 
-@dataclass(frozen=True, eq=False)
-class _LoopOfCells:
-    """The loop along all cells."""
-
-    own: tuple[_Cell, ...]
-    n: int
-    T: float
-
-    @classmethod
-    def of(cls, cells: Sequence[tuple[UncertainSystem, Compensator, Interval]]) -> _LoopOfCells:
-        middle_cell = cells[len(cells) // 2]
-        plain = _expressions(*middle_cell[:2], None)
-        (T, n), (a, b) = plain[1:], middle_cell[2]
-        M, L, R = (np.array(ca.DM(x)) for x in plain[0](a / 2 + b / 2)[:3])
-        Phi = L.copy()
-        Phi[:n] += (linalg.expm(M * T) @ R)[:n]
-        _, (units, _) = linalg.matrix_balance(Phi, permute=False, separate=True)
-        made = []
-        for system, law, (low, high) in cells:
-            function, _, _ = _expressions(system, law, units)
-            made.append(_Cell(program(function), low, high, n, T))
-        return cls(tuple(made), n, T)
-
-    @property
-    def cells(self) -> list[CellOfLoop]:
-        """The intervals of the laws."""
-        return [CellOfLoop(cell.at, cell.low, cell.high) for cell in self.own]
-
-    def at(self, p: float) -> Any:
-        """Phi in balls."""
-        return next(cell for cell in self.own if p <= cell.high).at(p)
-
-    def norms(self, P: Any) -> Norms:
-        """What is needed of changes of Phi, in units in which P is about one."""
-        return _MovingNorms(self, P)
+def _cells_of(cells: Sequence[tuple[UncertainSystem, Compensator, Interval]]) -> list[_Cell]:
+    """The loops as instructions, in units of xi in which the middle one is balanced."""
+    middle_cell = cells[len(cells) // 2]
+    plain, T, n = _expressions(*middle_cell[:2], None)
+    a, b = middle_cell[2]
+    M, L, R = (np.array(ca.DM(x)) for x in plain(a / 2 + b / 2)[:3])
+    Phi = L.copy()
+    Phi[:n] += (linalg.expm(M * T) @ R)[:n]
+    _, (units, _) = linalg.matrix_balance(Phi, permute=False, separate=True)
+    return [
+        _Cell(program(_expressions(system, law, units)[0]), low, high, n, T)
+        for system, law, (low, high) in cells
+    ]
 
 
 class _MovingNorms:
     """Norms of M and M' over the whole course, in units of (x, v) in which inputs move states as states do."""
 
-    def __init__(self, loop: _LoopOfCells, P: Any) -> None:
-        self.loop, n = loop, loop.n
-        M = middle(loop.own[0].every(arb(loop.own[0].low))[0])
+    def __init__(self, own: Sequence[_Cell], P: Any) -> None:
+        self.own, n = own, own[0].n
+        M = middle(own[0].every(arb(own[0].low))[0])
         m = len(M) - n
         X = np.linalg.inv(np.linalg.cholesky(middle(P)[:n, :n])).T
         back = np.linalg.inv(X)
@@ -181,7 +173,7 @@ class _MovingNorms:
         self.U = ball(np.block([[X, np.zeros((n, m))], [np.zeros((m, n)), np.diag(size)]]))
         self.back = self.U.inv()
         self.speed = self.slope = 0.0
-        for cell in loop.own:
+        for cell in own:
             edges = np.linspace(cell.low, cell.high, FAR + 1).tolist()
             for a, b in pairwise(edges):
                 whole, first, *_ = cell.every(_between(a, b))
@@ -190,9 +182,9 @@ class _MovingNorms:
 
     def changes(self, X: Any, back: Any, low: float, high: float) -> Changes:
         """Within an interval, in the units X."""
-        cell = next(cell for cell in self.loop.own if cell.low <= low and high <= cell.high)
+        cell = next(cell for cell in self.own if cell.low <= low and high <= cell.high)
         second, R = cell.bent(_between(low, high))
-        onto = arb_mat([row[: self.loop.n] for row in back.tolist()])
+        onto = arb_mat([row[: cell.n] for row in back.tolist()])
         spread = spectral(onto * self.X) * spectral(self.back * R * X)
         return Changes(spread, self._first(cell, (low, high), onto, R * X), spectral(back * second * X))
 
@@ -201,7 +193,7 @@ class _MovingNorms:
 
         p moves s at most until s: the integral of s is T^2/2. It stays within a width of the interval.
         """
-        low, high, n, T = *ends, self.loop.n, cell.T
+        low, high, n, T = *ends, cell.n, cell.T
         M, slope, *_ = cell.every(_between(2 * low - high, 2 * high - low))
         most = 0.0
         for k in range(SAMPLE):
@@ -215,14 +207,6 @@ class _MovingNorms:
 def _between(a: float, b: float) -> Any:
     """A ball with all numbers between a and b."""
     return arb((a + b) / 2, (b - a) / 2 * (1 + 1e-9) + 1e-300)
-
-
-def _on_top(L: Any, rows: Any, n: int) -> Any:
-    """L with the first n of other rows added to its own."""
-    own, top = L.tolist(), rows.tolist()[:n]
-    return arb_mat(
-        [[a + b for a, b in zip(*pair, strict=True)] for pair in zip(own, top, strict=False)] + own[n:]
-    )
 
 
 def _expressions(

@@ -39,8 +39,8 @@ from malta.proof.robust import (
 )
 from malta.proof.time_limit import TimeUp, time_limit
 from malta.proof.uncertain import Compensator, UncertainSystem, is_commutated, model_of
+from malta.proof.weak_coupling import HeldLoop
 from malta.proof.weak_coupling.held_currents import held_machine
-from malta.proof.weak_coupling.weak_coupling import HeldLoop
 from malta.proof.windings import CurrentLoops
 from malta.synthesis.schedule import point_at
 

@@ -54,9 +54,8 @@ from malta.model.plant import Plant, position_at
 from malta.processes import on_one_thread
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.parametric_plants import of_plant
-from malta.proof.responses import crossing_frequency, find_peaks
 from malta.proof.robust import robust_margin
-from malta.proof.uncertain import Compensator
+from malta.proof.uncertain import Compensator, crossing_frequency, find_peaks
 from malta.proof.windings import CurrentLoops, chosen_loops
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import gain_at_rest

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
-    from malta.proof.blocks.blocks import Dynamic as Dynamic
+    from malta.proof.blocks import Dynamic as Dynamic
     from malta.proof.blocks.gain import Gain as Gain
     from malta.proof.connections import append as append
     from malta.proof.connections import feedback as feedback

@@ -204,10 +204,6 @@ KNOWN = frozenset({*FIELD, *_BALLS, "const", "input", "constpow"})
 EXACT = Arithmetic(exact, {})
 
 
-def _real(x: float) -> Any:
-    return arb(exact(x))
-
-
 def _ball(x: float) -> Any:
     exact(x)
     return acb(x)
@@ -230,7 +226,7 @@ def _at_points(functions: dict[str, Callable[..., Any]]) -> dict[str, Callable[.
     return {name: wrap(function) for name, function in functions.items()}
 
 
-POINTS = _Checked(_real, _at_points(_POINTS))
+POINTS = _Checked(lambda x: arb(exact(x)), _at_points(_POINTS))
 BALLS = _Checked(_ball, _BALLS)
 
 
@@ -274,7 +270,7 @@ def program(function: ca.Function) -> Program:
             tuple(
                 (i, j, outputs[n, k])
                 for k, (i, j) in enumerate(zip(rows, columns, strict=True))
-                if (n, k) in outputs and not _is_zero(steps[outputs[n, k]])
+                if (n, k) in outputs and steps[outputs[n, k]] != ("const", 0, (), 0.0)
             )
         )
     shapes = tuple(flat.size_out(n) for n in range(flat.n_out()))
@@ -287,7 +283,3 @@ def _step(
     if name == "pow" and steps[operands[1]][0] == "const":
         return ("constpow", 0, (operands[0],), steps[operands[1]][3])
     return (name, 0, tuple(operands), 0.0)
-
-
-def _is_zero(step: tuple[str, int, tuple[int, ...], float]) -> bool:
-    return step[0] == "const" and step[3] == 0.0

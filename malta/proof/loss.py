@@ -20,7 +20,7 @@ from malta.proof.uncertain import Compensator, UncertainSystem, critical_frequen
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
     from malta.proof.box import Box
-    from malta.proof.box_parts import Part
+    from malta.proof.exclusion import Part
     from malta.proof.exclusion.witness import Zero
     from malta.proof.problem import Problem
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.model.equilibrium import commanded
-from malta.model.parameters import shape_parameters, twins_of, units_of
-from malta.model.plant import Plant, position_in, readonly, symbolic
+from malta.model.parameters import shape_parameters, units_of
+from malta.model.plant import Plant, position_in, readonly
 from malta.model.signals import LateSensors, with_lags
 from malta.proof.box import without_branches
 from malta.proof.expressions import NotAnalytic, program
@@ -21,7 +21,7 @@ from malta.proof.polynomial import rational
 from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge
 from malta.proof.polynomial.rational import symbolic as rational_functions
 from malta.proof.time_limit import check_time
-from malta.proof.uncertain import UncertainSystem, describe, is_commutated, lower_limit, model_of, upper_limit
+from malta.proof.uncertain import UncertainSystem, describe, in_symbols, is_commutated, limits_of, model_of
 from malta.proof.windings import Windings, with_windings
 
 if TYPE_CHECKING:
@@ -172,26 +172,11 @@ def _coefficients(s: Symbolic, polynomial: Any, first: int, m: int) -> dict[tupl
 
 
 def _resolved(s: Symbolic, r: Ratio) -> Ratio:
-    """The ratio with squares of roots replaced by what the roots are of, the outermost first."""
-    for k, step in reversed(list(enumerate(s.atoms))):
-        name, _, _, power = s.program.steps[step]
-        if name == "sqrt" or (name == "constpow" and power == 0.5):
-            r = _without_squares(s, r, s.inputs + k, s.arguments[k])
-    return r
-
-
-def _without_squares(s: Symbolic, r: Ratio, root: int, argument: Ratio) -> Ratio:
-    def turn(polynomial: Any) -> Ratio:
-        total = Ratio(s.context.constant(0))
-        for monomial, c in polynomial.to_dict().items():
-            squares, odd = divmod(int(monomial[root]), 2)
-            rest = tuple(odd if k == root else e for k, e in enumerate(monomial))
-            term = Ratio(s.context.from_dict({rest: c}))
-            total = total + (term * argument**squares if squares else term)
-        return total
-
-    num = turn(r.num)
-    return num if r.den is None else num / turn(r.den)
+    """The ratio with squares of roots replaced by what the roots are of."""
+    steps = [s.program.steps[step] for step in s.atoms]
+    is_root = (name == "sqrt" or (name == "constpow" and power == 0.5) for name, _, _, power in steps)
+    roots = {s.inputs + k: s.arguments[k] for k, root in enumerate(is_root) if root}
+    return rational.replace_squares(s, r, roots)
 
 
 LONGEST = 20_000  # operations up to which a model is expanded
@@ -237,6 +222,7 @@ def of_plant(
     check_time()
     p = ca.SX.sym("p", len(names))
     own = [k for k, name in enumerate(names) if name != plant.stroke]
+    symbols = {names[k]: p[k] for k in own}
     z = p[names.index(plant.stroke)] if plant.stroke in names else position
     nominal = [position if name == plant.stroke else getattr(par, name) for name in names]
     short, positive, why = None, None, ""
@@ -257,15 +243,15 @@ def of_plant(
             A, left = A - E @ C, E - B @ ca.DM(held)
             B = ca.horzcat(B, left)
     if late:
-        A, B, C = with_lags(_sensors_in(plant, p, names), A, B, C)
+        A, B, C = with_lags(_sensors_in(plant, symbols), A, B, C)
     if windings is not None:
         point = ca.SX(x0)
         if plant.has_stroke:
             point[plant.stroke_state] = z
-        A, B, C = with_windings(_in_symbols(plant, p, names), windings, point, A, B, C)
+        A, B, C = with_windings(in_symbols(plant, symbols), windings, point, A, B, C)
     if states:
         C = ca.vertcat(C, ca.DM.eye(len(plant.controlled)))
-    bounds = {f.name: (lower_limit(f.metadata), upper_limit(f.metadata)) for f in fields(par)}
+    bounds = {f.name: limits_of(f.metadata) for f in fields(par)}
     limits = tuple(bounds.get(name, (-math.inf, math.inf)) for name in names)
     matrices = ca.Function("matrices", [p], [A, B, C])
     if short is None:
@@ -275,29 +261,20 @@ def of_plant(
     )
 
 
-def _sensors_in(plant: Plant, p: Any, names: Sequence[str]) -> LateSensors | None:
-    """The sensors of a plant in symbols p of these parameters.
+def _sensors_in(plant: Plant, symbols: Mapping[str, Any]) -> LateSensors | None:
+    """The sensors of a plant in symbols of some parameters.
 
     Raises InputError for an uncertain lag whose nominal value is none.
     """
-    uncertain = [name for name in names if name != plant.stroke]
-    if plant.sensors is None and all(getattr(plant.parameters, name) for name in uncertain):
+    if plant.sensors is None and all(getattr(plant.parameters, name) for name in symbols):
         return None  # no uncertain parameter is a lag of 0 s
-    sensors = _in_symbols(plant, p, names).sensors
+    sensors = in_symbols(plant, symbols).sensors
     nominal = [] if plant.sensors is None else plant.sensors.lagging
     if sensors is not None and sensors.lagging != nominal:
         raise InputError(
             "uncertain", "sensors", "an uncertain lag of 0 s", "one above 0 s, set in the machine"
         )
     return sensors
-
-
-def _in_symbols(plant: Plant, p: Any, names: Sequence[str]) -> Plant:
-    """The plant with symbols p for these parameters; twins share a symbol."""
-    symbols = {name: p[k] for k, name in enumerate(names) if name != plant.stroke}
-    twins = {name: symbols[twin] for name, twin in twins_of(plant.parameters).items() if twin in symbols}
-    machine: Plant = plant.variant(symbolic(plant.parameters, twins | symbols))
-    return machine
 
 
 def _check_names(plant: Plant, names: Any) -> None:

@@ -28,16 +28,24 @@ from malta.proof.polynomial.characteristic import (
     pair,
 )
 from malta.proof.polynomial.closed_loop import Couplings, closed_loop, driven_group, loop_parts
+from malta.proof.polynomial.enclosure import precision
 from malta.proof.polynomial.family import binary
-from malta.proof.polynomial.rational import Symbolic, TooLarge, symbolic
+from malta.proof.polynomial.rational import Symbolic, TooLarge, over_common_denominator, symbolic
 from malta.proof.time_limit import TimeUp
-from malta.proof.uncertain import Compensator, Group, UncertainSystem, critical_frequency, instability
+from malta.proof.uncertain import (
+    Compensator,
+    Group,
+    UncertainSystem,
+    critical_frequency,
+    instability,
+    worst_frequency,
+)
 from malta.proof.uncertain import closed_loop as closed_matrices
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
     from malta.proof.box import Box
-    from malta.proof.box_parts import Part
+    from malta.proof.exclusion import Part
     from malta.proof.polynomial.enclosure import Polynomial
 
 
@@ -211,7 +219,6 @@ class OfLoop:
     """A closed loop."""
 
     loop: UncertainLoop
-    names: tuple[str, ...]
     known: dict[Any, Characteristic] = field(default_factory=dict)
 
     @property
@@ -233,7 +240,7 @@ class OfLoop:
         for part in loop_parts(self.loop, self.couplings if neglect else None, p):
             key = (part.group.states, part.group.own)
             if key not in self.known:
-                self.known[key] = Characteristic(self.loop, part.group, self.names)
+                self.known[key] = Characteristic(self.loop, part.group)
             found.append((self.known[key], part.moves))
         return found
 
@@ -293,11 +300,7 @@ class OfLoop:
     def critical_frequency(self, p: FloatArray) -> float:
         if self._plain:
             return critical_frequency(self.loop.system, self.loop.law, p)
-        poles, T = self._poles(p), self.loop.law.sample_time
-        if T is None:
-            return float(abs(poles[poles.real.argmax()].imag))
-        z = 1 + poles
-        return float(abs(np.angle(z[np.abs(z).argmax()])) / T)
+        return worst_frequency(self._poles(p), self.loop.law.sample_time)
 
     def physical(self, x: float) -> float:
         return physical(x, self.loop.law.sample_time)
@@ -370,14 +373,10 @@ class CoefficientPolynomial:
         return (False,) * len(self.names)
 
     @cached_property
-    def _common(self) -> Any:
-        """The common denominator of the coefficients; None for one."""
+    def _scaled(self) -> tuple[dict[int, Any], Any]:
+        """The coefficients as polynomials of p over their common denominator, and this; None for one."""
         assert self._symbolic is not None
-        found = None
-        for r in self._symbolic.entries[0].values():
-            if r.den is not None:
-                found = r.den if found is None else found * (r.den / found.gcd(r.den))
-        return found
+        return over_common_denominator({i: r for (i, _), r in self._symbolic.entries[0].items()})
 
     @cached_property
     def degrees(self) -> tuple[int | None, ...]:
@@ -386,28 +385,18 @@ class CoefficientPolynomial:
             used = self.program.depends[0]
             return tuple(None if i in used else 0 for i in range(len(self.names)))
         found = np.zeros(len(self.names), dtype=int)
-        for num in self._scaled.values():
-            found = np.maximum(found, num.degrees()[: len(self.names)])
-        if self._common is not None:
-            found = np.maximum(found, self._common.degrees()[: len(self.names)])
+        scaled, common = self._scaled
+        for polynomial in (*scaled.values(), *([] if common is None else [common])):
+            found = np.maximum(found, polynomial.degrees()[: len(self.names)])
         return tuple(int(d) for d in found)
-
-    @cached_property
-    def _scaled(self) -> dict[int, Any]:
-        """The coefficients as polynomials of p, multiplied by the common denominator."""
-        assert self._symbolic is not None
-        common = self._common
-        return {
-            i: r.num if common is None else r.num * (common if r.den is None else common / r.den)
-            for (i, _), r in self._symbolic.entries[0].items()
-        }
 
     @cached_property
     def loops(self) -> tuple[UncertainLoop | None]:
         """A loop with this polynomial, linear in p; None where there is no short one."""
         if not self.exact:
             return (None,)
-        a = [self._scaled[i].to_dict() if i in self._scaled else {} for i in range(self.count)]
+        scaled, _ = self._scaled
+        a = [scaled[i].to_dict() if i in scaled else {} for i in range(self.count)]
         return (companion(self.names, a, 1.0 if self.discrete else None),)
 
     def values(self, v: Sequence[Any]) -> list[Any]:
@@ -420,7 +409,8 @@ class CoefficientPolynomial:
         return a
 
     def at(self, v: Sequence[Any]) -> list[Any]:
-        scale = self._common(*v) if self.exact and self._common is not None else 1
+        common = self._scaled[1] if self.exact else None
+        scale = 1 if common is None else common(*v)
         a = [x * scale for x in self.values(v)]
         return map_bilinear(_about_one(a)) if self.discrete else a
 
@@ -430,9 +420,7 @@ class CoefficientPolynomial:
         for i, _, x in entries:
             a[i] = abs(x)
         if self.discrete:  # z = 1 + g
-            a = map_bounds(
-                [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), arb(0)) for j in range(len(a))]
-            )
+            a = map_bounds(_about_one(a))
         return [pair(x) for x in a]
 
     def coupling_bounds(
@@ -488,6 +476,27 @@ class CoefficientPolynomial:
 def _about_one(a: list[Any]) -> list[Any]:
     """The coefficients of g = z - 1 from those of z."""
     return [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), 0 * a[0]) for j in range(len(a))]
+
+
+MOST_BITS = 5120  # of the ball arithmetic in which Routh's scheme is tried
+
+
+def is_nominal_stable(problem: Problem, box: Box) -> bool:
+    """Whether the nominal loop is proven stable, by Routh's scheme in exact numbers or balls.
+
+    No coupling is neglected: over a box that is proven, other couplings may be than at the nominal values.
+    """
+    for f, _ in problem.parts([arb(x) for x in box.nominal.tolist()], neglect=False):
+        bits, stable = 160, None
+        while stable is None and bits <= MOST_BITS:
+            with precision(bits):
+                v = [exact(x) for x in box.nominal.tolist()]
+                v = [1 / x if inverted else x for x, inverted in zip(v, f.inverted, strict=True)]
+                stable = hurwitz(f.at(v))
+            bits *= 2
+        if not stable:
+            return False
+    return True
 
 
 def hurwitz(a: Sequence[Any]) -> bool | None:

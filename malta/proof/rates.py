@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 import time as clock
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import casadi as ca
@@ -101,26 +102,11 @@ class _Loop:
     R: Any  # xi -> (x, u)
     n: int
     T: float
-    over: tuple[float, float] = (0.0, 0.0)  # of p
-
-    @property
-    def cells(self) -> list[CellOfLoop]:
-        """The intervals within which Phi is one smooth function of p."""
-        return [CellOfLoop(self.at, *self.over)]
-
-    def norms(self, P: Any) -> Norms:
-        """What is needed of changes of Phi, in units in which P is about one."""
-        return _Units(self, P, max(map(abs, self.over)))
 
     def at(self, p: float) -> Any:
         """Phi in balls."""
         M = self.M[0] + self.M[1] * arb(p)
-        top = ((M * arb(self.T)).exp() * self.R).tolist()[: self.n]
-        rows = self.L.tolist()
-        return arb_mat(
-            [[a + b for a, b in zip(*pair, strict=True)] for pair in zip(rows, top, strict=False)]
-            + rows[self.n :]
-        )
+        return add_on_top(self.L, (M * arb(self.T)).exp() * self.R, self.n)
 
 
 class CellOfLoop(NamedTuple):
@@ -150,26 +136,22 @@ class Norms(Protocol):
         ...
 
 
-class MovingLoop(Protocol):
-    """A frozen sampled loop xi+ = Phi(p) xi along an interval of p."""
+@dataclass(frozen=True, eq=False)
+class MovingLoop:
+    """A frozen sampled loop xi+ = Phi(p) xi along an interval of p.
 
-    @property
-    def T(self) -> float:
-        """The sample time, s."""
-        ...
+    cells : the intervals within which Phi is one smooth function of p, in order
+    norms : P -> bounds of changes of Phi, in units in which P is about one
+    T : sample time, s
+    """
 
-    @property
-    def cells(self) -> list[CellOfLoop]:
-        """The intervals within which Phi is one smooth function of p, in order."""
-        ...
+    cells: tuple[CellOfLoop, ...]
+    norms: Callable[[Any], Norms]
+    T: float
 
     def at(self, p: float) -> Any:
         """Phi in balls."""
-        ...
-
-    def norms(self, P: Any) -> Norms:
-        """What is needed of changes of Phi, in units in which P is about one."""
-        ...
+        return next(cell for cell in self.cells if p <= cell.high).at(p)
 
 
 class _Piece(NamedTuple):
@@ -223,7 +205,8 @@ def varying(
     positive(CALLER, "time", time)
     with precision(BITS):
         loop = _loop_of(system, law_of(system, compensator, CALLER), name)
-        return rate_bound(replace(loop, over=(low, high)), name, begun, time)
+        norms = partial(_Units, loop, max(abs(low), abs(high)))
+        return rate_bound(MovingLoop((CellOfLoop(loop.at, low, high),), norms, loop.T), name, begun, time)
 
 
 def rate_bound(loop: MovingLoop, name: str, begun: float, time: float) -> RateBound:
@@ -301,6 +284,14 @@ def _closed(A: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray, law: Co
 
 def ball(M: FloatArray) -> Any:
     return arb_mat(len(M), M.shape[1], [arb(float(x)) for x in M.ravel()])
+
+
+def add_on_top(L: Any, rows: Any, n: int) -> Any:
+    """L with the first n of other rows added to its own."""
+    own, top = L.tolist(), rows.tolist()[:n]
+    return arb_mat(
+        [[a + b for a, b in zip(*pair, strict=True)] for pair in zip(own, top, strict=False)] + own[n:]
+    )
 
 
 def _put(rows: list[list[Any]], i: int, j: int, M: Any) -> None:
@@ -399,7 +390,7 @@ class _Units:
     second derivative, and |x(s)| <= e^(|A| s) (|x| + T |B u|).
     """
 
-    def __init__(self, loop: _Loop, P: Any, most: float) -> None:
+    def __init__(self, loop: _Loop, most: float, P: Any) -> None:
         self.n, self.T = loop.n, loop.T
         n = loop.n
         self.U = ball(np.linalg.inv(np.linalg.cholesky(middle(P)[:n, :n])).T)

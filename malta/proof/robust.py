@@ -31,10 +31,10 @@ from malta.proof.expressions import NotAnalytic, Program, exact, program
 from malta.proof.groups import A, B, C, E, UncertainLoop, loop_of
 from malta.proof.loss import first_loss, loss_beside
 from malta.proof.margin import Margin, Progress, Ranges
-from malta.proof.polynomial.rational import Ratio, Symbolic
+from malta.proof.polynomial.rational import Ratio, Symbolic, product
 from malta.proof.problem import CoefficientPolynomial, OfLoop, OfSeveral, Problem
 from malta.proof.search import Question, search
-from malta.proof.systems import compensator_of, polynomial_system
+from malta.proof.systems import compensator_of, polynomial_of
 from malta.proof.uncertain import (
     Compensator,
     UncertainSystem,
@@ -88,10 +88,17 @@ def _transformed(loop: UncertainLoop, s: Symbolic) -> Program | None:
     S = _basis(loop, s, E_0.inv())
     if S is None:
         return None
-    S_1 = (E_0 * S).inv()
-    made = [_left(S_1, _right(s.entries[A], S)), _left(S_1, s.entries[B]), _right(s.entries[C], S)]
+    right, left = (
+        {(i, j): s.constant(M[i, j]) for i in range(n) for j in range(n) if M[i, j] != 0}
+        for M in (S, (E_0 * S).inv())
+    )
+    made = [
+        product(left, product(s.entries[A], right)),
+        product(left, s.entries[B]),
+        product(s.entries[C], right),
+    ]
     if loop.descriptor:
-        made += [{}, _left(S_1, _right(s.entries[E], S))]
+        made += [{}, product(left, product(s.entries[E], right))]
     if _terms(made, nominal) > FEWER * _terms(s.entries, nominal):
         return None
     return _program(made, loop.program)
@@ -181,27 +188,6 @@ def _extend(vectors: list[list[Any]], more: list[list[Any]]) -> None:
 
 def _value(r: Ratio, p: list[Any]) -> Any:
     return r.num(*p) / (1 if r.den is None else r.den(*p))
-
-
-def _left(M: Any, entries: dict[tuple[int, int], Ratio]) -> dict[tuple[int, int], Ratio]:
-    """M times a matrix."""
-    found: dict[tuple[int, int], Ratio] = {}
-    for (k, j), r in entries.items():
-        for i in range(M.nrows()):
-            if M[i, k] != 0:
-                _add(found, (i, j), r, M[i, k])
-    return {at: r for at, r in found.items() if not r.is_zero()}
-
-
-def _right(entries: dict[tuple[int, int], Ratio], M: Any) -> dict[tuple[int, int], Ratio]:
-    """A matrix times M."""
-    turned = _left(M.transpose(), {(j, i): r for (i, j), r in entries.items()})
-    return {(j, i): r for (i, j), r in turned.items()}
-
-
-def _add(found: dict[tuple[int, int], Ratio], at: tuple[int, int], r: Ratio, factor: Any) -> None:
-    part = Ratio(r.num * factor, r.den)
-    found[at] = found[at] + part if at in found else part
 
 
 def _terms(matrices: Any, p: list[Any]) -> int:
@@ -390,7 +376,7 @@ def law_of(system: UncertainSystem, compensator: Any, caller: str = "robust_marg
 @lru_cache(maxsize=32)  # several margins need the same loops; records compare by identity
 def problem_of(system: UncertainSystem, law: Compensator) -> OfLoop:
     """The closed loop as a problem, which remembers its polynomials."""
-    return OfLoop(in_plain_basis(loop_of(system, law)), system.names)
+    return OfLoop(in_plain_basis(loop_of(system, law)))
 
 
 @on_one_thread
@@ -433,7 +419,7 @@ def margin_of_polynomial(
     outside = by_name(caller, "over", {} if over is None else over, '{"k": (1, 2)}')
     values = _middles({**by_name(caller, "box", box, '{"k": (1, 2)}'), **outside}, nominal)
     names = tuple(values)
-    function, _ = polynomial_system(coefficients, names)
+    function = polynomial_of(coefficients, names)
     problem = CoefficientPolynomial(program(function), names, discrete)
     where = box_of(names, np.array(list(values.values())), (), box, outside, caller=caller)
     return margin_of(problem, where, effort)

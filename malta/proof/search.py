@@ -6,26 +6,29 @@ import math
 import time as clock
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from flint import arb
 
 from malta.errors import CheckError
 from malta.proof.box import EDGE, Box
-from malta.proof.box_parts import Part
-from malta.proof.exclusion.exclusion import Search, advance, start
+from malta.proof.exclusion import Part, Search, advance, cut, growth_over, merge_twins, start
 from malta.proof.exclusion.hurwitz import Signs, raise_bound, signs_over
 from malta.proof.exclusion.witness import Zero, from_cell, nearest, starts
-from malta.proof.families import is_nominal_stable, parts_over
+from malta.proof.expressions import NotAnalytic
 from malta.proof.loss import confirm, contributions, corner_loss, first_loss
 from malta.proof.margin import TIME_UP, Certificate, Margin, Progress
 from malta.proof.multipliers.structured import Proof, Structured, rows_of
-from malta.proof.polynomial.enclosure import Unproven
-from malta.proof.problem import Problem
+from malta.proof.polynomial.enclosure import Unproven, family_over
+from malta.proof.problem import Problem, is_nominal_stable
 from malta.proof.time_limit import TimeUp, time_limit
 
 if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
     from malta.proof.loss import Loss
+    from malta.proof.polynomial.enclosure import Polynomial
 
 
 FIRST = 3.97  # the first box that is searched, in multiples of the modelled one
@@ -213,6 +216,32 @@ def _families(q: Question, known: Findings, until: float) -> tuple[Findings, lis
             parts = parts_over(q.problem, q.box, room * known.upper, until)
             done = room * known.upper
     return known, parts, done
+
+
+def parts_over(problem: Problem, box: Box, reach: float, last: float) -> list[Part]:
+    """The families of all groups over box(reach), cut into parts where one expansion does not do.
+
+    last : time.monotonic() at which the search gives up
+
+    Raises Unproven when a matrix has no value on the box, or when time is up.
+    """
+    sides = box.sides(reach)
+    parts: list[Part] = []
+    try:
+        with time_limit(last):
+            if (enclose := problem.traits.enclose) is not None:
+                return enclose(box, reach)
+            for polynomial, moves in problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
+                parts += cut(sides, box.nominal, last, partial(_part_over, polynomial, moves, box, last))
+    except NotAnalytic as error:
+        raise Unproven(f"the matrices have no value on the box: {error}") from error
+    except TimeUp as error:
+        raise Unproven("time was up before the coefficients were found") from error
+    return merge_twins(parts)
+
+
+def _part_over(f: Polynomial, moves: tuple[Any, ...], box: Box, last: float, sides: FloatArray) -> list[Part]:
+    return [Part(f, sides, family_over(f, sides, moves, last), growth_over(sides, f.inverted, box))]
 
 
 def _first_reach(q: Question) -> float:

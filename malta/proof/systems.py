@@ -121,19 +121,10 @@ def from_source(
     limits: Mapping[str, tuple[float, float]] | None = None,
     sample_time: float | None = None,
 ) -> UncertainSystem:
-    """E(p) x' = A(p) x + B(p) u, y = C(p) x + D(p) u from a function, a CasADi function, or matrices.
+    """The system of a function, a CasADi function or matrices, with what `uncertain` says of them.
 
-    Parameters
-    ----------
-    source : a function of the parameters by name (or of one array p), of numpy and CasADi operations, that returns
-        A, B, C, or with D, or with D and E (rows of zeros in E are algebraic equations); a casadi.Function of the
-        vector p; or matrices A0, B0, C0[, D0[, E0]]
-    nominal : values of the parameters by name
-    terms : with matrices, the factors of each parameter: {"k": (A1, B1, C1)}, None for zeros; A0 + sum p_i A_i
-    limits : of a parameter, (above, below), exclusive; infinite for parameters without
-    sample_time : s, of matrices that give x+ in place of x'
-
-    Raises InputError for names, shapes and values that do not fit.
+    terms : None in the place of a matrix: zeros
+    limits : infinite for parameters without
     """
     from malta.proof.uncertain import UncertainSystem
 
@@ -330,8 +321,8 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
     return found
 
 
-def polynomial_system(coefficients: Callable[..., Any], names: tuple[str, ...]) -> tuple[ca.Function, int]:
-    """The coefficients of s, lowest first, as a CasADi function of p; and the degree.
+def polynomial_of(coefficients: Callable[..., Any], names: tuple[str, ...]) -> ca.Function:
+    """The coefficients of s, lowest first, as a CasADi function of p.
 
     Raises InputError for anything but a function of the parameters that returns expressions of them.
     """
@@ -349,4 +340,4 @@ def polynomial_system(coefficients: Callable[..., Any], names: tuple[str, ...]) 
     if len(flat) < 2:
         found = plural(len(flat), "coefficient")
         raise InputError(caller, field, found, "a polynomial of degree 1 or more")
-    return ca.Function("coefficients", [p], [ca.vertcat(*reversed(flat))]), len(flat) - 1
+    return ca.Function("coefficients", [p], [ca.vertcat(*reversed(flat))])

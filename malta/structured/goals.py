@@ -19,8 +19,7 @@ import numpy as np
 
 from malta.display import display
 from malta.errors import InputError
-from malta.structured.loops import ClosedLoop
-from malta.structured.norms import Channels, Pole, gain_slope, noise, peaks_of, response_at
+from malta.structured.loops import Channels, ClosedLoop, Pole, gain_slope, noise, peaks_of, response_at
 from malta.synthesis.elements import CALLER
 from malta.synthesis.state_space import System
 

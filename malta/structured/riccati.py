@@ -30,7 +30,7 @@ from scipy.linalg import matrix_balance
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.processes import on_one_thread
-from malta.structured.norms import peak_gain
+from malta.structured.loops import peak_gain
 from malta.synthesis.elements import CALLER
 from malta.synthesis.state_space import System
 

@@ -43,6 +43,7 @@ from malta.synthesis.recovery import (
     numbers,
     order_entries,
     positive,
+    quantities,
     recovery_bounds,
     variances,
 )
@@ -80,10 +81,6 @@ def read_design(
         "unit": "um"}}
 
     Returns a Spec, in SI.
-
-    parameters : values of the machine's parameters that differ from its data file, SI
-    entries : entries of the design file that differ from it, by dotted name, as {"bases.state.x": {"value": 50,
-        "unit": "um"}}
 
     Raises InputError, naming file and field, for anything missing, unknown, of a wrong unit or out of range.
 
@@ -204,13 +201,11 @@ def _rates(
     if given is None:
         return ()
     units = {s.name: f"{s.unit}{per}" for s in plant.outputs}
-    rates = dict.fromkeys(units, 0.0)
-    for name, q in given.items():
-        if name not in units:
-            raise InputError(path, f"{key}.{name}", "an unknown output", "one of " + " ".join(units))
-        si = to_si(q.value, q.unit, units[name], path, f"{key}.{name}")
-        rates[name] = positive(si, path, f"{key}.{name}", units[name])
-    return tuple(rates.values())
+    rates = {
+        name: positive(rate, path, f"{key}.{name}", units[name])
+        for name, rate in quantities(given, units, path, key, "output").items()
+    }
+    return tuple(rates.get(name, 0.0) for name in units)
 
 
 def _references(given: ReferencesTable | None, plant: Plant, path: Path) -> tuple[tuple[float, ...], ...]:
@@ -440,14 +435,10 @@ def _bounds(requirement: Requirement, given: Any, spec: Spec) -> dict[str, float
     if not isinstance(given, Mapping):
         return {name: float(given)}
     units = {s.name: s.unit for s in requirement.signals(spec.plant)}
-    bounds = {}
-    for signal, q in given.items():
-        where = f"{field}.{signal}"
-        if signal not in units:
-            raise InputError(spec.path, where, "an unknown signal", "one of " + " ".join(units))
-        si = to_si(q.value, q.unit, units[signal], spec.path, where)
-        bounds[f"{name} {signal}"] = positive(si, spec.path, where, units[signal])
-    return bounds
+    return {
+        f"{name} {signal}": positive(bound, spec.path, f"{field}.{signal}", units[signal])
+        for signal, bound in quantities(given, units, spec.path, field, "signal").items()
+    }
 
 
 def _require_possible(asked: Mapping[str, float], spec: Spec) -> None:
@@ -524,12 +515,8 @@ def _with_entries(content: dict[str, Any], entries: Mapping[str, Any], where: Pa
 def _operating_point(entries: Mapping[str, Quantity], plant: Plant, where: Path) -> dict[str, float]:
     """States of the design model by name; the others are zero."""
     units = {s.name: s.unit for s in plant.design_states}
-    values = {}
-    for name, q in entries.items():
-        if name not in units:
-            expected = "one of " + " ".join(units)
-            raise InputError(where, f"operating_point.{name}", "an unknown state", expected)
-        values[name] = to_si(q.value, q.unit, units[name], where, f"operating_point.{name}")
-        if not math.isfinite(values[name]):
-            raise InputError(where, f"operating_point.{name}", str(values[name]), "a finite number")
+    values = quantities(entries, units, where, "operating_point", "state")
+    for name, value in values.items():
+        if not math.isfinite(value):
+            raise InputError(where, f"operating_point.{name}", str(value), "a finite number")
     return values

@@ -130,7 +130,7 @@ class Element:
             A = ca.blockcat([[A2, B2 @ C1], [ca.DM(A1.shape[0], A2.shape[0]), A1]])
             return A, ca.vertcat(B2 @ D1, B1), ca.horzcat(C2, D2 @ C1), D2 @ D1
 
-        return Element(f"{self.name} {other.name}", _joined(self, other), matrices, side_by_side(self, other))
+        return _diagram(" ", self, other, matrices)
 
     def __add__(self, other: Element) -> Element:
         """This element beside another: the sum of their outputs."""
@@ -141,9 +141,7 @@ class Element:
             A2, B2, C2, D2 = other.matrices(values[k:])
             return ca.diagcat(A1, A2), ca.vertcat(B1, B2), ca.horzcat(C1, C2), D1 + D2
 
-        return Element(
-            f"{self.name} + {other.name}", _joined(self, other), matrices, side_by_side(self, other)
-        )
+        return _diagram(" + ", self, other, matrices)
 
     def feedback(self, other: Element) -> Element:
         """This element with another in its negative feedback: self / (1 + other self).
@@ -164,19 +162,20 @@ class Element:
             A[:n1, n1:] = -B1 @ C2
             return A + back @ C, into + back @ D, C, D
 
-        return Element(
-            f"{self.name} / {other.name}", _joined(self, other), matrices, side_by_side(self, other)
-        )
+        return _diagram(" / ", self, other, matrices)
 
 
-def _joined(*elements: Element) -> tuple[Parameter, ...]:
-    """The parameters of several elements under their whole names. Raises InputError for a name that comes twice."""
-    named = [replace(p, name=name) for e in elements for p, name in zip(e.parameters, e.values, strict=True)]
+def _diagram(
+    sign: str, one: Element, other: Element, matrices: Callable[[Sequence[Any]], Matrices]
+) -> Element:
+    """An element of two, its parameters under their whole names. Raises InputError for a name that comes twice."""
+    pairs = [pair for e in (one, other) for pair in zip(e.parameters, e.values, strict=True)]
+    named = [replace(p, name=name) for p, name in pairs]
     names = [p.name for p in named]
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:
         raise InputError(CALLER, twice, "one parameter twice", "elements of different names in one diagram")
-    return tuple(named)
+    return Element(f"{one.name}{sign}{other.name}", tuple(named), matrices, side_by_side(one, other))
 
 
 def side_by_side(*elements: Element) -> Solve:

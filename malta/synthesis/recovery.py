@@ -206,6 +206,19 @@ def variances(
     return np.array(variances)
 
 
+def quantities(
+    entries: Mapping[str, Quantity], units: Mapping[str, str], where: Path, field: str, what: str
+) -> dict[str, float]:
+    """Quantities in SI, by names that have these units. Raises InputError for others; what: the names are of."""
+    found = {}
+    for name, q in entries.items():
+        if name not in units:
+            known = " ".join(units) or "none"
+            raise InputError(where, f"{field}.{name}", f"an unknown {what}", f"one of {known}")
+        found[name] = to_si(q.value, q.unit, units[name], where, f"{field}.{name}")
+    return found
+
+
 def positive(value: float, where: Path, field: str, unit: str) -> float:
     if not 0 < value < math.inf:
         raise InputError(where, field, f"{value:g} {unit}", f"a finite number above 0 {unit}")
@@ -330,12 +343,7 @@ def _by_disturbance(
     given: Mapping[str, Quantity], units: Mapping[str, str], path: Path, field: str
 ) -> tuple[float, ...]:
     """A number for each disturbance, in these units; zero for those that are not given."""
-    sizes = {}
-    for disturbance, q in given.items():
-        where = f"{field}.{disturbance}"
-        if disturbance not in units:
-            raise InputError(path, where, "an unknown disturbance", "one of " + (" ".join(units) or "none"))
-        sizes[disturbance] = to_si(q.value, q.unit, units[disturbance], path, where)
+    sizes = quantities(given, units, path, field, "disturbance")
     return tuple(sizes.get(disturbance, 0.0) for disturbance in units)
 
 

@@ -258,21 +258,12 @@ def reached_with_every_seed(draw: Callable[[int], bool], reached: float, source:
 
 def motion_of(name: str, outputs: Indices, heading: str) -> Requirement:
     """Bound the true motion of some outputs at rest, rms, from the sensors' noise and steps: the worst of them."""
-
-    def measure(design: Design, _asked: float, _signal: str) -> list[Figure]:
-        return _worst(design, "motion", outputs(design.plant))
-
-    def estimate(trial: TrialFigures, _signal: str) -> float | None:
-        return _largest(trial.noise.motion, trial.outputs, outputs(trial.plant))
-
     meaning = f"{heading} motion at rest, rms, from the sensors' noise and steps"
-    return Requirement(
+    return _noise_at_rest(
         name,
-        measure,
-        "m",
-        laws=("LQG", "PID"),
-        estimate=estimate,
-        trade="motion",
+        "motion",
+        lambda plant, _: outputs(plant),
+        unit="m",
         heading=heading,
         meaning=meaning,
         indices=outputs,
@@ -281,51 +272,43 @@ def motion_of(name: str, outputs: Indices, heading: str) -> Requirement:
 
 def force_noise_of(name: str, inputs: Indices, heading: str) -> Requirement:
     """Bound the noise of some commanded forces at rest, rms: the worst of them."""
-
-    def measure(design: Design, _asked: float, _signal: str) -> list[Figure]:
-        return _worst(design, "force", inputs(design.plant))
-
-    def estimate(trial: TrialFigures, _signal: str) -> float | None:
-        return _largest(trial.noise.force, trial.inputs, inputs(trial.plant))
-
     meaning = f"noise of the commanded {heading} at rest, rms"
-    return Requirement(
+    return _noise_at_rest(
         name,
-        measure,
-        "N",
-        laws=("LQG", "PID"),
-        estimate=estimate,
-        trade="force",
+        "force",
+        lambda plant, _: inputs(plant),
+        unit="N",
         heading=heading,
         meaning=meaning,
         indices=inputs,
     )
 
 
-def worst_merit(experiment: Any, merit: int = 0) -> float:
-    """Take the largest of a figure of merit over an experiment's cases; infinite where the experiment failed.
+def _noise_at_rest(
+    name: str, kind: Trade, chosen: Callable[[Plant, str], Sequence[int]], **fields: Any
+) -> Requirement:
+    """A bound of motion or force, of the worst of those that are chosen by plant and signal: by the covariance."""
 
-    merit : the index of the figure among each case's
-    """
-    worst = max(case.merits[merit].value for case in experiment.cases)
+    def measure(design: Design, _asked: float, signal: str) -> list[Figure]:
+        noise = getattr(design.noise, kind)[list(chosen(design.plant, signal))]
+        return [Figure(float(noise.max()), "covariance")]
+
+    def estimate(trial: TrialFigures, signal: str) -> float | None:
+        own = chosen(trial.plant, signal)
+        places = trial.outputs if kind == "motion" else trial.inputs
+        noise = zip(places, getattr(trial.noise, kind), strict=True)
+        return max((float(value) for k, value in noise if k in own), default=None)
+
+    return Requirement(name, measure, laws=("LQG", "PID"), estimate=estimate, trade=kind, **fields)
+
+
+def worst_merit(experiment: Any) -> float:
+    """Take the largest of the first figure of merit over an experiment's cases; infinite where it failed."""
+    worst = max(case.merits[0].value for case in experiment.cases)
     return math.inf if experiment.failed else float(worst)
 
 
-def _worst(design: Design, kind: Trade, indices: Sequence[int]) -> list[Figure]:
-    """The largest of these, by the covariance."""
-    return [Figure(float(getattr(design.noise, kind)[list(indices)].max()), "covariance")]
-
-
-def _largest(values: FloatArray, places: Sequence[int], indices: Sequence[int]) -> float | None:
-    """The largest of the values whose index is among these; None where there is none."""
-    return max((float(value) for k, value in zip(places, values, strict=True) if k in indices), default=None)
-
-
 # --- the requirements of every machine ---
-
-
-def _noise_motion(design: Design, _asked: float, signal: str) -> list[Figure]:
-    return [Figure(design.load_figures.get(f"noise_motion {signal}", math.inf), "covariance")]
 
 
 def proven_margin(margin: Any) -> Figure:
@@ -333,38 +316,10 @@ def proven_margin(margin: Any) -> Figure:
     return Figure((margin and margin.lower) or 0.0, "proven over the travel")
 
 
-def _margin(design: Design, _asked: float, _signal: str) -> list[Figure]:
-    return [proven_margin(design.margins.robust)]
-
-
 def _peak_sensitivity(design: Design, _asked: float, _signal: str) -> list[Figure]:
     peaks = design.margins.peak_sensitivity
     worst = max(peaks[s.name] for s in design.controller.measurements)
     return [Figure(worst, "worst sensor, machine")]
-
-
-def _bandwidth(design: Design, _asked: float, _signal: str) -> list[Figure]:
-    return [design.bandwidth]
-
-
-def _motion(design: Design, _asked: float, signal: str) -> list[Figure]:
-    return _worst(design, "motion", _index(design.plant.outputs, signal))
-
-
-def _motion_estimate(trial: TrialFigures, signal: str) -> float | None:
-    return _largest(trial.noise.motion, trial.outputs, _index(trial.plant.outputs, signal))
-
-
-def _force_noise(design: Design, _asked: float, signal: str) -> list[Figure]:
-    return _worst(design, "force", _index(design.plant.inputs, signal))
-
-
-def _force_estimate(trial: TrialFigures, signal: str) -> float | None:
-    return _largest(trial.noise.force, trial.inputs, _index(trial.plant.inputs, signal))
-
-
-def _recovery(design: Design, _asked: float, signal: str) -> list[Figure]:
-    return [design.deviation(design.spec.recovery[signal])]
 
 
 def _recovery_estimate(trial: TrialFigures, signal: str) -> float | None:
@@ -387,14 +342,16 @@ def _index(signals: Sequence[Signal], name: str) -> list[int]:
 GENERIC = (
     Requirement(
         "noise_motion",
-        _noise_motion,
+        lambda design, _asked, signal: [
+            Figure(design.load_figures.get(f"noise_motion {signal}", math.inf), "covariance")
+        ],
         laws=("PID",),
         form="outputs",
         meaning="motion of outputs, rms, from the noise of [cost]",
     ),
     Requirement(
         "margin",
-        _margin,
+        lambda design, _asked, _signal: [proven_margin(design.margins.robust)],
         at_least=True,
         laws=("LQG", "PID"),
         estimate=lambda trial, _: trial.margin,
@@ -413,7 +370,7 @@ GENERIC = (
     ),
     Requirement(
         "bandwidth",
-        _bandwidth,
+        lambda design, _asked, _signal: [design.bandwidth],
         "rad/s",
         at_least=True,
         laws=("LQG", "PID"),
@@ -424,28 +381,24 @@ GENERIC = (
     ),
     Requirement(
         "recovery",
-        _recovery,
+        lambda design, _asked, signal: [design.deviation(design.spec.recovery[signal])],
         laws=("LQG", "PID"),
         form="loads",
         estimate=_recovery_estimate,
         meaning="what a constant load from outside does, by the name of a load",
     ),
-    Requirement(
+    _noise_at_rest(
         "motion",
-        _motion,
-        laws=("LQG", "PID"),
+        "motion",
+        lambda plant, signal: _index(plant.outputs, signal),
         form="outputs",
-        estimate=_motion_estimate,
-        trade="motion",
         meaning="motion of outputs at rest, rms, from the sensors' noise and steps",
     ),
-    Requirement(
+    _noise_at_rest(
         "force_noise",
-        _force_noise,
-        laws=("LQG", "PID"),
+        "force",
+        lambda plant, signal: _index(plant.inputs, signal),
         form="inputs",
-        estimate=_force_estimate,
-        trade="force",
         meaning="noise of commanded inputs at rest, rms",
     ),
 )

@@ -29,7 +29,7 @@ from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
 from malta.model.plant import position_in
 from malta.proof.parametric_plants import of_plant
-from malta.proof.responses import crossing_frequency
+from malta.proof.uncertain import crossing_frequency
 from malta.proof.windings import (
     Windings,
     emf_slope,

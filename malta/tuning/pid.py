@@ -33,7 +33,7 @@ from malta.model.data import plant_of
 from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
 from malta.model.plant import position_at, position_in
-from malta.proof.responses import crossing_frequency
+from malta.proof.uncertain import crossing_frequency
 from malta.proof.windings import emf_slope, estimated_rows, windings_of, with_estimated_emf
 from malta.synthesis.controller import linear_law_of, with_readings
 from malta.synthesis.pid import Axes, axes_of, law_of_outputs, pid_gains

@@ -34,10 +34,9 @@ from malta.margins.verify import MACHINE, SAMPLED, compensators, linear_report, 
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
 from malta.proof.blocks.gain import Gain
-from malta.proof.responses import responses
 from malta.proof.robust import robust_margin
 from malta.proof.systems import uncertain
-from malta.proof.uncertain import Compensator, UncertainSystem, closed_loop, instability
+from malta.proof.uncertain import Compensator, UncertainSystem, closed_loop, instability, responses
 from malta.report.figures.margins import chain_figure
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 import malta
 from malta.errors import InputError
 from malta.proof import Dynamic
-from malta.proof.blocks.blocks import Block, probe, weight_of
+from malta.proof.blocks import Block, probe, weight_of
 from malta.proof.blocks.transfer import Signals, mu_bound, performance, transfer
-from malta.proof.responses import responses
+from malta.proof.uncertain import responses
 
 ONE = weight_of(1.0, "")
 
@@ -214,7 +214,7 @@ def test_several_blocks_beside_parameters() -> None:
     assert m.witness is not None
     assert m.frequency is not None
     assert 0.998 * m.upper <= m.lower <= m.upper
-    from malta.proof.blocks.blocks import blocks_of
+    from malta.proof.blocks import blocks_of
     from malta.proof.robust import law_of as converted
 
     law, blocks = converted(s, F), blocks_of(s, every, "")

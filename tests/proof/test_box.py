@@ -10,7 +10,7 @@ import pytest
 
 import malta
 from malta.proof.box import Box, box_of
-from malta.proof.exclusion.exclusion import growth_over
+from malta.proof.exclusion import growth_over
 
 
 def one(nominal: float, value: float | tuple[float, float], *, fixed: bool = False) -> Box:

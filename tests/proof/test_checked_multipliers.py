@@ -14,7 +14,7 @@ from test_many_parameters import asked, chain, ranges
 
 import malta
 from malta.proof.certificate.checked_multipliers import refusal
-from malta.proof.multipliers.multipliers import Blocks, Multiplier
+from malta.proof.multipliers import Blocks, Multiplier
 from malta.proof.multipliers.structured import Proof, Shown, worst
 
 

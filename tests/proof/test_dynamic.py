@@ -15,7 +15,7 @@ from malta.errors import InputError
 from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
 from malta.proof import Dynamic
-from malta.proof.responses import responses
+from malta.proof.uncertain import responses
 
 
 def robstab() -> malta.proof.UncertainSystem:

@@ -20,9 +20,8 @@ from malta.margins.verify import controller_poles, linear_report, unstable_gain
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel
 from malta.model.plant import Plant
-from malta.proof.responses import responses
 from malta.proof.systems import uncertain
-from malta.proof.uncertain import UncertainSystem, closed_loop
+from malta.proof.uncertain import UncertainSystem, closed_loop, responses
 from malta.proof.windings import left_out
 from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario

@@ -15,7 +15,7 @@ from scipy import linalg
 
 import malta
 from malta.proof.box import Box, box_of
-from malta.proof.multipliers.multipliers import (
+from malta.proof.multipliers import (
     Blocks,
     Branch,
     Multiplier,

@@ -79,8 +79,7 @@ def test_the_enclosure_holds_the_loop_and_its_curvature(magnet: tuple[Any, Any])
     cells = loops_between_places(*magnet, (), "lag")
     assert not isinstance(cells, str)
     with precision(BITS):
-        loop = scheduled_loops._LoopOfCells.of(cells)
-        for cell in loop.own:
+        for cell in scheduled_loops._cells_of(cells):
             p, h = (cell.low + cell.high) / 2, 1e-5
             below, here, above = (middle(cell.at(p + d)) for d in (-h, 0.0, h))
             second, _ = cell.bent(arb(p, h))

@@ -20,10 +20,9 @@ from malta.loops.sampled_loops import machine_law, machine_system
 from malta.margins.travel import travel_margin
 from malta.margins.verify import compensators
 from malta.model.data import plant_of
-from malta.proof.responses import responses
 from malta.proof.robust import robust_margin
 from malta.proof.systems import uncertain
-from malta.proof.uncertain import Compensator, UncertainSystem, critical_frequency, instability
+from malta.proof.uncertain import Compensator, UncertainSystem, critical_frequency, instability, responses
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

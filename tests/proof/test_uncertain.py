@@ -11,10 +11,9 @@ import pytest
 import malta
 from malta.errors import InputError
 from malta.loops.sampled_loops import machine_law, sampled_loop
-from malta.proof.responses import responses
 from malta.proof.robust import robust_margin
 from malta.proof.systems import uncertain
-from malta.proof.uncertain import closed_loop, critical_frequency, instability
+from malta.proof.uncertain import closed_loop, critical_frequency, instability, responses
 
 if TYPE_CHECKING:
     from conftest import Design

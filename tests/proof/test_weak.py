@@ -21,11 +21,10 @@ from malta.model.data import plant_of
 from malta.proof.box import box_of
 from malta.proof.expressions import NotAnalytic, program
 from malta.proof.uncertain import closed_loop, instability, model_of
-from malta.proof.weak_coupling import taylor
+from malta.proof.weak_coupling import HeldLoop, coupling_bounds, taylor
 from malta.proof.weak_coupling.axes import members_of, state_matrix
 from malta.proof.weak_coupling.held_currents import HeldMachine, dominating_solution, held_machine
 from malta.proof.weak_coupling.taylor import Evaluation, Laurent
-from malta.proof.weak_coupling.weak_coupling import HeldLoop, coupling_bounds
 
 NAMES = ("m", "I_x", "I_z", "B_r", "r_z")
 BOX = {"m": 0.05, "I_x": 0.1, "I_z": 0.1, "B_r": 0.05, "r_z": 0.2}

@@ -13,8 +13,15 @@ from hypothesis import strategies as st
 
 import malta
 from malta import structured
-from malta.structured.loops import ClosedLoop, Model, models_of_systems
-from malta.structured.norms import noise, peak_gain, peaks_of, response_at
+from malta.structured.loops import (
+    ClosedLoop,
+    Model,
+    models_of_systems,
+    noise,
+    peak_gain,
+    peaks_of,
+    response_at,
+)
 from malta.synthesis.state_space import System
 from malta.synthesis.structure import Structure, places_of, sample_law
 

@@ -21,9 +21,9 @@ from tampering import claiming
 import malta
 from malta.margins.loop_report import Stage
 from malta.margins.travel import smallest_margin
+from malta.proof import exclusion
 from malta.proof.box import below
 from malta.proof.certificate import certificate, check, checked_file, checked_loop
-from malta.proof.exclusion import exclusion
 from malta.proof.groups import loop_of
 from malta.proof.margin import Margin
 from malta.proof.polynomial import characteristic as degrees
@@ -50,7 +50,7 @@ def _sampled() -> Compensator:
 
 
 def _polynomial(sides: Any) -> tuple[Any, tuple[Any, ...]]:
-    problem = OfLoop(loop_of(_spring(), _sampled()), ("m", "k"))
+    problem = OfLoop(loop_of(_spring(), _sampled()))
     ((f, moves),) = problem.parts([arb((a + b) / 2, (b - a) / 2) for a, b in sides])
     return f, moves
 
@@ -230,7 +230,7 @@ def _coupled(coupling: float) -> tuple[Any, Compensator]:
 
 def test_couplings_that_are_taken_as_zero_are_bounded() -> None:
     system, law = _coupled(1e-14)
-    problem = OfLoop(loop_of(system, law), ("k",))
+    problem = OfLoop(loop_of(system, law))
     found = loop_parts(problem.loop, problem.couplings, [arb(4.0, 0.5)])
     assert [part.group.states for part in found] == [(0, 1), (2, 3)]
     for part in found:
@@ -241,7 +241,7 @@ def test_couplings_that_are_taken_as_zero_are_bounded() -> None:
 def test_sizes_of_couplings_are_bounds() -> None:
     """Of every entry of the closed loop, at parameters throughout the balls."""
     system, law = _coupled(0.3)
-    problem = OfLoop(loop_of(system, law), ("k",))
+    problem = OfLoop(loop_of(system, law))
     assert problem.couplings is not None
     size = problem.couplings.bounds([arb(4.0, 1.5)])
     for k in (2.5, 3.3, 5.5):

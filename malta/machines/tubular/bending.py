@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.model.data import published_figures, published_value
-from malta.proof.blocks.blocks import Dynamic
+from malta.proof.blocks import Dynamic
 
 if TYPE_CHECKING:
     from malta.machines.tubular.plant import Parameters

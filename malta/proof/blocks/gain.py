@@ -19,7 +19,7 @@ import numpy as np
 from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.processes import on_one_thread
-from malta.proof.blocks.blocks import (
+from malta.proof.blocks import (
     At,
     Block,
     Channels,
@@ -45,16 +45,14 @@ from malta.proof.blocks.transfer import (
     transfer,
 )
 from malta.proof.box import Box, box_of, within_branches
-from malta.proof.families import is_nominal_stable
 from malta.proof.groups import loop_of
 from malta.proof.loss import first_loss
 from malta.proof.margin import Margin, unproven
 from malta.proof.polynomial.enclosure import Unproven
-from malta.proof.problem import OfLoop
-from malta.proof.responses import responses
+from malta.proof.problem import OfLoop, is_nominal_stable
 from malta.proof.robust import deadline, law_of, problem_of
 from malta.proof.time_limit import TimeUp, time_limit
-from malta.proof.uncertain import Compensator, UncertainSystem, positive
+from malta.proof.uncertain import Compensator, UncertainSystem, positive, responses
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -166,19 +164,12 @@ class Blocks:
         scaled = tuple(_scale_probe(system, law, box.nominal, b, problem) for b in blocks)
         first, one = len(system.names), scaled[0]
         if len(scaled) == 1 and one.kind in ("multiplicative", "feedback") and not one.full:
-            return cls(
-                system,
-                law,
-                box,
-                scaled,
-                problem,
-                _in_each_channel(system, law, one.at),
-                ([first + one.rows[0]],),
-            )
+            wide = _in_each_channel(system, law, one.at)
+            return cls(system, law, box, scaled, problem, wide, ([first + one.rows[0]],))
         ends = np.cumsum([first, *(len(b.entries) for b in scaled)]).tolist()
         entries = tuple(list(range(*pair)) for pair in pairwise(ends))
-        more, wider = probe(system, law, scaled)
-        return cls(system, law, box, scaled, problem, OfLoop(loop_of(more, wider), more.names), entries)
+        wide = OfLoop(loop_of(*probe(system, law, scaled)))
+        return cls(system, law, box, scaled, problem, wide, entries)
 
     def unstable(self) -> bool:
         """Whether the nominal loop is unstable anywhere in the intervals that do not grow."""
@@ -239,8 +230,9 @@ def _in_each_channel(system: UncertainSystem, law: Compensator, at: At) -> OfLoo
     """The loop with a block 1 + Delta in each channel at the sensors or at the forces."""
     count = dict(zip(("sensors", "forces"), shape_of(system), strict=True))[at]
     one = weight_of(1.0, "probe")
-    more, wider = probe(system, law, [Block("feedback", at, (i,), (i,), one) for i in range(count)])
-    return OfLoop(loop_of(more, wider), more.names)
+    return OfLoop(
+        loop_of(*probe(system, law, [Block("feedback", at, (i,), (i,), one) for i in range(count)]))
+    )
 
 
 def _scale_probe(

@@ -26,18 +26,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from flint import acb, arb
 
-from malta.proof.blocks.blocks import Block, Expanded
+from malta.proof.blocks import Block, Expanded
 from malta.proof.box import Box
-from malta.proof.box_parts import PATCHES, cut
-from malta.proof.exclusion.exclusion import (
+from malta.proof.exclusion import (
+    PATCHES,
     CellBounds,
     Growth,
     advance,
+    cut,
     growth_over,
     on_boxes,
     start,
 )
-from malta.proof.families import family_over
+from malta.proof.polynomial.enclosure import family_over
 from malta.proof.polynomial.family import Family, align, combine
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ def parts_of(
         math.isfinite(r) and (b.kind != "feedback" or r < 1) for (b, _), r in zip(blocks, most, strict=True)
     )
     p: list[Any] = [arb(low).union(arb(high)) for low, high in sides.tolist()]
-    p += [arb(0)] * (len(problem.names) - len(p))
+    p += [arb(0)] * (len(problem.loop.system.names) - len(p))
     grown = 1.0
     for (b, pins), r in zip(blocks, most, strict=True):
         if b.kind == "feedback" and known:  # the gain is 1 / (1 - delta), and f times 1 - delta

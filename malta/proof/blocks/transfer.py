@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.model.plant import readonly
-from malta.proof.blocks.blocks import Block
-from malta.proof.responses import Responses
+from malta.proof.blocks import Block
+from malta.proof.uncertain import Responses
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -75,7 +75,8 @@ def transfer(signals: Signals, blocks: Sequence[Block]) -> ComplexArray:
         into[[first + i for i in rows], own] = np.eye(len(rows))
         if b.kind == "feedback":  # it reads its own addition
             passed[first][rows, own] += np.eye(len(rows))
-        signal = signals.u if _acts_at_inputs(b) else signals.y
+        reads_u = b.kind in ("additive", "effort") or (b.kind in _LOOPS and b.at == "forces")
+        signal = signals.u if reads_u else signals.y
         if b.kind == "additive":
             signal = signals.of.H @ signal
         beside = passed[first][columns].copy() if b.kind in _LOOPS else 0.0
@@ -86,11 +87,6 @@ def transfer(signals: Signals, blocks: Sequence[Block]) -> ComplexArray:
 
 
 _LOOPS = ("multiplicative", "feedback")
-
-
-def _acts_at_inputs(b: Block) -> bool:
-    """Whether a block reads u, and not y."""
-    return b.kind in ("additive", "effort") or (b.kind in _LOOPS and b.at == "forces")
 
 
 def mu_bound(M: ComplexArray, blocks: Sequence[Block]) -> tuple[FloatArray, ComplexArray]:

@@ -34,7 +34,7 @@ from malta.proof.certificate.checked_loop import (
     height,
     split,
 )
-from malta.proof.exclusion.exclusion import Growth, advance, start
+from malta.proof.exclusion import Growth, advance, start
 from malta.proof.expressions import FIELD, exact
 from malta.proof.groups import E, UncertainLoop, loop_of
 from malta.proof.polynomial.family import Family, binary

@@ -19,7 +19,7 @@ from flint import acb, acb_mat, arb, arb_mat, fmpq
 
 from malta.proof.certificate.check import tiled
 from malta.proof.expressions import exact
-from malta.proof.multipliers.multipliers import SMALL, SMALLEST, Branch
+from malta.proof.multipliers import SMALL, SMALLEST, Branch
 from malta.proof.polynomial.enclosure import precision
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from malta.proof.box_parts import cut
+from malta.proof.exclusion import cut
 from malta.proof.expressions import NotAnalytic, exact
 from malta.proof.polynomial.characteristic import pair
 from malta.proof.polynomial.enclosure import Disc, TooWide, Unproven, discs_of, ends_of, precision
@@ -41,8 +41,6 @@ LARGEST = 14  # degree in s
 MOST_PLACES = 4000  # at which a_k, or H, is evaluated
 HIGHEST = 40  # degree of an interpolation along one parameter
 TAIL = -70.0  # log2 of what an interpolation may leave out, relative to each coefficient
-SNAP = 1e-4  # of a range: parameters nearer to zero than that are tried at zero
-FEW_PARTS = 16  # of a box
 
 
 class Tensor(NamedTuple):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from malta.proof.exclusion.exclusion import Cell, Growth, cover
+from malta.proof.exclusion import Cell, Growth, cover
 from malta.proof.polynomial.family import Family, basis
 from malta.proof.time_limit import is_late
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 STEPS = 8  # of the frequency grid in an octave
 SPACING = 0.6 / STEPS  # half a step and more, in ln w
 HALVINGS = 6  # of the way to a corner, of which the descent follows the rest
+STARTS = 6  # of descents, of each kind
 ENDS = ((0, 0.0), (1, 0.0))  # w = 0 and w = infinity
 
 
@@ -56,11 +57,6 @@ def _slope(degree: int, u: float) -> FloatArray:
         return np.zeros(1)
     low = basis(degree - 1, np.array(u))
     return np.asarray(degree * (np.append(0.0, low) - np.append(low, 0.0)))
-
-
-def rows_at(f: Family, branch: int, x: FloatArray) -> ComplexArray:
-    """Weights of a_k in f(x) at points of a branch, on a scale of each point's own: points x K."""
-    return rows_and_slopes(f, branch, x)[0]
 
 
 def rows_and_slopes(f: Family, branch: int, x: Any) -> tuple[ComplexArray, ComplexArray]:
@@ -108,7 +104,7 @@ def linear_distance(
     return np.asarray(np.nanmax(t, axis=1))
 
 
-def starts(f: Family, g: Growth, most: int = 6) -> list[tuple[float, int, float, FloatArray]]:
+def starts(f: Family, g: Growth) -> list[tuple[float, int, float, FloatArray]]:
     """Starts of descents (estimated t, branch, x, u): small linear distances along frequency, and unstable corners."""
     cells = cover(f)
     inner = cells[(cells[:, 0] == 0) & (cells[:, 1] > 0)]
@@ -126,16 +122,16 @@ def starts(f: Family, g: Growth, most: int = 6) -> list[tuple[float, int, float,
         at = coefficients_at(f, u)
         t = linear_distance(f, g, u, 0, x, at)
         low = np.flatnonzero((t <= np.r_[np.inf, t[:-1]]) & (t <= np.r_[t[1:], np.inf]) & np.isfinite(t))
-        for k in low[np.argsort(t[low])][:most]:
+        for k in low[np.argsort(t[low])][:STARTS]:
             found.append((float(t[k]), 0, float(x[k]), u))
         for branch, end in ENDS:
             found.append((float(linear_distance(f, g, u, branch, np.array([end]), at)[0]), branch, end, u))
     found.sort(key=lambda s: s[0])
-    crossings = _corners(f, g, most)  # first: these do cross, where a small linear distance may lead nowhere
-    return [*crossings, *(start for start in found[: 2 * most] if np.isfinite(start[0]))]
+    crossings = _corners(f, g)  # first: these do cross, where a small linear distance may lead nowhere
+    return [*crossings, *(start for start in found[: 2 * STARTS] if np.isfinite(start[0]))]
 
 
-def _corners(f: Family, g: Growth, most: int) -> list[tuple[float, int, float, FloatArray]]:
+def _corners(f: Family, g: Growth) -> list[tuple[float, int, float, FloatArray]]:
     """The first loss of stability, by the roots, on the ways from the nominal values to corners of the box."""
     free = [i for i, n in enumerate(f.shape) if n > 1 and g.high[i] > g.low[i]]
     if not free:
@@ -166,7 +162,7 @@ def _corners(f: Family, g: Growth, most: int) -> list[tuple[float, int, float, F
         at = _worst_root(f, u)[1]
         found.append((float(g.margin(g.parameters(u))), 0, at, u))
     found.sort(key=lambda s: s[0])
-    return found[:most]
+    return found[:STARTS]
 
 
 def _worst_root(f: Family, u: FloatArray) -> tuple[float, float]:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import linalg
 
 from malta.proof.groups import groups
-from malta.proof.multipliers.multipliers import (
+from malta.proof.multipliers import (
     Blocks,
     Branch,
     Multiplier,

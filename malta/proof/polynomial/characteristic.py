@@ -37,7 +37,7 @@ from malta.proof.polynomial.closed_loop import (
     majorant_matrix,
 )
 from malta.proof.polynomial.minors import Minors, Resolvent, minors
-from malta.proof.polynomial.rational import Ratio, Symbolic, value
+from malta.proof.polynomial.rational import Ratio, Symbolic, over_common_denominator, value
 from malta.proof.uncertain import Group
 
 # Degrees of a characteristic polynomial in each parameter, upper bounds read from the entries of the matrices.
@@ -93,18 +93,8 @@ def clear_denominators(loop: UncertainLoop, g: Group, s: Symbolic) -> list[dict[
 
 def _row(row: dict[Any, Ratio]) -> dict[Any, Any]:
     """The numerators of a row over its common denominator, which is the entry None."""
-    common = None
-    for r in row.values():
-        if r.den is None:
-            continue
-        common = r.den if common is None else common * (r.den / common.gcd(r.den))
-    found = {
-        at: r.num if common is None else r.num * (common if r.den is None else common / r.den)
-        for at, r in row.items()
-    }
-    if common is not None:
-        found[None] = common
-    return found
+    found, common = over_common_denominator(row)
+    return found if common is None else found | {None: common}
 
 
 def determinant_degree(rows: list[dict[Any, Any]], i: int) -> int:
@@ -153,7 +143,10 @@ class Characteristic:
 
     loop: UncertainLoop
     group: Group
-    names: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.loop.system.names
 
     @property
     def foreign(self) -> tuple[str, ...]:
@@ -250,7 +243,8 @@ class Characteristic:
         Raises NotAnalytic when the matrices have no value there.
         """
         p = [1 / x if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
-        a = self._map_to_v(self._coefficients(p, fmpq_mat if self.exact else arb_mat))
+        a = self._coefficients(p, fmpq_mat if self.exact else arb_mat)
+        a = map_bilinear(a) if self.discrete else a
         if not self.exact:
             return a
         scale = _multiplier(self.loop, self.group, p)
@@ -299,9 +293,6 @@ class Characteristic:
         if not (self.exact or (self.loop.program.rational and self.loop.program.short)):
             return program.run([arb(x) for x in p], POINTS)
         return program.run(p, EXACT)
-
-    def _map_to_v(self, a: list[Any]) -> list[Any]:
-        return map_bilinear(a) if self.discrete else a
 
     # bounds
 

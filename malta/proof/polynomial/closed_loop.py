@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -221,6 +221,42 @@ def coefficients(closed: tuple[Any, Any]) -> list[Any]:
     return [c * factor for c in found]
 
 
+def entry_bounds(
+    entries: list[list[tuple[int, int, Any]]],
+    states: Sequence[int],
+    inputs: Sequence[int],
+    outputs: Sequence[int],
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Entrywise bounds of E^-1 A, E^-1 B and C between these signals, and of the real parts of A's diagonal.
+
+    entries : balls of A, B, C, and of D and E where there are any
+
+    Raises NotAnalytic where E is singular.
+    """
+    x, u, y = ({signal: k for k, signal in enumerate(side)} for side in (states, inputs, outputs))
+    n, m = len(x), len(u)
+    a = [(x[i], x[j], z) for i, j, z in entries[A] if i in x and j in x]
+    b = [(x[i], u[j], z) for i, j, z in entries[B] if i in x and j in u]
+    if len(entries) > E:
+        e = dense(acb_mat, n, n, ((x[i], x[j], z) for i, j, z in entries[E] if i in x and j in x))
+        ab = solve(e, join_columns(acb_mat, dense(acb_mat, n, n, a), dense(acb_mat, n, m, b)))
+        a = [(i, j, ab[i, j]) for i in range(n) for j in range(n)]
+        b = [(i, j, ab[i, n + j]) for i in range(n) for j in range(m)]
+    diagonal = np.zeros(n)
+    for i, j, z in a:
+        if i == j:
+            diagonal[i] = upper(z)
+    c = ((y[i], x[j], z) for i, j, z in entries[C] if i in y and j in x)
+    return _sizes(n, n, a), _sizes(n, m, b), _sizes(len(y), n, c), diagonal
+
+
+def _sizes(rows: int, columns: int, entries: Iterable[tuple[int, int, Any]]) -> FloatArray:
+    found = np.zeros((rows, columns))
+    for i, j, z in entries:
+        found[i, j] = float(abs(z).upper()) * (1 + 1e-9)
+    return found
+
+
 def majorant_matrix(loop: UncertainLoop, g: Group, entries: list[list[tuple[int, int, Any]]]) -> FloatArray:
     """Entrywise bounds of the closed loop's state matrix (of differences where discrete), from balls of the entries.
 
@@ -228,27 +264,8 @@ def majorant_matrix(loop: UncertainLoop, g: Group, entries: list[list[tuple[int,
     """
     law, x = loop.law, {state: k for k, state in enumerate(g.states)}
     m, p, n = loop.program.shapes[B][1], loop.program.shapes[C][0], len(x)
-
-    def sizes(rows: int, columns: int, values: Any) -> FloatArray:
-        found = np.zeros((rows, columns))
-        for i, j, z in values:
-            found[i, j] = float(abs(z).upper()) * (1 + 1e-9)
-        return found
-
-    a_balls = [(x[i], x[j], r) for i, j, r in entries[A] if i in x and j in x]
-    b_balls = [(x[i], j, r) for i, j, r in entries[B] if i in x]
-    if len(entries) > E:
-        e = dense(acb_mat, n, n, ((x[i], x[j], r) for i, j, r in entries[E] if i in x and j in x))
-        ab = solve(e, join_columns(acb_mat, dense(acb_mat, n, n, a_balls), dense(acb_mat, n, m, b_balls)))
-        a_balls = [(i, j, ab[i, j]) for i in range(n) for j in range(n)]
-        b_balls = [(i, j, ab[i, n + j]) for i in range(n) for j in range(m)]
-    diagonal = np.zeros(n)
-    for i, j, z in a_balls:
-        if i == j:
-            diagonal[i] = upper(z)
-    a, b = sizes(n, n, a_balls), sizes(n, m, b_balls)
-    c = sizes(p, n, ((i, x[j], r) for i, j, r in entries[C] if j in x))
-    d = sizes(p, m, entries[D]) if loop.direct else None
+    a, b, c, diagonal = entry_bounds(entries, g.states, range(m), range(p))
+    d = _sizes(p, m, entries[D]) if loop.direct else None
     out, through = np.abs(law.C[:, list(g.own)]), np.abs(law.D)
     if not all(np.isfinite(part).all() for part in (a, b, c, d) if part is not None):
         raise NotAnalytic("numbers that overflow")

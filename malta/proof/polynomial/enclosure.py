@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from weakref import WeakKeyDictionary
 
 from flint import acb, arb, ctx, fmpq
 
@@ -111,12 +112,26 @@ def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until:
         for i, side in enumerate(plan)
     ]
     points = values_within(f, list(itertools.product(*grid)), until)
-    tails = add_bounds(_sum_tails(plan), f.coupling_bounds(moves, _real(sides)))
+    tails = add_bounds(
+        _sum_tails(plan), f.coupling_bounds(moves, [(arb(a), arb(b)) for a, b in sides.tolist()])
+    )
     return family([s.degree + 1 for s in plan], [s.chebyshev for s in plan], points, tails)
 
 
-def _real(sides: FloatArray) -> list[tuple[Any, Any]]:
-    return [(arb(a), arb(b)) for a, b in sides.tolist()]
+FAMILIES: WeakKeyDictionary[Polynomial, dict[Any, Family]] = WeakKeyDictionary()
+REMEMBERED = 4_000_000  # numbers in the families of a polynomial, beyond which the oldest are forgotten
+
+
+def family_over(f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> Family:
+    """The family of a polynomial over `sides`, remembered: several margins need it over the same box."""
+    known = FAMILIES.setdefault(f, {})
+    key = (sides.tobytes(), tuple(pair(m) for m in moves))
+    if key not in known:
+        family = over_box(f, sides, moves, last)
+        while sum(other.values.size for other in known.values()) > REMEMBERED:
+            known.pop(next(iter(known)))
+        known[key] = family
+    return known[key]
 
 
 def add_bounds(

@@ -15,17 +15,18 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
-from flint import acb_mat, arb, arb_mat, arb_poly, ctx, fmpq_mat, fmpq_poly
+from flint import arb, arb_mat, arb_poly, ctx, fmpq_mat, fmpq_poly
 from scipy import sparse
 
 from malta.proof.expressions import NotAnalytic, Program, exact
-from malta.proof.groups import A, B, C, E, UncertainLoop, rational, upper
+from malta.proof.groups import A, B, C, E, UncertainLoop, rational
 from malta.proof.polynomial.closed_loop import (
     add_lag,
     all_bounds,
     coefficient_bounds,
     dense,
     driven_bounds,
+    entry_bounds,
     hold,
     join_columns,
     solve,
@@ -290,7 +291,14 @@ class Minors:
 
         Raises NotAnalytic when numbers overflow.
         """
-        a, b, c, diagonal = parts = _sizes(self, entries)
+        a, b, c, diagonal = entry_bounds(
+            entries,
+            self.group.states,
+            self.inputs,
+            self.outputs,
+        )
+        b = b[list(self.rows)]
+        parts = a, b, c, diagonal
         known, key = self.resolvents, tuple((part.shape, part.tobytes()) for part in parts)
         if key in known:  # of an image
             return cast("Sizes", known[key])
@@ -334,7 +342,7 @@ class Minors:
                 if sizes.beta[R, T]:
                     weight = _sum(weight, [arb(sizes.beta[R, T]) * x for x in self._absolute_kappa[T, S]])
             if weight:
-                result = _sum(result, _product(pi, weight))
+                result = _sum(result, list((arb_poly(pi) * arb_poly(weight)).coeffs()) if pi else [])
         return result
 
     @cached_property
@@ -459,44 +467,11 @@ def _minors(resolvent: Resolvent, c: Any, order: int) -> dict[Pair, Any]:
     return found
 
 
-def _sizes(
-    m: Minors, entries: list[list[tuple[int, int, Any]]]
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    x = {state: k for k, state in enumerate(m.group.states)}
-    u, y = ({j: k for k, j in enumerate(own)} for own in (m.inputs, m.outputs))
-    n = len(x)
-    a_balls = [(x[i], x[j], z) for i, j, z in entries[A] if i in x and j in x]
-    b_balls = [(x[i], u[j], z) for i, j, z in entries[B] if i in x and j in u]
-    if len(entries) > E:
-        e = dense(acb_mat, n, n, ((x[i], x[j], z) for i, j, z in entries[E] if i in x and j in x))
-        both = join_columns(acb_mat, dense(acb_mat, n, n, a_balls), dense(acb_mat, n, len(u), b_balls))
-        ab = solve(e, both)
-        a_balls = [(i, j, ab[i, j]) for i in range(n) for j in range(n)]
-        b_balls = [(i, j, ab[i, n + j]) for i in range(n) for j in range(len(u))]
-
-    def size(rows: int, count: int, values: Any) -> FloatArray:
-        found = np.zeros((rows, count))
-        for i, j, z in values:
-            found[i, j] = float(abs(z).upper()) * (1 + 1e-9)
-        return found
-
-    c = size(len(y), n, ((y[i], x[j], z) for i, j, z in entries[C] if i in y and j in x))
-    diagonal = np.zeros(n)
-    for i, j, z in a_balls:
-        if i == j:
-            diagonal[i] = upper(z)
-    return size(n, n, a_balls), size(n, len(u), b_balls)[list(m.rows)], c, diagonal
-
-
 def _bounds(a: FloatArray, sides: list[tuple[FloatArray, FloatArray]]) -> list[list[Any]]:
     """Upper bounds of the coefficients of det [[g - A, B], [C, 0]], from entrywise bounds of A and of each B and C."""
     k = len(sides[0][1])
     m = np.array([np.block([[a, b], [c, np.zeros((k, k))]]) for b, c in sides])
     return all_bounds(m, np.where(np.arange(m.shape[1]) < len(a), 1.0, 0.0))
-
-
-def _product(one: list[Any], two: list[Any]) -> list[Any]:
-    return list((arb_poly(one) * arb_poly(two)).coeffs()) if one and two else []
 
 
 def _sum(one: list[Any], two: list[Any]) -> list[Any]:

@@ -121,6 +121,18 @@ class Symbolic:
         return Ratio(self.context.constant(exact(x)))
 
 
+def over_common_denominator(entries: Mapping[Any, Ratio]) -> tuple[dict[Any, Any], Any]:
+    """The numerators of rational functions over their common denominator, and this; None for one."""
+    common = None
+    for r in entries.values():
+        if r.den is not None:
+            common = r.den if common is None else common * (r.den / common.gcd(r.den))
+    return {
+        at: r.num if common is None else r.num * (common if r.den is None else common / r.den)
+        for at, r in entries.items()
+    }, common
+
+
 def value(polynomial: Any, p: Sequence[Any]) -> Any:
     """The value of a polynomial at complex balls."""
     check_time()
@@ -198,21 +210,17 @@ def expand_matrices(function: ca.Function, nominal: FloatArray) -> tuple[Symboli
     scales = np.concatenate([nominal, np.ones(len(s.atoms))])
     circles, zero = _circles(s), Ratio(s.context.constant(0))
     above = [positive.get((k, 0), zero) for k in range(resolved.shapes[-1][0])]
-    roots = dict(zip(_roots(s), above[conditions:], strict=True))
+    found = [s.inputs + k for k, step in enumerate(s.atoms) if s.program.steps[step][0] == "sqrt"]
+    roots = dict(zip(found, above[conditions:], strict=True))
 
     def replace_roots(r: Ratio) -> Ratio:
-        return _replace_squares(s, _replace_cosines(s, r, circles), roots)
+        return replace_squares(s, _replace_cosines(s, r, circles), roots)
 
     tables = [drop_rounding(s, {at: replace_roots(r) for at, r in t.items()}, scales) for t in matrices]
     return s, tables, [replace_roots(r) for r in above]
 
 
-def _roots(s: Symbolic) -> list[int]:
-    """The variables that are square roots."""
-    return [s.inputs + k for k, step in enumerate(s.atoms) if s.program.steps[step][0] == "sqrt"]
-
-
-def _replace_squares(s: Symbolic, r: Ratio, roots: Mapping[int, Ratio]) -> Ratio:
+def replace_squares(s: Symbolic, r: Ratio, roots: Mapping[int, Ratio]) -> Ratio:
     """Replace squares of roots by their arguments, of the last root first, as its argument may have others."""
     for i, argument in reversed(list(roots.items())):
 
@@ -309,13 +317,13 @@ def _sizes(r: Ratio, weights: list[float]) -> dict[Any, float]:
 
 
 def product(one: Table, two: Table) -> Table:
-    """The product of two matrices."""
+    """The product of two matrices, without zeros."""
     found: Table = {}
     for (i, k), r in one.items():
         for (row, j), q in two.items():
             if k == row:
                 found[i, j] = found[i, j] + r * q if (i, j) in found else r * q
-    return found
+    return {at: r for at, r in found.items() if not r.is_zero()}
 
 
 def difference(one: Table, two: Table) -> Table:

@@ -18,7 +18,6 @@ import numpy as np
 
 from malta.proof.expressions import NotAnalytic, Program
 from malta.proof.time_limit import check_time
-from malta.proof.weak_coupling import taylor
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -181,9 +180,9 @@ class Laurent:
 
 Value = float | Taylor | Laurent  # a constant, of y alone, of p and y
 FUNCTIONS: dict[str, Callable[[Taylor], Taylor]] = {
-    "sin": taylor.sine,
-    "cos": taylor.cosine,
-    "sqrt": taylor.root,
+    "sin": sine,
+    "cos": cosine,
+    "sqrt": root,
 }
 
 
@@ -192,11 +191,11 @@ class Evaluation:
 
     def __init__(self, parameters: int, low: float, high: float, count: int) -> None:
         self.count, self.none = count, (0,) * parameters
-        self.y = taylor.variable(low, high, count)
+        self.y = variable(low, high, count)
 
     def parameter(self, i: int) -> Laurent:
         exponents = tuple(int(i == k) for k in range(len(self.none)))
-        return Laurent({exponents: taylor.constant(1.0, self.count)})
+        return Laurent({exponents: constant(1.0, self.count)})
 
     def run(self, program: Program, inputs: Sequence[Value]) -> list[list[tuple[int, int, Value]]]:
         """The entries (row, column, value) of each matrix.
@@ -235,7 +234,7 @@ class Evaluation:
         return FUNCTIONS[name](self._model(a))
 
     def _model(self, a: float | Taylor) -> Taylor:
-        return taylor.constant(a, self.count) if isinstance(a, float) else a
+        return constant(a, self.count) if isinstance(a, float) else a
 
     def laurent(self, a: Value) -> Laurent:
         return a if isinstance(a, Laurent) else Laurent({self.none: self._model(a)})
@@ -244,10 +243,10 @@ class Evaluation:
         if a == 0.0 or b == 0.0:
             return b if a == 0.0 else a
         if not isinstance(a, Laurent) and not isinstance(b, Laurent):
-            return taylor.add(self._model(a), self._model(b))
+            return add(self._model(a), self._model(b))
         found = dict(self.laurent(a).terms)
         for m, c in self.laurent(b).terms.items():
-            found[m] = taylor.add(found[m], c) if m in found else c
+            found[m] = add(found[m], c) if m in found else c
         return Laurent(found)
 
     def product(self, a: Value, b: Value) -> Value:
@@ -255,21 +254,21 @@ class Evaluation:
             a, b = b, a
         if isinstance(b, float):
             if isinstance(a, Laurent):
-                return Laurent({m: taylor.scaled(c, b) for m, c in a.terms.items()})
-            return taylor.scaled(self._model(a), b)
+                return Laurent({m: scaled(c, b) for m, c in a.terms.items()})
+            return scaled(self._model(a), b)
         if not isinstance(a, Laurent) and not isinstance(b, Laurent):
-            return taylor.multiply(self._model(a), b)
+            return multiply(self._model(a), b)
         found: dict[Monomial, Taylor] = {}
         for m, c in self.laurent(a).terms.items():
             for n, d in self.laurent(b).terms.items():
-                at, part = tuple(i + j for i, j in zip(m, n, strict=True)), taylor.multiply(c, d)
-                found[at] = taylor.add(found[at], part) if at in found else part
+                at, part = tuple(i + j for i, j in zip(m, n, strict=True)), multiply(c, d)
+                found[at] = add(found[at], part) if at in found else part
         return Laurent(found)
 
     def _inverse(self, a: Value) -> Value:
         if not isinstance(a, Laurent):
-            return taylor.inverse(self._model(a))
+            return inverse(self._model(a))
         if len(a.terms) != 1:
             raise NotAnalytic("a division by a sum of parameters")
         ((m, c),) = a.terms.items()
-        return Laurent({tuple(-i for i in m): taylor.inverse(c)})
+        return Laurent({tuple(-i for i in m): inverse(c)})
