@@ -76,7 +76,7 @@ def toy(designs: dict[str, Design], monkeypatch: pytest.MonkeyPatch) -> Plant:
 
 def test_parts_of_a_machine_are_found_by_its_name(toy: Plant) -> None:
     found = [require_part(part, "tubular").__name__ for part in ("experiments", "figures", "claims")]
-    assert found == [f"malta.machines.tubular.{name}" for name in ("experiments", "figures", "paper.claims")]
+    assert found == [f"malta.machines.tubular.{name}" for name in ("experiments", "figures", "paper")]
     assert part_of("figures", toy.name) is None
     error = refusal(lambda: require_part("claims", "toy"), Path("claims"))
     assert (error.field, error.found) == ("machine", "'toy'")

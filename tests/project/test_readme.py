@@ -11,8 +11,8 @@ from scipy.stats import binomtest
 
 import malta
 from malta.campaigns.run import main_yields
-from malta.machines.tubular.paper.claims import SOURCE
-from malta.machines.tubular.paper.evidence import FEWER, MACHINES
+from malta.machines.tubular.paper import SOURCE
+from malta.machines.tubular.paper.quantities import FEWER, MACHINES
 from malta.report.ledger import find_tables
 
 pytestmark = pytest.mark.usefixtures("proven_once")
@@ -89,7 +89,7 @@ def test_the_table_of_claims_is_computed(
     machine: str, designs: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Yields, of MACHINES on the pages, are computed of FEW: they lie within the interval of these."""
-    monkeypatch.setattr("malta.machines.tubular.paper.evidence.MACHINES", FEW)
+    monkeypatch.setattr("malta.machines.tubular.paper.quantities.MACHINES", FEW)
     specs = [malta.read_design(f"design/{name}.toml") for name in designs]
     ledger = malta.ledger(specs, malta.model.published(f"data/{machine}.toml"))
     found, shown = _cells(ledger.markdown()), _shown(ledger.title, designs)
