@@ -102,8 +102,7 @@ def measure(
         found = _measured(gains, controller, logs, uncertain, identified)
     files = []
     if out is not None:
-        from malta.report.figures import save
-        from malta.report.figures.runs import measured_figure
+        from malta.report.figures import measured_figure, save
 
         files.append(save(measured_figure(found), out))
     if as_json:

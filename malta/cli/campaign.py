@@ -255,7 +255,7 @@ def _sobol(limit: Limit, _: float, setting: Setting, progress: Progress | None) 
     files = [_write(setting, f"sobol_{limit.slug}.json", sensitivity_document(found))]
     if found.of_yield or any(found.of_merits.values()):
         files.append(setting.folder / f"sobol_{limit.slug}.png")
-        report.sensitivity(found, files[-1])
+        report.sensitivity_figure(found, files[-1])
     notes = [text for text in (report.sensitivity_sentence(found),) if text]
     output = SobolOutput(**_head(setting, files), **sobol_fields(found))
     return Outcome(output, files, [report.sensitivity_tables(found)], notes)

@@ -296,8 +296,7 @@ def log(
     found = read_log(file)
     files = []
     if out is not None:
-        from malta.report.figures import save
-        from malta.report.figures.runs import log_figure
+        from malta.report.figures import log_figure, save
 
         files.append(save(log_figure(found), out))
     if as_json:

@@ -281,7 +281,7 @@ def _save(simulation: Simulation, folder: Path, published: Mapping[str, Any] | N
     stems = [stem] if len(cases) == 1 else [f"{stem}_{_slug(case.label)}" for case in cases]
     series = [save_series(case.run, folder / f"{name}.npz") for name, case in zip(stems, cases, strict=True)]
     picture = folder / f"{stem}.png"
-    report.experiment(simulation.experiment, picture, published)
+    report.experiment_figure(simulation.experiment, published, picture)
     return [*series, picture]
 
 

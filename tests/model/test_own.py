@@ -145,7 +145,7 @@ def test_without_a_figure_of_its_own_an_experiment_has_that_of_its_first_run(
         "z, off reference [µm]",
         "clearance used up [%]",
     ]
-    report.stroke(found.run, tmp_path / "run.svg")
+    report.stroke_figure(found.run, path=tmp_path / "run.svg")
     assert (tmp_path / "run.svg").stat().st_size > 10_000
     with pytest.raises(malta.InputError, match="'lunch', expected one of rest, run"):
         report.experiment_figure(replace(found, name="lunch"))
