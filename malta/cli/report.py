@@ -99,9 +99,10 @@ def report(
             contents[page_file.with_suffix(".pdf")] = pdf_of(page)
     replace_files(contents)
     if as_json:
-        from malta.cli.documents.loops import report_output
+        from malta.cli.documents.loops import ReportOutput, merits_of
 
-        print_document(report_output(gains, analysis, contents))
+        figures = merits_of(analysis.figures)
+        print_document(ReportOutput.of(analysis, gains=gains, figures=figures, files=contents))
     else:
         print_written(make_console(), contents)
     for note in analysis.notes:

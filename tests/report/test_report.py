@@ -213,7 +213,9 @@ def test_a_figure_of_the_version_before_says_its_new_name(
     design = designs["calibrated"]
     run = malta.simulate(design.spec.plant, design.controller, Scenario.stroke(duration=0.05))
     new = malta.report.stroke_figure(run, published, tmp_path / "new.png")
-    with pytest.warns(DeprecationWarning, match=r"malta.report.stroke goes: write malta.report.stroke_figure"):
+    with pytest.warns(
+        DeprecationWarning, match=r"malta.report.stroke goes: write malta.report.stroke_figure"
+    ):
         old = malta.report.stroke(run, tmp_path / "old.png", published)
     assert len(old.axes) == len(new.axes)
     assert (tmp_path / "old.png").read_bytes() == (tmp_path / "new.png").read_bytes()

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from malta.loops.time_domain import Deviation, Recovery
     from malta.margins.loop_report import LoopReport
     from malta.merits import Merit
-    from malta.report.page.analysis import Analysis
     from malta.report.page.comparison import Comparison
 
 
@@ -384,11 +383,6 @@ class CompareOutput(Part):
     figures: list[ComparedFigure]
     remarks: list[str] = Field(description="what could not be compared, and why")
     files: Files
-
-
-def report_output(gains: Path, analysis: Analysis, files: Iterable[Path]) -> ReportOutput:
-    """The document of a report."""
-    return ReportOutput.of(analysis, gains=gains, figures=merits_of(analysis.figures), files=files)
 
 
 def compare_output(found: Comparison, files: Iterable[Path]) -> CompareOutput:
