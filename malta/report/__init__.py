@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from malta.contents import contents
@@ -40,19 +41,13 @@ if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that dr
     from malta.report.plots import sigma as sigma
     from malta.report.plots import step as step
     from malta.report.plots.polar import margin_map as margin_map
-    from malta.report.tables.campaign import box_text as box_text
     from malta.report.tables.campaign import campaign_tables as campaign_tables
-    from malta.report.tables.campaign import rare_event_sentence as rare_event_sentence
     from malta.report.tables.campaign import rare_event_tables as rare_event_tables
-    from malta.report.tables.campaign import run_text as run_text
-    from malta.report.tables.campaign import sensitivity_sentence as sensitivity_sentence
     from malta.report.tables.campaign import sensitivity_tables as sensitivity_tables
     from malta.report.tables.campaign import spreads_table as spreads_table
-    from malta.report.tables.campaign import tolerance_sentence as tolerance_sentence
     from malta.report.tables.design import bandwidth_table as bandwidth_table
     from malta.report.tables.design import design_page as design_page
     from malta.report.tables.design import front_markdown as front_markdown
-    from malta.report.tables.design import front_rows as front_rows
     from malta.report.tables.design import front_table as front_table
     from malta.report.tables.design import loop_poles_table as loop_poles_table
     from malta.report.tables.design import poles_table as poles_table
@@ -85,11 +80,21 @@ _OLD = {
     "stroke": "stroke_figure",
     "loads": "recovery_figure",
 }
+_INNER = {  # others, which are parts of what prints them
+    "front_rows": "design",
+    **dict.fromkeys(
+        ("box_text", "rare_event_sentence", "run_text", "sensitivity_sentence", "tolerance_sentence"),
+        "campaign",
+    ),
+}
 
 __all__, _load, __dir__ = contents(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
+    if name in _INNER:
+        warnings.warn(f"malta.report.{name} goes without another name", DeprecationWarning, stacklevel=2)
+        return getattr(import_module(f"malta.report.tables.{_INNER[name]}"), name)
     if name not in _OLD:
         return _load(name)
     new = _OLD[name]

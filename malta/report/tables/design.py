@@ -429,24 +429,7 @@ def _front_columns(tuned: Tuned) -> dict[str, tuple[str, float, str]]:
 
 
 def front_rows(tuned: Tuned) -> tuple[list[str], list[list[str]]]:
-    """List the Pareto front as headings and cells: a row for each trial, the chosen one with a star.
-
-    tuned : from `malta.tune`
-
-    Returns headings and rows.
-
-    >>> import malta
-    >>> from malta.tuning.search import Trial
-    >>> from malta.tuning.tune import Tuned
-    >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
-    >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
-    >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
-    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
-    >>> heads, rows = malta.report.front_rows(tuned)
-    >>> rows[1]
-    ['363', '0.0414', '0.501', '*']
-    """
+    """The Pareto front as headings and cells: a row for each trial, the chosen one with a star."""
     columns = _front_columns(tuned)
     shown = [name for name in columns if any(name in one.figures for one in tuned.front)]
     heads = [f"{columns[k][0]} [{columns[k][2]}]".removesuffix(" []") for k in shown]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import wraps
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
@@ -192,6 +193,32 @@ def fly_all(
         if run.verdict.name == "interrupted":
             return tuple(cases), True
     return tuple(cases), False
+
+
+def experiment_of(
+    name: str,
+    question: str,
+    cases: Callable[..., list[PlannedRun]],
+    merits: Callable[[Sequence[Case]], tuple[Merit, ...]] = lambda _: (),
+) -> Callable[..., Experiment]:
+    """The experiment that flies the runs which `cases` lists: with its options, its docstring and its refusals.
+
+    merits : the figures of merit of the whole
+    """
+
+    @wraps(cases)
+    def fly_cases(
+        plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
+    ) -> Experiment:
+        flown, cut = fly(plant, controller, cases(plant, controller, **options), progress, options)
+        return Experiment(name, question, flown, merits(flown), interrupted=cut)
+
+    return fly_cases
+
+
+def merits_of_first(cases: Sequence[Case]) -> tuple[Merit, ...]:
+    """The figures of merit of the first run."""
+    return cases[0].merits
 
 
 def progress_of_part(progress: Progress | None, n: int, total: int) -> Progress | None:
