@@ -18,15 +18,13 @@ from malta.merits import Merit
 from malta.model.data import published_value
 from malta.model.machines import inputs_of, outputs_of, stroke_unit
 from malta.model.parameters import differences, units_of
-from malta.model.plant import readonly
+from malta.model.plant import FloatArray, readonly
 from malta.simulation.engine.digest import Batch, verdicts
 from malta.simulation.experiments import setting
 from malta.units import in_unit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from malta.model.plant import FloatArray
 
 
 CONFIDENCE = 0.95  # of the interval about a share

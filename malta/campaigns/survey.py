@@ -11,12 +11,11 @@ import numpy as np
 
 from malta.campaigns.result import gather
 from malta.campaigns.run import Session, campaign_folder, run_blocks
-from malta.campaigns.store import MANIFEST, read_blocks, read_manifest, read_plan
+from malta.campaigns.store import MANIFEST, Block, read_blocks, read_manifest, read_plan
 from malta.campaigns.summary import UNBOUNDED, Bounds, Summary, join, summary_of
 
 if TYPE_CHECKING:
     from malta.campaigns.plan import Plan
-    from malta.campaigns.store import Block
     from malta.simulation.experiments import Progress
     from malta.synthesis.controller import Controller
 

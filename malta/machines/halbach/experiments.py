@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from malta.errors import InputError
 from malta.machines.halbach import electronics
 from malta.machines.halbach.electronics import IDEAL, IQ_BITS, MEAN_OF, Options, Pwm
 from malta.machines.halbach.open_loop import F_MOST, force, identify, lift_deviation, stairs
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,
@@ -43,10 +43,6 @@ from malta.simulation.experiments import (
 from malta.simulation.references import Motion, Reference
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # Options of the electronics in an experiment.
 

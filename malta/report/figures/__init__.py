@@ -20,12 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.errors import InputError
-from malta.model.machines import (
-    KINDS,
-    Group,
-    attribute_of,
-    outputs_of,
-)
+from malta.model.machines import KINDS, Group, attribute_of, outputs_of
 from malta.report.figures.campaign import distributions_figure as distributions_figure
 from malta.report.figures.campaign import worst_figure as worst_figure
 from malta.report.figures.campaign import yield_figure as yield_figure

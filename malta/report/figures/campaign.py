@@ -37,8 +37,6 @@ from malta.simulation.engine.digest import LARGEST_FIGURE
 from malta.units import in_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 

@@ -18,7 +18,7 @@ from malta.errors import InputError
 from malta.files import replace_files
 from malta.merits import ROOTS
 from malta.model.data import published_value
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.requirements import Trade, requirements_for
 from malta.units import in_unit
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    from malta.model.plant import FloatArray
     from malta.simulation.experiments import Case, Experiment
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from malta.errors import InputError
 from malta.loops.loop import loop_along
 from malta.loops.sampled_loops import SampledLoop
-from malta.loops.time_domain import furthest, load_vector, recovery
-from malta.margins.loop_report import ZONES
+from malta.loops.time_domain import Deviation, Recovery, furthest, load_vector, recovery
+from malta.margins.loop_report import ZONES, LoopReport
 from malta.model.parameters import box_words
 from malta.report.figures.drawing import (
     BOUND,
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.loops.time_domain import Deviation, Recovery
-    from malta.margins.loop_report import LoopReport
     from malta.model.plant import FloatArray, Plant
     from malta.proof.blocks.gain import Gain
     from malta.proof.margin import Margin

@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING
 from rich.console import Group
 from rich.table import Table
 
-from malta.model.machines import (
-    lateral_outputs,
-)
+from malta.model.machines import lateral_outputs
 from malta.model.parameters import differences
 from malta.report.figures.drawing import Published, number
 from malta.report.tables.layout import Paragraph, add_row, end_cell, new_table

@@ -14,13 +14,13 @@ from rich.text import Text
 from scipy import sparse
 
 from malta.display import RADIANS, frequency
-from malta.loops.time_domain import SHARE, furthest
-from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, zone
+from malta.loops.time_domain import SHARE, Recovery, furthest
+from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, Outcome, zone
 from malta.model.data import published_value
 from malta.model.linearize import LinearModel
 from malta.model.machines import FINE
 from malta.model.parameters import box_words
-from malta.proof.certificate.checked_file import double
+from malta.proof.certificate.checked_file import Claim, double
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
 from malta.report.tables.experiments import experiment_table
 from malta.report.tables.layout import COLOURS, Paragraph, add_row, new_table
@@ -29,10 +29,7 @@ from malta.synthesis.requirements import Trade, requirements_for
 from malta.units import in_unit
 
 if TYPE_CHECKING:
-    from malta.loops.time_domain import Recovery
-    from malta.margins.loop_report import Outcome
     from malta.model.plant import ComplexArray, FloatArray, Plant
-    from malta.proof.certificate.checked_file import Claim
     from malta.simulation.experiments import Experiment
     from malta.synthesis.spec import Spec
     from malta.tuning.tune import Tuned

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import wraps
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -24,17 +24,13 @@ from malta.merits import Merit as Merit
 from malta.merits import figure
 from malta.model.linearize import linearize
 from malta.model.machines import attribute_of
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.inputs import LONGEST
 from malta.simulation.references import Reference
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 Progress = Callable[[float], None]
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.merits import reported_merits
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,
@@ -44,7 +44,6 @@ from malta.simulation.trajectory import Trajectory, stroke_figures
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
     from malta.simulation.experiments.time_optimal import FastestStroke, SigmoidStroke
 
 

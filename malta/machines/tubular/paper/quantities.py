@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import stdtrit
 
-from malta.campaigns.result import rate
+from malta.campaigns.result import Rate, rate
 from malta.campaigns.run import Yields, main_campaign, main_plan, replay, yields_of
 from malta.errors import CheckError, InputError
 from malta.identification.learn import learn
@@ -44,7 +44,6 @@ from malta.synthesis.spec import Spec
 from malta.synthesis.tunable_lqg import calibrate
 
 if TYPE_CHECKING:
-    from malta.campaigns.result import Rate
     from malta.machines.tubular.parameters import Parameters
     from malta.model.plant import FloatArray, Plant
 
