@@ -48,8 +48,8 @@ from malta.files import json_text, replace_files
 if TYPE_CHECKING:
     from malta.campaigns.limits import Limit
     from malta.campaigns.plan import Law, Plan, Sampler
+    from malta.campaigns.run import Status
     from malta.campaigns.summary import Bounds, Summary
-    from malta.campaigns.survey import Status
     from malta.cli.documents.loops import Part
     from malta.simulation.experiments import Progress
 
@@ -84,9 +84,9 @@ class StatusOptions(NamedTuple):
 
 def show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: StatusOptions) -> None:
     """Print the status of the campaign in a folder. Raises InputError for options that the campaign decides."""
+    from malta.campaigns.run import status as status_of
     from malta.campaigns.store import noted_gains
     from malta.campaigns.summary import Bounds
-    from malta.campaigns.survey import status as status_of
     from malta.model.data import plant_of, published_figures
 
     sources = {param: ctx.get_parameter_source(str(param.name)) for param in ctx.command.params}
@@ -451,9 +451,8 @@ def campaign(
     if gains is None:
         raise InputError("campaign", "GAINS", "nothing", "a gain file, or --status FOLDER")
     from malta.campaigns.plan import Plan
-    from malta.campaigns.run import Session, campaign_folder
+    from malta.campaigns.run import Session, campaign_folder, summarize
     from malta.campaigns.summary import Bounds
-    from malta.campaigns.survey import summarize
     from malta.model.data import plant_of, published_figures
     from malta.simulation.experiments.catalogue import main_job, settling
 

@@ -155,8 +155,8 @@ def campaigns_of(
     kept = [] if changed else sorted(path.parent for path in CAMPAIGNS.glob("*/campaign.json"))
     if not folders and not kept:
         return []
+    from malta.campaigns.run import status
     from malta.campaigns.summary import Bounds
-    from malta.campaigns.survey import status
     from malta.model.data import plant_of, published_figures
 
     bounds = Bounds(published_figures(plant_of(controller.parameters).name), spec)

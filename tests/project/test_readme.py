@@ -10,7 +10,8 @@ from conftest import ROOT
 from scipy.stats import binomtest
 
 import malta
-from malta.campaigns.run import main_yields
+from malta.campaigns.result import yields_of
+from malta.campaigns.run import main_campaign
 from malta.machines.tubular.paper import SOURCE
 from malta.machines.tubular.paper.quantities import FEWER, MACHINES
 from malta.report.ledger import find_tables
@@ -138,7 +139,7 @@ def test_yields_of_the_flagship_are_those_of_all_machines() -> None:
         k = DESIGNS["tubular"].index(name)
         controller = malta.gains.read(f"design/gains/{name}.json")
         spec = malta.read_design(f"design/{name}.toml")
-        found = main_yields(controller, spec, published, machines=MACHINES)
+        found = yields_of(main_campaign(controller, spec, MACHINES), published, spec)
         within = shown[f"{DRAWN}: stroke within the published bounds [%]"][1 + k]
         assert found.published is not None
         assert _number(within) == pytest.approx(100 * found.published.share, abs=0.2)

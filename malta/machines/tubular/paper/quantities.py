@@ -12,8 +12,8 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import stdtrit
 
-from malta.campaigns.result import Rate, rate
-from malta.campaigns.run import Yields, main_campaign, main_plan, replay, yields_of
+from malta.campaigns.result import Rate, Yields, rate, yields_of
+from malta.campaigns.run import main_campaign, main_plan, replay
 from malta.errors import CheckError, InputError
 from malta.identification.learn import learn
 from malta.identification.log import log_of
