@@ -84,7 +84,7 @@ figures: $(VENV)/dev  # the pictures of the README, of the theory pages, of note
 	$(BIN)/python docs/page_figures.py
 	$(BIN)/python -c "import malta; c = malta.gains.read('design/gains/calibrated.json'); \
 	  run = malta.simulate(malta.plant_of(c.parameters), c, malta.Scenario.stroke()); \
-	  malta.report.stroke(run, 'design/figures/stroke.svg', malta.published('data/tubular.toml'))"
+	  malta.report.stroke_figure(run, malta.model.published('data/tubular.toml'), 'design/figures/stroke.svg')"
 	$(BIN)/malta plot design/gains/calibrated.json marginmap --x K_A --y K_B --out design/figures/margin_map.svg
 	$(BIN)/malta simulate design/gains/calibrated.json --scenario stroke --out build
 	$(BIN)/malta motion design/gains/calibrated.json build/calibrated_stroke.npz --out design/figures/stroke.gif

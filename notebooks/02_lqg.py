@@ -168,7 +168,7 @@ for name, controller in controllers.items():
     assert figures.overshoot < 0.015
     assert figures.axial_error < 0.6e-3
     assert max(figures.radial.values()) < 20e-6
-    display(malta.report.stroke(run, f"build/02_lqg_{name}.png", published))
+    display(malta.report.stroke_figure(run, published, f"build/02_lqg_{name}.png"))
 
 # %% [markdown]
 # ## Judgement

@@ -40,7 +40,7 @@ plants = {name: malta.plant_of(c.parameters) for name, c in controllers.items()}
 strokes = {}
 for key, controller in controllers.items():
     e = strokes[key] = malta.experiment("stroke", plants[key], controller)
-    display(malta.report.experiment(e, f"build/03_{key}_stroke.png", published))
+    display(malta.report.experiment_figure(e, published, f"build/03_{key}_stroke.png"))
     print(f"{key}, {e}")
 lagged = malta.experiment("stroke", plants["calibrated"], controllers["calibrated"], fidelity="force")
 figures = malta.simulation.stroke_figures(lagged.run)
@@ -68,7 +68,7 @@ for e in strokes.values():
 rests = {}
 for key, controller in controllers.items():
     e = rests[key] = malta.experiment("hold", plants[key], controller)
-    display(malta.report.experiment(e, f"build/03_{key}_hold.png", published))
+    display(malta.report.experiment_figure(e, published, f"build/03_{key}_hold.png"))
     print(f"{key}, {e}")
 table = np.array([published["table_III"]["std"][name]["value"] for name in ("x1", "y1", "x2", "y2")])
 print("Table III", table.round(2), "µm")
@@ -97,7 +97,7 @@ for key, e in rests.items():
 drifts = {}
 for key, controller in controllers.items():
     e = drifts[key] = malta.experiment("thermal", plants[key], controller)
-    display(malta.report.experiment(e, f"build/03_{key}_thermal.png", published))
+    display(malta.report.experiment_figure(e, published, f"build/03_{key}_thermal.png"))
     print(f"{key}, {e}")
 for e in drifts.values():
     left, raw = (case.merits[0].value for case in e.cases)
@@ -119,7 +119,7 @@ for key, e in drifts.items():
 tilts = {}
 for key, controller in controllers.items():
     e = tilts[key] = malta.experiment("tilt", plants[key], controller)
-    display(malta.report.experiment(e, f"build/03_{key}_tilt.png", published))
+    display(malta.report.experiment_figure(e, published, f"build/03_{key}_tilt.png"))
     print(f"{key}, {e}")
 for key, e in tilts.items():
     as_printed, held = (case.merits[0].value * 1e6 for case in e.cases)
@@ -153,7 +153,7 @@ for name in ("lift-off", "payload", "faults"):
     others[name] = {}
     for key, controller in controllers.items():
         e = others[name][key] = malta.experiment(name, plants[key], controller)
-        display(malta.report.experiment(e, f"build/03_{key}_{name}.png", published))
+        display(malta.report.experiment_figure(e, published, f"build/03_{key}_{name}.png"))
         print(f"{key}, {e}")
 
 # %% [markdown]
@@ -193,12 +193,12 @@ for key in controllers:
 stiff = {}
 for key, controller in controllers.items():
     e = stiff[key] = malta.experiment("disturbance", plants[key], controller)
-    display(malta.report.experiment(e, f"build/03_{key}_disturbance.png", published))
+    display(malta.report.experiment_figure(e, published, f"build/03_{key}_disturbance.png"))
     print(f"{key}, {e}")
 limits = {}
 for key, controller in controllers.items():
     e = limits[key] = malta.experiment("drive-limits", plants[key], controller)
-    display(malta.report.experiment(e, f"build/03_{key}_drive-limits.png", published))
+    display(malta.report.experiment_figure(e, published, f"build/03_{key}_drive-limits.png"))
     print(f"{key}, {e}")
 fastest, sigmoid = (case.merits[0].value for case in limits["calibrated"].cases)
 print(f"rise {fastest * 1e3:.1f} ms against {sigmoid * 1e3:.1f} ms of the sigmoid at the same peak current")

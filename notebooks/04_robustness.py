@@ -44,7 +44,7 @@ found = {
     for name, controller in controllers.items()
 }
 for name, result in found.items():
-    display(malta.report.robustness(result, f"build/04_{name}_margins.png"))
+    display(malta.report.chain_figure(result, f"build/04_{name}_margins.png"))
     print(name)
     for link in result.chain:
         print(f"  {link.name:16} {link.margin};  peak |S| {link.peak:.2f} at the {link.broken_at}")

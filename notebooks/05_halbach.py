@@ -106,7 +106,7 @@ for name, controller in controllers.items():
 # %%
 for name, controller in controllers.items():
     e = malta.experiment("step", plant, controller)
-    display(malta.report.experiment(e, f"build/05_{name}_step.png", published))
+    display(malta.report.experiment_figure(e, published, f"build/05_{name}_step.png"))
     print(f"{name}, {e}")
     jumps, quintics = ({merit.label: merit.value for merit in case.merits} for case in e.cases)
     assert quintics["mean overshoot"] < 0.1
@@ -125,7 +125,7 @@ for name, controller in controllers.items():
 
 # %%
 force = malta.experiment("force", plant, controllers["halbach"])
-display(malta.report.experiment(force, "build/05_halbach_force.png", published))
+display(malta.report.experiment_figure(force, published, "build/05_halbach_force.png"))
 steady = {case.label: case.merits[0].value for case in force.cases}
 for label, value in steady.items():
     print(f"{label}: {100 * value:.2f} %")
@@ -144,7 +144,7 @@ assert abs(force.cases[0].merits[1].value + 0.503) < 1e-3
 
 # %%
 budget = malta.experiment("budget", plant, controllers["halbach"])
-display(malta.report.experiment(budget, "build/05_halbach_budget.png", published))
+display(malta.report.experiment_figure(budget, published, "build/05_halbach_budget.png"))
 rms = {case.label: 1e6 * case.merits[0].value for case in budget.cases}
 for label, value in rms.items():
     print(f"{label}: {value:.3f} µm rms")

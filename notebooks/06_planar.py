@@ -144,7 +144,7 @@ for name, controller in controllers.items():
 
 # %%
 e = malta.experiment("step", plant, controllers["planar"], engine="virtual machine")
-display(malta.report.experiment(e, "build/06_planar_step.png", published))
+display(malta.report.experiment_figure(e, published, "build/06_planar_step.png"))
 print(e)
 moved = {merit.label: merit.value for merit in e.merits}
 assert moved["table moves phi by"] < 0.02e-6
@@ -162,7 +162,7 @@ for case in e.cases:
 
 # %%
 late = malta.experiment("delay", plant, controllers["planar"], speeds=(1.0, 2.0), engine="virtual machine")
-display(malta.report.experiment(late, "build/06_planar_delay.png", published))
+display(malta.report.experiment_figure(late, published, "build/06_planar_delay.png"))
 left_at_rest = {case.label: case.merits[1].value for case in late.cases}
 print(late)
 assert left_at_rest["with, 2 x"] < 1e-9 < 30e-6 < left_at_rest["without, 2 x"]

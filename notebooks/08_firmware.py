@@ -141,7 +141,7 @@ if can_build:
     commissioning = malta.experiment("commissioning", plant, c)
     for merit in commissioning.merits:
         print(merit)
-    display(malta.report.experiment(commissioning, "build/robust_commissioning.png"))
+    display(malta.report.experiment_figure(commissioning, path="build/robust_commissioning.png"))
     assert commissioning.run.verdict.completed
     by_label = {merit.label: merit.value for merit in commissioning.merits}
     assert by_label["in operation after"] < 0.1

@@ -15,7 +15,7 @@ import numpy as np
 from IPython.display import Markdown, display
 
 import malta
-from malta.report.figures.runs import measured_figure
+from malta.report.figures import measured_figure
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

@@ -34,4 +34,4 @@ print(step)
 print(push)
 
 # %%
-malta.report.experiment(push, HERE / "build" / "push.png")
+malta.report.experiment_figure(push, path=HERE / "build" / "push.png")

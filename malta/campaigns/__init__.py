@@ -1,7 +1,6 @@
 """Campaigns: one scenario on thousands of machines, or on a hundred million.
 
-plan -> store -> result -> run, with dask.py for a cluster
-                        -> summary -> survey: of any size, without the figures of each run
+plan -> store -> result -> summary -> run, with dask.py for a cluster: all figures, or a summary of any number of runs
 limits -> rare, studies: rare events, sensitivities and tolerances on the box of a plan
 """
 
@@ -16,9 +15,9 @@ if TYPE_CHECKING:
     from malta.campaigns.plan import Plan as Plan
     from malta.campaigns.rare import rare_event as rare_event
     from malta.campaigns.result import Campaign as Campaign
+    from malta.campaigns.run import summarize as summarize
     from malta.campaigns.studies import sensitivity as sensitivity
     from malta.campaigns.studies import tolerances as tolerances
     from malta.campaigns.summary import Summary as Summary
-    from malta.campaigns.survey import summarize as summarize
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.campaigns.plan import Plan, machines_at, planned_run, varied_names
-from malta.campaigns.result import Campaign, Finding, figures_of
-from malta.campaigns.run import specified_bounds
+from malta.campaigns.result import Campaign, Finding, figures_of, specified_bounds
 from malta.campaigns.store import simulate_machines
 from malta.campaigns.summary import UNBOUNDED, Bounds
 from malta.display import display

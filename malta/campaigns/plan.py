@@ -29,7 +29,7 @@ from malta.gains.encodings import decode
 from malta.model.data import plant_of
 from malta.model.machines import module_of, part_of
 from malta.model.parameters import differences, fingerprint, shape_parameters, twins_of, units_of, values_of
-from malta.model.plant import Plant, readonly
+from malta.model.plant import FloatArray, Plant, readonly
 from malta.simulation.engine.batch import functions_text
 from malta.simulation.experiments import PlannedRun
 from malta.simulation.experiments.catalogue import cases_of
@@ -39,7 +39,6 @@ from malta.synthesis.controller import Controller
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from malta.model.plant import FloatArray
     from malta.simulation.scenario import Scenario
 
 

@@ -41,13 +41,12 @@ from malta.campaigns.store import seal, simulate_machines
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.files import file_exists, json_text, read_file, replace_files
-from malta.simulation.engine.digest import verdicts
+from malta.simulation.engine.digest import Batch, verdicts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from malta.model.plant import FloatArray
-    from malta.simulation.engine.digest import Batch
     from malta.simulation.engine.engines import EngineChoice
     from malta.simulation.experiments import Experiment, Progress
     from malta.simulation.simulate import EngineOf

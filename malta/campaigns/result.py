@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,7 +18,7 @@ from malta.merits import Merit
 from malta.model.data import published_value
 from malta.model.machines import inputs_of, outputs_of, stroke_unit
 from malta.model.parameters import differences, units_of
-from malta.model.plant import readonly
+from malta.model.plant import FloatArray, readonly
 from malta.simulation.engine.digest import Batch, verdicts
 from malta.simulation.experiments import setting
 from malta.units import in_unit
@@ -26,7 +26,7 @@ from malta.units import in_unit
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from malta.model.plant import FloatArray
+    from malta.synthesis.spec import Spec
 
 
 CONFIDENCE = 0.95  # of the interval about a share
@@ -268,3 +268,58 @@ def spread_text(plan: Plan, name: str) -> str:
     unit = unit_of(plan, name)
     size = f"±{in_unit(half_width(plan, name), unit):.4g}"
     return f"{size} %" if unit == "percent" else f"{size} {unit.replace('um', 'µm')}"
+
+
+# The yield of a campaign: shares of its machines that complete a scenario, within the bounds of a paper or a design.
+#
+# campaign -> runs_within_bounds         every bound that the paper prints for the scenario
+#          -> runs_within_specification  every bound of [specification] on the motion in the scenario
+
+
+class Yields(NamedTuple):
+    """Shares of machines, each with its interval; None where there are no bounds."""
+
+    completed: Rate
+    published: Rate | None  # completed within every published bound
+    specified: Rate | None  # completed within every bound of [specification]
+
+
+def specified_bounds(plan: Plan, spec: Spec) -> dict[str, float]:
+    """The bounds of a design's [specification] on the scenario of a plan, SI: by "stroke", or by unit of the others."""
+    names: Callable[..., Mapping[str, str]] | None = setting(plan.plant, "bounds_in_specification", None)
+    if names is None:
+        return {}
+    found = names(plan.scenario, plan.options)
+    return {key: spec.specification[name] for key, name in found.items() if name in spec.specification}
+
+
+def runs_within_specification(found: Campaign, spec: Spec | None) -> NDArray[np.bool_] | None:
+    """True for runs that were completed within the bounds of [specification]; None where it has none for them."""
+    bounds = {} if spec is None else specified_bounds(found.plan, spec)
+    if not bounds:
+        return None
+    plant, within = found.plan.plant, found.completed
+    for k, group in enumerate(outputs_of(plant)):
+        bound = bounds.get("stroke" if plant.has_stroke and k == 0 else group.unit, np.inf)
+        within = within & (found.batch.deviation[:, group.columns] <= bound).all(axis=1)
+    return np.asarray(within)
+
+
+def yields_of(
+    found: Campaign, published: Mapping[str, Any] | None = None, spec: Spec | None = None
+) -> Yields:
+    """The yields of a campaign.
+
+    published : the figures of the machine's paper
+    spec : the design whose [specification] counts
+    """
+    runs = len(found.index)
+
+    def share(within: NDArray[np.bool_] | None) -> Rate | None:
+        return None if within is None else rate(int(within.sum()), runs)
+
+    return Yields(
+        found.rate,
+        share(runs_within_bounds(found, published)),
+        share(runs_within_specification(found, spec)),
+    )

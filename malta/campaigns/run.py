@@ -1,7 +1,7 @@
 """Run a campaign, on this machine or on a cluster, and simulate single runs of it again.
 
     Plan -> fly() block by block -> Campaign, which has the figures of every run
-                                 -> Summary, see survey.py, which has those of no run
+                                 -> Summary, which has those of no run
 
 Every block is stored as soon as it is done. A campaign that was interrupted goes on with the blocks that are missing,
 and a campaign that is complete is read from its folder.
@@ -9,17 +9,18 @@ and a campaign that is complete is read from its folder.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args
+from typing import TYPE_CHECKING, NamedTuple, Protocol, get_args
 
 import numpy as np
 
 from malta.campaigns.plan import PRECISIONS, Machines, Plan, draw_machines, planned_run
-from malta.campaigns.result import Campaign, Rate, gather, rate, runs_within_bounds
+from malta.campaigns.result import Campaign, gather
 from malta.campaigns.store import (
     MANIFEST,
     Block,
@@ -29,15 +30,17 @@ from malta.campaigns.store import (
     forget_folder,
     open_folder,
     read_blocks,
+    read_manifest,
+    read_plan,
 )
+from malta.campaigns.summary import UNBOUNDED, Bounds, Summary, join, summary_of
 from malta.errors import InputError
 from malta.files import file_exists, replace_files, watch_interrupts
 from malta.firmware.flight import engine_of_c
-from malta.model.machines import outputs_of
 from malta.simulation.engine import compiled
 from malta.simulation.engine.batch import record_run, replayed
 from malta.simulation.engine.engines import EngineChoice
-from malta.simulation.experiments import Experiment, Progress, setting
+from malta.simulation.experiments import Experiment, Progress
 from malta.simulation.experiments.catalogue import main_job, settling, single_run
 from malta.simulation.simulate import EngineOf
 
@@ -157,7 +160,7 @@ def run_blocks(plan: Plan, place: Path | None, size: int, session: Session, done
 
     A block is forgotten here once `done` has it and the folder too.
     """
-    parts = {first: min(size, plan.samples - first) for first in range(0, plan.samples, size)}
+    parts = parts_of(plan, size)
     damaged: list[Path] = []
     runs = 0
 
@@ -192,6 +195,11 @@ def run_blocks(plan: Plan, place: Path | None, size: int, session: Session, done
                     done[first] = found
         return Ending(True, tuple(damaged))
     return Ending(False, tuple(damaged))
+
+
+def parts_of(plan: Plan, size: int) -> dict[int, int]:
+    """The blocks of a plan: first run -> number of runs."""
+    return {first: min(size, plan.samples - first) for first in range(0, plan.samples, size)}
 
 
 def block_size(plan: Plan, session: Session) -> int:
@@ -291,84 +299,10 @@ def replay_machine(
     return single_run(plan.scenario, plant, plan.controller, own, engine, progress, run)
 
 
-# The yield of a campaign: shares of its machines that complete a scenario, within the bounds of a paper or a design.
-#
-# campaign -> runs_within_bounds         every bound that the paper prints for the scenario
-#          -> runs_within_specification  every bound of [specification] on the motion in the scenario
+# The main job of a machine on machines that differ.
 
 
 MACHINES = 4_000  # a share of 1 % is known to 0.3 %
-
-
-class Yields(NamedTuple):
-    """Shares of machines, each with its interval; None where there are no bounds."""
-
-    completed: Rate
-    published: Rate | None  # completed within every published bound
-    specified: Rate | None  # completed within every bound of [specification]
-
-
-def specified_bounds(plan: Plan, spec: Spec) -> dict[str, float]:
-    """The bounds of a design's [specification] on the scenario of a plan, SI: by "stroke", or by unit of the others."""
-    names: Callable[..., Mapping[str, str]] | None = setting(plan.plant, "bounds_in_specification", None)
-    if names is None:
-        return {}
-    found = names(plan.scenario, plan.options)
-    return {key: spec.specification[name] for key, name in found.items() if name in spec.specification}
-
-
-def runs_within_specification(found: Campaign, spec: Spec | None) -> NDArray[np.bool_] | None:
-    """True for runs that were completed within the bounds of [specification]; None where it has none for them."""
-    bounds = {} if spec is None else specified_bounds(found.plan, spec)
-    if not bounds:
-        return None
-    plant, within = found.plan.plant, found.completed
-    for k, group in enumerate(outputs_of(plant)):
-        bound = bounds.get("stroke" if plant.has_stroke and k == 0 else group.unit, np.inf)
-        within = within & (found.batch.deviation[:, group.columns] <= bound).all(axis=1)
-    return np.asarray(within)
-
-
-def yields_of(
-    found: Campaign, published: Mapping[str, Any] | None = None, spec: Spec | None = None
-) -> Yields:
-    """The yields of a campaign.
-
-    published : the figures of the machine's paper
-    spec : the design whose [specification] counts
-    """
-    runs = len(found.index)
-
-    def share(within: NDArray[np.bool_] | None) -> Rate | None:
-        return None if within is None else rate(int(within.sum()), runs)
-
-    return Yields(
-        found.rate,
-        share(runs_within_bounds(found, published)),
-        share(runs_within_specification(found, spec)),
-    )
-
-
-def main_yields(
-    controller: Controller,
-    spec: Spec,
-    published: Mapping[str, Any] | None = None,
-    *,
-    machines: int = MACHINES,
-    settle: bool = True,
-    progress: Progress | None = None,
-) -> Yields:
-    """The yields of a machine's main job over machines drawn at random from the design's uncertainty.
-
-    settle : machines come to rest before, as long as the machine's SETTLE says; False: they begin with what v0 lacks
-        for them, and with empty integrals
-
-    spec, controller = malta.read_design("design/robust.toml"), malta.gains.read("design/gains/robust.json")
-    print(main_yields(controller, spec, malta.model.published("data/tubular.toml"), machines=1000).published)
-    """
-    return yields_of(
-        main_campaign(controller, spec, machines, settle=settle, progress=progress), published, spec
-    )
 
 
 def main_campaign(
@@ -379,7 +313,11 @@ def main_campaign(
     settle: bool = True,
     progress: Progress | None = None,
 ) -> Campaign:
-    """The campaign of `main_yields`."""
+    """The campaign of a machine's main job over machines drawn at random from the design's uncertainty.
+
+    settle : machines come to rest before, as long as the machine's SETTLE says; False: they begin with what v0 lacks
+        for them, and with empty integrals
+    """
     return campaign(main_plan(controller, spec, machines, settle=settle), progress=progress)
 
 
@@ -388,3 +326,143 @@ def main_plan(controller: Controller, spec: Spec, machines: int = MACHINES, *, s
     job = main_job(spec.plant)
     options = settling(job, spec.plant) if settle else {}
     return Plan(controller, job, dict(spec.uncertainty), samples=machines, options=options)
+
+
+# A campaign of any size: blocks are simulated, stored, added to the summary, and forgotten.
+
+
+class Sum:
+    """The summary of the blocks so far, and which ones they are."""
+
+    def __init__(self, plan: Plan, size: int, bounds: Bounds) -> None:
+        self.size = size  # runs in a block
+        # One pair, so that Ctrl-C between two statements leaves no block that is counted and not noted.
+        self.state = summary_of(gather(plan, {}), bounds), 0  # a bit for each block
+
+    def __setitem__(self, first: int, block: Block) -> None:
+        summary, noted = self.state
+        own = summary_of(gather(summary.plan, {first: block}), summary.bounds)
+        self.state = join(summary, own), noted | 1 << first // self.size
+
+    def __contains__(self, first: object) -> bool:
+        return isinstance(first, int) and bool(self.state[1] >> first // self.size & 1)
+
+
+def summarize(
+    plan: Plan,
+    folder: str | Path | None = None,
+    bounds: Bounds = UNBOUNDED,
+    *,
+    workers: int | None = None,
+    cluster: str | None = None,
+    block: int | None = None,
+    progress: Progress | None = None,
+) -> Summary:
+    """Simulate all runs of a plan, or those that its folder does not have yet, and return what they have in common.
+
+    As `malta.campaign`, but in memory that does not grow with the runs: a million of them fit.
+
+    plan : the plan of the campaign
+    folder : stores every block as soon as it is done, and the manifest; None: nothing is written
+    bounds : figures of a paper and the design whose bounds the summary counts
+    workers : threads on this machine; None: one for each core
+    cluster : address of a Dask scheduler, as tcp://host:8786, whose workers simulate the blocks
+    block : runs in a block, a multiple of 8; a folder that has a campaign keeps its own number
+    progress : called now and then with the share of the runs that is done, 0 to 1
+
+    Returns a Summary. After Ctrl-C it is of the blocks that are done, and says `interrupted`.
+
+    Raises InputError as `malta.campaign`, for any number of runs.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> short = {"duration": 0.01}  # s
+    >>> plan = malta.campaigns.Plan(
+    ...     controller, "hold", {"m": 0.1}, samples=16, options=short
+    ... )
+    >>> rate = malta.campaigns.summarize(plan, workers=1).rate
+    >>> f"{rate.passed} of {rate.runs}; with 95 % confidence above {rate.low:.2f}"
+    '16 of 16; with 95 % confidence above 0.79'
+    """
+    session = Session(workers, cluster, block, progress)
+    with campaign_folder(plan, folder, session) as (place, size):
+        found = Sum(plan, size, bounds)
+        ending = run_blocks(plan, place, size, session, found)
+    return replace(found.state[0], **ending._asdict(), folder=place)
+
+
+# The status of a campaign: which of its blocks a folder has, also while another process adds some.
+
+
+RECENT = 50  # blocks whose times tell the pace
+QUIET = 30.0  # s without a new block, after which nobody seems to simulate any
+PATIENCE = 5.0  # paces without a new block, likewise
+
+
+@dataclass(frozen=True)
+class Status:
+    """How far a campaign is."""
+
+    blocks: int  # sound ones in the folder
+    of: int
+    size: int  # runs in a block
+    stored: int  # bytes of the blocks
+    pace: float | None  # s from one block to the next, the median of the last ones; None for fewer than two
+    age: float | None  # s since the last block; None without one
+    summary: Summary  # of the blocks that are done; `damaged` lists the files that are not sound
+
+    @property
+    def running(self) -> bool:
+        """Whether blocks are missing and the last one is so young that a process seems to simulate the next."""
+        return (
+            self.blocks < self.of
+            and self.age is not None
+            and self.age < max(QUIET, PATIENCE * (self.pace or 0))
+        )
+
+    @property
+    def left(self) -> float | None:
+        """Seconds that the rest takes at the pace of the last blocks; None where nothing runs or little is done."""
+        return self.pace * (self.of - self.blocks) if self.running and self.pace is not None else None
+
+
+def status(
+    folder: str | Path,
+    controller: Controller,
+    bounds: Bounds = UNBOUNDED,
+    progress: Progress | None = None,
+) -> Status:
+    """The status of the campaign in a folder. Every block is read and its seal checked; nothing is written.
+
+    Raises InputError for a folder without a campaign, and for one of another controller.
+
+        found = status("build/campaigns/mass", malta.gains.read("design/gains/calibrated.json"))
+        print(found.blocks, found.of, found.summary.rate)
+    """
+    place = Path(folder)
+    _, size = read_manifest(place / MANIFEST)
+    plan = read_plan(place, controller)
+    parts = parts_of(plan, size)
+    total = Sum(plan, size, bounds)
+    damaged, times, stored = [], [], 0
+    for first, path, block in read_blocks(place, plan, parts):
+        if block is None:
+            damaged.append(path)
+            continue
+        total[first] = block
+        file = path.stat()
+        times.append(file.st_mtime)
+        stored += file.st_size
+        if progress is not None:
+            progress((first + parts[first]) / plan.samples)
+    times.sort()
+    gaps = np.diff(times[-RECENT - 1 :])
+    return Status(
+        len(times),
+        len(parts),
+        size,
+        stored,
+        float(np.median(gaps)) if len(gaps) else None,
+        max(time.time() - times[-1], 0.0) if times else None,
+        replace(total.state[0], damaged=tuple(damaged), folder=place),
+    )

@@ -10,7 +10,7 @@ factor like the parameters: its index says what part of the variance no toleranc
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -33,13 +33,10 @@ from malta.campaigns.store import simulate_machines
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.model.parameters import differences
-from malta.simulation.experiments import progress_of_part
+from malta.simulation.experiments import Progress, progress_of_part
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from malta.model.plant import FloatArray
-    from malta.simulation.experiments import Progress
 
 
 NOISE = "noise"  # the name of its factor

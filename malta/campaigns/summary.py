@@ -24,11 +24,12 @@ from malta.campaigns.result import (
     Campaign,
     Finding,
     Rate,
+    Yields,
     every_figure,
     rate,
     runs_within_bounds,
+    runs_within_specification,
 )
-from malta.campaigns.run import Yields, runs_within_specification
 from malta.display import Description, display
 from malta.merits import Merit, figure
 from malta.simulation.engine.digest import LARGEST_FIGURE, Batch, verdicts

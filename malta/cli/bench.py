@@ -102,8 +102,7 @@ def measure(
         found = _measured(gains, controller, logs, uncertain, identified)
     files = []
     if out is not None:
-        from malta.report.figures import save
-        from malta.report.figures.runs import measured_figure
+        from malta.report.figures import measured_figure, save
 
         files.append(save(measured_figure(found), out))
     if as_json:
@@ -262,9 +261,10 @@ def commission(
     files = [Path(entry.log) for entry in done.entries if entry.sha256 and logs is None]
     files += [folder / JOURNAL, page, text]
     if as_json:
-        from malta.cli.documents.others import commission_output
+        from malta.cli.documents.others import CommissionOutput
 
-        print_document(commission_output(done, files))
+        left = done.steps[len(done.entries) :]
+        print_document(CommissionOutput.of(done, steps=done.entries, left=left, files=files))
     else:
         _print_commissioning(done, files)
     if not done.passed:

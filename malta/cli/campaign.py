@@ -48,8 +48,8 @@ from malta.files import json_text, replace_files
 if TYPE_CHECKING:
     from malta.campaigns.limits import Limit
     from malta.campaigns.plan import Law, Plan, Sampler
+    from malta.campaigns.run import Status
     from malta.campaigns.summary import Bounds, Summary
-    from malta.campaigns.survey import Status
     from malta.cli.documents.loops import Part
     from malta.simulation.experiments import Progress
 
@@ -59,14 +59,14 @@ if TYPE_CHECKING:
 
 def print_tables(gains: Path, found: Summary, worst: int) -> None:
     """Print what was flown, the yield, the distributions and the worst runs; only the first without runs."""
-    from malta import report
+    from malta.report.tables.campaign import box_text, campaign_tables, run_text
 
     plan, console = found.plan, make_console()
-    print_text(console, f"{gains}: {report.run_text(plan)}, {found.runs} of {plan.samples} machines")
-    print_text(console, f"{report.box_text(plan)}; {plan.sampler}, seed {plan.seed}")
+    print_text(console, f"{gains}: {run_text(plan)}, {found.runs} of {plan.samples} machines")
+    print_text(console, f"{box_text(plan)}; {plan.sampler}, seed {plan.seed}")
     if not found.runs:
         return
-    console.print(report.campaign_tables(found, worst=worst))
+    console.print(campaign_tables(found, worst=worst))
     if worst:
         console.print(
             f"one of them again: malta simulate {gains} --replay {found.folder}:RUN", soft_wrap=True
@@ -84,9 +84,9 @@ class StatusOptions(NamedTuple):
 
 def show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: StatusOptions) -> None:
     """Print the status of the campaign in a folder. Raises InputError for options that the campaign decides."""
+    from malta.campaigns.run import status as status_of
     from malta.campaigns.store import noted_gains
     from malta.campaigns.summary import Bounds
-    from malta.campaigns.survey import status as status_of
     from malta.model.data import plant_of, published_figures
 
     sources = {param: ctx.get_parameter_source(str(param.name)) for param in ctx.command.params}
@@ -187,14 +187,14 @@ class Outcome(NamedTuple):
     document: Part
     files: list[Path]
     parts: list[Any]  # tables and lines for the console
-    notes: list[str]
+    note: str  # "": none
 
 
 def run_study(study: Study, setting: Setting) -> None:
     """Run a study, write it into the campaign's folder and print it; exit with code 130 after Ctrl-C."""
-    from malta import report
     from malta.campaigns.plan import planned_run
     from malta.campaigns.run import Session, campaign_folder
+    from malta.report.tables.campaign import box_text, run_text
     from malta.simulation.engine.batch import is_compiled
 
     if study.limit == "help":
@@ -213,13 +213,13 @@ def run_study(study: Study, setting: Setting) -> None:
         print_document(outcome.document)
     else:
         console = make_console()
-        print_text(console, f"{setting.gains}: {report.run_text(setting.plan)}")
-        print_text(console, f"{report.box_text(setting.plan)}; seed {setting.plan.seed}")
+        print_text(console, f"{setting.gains}: {run_text(setting.plan)}")
+        print_text(console, f"{box_text(setting.plan)}; seed {setting.plan.seed}")
         for part in outcome.parts:
             console.print(part, soft_wrap=isinstance(part, str))
         print_written(console, outcome.files)
-    for note in outcome.notes:
-        print_note(note)
+    if outcome.note:
+        print_note(outcome.note)
     plan = setting.plan
     if not (plan.plant.tabulated or is_compiled(plan.plant, plan.controller, planned_run(plan).scenario)):
         print_note(NO_COMPILER)
@@ -227,51 +227,49 @@ def run_study(study: Study, setting: Setting) -> None:
 
 def _rare(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> Outcome:
     """The probability of exceeding a limit."""
-    from malta import report
     from malta.campaigns.rare import event_name, rare_event, write_event
     from malta.cli.documents.campaigns import RareOutput, rare_fields
+    from malta.report.tables.campaign import rare_event_sentence, rare_event_tables
 
     try:
         event = rare_event(setting.plan, limit, setting.folder, workers=setting.workers, progress=progress)
     except KeyboardInterrupt:
         raise interruption(f"the same command goes on with the repetitions in {setting.folder}") from None
     files = [write_event(event, setting.folder)]
-    parts: list[Any] = [report.rare_event_tables(event)]
+    parts: list[Any] = [rare_event_tables(event)]
     if event.design_point is not None:
         place = f"{setting.folder}:{event_name(limit)}"
         parts.append(f"the design point again: malta simulate {setting.gains} --replay {place}")
-    notes = [text for text in (report.rare_event_sentence(event),) if text]
     document = RareOutput(**_head(setting, files), **rare_fields(event))
-    return Outcome(document, files, parts, notes)
+    return Outcome(document, files, parts, rare_event_sentence(event))
 
 
 def _sobol(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> Outcome:
     """Which parameter costs yield."""
-    from malta import report
     from malta.campaigns.studies import sensitivity, sensitivity_document
     from malta.cli.documents.campaigns import SobolOutput, sobol_fields
+    from malta.report.figures.campaign import sensitivity_figure
+    from malta.report.tables.campaign import sensitivity_sentence, sensitivity_tables
 
     found = sensitivity(setting.plan, limit, workers=setting.workers, progress=progress)
     files = [_write(setting, f"sobol_{limit.slug}.json", sensitivity_document(found))]
     if found.of_yield or any(found.of_merits.values()):
         files.append(setting.folder / f"sobol_{limit.slug}.png")
-        report.sensitivity(found, files[-1])
-    notes = [text for text in (report.sensitivity_sentence(found),) if text]
+        sensitivity_figure(found, files[-1])
     output = SobolOutput(**_head(setting, files), **sobol_fields(found))
-    return Outcome(output, files, [report.sensitivity_tables(found)], notes)
+    return Outcome(output, files, [sensitivity_tables(found)], sensitivity_sentence(found))
 
 
 def _tolerance(limit: Limit, wanted: float, setting: Setting, progress: Progress | None) -> Outcome:
     """The largest spreads that keep a yield."""
-    from malta import report
     from malta.campaigns.studies import tolerance_document, tolerances
     from malta.cli.documents.campaigns import ToleranceOutput, tolerance_fields
+    from malta.report.tables.campaign import spreads_table, tolerance_sentence
 
     found = tolerances(setting.plan, limit, wanted, workers=setting.workers, progress=progress)
     files = [_write(setting, f"tolerance_{limit.slug}.json", tolerance_document(found))]
-    notes = [text for text in (report.tolerance_sentence(found),) if text]
     output = ToleranceOutput(**_head(setting, files), **tolerance_fields(found))
-    return Outcome(output, files, [report.spreads_table(found)], notes)
+    return Outcome(output, files, [spreads_table(found)], tolerance_sentence(found))
 
 
 def _head(setting: Setting, files: list[Path]) -> dict[str, Any]:
@@ -453,9 +451,8 @@ def campaign(
     if gains is None:
         raise InputError("campaign", "GAINS", "nothing", "a gain file, or --status FOLDER")
     from malta.campaigns.plan import Plan
-    from malta.campaigns.run import Session, campaign_folder
+    from malta.campaigns.run import Session, campaign_folder, summarize
     from malta.campaigns.summary import Bounds
-    from malta.campaigns.survey import summarize
     from malta.model.data import plant_of, published_figures
     from malta.simulation.experiments.catalogue import main_job, settling
 

@@ -429,7 +429,7 @@ def _write(spec: Spec, tuned: Tuned, target: Path) -> list[Path]:
     files[target.with_name(f"{target.stem}_front.md")] = report.front_markdown(tuned).encode()
     replace_files(files)
     picture = target.with_name(f"{target.stem}_front.png")
-    report.front(tuned, picture)
+    report.front_figure(tuned, picture)
     return [*files, picture]
 
 

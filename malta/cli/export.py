@@ -22,7 +22,6 @@ from malta.errors import InputError
 from malta.units import to_si
 
 if TYPE_CHECKING:
-    from malta.cli.documents.others import PilOutput
     from malta.firmware.pil import Replay
 
 
@@ -211,7 +210,15 @@ def pil(
     with progress_bar(f"replaying on {port}") as tell:
         replay = replay_on_target(gains, port, baud=baud, seconds=timeout, tell=tell)
     if as_json:
-        print_document(_document(str(gains), port, replay))
+        from malta.cli.documents.others import PilOutput, VectorPart
+
+        vectors = [
+            VectorPart.of(v, first_that_differs=None if v.differs < 0 else v.differs) for v in replay.vectors
+        ]
+        counts = replay.counts or None
+        print_document(
+            PilOutput.of(replay, gains=gains, port=port, vectors=vectors, slowest_step_counts=counts)
+        )
     else:
         _print(port, replay)
     raise typer.Exit(0 if replay.agrees else 1)
@@ -236,25 +243,35 @@ def _print(port: str, replay: Replay) -> None:
     print_line(console, "pass: all bits agree" if replay.agrees else "fail: the target computes other bits")
 
 
-def _document(gains: str, port: str, replay: Replay) -> PilOutput:
-    """The JSON document of a replay."""
-    from malta.cli.documents.others import PilOutput, VectorPart
+# `malta schema`: the JSON schemas of files, and of what commands print with --json.
 
-    return PilOutput(
-        gains=gains,
-        port=port,
-        precision=replay.precision,
-        agrees=replay.agrees,
-        vectors=[
-            VectorPart(
-                name=v.name,
-                samples=v.samples,
-                first_that_differs=None if v.differs < 0 else v.differs,
-                largest_difference=v.largest,
-            )
-            for v in replay.vectors
-        ],
-        samples_per_s=replay.samples_per_second,
-        requests_sent_again=replay.repeated,
-        slowest_step_counts=replay.counts or None,
-    )
+
+def schema(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Which one; all names if none is given.")
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[DATA]", help="Data file of a machine: a schema with the names of its signals."
+        ),
+    ] = None,
+) -> None:
+    """Print the JSON schema of a file, or of what a command prints with --json.
+
+    \b
+    Example:  malta schema verify-output
+              malta schema design > design.schema.json
+              malta schema design data/tubular.toml > tubular.schema.json
+    """
+    from malta import schemas
+    from malta.cli.documents.published import ALL_SCHEMAS, schema_of
+    from malta.files import json_text
+    from malta.model.data import plant_of, read
+
+    if name is None:
+        print("\n".join(ALL_SCHEMAS))
+    elif data is None:
+        print(json_text(schema_of(name)))
+    else:
+        print(json_text(schemas.schema(name, plant_of(read(data)))))

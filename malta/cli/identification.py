@@ -227,9 +227,9 @@ def excite(
             _fly(plan, plant_of(change_machine(controller.parameters, change)), controller, log, seed)
         )
     if as_json:
-        from malta.cli.documents.others import excite_output
+        from malta.cli.documents.others import ExciteOutput
 
-        print_document(excite_output(gains, plan, files))
+        print_document(ExciteOutput.of(plan, gains=gains, files=files))
     else:
         print_written(console, files)
 
@@ -296,8 +296,7 @@ def log(
     found = read_log(file)
     files = []
     if out is not None:
-        from malta.report.figures import save
-        from malta.report.figures.runs import log_figure
+        from malta.report.figures import log_figure, save
 
         files.append(save(log_figure(found), out))
     if as_json:
@@ -421,9 +420,9 @@ def _learn_from(
         sent = plant.inputs[plant.thrust_input :][:1], thrust[:, None]
         files.append(_write_forces(following, controller.sample_time, *sent))
     if as_json:
-        from malta.cli.documents.others import learn_output
+        from malta.cli.documents.others import LearnOutput
 
-        print_document(learn_output(gains, log, found, files))
+        print_document(LearnOutput.of(found, gains=gains, log=log, files=files))
         return
     console = make_console()
     half = 1.96 * found.deviation
@@ -448,9 +447,9 @@ def _learn_v0(gains: Path, controller: Controller, log: Path, out: Path | None, 
     found = learn_v0(controller, read_log(log))
     files = [] if out is None else verify_and_write(found.controller, gains, out)
     if as_json:
-        from malta.cli.documents.others import learned_v0_output
+        from malta.cli.documents.others import LearnedV0Output
 
-        print_document(learned_v0_output(gains, log, found, files))
+        print_document(LearnedV0Output.of(found, gains=gains, log=log, files=files))
         return
     console, plant = make_console(), plant_of(controller.parameters)
     low, high = 1e3 * found.z[0], 1e3 * found.z[-1]

@@ -18,16 +18,16 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from malta.cli.app import app as live_page
 from malta.cli.bench import commission, measure
 from malta.cli.campaign import campaign
-from malta.cli.claims import claims, schema
 from malta.cli.design import design, new, tune
-from malta.cli.export import export, pil
+from malta.cli.export import export, pil, schema
 from malta.cli.identification import excite, identify, learn, log, replay
 from malta.cli.output import interruption, print_error, print_note, silence
+from malta.cli.pages import app as live_page
+from malta.cli.pages import claims, motion
 from malta.cli.report import compare, plot, report
-from malta.cli.simulate import motion, simulate
+from malta.cli.simulate import simulate
 from malta.cli.verify import check, verify
 from malta.errors import CheckError, InputError, shorten
 from malta.files import is_interrupt, noting_files

@@ -99,9 +99,10 @@ def report(
             contents[page_file.with_suffix(".pdf")] = pdf_of(page)
     replace_files(contents)
     if as_json:
-        from malta.cli.documents.loops import report_output
+        from malta.cli.documents.loops import ReportOutput, merits_of
 
-        print_document(report_output(gains, analysis, contents))
+        figures = merits_of(analysis.figures)
+        print_document(ReportOutput.of(analysis, gains=gains, figures=figures, files=contents))
     else:
         print_written(make_console(), contents)
     for note in analysis.notes:
@@ -154,8 +155,8 @@ def campaigns_of(
     kept = [] if changed else sorted(path.parent for path in CAMPAIGNS.glob("*/campaign.json"))
     if not folders and not kept:
         return []
+    from malta.campaigns.run import status
     from malta.campaigns.summary import Bounds
-    from malta.campaigns.survey import status
     from malta.model.data import plant_of, published_figures
 
     bounds = Bounds(published_figures(plant_of(controller.parameters).name), spec)

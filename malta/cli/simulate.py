@@ -281,7 +281,7 @@ def _save(simulation: Simulation, folder: Path, published: Mapping[str, Any] | N
     stems = [stem] if len(cases) == 1 else [f"{stem}_{_slug(case.label)}" for case in cases]
     series = [save_series(case.run, folder / f"{name}.npz") for name, case in zip(stems, cases, strict=True)]
     picture = folder / f"{stem}.png"
-    report.experiment(simulation.experiment, picture, published)
+    report.experiment_figure(simulation.experiment, published, picture)
     return [*series, picture]
 
 
@@ -333,71 +333,3 @@ def _conclude(gains: Path, simulation: Simulation, engine: str) -> None:
         raise typer.Exit(130)
     if result.failed:
         raise CheckError(f"{gains}: {simulation.scenario}: {result.outcome}")
-
-
-# `malta motion`: the bodies of a machine as they move, from the files of runs and from runs that are simulated for it.
-
-
-def motion(
-    gains: GainFile,
-    run: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="[RUN]...", help="Files (.npz) of malta simulate --out: a button each."),
-    ] = None,
-    scenario: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="SCENARIO",
-            help="Simulate this too, a button for each of its runs, as faults. Repeatable.",
-            autocompletion=scenarios,
-        ),
-    ] = None,
-    witness: Annotated[
-        bool, typer.Option("--witness", help="Fly machines inside and beyond the proven margin too.")
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="A page (.html), or an animated picture (.gif) of the first run. [build/RUN_motion.html]",
-        ),
-    ] = None,
-    machine: MachineFile = None,
-) -> None:
-    """Show the machine in motion: its bodies in three dimensions, as they move in a run.
-
-    The page needs no network: drag the machine to turn it, go through time with the scrubber, magnify small motion.
-    Buttons choose among the runs. Bodies are those that the machine's module describes: Plant(bodies=...).
-
-    \b
-    Examples:  malta motion design/gains/robust.json build/robust_stroke.npz
-               malta motion design/gains/robust.json --scenario faults --witness
-    """
-    from malta.files import replace_files
-    from malta.gains.file import content_of
-    from malta.model.data import plant_of
-    from malta.report.page.motion import motion_gif, motion_of, motion_page, read_motion
-    from malta.simulation.experiments.catalogue import experiment, witness_flights
-
-    controller = read_controller(gains, machine)
-    if not (run or scenario or witness):
-        raise InputError("motion", "", "no run", "files of runs, --scenario NAME, or --witness")
-    stem = run[0].stem if run else "_".join([controller.name, *(scenario or ["witness"])[:1]])
-    file = out or Path("build") / f"{stem}_motion.html"
-    if file.suffix not in (".html", ".gif"):
-        raise InputError("--out", "", f"suffix {file.suffix!r}", ".html or .gif")
-    plant = plant_of(controller.parameters)
-    found = [read_motion(one, plant) for one in run or ()]
-    for name in scenario or ():
-        cases = experiment(name, plant, controller).cases
-        found += [motion_of(case.run, case.label if len(cases) > 1 else name) for case in cases]
-    if witness:
-        robust = content_of(gains)[0].verification.robust
-        point = None if robust is None else robust.witness
-        if point is None:
-            raise InputError(gains, "verification.robust.witness", "none", "a margin with a witness")
-        found += [motion_of(case.run, case.label) for case in witness_flights(plant, controller, point)]
-    about = f"Design {controller.name}, machine {plant.name}"
-    content = motion_gif(found[0]) if file.suffix == ".gif" else motion_page(found, about).content
-    replace_files({file: content})
-    print_written(make_console(), [file])

@@ -189,10 +189,10 @@ def _draw(found: LoopReport, folder: Path) -> list[Path]:
     from malta import report
 
     files = [folder / f"{found.controller.name}_margins.png"]
-    report.robustness(found, files[0])
+    report.chain_figure(found, files[0])
     if found.recovery:
         files.append(folder / f"{found.controller.name}_loads.png")
-        report.loads(found.plant, found.controller, files[-1], found.recovery)
+        report.recovery_figure(found.plant, found.controller, found.recovery, files[-1])
     return files
 
 

@@ -9,7 +9,7 @@ A gain file names a machine, never a path, so reading one never runs code that t
 
 Optional parts are found beside the model: EXPERIMENTS, FIGURES, CLAIMS, REQUIREMENTS, WORDS and other names are those
 of the module itself, or of the modules `experiments`, `figures`, `claims`, `requirements` beside it; claims may stand
-in the folder `paper`, with what they are computed from.
+in `paper`, a module or a folder, with what they are computed from.
 
 Groups of a machine's signals for figures and tables: one unit each, named by the WORDS of its experiments.
 """
@@ -154,12 +154,11 @@ def part_of(part: Part, name: str) -> ModuleType | None:
         return None
     module = machine(name)
     folder = module.__name__ if hasattr(module, "__path__") else module.__name__.rpartition(".")[0]
-    paper = f"{folder}.paper"
-    for target in (f"{paper}.{part}", f"{folder}.{part}") if part == "claims" else (f"{folder}.{part}",):
+    for target in (*([f"{folder}.paper"] if part == "claims" else []), f"{folder}.{part}"):
         try:
             return import_module(target)
         except ModuleNotFoundError as error:
-            if error.name not in (target, folder, paper):  # a module that the part imports
+            if error.name not in (target, folder):  # a module that the part imports
                 raise
     return None
 

@@ -20,6 +20,8 @@ from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.model.parameters import Parameters as Parameters
 from malta.model.signals import CasadiFn, Drive, Electronics, LateSensors, require_short, split_dead_time
+from malta.model.signals import ComplexArray as ComplexArray
+from malta.model.signals import FloatArray as FloatArray
 from malta.model.signals import Signal as Signal
 from malta.model.signals import readonly as readonly
 
@@ -27,8 +29,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from malta.model.equations import Body
-    from malta.model.signals import ComplexArray as ComplexArray
-    from malta.model.signals import FloatArray as FloatArray
     from malta.model.signals import InverseCheck
 
 DEFAULT: Any = None  # stands for a function that follows from the other fields

@@ -2,35 +2,34 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import warnings
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from malta.contents import contents
 
 if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that draw nothing start sooner
-    from malta.report.figures import distributions_figure as distributions_figure
-    from malta.report.figures import encode_figure as encode_figure
     from malta.report.figures import experiment_figure as experiment_figure
-    from malta.report.figures import front_figure as front_figure
-    from malta.report.figures import save as save
     from malta.report.figures import stroke_figure as stroke_figure
-    from malta.report.figures import worst_figure as worst_figure
-    from malta.report.figures import yield_figure as yield_figure
+    from malta.report.figures.campaign import CAMPAIGN_FILES as CAMPAIGN_FILES
+    from malta.report.figures.campaign import CampaignFigures as CampaignFigures
+    from malta.report.figures.campaign import campaign as campaign
+    from malta.report.figures.campaign import distributions_figure as distributions_figure
+    from malta.report.figures.campaign import sensitivity_figure as sensitivity_figure
+    from malta.report.figures.campaign import worst_figure as worst_figure
+    from malta.report.figures.campaign import yield_figure as yield_figure
     from malta.report.figures.drawing import STYLES as STYLES
+    from malta.report.figures.drawing import encode_figure as encode_figure
     from malta.report.figures.drawing import new_figure as new_figure
+    from malta.report.figures.drawing import save as save
     from malta.report.figures.margins import chain_figure as chain_figure
+    from malta.report.figures.margins import front_figure as front_figure
+    from malta.report.figures.margins import recovery_figure as recovery_figure
     from malta.report.page.report import compare_gains as compare_gains
     from malta.report.page.report import comparison_page as comparison_page
     from malta.report.page.report import gain_page as gain_page
-    from malta.report.pages import CAMPAIGN_FILES as CAMPAIGN_FILES
-    from malta.report.pages import CampaignFigures as CampaignFigures
-    from malta.report.pages import campaign as campaign
-    from malta.report.pages import design_page as design_page
-    from malta.report.pages import experiment as experiment
-    from malta.report.pages import front as front
-    from malta.report.pages import loads as loads
-    from malta.report.pages import robustness as robustness
-    from malta.report.pages import sensitivity as sensitivity
-    from malta.report.pages import stroke as stroke
     from malta.report.plots import bode as bode
     from malta.report.plots import gang_of_four as gang_of_four
     from malta.report.plots import load_response as load_response
@@ -42,18 +41,13 @@ if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that dr
     from malta.report.plots import sigma as sigma
     from malta.report.plots import step as step
     from malta.report.plots.polar import margin_map as margin_map
-    from malta.report.tables.campaign import box_text as box_text
     from malta.report.tables.campaign import campaign_tables as campaign_tables
-    from malta.report.tables.campaign import rare_event_sentence as rare_event_sentence
     from malta.report.tables.campaign import rare_event_tables as rare_event_tables
-    from malta.report.tables.campaign import run_text as run_text
-    from malta.report.tables.campaign import sensitivity_sentence as sensitivity_sentence
     from malta.report.tables.campaign import sensitivity_tables as sensitivity_tables
     from malta.report.tables.campaign import spreads_table as spreads_table
-    from malta.report.tables.campaign import tolerance_sentence as tolerance_sentence
     from malta.report.tables.design import bandwidth_table as bandwidth_table
+    from malta.report.tables.design import design_page as design_page
     from malta.report.tables.design import front_markdown as front_markdown
-    from malta.report.tables.design import front_rows as front_rows
     from malta.report.tables.design import front_table as front_table
     from malta.report.tables.design import loop_poles_table as loop_poles_table
     from malta.report.tables.design import poles_table as poles_table
@@ -77,4 +71,40 @@ if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that dr
     from malta.report.verdict import verdict_lines as verdict_lines
     from malta.report.verdict import verdict_text as verdict_text
 
-__all__, __getattr__, __dir__ = contents(__name__, __file__)
+# Names that go with the next minor version: functions whose second argument was the path.
+_OLD = {
+    "experiment": "experiment_figure",
+    "front": "front_figure",
+    "robustness": "chain_figure",
+    "sensitivity": "sensitivity_figure",
+    "stroke": "stroke_figure",
+    "loads": "recovery_figure",
+}
+_INNER = {  # others, which are parts of what prints them
+    "front_rows": "design",
+    **dict.fromkeys(
+        ("box_text", "rare_event_sentence", "run_text", "sensitivity_sentence", "tolerance_sentence"),
+        "campaign",
+    ),
+}
+
+__all__, _load, __dir__ = contents(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    if name in _INNER:
+        warnings.warn(f"malta.report.{name} goes without another name", DeprecationWarning, stacklevel=2)
+        return getattr(import_module(f"malta.report.tables.{_INNER[name]}"), name)
+    if name not in _OLD:
+        return _load(name)
+    new = _OLD[name]
+    warnings.warn(
+        f"malta.report.{name} goes: write malta.report.{new}(..., path=...)", DeprecationWarning, stacklevel=2
+    )
+    return partial(_draw_as_before, _load(new), 2 if name == "loads" else 1)
+
+
+def _draw_as_before(draw: Callable[..., Any], subjects: int, *given: Any, **named: Any) -> Any:
+    """Draw with the arguments of the version before: what is drawn, path, published figures or answers to loads."""
+    others = ("path", "found" if subjects == 2 else "published")
+    return draw(*given[:subjects], **dict(zip(others, given[subjects:], strict=False)), **named)

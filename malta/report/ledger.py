@@ -153,15 +153,13 @@ class Row(NamedTuple):
     """A figure that the paper publishes, and the function of a design's evidence that computes ours."""
 
     subject: str
-    unit: str  # shown for both figures
-    form: str
+    shown: str  # form and unit of both figures: "{:.2f} mm", "{:.1f}" of a number
     value: Callable[[Any], float]  # of the machine's evidence; SI
     published: str | float | None = (
-        None  # key of data/published/, or a figure that the text implies; None: ours alone
+        None  # key of data/published/, or a figure that the text implies; None: ours
     )
-    relation: str = (
-        "about"  # "equal" to the printed digits, "at most", "at least", "about"; "beside": not compared
-    )
+    # "equal" to the printed digits, "at most", "at least", "about"; "beside": not compared
+    relation: str = "about"
     note: str = ""  # where the paper leaves a definition open, or what explains the figures
     why: str = ""  # the reason why a figure is not reproduced
     of_lqg: bool = False  # a PID has no such figure: it shows a dash, and no verdict
@@ -169,6 +167,16 @@ class Row(NamedTuple):
     by_construction: bool | Callable[[Any], bool] = False
     of_machine: bool = False  # no design changes the figure: any is judged
     designs: tuple[str, ...] = ()  # that are meant to reproduce the row, where it is not REPRODUCING
+
+    @property
+    def form(self) -> str:
+        """The format of a figure in its unit."""
+        return self.shown.partition(" ")[0]
+
+    @property
+    def unit(self) -> str:
+        """The unit of both figures; "1" for a number."""
+        return self.shown.partition(" ")[2] or "1"
 
 
 def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progress | None = None) -> Ledger:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from rich.text import Text
 
 from malta.display import ceil_to, floor_to, micro, number
-from malta.margins.loop_report import zone
+from malta.margins.loop_report import LoopReport, Outcome, zone
 from malta.model.parameters import box_words
 from malta.report.tables.layout import fold
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderResult
 
     from malta.campaigns.summary import Summary
-    from malta.margins.loop_report import LoopReport, Outcome
 
 LABEL = 14  # columns of a terminal, of the labels
 BLOCKS = "▁▂▃▄▅▆▇█"

@@ -15,7 +15,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -26,8 +26,8 @@ from malta.errors import CheckError, InputError
 from malta.loops.sampled_loops import disturbance_map, push_through
 from malta.loops.time_domain import covariance, noise_variance
 from malta.model.equilibrium import trim
-from malta.model.linearize import linearize
-from malta.model.plant import position_in
+from malta.model.linearize import LinearModel, linearize
+from malta.model.plant import ComplexArray, FloatArray, Plant, position_in
 from malta.proof.parametric_plants import of_plant
 from malta.proof.uncertain import crossing_frequency
 from malta.proof.windings import (
@@ -39,33 +39,19 @@ from malta.proof.windings import (
     with_estimated_emf,
     with_windings,
 )
-from malta.synthesis.controller import linear_law_of
+from malta.synthesis.controller import CurrentLoop, LinearLaw, linear_law_of
 from malta.synthesis.feedforward import current_loop_of, holding_gain, static_feedforward
-from malta.synthesis.filters import gain_at_rest
+from malta.synthesis.filters import Gains, gain_at_rest
 from malta.synthesis.lqg import gains
-from malta.synthesis.recovery import step_response
-from malta.synthesis.requirements import Noise, TrialFigures, requirements_for
+from malta.synthesis.recovery import StepResponse, step_response
+from malta.synthesis.requirements import Noise, Requirement, TrialFigures, requirements_for
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 from malta.synthesis.spec import Spec, Weights
-
-if TYPE_CHECKING:
-    from malta.model.linearize import LinearModel
-    from malta.model.plant import ComplexArray, FloatArray, Plant
-    from malta.synthesis.controller import CurrentLoop, LinearLaw
-    from malta.synthesis.filters import Gains
-    from malta.synthesis.recovery import StepResponse
-    from malta.synthesis.requirements import Requirement
-
 
 # The sampled machine at the corners of its box of parameters, and where each corner of the growing box is lost.
 
 
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-    from malta.synthesis.controller import LinearLaw
-
-    Indices = NDArray[np.int_]
-
+Indices = NDArray[np.int_]
 STEP = 0.15  # of the multiples of the box at which the machine is sampled; linear between them
 NEAR = 1.3  # times the smallest margin, beyond which no corner is looked at
 

@@ -17,10 +17,10 @@ over the travel is only judged, as the regulator's natural frequencies are every
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize, sparse
@@ -31,16 +31,16 @@ from malta.loops.sampled_loops import SampledLoop
 from malta.loops.time_domain import covariance
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim
-from malta.model.linearize import linearize
-from malta.model.plant import position_at, position_in
+from malta.model.linearize import LinearModel, linearize
+from malta.model.plant import FloatArray, position_at, position_in
 from malta.proof.uncertain import crossing_frequency
 from malta.proof.windings import emf_slope, estimated_rows, windings_of, with_estimated_emf
-from malta.synthesis.controller import linear_law_of, with_readings
+from malta.synthesis.controller import Controller, linear_law_of, with_readings
 from malta.synthesis.pid import Axes, axes_of, law_of_outputs, pid_gains
 from malta.synthesis.requirements import ratio_of
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Loads, Pid, Spec, pid_signals
-from malta.tuning.groups import figures_of_gains, groups_of
+from malta.tuning.groups import Group, figures_of_gains, groups_of
 from malta.tuning.search import (
     UNSTABLE,
     Effort,
@@ -57,15 +57,6 @@ from malta.tuning.search import (
     model_and_controller,
     separate,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from malta.model.linearize import LinearModel
-    from malta.model.plant import FloatArray
-    from malta.synthesis.controller import Controller
-    from malta.tuning.groups import Group
-
 
 # What requirements estimate of a trial of PID gains: noise of forces, answers to loads, margin at corners of the box.
 #

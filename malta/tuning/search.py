@@ -21,12 +21,11 @@ from scipy import optimize, sparse
 
 from malta.errors import InputError
 from malta.files import file_exists, read_file, replace_files
-from malta.model.linearize import linearize
+from malta.model.linearize import LinearModel, linearize
 from malta.synthesis.requirements import requirements_for
 from malta.synthesis.synthesize import synthesize
 
 if TYPE_CHECKING:
-    from malta.model.linearize import LinearModel
     from malta.model.plant import FloatArray, Plant
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec

@@ -30,7 +30,7 @@ from malta.display import Description, display
 from malta.errors import InputError
 from malta.margins.travel import travel_margin
 from malta.model.parameters import describe
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.synthesis.requirements import Trade, ratio_of, requirements_for
 from malta.synthesis.spec import Spec, Weights
 from malta.tuning import groups, pid
@@ -56,7 +56,6 @@ from malta.tuning.verify import judge
 
 if TYPE_CHECKING:
     from malta.margins.loop_report import Outcome
-    from malta.model.plant import FloatArray
 
 
 # Descent by linear programs: the smallest worst ratio, or the least noise that bounds allow.

@@ -16,9 +16,8 @@ from conftest import Run
 
 import malta
 from malta.campaigns.plan import Plan
-from malta.campaigns.run import campaign
+from malta.campaigns.run import campaign, status
 from malta.campaigns.store import MANIFEST, block_name, noted_gains
-from malta.campaigns.survey import status
 
 if TYPE_CHECKING:
     pass

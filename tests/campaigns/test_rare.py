@@ -30,8 +30,8 @@ from malta.campaigns.rare import (
     replay_design_point,
     write_event,
 )
-from malta.campaigns.result import runs_within_bounds
-from malta.campaigns.run import campaign, runs_within_specification
+from malta.campaigns.result import runs_within_bounds, runs_within_specification
+from malta.campaigns.run import campaign
 from malta.campaigns.store import seal
 from malta.campaigns.summary import Bounds
 from malta.simulation.readings import keys

@@ -20,11 +20,20 @@ from malta import report
 from malta.campaigns import summary
 from malta.campaigns import summary as sketch
 from malta.campaigns.plan import SAMPLERS, Plan, draw_machines
-from malta.campaigns.result import Campaign, figures_of, gather, runs_within_bounds
-from malta.campaigns.run import BLOCK, FILES, LARGE_BLOCK, Session, block_size, campaign, replay, yields_of
+from malta.campaigns.result import Campaign, figures_of, gather, runs_within_bounds, yields_of
+from malta.campaigns.run import (
+    BLOCK,
+    FILES,
+    LARGE_BLOCK,
+    Session,
+    Sum,
+    block_size,
+    campaign,
+    replay,
+    summarize,
+)
 from malta.campaigns.store import MANIFEST, Block, block_name, figure_shapes, fly
 from malta.campaigns.summary import Bounds, Summary, join, summary_of, worst_of, worst_runs
-from malta.campaigns.survey import Sum, summarize
 from malta.simulation.engine.digest import Batch, verdicts
 
 if TYPE_CHECKING:

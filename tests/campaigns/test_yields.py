@@ -12,7 +12,8 @@ from conftest import Run
 import malta
 from malta import gains
 from malta.campaigns.plan import Plan
-from malta.campaigns.run import campaign, main_yields, runs_within_specification, specified_bounds, yields_of
+from malta.campaigns.result import runs_within_specification, specified_bounds, yields_of
+from malta.campaigns.run import campaign, main_campaign
 from malta.machines.tubular.experiments.strokes import SETTLE
 
 if TYPE_CHECKING:
@@ -74,21 +75,20 @@ def test_yields_of_the_main_job_are_drawn_from_the_designs_uncertainty(
     spec: Spec, published: dict[str, Any], flown: Campaign
 ) -> None:
     shares: list[float] = []
-    found = main_yields(flown.plan.controller, spec, published, machines=256, progress=shares.append)
+    found = yields_of(
+        main_campaign(flown.plan.controller, spec, 256, progress=shares.append), published, spec
+    )
     assert found == yields_of(flown, published, spec)
     assert shares[-1] == pytest.approx(1)
 
 
 def test_fewer_machines_of_table2_than_of_calibrated_fly_as_published(published: dict[str, Any]) -> None:
     """Ten times 1 % are 10 %; the intervals are far apart."""
+    controllers = [gains.read(f"design/gains/{name}.json") for name in ("table2", "calibrated")]
+    specs = [malta.read_design(f"design/{name}.toml") for name in ("table2", "calibrated")]
     first, second = (
-        main_yields(
-            gains.read(f"design/gains/{name}.json"),
-            malta.read_design(f"design/{name}.toml"),
-            published,
-            machines=512,
-        )
-        for name in ("table2", "calibrated")
+        yields_of(main_campaign(controller, spec, 512), published, spec)
+        for controller, spec in zip(controllers, specs, strict=True)
     )
     assert first.published is not None
     assert second.published is not None

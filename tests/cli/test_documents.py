@@ -141,7 +141,7 @@ def test_campaign_and_its_status(run: Run, tmp_path: Path) -> None:
 def test_claims(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     claim = Claim("poles [rad/s]", "1", ("2",), "not reproduced; so", "differs")
     ledger = Ledger("tubular", "A. Author", ("a",), (claim,), ("a",))
-    monkeypatch.setattr("malta.cli.claims.compute_ledgers", lambda *_: [ledger])
+    monkeypatch.setattr("malta.cli.pages.compute_ledgers", lambda *_: [ledger])
     found = document(run("claims", "design/table2.toml", "--json"), "claims-output")
     assert found["ledgers"][0]["reproducing"] == ["a"]
     assert found["ledgers"][0]["claims"][0] == claim._asdict() | {"ours": ["2"]}

@@ -14,7 +14,7 @@ from conftest import Run
 import malta
 from malta.identification import log_files
 from malta.identification.spectra import in_axes
-from malta.report.figures.runs import log_figure
+from malta.report.figures import log_figure
 
 ROBUST = "design/gains/robust.json"
 CONTROLLER = malta.gains.read(ROBUST)

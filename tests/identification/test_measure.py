@@ -18,7 +18,7 @@ from malta.identification import ExcitationPlan, Log, Measurement
 from malta.identification import measure as measuring
 from malta.identification.measure import cut_loop
 from malta.identification.spectra import interpolate_columns
-from malta.report.figures.runs import measured_figure
+from malta.report.figures import measured_figure
 
 if TYPE_CHECKING:
     from malta.identification.measure import Curve

@@ -23,6 +23,7 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 import malta
 from malta.machines.halbach import electronics
 from malta.machines.halbach import electronics as motor
+from malta.machines.halbach import paper as claims
 from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.electronics import IDEAL, Options
 from malta.machines.halbach.experiments import steps_reference
@@ -35,8 +36,7 @@ from malta.machines.halbach.open_loop import (
     positions_at_rest,
     servo_step,
 )
-from malta.machines.halbach.paper import claims as claims
-from malta.machines.halbach.paper.evidence import Evidence, open_loop_dip, rise_of_dip
+from malta.machines.halbach.paper import Evidence, open_loop_dip, rise_of_dip
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import published_value
 from malta.model.plant import Plant

@@ -15,8 +15,8 @@ import pytest
 import malta
 from malta.machines.halbach import electronics
 from malta.machines.halbach import electronics as motor
+from malta.machines.halbach import paper as claims
 from malta.machines.halbach.electronics import DEAD_ENDS, IDEAL, IQ_BITS, Options
-from malta.machines.halbach.paper import claims, evidence
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import plant_of, published_value
 from malta.simulation.scenario import Scenario
@@ -85,8 +85,8 @@ def test_the_ends_cost_eight_times_in_place_and_a_hundred_times_in_force(par: Pa
     places = np.linspace(0, math.pi / 3 / par.k, 1001)
 
     def off(pwm: electronics.Pwm, ends: int) -> tuple[float, float]:
-        points = electronics.resting_points(par, places, evidence.DEAD_FORCE, pwm, ends)
-        F = points[:, 1] / evidence.DEAD_FORCE
+        points = electronics.resting_points(par, places, claims.DEAD_FORCE, pwm, ends)
+        F = points[:, 1] / claims.DEAD_FORCE
         return 1e9 * float(np.abs(points[:, 0] - places).max()), 1e6 * float(np.abs(F - 1).max())
 
     assert off("fine", 0) == pytest.approx((11.6, 2.4), rel=0.03)
@@ -155,7 +155,7 @@ def test_the_forces_that_are_wanted_have_no_angle_in_them(par: Parameters) -> No
 
 def test_range_of_current_samples(par: Parameters, paper: Any) -> None:
     """The printed 0.12 A is the range of 177 samples; 32 have 0.092 A. Both by drawing samples, too."""
-    count = round(evidence.samples_of_range(paper))
+    count = round(claims.samples_of_range(paper))
     assert count == 177
     rng = np.random.default_rng(1)
     for n, wanted in ((count, 0.12), (32, 0.0919)):
@@ -168,7 +168,7 @@ def test_range_of_current_samples(par: Parameters, paper: Any) -> None:
 
 def test_bits_of_the_rolling_mean(paper: Any) -> None:
     """White noise: log2 sqrt(32) = 2.5. The paper's own figures, 22 and 3.2 mA, are 2.8; its text says two."""
-    assert evidence.bits_of_mean(paper) == pytest.approx(2.5, abs=0.03)
+    assert claims.bits_of_mean(paper) == pytest.approx(2.5, abs=0.03)
     ratio = paper.value("current_sampling.noise") / paper.value("current_sampling.noise_of_mean")
     assert math.log2(ratio) == pytest.approx(2.78, abs=0.01)
 

@@ -19,8 +19,8 @@ from malta.machines.planar import commutation, field, motions
 from malta.machines.planar import experiments as experiments
 from malta.machines.planar import experiments as timings
 from malta.machines.planar import motions as jumps
+from malta.machines.planar import paper as claims
 from malta.machines.planar import plant as planar
-from malta.machines.planar.paper import claims as claims
 from malta.margins.loop_report import LoopReport
 from malta.model.data import published as read_published
 from malta.model.data import published_value

@@ -20,7 +20,7 @@ from malta.gains.encodings import content_sha256
 from malta.machines.tubular import plant as tubular
 from malta.machines.tubular.drive import SIDES, attraction, potential
 from malta.machines.tubular.experiments.strokes import delayed_stroke
-from malta.machines.tubular.paper.further_claims import (
+from malta.machines.tubular.paper.quantities import (
     WAIT,
     Figure13,
     carried_weight,

@@ -76,7 +76,7 @@ def toy(designs: dict[str, Design], monkeypatch: pytest.MonkeyPatch) -> Plant:
 
 def test_parts_of_a_machine_are_found_by_its_name(toy: Plant) -> None:
     found = [require_part(part, "tubular").__name__ for part in ("experiments", "figures", "claims")]
-    assert found == [f"malta.machines.tubular.{name}" for name in ("experiments", "figures", "paper.claims")]
+    assert found == [f"malta.machines.tubular.{name}" for name in ("experiments", "figures", "paper")]
     assert part_of("figures", toy.name) is None
     error = refusal(lambda: require_part("claims", "toy"), Path("claims"))
     assert (error.field, error.found) == ("machine", "'toy'")
@@ -145,7 +145,7 @@ def test_without_a_figure_of_its_own_an_experiment_has_that_of_its_first_run(
         "z, off reference [µm]",
         "clearance used up [%]",
     ]
-    report.stroke(found.run, tmp_path / "run.svg")
+    report.stroke_figure(found.run, path=tmp_path / "run.svg")
     assert (tmp_path / "run.svg").stat().st_size > 10_000
     with pytest.raises(malta.InputError, match="'lunch', expected one of rest, run"):
         report.experiment_figure(replace(found, name="lunch"))

@@ -30,7 +30,7 @@ DRAWING = (
 )  # of malta.report
 KERNEL = """
 import malta
-from malta.report.pages import CampaignFigures
+from malta.report.figures.campaign import CampaignFigures
 def drawn():
     figure = malta.report.new_figure("title", "found")
     figure.subplots().plot([1, 2])

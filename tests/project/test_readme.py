@@ -10,9 +10,10 @@ from conftest import ROOT
 from scipy.stats import binomtest
 
 import malta
-from malta.campaigns.run import main_yields
-from malta.machines.tubular.paper.claims import SOURCE
-from malta.machines.tubular.paper.evidence import FEWER, MACHINES
+from malta.campaigns.result import yields_of
+from malta.campaigns.run import main_campaign
+from malta.machines.tubular.paper import SOURCE
+from malta.machines.tubular.paper.quantities import FEWER, MACHINES
 from malta.report.ledger import find_tables
 
 pytestmark = pytest.mark.usefixtures("proven_once")
@@ -89,8 +90,8 @@ def test_the_table_of_claims_is_computed(
     machine: str, designs: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Yields, of MACHINES on the pages, are computed of FEW: they lie within the interval of these."""
-    monkeypatch.setattr("malta.machines.tubular.paper.evidence.MACHINES", FEW)
-    monkeypatch.setattr("malta.machines.tubular.paper.further_claims.LEARNERS", LEARNERS)
+    monkeypatch.setattr("malta.machines.tubular.paper.quantities.MACHINES", FEW)
+    monkeypatch.setattr("malta.machines.tubular.paper.quantities.LEARNERS", LEARNERS)
     specs = [malta.read_design(f"design/{name}.toml") for name in designs]
     ledger = malta.ledger(specs, malta.model.published(f"data/{machine}.toml"))
     found, shown = _cells(ledger.markdown()), _shown(ledger.title, designs)
@@ -140,7 +141,7 @@ def test_yields_of_the_flagship_are_those_of_all_machines() -> None:
         k = DESIGNS["tubular"].index(name)
         controller = malta.gains.read(f"design/gains/{name}.json")
         spec = malta.read_design(f"design/{name}.toml")
-        found = main_yields(controller, spec, published, machines=MACHINES)
+        found = yields_of(main_campaign(controller, spec, MACHINES), published, spec)
         within = shown[f"{DRAWN}: stroke within the published bounds [%]"][1 + k]
         assert found.published is not None
         assert _number(within) == pytest.approx(100 * found.published.share, abs=0.2)

@@ -19,7 +19,7 @@ from jsonschema import Draft202012Validator
 import malta
 from fuzz.edits import EDITS, edited
 from fuzz.gain_files import gain_document, signed
-from malta.cli.claims import schema as schema_command
+from malta.cli.export import schema as schema_command
 from malta.gains.encodings import decode
 from malta.schemas import SCHEMAS, schema
 from malta.tables import load_toml

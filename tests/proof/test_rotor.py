@@ -271,7 +271,7 @@ def test_tables_of_a_machine_without_a_travel(
         "k_i down: nothing proven (time was up)",
         "|S| of x: 1 at 2 rad/s, nothing proven (why)",
     ]
-    report.robustness(found, tmp_path / "margins.png")
+    report.chain_figure(found, tmp_path / "margins.png")
     assert (tmp_path / "margins.png").stat().st_size > 10_000
     point = replace(found, extent=NOWHERE, places=found.places[1:2])
     text = "\n".join(printed(table) for table in (report.chain_table(point), report.places_table(point)))

@@ -19,11 +19,10 @@ from scipy.linalg import expm
 import malta
 from malta import references
 from malta.loops.sampled_loops import machine_loop
+from malta.machines.tubular import paper as tubular
 from malta.machines.tubular.experiments.disturbances import RESTING
-from malta.machines.tubular.paper import claims as tubular
-from malta.machines.tubular.paper import evidence as tubular_evidence
-from malta.machines.tubular.paper import further_claims
-from malta.machines.tubular.paper.evidence import (
+from malta.machines.tubular.paper import quantities as tubular_evidence
+from malta.machines.tubular.paper.quantities import (
     EXPERIMENT_NAMES,
     SEEDS,
     Evidence,
@@ -106,7 +105,7 @@ def found(designs: dict[str, Design], published: dict[str, Any]) -> Found:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tubular, "evidence", kept)
         patch.setattr(tubular_evidence, "MACHINES", 256)
-        patch.setattr(further_claims, "LEARNERS", 3)
+        patch.setattr(tubular_evidence, "LEARNERS", 3)
         ledger = claims.ledger([designs[name].spec for name in NAMES], published, shares.append)
     return Found(ledger, tuple(made), tuple(shares), {})
 
@@ -176,7 +175,7 @@ def test_rows_are_well_formed(published: dict[str, Any]) -> None:
 
 
 def _row(relation: str = "about", form: str = "{:.2f}", note: str = "", why: str = "") -> Row:
-    return Row("a figure", "1", form, lambda _: math.nan, 1.0, relation, note, why)
+    return Row("a figure", form, lambda _: math.nan, 1.0, relation, note, why)
 
 
 @pytest.mark.parametrize(
@@ -323,7 +322,7 @@ def test_only_designs_that_are_meant_to_reproduce_a_paper_are_judged(published: 
         SimpleNamespace(spec=SimpleNamespace(name=name, kind="LQG")) for name in ("table2", "robust")
     ]
     values = {"table2": 16.2e-3, "robust": 20e-3}
-    row = Row("rise", "ms", "{:.1f}", lambda e: values[e.spec.name], "figure_12.rise_time", why="so")
+    row = Row("rise", "{:.1f} ms", lambda e: values[e.spec.name], "figure_12.rise_time", why="so")
 
     def claim(names: Sequence[str], meant: Sequence[str] = ("table2",), **changes: Any) -> tuple[str, str]:
         chosen = [e for e in found if e.spec.name in names]
@@ -345,7 +344,7 @@ def test_a_claim_shows_its_figures(found: Found, published: dict[str, Any]) -> N
     values = iter([16.2e-3, math.nan, 17e-3, 17e-3])
 
     def claim(**changes: Any) -> Claim:
-        row = Row("rise", "ms", "{:.2f}", lambda _: next(values), "figure_12.rise_time")
+        row = Row("rise", "{:.2f} ms", lambda _: next(values), "figure_12.rise_time")
         return claims.claim_of(row._replace(**changes), found.evidence, published, NAMES)
 
     assert claim() == Claim(

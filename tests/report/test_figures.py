@@ -189,8 +189,8 @@ def test_nothing_is_wrong_with_the_figures_of_margins_and_loads(name: str) -> No
     plant, c, _ = machine(name)
     box = read_shares(ROOT / "design" / "gains" / f"{name}.json", [], plant.parameters, None)
     found = malta.verify(plant, c, box, stages=True, worst_case=False)
-    assert defects(report.robustness(found)) == []
-    assert defects(report.loads(plant, c)) == []
+    assert defects(report.chain_figure(found)) == []
+    assert defects(report.recovery_figure(plant, c)) == []
 
 
 @pytest.mark.slow
@@ -203,7 +203,7 @@ def test_nothing_is_wrong_with_the_figures_of_machines_of_ones_own(name: str) ->
     c = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at(**spec.operating_point)))
     for experiment in experiments_of(spec.plant):
         assert defects(report.experiment_figure(malta.experiment(experiment, spec.plant, c))) == []
-    assert defects(report.loads(spec.plant, c)) == []
+    assert defects(report.recovery_figure(spec.plant, c)) == []
 
 
 @pytest.mark.parametrize("end", ["png", "svg", "pdf"])

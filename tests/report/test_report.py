@@ -177,7 +177,7 @@ def test_a_figure_of_a_failed_run_says_so(designs: dict[str, Design]) -> None:
 def test_the_same_figure_gives_the_same_bytes(design: Design, tmp_path: Path, suffix: str) -> None:
     run = malta.simulate(design.plant, design.controller, Scenario.stroke())
     for name in "ab":
-        report.stroke(run, tmp_path / f"{name}{suffix}")
+        report.stroke_figure(run, path=tmp_path / f"{name}{suffix}")
     first, second = ((tmp_path / f"{name}{suffix}").read_bytes() for name in "ab")
     assert first == second
     assert len(first) > 10_000
@@ -186,7 +186,7 @@ def test_the_same_figure_gives_the_same_bytes(design: Design, tmp_path: Path, su
 def test_unknown_kinds_of_figures_are_refused(design: Design, tmp_path: Path) -> None:
     run = malta.simulate(design.plant, design.controller, Scenario.stroke(duration=0.005))
     with pytest.raises(malta.InputError, match=r"suffix '\.gif', expected one of \.png, \.svg"):
-        report.stroke(run, tmp_path / "a.gif")
+        report.stroke_figure(run, path=tmp_path / "a.gif")
     assert not list(tmp_path.iterdir())
 
 
@@ -201,10 +201,25 @@ def test_a_stroke_is_drawn_whole_and_saved_only_where_a_path_is_given(
     assert figure.axes[2].get_ylim()[1] > 1.8
     assert figure.axes[1].get_ylim()[1] > 145
     monkeypatch.chdir(tmp_path)
-    shown = malta.report.stroke(run)
+    shown = malta.report.stroke_figure(run)
     assert not list(tmp_path.iterdir())  # a path is named by who wants a file
-    shown = malta.report.stroke(run, tmp_path / "build" / "stroke.png")
+    shown = malta.report.stroke_figure(run, path=tmp_path / "build" / "stroke.png")
     assert shown._repr_png_() == (tmp_path / "build" / "stroke.png").read_bytes()  # type: ignore[attr-defined]
+
+
+def test_a_figure_of_the_version_before_says_its_new_name(
+    designs: dict[str, Design], tmp_path: Path, published: dict[str, Any]
+) -> None:
+    """Its second argument was the path."""
+    design = designs["calibrated"]
+    run = malta.simulate(design.spec.plant, design.controller, Scenario.stroke(duration=0.05))
+    new = malta.report.stroke_figure(run, published, tmp_path / "new.png")
+    with pytest.warns(
+        DeprecationWarning, match=r"malta.report.stroke goes: write malta.report.stroke_figure"
+    ):
+        old = malta.report.stroke(run, tmp_path / "old.png", published)
+    assert len(old.axes) == len(new.axes)
+    assert (tmp_path / "old.png").read_bytes() == (tmp_path / "new.png").read_bytes()
 
 
 # --- experiments ---
@@ -382,16 +397,16 @@ def test_experiments_are_saved_where_a_path_is_given(
     flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    report.experiment(flown("table2", "payload"))
+    report.experiment_figure(flown("table2", "payload"))
     assert not list(tmp_path.iterdir())
     for name in "ab":
-        report.experiment(flown("table2", "hold"), tmp_path / f"{name}.svg")
+        report.experiment_figure(flown("table2", "hold"), path=tmp_path / f"{name}.svg")
     svg = (tmp_path / "a.svg").read_text()
     assert svg == (tmp_path / "b.svg").read_text()
     assert ">2000 samples" in svg or "2000 samples at rest" in svg
     unknown = replace(flown("table2", "hold"), name="lunch")
     with pytest.raises(malta.InputError, match="'lunch', expected one of stroke, hold, tilt"):
-        report.experiment(unknown)
+        report.experiment_figure(unknown)
 
 
 @pytest.mark.slow

@@ -12,9 +12,14 @@ from conftest import ROOT, Run, one_sentence, refusal
 
 import malta
 from malta.loops.sampled_loops import machine_loop
-from malta.machines.tubular.paper import claims as tubular
-from malta.machines.tubular.paper.evidence import axial_deviation, axis_coupling, load_deviation, noise_forces
-from malta.machines.tubular.paper.evidence import evidence as evidence_of
+from malta.machines.tubular import paper as tubular
+from malta.machines.tubular.paper.quantities import (
+    axial_deviation,
+    axis_coupling,
+    load_deviation,
+    noise_forces,
+)
+from malta.machines.tubular.paper.quantities import evidence as evidence_of
 from malta.margins.loop_report import Outcome
 from malta.report import ledger as claims
 from malta.report.ledger import Row
@@ -41,7 +46,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from malta.machines.tubular.paper.evidence import Evidence
+    from malta.machines.tubular.paper.quantities import Evidence
     from malta.model.linearize import LinearModel
     from malta.synthesis.spec import Spec
 
@@ -73,8 +78,8 @@ def design(spec: Spec) -> SynthesizedDesign:
 @pytest.fixture(scope="module")
 def found(spec: Spec, published: dict[str, Any]) -> Iterator[Evidence]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("malta.machines.tubular.paper.evidence.MACHINES", 16)
-        patch.setattr("malta.machines.tubular.paper.further_claims.LEARNERS", 2)
+        patch.setattr("malta.machines.tubular.paper.quantities.MACHINES", 16)
+        patch.setattr("malta.machines.tubular.paper.quantities.LEARNERS", 2)
         yield evidence_of(spec, published)
 
 
@@ -333,7 +338,7 @@ def test_a_pid_has_no_verdict_on_figures_of_an_lqg(found: Evidence, published: d
     dashes = {subject for subject, line in lines.items() if line.ours == ("–",)}
     assert dashes == only | {"slowest radial pole with integrals"}
     assert not any("nan" in line.ours[0] for line in lines.values())
-    row = Row("a gain", "1", "{:.1f}", lambda e: e.K[0, 0], 4.0, of_lqg=True)
+    row = Row("a gain", "{:.1f}", lambda e: e.K[0, 0], 4.0, of_lqg=True)
     lqg = replace(found, spec=malta.read_design(ROOT / "design" / "table2.toml"), K=np.array([[4.0]]))
     line = claims.claim_of(row, [lqg, found], published, ["table2"])
     assert (line.ours, line.verdict, line.word) == (("4.0", "–"), "reproduced", "reproduced")

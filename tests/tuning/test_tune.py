@@ -360,7 +360,7 @@ def test_the_front_trades_margin_for_noise(
         for share in (2.2, 3.3)
     }
     assert least[2.2] < 0.7 * least[3.3]
-    report.front(found, tmp_path / "front.png")
+    report.front_figure(found, tmp_path / "front.png")
     assert (tmp_path / "front.png").stat().st_size > 10_000
     rows = report.front_markdown(found).splitlines()
     assert len(rows) == 2 + len(found.front)

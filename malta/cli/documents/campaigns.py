@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from malta.campaigns.rare import RareEvent
+    from malta.campaigns.run import Status
     from malta.campaigns.studies import Index, Sensitivity, Tolerances
     from malta.campaigns.summary import Distribution, Runs, Summary
-    from malta.campaigns.survey import Status
     from malta.firmware.flight import Difference
     from malta.firmware.program import Precision
     from malta.margins.loop_report import LoopReport

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from malta.merits import by_identifier
+from malta.merits import Merit, by_identifier
 from malta.units import distinct
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
     from malta.loops.time_domain import Deviation, Recovery
     from malta.margins.loop_report import LoopReport
-    from malta.merits import Merit
-    from malta.report.page.analysis import Analysis
     from malta.report.page.comparison import Comparison
 
 
@@ -384,11 +381,6 @@ class CompareOutput(Part):
     figures: list[ComparedFigure]
     remarks: list[str] = Field(description="what could not be compared, and why")
     files: Files
-
-
-def report_output(gains: Path, analysis: Analysis, files: Iterable[Path]) -> ReportOutput:
-    """The document of a report."""
-    return ReportOutput.of(analysis, gains=gains, figures=merits_of(analysis.figures), files=files)
 
 
 def compare_output(found: Comparison, files: Iterable[Path]) -> CompareOutput:

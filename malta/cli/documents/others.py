@@ -16,18 +16,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from malta.identification.commission import Commissioning
     from malta.identification.dump import ExactReplay
-    from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
-    from malta.identification.learn import Learned, LearnedV0
     from malta.identification.log import Log
     from malta.identification.measure import Curve, Measurement, MeasurementPlan
     from malta.identification.replay import LawReplay
     from malta.identification.strokes import LearnedStrokes
     from malta.proof.blocks.gain import Gain
     from malta.proof.certificate.checked_file import Claim
-    from malta.report.ledger import Ledger
     from malta.synthesis.spec import Spec
     from malta.tuning.tune import Tuned
 
@@ -160,6 +156,8 @@ class ExportOutput(Part):
 class VectorPart(Part):
     """What a target made of a recorded vector."""
 
+    READS: ClassVar = {"largest_difference": "largest"}
+
     name: str
     samples: int
     first_that_differs: int | None = Field(description="a sample; null where all bits agree")
@@ -169,9 +167,11 @@ class VectorPart(Part):
 class PilOutput(Part):
     """What `malta pil --json` prints."""
 
+    READS: ClassVar = {"samples_per_s": "samples_per_second", "requests_sent_again": "repeated"}
+
     kind: Literal["malta-pil-output"] = Field(default="malta-pil-output", alias="schema")
     version: Literal[1] = 1
-    gains: str
+    gains: Name
     port: str
     precision: Literal["double", "float"]
     agrees: bool
@@ -196,11 +196,6 @@ def tune_output(spec: Spec, tuned: Tuned, files: Sequence[Path]) -> TuneOutput:
         ],
     )
     return TuneOutput.of(tuned, design=spec.name, files=files, search=search)
-
-
-def claims_output(ledgers: Sequence[Ledger]) -> ClaimsOutput:
-    """The document of ledgers."""
-    return ClaimsOutput(ledgers=[LedgerPart.of(one) for one in ledgers])
 
 
 # The documents of `malta excite`, `log`, `identify`, `learn`, `replay`, `measure` and `commission`.
@@ -269,9 +264,11 @@ class IdentifiedParameter(Part):
 class IdentifyOutput(Part):
     """What `malta identify --json` prints."""
 
+    READS: ClassVar = {"log": "log.source", "chi2_per_dof": "chi2", "chi2_limit": "limit"}
+
     kind: Literal["malta-identify-output"] = Field(default="malta-identify-output", alias="schema")
     version: Literal[1] = 1
-    gains: str
+    gains: Name
     log: str
     parameters: dict[str, IdentifiedParameter]
     correlation: list[list[float]]
@@ -316,11 +313,13 @@ class LearnedV0Output(Part):
 class LearnedStrokesOutput(Part):
     """What `malta learn --strokes --json` prints."""
 
+    READS: ClassVar = {"axial_error_m": "axial_error"}
+
     kind: Literal["malta-learned-strokes-output"] = Field(
         default="malta-learned-strokes-output", alias="schema"
     )
     version: Literal[1] = 1
-    gains: str
+    gains: Name
     axial_error_m: list[float] = Field(description="the largest true error of each stroke")
     without_noise_m: list[float] = Field(description="the same of each stroke flown again without noise")
     patterns: list[int] = Field(description="of each stroke: patterns of its error that rose above the noise")
@@ -390,9 +389,11 @@ class MeasuredSensor(Part):
 class MeasureOutput(Part):
     """What `malta measure GAINS LOG --json` prints."""
 
+    READS: ClassVar = {"logs": "source", "law_missed_share": "law"}
+
     kind: Literal["malta-measure-output"] = Field(default="malta-measure-output", alias="schema")
     version: Literal[1] = 1
-    gains: str
+    gains: Name
     logs: str
     frequency_Hz: list[float]
     sensors: dict[str, MeasuredSensor]
@@ -411,7 +412,7 @@ class MeasurePlanOutput(Part):
 
     kind: Literal["malta-measure-plan-output"] = Field(default="malta-measure-plan-output", alias="schema")
     version: Literal[1] = 1
-    gains: str
+    gains: Name
     flights: int
     duration_s: float = Field(description="of all flights")
     periods: int
@@ -426,6 +427,8 @@ class MeasurePlanOutput(Part):
 
 class CommissionFinding(Part):
     """A figure of a step, with half of its 95 % interval and its limits."""
+
+    READS: ClassVar = {"unit": "found.unit", "value": "found.value", "half": "found.half"}
 
     name: str
     unit: str
@@ -464,11 +467,6 @@ class CommissionOutput(Part):
     files: Files
 
 
-def excite_output(gains: Path, plan: ExcitationPlan, files: Iterable[Path]) -> ExciteOutput:
-    """The document of an excitation."""
-    return ExciteOutput.of(plan, gains=gains, files=files)
-
-
 def log_output(log: Log, files: Iterable[Path]) -> LogOutput:
     """The document of a log."""
     signals = {}
@@ -483,7 +481,7 @@ def identify_output(gains: Path, found: Identified, files: Iterable[Path]) -> Id
     """The document of an identification."""
     units = units_of_model(found.plant)
     in_time = (
-        None if found.in_time is None else dict(zip(found.names, found.in_time.values.tolist(), strict=True))
+        {} if found.in_time is None else dict(zip(found.names, found.in_time.values.tolist(), strict=True))
     )
     parameters = {
         name: IdentifiedParameter(
@@ -492,53 +490,27 @@ def identify_output(gains: Path, found: Identified, files: Iterable[Path]) -> Id
             low=found.intervals[name][0],
             high=found.intervals[name][1],
             start=float(found.start[k]),
-            in_time=None if in_time is None else in_time[name],
+            in_time=in_time.get(name),
             apart_sigma=found.differences.get(name),
         )
         for k, name in enumerate(found.names)
     }
-    return IdentifyOutput(
-        gains=str(gains),
-        log=found.log.source,
-        parameters=parameters,
-        correlation=found.correlation.tolist(),
-        held=dict(found.held),
-        chi2_per_dof=found.chi2,
-        chi2_limit=found.limit,
-        dof=found.dof,
-        whiteness=found.whiteness,
-        distortion=found.distortion,
-        refusal=found.refusal,
-        files=list(map(str, files)),
-    )
-
-
-def learn_output(gains: Path, log: Path, found: Learned, files: Iterable[Path]) -> LearnOutput:
-    """The document of what a stroke taught."""
-    return LearnOutput.of(found, gains=gains, log=log, files=files)
-
-
-def learned_v0_output(gains: Path, log: Path, found: LearnedV0, files: Iterable[Path]) -> LearnedV0Output:
-    """The document of v0(z) from a slow stroke."""
-    z, change, deviation = (table.tolist() for table in (found.z, found.change, found.deviation))
-    return LearnedV0Output(
-        gains=str(gains), log=str(log), z=z, change=change, deviation=deviation, files=list(map(str, files))
-    )
+    return IdentifyOutput.of(found, gains=gains, parameters=parameters, files=files)
 
 
 def learned_strokes_output(
     gains: Path, found: LearnedStrokes, shrinks: Gain | None, files: Iterable[Path]
 ) -> LearnedStrokesOutput:
     """The document of strokes that learned."""
-    return LearnedStrokesOutput(
-        gains=str(gains),
-        axial_error_m=list(found.axial_error),
-        without_noise_m=list(found.without_noise[:-1]),
-        patterns=list(found.patterns),
+    *flown, following = found.without_noise
+    return LearnedStrokesOutput.of(
+        found,
+        gains=gains,
+        without_noise_m=flown,
         largest_thrust_N=float(abs(found.thrust).max()),
-        repeatable_error_m=found.without_noise[-1],
+        repeatable_error_m=following,
         contraction=None if shrinks is None else shrinks.upper,
-        files=list(map(str, files)),
+        files=files,
     )
 
 
@@ -572,19 +544,15 @@ def measure_output(gains: Path, found: Measurement, files: Iterable[Path]) -> Me
             compliance={force: _curve(found.compliance, i, j) for j, force in enumerate(found.forces)},
         )
     disk, low = found.disks[-1]
-    return MeasureOutput(
-        gains=str(gains),
-        logs=found.source,
+    return MeasureOutput.of(
+        found,
+        gains=gains,
         frequency_Hz=(found.w / (2 * math.pi)).tolist(),
         sensors=sensors,
         largest=_curve(found.largest, 0),
         disk=disk.size,
         disk_above=low,
-        machines=found.machines,
-        box_share=dict(found.box),
-        law_missed_share=found.law,
-        refusal=found.refusal,
-        files=list(map(str, files)),
+        files=files,
     )
 
 
@@ -599,44 +567,14 @@ def _curve(curve: Curve, *at: int) -> MeasuredCurve:
 def measure_plan_output(gains: Path, plan: MeasurementPlan) -> MeasurePlanOutput:
     """The document of a measurement that is planned."""
     first = plan.excitations[0]
-    return MeasurePlanOutput(
-        gains=str(gains),
+    return MeasurePlanOutput.of(
+        plan,
+        gains=gains,
         flights=len(plan.excitations),
-        duration_s=plan.duration,
         periods=first.periods,
         frequency_Hz=first.signal.frequencies.tolist(),
         half_width=dict(zip(plan.sensors, plan.half_width.T.tolist(), strict=True)),
         coherence={name: values.tolist() for name, values in plan.coherence.items()},
         motion={name: max(one.motion[name] for one in plan.excitations) for name in first.motion},
         current_A={name: max(one.current[name] for one in plan.excitations) for name in first.current},
-    )
-
-
-def commission_output(done: Commissioning, files: Iterable[Path]) -> CommissionOutput:
-    """The document of a commissioning."""
-    steps = []
-    for e in done.entries:
-        findings = [
-            CommissionFinding(
-                name=one.name,
-                unit=one.found.unit,
-                value=one.found.value,
-                half=one.found.half,
-                low=one.low,
-                high=one.high,
-                holds=one.holds,
-            )
-            for one in e.findings
-        ]
-        steps.append(CommissionStep.of(e, findings=findings))
-    return CommissionOutput(
-        gains=done.gains,
-        sha256=done.sha256,
-        machine=done.machine,
-        passed=done.passed,
-        steps=steps,
-        left=list(done.steps[len(done.entries) :]),
-        kept=list(done.kept),
-        signature=done.signature,
-        files=list(map(str, files)),
     )

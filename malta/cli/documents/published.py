@@ -6,66 +6,25 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from malta.cli.documents.campaigns import (
-    CampaignOutput,
-    DesignOutput,
-    RareOutput,
-    SimulateOutput,
-    SobolOutput,
-    StatusOutput,
-    ToleranceOutput,
-)
-from malta.cli.documents.loops import CompareOutput, Part, ReportOutput, VerifyOutput
-from malta.cli.documents.others import (
-    CheckOutput,
-    ClaimsOutput,
-    CommissionOutput,
-    ExciteOutput,
-    ExportOutput,
-    IdentifyOutput,
-    LearnedStrokesOutput,
-    LearnedV0Output,
-    LearnOutput,
-    LogOutput,
-    MeasureOutput,
-    MeasurePlanOutput,
-    PilOutput,
-    ReplayOutput,
-    TuneOutput,
-)
-from malta.cli.documents.plots import PlotOutput
+from malta.cli.documents import campaigns, loops, others, plots
+from malta.cli.documents.loops import Part
 from malta.errors import InputError
 from malta.schemas import SCHEMAS
 from malta.schemas.files import DRAFT
 
-MODELS: dict[str, type[Part]] = {
-    "design-output": DesignOutput,
-    "verify-output": VerifyOutput,
-    "check-output": CheckOutput,
-    "simulate-output": SimulateOutput,
-    "campaign-output": CampaignOutput,
-    "status-output": StatusOutput,
-    "rare-output": RareOutput,
-    "sobol-output": SobolOutput,
-    "tolerance-output": ToleranceOutput,
-    "tune-output": TuneOutput,
-    "excite-output": ExciteOutput,
-    "log-output": LogOutput,
-    "identify-output": IdentifyOutput,
-    "learn-output": LearnOutput,
-    "learned-strokes-output": LearnedStrokesOutput,
-    "learned-v0-output": LearnedV0Output,
-    "replay-output": ReplayOutput,
-    "measure-output": MeasureOutput,
-    "measure-plan-output": MeasurePlanOutput,
-    "commission-output": CommissionOutput,
-    "plot-output": PlotOutput,
-    "report-output": ReportOutput,
-    "compare-output": CompareOutput,
-    "export-output": ExportOutput,
-    "pil-output": PilOutput,
-    "claims-output": ClaimsOutput,
+# Each stands for the document that `malta NAME --json` prints, or one of its subcommands.
+NAMES = (
+    "design", "verify", "check", "simulate", "campaign", "status", "rare", "sobol", "tolerance", "tune", "excite",
+    "log", "identify", "learn", "learned-strokes", "learned-v0", "replay", "measure", "measure-plan", "commission",
+    "plot", "report", "compare", "export", "pil", "claims",
+)  # fmt: skip
+_KINDS = {
+    str(model.model_fields["kind"].default): model
+    for module in (campaigns, loops, others, plots)
+    for model in vars(module).values()
+    if isinstance(model, type) and issubclass(model, Part) and "kind" in model.model_fields
 }
+MODELS: dict[str, type[Part]] = {f"{name}-output": _KINDS[f"malta-{name}-output"] for name in NAMES}
 
 
 def output_schema(name: str) -> dict[str, Any]:

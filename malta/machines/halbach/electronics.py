@@ -6,23 +6,18 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import casadi as ca
 import numpy as np
 from scipy.special import ndtr
 
 from malta.errors import InputError
-from malta.machines.halbach.parameters import GAP
+from malta.machines.halbach.parameters import GAP, Parameters
 from malta.model.equations import note
-from malta.model.plant import Signal
+from malta.model.plant import FloatArray, Signal
 from malta.model.signals import Electronics
 from malta.simulation.period import runge_kutta
-
-if TYPE_CHECKING:
-    from malta.machines.halbach.parameters import Parameters
-    from malta.model.plant import FloatArray
-
 
 # The Halbach motor: Park transform, forces, motion and voltages of the three phases.
 #

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from malta.errors import InputError
 from malta.machines.halbach import electronics
 from malta.machines.halbach.electronics import IDEAL, IQ_BITS, MEAN_OF, Options, Pwm
 from malta.machines.halbach.open_loop import F_MOST, force, identify, lift_deviation, stairs
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,
@@ -35,6 +35,7 @@ from malta.simulation.experiments import (
     Merit,
     PlannedRun,
     Progress,
+    experiment_of,
     fly,
     rms,
     scenario_of,
@@ -43,26 +44,21 @@ from malta.simulation.references import Motion, Reference
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
-
 # Options of the electronics in an experiment.
 
 
 def electronics_options(
-    pwm: Pwm, adc_noise: bool, adc_steps: bool, mean_of: int, current_loops: bool
-) -> Options | None:
-    """A record of the electronics; None for those of the paper, as fidelity "force" takes none."""
+    options: Mapping[str, Any], pwm: Pwm, adc_noise: bool, adc_steps: bool, mean_of: int, current_loops: bool
+) -> dict[str, Any]:
+    """Options with a record of the electronics; None for those of the paper, as fidelity "force" takes none."""
     found = Options(pwm, adc_steps, adc_noise, mean_of, current_loops)
-    return None if found == electronics.REAL else found
+    parts = None if found == electronics.REAL else found
+    return {"fidelity": "phase", "electronics": parts} | dict(options)
 
 
-def campaign_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a campaign's scenario: fidelity "force" by default, electronics if their options differ."""
-    given = dict(options)
-    own = [given.pop(name) for name in ("pwm", "adc_noise", "adc_steps", "mean_of", "current_loops")]
-    return {"fidelity": "force", "electronics": electronics_options(*own)} | given
+def in_campaigns(cases: Callable[..., list[PlannedRun]]) -> Callable[..., list[PlannedRun]]:
+    """The same runs with fidelity "force", unless the options name another."""
+    return lambda plant, controller, **options: cases(plant, controller, **{"fidelity": "force"} | options)
 
 
 # The error of the Halbach motor at rest, by source: Sec. 5.1.
@@ -136,8 +132,8 @@ STEP, COUNT = 100e-6, 20  # m, Fig. 9
 BEFORE, PAUSE, REST = 5, 40, 400  # readings before the steps, between them, after the last
 
 
-def step(
-    plant: Plant,
+def step_cases(
+    _: Plant,
     controller: Controller,
     *,
     distance: float = STEP,
@@ -148,34 +144,15 @@ def step(
     adc_steps: bool = True,
     mean_of: int = MEAN_OF,
     current_loops: bool = True,
-    progress: Progress | None = None,
     **options: Any,
-) -> Experiment:
+) -> list[PlannedRun]:
     """Steps there and back, `count` of them, then 22 s of rest: as jumps, and as quintics with a rise of `rise` (s)."""
-    parts = electronics_options(pwm, adc_noise, adc_steps, mean_of, current_loops)
-    wanted = _step_wanted(
-        controller, distance, rise, count, {"fidelity": "phase", "electronics": parts} | options
-    )
-    cases, cut = fly(plant, controller, wanted, progress, options)
-    return Experiment("step", "Does it go where it is sent, and stay?", cases, (), interrupted=cut)
-
-
-def step_cases(
-    _: Plant, controller: Controller, *, distance: float, rise: float, count: int, **options: Any
-) -> list[PlannedRun]:
-    """The runs of `step` for a campaign."""
-    return _step_wanted(controller, distance, rise, count, campaign_options(options))
-
-
-def _step_wanted(
-    controller: Controller, distance: float, rise: float, count: int, options: Mapping[str, Any]
-) -> list[PlannedRun]:
-    """The runs of `step`: jumps, and quintics."""
+    own = electronics_options(options, pwm, adc_noise, adc_steps, mean_of, current_loops)
     Ts = controller.sample_time
     wanted = []
     for label, taken in (("jumps", 0.0), ("quintics", rise)):
         reference = partial(steps_reference, distance=distance, rise=taken, count=count, Ts=Ts)
-        scenario = scenario_of("step", (BEFORE + PAUSE * count + REST) * Ts, reference, options)
+        scenario = scenario_of("step", (BEFORE + PAUSE * count + REST) * Ts, reference, own)
         wanted.append(PlannedRun(label, scenario, partial(_step_merits, distance=distance, count=count)))
     return wanted
 
@@ -230,8 +207,8 @@ def _step_merits(run: Trajectory, distance: float, count: int) -> tuple[Merit, .
 STILL, SETTLING = 20, 2.0  # readings before and after the ramp; s, until the start at full speed has decayed
 
 
-def ramp(
-    plant: Plant,
+def ramp_cases(
+    _: Plant,
     controller: Controller,
     *,
     distance: float = 50e-3,
@@ -241,32 +218,15 @@ def ramp(
     adc_steps: bool = True,
     mean_of: int = MEAN_OF,
     current_loops: bool = True,
-    progress: Progress | None = None,
     **options: Any,
-) -> Experiment:
+) -> list[PlannedRun]:
     """Through the travel, half of `distance` to either side of the middle, at each of the speeds (m/s)."""
-    parts = electronics_options(pwm, adc_noise, adc_steps, mean_of, current_loops)
-    wanted = _ramp_wanted(controller, distance, speeds, {"fidelity": "phase", "electronics": parts} | options)
-    cases, cut = fly(plant, controller, wanted, progress, options)
-    return Experiment("ramp", "Does it follow through the whole travel?", cases, (), interrupted=cut)
-
-
-def ramp_cases(
-    _: Plant, controller: Controller, *, distance: float, speeds: tuple[float, ...], **options: Any
-) -> list[PlannedRun]:
-    """The runs of `ramp` for a campaign."""
-    return _ramp_wanted(controller, distance, speeds, campaign_options(options))
-
-
-def _ramp_wanted(
-    controller: Controller, distance: float, speeds: tuple[float, ...], options: Mapping[str, Any]
-) -> list[PlannedRun]:
-    """The runs of `ramp`: one for each speed."""
+    own = electronics_options(options, pwm, adc_noise, adc_steps, mean_of, current_loops)
     still, wanted = STILL * controller.sample_time, []
     for speed in speeds:
         moving = abs(distance) / speed
         reference = partial(ramp_reference, distance=distance, speed=speed, start=still)
-        scenario = scenario_of("ramp", moving + 2 * still, reference, options)
+        scenario = scenario_of("ramp", moving + 2 * still, reference, own)
         merits = partial(_ramp_merits, start=still, moving=moving)
         wanted.append(PlannedRun(f"{1e3 * speed:g} mm/s", scenario, merits))
     return wanted
@@ -305,14 +265,17 @@ def _ramp_merits(run: Trajectory, start: float, moving: float) -> tuple[Merit, .
 
 
 EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
-    "step": step,
+    "step": experiment_of("step", "Does it go where it is sent, and stay?", step_cases),
     "stairs": stairs,
-    "ramp": ramp,
+    "ramp": experiment_of("ramp", "Does it follow through the whole travel?", ramp_cases),
     "force": force,
     "budget": budget,
     "identify": identify,
 }
-CASES: dict[str, Callable[..., list[PlannedRun]]] = {"step": step_cases, "ramp": ramp_cases}
+CASES: dict[str, Callable[..., list[PlannedRun]]] = {
+    "step": in_campaigns(step_cases),
+    "ramp": in_campaigns(ramp_cases),
+}
 ALONE = ("step", "ramp")
 WORDS = {"stroke": "position", "thrust": "force"}
 OPTION_UNITS = {"distance": "m", "rise": "s", "speeds": "m/s", "place": "m", "F_z": "N"}

@@ -9,15 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.machines.halbach.experiments import BEFORE, PAUSE, responses
-from malta.machines.halbach.open_loop import (
-    AFTER,
-    CALM,
-    FAULTS,
-    LAWS,
-    PRINTED,
-    commanded_lift,
-    lift_force,
-)
+from malta.machines.halbach.open_loop import AFTER, CALM, FAULTS, LAWS, PRINTED, commanded_lift, lift_force
 from malta.report.figures.drawing import (
     MORE,
     REFERENCE,

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from malta.errors import CheckError, InputError
 from malta.machines.halbach import electronics
 from malta.machines.halbach import electronics as motor
 from malta.machines.halbach.electronics import IDEAL, Options, Pwm
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,
@@ -33,9 +33,6 @@ from malta.simulation.references import Motion, Reference
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.riccati import sample
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 
 def lift_deviation(run: Trajectory) -> float:

@@ -36,11 +36,7 @@ from malta.machines.halbach.electronics import (
 )
 from malta.machines.halbach.parameters import Parameters as Parameters
 from malta.model.equations import Body, Resultant
-from malta.model.plant import (
-    Actuator,
-    Plant,
-    Signal,
-)
+from malta.model.plant import Actuator, Plant, Signal
 
 POSITION = Signal("x", "m")
 FORCE = Signal("F_x", "N")

@@ -27,20 +27,11 @@ from malta.machines.planar.field import (
     shape_of,
     simulation_model,
 )
-from malta.model.equations import (
-    Equation,
-    note,
-    recorded_equations,
-    recording,
-    rotation,
-)
-from malta.model.plant import (
-    readonly,
-)
+from malta.model.equations import Equation, note, recorded_equations, recording, rotation
+from malta.model.plant import FloatArray, readonly
 
 if TYPE_CHECKING:
     from malta.machines.planar.parameters import Parameters
-    from malta.model.plant import FloatArray
 
 
 STEPS = (-1.5, -0.5, 0.5, 1.5)  # coil pitches from the mover's centre, along x and y

@@ -18,7 +18,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -37,7 +37,7 @@ from malta.machines.planar.motions import (
     step_cases,
     with_coil_model,
 )
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation import references
 from malta.simulation.engine import compiled as engine
 from malta.simulation.experiments import Experiment, Merit, PlannedRun, Progress, fly, fly_all, scenario_of
@@ -46,10 +46,6 @@ from malta.simulation.period import period_of
 from malta.simulation.scenario import Scenario, setup_of
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 CURRENT = 3.0  # A in one coil: Sec. 4.1
 NODES = (5, 7, 10, 14, 20, 28, 35, 50, 70)  # cells over tau_n of the tables whose errors are compared

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from malta.machines.planar import commutation
 from malta.machines.planar import plant as planar
 from malta.machines.planar.parameters import COIL_ORDER
 from malta.model.linearize import linearize
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,
@@ -32,10 +32,6 @@ from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import commutate_ahead
 from malta.synthesis.lqg import lqg, weights_of
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 MODELS = ("exact", "table", "analytical")  # coil models of the controller
 PLACE = (6e-3, 4e-3)  # m, x and y of a place without symmetry; the paper does not print its own

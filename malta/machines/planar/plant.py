@@ -27,27 +27,10 @@ from malta.machines.planar.commutation import (
     limit_currents,
     wrench_matrix,
 )
-from malta.machines.planar.field import (
-    CoilModel,
-    centre_of_force,
-    shape_of,
-    simulation_model,
-)
+from malta.machines.planar.field import CoilModel, centre_of_force, shape_of, simulation_model
 from malta.machines.planar.parameters import Parameters as Parameters
-from malta.model.equations import (
-    Body,
-    Resultant,
-    acceleration,
-    principal_angles,
-    rotate,
-    rotation,
-)
-from malta.model.plant import (
-    Actuator,
-    Plant,
-    Signal,
-    trace,
-)
+from malta.model.equations import Body, Resultant, acceleration, principal_angles, rotate, rotation
+from malta.model.plant import Actuator, Plant, Signal, trace
 
 POSITIONS = tuple(Signal(n, "m") for n in "xyz") + tuple(Signal(n, "rad") for n in ("phi", "theta", "psi"))
 RATES = tuple(Signal(f"{s.name}_dot", f"{s.unit}/s") for s in POSITIONS)

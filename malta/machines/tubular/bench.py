@@ -26,25 +26,16 @@ from malta.identification.calibration import (
     unstable_pole,
     wave,
 )
-from malta.identification.commission import (
-    Bench,
-    Finding,
-    Step,
-    fly,
-    judge_noise,
-    loop_step,
-    stroke_step,
-)
+from malta.identification.commission import Bench, Finding, Step, fly, judge_noise, loop_step, stroke_step
 from malta.identification.log import Log
 from malta.machines.tubular.drive import hall_signals
 from malta.machines.tubular.experiments.lifting import lift_cases, rest_on_bearing
 from malta.model.data import plant_of
-from malta.model.plant import Signal
+from malta.model.plant import FloatArray, Signal
 from malta.simulation import references
 from malta.simulation.scenario import Scenario
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
     from malta.synthesis.controller import Controller
 
 PLANES = (("x1", "y1"), ("x2", "y2"))

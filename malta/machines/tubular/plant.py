@@ -37,12 +37,7 @@ from malta.model.equations import (
     rotate,
     rotation,
 )
-from malta.model.plant import (
-    Actuator,
-    Plant,
-    Signal,
-    trace,
-)
+from malta.model.plant import Actuator, Plant, Signal, trace
 from malta.model.signals import late_sensors
 
 # The mover's centre of gravity off its axis, by c = (c_x, c_y, 0) in frame R.

@@ -11,9 +11,7 @@ An experiment without a figure of its own is drawn by `run_figure`: its first ru
 
 from __future__ import annotations
 
-import io
 import math
-import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -22,14 +20,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.errors import InputError
-from malta.files import replace_files
-from malta.model.machines import (
-    KINDS,
-    Group,
-    attribute_of,
-    outputs_of,
-)
+from malta.model.machines import KINDS, Group, attribute_of, outputs_of
 from malta.report.figures.campaign import distributions_figure as distributions_figure
+from malta.report.figures.campaign import worst_figure as worst_figure
 from malta.report.figures.campaign import yield_figure as yield_figure
 from malta.report.figures.drawing import MORE as MORE
 from malta.report.figures.drawing import POINTS as POINTS
@@ -37,16 +30,19 @@ from malta.report.figures.drawing import STYLES as STYLES
 from malta.report.figures.drawing import (
     Published,
     draw_bound,
+    draw_grid,
     draw_group,
     draw_line,
     ending_text,
     finish_axes,
     micro,
+    new_figure,
     new_page,
+    saved,
 )
+from malta.report.figures.drawing import encode_figure as encode_figure
 from malta.report.figures.drawing import number as number
-from malta.report.figures.margins import front_figure as front_figure
-from malta.report.figures.runs import worst_figure as worst_figure
+from malta.report.figures.drawing import save as save
 from malta.simulation.experiments import Case, Experiment
 from malta.simulation.experiments.catalogue import experiments_of
 from malta.simulation.trajectory import Trajectory
@@ -56,16 +52,23 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from malta.identification.log import Log
+    from malta.identification.measure import Curve, Measurement
+    from malta.model.plant import FloatArray
 
-def experiment_figure(e: Experiment, published: Published | None = None) -> Figure:
-    """Draw an experiment: the machine's own figure of it, or that of its first run.
+
+def experiment_figure(
+    e: Experiment, published: Published | None = None, path: str | Path | None = None
+) -> Figure:
+    """Draw an experiment: the machine's own figure of it, or that of its first run; save it where a path is given.
 
     e : the experiment
     published : figures of the machine's paper, from `malta.model.published`; None: none
+    path : .png, .svg or .pdf file; None: nothing is written
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
-    Raises InputError for an experiment that the machine does not have.
+    Raises InputError for an experiment that the machine does not have, and for another suffix.
 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
@@ -84,14 +87,17 @@ def experiment_figure(e: Experiment, published: Published | None = None) -> Figu
     }
     if e.name not in drawn:
         raise InputError("figure", "experiment", repr(e.name), "one of " + ", ".join(drawn))
-    return drawn[e.name](e, published)
+    return saved(drawn[e.name](e, published), path)
 
 
-def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure:
+def stroke_figure(
+    run: Trajectory, published: Published | None = None, path: str | Path | None = None
+) -> Figure:
     """Draw a run: the machine's own figure of a stroke; of a machine without one, errors, forces and clearances.
 
     run : from `malta.simulate`
     published : figures of the machine's paper, from `malta.model.published`; None: none
+    path : .png, .svg or .pdf file; None: nothing is written
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -107,80 +113,9 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     """
     draw = attribute_of(run.plant, "figures", "stroke_figure")
     if draw is None:
-        return run_figure(Experiment("run", run.scenario.name, (Case(run.scenario.name, run, ()),), ()))
-    figure: Figure = draw(run, published)
-    return figure
-
-
-def save(figure: Figure, path: str | Path, *, dark: bool = False) -> Path:
-    """Write a figure as .png, .svg or .pdf, whole or not at all; the same figure gives the same bytes.
-
-    A .svg file is light on screens that prefer light pages, and dark on those that prefer dark ones.
-
-    figure : a matplotlib Figure
-    path : of the file; its suffix gives the form
-    dark : light lines on a dark page, of a .png or .svg file
-
-    Returns the path.
-
-    Raises InputError for another suffix, a dark .pdf file, or a folder that cannot be written to.
-
-    >>> import malta
-    >>> malta.report.save(malta.report.new_figure("empty"), "build/empty.svg").name
-    'empty.svg'
-    """
-    path = Path(path)
-    replace_files({path: encode_figure(figure, path, dark=dark)})
-    return path
-
-
-def encode_figure(figure: Figure, path: Path, *, dark: bool = False) -> bytes:
-    r"""Make the content of a .png, .svg or .pdf file of a figure; the same figure gives the same bytes.
-
-    A .svg file is light on screens that prefer light pages, and dark on those that prefer dark ones.
-
-    figure : a matplotlib Figure
-    path : of the file; its suffix gives the form
-    dark : light lines on a dark page, of a .png or .svg file
-
-    Returns the bytes.
-
-    Raises InputError for another suffix, and for a dark .pdf file.
-
-    >>> import malta
-    >>> from pathlib import Path
-    >>> figure = malta.report.new_figure("empty")
-    >>> malta.report.encode_figure(figure, Path("empty.png"))[:4]
-    b'\x89PNG'
-    """
-    import matplotlib
-
-    from malta.report.figures.inline import png_of
-
-    if path.suffix not in (".png", ".svg", ".pdf"):
-        raise InputError(path, "", f"suffix {path.suffix!r}", "one of .png, .svg, .pdf")
-    if path.suffix == ".pdf" and dark:
-        raise InputError(path, "", "a dark figure on paper", "a .png or .svg file, or a light figure")
-    if path.suffix == ".png":
-        return png_of(figure, dark=dark)
-    buffer = io.BytesIO()
-    date = {"Date": None} if path.suffix == ".svg" else {"CreationDate": None}
-    with matplotlib.rc_context({"svg.hashsalt": "malta", "svg.fonttype": "none", "pdf.fonttype": 42}):
-        figure.savefig(buffer, format=path.suffix[1:], metadata=date)
-    return with_dark_mode(buffer.getvalue(), always=dark) if path.suffix == ".svg" else buffer.getvalue()
-
-
-def with_dark_mode(svg: bytes, *, always: bool = False) -> bytes:
-    """An SVG file that has light lines on a dark page, where the reader's screen prefers dark or `always`."""
-    from malta.report.page.document import dark_colour
-
-    text = svg.decode()
-    rules = ["svg{fill:#ededed}"]  # of texts, which have no colour of their own
-    for side, name in sorted(set(re.findall(r"(fill|stroke): #([0-9a-f]{6})", text))):
-        rules.append(f'[style*="{side}: #{name}"]{{{side}:{dark_colour(name)} !important}}')
-    inside = "".join(rules)
-    style = f"<style>{inside if always else f'@media (prefers-color-scheme: dark){{{inside}}}'}</style>"
-    return re.sub(r"(<svg\b[^>]*>)", lambda found: found[0] + style, text, count=1).encode()
+        alone = Experiment("run", run.scenario.name, (Case(run.scenario.name, run, ()),), ())
+        return saved(run_figure(alone), path)
+    return saved(draw(run, published), path)
 
 
 def run_figure(e: Experiment, _: Published | None = None) -> Figure:
@@ -267,3 +202,81 @@ def _draw_currents(axes: Axes, x: str, run: Trajectory) -> None:
         values = run.current.max(axis=1) if side == "largest" else run.current.min(axis=1)
         draw_line(axes, run.t * 1e3, values, label=f"{side} of {run.current.shape[1]}", **style)
     finish_axes(axes, x, "currents, from least to largest [A]", legend=2)
+
+
+# Figures of a log, and of a loop that was measured.
+
+
+PANELS = {
+    "y": "measured",
+    "reference": "reference",
+    "v": "command",
+    "excitation": "excitation",
+    "i": "current",
+}
+INTERVALS = 2000  # of a line of a log, each drawn from its least to its largest value
+
+
+def log_figure(log: Log) -> Figure:
+    """Draw a log: measured outputs, reference, commands, excitation and currents over time."""
+    groups = [g for g in PANELS if log.names(g) and (g == "y" or np.nan_to_num(log.columns[g]).any())]
+    figure = new_figure(log.source, "; ".join(log.survey.findings), size=(9.0, 1.2 + 1.9 * len(groups)))
+    for axes, group in zip(
+        figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0], groups, strict=True
+    ):
+        micro = {"m": 1e6, "rad": 1e6}.get(log.signals[group][0].unit, 1.0)
+        for signal, values in zip(log.signals[group], log.columns[group].T, strict=True):
+            axes.plot(*_thinned(log.t, micro * values), lw=0.8, label=signal.name)
+        unit = log.signals[group][0].unit
+        finish_axes(
+            axes, "time [s]", f"{PANELS[group]} [{'u' if micro != 1 else ''}{unit}]", legend=len(axes.lines)
+        )
+    return figure
+
+
+def _thinned(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The least and the largest value of each of INTERVALS."""
+    each = len(t) // INTERVALS
+    if each < 4:
+        return t, values
+    whole = INTERVALS * each
+    parts = values[:whole].reshape(INTERVALS, each)
+    ends = np.stack([parts.min(axis=1), parts.max(axis=1)], axis=1).ravel()
+    return np.repeat(t[:whole:each], 2), ends
+
+
+def measured_figure(found: Measurement) -> Figure:
+    """Draw a loop that was measured: S, T, open loop and compliance of each sensor with bands over the tube."""
+    p = len(found.sensors)
+    verdict = found.refusal or f"as predicted by {found.machines} machines of the box"
+    figure = new_figure(
+        f"{found.source}: the loop as measured", verdict, size=(11.0, 1.4 + 1.75 * p), wspace=0.42, left=0.07
+    )
+    curves = {"|S| [1]": found.S, "|T| [1]": found.T, "|L| [1]": found.L, "|S P| [m/N]": found.compliance}
+    panels = figure.subplots(p, 4, sharex=True, squeeze=False)
+    for i, (name, row) in enumerate(zip(found.sensors, panels, strict=True)):
+        for axes, (label, curve) in zip(row, curves.items(), strict=True):
+            at: tuple[int, ...] = (i,)
+            if curve is found.compliance:
+                j = int(curve.size[:, i].max(axis=0).argmax())
+                at, label = (i, j), f"{name} by {found.forces[j]} [SI]"
+            _draw_curve(axes, found.w / (2 * np.pi), curve.at(*at))
+            axes.set_ylabel(label if len(at) > 1 else f"{name}: {label}", fontsize=8)
+            axes.tick_params(which="both", labelsize=7)
+    for axes in panels[-1]:
+        axes.set_xlabel("frequency [Hz]", fontsize=8)
+    panels[0, 0].legend(fontsize=7, frameon=False)
+    return figure
+
+
+def _draw_curve(axes: Axes, f: FloatArray, curve: Curve) -> None:
+    """A response with its 95 % band as bars, the prediction as a line and its tube as an area."""
+    size, half = curve.size, 1.96 * curve.deviation
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.fill_between(f, curve.low, curve.high, color="#d9d9d9", linewidth=0, label="tube")
+    axes.plot(f, np.abs(curve.predicted), color="#4a4a4a", linewidth=0.9, label="predicted")
+    bars = np.array([np.minimum(half, 0.999 * size), half])
+    axes.errorbar(f, size, bars, fmt=".", color="#c1440e", markersize=3, elinewidth=0.8, label="measured")
+    axes.set_ylim(bottom=0.5 * min(float(size.min()), float(curve.low.min())))
+    draw_grid(axes)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -12,9 +14,11 @@ import numpy as np
 
 from malta.display import micro as micro
 from malta.display import number as number
+from malta.errors import InputError
+from malta.files import replace_files
 from malta.merits import ROOTS
 from malta.model.data import published_value
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.requirements import Trade, requirements_for
 from malta.units import in_unit
@@ -25,7 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    from malta.model.plant import FloatArray
     from malta.simulation.experiments import Case, Experiment
 
 
@@ -118,6 +121,84 @@ def show_plain_texts(figure: Figure) -> None:
 def printable(text: str) -> str:
     """A text without the characters that no page may have, as control characters: each becomes a mark."""
     return UNPRINTABLE.sub("\ufffd", text)
+
+
+def save(figure: Figure, path: str | Path, *, dark: bool = False) -> Path:
+    """Write a figure as .png, .svg or .pdf, whole or not at all; the same figure gives the same bytes.
+
+    A .svg file is light on screens that prefer light pages, and dark on those that prefer dark ones.
+
+    figure : a matplotlib Figure
+    path : of the file; its suffix gives the form
+    dark : light lines on a dark page, of a .png or .svg file
+
+    Returns the path.
+
+    Raises InputError for another suffix, a dark .pdf file, or a folder that cannot be written to.
+
+    >>> import malta
+    >>> malta.report.save(malta.report.new_figure("empty"), "build/empty.svg").name
+    'empty.svg'
+    """
+    path = Path(path)
+    replace_files({path: encode_figure(figure, path, dark=dark)})
+    return path
+
+
+def encode_figure(figure: Figure, path: Path, *, dark: bool = False) -> bytes:
+    r"""Make the content of a .png, .svg or .pdf file of a figure; the same figure gives the same bytes.
+
+    A .svg file is light on screens that prefer light pages, and dark on those that prefer dark ones.
+
+    figure : a matplotlib Figure
+    path : of the file; its suffix gives the form
+    dark : light lines on a dark page, of a .png or .svg file
+
+    Returns the bytes.
+
+    Raises InputError for another suffix, and for a dark .pdf file.
+
+    >>> import malta
+    >>> from pathlib import Path
+    >>> figure = malta.report.new_figure("empty")
+    >>> malta.report.encode_figure(figure, Path("empty.png"))[:4]
+    b'\x89PNG'
+    """
+    import matplotlib
+
+    from malta.report.figures.inline import png_of
+
+    if path.suffix not in (".png", ".svg", ".pdf"):
+        raise InputError(path, "", f"suffix {path.suffix!r}", "one of .png, .svg, .pdf")
+    if path.suffix == ".pdf" and dark:
+        raise InputError(path, "", "a dark figure on paper", "a .png or .svg file, or a light figure")
+    if path.suffix == ".png":
+        return png_of(figure, dark=dark)
+    buffer = io.BytesIO()
+    date = {"Date": None} if path.suffix == ".svg" else {"CreationDate": None}
+    with matplotlib.rc_context({"svg.hashsalt": "malta", "svg.fonttype": "none", "pdf.fonttype": 42}):
+        figure.savefig(buffer, format=path.suffix[1:], metadata=date)
+    return with_dark_mode(buffer.getvalue(), always=dark) if path.suffix == ".svg" else buffer.getvalue()
+
+
+def with_dark_mode(svg: bytes, *, always: bool = False) -> bytes:
+    """An SVG file that has light lines on a dark page, where the reader's screen prefers dark or `always`."""
+    from malta.report.page.document import dark_colour
+
+    text = svg.decode()
+    rules = ["svg{fill:#ededed}"]  # of texts, which have no colour of their own
+    for side, name in sorted(set(re.findall(r"(fill|stroke): #([0-9a-f]{6})", text))):
+        rules.append(f'[style*="{side}: #{name}"]{{{side}:{dark_colour(name)} !important}}')
+    inside = "".join(rules)
+    style = f"<style>{inside if always else f'@media (prefers-color-scheme: dark){{{inside}}}'}</style>"
+    return re.sub(r"(<svg\b[^>]*>)", lambda found: found[0] + style, text, count=1).encode()
+
+
+def saved(figure: Figure, path: str | Path | None) -> Figure:
+    """The figure itself, saved where a path is given."""
+    if path is not None:
+        save(figure, path)
+    return figure
 
 
 def rows_and_columns(count: int) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import cycle, pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -12,8 +13,8 @@ import numpy as np
 from malta.errors import InputError
 from malta.loops.loop import loop_along
 from malta.loops.sampled_loops import SampledLoop
-from malta.loops.time_domain import furthest, load_vector
-from malta.margins.loop_report import ZONES
+from malta.loops.time_domain import Deviation, Recovery, furthest, load_vector, recovery
+from malta.margins.loop_report import ZONES, LoopReport
 from malta.model.parameters import box_words
 from malta.report.figures.drawing import (
     BOUND,
@@ -29,6 +30,7 @@ from malta.report.figures.drawing import (
     front_lines,
     micro,
     new_figure,
+    saved,
 )
 from malta.synthesis.requirements import Trade
 from malta.units import unit_factor
@@ -38,8 +40,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.loops.time_domain import Deviation, Recovery
-    from malta.margins.loop_report import LoopReport
     from malta.model.plant import FloatArray, Plant
     from malta.proof.blocks.gain import Gain
     from malta.proof.margin import Margin
@@ -54,16 +54,17 @@ NO_WITNESS: dict[str, Any] = {"marker": ">", "markersize": 7, "linestyle": "none
 CROWDED = 12.0  # peak |S| up to which the names of the zones have room
 
 
-def chain_figure(found: LoopReport) -> Figure:
+def chain_figure(found: LoopReport, path: str | Path | None = None) -> Figure:
     """Draw margins and peak sensitivities of all stages as bars, and below them both along the travel.
 
     A machine without a travel has the first parameter that its proofs cover in its place, or nothing below.
 
     found : from `malta.verify`, with `stages`
+    path : .png, .svg or .pdf file; None: nothing is written
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
-    Raises InputError for a report without stages.
+    Raises InputError for a report without stages, and for another suffix.
 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
@@ -97,7 +98,7 @@ def chain_figure(found: LoopReport) -> Figure:
         for axes in along:
             along_travel = f"position {extent.stroke} [mm]"
             axes.set_xlabel(along_travel if extent.stroke else f"{extent.course} [{extent.unit}]")
-    return figure
+    return saved(figure, path)
 
 
 def _draw_stages(left: Axes, right: Axes, found: LoopReport) -> None:
@@ -239,14 +240,33 @@ RECOVERY_LOOKS = (
 )  # a line that covers another has gaps
 
 
-def recovery_figure(plant: Plant, controller: Controller, found: Sequence[Recovery]) -> Figure:
-    """Deviation after a unit step of every disturbance, and compliance over frequency, of the output furthest off.
+def recovery_figure(
+    plant: Plant,
+    controller: Controller,
+    found: Sequence[Recovery] | None = None,
+    path: str | Path | None = None,
+) -> Figure:
+    """Draw the answer to a unit step of every load from outside, and the compliance over frequency.
 
-    found : the answers of this machine to its disturbances, as malta.loops.recovery(plant, controller) gives them
+    A row for each pair of units, as um under N, with the output that each load moves furthest.
 
-    A row for each pair of units, as um under N. Raises CheckError for an unstable loop.
+    plant : the machine
+    controller : its controller
+    found : from `malta.loops.recovery`, where it is known already; None: it is computed
+    path : .png, .svg or .pdf file; None: nothing is written
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for a machine without disturbances and for another suffix, CheckError for an unstable loop.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> figure = malta.report.recovery_figure(spec.plant, controller)
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['deviation under 1 N [µm]', 'compliance [µm/N]']
     """
-    picked = furthest(found)
+    picked = furthest(recovery(plant, controller) if found is None else found)
     units = {s.name: s.unit for s in plant.disturbances}
     rows: dict[tuple[str, str], list[tuple[Recovery, Deviation]]] = {}
     for load, output in picked:
@@ -266,7 +286,7 @@ def recovery_figure(plant: Plant, controller: Controller, found: Sequence[Recove
     for (left, right), ((unit, of), lines) in zip(panels, rows.items(), strict=True):
         _draw_steps(left, plant, answer, lines, FINE.get(unit, unit), of)
         _draw_compliance(right, plant, loop, lines, FINE.get(unit, unit), of)
-    return figure
+    return saved(figure, path)
 
 
 def _draw_steps(
@@ -323,13 +343,14 @@ LABELS = ("noise of the force [N rms]", "true motion [µm rms]")  # by trade
 MARKS = ((0, "o"), (2, "s"), (1, "D"))  # style of a line and marker
 
 
-def front_figure(tuned: Tuned) -> Figure:
+def front_figure(tuned: Tuned, path: str | Path | None = None) -> Figure:
     """Draw the Pareto front of a search: force noise and motion over the proven margin, the chosen trial ringed.
 
     A dot has the least force noise, or the least motion, that goes with its margin. The chosen trial has to keep the
     bounds of both and of the experiments at once, so it may lie off either front.
 
     tuned : from `malta.tune`
+    path : .png, .svg or .pdf file; None: nothing is written
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -371,7 +392,7 @@ def front_figure(tuned: Tuned) -> Figure:
         axes.margins(x=0.04)
         finish_axes(axes, "proven margin [% of the box]", y, legend=2)
         axes.margins(x=0.04)
-    return figure
+    return saved(figure, path)
 
 
 def _draw_points(

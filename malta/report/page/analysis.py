@@ -12,32 +12,34 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.loops.curves import loop_curves
+from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.sampled_loops import LAST
-from malta.margins.loop_report import BANDWIDTHS
-from malta.merits import in_groups
+from malta.margins.loop_report import BANDWIDTHS, LoopReport
+from malta.merits import Merit, in_groups
 from malta.model.data import plant_of
 from malta.model.linear import is_linear
 from malta.model.machines import FINE
 from malta.model.parameters import units_of
-from malta.model.plant import Signal
+from malta.model.plant import FloatArray, Parameters, Plant, Signal
 from malta.report.figures.drawing import micro, number
-from malta.simulation.experiments import progress_of_part
+from malta.simulation.experiments import Experiment, progress_of_part
 from malta.simulation.experiments.catalogue import experiment, main_job
-from malta.synthesis.spec import Pid, StructuredLaw, Weights, integral_signals, pid_signals, process_signals
+from malta.synthesis.spec import (
+    Pid,
+    Spec,
+    StructuredLaw,
+    Weights,
+    integral_signals,
+    pid_signals,
+    process_signals,
+)
 from malta.tuning.verify import verify, with_requirements
 from malta.units import identifier, in_unit
 
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
-    from malta.loops.curves import LoopCurves
-    from malta.margins.loop_report import LoopReport
-    from malta.merits import Merit
-    from malta.model.plant import FloatArray, Parameters, Plant
     from malta.proof.windings import CurrentLoops
-    from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
-    from malta.synthesis.spec import Spec
 
 
 Share = Callable[[float], None]  # takes the share of the work that is done, 0 to 1

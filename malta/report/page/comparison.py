@@ -14,17 +14,15 @@ from rich.text import Text
 
 from malta.errors import InputError
 from malta.merits import Merit, by_identifier, find_best
-from malta.report.page.analysis import GROUPS, Entry, design_entries, display_unit
+from malta.report.page.analysis import GROUPS, Analysis, Entry, Subject, design_entries, display_unit
 from malta.report.tables.layout import Paragraph, new_table
-from malta.report.verdict import Stair, staircase, verdict_lines
+from malta.report.verdict import Stair, VerdictLine, staircase, verdict_lines
 from malta.simulation.experiments import progress_of_part
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from malta.campaigns.summary import Summary
-    from malta.report.page.analysis import Analysis, Subject
-    from malta.report.verdict import VerdictLine
 
 
 LEAST, MOST = 2, 8  # designs

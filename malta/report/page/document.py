@@ -9,7 +9,7 @@ import io
 import json
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -22,12 +22,10 @@ from malta.errors import InputError
 from malta.files import replace_files
 from malta.report.figures.drawing import BOUND_LINE, printable
 from malta.report.page.analysis import KeyFigure
-from malta.report.page.sections import Folded, Item, Picture, Section, plain_sheet, polish
+from malta.report.page.sections import Folded, Item, Picture, Section, Sheet, plain_sheet, polish
 from malta.report.tables.experiments import finding_cells
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
     import jinja2
     from matplotlib.axes import Axes
     from matplotlib.backends.backend_pdf import PdfPages
@@ -35,7 +33,6 @@ if TYPE_CHECKING:
 
     from malta.identification.commission import Commissioning, Entry
     from malta.model.plant import FloatArray
-    from malta.report.page.sections import Sheet
 
 
 # A figure as SVG that stands inside a page: colours by CSS variables, so that a dark page has light lines.

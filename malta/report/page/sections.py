@@ -20,9 +20,9 @@ from malta.loops.time_domain import budget_of
 from malta.merits import four_digits
 from malta.model.data import published_figures
 from malta.model.machines import FINE
-from malta.model.plant import Signal
+from malta.model.plant import FloatArray, Signal
 from malta.report.figures.drawing import micro
-from malta.report.page.analysis import design_entries, display_unit, summary_sentences
+from malta.report.page.analysis import Analysis, design_entries, display_unit, summary_sentences
 from malta.report.tables.campaign import box_text, campaign_tables, run_text
 from malta.report.tables.design import (
     bandwidth_table,
@@ -49,8 +49,6 @@ if TYPE_CHECKING:
     from malta.loops.classical import Classical
     from malta.loops.curves import LoopCurves
     from malta.margins.loop_report import LoopReport, Outcome
-    from malta.model.plant import FloatArray
-    from malta.report.page.analysis import Analysis
 
 
 # Which channels of a loop need a panel of their own: mirror images have the same curves.

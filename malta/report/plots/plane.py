@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
-from malta.loops.curves import loop_curves
+from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.locus import DELAY, GAIN, RootLocus
 from malta.loops.locus import root_locus as locus_of
 from malta.report.figures.drawing import new_figure, number
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from malta.loops.curves import LoopCurves
     from malta.loops.linear_loops import Place
     from malta.model.plant import ComplexArray
 

@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING
 from rich.console import Group
 from rich.table import Table
 
-from malta.model.machines import (
-    lateral_outputs,
-)
+from malta.model.machines import lateral_outputs
 from malta.model.parameters import differences
 from malta.report.figures.drawing import Published, number
 from malta.report.tables.layout import Paragraph, add_row, end_cell, new_table
@@ -26,19 +24,7 @@ if TYPE_CHECKING:
 
 
 def run_text(plan: Plan) -> str:
-    """Say what each machine of a plan does: its scenario, with the case, and the fidelity.
-
-    plan : of a campaign
-
-    Returns a line of text.
-
-    >>> import malta
-    >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> malta.report.run_text(
-    ...     malta.campaigns.Plan(controller, "stroke", spread={"m": 0.1})
-    ... )
-    'stroke, fidelity dq'
-    """
+    """What each machine of a plan does: its scenario, with the case, and the fidelity."""
     from malta.campaigns.plan import planned_run
 
     wanted = planned_run(plan)
@@ -47,19 +33,7 @@ def run_text(plan: Plan) -> str:
 
 
 def box_text(plan: Plan) -> str:
-    """Name the parameters that a plan varies, with their half-widths.
-
-    plan : of a campaign
-
-    Returns a line of text.
-
-    >>> import malta
-    >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> malta.report.box_text(
-    ...     malta.campaigns.Plan(controller, spread={"m": 0.1, "K_A": 0.05})
-    ... )
-    'm ±10 %, K_A ±5 %'
-    """
+    """The parameters that a plan varies, with their half-widths: "m ±10 %, K_A ±5 %"."""
     from malta.campaigns.result import spread_text
 
     spreads: dict[str, list[str]] = {}
@@ -234,25 +208,7 @@ def rare_event_tables(event: RareEvent) -> Group:
 
 
 def rare_event_sentence(event: RareEvent) -> str:
-    """Say what is known of a rare event where no run failed.
-
-    event : from `malta.campaigns.rare_event`
-
-    Returns a sentence; "" where runs failed.
-
-    >>> import malta
-    >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> short = {"duration": 0.02}  # s
-    >>> box = {"m": 0.1}
-    >>> plan = malta.campaigns.Plan(
-    ...     controller, "disturbance", box, samples=2000, options=short
-    ... )
-    >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 40e-6)
-    >>> event = malta.campaigns.rare_event(plan, limit, workers=1)
-    >>> malta.report.rare_event_sentence(event).partition(" below")[0]
-    'no run failed: deviation y above 40 um or an earlier end has a probability'
-    """
+    """What is known of a rare event where no run failed; "" where runs failed."""
     found = event.found
     if found.reached:
         return ""
@@ -342,26 +298,7 @@ def sensitivity_tables(found: Sensitivity) -> Group:
 
 
 def sensitivity_sentence(found: Sensitivity) -> str:
-    """Say why figures have no indices.
-
-    found : from `malta.campaigns.sensitivity`
-
-    Returns a sentence; "" where all figures have indices.
-
-    >>> import malta
-    >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> options = {"duration": 0.02, "noise": 0.0}
-    >>> box = {"m": 0.2, "C": 0.2}
-    >>> plan = malta.campaigns.Plan(
-    ...     controller, "disturbance", box, samples=64, options=options
-    ... )
-    >>> found = malta.campaigns.sensitivity(
-    ...     plan, malta.campaigns.limit_of(plan, "touchdown"), workers=1
-    ... )
-    >>> malta.report.sensitivity_sentence(found)
-    'every run is without touchdown: the yield has no indices'
-    """
+    """Why figures have no indices; "" where all have."""
     if not found.of_yield:
         every = "every" if found.within.share == 1 else "no"
         return f"{every} run is {found.limit.kept}: the yield has no indices"
@@ -424,25 +361,7 @@ def spreads_table(found: Tolerances) -> Table:
 
 
 def tolerance_sentence(found: Tolerances) -> str:
-    """Name the parameters that keep the yield again with a wider spread.
-
-    found : from `malta.campaigns.tolerances`
-
-    Returns a sentence; "" where none does.
-
-    >>> import malta
-    >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> short = {"duration": 0.02}  # s
-    >>> box = {"m": 0.1}
-    >>> plan = malta.campaigns.Plan(
-    ...     controller, "disturbance", box, samples=20, options=short
-    ... )
-    >>> limit = malta.campaigns.limit_of(plan, "deviation-y", 50e-6)
-    >>> found = malta.campaigns.tolerances(plan, limit, 0.95, workers=1)
-    >>> malta.report.tolerance_sentence(found)
-    ''
-    """
+    """The parameters that keep the yield again with a wider spread; "" for none."""
     names = " ".join(spread.name for spread in found.spreads if not spread.monotone)
     return f"a wider spread keeps the yield again: {names}" if names else ""
 

@@ -1,4 +1,4 @@
-"""Tables of a design's loop: poles, bandwidths, peak sensitivity."""
+"""The page of a design, and its tables: poles, bandwidths, peak sensitivity, loads, requirements, the front."""
 
 from __future__ import annotations
 
@@ -8,28 +8,90 @@ from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 from scipy import sparse
 
 from malta.display import RADIANS, frequency
-from malta.loops.time_domain import SHARE, furthest
-from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, zone
+from malta.loops.time_domain import SHARE, Recovery, furthest
+from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, Outcome, zone
 from malta.model.data import published_value
 from malta.model.linearize import LinearModel
 from malta.model.machines import FINE
-from malta.proof.certificate.checked_file import double
+from malta.model.parameters import box_words
+from malta.proof.certificate.checked_file import Claim, double
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
-from malta.report.tables.layout import COLOURS, add_row, new_table
+from malta.report.tables.experiments import experiment_table
+from malta.report.tables.layout import COLOURS, Paragraph, add_row, new_table
+from malta.synthesis.lqg import continuous_poles
 from malta.synthesis.requirements import Trade, requirements_for
 from malta.units import in_unit
 
 if TYPE_CHECKING:
-    from malta.loops.time_domain import Recovery
-    from malta.margins.loop_report import Outcome
     from malta.model.plant import ComplexArray, FloatArray, Plant
-    from malta.proof.certificate.checked_file import Claim
+    from malta.simulation.experiments import Experiment
+    from malta.synthesis.spec import Spec
     from malta.tuning.tune import Tuned
+
+
+def design_page(
+    spec: Spec, model: LinearModel, margins: LoopReport, flown: Experiment, published: Published | None
+) -> Group:
+    """Make the page of a design for a terminal: its loop, its margins, and the machine's main experiment.
+
+    spec : the design, from `malta.read_design`
+    model : the machine's linear model
+    margins : from `malta.verify`
+    flown : the experiment that is the machine's main job, from `malta.experiment`
+    published : figures of the machine's paper, from `malta.model.published`; None: none
+
+    Returns a rich Group, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> controller = malta.synthesize(spec, model)
+    >>> exact = {"noise": 0.0, "quantize": False}  # sensors
+    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, **exact)
+    >>> margins = malta.verify(model, controller)
+    >>> page = malta.report.design_page(spec, model, margins, push, None)
+    >>> for line in page.renderables[:2]:
+    ...     rich.print(line)
+    ball: LQG with integral action
+    ball, preset data, sampled-data, 5 kHz, delay 1 in the design model
+    """
+    made = f"{spec.discretization}, {_rate_text(spec.sample_time)}, delay {spec.delay} in the design model"
+    made += ", with the lag of the current loops" if spec.current_lag else ""
+    if spec.pid is not None:
+        made = f"PID, {_rate_text(spec.sample_time)}"
+    if spec.structure is not None:
+        made = f"elements of a given structure, {_rate_text(spec.sample_time)}"
+    made += ", commutated for the predicted place" if spec.commutation == "predicted" else ""
+    return Group(
+        Paragraph(f"{spec.name}: {spec.summary}", style="bold"),
+        Paragraph(f"{model.plant.name}, preset {spec.parameters.preset}, {made}"),
+        "",
+        poles_table(model, published),
+        loop_poles_table(margins, continuous_poles(model, spec.weights) if spec.kind == "LQG" else None),
+        bandwidth_table(margins, published),
+        sensitivity_table(margins),
+        *([] if margins.robust is None else [_margin_text(margins)]),
+        experiment_table(flown, published),
+    )
+
+
+def _margin_text(margins: LoopReport) -> Paragraph:
+    box = box_words(margins.uncertainty, margins.plant.parameters)
+    assert margins.robust is not None
+    where = margins.places_covered
+    if margins.covers_travel:
+        where = where.replace("the travel", "the whole travel")
+    return Paragraph(f"{f'Parametric margin {where}'.rstrip()} ({box}): {margins.robust}\n")
+
+
+def _rate_text(Ts: float) -> str:
+    return f"{1e-3 / Ts:g} kHz" if Ts <= 1e-3 else f"a sample every {Ts * 1e3:g} ms"
 
 
 def poles_table(model: LinearModel, published: Published | None) -> Table:
@@ -364,24 +426,7 @@ def _front_columns(tuned: Tuned) -> dict[str, tuple[str, float, str]]:
 
 
 def front_rows(tuned: Tuned) -> tuple[list[str], list[list[str]]]:
-    """List the Pareto front as headings and cells: a row for each trial, the chosen one with a star.
-
-    tuned : from `malta.tune`
-
-    Returns headings and rows.
-
-    >>> import malta
-    >>> from malta.tuning.search import Trial
-    >>> from malta.tuning.tune import Tuned
-    >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
-    >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
-    >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
-    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
-    >>> heads, rows = malta.report.front_rows(tuned)
-    >>> rows[1]
-    ['363', '0.0414', '0.501', '*']
-    """
+    """The Pareto front as headings and cells: a row for each trial, the chosen one with a star."""
     columns = _front_columns(tuned)
     shown = [name for name in columns if any(name in one.figures for one in tuned.front)]
     heads = [f"{columns[k][0]} [{columns[k][2]}]".removesuffix(" []") for k in shown]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.console import Group
+from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.table import Table
 from rich.text import Text
 
@@ -28,12 +28,10 @@ from malta.report.tables.layout import (
     new_table,
     published_text,
 )
-from malta.simulation.experiments import setting
+from malta.simulation.experiments import Experiment, setting
 from malta.simulation.experiments.catalogue import experiments_of, options_of
 
 if TYPE_CHECKING:
-    from rich.console import Console, ConsoleOptions, RenderResult
-
     from malta.identification.commission import Commissioning, Finding, Step
     from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
@@ -45,7 +43,6 @@ if TYPE_CHECKING:
     from malta.merits import Merit
     from malta.model.plant import Plant
     from malta.report.ledger import Claim, Ledger
-    from malta.simulation.experiments import Experiment
 
 
 def limits_text(e: Experiment) -> list[str]:

@@ -14,7 +14,7 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from rich import box
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from malta.display import micro
@@ -24,7 +24,6 @@ from malta.units import in_unit
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderResult
     from rich.style import Style
-    from rich.table import Column
 
     from malta.merits import Merit
 

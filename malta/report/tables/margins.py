@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from malta.display import RADIANS, frequency
-from malta.margins.loop_report import zone
+from malta.margins.loop_report import LoopReport, zone
 from malta.model.machines import axis_units
 from malta.model.parameters import box_words
-from malta.proof.margin import NOT_PROVEN, unproven
+from malta.proof.margin import NOT_PROVEN, Margin, unproven
 from malta.report.tables.design import (
     bandwidth_table,
     loop_poles_table,
@@ -23,10 +23,8 @@ from malta.report.tables.design import (
 from malta.report.tables.layout import Paragraph, add_row, new_table
 
 if TYPE_CHECKING:
-    from malta.margins.loop_report import LoopReport
     from malta.margins.travel import Extent
     from malta.proof.blocks.gain import Gain
-    from malta.proof.margin import Margin
     from malta.report.figures.drawing import Published
     from malta.synthesis.spec import Spec
 

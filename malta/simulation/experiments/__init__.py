@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import wraps
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -23,17 +24,13 @@ from malta.merits import Merit as Merit
 from malta.merits import figure
 from malta.model.linearize import linearize
 from malta.model.machines import attribute_of
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.inputs import LONGEST
 from malta.simulation.references import Reference
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 Progress = Callable[[float], None]
 
@@ -192,6 +189,32 @@ def fly_all(
         if run.verdict.name == "interrupted":
             return tuple(cases), True
     return tuple(cases), False
+
+
+def experiment_of(
+    name: str,
+    question: str,
+    cases: Callable[..., list[PlannedRun]],
+    merits: Callable[[Sequence[Case]], tuple[Merit, ...]] = lambda _: (),
+) -> Callable[..., Experiment]:
+    """The experiment that flies the runs which `cases` lists: with its options, its docstring and its refusals.
+
+    merits : the figures of merit of the whole
+    """
+
+    @wraps(cases)
+    def fly_cases(
+        plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
+    ) -> Experiment:
+        flown, cut = fly(plant, controller, cases(plant, controller, **options), progress, options)
+        return Experiment(name, question, flown, merits(flown), interrupted=cut)
+
+    return fly_cases
+
+
+def merits_of_first(cases: Sequence[Case]) -> tuple[Merit, ...]:
+    """The figures of merit of the first run."""
+    return cases[0].merits
 
 
 def progress_of_part(progress: Progress | None, n: int, total: int) -> Progress | None:

@@ -30,7 +30,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -38,7 +38,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.machines import FINE
-from malta.model.plant import Plant, Signal
+from malta.model.plant import FloatArray, Plant, Signal
 from malta.simulation import references
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import (
@@ -47,7 +47,9 @@ from malta.simulation.experiments import (
     Merit,
     PlannedRun,
     Progress,
+    experiment_of,
     fly,
+    merits_of_first,
     rms,
     scenario_of,
     setting,
@@ -59,10 +61,6 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import EngineOf, simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # Experiments of any machine: hold still, step an output, push.
 #
@@ -84,48 +82,26 @@ CLEARANCE = 0.1  # of a step of default size, as a share of the clearance
 SIZE = 1e-5  # SI, of a step of a machine without contacts and without noise
 
 
-def hold(
-    plant: Plant,
-    controller: Controller,
-    *,
-    time: float = 0.0,
-    progress: Progress | None = None,
-    **options: Any,
-) -> Experiment:
+def hold_cases(
+    plant: Plant, controller: Controller, *, time: float = 0.0, **options: Any
+) -> list[PlannedRun]:
     """Hold still for `time` (s; 0: 2000 samples), with the noise of the sensors as built."""
-    planned = hold_cases(plant, controller, time=time, **options)
-    cases, cut = fly(plant, controller, planned, progress, options)
-    return Experiment("hold", "How still does it stand?", cases, cases[0].merits, interrupted=cut)
-
-
-def hold_cases(plant: Plant, controller: Controller, *, time: float, **options: Any) -> list[PlannedRun]:
-    """The run of `hold`."""
     scenario = scenario_of(
         "hold", _duration(controller, time), references.hold, _with_fidelity(plant, options)
     )
     return [PlannedRun("hold", scenario, _rest_merits)]
 
 
-def step(
+def step_cases(
     plant: Plant,
     controller: Controller,
     *,
     output: str = "all",
     size: float = 0.0,
     time: float = 0.0,
-    progress: Progress | None = None,
     **options: Any,
-) -> Experiment:
-    """A step of one output, or of each in turn, by `size` (SI; 0: a tenth of the clearance), with exact sensors."""
-    planned = step_cases(plant, controller, output=output, size=size, time=time, **options)
-    cases, cut = fly(plant, controller, planned, progress, options)
-    return Experiment("step", "Does it go where it is sent?", cases, cases[0].merits, interrupted=cut)
-
-
-def step_cases(
-    plant: Plant, controller: Controller, *, output: str, size: float, time: float, **options: Any
 ) -> list[PlannedRun]:
-    """The runs of `step`."""
+    """A step of one output, or of each in turn, by `size` (SI; 0: a tenth of the clearance), with exact sensors."""
     duration, planned = _duration(controller, time), []
     for k in _choose(plant.outputs, output, "output"):
         signal, distance = plant.outputs[k], size or default_step(plant, k)
@@ -137,27 +113,19 @@ def step_cases(
     return planned
 
 
-def disturbance(
+def disturbance_cases(
     plant: Plant,
     controller: Controller,
     *,
     on: str = "all",
     size: float = 1.0,
     time: float = 0.0,
-    progress: Progress | None = None,
     **options: Any,
-) -> Experiment:
-    """A constant force or torque of `size` (N or N m) on one input of disturbance, or on each in turn."""
-    planned = disturbance_cases(plant, controller, on=on, size=size, time=time, **options)
-    cases, cut = fly(plant, controller, planned, progress, options)
-    question = "How far does a load move it, and does it come back?"
-    return Experiment("disturbance", question, cases, cases[0].merits, interrupted=cut)
-
-
-def disturbance_cases(
-    plant: Plant, controller: Controller, *, on: str, size: float, time: float, **options: Any
 ) -> list[PlannedRun]:
-    """The runs of `disturbance`. Raises InputError for a machine without inputs of disturbance."""
+    """A constant force or torque of `size` (N or N m) on one input of disturbance, or on each in turn.
+
+    Raises InputError for a machine without inputs of disturbance.
+    """
     if not plant.disturbances:
         raise InputError(plant.name, "disturbances", "none", "a machine on which forces act from outside")
     duration, planned = _duration(controller, time), []
@@ -316,15 +284,18 @@ def _load_merits(run: Trajectory) -> tuple[Merit, ...]:
     )
 
 
-EXPERIMENTS: Mapping[str, Callable[..., Experiment]] = {
-    "hold": hold,
-    "step": step,
-    "disturbance": disturbance,
+QUESTIONS = {
+    "hold": "How still does it stand?",
+    "step": "Does it go where it is sent?",
+    "disturbance": "How far does a load move it, and does it come back?",
 }
 CASES: Mapping[str, Callable[..., list[PlannedRun]]] = {
     "hold": hold_cases,
     "step": step_cases,
     "disturbance": disturbance_cases,
+}
+EXPERIMENTS: Mapping[str, Callable[..., Experiment]] = {
+    name: experiment_of(name, question, CASES[name], merits_of_first) for name, question in QUESTIONS.items()
 }
 
 

@@ -31,7 +31,7 @@ from scipy.integrate import solve_ivp
 
 from malta.display import Curves, Description, display, quantity
 from malta.errors import CheckError, InputError
-from malta.model.plant import Plant, readonly
+from malta.model.plant import FloatArray, Plant, readonly
 from malta.simulation import references
 
 if TYPE_CHECKING:
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
     from scipy.interpolate import PPoly
 
-    from malta.model.plant import FloatArray
 
 ROUNDS = 8  # meshes, at most
 STILL = 5e-4  # share of T by which the last mesh may still change T

@@ -32,7 +32,6 @@ from malta.machines.tubular.experiments.disturbances import (
     hold,
     hold_cases,
     thermal,
-    tilt,
     tilt_cases,
 )
 from malta.machines.tubular.experiments.faults import faults
@@ -43,22 +42,18 @@ from malta.machines.tubular.experiments.strokes import (
     drive_limit_cases,
     drive_limits,
     record_v0,
-    stroke,
     stroke_cases,
 )
 from malta.machines.tubular.experiments.strokes import SETTLE as SETTLE
-from malta.simulation.experiments import (
-    Experiment,
-    PlannedRun,
-)
+from malta.simulation.experiments import Experiment, PlannedRun, experiment_of, merits_of_first
 
 if TYPE_CHECKING:
     from malta.identification.commission import Step
 
 EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
-    "stroke": stroke,
+    "stroke": experiment_of("stroke", "Does it follow the stroke?", stroke_cases, merits_of_first),
     "hold": hold,
-    "tilt": tilt,
+    "tilt": experiment_of("tilt", "Does it tilt about sensor plane 2?", tilt_cases),
     "lift-off": lift_off,
     "payload": payload,
     "thermal": thermal,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from malta.machines.tubular.experiments.faults import (
 )
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE
-from malta.model.plant import Plant, outputs_at
+from malta.model.plant import FloatArray, Plant, outputs_at
 from malta.simulation import references
 from malta.simulation.experiments import (
     Case,
@@ -37,9 +37,6 @@ from malta.simulation.experiments import (
 )
 from malta.simulation.trajectory import Trajectory, Verdict
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 STROKE, LAND, END = 0.4, 0.5, 0.75  # s: middle of the stroke, request to land, end
 LASTING = 0.4  # s, of a run with a fault: room for a landing

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from malta.machines.tubular.experiments.strokes import delayed_stroke
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,
@@ -20,7 +20,9 @@ from malta.simulation.experiments import (
     Progress,
     amplitude,
     compliance,
+    experiment_of,
     fly,
+    merits_of_first,
     rms,
     scenario_of,
     sine_wrench,
@@ -30,9 +32,6 @@ from malta.simulation.readings import keys, normals
 from malta.simulation.scenario import Correction
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 
 def disturbance(
@@ -188,18 +187,13 @@ def _merits(run: Trajectory) -> tuple[Merit, ...]:
 # MALTA at rest: sensor noise, a tilt about one sensor plane, and a support that drifts.
 
 
-def hold(
-    plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
-) -> Experiment:
-    """Rest at the middle with sensor noise: statistics of the last 2000 measured samples, and the true motion."""
-    cases, cut = fly(plant, controller, hold_cases(plant, controller, **options), progress, options)
-    return Experiment("hold", "How still does it stand?", cases, cases[0].merits, interrupted=cut)
-
-
 def hold_cases(_: Plant, controller: Controller, **options: Any) -> list[PlannedRun]:
-    """The run of `hold`."""
+    """Rest at the middle with sensor noise: statistics of the last 2000 measured samples, and the true motion."""
     scenario = scenario_of("hold", (RESTING + 6000) * controller.sample_time, references.hold, options)
     return [PlannedRun("hold", scenario, _rest_merits)]
+
+
+hold = experiment_of("hold", "How still does it stand?", hold_cases, merits_of_first)
 
 
 RESTING = 2000  # samples of the statistics, Table III
@@ -224,28 +218,13 @@ def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
     )
 
 
-def tilt(
-    plant: Plant,
-    controller: Controller,
-    *,
-    radius: float = 200e-6,
-    frequency: float = 2.0,
-    progress: Progress | None = None,
-    **options: Any,
-) -> Experiment:
+def tilt_cases(
+    _: Plant, __: Controller, *, radius: float = 200e-6, frequency: float = 2.0, **options: Any
+) -> list[PlannedRun]:
     """Eq. (21): a circle of `radius` (m) at `frequency` (Hz) in sensor plane 1, the other plane held at its centre.
 
     As the paper, and with the attraction at the reference fed forward.
     """
-    wanted = tilt_cases(plant, controller, radius=radius, frequency=frequency, **options)
-    cases, cut = fly(plant, controller, wanted, progress, options)
-    return Experiment("tilt", "Does it tilt about sensor plane 2?", cases, (), interrupted=cut)
-
-
-def tilt_cases(
-    _: Plant, __: Controller, *, radius: float, frequency: float, **options: Any
-) -> list[PlannedRun]:
-    """The runs of `tilt`: one for each feedforward."""
     kinds = [options["feedforward"]] if "feedforward" in options else ["axial", "attraction"]
     reference = partial(references.circle, radius=radius, frequency=frequency)
     merits = partial(_tilt_merits, settled=1 / frequency)

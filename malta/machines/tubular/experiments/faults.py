@@ -11,10 +11,11 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from malta.errors import InputError
 from malta.firmware.flight import view
@@ -29,7 +30,7 @@ from malta.firmware.supervisor_text import (
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE, delayed_stroke
 from malta.model.equilibrium import trim
-from malta.model.plant import Plant, outputs_at
+from malta.model.plant import FloatArray, Plant, outputs_at
 from malta.simulation import references
 from malta.simulation.experiments import (
     Case,
@@ -45,10 +46,6 @@ from malta.simulation.scenario import Fault, Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory, Verdict
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # Faults of sensors, samples, a phase and the DC link.
 
@@ -142,17 +139,10 @@ def _fault_merits(run: Trajectory, at: float) -> tuple[Merit, ...]:
 # When and how fast the mover meets its touchdown bearings.
 
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import FloatArray
-
-    IntArray = NDArray[np.intp]
-
 SOFT = 0.05  # m/s: a landing that meets its bearing faster is a touchdown; a fall by 33 um, pulled by the magnets
 
 
-def contacts_of(run: Trajectory, since: float = 0.0) -> tuple[IntArray, FloatArray]:
+def contacts_of(run: Trajectory, since: float = 0.0) -> tuple[NDArray[np.intp], FloatArray]:
     """Samples at which a touchdown bearing is met after `since`, s, and how fast, m/s.
 
     Every contact counts, also after a bounce, but that at the start; its speed is that of the sensor planes over the

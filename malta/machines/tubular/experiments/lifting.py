@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.machines.tubular.experiments.strokes import delayed_stroke
 from malta.model.linearize import linearize
-from malta.model.plant import Plant, outputs_at
+from malta.model.plant import FloatArray, Plant, outputs_at
 from malta.simulation import references
 from malta.simulation.engine.batch import is_compiled, simulate_many
 from malta.simulation.experiments import (
@@ -33,9 +33,6 @@ from malta.simulation.scenario import ESTIMATORS, Scenario
 from malta.simulation.simulate import fits_kalman_filter
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 
 def lift_off(

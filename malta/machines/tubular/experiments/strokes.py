@@ -13,7 +13,7 @@ import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.merits import reported_merits
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,
@@ -44,7 +44,6 @@ from malta.simulation.trajectory import Trajectory, stroke_figures
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
     from malta.simulation.experiments.time_optimal import FastestStroke, SigmoidStroke
 
 
@@ -52,26 +51,16 @@ SETTLE = 0.3  # s at rest before the strokes of yields, as on the bench
 DISTANCE, RISE = 10e-3, 16.2e-3  # m, s from 10 to 90 %: the published stroke, Fig. 12
 
 
-def stroke(
-    plant: Plant,
-    controller: Controller,
+def stroke_cases(
+    _: Plant,
+    __: Controller,
     *,
     distance: float = DISTANCE,
     rise: float = RISE,
     profile: Profile = "logistic",
-    progress: Progress | None = None,
     **options: Any,
-) -> Experiment:
-    """The published stroke: tracking, radial deviation, currents, and K_D as the ratio of force and current."""
-    wanted = stroke_cases(plant, controller, distance=distance, rise=rise, profile=profile, **options)
-    cases, cut = fly(plant, controller, wanted, progress, options)
-    return Experiment("stroke", "Does it follow the stroke?", cases, cases[0].merits, interrupted=cut)
-
-
-def stroke_cases(
-    _: Plant, __: Controller, *, distance: float, rise: float, profile: Profile, **options: Any
 ) -> list[PlannedRun]:
-    """The run of `stroke`."""
+    """The published stroke: tracking, radial deviation, currents, and K_D as the ratio of force and current."""
     asked = {name: value for name, value in options.items() if name != "engine"}
     scenario = Scenario.stroke(distance, rise=rise, profile=profile, **asked)
     published = distance == DISTANCE and rise == RISE
