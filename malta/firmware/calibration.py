@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import textwrap
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -21,12 +21,9 @@ from malta.firmware.ctext import c_number
 from malta.firmware.program import TYPES
 from malta.firmware.signals import Field, Target
 from malta.firmware.supervisor import Monitor, monitors_of, reference_limits
-from malta.model.plant import Signal
+from malta.model.plant import FloatArray, Signal
 from malta.synthesis.controller import gains_of
 from malta.units import unit_factor
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 SCATTER = 0.1  # share of each gain by which it may differ, either way
 SAME = {"double": 1e-9, "float": 1e-6}  # of a gain, by which entries with one factor may differ: rounding

@@ -22,16 +22,15 @@ from malta.firmware.ring import ring_sources
 from malta.firmware.signals import Target
 from malta.firmware.step import programs_of, started_state, step_function, zero_reference
 from malta.firmware.supervisor_text import supervisor_sources
-from malta.model.plant import position_in
+from malta.model.plant import FloatArray, position_in
 from malta.simulation import references
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
+from malta.synthesis.controller import Controller
 from malta.synthesis.schedule import SCHEDULED
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
     from malta.proof.margin import Margin
-    from malta.synthesis.controller import Controller
 
 
 # Instructions on the longest path of a compiled function, at most: a bound for the time of the supervised step.

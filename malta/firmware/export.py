@@ -37,12 +37,11 @@ from malta.firmware.signals import (
 )
 from malta.firmware.step import programs_of
 from malta.firmware.supervisor import JUMP, MOST_RATE, bounds_of, reading_deviations, reference_limits
+from malta.model.plant import FloatArray
 from malta.simulation.period import state_reference
 
 if TYPE_CHECKING:
     import jinja2
-
-    from malta.model.plant import FloatArray
 
 MOST_POINTS = 65_535  # of a table of v0(z)
 FUSED = ("sense", "decide", "state_at")  # functions that a step consists of; the others are its pieces

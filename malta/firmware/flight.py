@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -29,7 +29,7 @@ from malta.firmware.signals import (
     state_fields,
 )
 from malta.firmware.step import programs_of
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.engine.compiled import library
 from malta.simulation.engine.engines import Engine, evaluate, substeps_until
 from malta.simulation.layout import (
@@ -45,12 +45,8 @@ from malta.simulation.layout import (
 from malta.simulation.period import Period, period_of
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import Prepared, sensor_errors_of
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-    from malta.simulation.trajectory import Trajectory
-
 
 # The exported C, compiled on this computer and called from Python: `--controller c`, and tests.
 

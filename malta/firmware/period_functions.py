@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import nullcontext
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -29,6 +29,7 @@ from malta.firmware.signals import (
     state_fields,
 )
 from malta.model.equations import note, recorded_equations, recorded_look_ups
+from malta.model.plant import FloatArray
 from malta.simulation.current_control import control_currents
 from malta.simulation.layout import Loop, Signals, electronics_of, numbers_of
 from malta.simulation.period import law_reference, limited_currents, state_reference
@@ -42,9 +43,6 @@ from malta.synthesis.controller import (
     sum_errors,
 )
 from malta.synthesis.schedule import interpolate
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 FAR = 1e3  # times the reach of a reading: what a filter may expect in its place, which supervisors call astray before
 LINK_RANGE = (0.05, 4.0)  # readings of the link's voltage that are believed, in multiples of the nominal one

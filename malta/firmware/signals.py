@@ -15,13 +15,12 @@ from malta.errors import InputError
 from malta.firmware.program import Precision
 from malta.model.data import plant_of
 from malta.model.equations import LookUp, recorded_look_ups
-from malta.model.plant import Plant, Signal, readonly
+from malta.model.plant import FloatArray, Plant, Signal, readonly
 from malta.simulation.layout import Fidelity, Setup, electronics_of, fidelities
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
     from malta.margins.tuned_gains import GainBox
-    from malta.model.plant import FloatArray
 
 
 SLOW = 0.1  # share that a state changes by in a sample without anything added, at most: it is then a sum

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -31,14 +31,10 @@ from malta.firmware.signals import (
     reading_ranges,
     used_clearances,
 )
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import noise_input
 from malta.synthesis.riccati import dare, eigenvalues, sample
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # Of the process noise's variance, for a filter that does without a sensor. For none at all the Kalman filter is the one
 # of least gain that is stable: two unstable modes seen by one sensor take large gains, which noise and errors grow by.

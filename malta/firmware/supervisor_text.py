@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -58,14 +58,11 @@ from malta.firmware.supervisor import (
     reference_limits,
     stars_of,
 )
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.engine.compiled import compiler
+from malta.simulation.engine.engines import Engine
 from malta.simulation.layout import electronics_of
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
-    from malta.simulation.engine.engines import Engine
-    from malta.simulation.simulate import Prepared
-
+from malta.simulation.simulate import Prepared
 
 SHORTEST = 20.0  # samples in which a reference stops at least
 QUICK = 40.0  # samples in which an acceleration fades that the next state does not have

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -43,15 +43,12 @@ from malta.firmware.supervisor import (
     monitors_of,
     reference_limits,
 )
+from malta.model.plant import FloatArray
 from malta.simulation import references
 from malta.simulation.inputs import motion_of
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-    from malta.simulation.trajectory import Trajectory
-
+from malta.simulation.trajectory import Trajectory
 
 SAMPLES = 60  # of each vector
 STROKE = 0.02  # of the travel, at most

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import math
 import operator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from malta.model.data import plant_of
 from malta.model.equations import note
-from malta.model.plant import Actuator
+from malta.model.plant import Actuator, FloatArray
 from malta.model.signals import Drive
 from malta.simulation.layout import Loop, Setup, Signals
 from malta.synthesis.controller import Add
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # Half-bridges on a DC link: voltages and duty cycles within their limits, star points, the link voltage.
 

@@ -30,7 +30,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -38,7 +38,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.machines import FINE
-from malta.model.plant import Plant, Signal
+from malta.model.plant import FloatArray, Plant, Signal
 from malta.simulation import references
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import (
@@ -59,10 +59,6 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import EngineOf, simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # Experiments of any machine: hold still, step an output, push.
 #
