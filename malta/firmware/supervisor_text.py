@@ -11,7 +11,6 @@ import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from importlib.metadata import version
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
@@ -19,7 +18,6 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.firmware.ctext import c_number, function_text
-from malta.firmware.export import arithmetic_context, comment, render, sources
 from malta.firmware.flight import (
     EXTRA,
     REALS,
@@ -34,6 +32,7 @@ from malta.firmware.flight import (
 )
 from malta.firmware.program import Precision, Program, build_program, lower
 from malta.firmware.signals import Target, current_readings, input_fields, output_fields
+from malta.firmware.sources import arithmetic_context, head_context, render, sources
 from malta.firmware.supervisor import (
     FLYING,
     JUMP,
@@ -191,13 +190,9 @@ def _context(t: Target, name: str) -> dict[str, Any]:
     c, plant = t.controller, t.believed
     times = TIMES if t.driven else TIMES._replace(offsets=0)
     off = _off_command(t)
-    return {
+    return head_context(t, name) | {
         "tunable": t.tunable,
         "logged": t.logged > 0,
-        "name": name,
-        "NAME": name.upper(),
-        "title": comment(c.name),
-        "version": version("malta"),
         "states": list(STATES),
         "monitors": MONITORS,
         "reactions": REACTIONS,

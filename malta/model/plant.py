@@ -435,6 +435,13 @@ def whole_samples(plant: Plant, Ts: float) -> int:
     return whole
 
 
+def placed(plant: Plant, design: Any) -> Any:
+    """All states as an expression: these first ones of the design model, the others zero. design : a CasADi column"""
+    x = type(design).zeros(len(plant.states))
+    x[list(plant.controlled[: design.numel()])] = design
+    return x
+
+
 def position_in(plant: Plant, x: ArrayLike) -> float:
     """The position along the stroke in a state; 0 for a machine without a stroke."""
     return float(np.asarray(x)[plant.stroke_state]) if plant.has_stroke else 0.0

@@ -18,7 +18,7 @@ from scipy.special import erf
 
 from malta.errors import InputError
 from malta.model.data import plant_of
-from malta.model.plant import FloatArray, Plant, off_stroke, outputs_at, position_in, readonly
+from malta.model.plant import FloatArray, Plant, off_stroke, outputs_at, placed, position_in, readonly
 from malta.simulation import references
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.layout import electronics_of, layout_of, noise_scales
@@ -208,8 +208,7 @@ def _effects(plant: Plant) -> ca.Function:
     kind = ca.MX if plant.tabulated else ca.SX
     chosen = list(plant.controlled)
     controlled = kind.sym("x", len(chosen))
-    x = kind.zeros(len(plant.states))
-    x[chosen] = controlled
+    x = placed(plant, controlled)
     v, w = kind.sym("v", len(plant.inputs)), kind.sym("w", len(plant.disturbances))
     rate = plant.f(x, v, w)[chosen]
     by_v, by_w = (ca.densify(ca.vec(ca.densify(ca.jacobian(rate, u)))) for u in (v, w))

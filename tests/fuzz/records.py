@@ -21,8 +21,8 @@ from malta.campaigns.plan import Plan
 from malta.campaigns.rare import rare_event, read_design_point, write_event
 from malta.campaigns.run import campaign
 from malta.campaigns.store import MANIFEST, block_name, read_plan, seal
-from malta.firmware.ring import LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
 from malta.firmware.signals import Target
+from malta.firmware.sources import LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
 from malta.identification.calibration import Estimate
 from malta.identification.commission import Commissioning, Entry, Finding, read_journal
 from malta.machines.tubular.experiments.strokes import forces_of, record
