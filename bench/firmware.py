@@ -22,10 +22,10 @@ from timing import Result, medians
 import malta
 from malta.firmware.cost import CLOCK, FLAGS, PROCESSORS, Processor, cost_on
 from malta.firmware.ctext import c_name, c_number, function_text, signature
-from malta.firmware.export import sources
-from malta.firmware.period_functions import decide_function, named_function, sense_function
+from malta.firmware.period_functions import decide, named_function, sense
 from malta.firmware.program import Precision, build_program, evaluate, lower
 from malta.firmware.signals import Target, input_fields, reference_fields, state_fields
+from malta.firmware.sources import sources
 from malta.firmware.step import look_up, programs_of, started_state, step_function
 from malta.firmware.vectors import record_vectors
 from malta.synthesis.controller import commanded, estimated, gains_of
@@ -97,7 +97,7 @@ def law_ways(t: Target) -> dict[str, Way]:
 
 def period_ways(t: Target) -> dict[str, Way]:
     """What is read, and all that follows from it to the duty cycles; without the search in the table of v0(z)."""
-    functions = [sense_function(t), decide_function(t)]
+    functions = [sense(t).plain, decide(t).plain]
     read, decided = (own(f, t.precision) for f in functions)
     return {
         "malta": Way(
@@ -264,7 +264,7 @@ def cases(t: Target) -> list[Case]:
     known = readings(t)
     given: dict[str, Any] = {}
     sizes: dict[str, int] = {}
-    for f in (sense_function(t), decide_function(t)):
+    for f in (sense(t).plain, decide(t).plain):
         arguments = [f.name_in(k) for k in range(f.n_in())]
         given |= {f"{f.name()}_{name}": known[name] for name in arguments}
         sizes |= {f"{f.name()}_{f.name_out(k)}": f.size1_out(k) for k in range(f.n_out())}

@@ -29,8 +29,8 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.campaigns.run import campaign as campaign
     from malta.errors import CheckError as CheckError
     from malta.errors import InputError as InputError
-    from malta.firmware.exports import export_c as export_c
-    from malta.firmware.exports import export_fmu as export_fmu
+    from malta.firmware.export import export_c as export_c
+    from malta.firmware.export import export_fmu as export_fmu
     from malta.identification.excite import excite as excite
     from malta.identification.identify import identify as identify
     from malta.identification.learn import learn as learn

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import ctypes
 import shutil
 import subprocess
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 from conftest import ROOT
 
 import malta
-from malta.firmware import report
-from malta.firmware.export import render, root_context
-from malta.firmware.exports import folder_files
+from malta.firmware import export
+from malta.firmware.export import folder_files
+from malta.firmware.flight import Native
 from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of
+from malta.firmware.sources import piece_records, render, root_context
+from malta.firmware.step import programs_of
+from malta.model.plant import FloatArray
 from malta.synthesis.controller import Controller
 
 PRECISIONS: tuple[Precision, ...] = ("double", "float")
@@ -78,7 +84,7 @@ def target(name: str, precision: Precision) -> Target:
 def texts(name: str, precision: Precision) -> dict[str, str]:
     """The files of an export by name, as where no compiler counts what a step costs: that takes seconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "costs", lambda _: [])
+        patch.setattr(export, "costs", lambda _: [])
         return folder_files(target(name, precision), "0" * 64, proof=False)
 
 
@@ -149,3 +155,20 @@ def run_test(
 ) -> subprocess.CompletedProcess[str]:
     """What the program of a folder prints on a processor."""
     return run([*p.runner, str(build(p, folder, *flags, main=main))], folder)
+
+
+def call_piece(
+    native: Native, piece: str, given: Mapping[str, FloatArray], sizes: Mapping[str, int]
+) -> dict[str, Any]:
+    """Call a piece of compiled C with vectors; the results by name. sizes : of the results"""
+    results = {name: np.zeros(size, dtype=native.target.real) for name, size in sizes.items()}
+    vectors = [np.ascontiguousarray(value, dtype=native.target.real) for value in given.values()]
+    function = getattr(native.lib, f"{native.name}_{piece}")
+    if piece_records(programs_of(native.target)[piece]):  # of nothing but these arrays, in this order
+        both = [np.concatenate(vectors), np.concatenate(list(results.values()))]
+        function(*(v.ctypes.data_as(ctypes.c_void_p) for v in both))
+        ends = np.cumsum([v.size for v in results.values()])[:-1]
+        return dict(zip(results, np.split(both[1], ends), strict=True))
+    # The C has no arguments without entries.
+    function(*(v.ctypes.data_as(ctypes.c_void_p) for v in (*vectors, *results.values()) if v.size))
+    return results

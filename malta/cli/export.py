@@ -94,7 +94,7 @@ def export(
     Example:  malta export design/gains/robust.json --precision float
               malta export design/gains/robust.json --to fmu --part loop --fmi 3
     """
-    from malta.firmware.exports import export_c, export_fmu
+    from malta.firmware.export import export_c, export_fmu
 
     _require_known(to, precision, until, part, fmi, platforms, clock)
     for option, given in (("--excitation", excitation), ("--log", log)):
@@ -159,7 +159,7 @@ def _require_known(
     clock: str | None,
 ) -> None:
     """Raise InputError for an option with a value that there is not, or that the form does not have."""
-    from malta.firmware.exports import Until
+    from malta.firmware.export import Until
     from malta.firmware.fmu import Part
     from malta.firmware.program import Precision
 

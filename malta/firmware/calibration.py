@@ -11,22 +11,18 @@ from __future__ import annotations
 import math
 import textwrap
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.firmware.ctext import c_number
-from malta.firmware.program import TYPES
+from malta.firmware.ctext import c_number, c_numbers
 from malta.firmware.signals import Field, Target
 from malta.firmware.supervisor import Monitor, monitors_of, reference_limits
-from malta.model.plant import Signal
+from malta.model.plant import FloatArray, Signal
 from malta.synthesis.controller import gains_of
 from malta.units import unit_factor
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 SCATTER = 0.1  # share of each gain by which it may differ, either way
 SAME = {"double": 1e-9, "float": 1e-6}  # of a gain, by which entries with one factor may differ: rounding
@@ -80,9 +76,7 @@ def law_fields(t: Target) -> list[Field]:
 
 def law_values(t: Target) -> dict[str, Any]:
     """Their numbers by name, in the precision of the target."""
-    return {
-        p.field.name: p.values.astype(TYPES[t.precision]) for p in parameters_of(t) if p.field.name in LAW
-    }
+    return {p.field.name: p.values.astype(t.real) for p in parameters_of(t) if p.field.name in LAW}
 
 
 def counts_of(t: Target) -> list[int]:
@@ -225,7 +219,7 @@ def monitor_titles(rows: tuple[Monitor, ...]) -> list[str]:
 
 def checksum_of(t: Target) -> int:
     """FNV-1a over the bytes of all numbers of the default record, the lowest byte of each first."""
-    real = TYPES[t.precision]
+    real = t.real
     data = b"".join(p.values.astype(np.dtype(real).newbyteorder("<")).tobytes() for p in parameters_of(t))
     data += np.array(counts_of(t), dtype="<i4").tobytes()
     found = FNV_START
@@ -238,10 +232,10 @@ def parameter_context(t: Target) -> dict[str, Any]:
     """What the templates are filled with for a target that is tunable; `tunable` alone for one that is not."""
     if not t.tunable:
         return {"tunable": False}
-    real = TYPES[t.precision]
+    real = t.real
 
     def numbers(values: FloatArray) -> str:
-        text = ", ".join(c_number(float(v), t.precision) for v in values)
+        text = c_numbers(values, t.precision)
         return textwrap.fill(text, 110, subsequent_indent="    ")
 
     def inside(p: Parameter) -> Any:

@@ -6,32 +6,35 @@ import re
 import shutil
 import subprocess
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from malta.files import scratch_folder
 from malta.firmware.ctext import c_name
-from malta.firmware.export import sources
-from malta.firmware.program import TRUTHS, TYPES
-from malta.firmware.ring import ring_sources
+from malta.firmware.program import TRUTHS
 from malta.firmware.signals import Target
+from malta.firmware.sources import ring_sources, sources
 from malta.firmware.step import programs_of, started_state, step_function, zero_reference
 from malta.firmware.supervisor_text import supervisor_sources
-from malta.model.plant import position_in
+from malta.firmware.vectors import readings_of
+from malta.model.plant import FloatArray, position_in
 from malta.simulation import references
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
+from malta.synthesis.controller import Controller
 from malta.synthesis.schedule import SCHEDULED
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
     from malta.proof.margin import Margin
-    from malta.synthesis.controller import Controller
 
 
 # Instructions on the longest path of a compiled function, at most: a bound for the time of the supervised step.
@@ -137,55 +140,34 @@ def _longest(code: list[Instruction], costs: list[int]) -> int:
 
 def _way(after: Mapping[int, list[int]], costs: list[int], nodes: set[int], start: int) -> int:
     """The dearest way from a node within others; a loop is one node, whose cost is its dearest way round."""
-    ways: dict[int, int] = {}  # from each loop on, by its first node in the order of its group
-    groups = _loops(after, nodes, start)  # the last ones first
-    group_of = {k: n for n, group in enumerate(groups) for k in group}
-    for n, group in enumerate(groups):
+    edges = [(k, j) for k in nodes for j in after[k] if j in nodes]
+    ends = np.array(edges, dtype=int).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(edges)), ends), shape=(max(nodes) + 1,) * 2).tocsr()
+    reached = set(breadth_first_order(graph, start, return_predecessors=False).tolist())
+    group_of = connected_components(graph, connection="strong")[1].tolist()
+    groups: dict[int, set[int]] = {}
+    for k in reached:
+        groups.setdefault(group_of[k], set()).add(k)
+    onward = {
+        n: {group_of[j] for k in group for j in after[k] if j in reached} - {n} for n, group in groups.items()
+    }
+    ways: dict[int, int] = {}  # from each loop on
+    for n in TopologicalSorter(onward).static_order():  # the last ones first
+        group = groups[n]
         if len(group) == 1:
             own = costs[min(group)]
         else:
             first = start if start in group else min(j for k in nodes - group for j in after[k] if j in group)
             inside = {k: [j for j in after[k] if j in group and j != first] for k in group}
             own = _way(inside, costs, group, first)
-        onward = {group_of[j] for k in group for j in after[k] if j in group_of and group_of[j] != n}
-        ways[n] = own + max((ways[m] for m in onward), default=0)
+        ways[n] = own + max((ways[m] for m in onward[n]), default=0)
     return ways[group_of[start]]
-
-
-def _loops(after: Mapping[int, list[int]], nodes: Iterable[int], start: int) -> list[set[int]]:
-    """The strongly connected groups that a node reaches, each behind those that it leads to (Tarjan 1972)."""
-    allowed = set(nodes)
-    number: dict[int, int] = {start: 0}
-    low, path, found = {start: 0}, [start], []
-    work = [(start, iter([j for j in after[start] if j in allowed]))]
-    on_path = {start}
-    while work:
-        k, onward = work[-1]
-        j = next(onward, None)
-        if j is None:
-            work.pop()
-            if work:
-                low[work[-1][0]] = min(low[work[-1][0]], low[k])
-            if low[k] == number[k]:
-                group = set()
-                while k not in group:
-                    group.add(path.pop())
-                found.append(group)
-                on_path -= group
-        elif j not in number:
-            number[j] = low[j] = len(number)
-            path.append(j)
-            on_path.add(j)
-            work.append((j, iter([i for i in after[j] if i in allowed])))
-        elif j in on_path:
-            low[k] = min(low[k], number[j])
-    return found
 
 
 # What single precision does to a controller: its coefficients, its margin, and the noise of its rounding.
 
 
-SAMPLES = 200  # over which the noise of rounding is measured
+ROUNDED = 200  # samples over which the noise of rounding is measured
 
 
 class RoundingNoise(NamedTuple):
@@ -222,24 +204,19 @@ def rounding_noise(t: Target) -> RoundingNoise:
     Both precisions take the readings of one flight; what their forces differ by is the rounding.
     """
     c, plant = t.controller, t.believed
-    lasts = SAMPLES * c.sample_time
+    lasts = ROUNDED * c.sample_time
     fidelity: Any = t.fidelity if t.driven else "force"
     run = simulate(plant, c, Scenario("hold", lasts, references.hold, noise=1.0, fidelity=fidelity))
+    read = readings_of(t, run)
+    if t.excited:
+        read["excitation"] = np.zeros_like(read["excitation"])
     forces = {}
     for precision in ("double", "float"):
         own = replace(t, precision=precision)
         step, reference = step_function(own), zero_reference(own)
-        real = TYPES[own.precision]
-        state = started_state(own, reference)
-        rows = []
+        state, rows = started_state(own, reference), []
         for k in range(len(run.t)):
-            readings: dict[str, Any] = {"y": run.y[k].astype(real), "y_valid": np.ones(len(plant.outputs))}
-            if t.driven:
-                i = run.i_phase if t.fidelity == "phase" else run.i
-                readings |= {"i": i[k], "i_valid": np.ones(i.shape[1]), "link": run.link[k]}
-            if t.excited:
-                readings["excitation"] = np.zeros(len(plant.inputs))
-            state, out = step(state, reference, readings)
+            state, out = step(state, reference, {name: column[k] for name, column in read.items()})
             rows.append(out["v"].astype(float))
         forces[precision] = np.array(rows)
     apart = forces["float"] - forces["double"]
@@ -320,51 +297,65 @@ def costs(t: Target) -> list[Cost]:
 
 def cost_on(p: Processor, files: Mapping[str, str], straight: Mapping[str, str], name: str) -> Cost | None:
     """The cost on one processor; None without its compiler. straight : the same controller, its loops written out"""
-    tools = [shutil.which(p.prefix + tool) for tool in ("gcc", "size", "objdump")]
-    if any(tool is None for tool in tools):
+    if any(shutil.which(p.prefix + tool) is None for tool in ("gcc", "size", "objdump")):
         return None
-    gcc, size, objdump = map(str, tools)
-    with scratch_folder() as folder:
-        for file, text in files.items():
-            (folder / file).write_text(text, encoding="utf-8")
-        # A loop's instructions are executed several times: they are counted where it is written out.
-        counted = "straight" if straight != files else name
-        (folder / f"{counted}.c").write_text(straight[f"{name}.c"], encoding="utf-8")
-        (folder / "state.c").write_text(
-            f'#include "{name}.h"\nconst char state_bytes[sizeof({name}_state)] = {{0}};\n', encoding="utf-8"
-        )
-        for file in dict.fromkeys((f"{name}.c", f"{counted}.c", "state.c")):
-            command = [gcc, *FLAGS, *p.options, "-fstack-usage", "-c", file]
-            if _run(command, folder) is None:
+    # A loop's instructions are executed several times: they are counted where it is written out.
+    counted = "straight" if straight != files else name
+    state = f'#include "{name}.h"\nconst char state_bytes[sizeof({name}_state)] = {{0}};\n'
+    more = {f"{counted}.c": straight[f"{name}.c"], "state.c": state}
+    with _written({**files, **more}) as folder:
+        for file in dict.fromkeys((name, counted, "state")):
+            if _compiled(p, folder, file, "-fstack-usage") is None:
                 return None
-        sizes = (_run([size, f"{name}.o"], folder) or "").splitlines()[-1].split()
-        state = (_run([size, "state.o"], folder) or "").splitlines()[-1].split()
-        listing = _run([objdump, "-d", "--no-show-raw-insn", f"{counted}.o"], folder) or ""
-        supervised = _supervised(p, files, name, folder)
+        sizes, (bytes_of_state, *_) = (
+            (_run([f"{p.prefix}size", f"{of}.o"], folder) or "").splitlines()[-1].split()
+            for of in (name, "state")
+        )
+        listing = _run([f"{p.prefix}objdump", "-d", "--no-show-raw-insn", f"{counted}.o"], folder) or ""
+        apart = {f"{of}.c": _listing(p, folder, of) for of in (name, f"{name}_supervisor")}
         stacks = _stacks((folder / f"{name}.su").read_text(encoding="utf-8"))
-    own = {f"{name}_{function}" for function in STEP} | {"look_up"}
-    lines = _instructions(listing, lambda function: function in own or function.startswith(_blocks(name)))
+    supervised = 0
+    if None not in apart.values():
+        listings = {file: str(text) for file, text in apart.items()}
+        supervised = longest_path(listings, files, f"{name}_supervisor_step")
+    own = {*(f"{name}_{function}" for function in STEP), "look_up"}
+    blocks = tuple(f"{name}_{function}_" for function in STEP if function != "step")
+    code = [
+        instruction.text
+        for function, instructions in _functions_of(listing, []).items()
+        if function.split(".")[0] in own or function.startswith(blocks)
+        for instruction in instructions
+    ]
     return Cost(
         p.name,
         int(sizes[0]),
         int(sizes[1]) + int(sizes[2]),
-        int(state[0]),
+        int(bytes_of_state),
         _deepest(stacks, name),
-        len(lines),
-        sum("__aeabi_" in line for line in lines),
+        len(code),
+        sum("__aeabi_" in text for text in code),
         supervised,
     )
 
 
-def _supervised(p: Processor, files: Mapping[str, str], name: str, folder: Path) -> int:
-    """The instructions on the longest path of the supervisor's step; 0 where a tool fails."""
-    listings = {}
-    for file in (f"{name}.c", f"{name}_supervisor.c"):
-        listed = Path(file).with_suffix(".apart").name
-        if _run([f"{p.prefix}gcc", *FLAGS, *APART, *p.options, "-c", file, "-o", listed], folder) is None:
-            return 0
-        listings[file] = _run([f"{p.prefix}objdump", *LISTING, listed], folder) or ""
-    return longest_path(listings, files, f"{name}_supervisor_step")
+@contextmanager
+def _written(files: Mapping[str, str]) -> Iterator[Path]:
+    """A folder with these files."""
+    with scratch_folder() as folder:
+        for file, text in files.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        yield folder
+
+
+def _compiled(p: Processor, folder: Path, name: str, *options: str) -> str | None:
+    """Compile NAME.c to NAME.o; None where that fails."""
+    return _run([f"{p.prefix}gcc", *FLAGS, *options, *p.options, "-c", f"{name}.c"], folder)
+
+
+def _listing(p: Processor, folder: Path, name: str) -> str | None:
+    """The instructions of NAME.c with its lines, each function apart; None where a tool fails."""
+    done = _compiled(p, folder, name, *APART, "-o", f"{name}.apart")
+    return None if done is None else _run([f"{p.prefix}objdump", *LISTING, f"{name}.apart"], folder)
 
 
 SELDOM = (
@@ -388,23 +379,14 @@ def log_costs(t: Target) -> list[LogCost]:
     files = sources(t, "", name) | ring_sources(t, "", name)
     file, found = f"{name}_log.c", []
     for p in PROCESSORS:
-        with scratch_folder() as folder:
-            for one, text in files.items():
-                (folder / one).write_text(text, encoding="utf-8")
-            command = [f"{p.prefix}gcc", *FLAGS, *APART, *p.options, "-c", file, "-o", "log.o"]
-            done = _run(command, folder)
-            listing = None if done is None else _run([f"{p.prefix}objdump", *LISTING, "log.o"], folder)
+        with _written(files) as folder:
+            listing = _listing(p, folder, f"{name}_log")
         if listing is not None:
             own = [f"{name}_log_sample", f"{name}_log_keep"]
             most = sum(1 + longest_path({file: listing}, files, part) for part in own)  # 1: the call
             seldom = sum(longest_path({file: listing}, files, part) for part in SELDOM)
             found.append(LogCost(p.name, most - seldom, most))
     return found
-
-
-def _blocks(name: str) -> tuple[str, ...]:
-    """How the names of the functions of a step's blocks begin."""
-    return tuple(f"{name}_{function}_" for function in STEP if function != "step")
 
 
 def _deepest(stacks: Mapping[str, int], name: str) -> int:
@@ -433,16 +415,4 @@ def _stacks(usage: str) -> dict[str, int]:
     for line in usage.splitlines():
         where, count, *_ = line.split("\t")
         found[where.rpartition(":")[2]] = int(count)
-    return found
-
-
-def _instructions(listing: str, is_own: Callable[[str], bool]) -> list[str]:
-    """The instructions of a step's functions in objdump's listing."""
-    found, inside = [], False
-    for line in listing.splitlines():
-        head = re.match(r"^[0-9a-f]+ <([^>]+)>:$", line)
-        if head:
-            inside = is_own(head[1].split(".")[0])
-        elif inside and re.match(r"^\s+[0-9a-f]+:\s+[a-z]", line) and ".word" not in line:
-            found.append(line)
     return found

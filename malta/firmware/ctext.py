@@ -59,6 +59,11 @@ def c_number(value: float, precision: Precision) -> str:
     return _with_point(repr(float(value)))
 
 
+def c_numbers(values: Any, precision: Precision) -> str:
+    """Numbers as C reads them, with commas between them."""
+    return ", ".join(c_number(float(value), precision) for value in np.ravel(values))
+
+
 def _with_point(text: str) -> str:
     return text if any(mark in text for mark in ".e") else f"{text}.0"
 
@@ -67,8 +72,7 @@ def signature(p: Program, prefix: str) -> str:
     """The declaration of a program's function, without its end."""
     takes = [f"const {prefix}_real {name}[{size}]" for name, size in p.arguments if size]
     gives = [f"{prefix}_real {name}[{size}]" for name, size in p.results if size]
-    text = f"void {prefix}_{p.name}({', '.join([*takes, *gives])})"
-    return "\n".join(textwrap.wrap(text, 118, subsequent_indent="    ", break_long_words=False))
+    return _wrapped(f"void {prefix}_{p.name}({', '.join([*takes, *gives])})")
 
 
 def function_text(p: Program, prefix: str, precision: Precision, *, static: bool = False) -> str:
@@ -501,8 +505,7 @@ def _stage_call(w: _Writer, stage: Stage, body: _Body) -> str:
 
 def _comment(stage: Stage) -> str:
     part = f" (part {stage.part})" if stage.part else ""
-    text = f"/* {stage.block.equation}{part} */"
-    return "\n".join(textwrap.wrap(text, 118, subsequent_indent="   ", break_long_words=False))
+    return _wrapped(f"/* {stage.block.equation}{part} */", "   ")
 
 
 def _record(w: _Writer) -> list[str]:
@@ -519,5 +522,5 @@ def _record(w: _Writer) -> list[str]:
     ]
 
 
-def _wrapped(text: str) -> str:
-    return "\n".join(textwrap.wrap(text, 118, subsequent_indent="    ", break_long_words=False))
+def _wrapped(text: str, indent: str = "    ") -> str:
+    return "\n".join(textwrap.wrap(text, 118, subsequent_indent=indent, break_long_words=False))

@@ -1,435 +1,620 @@
-"""The exported folder: C of the controller, its test, build files, an example and a report, from jinja2 templates."""
+"""What `malta export` writes: a gain file's controller as a folder of C, or a part of its loop as an FMU."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cache
-from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
 
-import casadi as ca
 import numpy as np
 
-from malta.firmware.blocks import unrolled
-from malta.firmware.calibration import counts_of, gain_lines, law_fields, parameter_context, parameters_of
-from malta.firmware.ctext import (
-    APART,
-    Place,
-    array_place,
-    blocks_call,
-    blocks_signature,
-    blocks_text,
-    c_name,
-    c_number,
-    function_text,
-    member_place,
+from malta.errors import InputError
+from malta.files import file_exists, locate, replace_files
+from malta.firmware.calibration import (
+    FNV_FACTOR,
+    FNV_START,
+    LEAST,
+    Parameter,
+    counts_of,
+    gain_lines,
+    monitor_titles,
+    parameters_of,
 )
-from malta.firmware.period_functions import table_size
-from malta.firmware.program import TYPES, Precision, Program, build_program, lower
+from malta.firmware.cost import (
+    CLOCK,
+    PROCESSORS,
+    ROUNDED,
+    Cost,
+    costs,
+    log_costs,
+    operations,
+    rounded,
+    rounded_margin,
+    rounding_noise,
+    smallest_error,
+)
+from malta.firmware.ctext import c_name, c_number
+from malta.firmware.fmu import Part, build_fmu
+from malta.firmware.period_functions import LINK_RANGE
+from malta.firmware.program import Precision
 from malta.firmware.signals import (
     Field,
     Target,
+    current_readings,
+    fidelity_of,
     input_fields,
     output_fields,
-    place_of_readings,
+    reading_ranges,
     reference_fields,
     state_fields,
 )
+from malta.firmware.sources import (
+    RISES,
+    comment,
+    example_stroke,
+    render,
+    ring_of,
+    ring_sources,
+    sources,
+    stand_in_context,
+    template_context,
+)
 from malta.firmware.step import programs_of
-from malta.firmware.supervisor import JUMP, MOST_RATE, bounds_of, reading_deviations, reference_limits
-from malta.simulation.period import state_reference
+from malta.firmware.supervisor import (
+    MONITORS,
+    STATES,
+    TIMES,
+    ReferenceLimits,
+    monitors_of,
+    reference_limits,
+)
+from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
+from malta.firmware.vectors import SAMPLES, Vector, record_vectors, trial_context, watch_lines
+from malta.gains.file import content_of, read
+from malta.model.data import plant_of
+from malta.model.parameters import box_words
+from malta.proof.uncertain import positive
+from malta.simulation.layout import Fidelity
+from malta.synthesis.controller import Controller
 
-if TYPE_CHECKING:
-    import jinja2
+# ASAP2 description (1.7) of a tunable controller: its parameters as CHARACTERISTIC, what it commands as MEASUREMENT.
+#
+# Addresses are symbol links with offsets: the parameters are those of <name>_default_parameters, the measurements
+# those of the variables `out` and `supervisor` of the program, as in <name>_example.c. A linker's map makes them
+# numbers.
 
-    from malta.model.plant import FloatArray
 
-MOST_POINTS = 65_535  # of a table of v0(z)
-FUSED = ("sense", "decide", "state_at")  # functions that a step consists of; the others are its pieces
-MOST_PARAMETERS = 6  # of a function
-LONGEST_RISE = 1000.0  # s, of a stroke
-RISES = 6.0  # times its rise that a stroke lasts: a logistic one is then within 2e-6 of its ends
-MOST_SAMPLES = 1e9  # of a stroke: twice their number is an int32_t
-DIVISOR, DIVIDENDS = 7.0, (9.0, 13.0, 18.0)  # of quotients that a reciprocal rounds otherwise
-WORDS = {
-    "double": "Double precision: the numbers of the simulation.",
-    "float": "Single precision: sums keep what rounding takes from them.",
+WIDE = 1e12  # of a measurement without a limit
+WHOLE = 4  # bytes of an int32_t
+
+
+class Entry(NamedTuple):
+    """A number in the target's memory."""
+
+    name: str
+    meaning: str
+    unit: str
+    factor: float  # the number times this is in the unit
+    low: float  # in the unit
+    high: float
+    symbol: str
+    offset: int  # bytes
+    kind: str = "REAL"  # or LONG, ULONG
+    table: str = ""  # words for its values
+
+
+def a2l_text(t: Target, name: str) -> str:
+    """The text of <name>.a2l. name : the controller's, as a C identifier"""
+    entries = list(_parameters(t, name))
+    measured = [*_outputs(t), *_supervision()]
+    known = dict.fromkeys((e.unit, e.factor) for e in (*entries, *measured) if not e.table)
+    methods = {key: f"conversion_{k}" for k, key in enumerate(known, 1)}
+    return render(
+        "parameters.a2l",
+        {
+            "name": name,
+            "title": comment(t.controller.name).replace('"', "'"),
+            "real": "FLOAT64_IEEE" if t.precision == "double" else "FLOAT32_IEEE",
+            "methods": [
+                {"name": title, "unit": unit, "factor": repr(factor)}
+                for (unit, factor), title in methods.items()
+            ],
+            "characteristics": [_shown(e, methods) for e in entries],
+            "measurements": [_shown(e, methods) for e in measured],
+            "states": list(enumerate(STATES)),
+            "monitors": [(-1, "NONE"), *enumerate(MONITORS)],
+        },
+    )
+
+
+def _shown(e: Entry, methods: dict[tuple[str, float], str]) -> dict[str, Any]:
+    return e._asdict() | {
+        "meaning": comment(e.meaning).replace('"', "'"),
+        "method": e.table or methods[e.unit, e.factor],
+        "low": repr(float(e.low)),
+        "high": repr(float(e.high)),
+    }
+
+
+def _labels(field: Field) -> list[str]:
+    """A name for each number of a field, which is a C identifier."""
+    if field.size == 1 and not field.signals[0].name:
+        return [field.name]
+    labels = [f"{field.name}.{c_name(s.name.replace('*', ''))}" for s in field.signals]
+    if len(set(labels)) < len(labels):
+        return [f"{field.name}.entry_{k}" for k in range(field.size)]
+    return labels
+
+
+def _parameters(t: Target, name: str) -> Iterator[Entry]:
+    """The record of parameters, in its order."""
+    symbol, at = f"{name}_default_parameters", 0
+    for p in parameters_of(t):
+        factor, own = p.shown or (1.0, "")
+        ranges = np.stack([p.least, p.most]) * factor
+        for label, signal, low, high in zip(_labels(p.field), p.field.signals, *ranges, strict=True):
+            unit = own or ("" if signal.unit in ("SI", "1") else signal.unit)
+            yield Entry(label, p.field.meaning, unit, factor, low, high, symbol, at)
+            at += t.real_bytes
+    for title, most in zip(monitor_titles(monitors_of(t)), counts_of(t), strict=True):
+        words = "samples in a row until a monitor acts"
+        yield Entry(f"samples.{c_name(title)}", words, "", 1.0, 1, most, symbol, at, "LONG")
+        at += WHOLE
+    words = f"FNV-1a, from 0x{FNV_START:08x}, over the bytes of the record before it"
+    yield Entry("checksum", words, "", 1.0, 0, 2**32 - 1, symbol, at, "ULONG")
+
+
+def _outputs(t: Target) -> Iterator[Entry]:
+    """What a step commands and estimates."""
+    c, at = t.controller, 0
+    most = {
+        "y_used": reading_ranges(t.believed),
+        "v": np.asarray(c.limits.force, dtype=float),
+        "current": np.broadcast_to(c.limits.current, len(t.believed.actuator.coils)),
+    }
+    for field in output_fields(t):
+        limits = np.minimum(most.get(field.name, np.full(field.size, WIDE)), WIDE)
+        for label, signal, limit in zip(_labels(field), field.signals, limits, strict=True):
+            unit = "" if signal.unit in ("SI", "1") else signal.unit
+            is_share = field.name in ("refused", "saturated", "met")
+            low, high = (0.0, 1.0) if is_share else (-limit, limit)
+            yield Entry(label, field.meaning, unit, 1.0, low, high, "out", at)
+            at += t.real_bytes
+
+
+def _supervision() -> Iterator[Entry]:
+    """What a supervisor says; its record begins with its times."""
+    at = WHOLE * len(TIMES)
+    tables = {"state": "state_names", "enable": "", "monitor": "monitor_names", "reaction": ""}
+    for k, (key, table) in enumerate(tables.items()):
+        low, high = (-1, len(MONITORS)) if key == "monitor" else (0, len(STATES))
+        words = "of the supervisor"
+        yield Entry(
+            f"supervisor.{key}", words, "", 1.0, low, high, "supervisor", at + WHOLE * k, "LONG", table
+        )
+
+
+# The exported folder: the controller's C, its test with recorded vectors, build files, an example and a report.
+
+
+EXAMPLE_SAMPLES = 10_000  # of the example's main program, beside its stroke
+
+
+def folder_files(
+    t: Target,
+    sha256: str,
+    uncertainty: Mapping[str, float] | None = None,
+    *,
+    proof: bool = True,
+    clock: float | None = None,
+) -> dict[str, str]:
+    """Every file of an export by its name.
+
+    sha256 : of the gain file
+    uncertainty : of the gain file's margin; proof : whether the report proves it again with rounded coefficients
+    clock : Hz, of the processor that the report thinks of; None: that of the paper
+
+        files = folder_files(Target(controller, "float"), sha256)
+    """
+    name = c_name(t.controller.name)
+    files = sources(t, sha256, name) | supervisor_sources(t, name) | ring_sources(t, sha256, name)
+    c_files = [file for file in files if file.endswith(".c")]
+    context = template_context(t, programs_of(t), name, sha256) | {
+        "objects": " ".join(file.removesuffix(".c") + ".o" for file in c_files),
+        "c_files": " ".join(c_files),
+        "driven": t.driven,
+        "logged": t.logged > 0,
+        "currents": len(current_readings(t)) if t.driven else 0,
+        **stand_in_context(t, name),
+        **_example_context(t),
+    }
+    tested = context | _test_context(t)
+    files |= {
+        f"{name}_test.c": render("test.c", tested | trial_context(t, name)),
+        f"{name}_pil.c": render("pil.c", tested),
+        f"{name}_example.c": render("example.c", context),
+        "Makefile": render("Makefile", context),
+        "CMakeLists.txt": render("CMakeLists.txt", context),
+    }
+    context["monitors"] = monitor_lines(t)
+    if t.tunable:
+        files[f"{name}.a2l"] = a2l_text(t, name)
+    report = report_text(t, context, list(files), dict(uncertainty or {}), proof=proof, clock=clock)
+    return files | {"REPORT.md": report}
+
+
+def _example_context(t: Target) -> dict[str, Any]:
+    """How long the example runs, and its stroke."""
+    if not (t.believed.has_stroke and t.believed.travel > 0):
+        return {"example_samples": EXAMPLE_SAMPLES}
+    end, rise = example_stroke(t)
+    return {
+        "example_samples": EXAMPLE_SAMPLES + math.ceil(RISES * rise / t.controller.sample_time),
+        "example_end": c_number(end, t.precision),
+        "example_rise": c_number(rise, t.precision),
+    }
+
+
+def _test_context(t: Target) -> dict[str, Any]:
+    """What the template of the test is filled with."""
+    vectors = record_vectors(t)
+    return {
+        "samples": SAMPLES,
+        "real_bytes": t.real_bytes,
+        "word": "uint64_t" if t.precision == "double" else "uint32_t",
+        "readings": vectors[0].readings.shape[1],
+        "answers": vectors[0].expected.shape[1],
+        "last": "commands" if t.driven or t.has_set_points else "currents",
+        "last_field": "command" if t.driven or t.has_set_points else "current",
+        "fnv_start": FNV_START,
+        "fnv_factor": FNV_FACTOR,
+        "reference_all": reference_fields(t),
+        "input_all": input_fields(t),
+        "output_all": _filled(output_fields(t)),
+        "state_all": _filled(state_fields(t)),
+        "vectors": [_vector_text(v, t.precision) for v in vectors],
+    }
+
+
+def _filled(fields: list[Field]) -> list[Field]:
+    return [field for field in fields if field.size]
+
+
+def _vector_text(v: Vector, precision: Precision) -> dict[str, Any]:
+    """A vector's numbers as C."""
+
+    def rows(values: Any) -> str:
+        lines = ["{" + ", ".join(_number(x, precision) for x in row) + "}" for row in values]
+        return ",\n".join(lines)
+
+    sums = [f"0x{x:08x}u" for x in v.checksums]
+    return {
+        "name": v.name,
+        "warm": int(v.warm),
+        "readings": rows(v.readings),
+        "answers": rows(v.expected),
+        "checksums": ",\n".join(", ".join(sums[k : k + 10]) for k in range(0, len(sums), 10)),
+    }
+
+
+def _number(value: Any, precision: Precision) -> str:
+    """A number as C, also one that is not finite."""
+    kind = "double" if precision == "double" else "float"
+    if math.isnan(value):
+        return f"({kind})NAN"
+    if math.isinf(value):
+        return f"({kind})INFINITY" if value > 0 else f"-({kind})INFINITY"
+    return c_number(float(np.float32(value)) if precision == "float" else float(value), precision)
+
+
+# REPORT.md of an exported folder: what a step costs, what rounding does, and the margin that is left.
+
+
+# MISRA C:2012 of the exported C: the rules that it deviates from, each with its reason.
+#
+# cppcheck and its MISRA addon find no other rule; directives, and rules that cppcheck does not look at, are not
+# covered.
+
+
+class Deviation(NamedTuple):
+    """A rule that files deviate from."""
+
+    rule: str
+    files: str  # whose names end so
+    reason: str
+
+
+DEVIATIONS = (
+    Deviation("2.5", ".h", "macros of the interface are for the caller: a program need not use all of them"),
+    Deviation("8.7", "_supervisor.c", "the caller too uses the table of monitors and the initialization"),
+    Deviation("21.6", "_test.c", "the test prints its verdict; the controller has no output of its own"),
+    Deviation("21.6", "_pil.c", "a PC has its port in the standard streams; a target defines NAME_PIL_PORT"),
+    Deviation("21.15", "_pil.c", "memcpy between numbers and words: the line carries bits"),
+    Deviation(
+        "21.15",
+        "_test.c",
+        "memcpy of numbers into words and records: the test compares bits, and calls pieces with records",
+    ),
+)
+
+
+FILES = {
+    ".h": "names, units and order of all signals; what may be called",
+    ".c": "the controller: one step of the control period",
+    "_parts.c": "its pieces, each usable alone",
+    "_test.c": "recorded vectors",
+    "_pil.c": "a main program that `malta pil` asks over a serial line",
+    "_example.c": "a main program with a timer loop, to be filled with hardware",
+    "Makefile": "build and test with make",
+    "CMakeLists.txt": "the same with CMake",
+    "_supervisor.h": "states, monitors and their reactions",
+    "_supervisor.c": "the supervisor, from current offsets to landing",
+    "_log.h": "a ring buffer of the last samples, with a trigger",
+    "_log.c": "the same",
+    "_parameters.c": "gains, limits, references and monitors that the target may change",
+    ".a2l": "their names, units and ranges for a calibration tool, ASAP2 1.7",
+    "_supervisor_test.c": "a walk through its states",
 }
 
 
-def sources(t: Target, sha256: str, name: str = "", *, loops: bool = True) -> dict[str, str]:
-    """The C files of a controller by name: <name>.h, <name>.c, <name>_parts.c.
+def report_text(
+    t: Target,
+    context: Mapping[str, Any],
+    files: list[str],
+    uncertainty: dict[str, float],
+    *,
+    proof: bool,
+    clock: float | None = None,
+) -> str:
+    """The text of REPORT.md.
 
-    sha256 : of the gain file; name : the controller's own, as a C identifier, by default
-    loops : False writes equal computations one after the other
+    files : names of the folder's files; uncertainty : of the gain file's margin; proof : whether to prove it again;
+        clock : Hz, of the processor; None: CLOCK
     """
-    name = name or c_name(t.controller.name)
-    programs = programs_of(t)
-    if not loops:
-        programs = {key: unrolled(p) for key, p in programs.items()}
-    context = template_context(t, programs, name, sha256)
-    return {
-        f"{name}.h": render("controller.h", context),
-        f"{name}.c": render("controller.c", context),
-        f"{name}_parts.c": render("parts.c", context),
-        **({f"{name}_parameters.c": render("parameters.c", context)} if t.tunable else {}),
-    }
-
-
-def render(template: str, context: Mapping[str, Any]) -> str:
-    """A template with a context; every undefined name is an error. Lines end without blanks."""
-    text = _environment().get_template(template).render(context)
-    return "\n".join(line.rstrip() for line in text.splitlines()) + "\n"
-
-
-@cache
-def _environment() -> jinja2.Environment:
-    import jinja2  # here: who flies a supervisor that is compiled already needs no template
-
-    return jinja2.Environment(
-        loader=jinja2.PackageLoader("malta.firmware"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        autoescape=False,
-    )
-
-
-def template_context(t: Target, programs: Mapping[str, Program], name: str, sha256: str) -> dict[str, Any]:
-    """What the templates of a controller are filled with."""
-    c, plant = t.controller, t.believed
-    return {
-        "name": name,
-        "NAME": name.upper(),
-        "title": comment(c.name),
-        "machine": comment(plant.name),
-        "version": version("malta"),
-        "sha256": sha256,
-        "precision": t.precision,
-        "precision_text": WORDS[t.precision],
-        "period": f"{c.sample_time * 1e6:g} us",
-        "sample_time": c_number(c.sample_time, t.precision),
-        "records": _records(t, name),
-        "state": state_fields(t),
-        "reference": reference_fields(t),
-        "sums": _sums(t),
-        "forces": len(c.forces),
-        "outputs": len(c.measurements),
-        "force_names": comment(" ".join(s.name for s in c.forces)),
-        "link": c_number(plant.drive.link_voltage, t.precision) if t.driven else "",
-        "last_output": _last_output(t),
-        **_function_context(t, programs, name),
-        **_limit_context(t),
-        **_table_context(t),
-        **root_context(t.precision),
-        "arithmetic": arithmetic_context(t.precision),
-        **parameter_context(t),
-        "gain_lines": [comment(line) for line in gain_lines(t)] if t.tunable else [],
-    }
-
-
-def _function_context(t: Target, programs: Mapping[str, Program], name: str) -> dict[str, Any]:
-    """The functions, the calls of those that a step consists of, and the root that they need."""
-    others = {key: p for key, p in programs.items() if key not in FUSED}
-    fused_root, parts_root = (
-        any(o.op == "SQRT" for key in keys for o in programs[key].operations) for keys in (FUSED, others)
-    )
-    fused = step_places(t, name)
-    pieces = {key: piece_places(p, name) for key, p in others.items()}
-    texts = {key: blocks_text(programs[key], fused, name, t.precision, static=True) for key in FUSED}
-    functions = "\n".join(
-        blocks_text(p, pieces[key], name, t.precision, static=False) for key, p in others.items()
-    )
-    return {
-        **texts,
-        "functions": functions,
-        "piece_records": [record for p in others.values() for record in piece_records(p)],
-        "declarations": [blocks_signature(p, pieces[key], name) for key, p in others.items()],
-        "loops": any(APART in text for text in texts.values()),
-        "parts_loops": APART in functions,
-        "root": fused_root,
-        "parts_root": parts_root,
-        **{f"call_{key}": blocks_call(programs[key], fused, name) for key in FUSED},
-    }
-
-
-def step_places(t: Target, name: str) -> dict[str, Place]:
-    """Where the vectors of a step are: in the records of the header; v0 and the table's values are the step's own."""
-    state, given, out = f"{name}_state", f"{name}_inputs", f"{name}_outputs"
-    places = {f.name: member_place(state, "s", f.name) for f in state_fields(t)}
-    places |= {f"{key}_next": place for key, place in places.items()}
-    places |= {f.name: member_place(state, "s", f"reference.{f.name}") for f in reference_fields(t)}
-    places |= {f.name: member_place(given, "in", f.name) for f in input_fields(t)}
-    places |= {f.name: member_place(out, "out", f.name) for f in output_fields(t)}
-    places |= {f.name: member_place(state, "s", f"parameters->{f.name}") for f in law_fields(t)}
-    sizes = {"v0": len(t.controller.forces), "table_at": 2 * len(t.look_ups), "table": table_size(t)}
-    return places | {key: array_place(key, size, name) for key, size in sizes.items()}
-
-
-def piece_places(p: Program, name: str) -> dict[str, Place]:
-    """Where the vectors of a piece are: parameters, or members of two records where these would be too many."""
-    if not piece_records(p):
-        return {key: array_place(key, size, name) for key, size in (*p.arguments, *p.results)}
-    given, found = (f"{name}_{p.name}_{of}" for of in ("given", "found"))
-    return {key: member_place(given, "given", key) for key, _ in p.arguments} | {
-        key: member_place(found, "found", key) for key, _ in p.results
-    }
-
-
-def piece_records(p: Program) -> list[dict[str, Any]]:
-    """The records of a piece with more vectors than a function has parameters; none for most."""
-    vectors = [[(key, size) for key, size in of if size] for of in (p.arguments, p.results)]
-    if len(vectors[0]) + len(vectors[1]) <= MOST_PARAMETERS - bool(p.between):
-        return []
-    return [
-        {"name": f"{p.name}_{of}", "fields": fields}
-        for of, fields in zip(("given", "found"), vectors, strict=True)
-    ]
-
-
-def _limit_context(t: Target) -> dict[str, Any]:
-    """What references, tables and strokes may be."""
-    plant = t.believed
-    stroke = plant.has_stroke and plant.travel > 0
-    longest = min(LONGEST_RISE, MOST_SAMPLES * t.controller.sample_time / RISES)
-    return {
-        "limit_lines": _limit_lines(t),
-        "force_limits": ", ".join(c_number(v, t.precision) for v in _finite(t.controller.limits.force)),
-        "limits": {
-            key: ", ".join(c_number(v, t.precision) for v in values)
-            for key, values in reference_limits(t)._asdict().items()
+    found = costs(t)
+    missing = [p.prefix.rstrip("-") for p in PROCESSORS if p.name not in {c.processor for c in found}]
+    name = context["name"]
+    return render(
+        "REPORT.md",
+        {
+            **context,
+            "file_list": [(f, FILES.get(f.removeprefix(name), "")) for f in sorted(files)],
+            "operations": operations(t),
+            "costs": found,
+            "clock": clock or CLOCK,
+            "sample_seconds": t.controller.sample_time,
+            "missing": f"Not found here, so not counted: {', '.join(missing)}." if missing else "",
+            "rounding_text": _rounding_text(t),
+            "noise": _noise_rows(t),
+            "rounding_samples": ROUNDED,
+            "deviations": DEVIATIONS,
+            "margin_text": _margin_text(t, uncertainty, proof=proof),
+            "link_range": f"{LINK_RANGE[0]:g} to {LINK_RANGE[1]:g} times its nominal value",
+            "ranges": [
+                {"name": comment(s.name), "unit": s.unit, "most": most}
+                for s, most in zip(t.controller.measurements, reading_ranges(t.believed), strict=True)
+            ],
+            "watched": watch_lines(t),
+            **(_tunable_context(t, found) if t.tunable else {}),
+            **(_log_context(t, found) if t.logged else {}),
+            "references": [
+                {"name": comment(s.name), "unit": s.unit, "position": p, "speed": v, "acceleration": a}
+                for s, p, v, a in zip(t.controller.measurements, *reference_limits(t), strict=True)
+            ],
         },
-        "most_points": MOST_POINTS,
-        "most_rate": c_number(MOST_RATE, t.precision),
-        "stroke": stroke,
-        "stroke_output": plant.stroke_output if stroke else 0,
-        "longest_rise": c_number(longest, t.precision),
-        "rises": c_number(RISES, t.precision),
-        "step_z": f"out->y_used[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]",
-        "start_z": f"s->reference.p[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]",
+    )
+
+
+def _tunable_context(t: Target, found: list[Cost]) -> dict[str, Any]:
+    """The section about parameters that the target may change."""
+    plain = {c.processor: c for c in costs(replace(t, tunable=False))}
+    limit = f"{100 * LEAST:g} % of the design's to all of it"
+    words = dict.fromkeys(("force_limit", "current_limit", *ReferenceLimits._fields), limit)
+    words["threshold"] = "0 to those of the table of monitors"
+    return {
+        "tuned": [
+            {"name": p.field.name, "size": p.field.size, "range": words.get(p.field.name, _scatter(p))}
+            for p in parameters_of(t)
+        ],
+        "gain_text": comment(" ".join(gain_lines(t))),
+        "tunable_costs": [(c, plain[c.processor]) for c in found if c.processor in plain],
     }
 
 
-def _limit_lines(t: Target) -> list[str]:
-    """The limits of references for readers: output, position, speed, acceleration."""
-    limits = reference_limits(t)
+def _log_context(t: Target, found: list[Cost]) -> dict[str, Any]:
+    """The section about the ring buffer."""
+    plain = {c.processor: c.instructions for c in found}
+    return {
+        "ring": ring_of(t, ""),
+        "seconds": f"{t.logged:g}",
+        "log_costs": [(c, plain[c.processor]) for c in log_costs(t) if c.processor in plain],
+    }
+
+
+def _scatter(p: Parameter) -> str:
+    """By how much a gain may differ."""
+    share = float(np.max(p.most - p.values) / np.max(np.abs(p.values)))
+    return f"{100 * share:.3g} % either way" if share else "that of the design"
+
+
+def _rounding_text(t: Target) -> str:
+    """What the precision means for the controller's sums."""
+    if t.precision == "double":
+        return "Coefficients and signals are those of the simulation; a step rounds as the simulation does."
+    error = smallest_error(t.controller, 1e-4)
+    return (
+        "Coefficients and signals have 24 bits. A plain sum of errors would stand still: at 1e-4 m s an error below "
+        f"{error * 1e9:.0f} nm no longer moves it. Sums here keep what rounding takes from them and add it at the next "
+        "sample (Kahan), so that they follow the sums of double precision."
+    )
+
+
+def _noise_rows(t: Target) -> list[dict[str, Any]]:
+    """Rows of the table of rounding noise; none for double precision."""
+    if t.precision == "double":
+        return []
+    found = rounding_noise(t)
     return [
-        comment(f"{s.name:<10}{p:.6g} {s.unit}, {v:.6g} {s.unit}/s, {a:.6g} {s.unit}/s^2")
-        for s, p, v, a in zip(t.controller.measurements, *limits, strict=True)
+        {
+            "name": comment(s.name),
+            "unit": s.unit,
+            "rounding": r,
+            "sensors": n,
+            "share": r / n if n else float("nan"),
+        }
+        for s, r, n in zip(t.controller.forces, found.rounding, found.sensors, strict=True)
     ]
 
 
-def _table_context(t: Target) -> dict[str, Any]:
-    """v0(z), and the table of the currents of a machine that has one."""
-    ff = t.controller.feedforward
-    nodes = t.look_ups[0].nodes if t.look_ups else np.zeros((1, 1, 0))
-    sizes = dict(zip(("table_rows", "table_columns", "table_values"), nodes.shape, strict=True))
-    return {
-        "points": len(ff.z_grid),
-        "z_rows": number_rows(ff.z_grid, 6, t.precision),
-        "v0_rows": number_rows(ff.v0, ff.v0.shape[1] if ff.v0.shape[1] > 2 else 6, t.precision),
-        "reads": len(t.look_ups),
-        **sizes,
-        "table_numbers": number_rows(nodes, 6, t.precision),
-        "last_row": c_number(nodes.shape[0] - 1, t.precision),
-        "last_column": c_number(nodes.shape[1] - 1, t.precision),
-    }
+def _margin_text(t: Target, uncertainty: dict[str, float], *, proof: bool) -> str:
+    """The margin of the loop with the coefficients that the C holds."""
+    if not uncertainty:
+        return "The gain file has no uncertainty, so that no margin was proven."
+    if not proof:
+        return "Not proven for this export: it was asked for without."
+    if t.precision == "double":
+        return (
+            "The coefficients are those of the gain file, to the bit: its proven margin is this controller's."
+        )
+    margin = rounded_margin(t.controller, uncertainty)
+    assert margin is not None
+    box = box_words(uncertainty, t.controller.parameters)
+    proven = (
+        f"nothing is proven ({margin.reason})"
+        if margin.lower is None
+        else f"{100 * margin.lower:.2f} % is proven"
+    )
+    lost = (
+        f"lost at {100 * margin.upper:.2f} %"
+        if math.isfinite(margin.upper)
+        else f"not lost {margin.searched}"
+    )
+    return (
+        f"With the coefficients that single precision holds, of {box} {proven} for the sampled loop over the whole "
+        f"travel; it is {lost}."
+    )
 
 
-def number_rows(values: Any, width: int, precision: Precision) -> str:
-    """Numbers in C, so many in a row."""
-    flat = [c_number(v, precision) for v in np.ravel(values)]
-    return ",\n".join("  " + ", ".join(flat[k : k + width]) for k in range(0, len(flat), width))
+FASTEST = 1e12  # Hz, of a clock
+Until = Literal["currents", "duty-cycles"]
 
 
-def root_context(precision: Precision) -> dict[str, Any]:
-    """What root.c is filled with, beside the name."""
-    double = precision == "double"
-    return {
-        "arm_fpu": f" || (defined(__ARM_FP) && ((__ARM_FP & {8 if double else 4}) != 0))",
-        "builtin_root": "__builtin_sqrt" if double else "__builtin_sqrtf",
-        "digits": 52 if double else 23,
-        **{key: c_number(v, precision) for key, v in _NUMBERS.items()},
-    }
+def export_c(
+    gains: str | Path,
+    out: str | Path,
+    *,
+    precision: Precision = "double",
+    until: Until | None = None,
+    proof: bool = True,
+    clock: float | None = None,
+    tunable: bool = False,
+    excitation: bool = False,
+    log: float | None = None,
+) -> list[Path]:
+    """Write the controller of a gain file as a folder of C99 with its test and a report.
 
+    gains : the gain file
+    out : the folder, new or empty
+    precision : of all numbers, "double" or "float"
+    until : how far down the C goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
+    proof : prove the margin again with the coefficients that single precision holds, and with other gains if tunable
+    clock : of the processor, Hz, with which the report turns instructions into a share of the sample; None: 667 MHz
+    tunable : gains, limits, references and monitors are in a record that the target may change, with an ASAP2 file
+    excitation : forces beside the law's are read at every sample, which the filter knows as sent
+    log : s, of the last samples that a ring buffer keeps, with a trigger; `malta log` and `malta replay` read its dump;
+        None: without
 
-def arithmetic_context(precision: Precision) -> dict[str, Any]:
-    """What arithmetic.c is filled with: numbers for operations whose results are known to the last bit.
+    Returns the files.
 
-    2^p + 1 is 2^p, and (1 + 2^-h)^2 is 1 + 2^(1-h) with 2 h > p; the quotients differ from products
-    with the rounded reciprocal in both precisions.
+    Raises InputError for a clock or a log that is not above 0, a folder that has files, an unknown precision, and duty
+    cycles of a machine without windings.
+
+    >>> import malta
+    >>> gains = "design/gains/tubular_pid.json"
+    >>> files = malta.export_c(gains, "build/pid_c", until="currents")
+    >>> [file.name for file in files if file.suffix == ".h"]
+    ['tubular_pid.h', 'tubular_pid_supervisor.h']
     """
-    real = TYPES[precision]
-    limits = np.finfo(real)
-    p = int(limits.nmant) + 1
-    odd = 2.0 ** -(p // 2 + 1)
-    quotients = [float(real(value) / real(DIVISOR)) for value in DIVIDENDS]
-    given = (0, 1, 2.0**p, 1 + odd, 1 + 2 * odd, DIVISOR, limits.tiny, limits.max, limits.eps / 4, *DIVIDENDS)
-    divided = [value for value in quotients for _ in range(2)]
-    expected = (0, 0, *divided, 1, 1 + limits.eps, limits.tiny, 1, 0)
-    return {
-        "given": [c_number(float(value), precision) for value in given],
-        "expected": [c_number(float(value), precision) for value in expected],
-        "dividends": len(DIVIDENDS),
-        "rest": 2 + len(divided),
-        "divisor": c_number(DIVISOR, precision),
-        **{key: c_number(_NUMBERS[key], precision) for key in ("zero", "half", "two")},
-    }
+    path = locate(gains)
+    if clock is not None:
+        positive("export", "clock", clock, below=FASTEST)
+    target = replace(_target(read(path), precision, until), tunable=tunable, excited=excitation)
+    if log is not None:
+        target = replace(target, logged=positive("export", "log", log))
+        ring_of(target, "")  # raises before anything is proven
+    folder, content = require_empty(Path(out)), content_of(path)[0]
+    robust = content.verification.robust
+    uncertainty = {} if robust is None else robust.uncertainty
+    if tunable and proof:
+        from malta.margins.tuned_gains import gain_box  # flint, which no other export needs
+
+        held = rounded(target.controller) if precision == "float" else target.controller
+        target = replace(target, gains=gain_box(target.believed, held, uncertainty))
+    texts = folder_files(target, content.sha256, uncertainty, proof=proof, clock=clock)
+    files = {folder / name: text.encode() for name, text in sorted(texts.items())}
+    replace_files(files)
+    return list(files)
 
 
-_NUMBERS = {"zero": 0.0, "one": 1.0, "two": 2.0, "four": 4.0, "half": 0.5, "quarter": 0.25}
+def export_fmu(
+    gains: str | Path,
+    out: str | Path,
+    *,
+    part: Part = "controller",
+    fmi: int = 2,
+    until: Until | None = None,
+    platforms: Sequence[str] | None = None,
+    tunable: bool = False,
+) -> str:
+    """Write a part of a gain file's loop as an FMU, for co-simulation.
 
+    gains : the gain file
+    out : the file
+    part : "controller", "supervised" (with its supervisor), "machine" or "loop" (controller and machine)
+    fmi : version of the interface, 2 or 3
+    until : how far down the controller goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
+    platforms : what it has binaries of, by the names of FMI 2 or 3, as "win64" or "aarch64-linux", or "all",
+        compiled by ziglang (the extra malta[platforms]); None: this computer
+    tunable : the controller's gains, limits, references and monitors are parameters of the FMU
 
-def _finite(values: Any) -> list[float]:
-    """Limits, with the largest number of single precision in place of none."""
-    return [min(float(v), float(np.finfo(np.float32).max)) for v in values]
+    Returns "", or a sentence that says why the FMU has sources but no binary.
 
+    Raises InputError for another part, version or platform, without ziglang where it is asked for, and for
+    duty cycles of a machine without windings; CheckError where ziglang fails.
 
-def _records(t: Target, n: str) -> list[dict[str, Any]]:
-    """The structs of the header."""
-    beside = [
-        f"{n}_reference reference; /* of the next step */",
-        f"const {n}_real *z; /* v0(z): points of z, m */",
-        f"const {n}_real *v0; /* forces at each */",
-        "int32_t points;",
-    ]
-    if t.tunable:
-        beside.insert(3, f"const {n}_parameters *parameters;")
-    commanded = "What is commanded at a sample, and what else a log or a supervisor wants."
-    remembered = "What the controller remembers from one sample to the next."
-    found: list[tuple[str, str, list[Field], list[str]]] = [
-        *([_parameter_record(t)] if t.tunable else []),
-        ("reference", "The reference of a sample.", reference_fields(t), []),
-        ("state", remembered, state_fields(t), beside),
-        ("inputs", "What is read at a sample.", input_fields(t), []),
-        ("outputs", commanded, output_fields(t), []),
-    ]
-    if t.believed.has_stroke:
-        reals = (("start", "m"), ("end", "m"), ("rise", "s, 10 to 90 %"))
-        whole = [f"{n}_real {key}; /* {unit} */" for key, unit in reals]
-        whole += [
-            "int32_t profile;",
-            "int32_t sample; /* that comes next */",
-            "int32_t samples; /* in all */",
-        ]
-        found.append(("stroke", "A stroke that is under way.", [], whole))
-    return [
-        {"name": key, "meaning": meaning, "more": more, "fields": [_shown(f) for f in fields if f.size]}
-        for key, meaning, fields, more in found
-    ]
-
-
-def _parameter_record(t: Target) -> tuple[str, str, list[Field], list[str]]:
-    """The record of what a target may change."""
-    whole = [
-        f"int32_t samples[{len(counts_of(t))}]; /* in a row until a monitor acts */",
-        "uint32_t checksum;",
-    ]
-    return "parameters", "What the target may change.", [p.field for p in parameters_of(t)], whole
-
-
-def _shown(field: Field) -> dict[str, Any]:
-    """A field with lines that name its signals, as long as lines may be."""
-    lines, line = [], ""
-    for text in (comment(f"{s.name} [{s.unit}]") for s in field.signals):
-        if line and len(line) + len(text) > 100:
-            lines.append(line + ",")
-            line = ""
-        line = f"{line}, {text}" if line else text
-    return {"name": field.name, "size": field.size, "meaning": field.meaning, "lines": [*lines, line]}
-
-
-def comment(text: str) -> str:
-    """A text that cannot end a comment in C, whoever gave the names in it."""
-    plain = "".join(letter if letter.isascii() and letter.isprintable() else "?" for letter in text)
-    return plain.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("??", "? ?")
-
-
-def _sums(t: Target) -> list[dict[str, Any]]:
-    """The fields that `reset_integrators` sets to zero."""
-    c = t.controller
-    sizes = {f.name: f.size for f in state_fields(t)}
-    whole = ("e", "e_rest", "frozen", "xi_rest", "u_integral", "u_limited", "u_rest")
-    found = [{"name": key, "first": 0, "end": sizes[key]} for key in whole if sizes.get(key)]
-    if c.observed:
-        n = len(c.states)
-        found.append({"name": "xi_pred", "first": n - len(c.forces), "end": n})
-    return found
-
-
-def _last_output(t: Target) -> str:
-    if t.has_set_points:
-        return "command: set points of the machine's electronics"
-    return "command: duty cycles of the half-bridges" if t.driven else "current: of each coil"
-
-
-def call_text(p: Program, prefix: str, places: Mapping[str, str]) -> str:
-    """The call of a program's function in C. places : where each argument and result is"""
-    given = [places[name] for name, size in (*p.arguments, *p.results) if size]
-    return f"{prefix}_{p.name}({', '.join(given)})"
-
-
-# What stands in for a machine in the exported example and test: it is where its reference is, with noisy sensors.
-
-
-UNEVEN_SHARE = 1e-3  # of the bound of the currents of a star: noise of a current sensor
-ROOM = 2.0  # by which an example's stroke stays below the limits of references
-QUINTIC_SPEED, QUINTIC_ACCELERATION = 1.3, 4.0  # largest, of a quintic: way / rise, way / rise^2, 10 to 90 %
-SHORTEST_RISE = 20  # samples
-
-
-def stand_in_context(t: Target, name: str) -> dict[str, Any]:
-    """What stand_in.c is filled with. name : the controller's"""
-    found: dict[str, Any] = {
-        "noise": ", ".join(c_number(float(v), t.precision) for v in reading_deviations(t.believed)),
-        "noise_step": c_number(2.0**-15, t.precision),
-    }
-    if (reached := readings_at_rest(t)) is not None:
-        found["reached"] = ", ".join(c_number(float(v), t.precision) for v in reached.ravel())
-    if not t.driven:
-        return found
-    program = build_program(lower(phase_currents(t), t.precision))
-    return found | {
-        "phases": function_text(program, name, t.precision, static=True),
-        "stand_in_root": any(o.op == "SQRT" for o in program.operations),
-        "current_noise": c_number(UNEVEN_SHARE * bounds_of(t).uneven, t.precision),
-    }
-
-
-def readings_at_rest(t: Target) -> FloatArray | None:
-    """Readings at rest per unit reference, p x p, where fewer forces cannot hold all of them; None: p* itself."""
-    plant = t.believed
-    if len(plant.outputs) <= len(plant.inputs):
-        return None
-    p = ca.SX.sym("p", len(plant.outputs))
-    x = ca.SX.zeros(len(plant.states))
-    x[list(plant.controlled)] = state_reference(plant)(p, 0 * p)
-    slope = ca.Function("slope", [p], [ca.densify(ca.jacobian(plant.h(x, 0), p))])
-    return np.array(slope(np.zeros(len(plant.outputs))))
-
-
-def phase_currents(t: Target) -> ca.Function:
-    """(readings of the positions, commanded currents of the coils) -> i, what the current sensors read then."""
-    plant, drive = t.believed, t.believed.drive
-    y, current = ca.SX.sym("y", len(plant.outputs)), ca.SX.sym("current", len(plant.actuator.coils))
-    axes = drive.command(current)
-    i = ca.densify(drive.to_phases(place_of_readings(plant, y)) @ axes if t.fidelity == "phase" else axes)
-    return ca.Function("phases", [y, current], [i], ["y", "current"], ["i"])
-
-
-def example_stroke(t: Target) -> tuple[float, float]:
-    """End in m and rise in s of an example's stroke: a tenth of the travel, within half of all limits of references.
-
-    A filter knows forces and the stand-in does not: it then moves by so little in a sample that it is no innovation.
+    >>> import malta
+    >>> from zipfile import ZipFile
+    >>> gains = "design/gains/calibrated.json"
+    >>> note = malta.export_fmu(gains, "build/calibrated.fmu", fmi=3)
+    >>> "modelDescription.xml" in ZipFile("build/calibrated.fmu").namelist()
+    True
     """
-    k, Ts = t.believed.stroke_output, t.controller.sample_time
-    limits = reference_limits(t)
-    way = min(t.believed.travel / 10, limits.position[k] / ROOM)
-    speed, acceleration = limits.speed[k] / ROOM, limits.acceleration[k] / ROOM
-    by_acceleration = float(np.sqrt(QUINTIC_ACCELERATION * way / acceleration))
-    rise = max(SHORTEST_RISE * Ts, QUINTIC_SPEED * way / speed, by_acceleration, 0.02)
-    if t.controller.tracks == "states":
-        sigma = float(bounds_of(t).sigma[k])
-        way = min(way, JUMP / ROOM * sigma * rise / (QUINTIC_SPEED * Ts))
-    return way, rise
+    path = locate(gains)
+    target = replace(_target(read(path), "double", until), tunable=tunable and part != "machine")
+    fmu = build_fmu(target, content_of(path)[0].sha256, part=part, fmi=fmi, platforms=platforms)
+    replace_files({Path(out): fmu.content})
+    return fmu.note
+
+
+def _target(c: Controller, precision: Precision, until: Until | None) -> Target:
+    """What is exported. Raises InputError for what a machine does not have."""
+    if until not in (None, *get_args(Until)):
+        raise InputError("export", "until", repr(until), "one of " + ", ".join(get_args(Until)))
+    deepest = fidelity_of(plant_of(c.parameters))
+    depths: dict[str | None, Fidelity] = {None: deepest, "currents": "force", "duty-cycles": "phase"}
+    return Target(c, precision, depths[until])
+
+
+def require_empty(folder: Path) -> Path:
+    """The folder, which is new or empty. Raises InputError for one with files, whatever they are."""
+    if file_exists(folder):
+        if not folder.is_dir():
+            raise InputError(folder, "", "a file of that name", "a folder, new or empty")
+        try:
+            if any(folder.iterdir()):
+                raise InputError(folder, "", "a folder with files in it", "one that is new or empty")
+        except OSError as error:
+            raise InputError(folder, "", error.strerror or str(error), "a folder that can be read") from error
+    return folder

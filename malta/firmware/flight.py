@@ -11,15 +11,14 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
 from malta.firmware.ctext import c_name
-from malta.firmware.export import piece_records, sources
-from malta.firmware.program import TYPES, Precision
+from malta.firmware.program import Precision
 from malta.firmware.signals import (
     Field,
     Target,
@@ -28,8 +27,8 @@ from malta.firmware.signals import (
     reference_fields,
     state_fields,
 )
-from malta.firmware.step import programs_of
-from malta.model.plant import Plant
+from malta.firmware.sources import sources
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.engine.compiled import library
 from malta.simulation.engine.engines import Engine, evaluate, substeps_until
 from malta.simulation.layout import (
@@ -45,12 +44,8 @@ from malta.simulation.layout import (
 from malta.simulation.period import Period, period_of
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import Prepared, sensor_errors_of
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-    from malta.simulation.trajectory import Trajectory
-
 
 # The exported C, compiled on this computer and called from Python: `--controller c`, and tests.
 
@@ -117,26 +112,6 @@ def call(native: Native, function: str, *arguments: Any) -> int:
     """Call a function of the controller with records and numbers."""
     given = [ctypes.byref(a) if isinstance(a, ctypes.Structure) else a for a in arguments]
     return int(getattr(native.lib, f"{native.name}_{function}")(*given))
-
-
-def call_piece(
-    native: Native, piece: str, given: Mapping[str, FloatArray], sizes: Mapping[str, int]
-) -> dict[str, Any]:
-    """Call a piece with vectors; the results by name. sizes : of the results"""
-    real = TYPES[native.target.precision]
-    results = {name: np.zeros(size, dtype=real) for name, size in sizes.items()}
-    vectors = [np.ascontiguousarray(value, dtype=real) for value in given.values()]
-    function = getattr(native.lib, f"{native.name}_{piece}")
-    if piece_records(
-        programs_of(native.target)[piece]
-    ):  # records have nothing but these arrays, in this order
-        both = [np.concatenate(vectors), np.concatenate(list(results.values()))]
-        function(*(v.ctypes.data_as(ctypes.c_void_p) for v in both))
-        ends = np.cumsum([v.size for v in results.values()])[:-1]
-        return dict(zip(results, np.split(both[1], ends), strict=True))
-    # The C has no arguments without entries.
-    function(*(v.ctypes.data_as(ctypes.c_void_p) for v in (*vectors, *results.values()) if v.size))
-    return results
 
 
 def new_state(native: Native) -> Any:

@@ -35,7 +35,6 @@ import numpy as np
 from malta.errors import CheckError, InputError, on_one_line
 from malta.firmware.calibration import parameters_of
 from malta.firmware.ctext import c_name, c_number
-from malta.firmware.export import comment, render, sources
 from malta.firmware.flight import FLAGS
 from malta.firmware.machine import (
     Machine,
@@ -49,6 +48,7 @@ from malta.firmware.machine import (
     wrench_fields,
 )
 from malta.firmware.signals import Field, Target, input_fields, output_fields, reference_fields
+from malta.firmware.sources import comment, head_context, render, sources
 from malta.firmware.supervisor import STATES
 from malta.firmware.supervisor_text import request_members, supervisor_sources
 from malta.model.plant import Signal
@@ -298,42 +298,42 @@ def _library_context(u: Unit, token: str) -> dict[str, Any]:
         ]
 
     checked = [] if m is None else wrench_fields(m) + ([] if u.has_controller else [command_field(t)])
-    return {
-        "title": comment(c.name),
-        "version": version("malta"),
-        "name": f"{u.name}_controller",
-        "plant": f"{u.name}_machine",
-        "token": token,
-        "NAME": f"{u.name}_controller".upper(),
-        "controller": u.has_controller,
-        "supervised": u.is_supervised,
-        "tunable": t.tunable,
-        "tuned": places([p.field for p in parameters_of(t)]),
-        "default_record": f"{u.name}_controller_default_parameters",
-        "requests": [signal.name for signal in request_field().signals],
-        "supervision": [signal.name for signal in supervision_field().signals],
-        "limits": [(v.reference, v.least, v.most) for v in u.variables if v.least is not None],
-        "noises": 0 if m is None else noise_channels(m),
-        "rests": len(c.measurements),
-        "machine": m is not None,
-        "variables": u.variables,
-        "at": u.at,
-        "sample_time": c_number(c.sample_time, "double"),
-        "roles": [roles[k : k + 80] for k in range(0, len(roles), 80)],
-        "starts": ",\n".join("  " + ", ".join(starts[k : k + 8]) for k in range(0, len(starts), 8)),
-        "one": c_number(1.0, t.precision),
-        "reference": places(reference_fields(t), "_ref"),
-        "inputs": places(inputs),
-        "outputs": places(output_fields(t)),
-        "readings": [] if m is None else places(reading_fields(m)),
-        "checked": places(checked),
-        "states": len(t.believed.states),
-        "filtered": len(c.states),
-        "currents": sum(f.size for f in inputs if f.name == "i"),
-        "volts": 0 if m is None else m.sizes.controller.get("u_integral", 0),
-        "wrench": 0 if m is None else sum(f.size for f in wrench_fields(m)),
-        "delay": 0 if m is None else m.setup.delay,
-    } | ({} if m is None else {"at": u.at | {"command": u.at[command_field(t).name]}})
+    return (
+        head_context(t, f"{u.name}_controller")
+        | {
+            "plant": f"{u.name}_machine",
+            "token": token,
+            "controller": u.has_controller,
+            "supervised": u.is_supervised,
+            "tunable": t.tunable,
+            "tuned": places([p.field for p in parameters_of(t)]),
+            "default_record": f"{u.name}_controller_default_parameters",
+            "requests": [signal.name for signal in request_field().signals],
+            "supervision": [signal.name for signal in supervision_field().signals],
+            "limits": [(v.reference, v.least, v.most) for v in u.variables if v.least is not None],
+            "noises": 0 if m is None else noise_channels(m),
+            "rests": len(c.measurements),
+            "machine": m is not None,
+            "variables": u.variables,
+            "at": u.at,
+            "sample_time": c_number(c.sample_time, "double"),
+            "roles": [roles[k : k + 80] for k in range(0, len(roles), 80)],
+            "starts": ",\n".join("  " + ", ".join(starts[k : k + 8]) for k in range(0, len(starts), 8)),
+            "one": c_number(1.0, t.precision),
+            "reference": places(reference_fields(t), "_ref"),
+            "inputs": places(inputs),
+            "outputs": places(output_fields(t)),
+            "readings": [] if m is None else places(reading_fields(m)),
+            "checked": places(checked),
+            "states": len(t.believed.states),
+            "filtered": len(c.states),
+            "currents": sum(f.size for f in inputs if f.name == "i"),
+            "volts": 0 if m is None else m.sizes.controller.get("u_integral", 0),
+            "wrench": 0 if m is None else sum(f.size for f in wrench_fields(m)),
+            "delay": 0 if m is None else m.setup.delay,
+        }
+        | ({} if m is None else {"at": u.at | {"command": u.at[command_field(t).name]}})
+    )
 
 
 # Binaries of an FMU for other computers than this one: which there are, and the cross compiler of ziglang.

@@ -16,17 +16,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.metadata import version
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from malta.firmware.ctext import c_number, function_text, signature
-from malta.firmware.export import call_text, comment, number_rows, render, root_context
+from malta.firmware.ctext import c_number, c_numbers, function_text, signature
 from malta.firmware.period_functions import named_function, symbols
 from malta.firmware.program import Program, build_program, lower
 from malta.firmware.signals import Field, Target, current_readings, output_fields
+from malta.firmware.sources import call_text, comment, head_context, number_rows, render, root_context
 from malta.model.parameters import acting_names, twins_of, units_of
 from malta.model.plant import Plant, Signal, symbolic
 from malta.simulation import references
@@ -301,11 +300,8 @@ def _context(m: Machine, programs: Mapping[str, Program], name: str) -> dict[str
         **{f.name: f"r->{f.name}" for f in reading_fields(m)},
     }
     ff = c.feedforward
-    return {
-        "name": name,
-        "NAME": name.upper(),
+    return head_context(m.target, name) | {
         "machine": comment(plant.name),
-        "version": version("malta"),
         "period": f"{c.sample_time * 1e6:g} us",
         "substeps": c_number(m.substeps, "double"),
         "tiny": c_number(TINY, "double"),
@@ -330,7 +326,7 @@ def _context(m: Machine, programs: Mapping[str, Program], name: str) -> dict[str
         "call_begin": call_text(programs["begin"], name, places | {"x": "x"}),
         "call_substep": call_text(programs["substep"], name, places),
         "call_read": call_text(programs["read"], name, places),
-        **{key: ", ".join(c_number(v, "float") for v in values) for key, values in WAVES.items()},
+        **{key: c_numbers(values, "float") for key, values in WAVES.items()},
         "root": noise_channels(m) > 0 or any(o.op == "SQRT" for p in programs.values() for o in p.operations),
         **root_context("double"),
     }

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import nullcontext
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -29,6 +29,7 @@ from malta.firmware.signals import (
     state_fields,
 )
 from malta.model.equations import note, recorded_equations, recorded_look_ups
+from malta.model.plant import FloatArray, placed
 from malta.simulation.current_control import control_currents
 from malta.simulation.layout import Loop, Signals, electronics_of, numbers_of
 from malta.simulation.period import law_reference, limited_currents, state_reference
@@ -42,9 +43,6 @@ from malta.synthesis.controller import (
     sum_errors,
 )
 from malta.synthesis.schedule import interpolate
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 FAR = 1e3  # times the reach of a reading: what a filter may expect in its place, which supervisors call astray before
 LINK_RANGE = (0.05, 4.0)  # readings of the link's voltage that are believed, in multiples of the nominal one
@@ -65,11 +63,6 @@ def numbers(t: Target) -> dict[str, Any]:
     """Every number of the law and of its machine, by name, as expressions take them; symbols of what is tunable."""
     values = {name: ca.SX(value) for name, value in numbers_of(t.believed, t.controller, 1).items()}
     return values | law_symbols(t)
-
-
-def sense_function(t: Target) -> ca.Function:
-    """`sense` without its blocks."""
-    return sense(t).plain
 
 
 def sense(t: Target) -> Staged:
@@ -115,11 +108,6 @@ def gate(raw: Any, valid: Any, ranges: FloatArray, instead: Any) -> tuple[Any, A
         used.append(ca.if_else(accepted, raw[k], instead[k]))
         refused.append(ca.logic_not(accepted))
     return ca.vertcat(*used), ca.vertcat(*refused)
-
-
-def decide_function(t: Target) -> ca.Function:
-    """`decide` without its blocks."""
-    return decide(t).plain
 
 
 def decide(t: Target) -> Staged:
@@ -410,10 +398,7 @@ def _state_on_reference(t: Target, reference: dict[str, Any], v0: Any) -> dict[s
         state["xi_pred"] = ca.vertcat(state_reference(plant)(p, dp), v_past)
         note("expect", "xi_pred = (q*, dq*, memory of forces under way)", xi_pred=state["xi_pred"])
     if t.driven:
-        drive, x = plant.drive, ca.SX.zeros(len(plant.states))
-        q = state_reference(plant)(p, dp)
-        for k, index in enumerate(plant.controlled):
-            x[index] = q[k]
+        drive, x = plant.drive, placed(plant, state_reference(plant)(p, dp))
         i = drive.command(plant.currents(p, v0))
         state["u_integral"] = plant.actuator.R * i
         note("hold_currents", "u_integral = R i_axes of the currents for v0", u_integral=state["u_integral"])

@@ -24,7 +24,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.files import locate
-from malta.firmware.program import TYPES, Precision
+from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of, input_fields, reference_fields
 from malta.firmware.vectors import SAMPLES, Vector, record_vectors
 from malta.gains.file import content_of, read
@@ -370,7 +370,7 @@ def _replay(
     line: Line, t: Target, v: Vector, tell: Callable[[float], None] | None
 ) -> tuple[ReplayedVector, int]:
     """What the target makes of a vector, and the counts of its slowest step."""
-    real, order = TYPES[t.precision], ORDERS[t.precision]
+    real, order = t.real, ORDERS[t.precision]
     line.ask(BEGIN, bytes([int(v.warm)]))
     differs, largest, slowest = -1, 0.0, 0
     for k in range(SAMPLES):

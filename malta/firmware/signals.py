@@ -12,16 +12,15 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.firmware.program import Precision
+from malta.firmware.program import TYPES, Precision
 from malta.model.data import plant_of
 from malta.model.equations import LookUp, recorded_look_ups
-from malta.model.plant import Plant, Signal, readonly
+from malta.model.plant import FloatArray, Plant, Signal, placed, readonly
 from malta.simulation.layout import Fidelity, Setup, electronics_of, fidelities
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
     from malta.margins.tuned_gains import GainBox
-    from malta.model.plant import FloatArray
 
 
 SLOW = 0.1  # share that a state changes by in a sample without anything added, at most: it is then a sum
@@ -114,6 +113,16 @@ class Target:
             return tuple(k for k in range(len(Ad)) if abs(Ad[k, k] - 1) < SLOW)
         unit = np.eye(len(Ad))
         return tuple(k for k in range(len(Ad)) if (Ad[k] == unit[k]).all() and not Bd[k].any())
+
+    @property
+    def real(self) -> Any:
+        """The type of its numbers."""
+        return TYPES[self.precision]
+
+    @property
+    def real_bytes(self) -> int:
+        """Bytes of each."""
+        return 8 if self.precision == "double" else 4
 
     @property
     def compensated(self) -> bool:
@@ -239,11 +248,7 @@ def signals_after(before: str, signals: tuple[Signal, ...], unit: str, after: st
 
 def place_of_readings(plant: Plant, y: Any) -> Any:
     """The states of a machine at rest that is read as y, as an expression."""
-    q = plant.position_of(y)
-    x = ca.SX.zeros(len(plant.states))
-    for k in range(q.numel()):
-        x[plant.controlled[k]] = q[k]
-    return x
+    return placed(plant, ca.SX(plant.position_of(y)))
 
 
 def used_clearances(plant: Plant) -> Callable[[int, float], FloatArray]:
@@ -254,9 +259,7 @@ def used_clearances(plant: Plant) -> Callable[[int, float], FloatArray]:
     def share_used(k: int, reading: float) -> FloatArray:
         p = np.zeros(len(plant.outputs))
         p[k] = reading
-        q = np.array(plant.position_of(ca.DM(p))).ravel()
-        state = np.zeros(len(plant.states))
-        state[list(plant.controlled)[: len(q)]] = q
+        state = placed(plant, ca.DM(plant.position_of(ca.DM(p))))
         return np.array(contact(state)).ravel()[: len(plant.contacts)]
 
     return share_used

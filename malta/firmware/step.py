@@ -26,7 +26,7 @@ from malta.firmware.period_functions import (
     symbols,
     table_size,
 )
-from malta.firmware.program import TYPES, Program, evaluate
+from malta.firmware.program import Program, evaluate
 from malta.firmware.signals import Field, Target, input_fields, reference_fields, state_fields
 from malta.model.equations import interpolate, note, recorded_equations
 from malta.model.plant import Plant
@@ -234,7 +234,7 @@ def programs_of(t: Target) -> dict[str, Program]:
 
 def look_up(t: Target, z: Any) -> Any:
     """v0(z), N, linear between the points of the gain file and constant beyond them."""
-    real, ff = TYPES[t.precision], t.controller.feedforward
+    real, ff = t.real, t.controller.feedforward
     grid, v0 = ff.z_grid.astype(real), ff.v0.astype(real)
     at = np.clip(real(z), grid[0], grid[-1])
     k = min(int(np.searchsorted(grid, at, side="right")) - 1, len(grid) - 2)
@@ -250,7 +250,7 @@ def _v0(t: Target, outputs: Any) -> Any:
 
 def read_table(t: Target, places: Any) -> Any:
     """The values of the table at (u, v), (u, v), ..., one reading after the other; none without a table."""
-    real = TYPES[t.precision]
+    real = t.real
     if not t.look_ups:
         return np.zeros(0, dtype=real)
     nodes = t.look_ups[0].nodes.astype(real)
@@ -259,7 +259,7 @@ def read_table(t: Target, places: Any) -> Any:
 
 def first_state(t: Target) -> Vectors:
     """The state that `init` leaves: at rest, knowing nothing."""
-    real = TYPES[t.precision]
+    real = t.real
     state = {f.name: np.zeros(f.size, dtype=real) for f in state_fields(t) if f.size}
     if t.driven:
         state["link_last"] = np.array([t.believed.drive.link_voltage], dtype=real)

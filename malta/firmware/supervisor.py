@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -31,14 +31,10 @@ from malta.firmware.signals import (
     reading_ranges,
     used_clearances,
 )
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant, placed
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import noise_input
 from malta.synthesis.riccati import dare, eigenvalues, sample
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # Of the process noise's variance, for a filter that does without a sensor. For none at all the Kalman filter is the one
 # of least gain that is stable: two unstable modes seen by one sensor take large gains, which noise and errors grow by.
@@ -152,9 +148,7 @@ def expected_readings(t: Target) -> ca.Function:
     """
     c, plant = t.controller, t.believed
     xi = ca.SX.sym("xi_pred", len(c.states))
-    x = ca.SX.zeros(len(plant.states))
-    for k, index in enumerate(plant.controlled[: len(c.A)]):
-        x[index] = xi[k]
+    x = placed(plant, xi[: len(plant.controlled)])
     y = ca.densify(plant.h(x, ca.SX.zeros(len(plant.inputs))))
     return ca.Function("expected", [xi], [y], ["xi_pred"], ["y"])
 
@@ -169,9 +163,7 @@ def prediction_correction(t: Target) -> ca.Function:
     c, plant = t.controller, t.believed
     xi = ca.SX.sym("xi_hat", len(c.states))
     n, m = len(c.A), len(c.forces)
-    x = ca.SX.zeros(len(plant.states))
-    for k, index in enumerate(plant.controlled):
-        x[index] = xi[k]
+    x = placed(plant, xi[: len(plant.controlled)])
     u = xi[n : n + m] if c.lagging + c.delay else ca.SX.zeros(m)
     held, outside = ca.DM(plant.at().u), ca.SX.zeros(len(plant.disturbances))
     rate = plant.f(x, held + u, outside) - plant.f(

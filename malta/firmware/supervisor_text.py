@@ -11,15 +11,13 @@ import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
 from malta.firmware.ctext import c_number, function_text
-from malta.firmware.export import arithmetic_context, comment, render, sources
 from malta.firmware.flight import (
     EXTRA,
     REALS,
@@ -34,6 +32,7 @@ from malta.firmware.flight import (
 )
 from malta.firmware.program import Precision, Program, build_program, lower
 from malta.firmware.signals import Target, current_readings, input_fields, output_fields
+from malta.firmware.sources import arithmetic_context, head_context, render, sources
 from malta.firmware.supervisor import (
     FLYING,
     JUMP,
@@ -58,14 +57,11 @@ from malta.firmware.supervisor import (
     reference_limits,
     stars_of,
 )
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.engine.compiled import compiler
+from malta.simulation.engine.engines import Engine
 from malta.simulation.layout import electronics_of
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
-    from malta.simulation.engine.engines import Engine
-    from malta.simulation.simulate import Prepared
-
+from malta.simulation.simulate import Prepared
 
 SHORTEST = 20.0  # samples in which a reference stops at least
 QUICK = 40.0  # samples in which an acceleration fades that the next state does not have
@@ -194,13 +190,9 @@ def _context(t: Target, name: str) -> dict[str, Any]:
     c, plant = t.controller, t.believed
     times = TIMES if t.driven else TIMES._replace(offsets=0)
     off = _off_command(t)
-    return {
+    return head_context(t, name) | {
         "tunable": t.tunable,
         "logged": t.logged > 0,
-        "name": name,
-        "NAME": name.upper(),
-        "title": comment(c.name),
-        "version": version("malta"),
         "states": list(STATES),
         "monitors": MONITORS,
         "reactions": REACTIONS,

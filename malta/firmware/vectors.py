@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from malta.firmware.calibration import FNV_FACTOR, FNV_START
-from malta.firmware.ctext import c_number
-from malta.firmware.export import FUSED, call_text, piece_records, readings_at_rest
-from malta.firmware.program import TYPES, Program, evaluate
+from malta.firmware.ctext import c_number, c_numbers
+from malta.firmware.program import Program, evaluate
 from malta.firmware.signals import (
     Target,
     input_fields,
@@ -27,8 +26,10 @@ from malta.firmware.signals import (
     reference_fields,
     state_fields,
 )
+from malta.firmware.sources import FUSED, call_text, piece_records, readings_at_rest
 from malta.firmware.step import first_state, programs_of, started_state, step_function, zero_reference
 from malta.firmware.supervisor import (
+    AWAKE,
     JUMP,
     LONG,
     MONITORS,
@@ -43,15 +44,12 @@ from malta.firmware.supervisor import (
     monitors_of,
     reference_limits,
 )
+from malta.model.plant import FloatArray
 from malta.simulation import references
 from malta.simulation.inputs import motion_of
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-    from malta.simulation.trajectory import Trajectory
-
+from malta.simulation.trajectory import Trajectory
 
 SAMPLES = 60  # of each vector
 STROKE = 0.02  # of the travel, at most
@@ -94,7 +92,7 @@ def _flight(t: Target, *, stroke: bool) -> dict[str, FloatArray]:
         scenario = Scenario("hold", lasts, references.hold, **options)
     run = simulate(plant, c, scenario)
     motion = motion_of(scenario, plant, c, run.t)
-    found = {"p": motion.p, "dp": motion.dp, "ddp": motion.ddp} | _readings(t, run)
+    found = {"p": motion.p, "dp": motion.dp, "ddp": motion.ddp} | readings_of(t, run)
     if len(run.t) < SAMPLES:  # it touched down: go on with the last reading
         found = {k: np.vstack([v, np.repeat(v[-1:], SAMPLES - len(v), axis=0)]) for k, v in found.items()}
     return found
@@ -107,7 +105,7 @@ def _distance(t: Target, rise: float) -> float:
     return float(min(STROKE * t.believed.travel, 0.5 * most * 6 * math.sqrt(3) / k**2))
 
 
-def _readings(t: Target, run: Trajectory) -> dict[str, FloatArray]:
+def readings_of(t: Target, run: Trajectory) -> dict[str, FloatArray]:
     """What the controller read in a flight."""
     found = {"y": run.y.copy(), "y_valid": np.ones_like(run.y)}
     if t.driven:
@@ -137,7 +135,7 @@ def _damage(t: Target, flight: dict[str, FloatArray]) -> dict[str, FloatArray]:
 
 def _answered(t: Target, name: str, flight: dict[str, FloatArray], *, warm: bool) -> Vector:
     """A vector with the controller's answers."""
-    real, step = TYPES[t.precision], step_function(t)
+    real, step = t.real, step_function(t)
     order = [*(f.name for f in reference_fields(t)), *(f.name for f in input_fields(t))]
     rows = {key: np.asarray(flight[key], dtype=real) for key in order}
     first = {key: rows[key][0] for key in zero_reference(t)}
@@ -269,7 +267,7 @@ def _faults(t: Target, per_unit: FloatArray) -> dict[str, str]:
 
 def _numbers(values: Iterable[float], t: Target) -> str:
     """Numbers in C, those that are infinite as one that nothing reaches."""
-    return ", ".join(c_number(float(np.clip(v, -1e18, 1e18)), t.precision) for v in values)
+    return c_numbers(np.clip([*values], -1e18, 1e18), t.precision)
 
 
 def _shown_states(t: Target) -> tuple[list[int], FloatArray]:
@@ -347,7 +345,7 @@ def _pieces(t: Target, name: str) -> dict[str, Any]:
         values = draws.take(given)
         starts = _starts(p.arguments)
         times = [starts[of] for of in ("rise", "pole") if of in starts]
-        values[times] = TYPES[t.precision](PIECE_TIME)
+        values[times] = t.real(PIECE_TIME)
         arguments = {of: values[starts[of] : starts[of] + size] for of, size in p.arguments}
         results = evaluate(p, arguments, t.precision)
         sums.append(checksum(np.concatenate([results[of] for of, _ in p.results])))
@@ -375,7 +373,7 @@ class _Draws:
     """The numbers that calls.c draws."""
 
     def __init__(self, t: Target) -> None:
-        self.real, self.seed = TYPES[t.precision], 1
+        self.real, self.seed = t.real, 1
 
     def take(self, count: int) -> Any:
         found = np.zeros(count, dtype=self.real)
@@ -402,3 +400,72 @@ def _starts(sizes: Sequence[tuple[str, int]]) -> dict[str, int]:
 
 def _size(sizes: Sequence[tuple[str, int]]) -> int:
     return sum(size for _, size in sizes)
+
+
+# Which monitor watches in which state of the supervisor, and why others do not: no cell of the table is empty.
+
+
+GROUND: tuple[State, ...] = ("OFFSETS", "SENSORS")
+OTHERS = {key: tuple(state for state in AWAKE if state != key) for key in AWAKE}
+
+# (monitors, states, why they cannot hurt or do not count there); OFF and FAULT have their gates off
+UNWATCHED: tuple[tuple[tuple[str, ...], tuple[State, ...], str], ...] = (
+    (("TOUCH",), GROUND, "the machine rests on its bearing"),
+    (("TOUCH",), ("LIFT", "LANDING"), "the machine leaves its bearing, or goes to it"),
+    (("RANGE", "STUCK", "STALE", "NAN"), ("OFFSETS",), "positions are not used yet"),
+    (("RATE",), GROUND, "the first readings come from anywhere, and nothing moves"),
+    (("INNOVATION", "UNBELIEVED", "BLIND", "ASTRAY"), GROUND, "the filter does not run"),
+    (("INNOVATION",), ("LIFT", "SETTLE", "LANDING"), "a bearing pushes; ASTRAY and UNSETTLED watch"),
+    (("HELPLESS", "SATURATION"), GROUND, "no force acts"),
+    (("SATURATION",), ("LIFT",), "lift-off ends after its time, and SETTLE watches"),
+    (("SATURATION", "LINK"), ("LANDING",), "it lands already; HELPLESS watches"),
+    (("MISSED", "OVERRUN"), GROUND, "nothing moves"),
+    (("OFFSET",), OTHERS["OFFSETS"], "offsets are known, and subtracted"),
+    (("CURRENT_SUM", "CURRENT_EXCESS"), ("OFFSETS",), "offsets are not known; OFFSET and CURRENT watch"),
+    (("CURRENT_ERROR",), GROUND, "nothing is commanded; OFFSET, CURRENT and CURRENT_EXCESS watch"),
+    (("CURRENT_FROZEN",), GROUND, "nothing is commanded"),
+    (("REFERENCE",), (*GROUND, "LIFT", "LANDING"), "requests are not followed"),
+    (("REFERENCE",), ("SETTLE",), "it waits until the request is within its limits"),
+    (("UNSETTLED",), OTHERS["SETTLE"], "nothing is waited for"),
+    (("UNREADY",), OTHERS["SENSORS"], "nothing is waited for"),
+)
+
+
+def watch_table(t: Target) -> dict[str, dict[State, str]]:
+    """The reactions of each monitor in each state, as "hold, land", or in brackets why it does not count there.
+
+    watch_table(Target(malta.gains.read("design/gains/robust.json")))["LINK"]["LIFT"]
+    """
+    table: dict[str, dict[State, str]] = {}
+    for row in monitors_of(t):
+        cells = table.setdefault(row.key, dict.fromkeys(STATES, ""))
+        for state in row.states:
+            cells[state] = ", ".join(filter(None, [cells[state], row.reaction.lower()]))
+    for key, cells in table.items():
+        for state in STATES:
+            if state not in AWAKE:
+                cells[state] = "(gates are off)"
+        for keys, states, reason in UNWATCHED:
+            for state in states if key in keys else ():
+                cells[state] = cells[state] or f"({reason})"
+    return table
+
+
+def watch_lines(t: Target) -> list[str]:
+    """The table in Markdown: monitors down, the states that are not off across; reasons are numbered below it."""
+    reasons: list[str] = []
+    lines = [
+        "| monitor | " + " | ".join(state.lower() for state in AWAKE) + " |",
+        "|---" * (1 + len(AWAKE)) + "|",
+    ]
+    for key, cells in watch_table(t).items():
+        shown = []
+        for state in AWAKE:
+            text = cells[state]
+            if text.startswith("("):
+                if text not in reasons:
+                    reasons.append(text)
+                text = f"({reasons.index(text) + 1})"
+            shown.append(text)
+        lines.append(f"| `{key.lower()}` | " + " | ".join(shown) + " |")
+    return [*lines, "", *(f"{k}. {reason.strip('()')}" for k, reason in enumerate(reasons, 1))]

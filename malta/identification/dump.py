@@ -21,8 +21,8 @@ from malta.display import Description, display
 from malta.errors import InputError
 from malta.files import read_file
 from malta.firmware.flight import compile_controller, new_state
-from malta.firmware.ring import CAUSES, HEAD, LARGEST, LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
 from malta.firmware.signals import Target
+from malta.firmware.sources import CAUSES, HEAD, LARGEST, LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

@@ -429,7 +429,7 @@ def _from_arrays(arrays: Mapping[str, Any], path: Path) -> Decoded:
         if group not in arrays:
             continue
         table, names = arrays[group], arrays.get(f"{group}_columns")
-        if names is None or names.dtype.kind != "U":
+        if names is None or names.dtype.kind != "U" or names.ndim != 1:
             raise InputError(path, f"{group}_columns", "no headings", f"those of {group}")
         if table.dtype.kind not in "fiub" or table.shape != (len(t), len(names)):
             found = f"an array of {table.dtype}, {table.shape}"

@@ -13,21 +13,17 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import null_space
 from scipy.optimize import linprog, nnls
 
 from malta.display import display
 from malta.errors import CheckError, InputError
-from malta.model.plant import readonly
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from malta.model.plant import FloatArray
+from malta.model.plant import FloatArray, readonly
 
 CALLER = "allocation"
 WORST = 1e8  # condition of T that is taken for full rank, its rows scaled

@@ -15,7 +15,7 @@ from dataclasses import MISSING, fields, is_dataclass
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import Field as Checked
 from pydantic import StrictStr
@@ -26,12 +26,9 @@ from malta.model.checks import check_numbers, line_of
 from malta.model.equilibrium import check_values, is_checked, register
 from malta.model.machines import file_of, machine, machine_names, module_of, name_of
 from malta.model.parameters import check_range
-from malta.model.plant import Plant
+from malta.model.plant import Parameters, Plant
 from malta.tables import Finite, Quantity, Record, entry, load_toml, validate
 from malta.units import to_si, unit_factor
-
-if TYPE_CHECKING:
-    from malta.model.plant import Parameters
 
 
 class Sourced(Quantity):

@@ -22,15 +22,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError
-
-if TYPE_CHECKING:
-    from malta.model.signals import FloatArray
+from malta.model.signals import FloatArray
 
 T = TypeVar("T")
 

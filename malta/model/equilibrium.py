@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import fields
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import casadi as ca
@@ -29,11 +29,9 @@ from malta.errors import CheckError
 from malta.model.checks import check_equations, check_signals, check_symbols
 from malta.model.parameters import acting_names
 from malta.model.plant import OperatingPoint, Plant
+from malta.model.signals import FloatArray
 
-if TYPE_CHECKING:
-    from malta.model.signals import FloatArray
-
-    Equations = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+Equations = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 
 Expressions = list[Any]

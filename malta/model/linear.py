@@ -24,7 +24,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from functools import cache
 from numbers import Real
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack, cast
+from typing import Any, TypedDict, Unpack, cast
 
 import casadi as ca
 import numpy as np
@@ -34,11 +34,7 @@ from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.machines import machine_names
 from malta.model.parameters import check_parameters, si, symbolic_names
-from malta.model.plant import Actuator, Parameters, Plant, Signal
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
+from malta.model.plant import Actuator, FloatArray, Parameters, Plant, Signal
 
 LONGEST = 4000  # characters of a formula
 FUNCTIONS = {

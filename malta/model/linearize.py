@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -20,11 +20,7 @@ import numpy as np
 from malta.errors import CheckError, InputError
 from malta.model.equilibrium import chain, commanded, trace
 from malta.model.plant import OperatingPoint, Plant
-from malta.model.signals import InverseCheck, Mismatch, readonly
-
-if TYPE_CHECKING:
-    from malta.model.signals import FloatArray
-
+from malta.model.signals import FloatArray, InverseCheck, Mismatch, readonly
 
 ROUNDING = 1e-14  # of a slope, beside the others of its row and column
 

@@ -11,25 +11,29 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from malta.display import Description, display, quantity
 from malta.errors import InputError
+from malta.model.equations import Body
 from malta.model.parameters import Parameters as Parameters
-from malta.model.signals import CasadiFn, Drive, Electronics, LateSensors, require_short, split_dead_time
+from malta.model.signals import (
+    CasadiFn,
+    Drive,
+    Electronics,
+    InverseCheck,
+    LateSensors,
+    require_short,
+    split_dead_time,
+)
 from malta.model.signals import ComplexArray as ComplexArray
 from malta.model.signals import FloatArray as FloatArray
 from malta.model.signals import Signal as Signal
 from malta.model.signals import readonly as readonly
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from malta.model.equations import Body
-    from malta.model.signals import InverseCheck
 
 DEFAULT: Any = None  # stands for a function that follows from the other fields
 
@@ -429,6 +433,13 @@ def whole_samples(plant: Plant, Ts: float) -> int:
         expected = f"whole samples of {Ts * 1e6:g} us in a linear loop; simulations take any"
         raise InputError(plant.name, "sensors", found, expected)
     return whole
+
+
+def placed(plant: Plant, design: Any) -> Any:
+    """All states as an expression: these first ones of the design model, the others zero. design : a CasADi column"""
+    x = type(design).zeros(len(plant.states))
+    x[list(plant.controlled[: design.numel()])] = design
+    return x
 
 
 def position_in(plant: Plant, x: ArrayLike) -> float:

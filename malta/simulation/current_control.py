@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import math
 import operator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from malta.model.data import plant_of
 from malta.model.equations import note
-from malta.model.plant import Actuator
+from malta.model.plant import Actuator, FloatArray, placed
 from malta.model.signals import Drive
 from malta.simulation.layout import Loop, Setup, Signals
 from malta.synthesis.controller import Add
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # Half-bridges on a DC link: voltages and duty cycles within their limits, star points, the link voltage.
 
@@ -119,9 +115,7 @@ def control_currents(
     plant, c, s, g = loop
     machine, controller, given = signals
     believed, drive = plant_of(c.parameters), plant.drive
-    estimate = ca.SX.zeros(len(believed.states))
-    for k, index in enumerate(believed.controlled):
-        estimate[index] = known[k]
+    estimate = placed(believed, known[: len(believed.controlled)])
     # The link voltage is measured: the modulators know of a sag at once.
     V = machine["link"] * (1 - given["sag"] if s.faulty else 1)
     if s.fidelity == "dq":

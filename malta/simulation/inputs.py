@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -18,20 +18,16 @@ from scipy.special import erf
 
 from malta.errors import InputError
 from malta.model.data import plant_of
-from malta.model.plant import Plant, off_stroke, outputs_at, position_in, readonly
+from malta.model.plant import FloatArray, Plant, off_stroke, outputs_at, placed, position_in, readonly
 from malta.simulation import references
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.layout import electronics_of, layout_of, noise_scales
 from malta.simulation.period import state_reference
 from malta.simulation.readings import keys, normals, normals_of_parts
+from malta.simulation.references import Motion
 from malta.simulation.scenario import Fault, FeedforwardChoice, Scenario, Simulation
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import holding_gain
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-    from malta.simulation.references import Motion
-
 
 STARTS = 3  # random phases for each axis
 NORMS = (4, 8, 32)  # of the signal that are minimized
@@ -212,8 +208,7 @@ def _effects(plant: Plant) -> ca.Function:
     kind = ca.MX if plant.tabulated else ca.SX
     chosen = list(plant.controlled)
     controlled = kind.sym("x", len(chosen))
-    x = kind.zeros(len(plant.states))
-    x[chosen] = controlled
+    x = placed(plant, controlled)
     v, w = kind.sym("v", len(plant.inputs)), kind.sym("w", len(plant.disturbances))
     rate = plant.f(x, v, w)[chosen]
     by_v, by_w = (ca.densify(ca.vec(ca.densify(ca.jacobian(rate, u)))) for u in (v, w))

@@ -12,19 +12,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import casadi as ca
 import numpy as np
 
 from malta.model.parameters import acting_names, twins_of
-from malta.model.plant import Plant, symbolic
+from malta.model.plant import FloatArray, Plant, symbolic
 from malta.model.signals import Electronics
 from malta.synthesis.controller import Controller, CurrentLoop, gains_of
 from malta.synthesis.schedule import SCHEDULED
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 # Names of numbers_of that all machines of a batch share: those of the controller and of its samples.
 SHARED = (

@@ -14,19 +14,14 @@ Lag and dead time have states beside those of the machine:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.layout import Loop, Setup
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import FloatArray
-
 
 TINY = 1e-6  # share of a step that rounding may take from the clock
 

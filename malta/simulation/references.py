@@ -8,17 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from malta.errors import InputError
 from malta.model.machines import attribute_of
-from malta.model.plant import Plant
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
+from malta.model.plant import FloatArray, Plant
 
 Profile = Literal["logistic", "quintic"]
 """The courses of a stroke: "logistic" or "quintic".
@@ -57,7 +53,7 @@ class Motion(NamedTuple):
     ddp: FloatArray
 
 
-Reference = Callable[["FloatArray"], Motion]
+Reference = Callable[[FloatArray], Motion]
 """A function of time (s, shape (k,)) that returns the Motion at these times.
 
 >>> import malta

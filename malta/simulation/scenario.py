@@ -6,22 +6,19 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from malta.display import display
 from malta.errors import InputError
 from malta.model.parameters import replace_fields, units_of
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.model.signals import require_short, split_dead_time
 from malta.simulation import references
 from malta.simulation.layout import FIDELITIES, Fidelity, Setup, electronics_of, fidelities
 from malta.simulation.references import Profile, Reference
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 Estimator = Literal["steady-state", "kalman", "extended"]
 ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)

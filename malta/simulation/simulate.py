@@ -21,7 +21,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import casadi as ca
 import numpy as np
@@ -30,7 +30,7 @@ from scipy.linalg import LinAlgWarning
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import shape_parameters, units_of
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant, placed
 from malta.proof.uncertain import is_commutated
 from malta.simulation import references
 from malta.simulation.engine.engines import Engine, EngineChoice, engine_of, evaluate, substeps_until
@@ -58,13 +58,7 @@ from malta.synthesis.controller import Controller, Noise
 from malta.synthesis.filters import noise_input
 from malta.synthesis.riccati import sample
 
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
-
-Observer = Callable[
-    [Engine, Plant, "FloatArray", "FloatArray", "FloatArray"], tuple["FloatArray", "FloatArray"]
-]
+Observer = Callable[[Engine, Plant, FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
 
 def observer(simulation: Simulation, substeps: int) -> Observer:
@@ -241,9 +235,7 @@ def _measurement(c: Controller) -> tuple[Callable[..., FloatArray], Callable[...
     """The functions x -> dh/dx and x -> h(x) of the controller's machine."""
     believed = plant_of(c.parameters)
     x = ca.SX.sym("x", len(c.A))
-    full = ca.SX.zeros(len(believed.states))
-    full[list(believed.controlled)] = x
-    y = believed.h(full, 0)
+    y = believed.h(placed(believed, x), 0)
     function = ca.Function("h", [x], [y, ca.jacobian(y, x)])
     return (
         lambda estimate: np.array(function(estimate)[1]),

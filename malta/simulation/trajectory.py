@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -16,16 +16,12 @@ from malta.display import Curves, Description, display, quantity
 from malta.files import replace_files
 from malta.merits import Merit, reported, reported_merits
 from malta.model.machines import FINE
-from malta.model.plant import Plant, Signal, readonly
+from malta.model.plant import FloatArray, Plant, Signal, readonly
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.inputs import Inputs
 from malta.simulation.layout import columns_of_row, electronics_of
 from malta.simulation.scenario import Scenario, Simulation, setup_of
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # How a simulation ended: completed, diverged, or at the first contact.
 

@@ -18,10 +18,10 @@ from exported import of_each_kind
 
 import malta
 from malta.firmware.ctext import c_name
-from malta.firmware.export import comment, sources
-from malta.firmware.exports import folder_files
+from malta.firmware.export import folder_files
 from malta.firmware.flight import differences, engine_of_c
 from malta.firmware.signals import Target
+from malta.firmware.sources import comment, sources
 from malta.simulation.engine import compiled
 
 if TYPE_CHECKING:

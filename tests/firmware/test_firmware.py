@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from exported import PRECISIONS, controller, of_each_kind, target
+from exported import PRECISIONS, call_piece, controller, of_each_kind, target
 
 import malta
-from malta.firmware.export import sources
-from malta.firmware.exports import folder_files
+from malta.firmware.export import folder_files
 from malta.firmware.flight import (
     call,
-    call_piece,
     compile_controller,
     differences,
     engine_of_c,
@@ -27,6 +25,7 @@ from malta.firmware.flight import (
 from malta.firmware.fmu import build_fmu
 from malta.firmware.program import Precision, evaluate
 from malta.firmware.signals import Target, reading_ranges, reference_fields, state_fields
+from malta.firmware.sources import sources
 from malta.firmware.step import look_up, programs_of, started_state, step_function, zero_reference
 from malta.simulation.engine.compiled import compiler
 

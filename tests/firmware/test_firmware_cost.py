@@ -14,7 +14,7 @@ from firmware import A9, M4F, RUNNERS, agree, can_count, cases, instructions, wh
 
 from malta.firmware.cost import CLOCK
 from malta.firmware.flight import call, compile_controller, new_state, view, write
-from malta.firmware.period_functions import decide_function
+from malta.firmware.period_functions import decide
 from malta.firmware.program import Precision
 from malta.firmware.signals import input_fields, output_fields, reference_fields, state_fields
 from malta.firmware.step import look_up
@@ -50,7 +50,7 @@ def test_casadi_generates_the_same_step(name: str, tmp_path: Path) -> None:
     """CasADi's C of the expressions before they are lowered, over the recorded vectors: within 1e-12 of each range."""
     require("gcc")
     t = target(name, "double")
-    native, theirs = compile_controller(t), generated(decide_function(t), tmp_path)
+    native, theirs = compile_controller(t), generated(decide(t).plain, tmp_path)
     names = [f.name for f in (*reference_fields(t), *input_fields(t))]
     ends = np.cumsum([f.size for f in (*reference_fields(t), *input_fields(t))])[:-1]
     largest: dict[str, float] = {}

@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 from exported import PRECISIONS, require, root_text, run, target, texts, write_folder
 
-from malta.firmware.export import sources
+from malta.firmware.export import DEVIATIONS
 from malta.firmware.program import Precision
-from malta.firmware.report import DEVIATIONS
-from malta.firmware.ring import ring_sources
+from malta.firmware.sources import ring_sources, sources
 
 CHECKS = ("--addon=misra", "--enable=warning,style,performance,portability", "--std=c99", "--quiet")
 SECONDS = 600.0  # for a file, on a computer with much else to do

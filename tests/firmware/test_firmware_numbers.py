@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta.firmware.export import sources
 from malta.firmware.flight import Native, call, compile_controller, engine_of_c, new_state, view, write
 from malta.firmware.program import TYPES, Precision
 from malta.firmware.signals import Target, input_fields, state_fields
+from malta.firmware.sources import sources
 from malta.simulation import references
 from malta.simulation.engine.compiled import compiler
 

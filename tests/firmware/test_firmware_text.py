@@ -11,8 +11,8 @@ from conftest import ROOT
 from exported import target
 
 from malta.firmware.ctext import c_name
-from malta.firmware.export import MOST_PARAMETERS, sources
 from malta.firmware.signals import Target
+from malta.firmware.sources import MOST_PARAMETERS, sources
 
 LINES = 150  # of a function
 LONGER = {

@@ -9,9 +9,8 @@ import pytest
 from exported import EXACT, HERE, of_each_kind, require, run, run_test, target, write_folder
 
 from malta.firmware.program import Precision
-from malta.firmware.report import watch_table
 from malta.firmware.supervisor import AWAKE, MONITORS, TRANSITIONS, absent_monitors, monitors_of
-from malta.firmware.vectors import out_of_reach
+from malta.firmware.vectors import out_of_reach, watch_table
 
 LINES = 95.0  # % of each file that a run executes
 

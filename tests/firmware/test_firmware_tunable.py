@@ -23,12 +23,12 @@ from malta.firmware.calibration import (
     parameters_of,
     proven_share,
 )
-from malta.firmware.export import sources
-from malta.firmware.exports import a2l_text, folder_files
+from malta.firmware.export import a2l_text, folder_files
 from malta.firmware.flight import Native, compile_controller, view
 from malta.firmware.period_functions import decide
 from malta.firmware.program import Precision
 from malta.firmware.signals import Target
+from malta.firmware.sources import sources
 from malta.firmware.supervisor_text import NUMBERS, compile_supervised
 from malta.firmware.vectors import record_vectors
 from malta.margins.tuned_gains import GainBox

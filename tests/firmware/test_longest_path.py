@@ -10,7 +10,7 @@ from exported import require, run, target, texts
 
 from malta.firmware.cost import APART as FLAGS
 from malta.firmware.cost import LISTING, PROCESSORS, cost_on, longest_path, passes_of
-from malta.firmware.exports import folder_files
+from malta.firmware.export import folder_files
 
 C = """int f(int x) {
   int sum = 0;

@@ -18,9 +18,8 @@ from exported import PRECISIONS, controller, require, target
 
 import malta
 from malta.firmware.cost import costs, log_costs
-from malta.firmware.export import sources
 from malta.firmware.flight import Native, compile_controller, compile_files, engine_of_c, new_state, view
-from malta.firmware.ring import HEAD, ring_of, ring_sources
+from malta.firmware.sources import HEAD, ring_of, ring_sources, sources
 from malta.identification.dump import read_dump, replay_dump
 from malta.simulation.engine.compiled import library
 

@@ -19,11 +19,10 @@ from test_firmware import WARNINGS
 import malta
 from malta.errors import InputError
 from malta.firmware import supervisor_text
-from malta.firmware.export import phase_currents, sources
 from malta.firmware.flight import call, compile_controller, new_state, view
 from malta.firmware.program import Precision
-from malta.firmware.report import UNWATCHED, watch_lines, watch_table
 from malta.firmware.signals import Target, fidelity_of
+from malta.firmware.sources import phase_currents, sources
 from malta.firmware.supervisor import (
     FLYING,
     LONG,
@@ -49,6 +48,7 @@ from malta.firmware.supervisor_text import (
     supervisor_members,
     supervisor_sources,
 )
+from malta.firmware.vectors import UNWATCHED, watch_lines, watch_table
 from malta.machines.tubular.experiments.faults import SOFT
 from malta.simulation.engine.compiled import compiler
 

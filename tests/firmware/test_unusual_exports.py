@@ -9,7 +9,7 @@ from conftest import ROOT
 from exported import EXACT, require, run
 
 import malta
-from malta.firmware.exports import folder_files
+from malta.firmware.export import folder_files
 from malta.firmware.program import Precision
 from malta.firmware.signals import Target
 from malta.simulation.layout import fidelities

@@ -21,10 +21,11 @@ from malta.campaigns.plan import Plan
 from malta.campaigns.rare import rare_event, read_design_point, write_event
 from malta.campaigns.run import campaign
 from malta.campaigns.store import MANIFEST, block_name, read_plan, seal
-from malta.firmware.ring import LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
 from malta.firmware.signals import Target
+from malta.firmware.sources import LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
 from malta.identification.calibration import Estimate
 from malta.identification.commission import Commissioning, Entry, Finding, read_journal
+from malta.machines.tubular.experiments.strokes import forces_of, record
 from malta.proof.certificate import certificate, checked_file
 from malta.proof.certificate.check import check
 from malta.proof.uncertain import Compensator
@@ -32,7 +33,6 @@ from malta.report import campaign_tables
 from malta.report.page.document import binder_page, binder_text
 from malta.report.page.motion import motion_page, read_motion
 from malta.report.tables.experiments import findings_table
-from malta.simulation.experiments.recording import columns_of_log, read_log, record
 from malta.simulation.trajectory import save as save_run
 from malta.tuning.search import Journal
 
@@ -200,7 +200,8 @@ def _log_rows() -> tuple[tuple[str, ...], Any]:
     t = np.linspace(0, 6, 1200)
     z = -0.99 * plant.travel * np.cos(np.pi * t / 3)
     forces = np.outer(1 + z / plant.travel, [0.1, 1.0, -0.2, 2.0, 0.5])
-    return columns_of_log(plant), np.column_stack([t, z, forces])
+    headings = ("t [s]", f"{plant.stroke} [m]", *(f"{s.name} [{s.unit}]" for s in plant.inputs))
+    return headings, np.column_stack([t, z, forces])
 
 
 def read_log_file(case: Case, folder: Path) -> Ended | None:
@@ -216,7 +217,7 @@ def read_log_file(case: Case, folder: Path) -> Ended | None:
     plant = _plan().plant
 
     def recorded() -> Any:
-        return record(read_log(path, plant), plant)
+        return record(forces_of(malta.identification.read_log(path), plant), plant)
 
     shown = observe(line("log", str(path)), folder, [str(path)])
     ended = observe(recorded, folder, [str(path)]) if shown.code == 0 else shown

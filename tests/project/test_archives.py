@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import ROOT, refusal
+from conftest import refusal
 
 import malta
 from malta import gains
 from malta.archives import read_npz
-from malta.simulation.experiments.recording import read_log
 
 
 def npz(**arrays: Any) -> bytes:
@@ -106,9 +105,9 @@ def test_other_archives_are_refused_before_they_take_memory(data: bytes, reason:
 def test_bombs_are_refused_by_all_that_read_archives(tmp_path: Path) -> None:
     path = tmp_path / "run.npz"
     path.write_bytes(bomb())
-    plant = malta.plant_of(malta.read(ROOT / "data" / "tubular.toml", "table1"))
     assert "compressed" in refusal(lambda: gains.read(path), path).found
-    assert refusal(lambda: read_log(path, plant), path).expected == "an .npz archive of a run, not compressed"
+    refused = refusal(lambda: malta.identification.read_log(path), path)
+    assert refused.expected == "an .npz archive, not compressed"
 
 
 def test_an_array_that_stands_twice_is_refused() -> None:

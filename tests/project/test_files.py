@@ -17,7 +17,6 @@ import malta
 from malta.campaigns.store import read_manifest
 from malta.files import read_file, replace_files, scratch_folder, temporary_name, writer
 from malta.proof.certificate import checked_file
-from malta.simulation.experiments.recording import read_log
 from malta.tables import load_toml
 
 
@@ -174,15 +173,14 @@ def test_rename_that_fails_leaves_no_temporary_files(
 
 def readers(path: Path) -> list[Callable[[], object]]:
     """All that reads a file which a user names."""
-    plant = malta.plant_of(malta.read("data/tubular.toml", "table1"))
     return [
         lambda: load_toml(path),
         lambda: malta.read_design(path),
         lambda: malta.gains.read(path.with_suffix(".json")),
         lambda: malta.gains.read(path.with_suffix(".npz")),
         lambda: malta.gains.read(path.with_suffix(".mat")),
-        lambda: read_log(path.with_suffix(".csv"), plant),
-        lambda: read_log(path.with_suffix(".npz"), plant),
+        lambda: malta.identification.read_log(path.with_suffix(".csv")),
+        lambda: malta.identification.read_log(path.with_suffix(".npz")),
         lambda: read_manifest(path),
         lambda: checked_file.content_of(path),
     ]

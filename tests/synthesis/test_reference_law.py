@@ -13,8 +13,8 @@ from exported import controller, target
 from reference_law import REACH, Drive, Law
 
 import malta
+from malta.firmware import period_functions
 from malta.firmware.flight import call, compile_controller, new_state, view, write
-from malta.firmware.period_functions import decide_function, sense_function
 from malta.firmware.signals import Target, reading_ranges, state_fields
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.references import Motion
@@ -51,7 +51,8 @@ def own_step(name: str) -> Step:
 
 def step_of_engine(t: Target) -> Step:
     """The expressions of every simulation, as CasADi computes them; no text of C, none of its forms of functions."""
-    sense, decide, ff = sense_function(t), decide_function(t), t.controller.feedforward
+    sense, decide = period_functions.sense(t).plain, period_functions.decide(t).plain
+    ff = t.controller.feedforward
     state = {f.name: np.zeros(f.size) for f in state_fields(t)}
     if t.driven:
         state["link_last"] += t.believed.drive.link_voltage

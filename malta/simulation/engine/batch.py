@@ -12,15 +12,16 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import replace
 from functools import cache, lru_cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import is_default, shape_parameters, twins_of, units_of
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.engine.compiled import (
     LANES,
     Lanes,
@@ -52,12 +53,6 @@ from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation
 from malta.simulation.simulate import EngineOf, simulate
 from malta.simulation.trajectory import Trajectory, stroke_figures, trajectory_of
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import FloatArray
-
 
 # Groups of machines on several threads: each takes the next call of the engine until none is left.
 

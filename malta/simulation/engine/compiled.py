@@ -23,19 +23,15 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import platformdirs
+from numpy.typing import NDArray
 
 from malta.errors import InputError
 from malta.files import scratch_folder
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import FloatArray
-
+from malta.model.plant import FloatArray
 
 # Folders that nobody else can write to: whoever writes a library's file decides what this process runs.
 #

@@ -5,18 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from malta.display import Description, display
-from malta.model.plant import Plant, readonly
+from malta.model.plant import FloatArray, Plant, readonly
 from malta.simulation.layout import flatten, layout_of, numbers_of
 from malta.simulation.readings import TOGETHER
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 LEVELS = (0.1, 0.9)  # shares of a stroke between which its rise is measured
 LARGEST_FIGURE = 1e30  # of a run that was completed, SI

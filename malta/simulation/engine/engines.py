@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import cache, lru_cache, partial
 from importlib.resources import files
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -17,7 +17,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import acting_names, shape_parameters, twins_of
-from malta.model.plant import Plant
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.engine.compiled import address_of, feedforward_table, library
 from malta.simulation.engine.instructions import (
     MASKS,
@@ -36,10 +36,6 @@ from malta.simulation.engine.integration_state import with_working_state
 from malta.simulation.layout import SHARED, Setup, electronics_of, ending_columns, flatten, numbers_of
 from malta.simulation.period import Period, chain, columns_of, period_of, without_zeros
 from malta.synthesis.controller import Controller, gains_of
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # C text of CasADi functions: the control period inside the loop of engine.c, on the numbers of numbers.c.
 #
@@ -474,7 +470,7 @@ void run(long count, const casadi_real *given, const casadi_real *numbers, casad
 }}
 """
 
-Loop = Callable[["FloatArray", "Sequence[FloatArray]", "FloatArray"], "FloatArray"]
+Loop = Callable[[FloatArray, Sequence[FloatArray], FloatArray], FloatArray]
 """(first state, tables of inputs with a line for each sample, numbers) -> rows, a line for each sample."""
 
 

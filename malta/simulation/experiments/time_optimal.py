@@ -20,6 +20,7 @@ voltage_share below 1 leaves room for this voltage, and a current_share below 1 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -35,10 +36,7 @@ from malta.model.plant import FloatArray, Plant, readonly
 from malta.simulation import references
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from scipy.interpolate import PPoly
-
 
 ROUNDS = 8  # meshes, at most
 STILL = 5e-4  # share of T by which the last mesh may still change T

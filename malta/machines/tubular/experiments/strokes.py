@@ -1,4 +1,4 @@
-"""Strokes of MALTA: the published one, and the fastest that the drive allows."""
+"""Strokes of MALTA: the published one, the fastest that the drive allows, and a slow one that records v0(z)."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache, partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
 
 from malta.errors import CheckError, InputError
 from malta.merits import reported_merits
@@ -28,22 +31,14 @@ from malta.simulation.experiments import (
     rms,
     scenario_of,
 )
-from malta.simulation.experiments.recording import (
-    ForceLog,
-    Recorded,
-    force_log,
-    read_log,
-    record,
-    require_integral_action,
-    slow_stroke,
-    with_recorded,
-)
-from malta.simulation.references import Profile, Reference
+from malta.simulation.references import QUINTIC_DURATION, Motion, Profile, Reference, quintic
 from malta.simulation.scenario import Scenario
 from malta.simulation.trajectory import Trajectory, stroke_figures
 from malta.synthesis.controller import Controller
+from malta.synthesis.feedforward import V0_STEP, V0_STEPS
 
 if TYPE_CHECKING:
+    from malta.identification.log import Log
     from malta.simulation.experiments.time_optimal import FastestStroke, SigmoidStroke
 
 
@@ -222,10 +217,176 @@ def induced_per_speed(plant: Plant) -> float:
     return float(np.abs(np.array(ca.evalf(plant.drive.emf(ca.SX(ca.DM(plant.at(**{rate: 1.0}).x)))))).max())
 
 
-# v0(z) of MALTA recorded by a slow stroke, beside the computed one, on machines whose cogging is displaced.
+# v0(z) of MALTA recorded by a slow stroke there and back, beside the computed one, also with displaced cogging.
+#
+# In steady state the commanded forces hold the mover, whatever the loads are: v + d(z) = m z'' ~ 0. What depends on
+# the way, as friction and the lag of the integrals, has opposite signs there and back, and the mean of both is
+#
+#     v0(z) = (v_there(z) + v_back(z)) / 2
+#
+# Each way is fitted by least squares with a function that is linear between the positions of a grid, as the law reads
+# it. Means of some neighbouring samples are fitted: the noise of a single reading of z is in the command of the same
+# sample.
 
 
 SLOW, OWN, RECORDED = "slow stroke", "own v0", "recorded v0"  # the cases of a machine
+COVERED = 0.98  # share of the travel, either way, that a log has to cover and the recorded table covers
+SWEPT = 0.99  # share of the travel that the slow stroke covers
+POINTS = 4000  # means of neighbouring samples, at least, where a log has so many samples
+TURN = 0.05  # share of the travel: a shorter way back is noise
+LEAST = 2  # means in each interval of the grid, each way
+INERTIA = 0.1  # N, largest inertial force of a stroke that counts as slow
+PLACES = 20  # parts of the travel with a mean speed each
+
+
+class ForceLog(NamedTuple):
+    """Samples of a machine under control, SI."""
+
+    source: str  # the file or the run, as errors name it
+    t: FloatArray  # s, k
+    z: FloatArray  # m, k, measured positions along the stroke
+    v: FloatArray  # N or N m, k x m, commanded forces
+
+
+def force_log(run: Trajectory) -> ForceLog:
+    """The log of a simulated run of a machine with a stroke."""
+    return ForceLog(run.scenario.name, run.t, run.y[:, run.plant.stroke_output], run.v)
+
+
+def forces_of(log: Log, plant: Plant) -> ForceLog:
+    """Positions and commanded forces of a log. Raises InputError for a missing column, and for a missing reading."""
+    names = [s.name for s in plant.inputs]
+    z, v = log.table("y", [plant.stroke]), log.table("v", names)
+    for name, column in zip([plant.stroke, *names], np.hstack([z, v]).T, strict=True):
+        missing = np.flatnonzero(~np.isfinite(column))
+        if len(missing):
+            found = f"no finite number in row {missing[0] + 1}"
+            raise InputError(log.source, name, found, "a number in every row")
+    return ForceLog(log.source, log.t, z[:, 0], v)
+
+
+class Recorded(NamedTuple):
+    """v0(z) from a log."""
+
+    z_grid: FloatArray  # m, g
+    v0: FloatArray  # N, g x m
+    apart: FloatArray  # N, g x m, half of the difference between the two ways
+
+
+def slow_stroke(plant: Plant, way: float) -> Reference:
+    """From one end of the travel to the other and back, a quintic of `way` seconds each.
+
+    The stroke begins and ends at -SWEPT of the travel; the other outputs stay at zero.
+    """
+    reach, axis = SWEPT * plant.travel, plant.stroke_output
+
+    def at(t: FloatArray) -> Motion:
+        motion = [np.zeros((len(t), len(plant.outputs))) for _ in range(3)]
+        there, back = (quintic(t - centre, way / QUINTIC_DURATION) for centre in (way / 2, 1.5 * way))
+        for column, one, other, offset in zip(motion, there, back, (-reach, 0.0, 0.0), strict=True):
+            column[:, axis] = offset + 2 * reach * (one - other)
+        return Motion(*motion)
+
+    return at
+
+
+def record(log: ForceLog, plant: Plant) -> Recorded:
+    """The forces v0(z) that held a machine along its travel, from a log of a slow stroke there and back.
+
+    Raises InputError, naming the log, where it does not cover the travel in both directions, or where the stroke is
+    so fast that inertia takes a part of the forces.
+
+        recorded = record(forces_of(malta.identification.read_log("stand.csv"), plant), plant)
+    """
+    reach = COVERED * plant.travel
+    low, high = float(log.z.min()), float(log.z.max())
+    if low > -reach or high < reach:
+        found = f"positions from {low * 1e3:.4g} to {high * 1e3:.4g} mm"
+        raise InputError(
+            log.source, plant.stroke, found, f"the travel, -{reach * 1e3:.4g} to {reach * 1e3:.4g} mm"
+        )
+    half = max(V0_STEPS, math.ceil(reach / V0_STEP))
+    z_grid = np.linspace(-reach, reach, 2 * half + 1)
+    means = _average(log)
+    _require_slow(means, plant)
+    rising = _rising(means.z, TURN * plant.travel)
+    there, back = (
+        _fit(means._replace(z=means.z[chosen], v=means.v[chosen]), z_grid, plant.stroke, way)
+        for chosen, way in ((rising, "there"), (~rising, "back"))
+    )
+    return Recorded(z_grid, (there + back) / 2, (there - back) / 2)
+
+
+def with_recorded(c: Controller, recorded: Recorded) -> Controller:
+    """The controller with the recorded v0(z) in its feedforward, named NAME_recorded."""
+    name = c.name if c.name.endswith("_recorded") else f"{c.name}_recorded"
+    table = replace(c.feedforward, z_grid=recorded.z_grid, v0=recorded.v0)
+    return replace(c, name=name, feedforward=table)
+
+
+def require_integral_action(c: Controller) -> None:
+    """Raise InputError for a controller that leaves a load at an offset, whose forces are not those of the load."""
+    if c.tracks == "states" and not c.integrating and not c.observed:
+        expected = "gains with integrals or observed disturbances"
+        raise InputError("record-v0", "gains", f"{c.name}, without integral action", expected)
+
+
+def _average(log: ForceLog) -> ForceLog:
+    """Means of neighbouring samples; the last samples are left out where they do not fill a mean."""
+    size = max(1, len(log.z) // POINTS)
+    count = len(log.z) // size * size
+    t, z, v = (s[:count].reshape(-1, size, *s.shape[1:]).mean(axis=1) for s in (log.t, log.z, log.v))
+    return log._replace(t=t, z=z, v=v)
+
+
+def _rising(z: FloatArray, turn: float) -> NDArray[np.bool_]:
+    """True on a way towards positive z; a way back that is shorter than `turn` counts as noise."""
+    from scipy.signal import find_peaks  # a third of a second to import
+
+    turns = np.concatenate([find_peaks(sign * z, prominence=turn)[0] for sign in (1, -1)])
+    edges = [0, *sorted(turns.tolist()), len(z)]
+    rising = np.zeros(len(z), dtype=bool)
+    for first, last in pairwise(edges):
+        rising[first:last] = z[last - 1] > z[first]
+    return rising
+
+
+def _require_slow(log: ForceLog, plant: Plant) -> None:
+    """Raise InputError where the mover's kinetic energy changes by more than INERTIA times the way.
+
+    The speed is the mean one in each of PLACES parts of the travel, so that noise does not show.
+    """
+    edges = np.linspace(-COVERED * plant.travel, COVERED * plant.travel, PLACES + 1)
+    middle, speed = (log.z[1:] + log.z[:-1]) / 2, np.abs(np.diff(log.z) / np.diff(log.t))
+    place = np.digitize(middle, edges)
+    mean = np.array([speed[place == k].mean() for k in range(1, PLACES + 1) if (place == k).any()])
+    force = plant.mass / 2 * np.abs(np.diff(mean**2)).max(initial=0.0) / (edges[1] - edges[0])
+    if force > INERTIA:
+        found = f"a stroke that accelerates the mover by {force:.3g} N"
+        raise InputError(log.source, plant.stroke, found, f"a slow one: at most {INERTIA:g} N")
+
+
+def _fit(log: ForceLog, z_grid: FloatArray, stroke: str, way: str) -> FloatArray:
+    """Values at the grid of the function, linear between them, that fits v(z) best: g x m.
+
+    Raises InputError where an interval of the grid has too few samples.
+    """
+    inside = (log.z >= z_grid[0]) & (log.z <= z_grid[-1])
+    z, v = log.z[inside], log.v[inside]
+    k = np.clip(np.searchsorted(z_grid, z, side="right") - 1, 0, len(z_grid) - 2)
+    counts = np.bincount(k, minlength=len(z_grid) - 1)
+    if counts.min() < LEAST:
+        found = f"no way {way} past {z_grid[int(counts.argmin())] * 1e3:.4g} mm"
+        raise InputError(log.source, stroke, found, "a slow stroke there and back over the whole travel")
+    b = (z - z_grid[k]) / (z_grid[k + 1] - z_grid[k])
+    a, g = 1 - b, len(z_grid)
+    normal = np.zeros(
+        (2, g)
+    )  # the symmetric tridiagonal matrix of the normal equations: diagonal, then below it
+    normal[0] = np.bincount(k, a * a, g) + np.bincount(k + 1, b * b, g)
+    normal[1] = np.bincount(k, a * b, g)
+    right = [np.bincount(k, a * f, g) + np.bincount(k + 1, b * f, g) for f in v.T]
+    return np.asarray(solveh_banded(normal, np.column_stack(right), lower=True))
 
 
 class _Found(NamedTuple):
@@ -246,7 +407,7 @@ def record_v0(
     progress: Progress | None = None,
     **options: Any,
 ) -> Experiment:
-    """v0(z) recorded by a slow stroke there and back (`way` s each), or from the file `log` (.csv, .npz).
+    """v0(z) recorded by a slow stroke there and back (`way` s each), or from the file `log`.
 
     The published stroke with the controller's own v0(z) and with the recorded one; the same on machines whose cogging
     is displaced by +-`phase_error` rad, which the controller does not know. With --out, gain files with the recorded
@@ -256,7 +417,11 @@ def record_v0(
     simulated slow stroke does not cover the travel.
     """
     require_integral_action(controller)
-    measured = read_log(log, plant) if log else None
+    measured = None
+    if log:
+        from malta.identification.log_files import read_log  # which no run reads
+
+        measured = forces_of(read_log(log), plant)
     machines = {"": plant} | dict(_displace(plant, phase_error))
     found: dict[str, _Found] = {}
     for n, (label, machine) in enumerate(machines.items()):

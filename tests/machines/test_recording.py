@@ -13,17 +13,18 @@ import pytest
 from conftest import refusal
 
 import malta
-from malta.machines.tubular.experiments.strokes import OWN, RECORDED, SLOW
-from malta.simulation.experiments import Experiment
-from malta.simulation.experiments.recording import (
+from malta.machines.tubular.experiments.strokes import (
+    OWN,
+    RECORDED,
+    SLOW,
     ForceLog,
-    columns_of_log,
     force_log,
-    read_log,
+    forces_of,
     record,
     slow_stroke,
     with_recorded,
 )
+from malta.simulation.experiments import Experiment
 from malta.simulation.scenario import Scenario
 from malta.simulation.trajectory import save
 from malta.synthesis.feedforward import static_feedforward
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
 
 ROBUST = "design/gains/robust.json"
+HEADINGS = ("t [s]", "z [m]", "fx_B1 [N]", "fy_B1 [N]", "fx_B2 [N]", "fy_B2 [N]", "f_D [N]")
 FORCES = np.array([0.1, 1.0, -0.2, 2.0, 0.5])
 
 
@@ -117,13 +119,15 @@ def test_observed_disturbances_record_as_well() -> None:
 # Files
 
 
+def _read(path: Path, plant: Plant) -> ForceLog:
+    return forces_of(malta.identification.read_log(path), plant)
+
+
 def test_a_log_reads_as_it_was_written(plant: Plant, tmp_path: Path) -> None:
     log = _log(plant)
-    headings = columns_of_log(plant)
-    assert headings == ("t [s]", "z [m]", "fx_B1 [N]", "fy_B1 [N]", "fx_B2 [N]", "fy_B2 [N]", "f_D [N]")
     for name, scale in (("z [m]", 1.0), ("z [mm]", 1e3)):
-        path = _write_csv(log, tmp_path / "a.csv", (headings[0], name, *headings[2:]), scale)
-        found = read_log(path, plant)
+        path = _write_csv(log, tmp_path / "a.csv", (HEADINGS[0], name, *HEADINGS[2:]), scale)
+        found = _read(path, plant)
         assert np.allclose(found.z, log.z, rtol=1e-12, atol=1e-18)
         assert np.array_equal(found.v, log.v)
         assert np.array_equal(found.t, log.t)
@@ -131,7 +135,7 @@ def test_a_log_reads_as_it_was_written(plant: Plant, tmp_path: Path) -> None:
 
 def test_a_saved_run_is_a_log(plant: Plant, tmp_path: Path) -> None:
     run = malta.simulate(plant, malta.gains.read(ROBUST), Scenario.stroke(noise=1.0))
-    found = read_log(save(run, tmp_path / "run.npz"), plant)
+    found = _read(save(run, tmp_path / "run.npz"), plant)
     for one, other in zip(found[1:], force_log(run)[1:], strict=True):
         assert np.array_equal(one, other)
 
@@ -155,38 +159,13 @@ def test_a_log_that_is_no_slow_stroke_is_refused(plant: Plant, spoil: Spoil, sen
     assert sentence in str(error)
 
 
-def test_a_file_that_is_no_log_is_refused(plant: Plant, tmp_path: Path) -> None:
-    log, headings = _log(plant), columns_of_log(plant)
-
-    def refused(path: Path) -> malta.InputError:
-        return refusal(lambda: read_log(path, plant), path)
-
-    missing = _write_csv(log, tmp_path / "a.csv", (*headings[:-1], "thrust [N]"))
-    assert refused(missing).field == "f_D"
-    assert "one, with the heading f_D [N]" in str(refused(missing))
-    wrong = _write_csv(log, tmp_path / "b.csv", ("t [s]", "z [N]", *headings[2:]))
-    assert refused(wrong).field == "z.unit"
-    for value in (np.nan, np.inf):
-        log.v[17, 1] = value
-        assert "fy_B1: found no finite number in row 18" in str(
-            refused(_write_csv(log, tmp_path / "c.csv", headings))
-        )
-    log.v[17, 1], first = 1.0, log.t[5]
-    log.t[5] = 0.0
-    assert "times that do not rise" in str(refused(_write_csv(log, tmp_path / "d.csv", headings)))
-    ragged = tmp_path / "e.csv"
-    ragged.write_text(",".join(headings) + "\n1,2,3\n")
-    assert refused(ragged).field == "line 2"
-    (tmp_path / "f.csv").write_text("")
-    assert refused(tmp_path / "f.csv").field == "t"
-    for name, content in (("g.npz", b"no archive"), ("h.npz", b"")):
-        (tmp_path / name).write_bytes(content)
-        assert "numpy cannot read" in str(refused(tmp_path / name))
-    log.t[5] = first
-    np.savez(tmp_path / "i.npz", t=log.t)
-    assert refused(tmp_path / "i.npz").found == "no such columns"
-    assert refused(tmp_path / "none.csv").found == "no such file"
-    assert refused(tmp_path / "log.txt").expected == "one of .csv, .npz"
+def test_a_log_without_its_forces_is_refused(plant: Plant, tmp_path: Path) -> None:
+    log = _log(plant)
+    path = _write_csv(log, tmp_path / "a.csv", (*HEADINGS[:-1], "thrust [N]"))
+    assert refusal(lambda: _read(path, plant), path).field == "f_D"
+    log.v[17, 1] = np.nan
+    path = _write_csv(log, tmp_path / "b.csv", HEADINGS)
+    assert "fy_B1: found no finite number in row 18" in str(refusal(lambda: _read(path, plant), path))
 
 
 # The experiment and its gain file
@@ -244,7 +223,7 @@ def test_the_gain_file_holds_the_recorded_v0(run: Run, recorded: Experiment, tmp
     assert f"wrote {tmp_path}/robust_recorded.mat" in out
     code, out, err = run(*once[:6], "--option", "log=none.csv")
     assert (code, out) == (2, "")
-    assert err == "malta: none.csv: found no such file, expected a log of a run\n"
+    assert err == "malta: none.csv: found no such file, expected a log\n"
 
 
 def test_a_second_record_keeps_the_name(recorded: Experiment) -> None:
