@@ -80,20 +80,20 @@ class Loop:
     @cached_property
     def sampled(self) -> SampledLoop:
         """The sampled matrices; voltages that the law forecasts are inputs beside the forces."""
-        return self._sampled(forces_alone=False)
-
-    @cached_property
-    def sampled_forces(self) -> SampledLoop:
-        """The same loop, with the forecast voltages as part of the law's forces."""
-        return self._sampled(forces_alone=True)
-
-    def _sampled(self, *, forces_alone: bool) -> SampledLoop:
-        found = machine_loop(self.model, self.controller, self.current_loops, forces_alone=forces_alone)
+        found = machine_loop(self.model, self.controller, self.current_loops)
         assert found.continuous is not None
         pushed = push_through(
             found.continuous, disturbance_map(self.model), self.controller.sample_time, len(found.Ad)
         )
         return replace(found, pushed=pushed)
+
+    @cached_property
+    def sampled_forces(self) -> SampledLoop:
+        """The same loop, with the forecast voltages as part of the law's forces."""
+        if chosen_loops(self.plant, self.controller, self.current_loops) != "pi":
+            return self.sampled  # which forecasts none
+        found = machine_loop(self.model, self.controller, self.current_loops, forces_alone=True)
+        return replace(found, pushed=self.sampled.pushed)
 
     @property
     def sample_time(self) -> float:

@@ -63,6 +63,8 @@ from malta.synthesis.lqg import integrals_of, kalman, lqi, lqr, weights_of
 from malta.synthesis.riccati import add_integrals, eigenvalues
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from malta.model.plant import ComplexArray, FloatArray
 
 
@@ -177,8 +179,14 @@ def stage_of(name: str, stage: SampledLoop, sensors: list[str]) -> Stage:
     def sizes(S: ComplexArray) -> FloatArray:
         return np.column_stack([np.abs(np.einsum("kii->ki", S)), _singular_values(S)[:, 0]])
 
+    def own(near: FloatArray, k: NDArray[np.int_]) -> FloatArray:
+        S, i = stage.sensitivity(near), np.minimum(k, len(sensors) - 1)
+        found, all_of_them = np.abs(S[np.arange(len(S)), i, i]), k == len(sensors)
+        found[all_of_them] = _singular_values(S[all_of_them])[:, 0]
+        return found
+
     w, _, S = _on_grid(stage)
-    peaks, at = find_peaks(lambda near: sizes(stage.sensitivity(near)), w, sizes(S))
+    peaks, at = find_peaks(lambda near: sizes(stage.sensitivity(near)), w, sizes(S), own)
     return Stage(name, dict(zip([*sensors, "sigma_max"], peaks.tolist(), strict=True)), float(at[-1]), radius)
 
 

@@ -293,6 +293,9 @@ def _search(
 STILL = 1e-9  # m/s, rad/s, m/s2 or rad/s2: a machine that changes by less is at rest
 SHARE = 1e-10  # of the rates that the inputs make: rounding
 LIMIT_ROUNDING = 1e-9  # of a limit
+MANY = (
+    32  # states at rest from which on a function of those entries alone that are not zero is worth its trace
+)
 STARTS = (1.0, 0.3, 0.1, 0.01)  # of the limits of the commands, from where a balance is searched at last
 
 
@@ -352,8 +355,7 @@ def exceeded_limit(plant: Plant, point: OperatingPoint) -> str:
     for s, v, most in zip(plant.inputs, point.v.tolist(), plant.actuator.force_limit, strict=False):
         if abs(v) > most * (1 + LIMIT_ROUNDING):
             return f"the command {s.name} = {v:.4g} {s.unit} is beyond its limit of {most:.4g} {s.unit}"
-    _, currents = chain(plant, None)
-    wanted = np.array(currents(point.x, point.v)).ravel()
+    wanted = trace(_currents_wanted, plant)(point.x, point.v)[0].ravel()
     carried = np.array(ca.evalf(ca.vertcat(plant.limited(ca.DM(wanted))))).ravel()
     carried = np.clip(carried, -plant.actuator.current_limit, plant.actuator.current_limit)
     missed = np.abs(carried - wanted)
@@ -448,8 +450,10 @@ def _commands(
     def near(acting: FloatArray) -> Any:
         return np.abs(acting - inputs) <= 1e-12 * sizes
 
-    if loaded and not before and near(made.each(states, inputs)[0].T).all():
-        return inputs, inputs  # the currents of a command make just what it commands
+    if loaded and not before:
+        here = made if len(states) < MANY else trace(_made, plant, believed, _used(states), _used(inputs))
+        if near(here.each(states, inputs)[0].T).all():
+            return inputs, inputs  # the currents of a command make just what it commands
     equations = _equations(trace(_effect_missed, plant, believed, loaded), np.hstack([states, inputs]))
     rough = np.where(inputs < 0, -1.0, 1.0) * scales
     starts = [
@@ -465,17 +469,39 @@ def _commands(
     return found.values, np.where(near(acting), inputs, acting)
 
 
-def _made(plant: Plant, believed: Plant | None) -> tuple[list[Any], list[Any]]:
-    """(x, v) -> inputs that the currents of v make."""
-    x, v, i = _currents_of(plant, believed)
-    return [x, v], [ca.densify(plant.forces(x, i))]
+def _used(rows: FloatArray) -> tuple[float, ...]:
+    """1 for columns that are not zero throughout, 0 for others."""
+    return tuple(rows.any(axis=0).astype(float).tolist())
+
+
+def _made(
+    plant: Plant, believed: Plant | None, states: tuple[float, ...] = (), commands: tuple[float, ...] = ()
+) -> tuple[list[Any], list[Any]]:
+    """(x, v) -> inputs that the currents of v make; of the states and the commands alone that are used, if any are."""
+    symbols = _symbols(plant, believed)
+    x, v = (one * ca.DM(used) if used else one for one, used in zip(symbols, (states, commands), strict=True))
+    return symbols, [ca.cse(ca.densify(plant.forces(x, _currents(plant, believed, x, v))))]
 
 
 def _currents_of(plant: Plant, believed: Plant | None) -> tuple[Any, Any, Any]:
     """Symbols for the states x and the command v, and the currents of v there."""
+    x, v = _symbols(plant, believed)
+    return x, v, _currents(plant, believed, x, v)
+
+
+def _symbols(plant: Plant, believed: Plant | None) -> list[Any]:
     kind = ca.MX if (believed or plant).tabulated else ca.SX
-    x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))
-    return x, v, (believed or plant).currents(plant.h(x, kind.zeros(len(plant.inputs))), v)
+    return [kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))]
+
+
+def _currents(plant: Plant, believed: Plant | None, x: Any, v: Any) -> Any:
+    return (believed or plant).currents(plant.h(x, type(x).zeros(len(plant.inputs))), v)
+
+
+def _currents_wanted(plant: Plant, believed: Plant | None) -> tuple[list[Any], list[Any]]:
+    """(x, v) -> the currents of v, A."""
+    x, v, i = _currents_of(plant, believed)
+    return [x, v], [ca.densify(i)]
 
 
 def _effect_missed(plant: Plant, believed: Plant | None, loaded: bool) -> tuple[list[Any], list[Any]]:

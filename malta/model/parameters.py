@@ -122,7 +122,8 @@ def describe(record: Parameters) -> str:
 
 def acting_names(record: Parameters) -> list[str]:
     """The names of the parameters that are symbols in simulations: those of `symbolic_names` without their defaults."""
-    return [name for name in symbolic_names(record) if not is_default(record, name)]
+    given = [f.name for f in fields(record) if f.default is MISSING or getattr(record, f.name) != f.default]
+    return [name for name in symbolic_names(record) if name in given]
 
 
 def differences(record: type[Parameters] | Parameters) -> dict[str, str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import casadi as ca
@@ -493,13 +493,22 @@ class OperatingPoint:
             object.__setattr__(self, "v", readonly(self.v))
 
 
-def trace(name: str, arguments: list[Any], expression: Any) -> CasadiFn:
-    """A function of `arguments` for an expression; symbols of parameters in the expression stay symbols."""
-    body = ca.cse(expression)
-    known = {symbol.__hash__() for a in arguments for symbol in ca.symvar(a)}
-    free = [symbol for symbol in ca.symvar(body) if symbol.__hash__() not in known]
-    function = ca.Function(name, [*arguments, *free], [body])
-    return lambda *given: function(*given, *free)
+def trace(name: str, arguments: list[Any], expression: Callable[..., Any]) -> CasadiFn:
+    """A function of `arguments` for expression(*arguments), traced at its first call: machines that differ in numbers
+    alone share what is traced of one of them. Symbols of parameters in the expression stay symbols."""
+
+    @cache
+    def traced() -> tuple[ca.Function, list[Any]]:
+        body = ca.cse(expression(*arguments))
+        known = {symbol.__hash__() for a in arguments for symbol in ca.symvar(a)}
+        free = [symbol for symbol in ca.symvar(body) if symbol.__hash__() not in known]
+        return ca.Function(name, [*arguments, *free], [body]), free
+
+    def call(*given: Any) -> Any:
+        function, free = traced()
+        return function(*given, *free)
+
+    return call
 
 
 def symbolic(parameters: Any, symbols: Mapping[str, Any]) -> Any:

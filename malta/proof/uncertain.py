@@ -24,6 +24,8 @@ from malta.proof.time_limit import check_time
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from malta.model.plant import ComplexArray, FloatArray
 
 
@@ -412,11 +414,15 @@ def _law(law: Compensator, w: bytes) -> tuple[ComplexArray, ComplexArray, Comple
 
 
 def find_peaks(
-    sizes: Callable[[FloatArray], FloatArray], w: FloatArray, values: FloatArray | None = None
+    sizes: Callable[[FloatArray], FloatArray],
+    w: FloatArray,
+    values: FloatArray | None = None,
+    own: Callable[[FloatArray, NDArray[np.int_]], FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """The largest value of each column of sizes(w) (k x n) over the frequencies w, and where it lies (rad/s).
 
-    The grid is refined three times around each peak. values : sizes(w), where they are known
+    The grid is refined three times around each peak. values : sizes(w), where they are known; own : own(w, k) is
+    column k[j] at w[j] alone, where that is less work than sizes(w)
     """
     values = (sizes(w) if values is None else values).T
     around = np.tile(w, (len(values), 1))
@@ -425,8 +431,10 @@ def find_peaks(
         rows = np.arange(len(k))
         low, high = around[rows, np.maximum(k - 1, 0)], around[rows, np.minimum(k + 1, around.shape[1] - 1)]
         around = np.geomspace(low, high, 17, axis=1)
-        found = sizes(around.ravel()).reshape(*around.shape, -1)
-        values = found[rows, :, rows]
+        if own is None:
+            values = sizes(around.ravel()).reshape(*around.shape, -1)[rows, :, rows]
+        else:
+            values = own(around.ravel(), np.repeat(rows, around.shape[1])).reshape(around.shape)
     return values.max(axis=1), around[rows, values.argmax(axis=1)]
 
 

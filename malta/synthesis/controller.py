@@ -417,15 +417,23 @@ def commanded(
     v0: Any,
 ) -> tuple[Any, Any, Any]:
     """Steps 3, 4 and 6: (xi_pred, forces that saturate, v) from the estimate and the sums of errors."""
-    # The first sum is the same for all machines under one reference: engines compute it once a sample.
-    wanted = (g["K"] @ xi_ref + v_ff) + (g["Ki"] @ e - g["K"] @ xi_hat) + v0
+    wanted = _wanted(g, xi_hat, e, xi_ref, v_ff, v0)
     if "braking" in g:
         wanted = wanted + _braking_force(g, xi_ref - xi_hat)
     note("law", "w = K (xi_ref - xi_hat) + Ki e + v_ff + v0", w=wanted)
     v = ca.fmax(ca.fmin(wanted, g["force_limit"]), -g["force_limit"])
     saturated = v != wanted
     note("limit_forces", "v = w within +-limits.force; saturated: v is not w", v=v, saturated=saturated)
-    return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), saturated, v
+    return _predicted(g, xi_hat, v, v0), saturated, v
+
+
+def _wanted(g: Mapping[str, Any], xi_hat: Any, e: Any, xi_ref: Any, v_ff: Any, v0: Any) -> Any:
+    # The first sum is the same for all machines under one reference: engines compute it once a sample.
+    return (g["K"] @ xi_ref + v_ff) + (g["Ki"] @ e - g["K"] @ xi_hat) + v0
+
+
+def _predicted(g: Mapping[str, Any], xi_hat: Any, v: Any, v0: Any) -> Any:
+    return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0)
 
 
 def frozen_axes(g: Mapping[str, Any], saturated: Any) -> Any:
@@ -501,21 +509,14 @@ def _fixed(c: Controller, r: float) -> Controller:
     return replace(c, **c.schedule.at(r), schedule=None)
 
 
-@lru_cache(
-    maxsize=8
-)  # every loop of a controller asks for it; records compare by identity, so no hit is stale
+@lru_cache(maxsize=8)  # every loop of a controller asks for it; records compare by identity
 def linear_law(c: Controller) -> LinearLaw:
-    """The control law linearized where no axis saturates: exact, by differentiating `law`.
+    """The control law linearized where no axis saturates or brakes: exact, from the steps that `law` is made of.
 
     Of a schedule it is the law at the operating point; `law_at` has those at other references.
     """
-    step = law(replace(c, schedule=None))
-    args = {step.name_in(i): ca.SX.sym(step.name_in(i), *step.size_in(i)) for i in range(step.n_in())}
-    out = dict(zip(step.name_out(), step(*args.values()), strict=True))
-    blocks = _blocks(args, out, c.summed)
-    found = LinearLaw(
-        *(np.array(M) for M in ca.Function("linear", list(args.values()), blocks)(*[0] * len(args)))
-    )
+    gains = {name: getattr(c, name) for name in SCHEDULED}
+    found = _without_limits(gains, c.sample_time, c.tracks, c.summed)
     k = len(c.states) - len(c.measurements)
     kept = any(M[k:].any() for M in (found.A, found.B_y, found.B_r))
     if c.tracks == "errors" and not kept:  # the last errors are new at every sample
@@ -524,36 +525,31 @@ def linear_law(c: Controller) -> LinearLaw:
 
 
 def linear_law_of(g: Gains, Ts: float) -> LinearLaw:
-    """The same of gains alone, for a search that tries thousands: without references, so r is empty.
-
-    It is differentiated once for each number of states, forces and measurements, with the gains as symbols, and only
-    evaluated afterwards: `linear_law` takes longer than all else in a trial.
-    """
-    (n, m), p = g.Bd.shape, len(g.Cd)
-    found = _law_of_gains(n, m, p, _summed(g.Ki))(*g, Ts)
-    A, B_y, C, D_y = (np.array(M) for M in found)
-    return LinearLaw(A, B_y, np.zeros((len(A), 0)), C, D_y, np.zeros((m, 0)))
+    """The same of gains alone, for a search that tries thousands: without references, so r is empty."""
+    return _without_limits(g._asdict(), Ts, "states", _summed(g.Ki), references=False)
 
 
-@lru_cache(maxsize=32)
-def _law_of_gains(n: int, m: int, p: int, summed: tuple[int, ...]) -> ca.Function:
-    """(Ad, Bd, Cd, K, Ki, L, control_time) -> (A, B_y, C, D_y)."""
-    shapes = {"Ad": (n, n), "Bd": (n, m), "Cd": (p, n), "K": (m, n), "Ki": (m, p), "L": (n, p)}
-    g = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
-    g["control_time"] = ca.SX.sym("control_time")
-    args, out = _symbolic_law(g | {"force_limit": ca.inf}, n, m, p)
-    A, B_y, _, C, D_y, _ = _blocks(args, out, summed)
-    still = [ca.DM.zeros(*symbol.shape) for symbol in args.values()]
-    blocks = ca.substitute([A, B_y, C, D_y], list(args.values()), still)
-    return ca.Function("law_of_gains", list(g.values()), blocks)
-
-
-def _blocks(args: Mapping[str, Any], out: Mapping[str, Any], summed: tuple[int, ...]) -> list[ca.SX]:
-    """The derivatives of a law, in the order of LinearLaw, with the sums of errors that are fed back."""
-    s = ca.vertcat(args["xi_pred"], *(args["e"][k] for k in summed))
-    r = ca.vertcat(*(args[name] for name in ("p_ref", "xi_ref", "v_ff", "v0")))
-    s_next = ca.vertcat(out["xi_pred_next"], *(out["e_next"][k] for k in summed))
-    return [ca.jacobian(of, by) for of in (s_next, out["v"]) for by in (s, args["y"], r)]
+def _without_limits(
+    gains: Mapping[str, FloatArray],
+    Ts: float,
+    tracks: Tracks,
+    summed: tuple[int, ...],
+    *,
+    references: bool = True,
+) -> LinearLaw:
+    """The law of one sample, whose steps are linear without limits: what it makes of unit vectors are its matrices."""
+    (n, m), p = gains["Bd"].shape, len(gains["Cd"])
+    g = {name: ca.sparsify(ca.DM(M)) for name, M in gains.items()} | {"control_time": Ts}
+    ends = np.cumsum([n, p, p, p, n, m, m]).tolist()
+    units = ca.DM.eye(ends[-1])[:, : ends[-1] if references else ends[2]]
+    xi_pred, e, y, p_ref, *given = ca.vertsplit(units, [0, *ends])
+    xi_hat = estimated(g, xi_pred, filtered(tracks, y, p_ref))
+    e_next = sum_errors(g, e, 0.0, y, p_ref)
+    v = _wanted(g, xi_hat, e_next, *given)
+    s_next = ca.vertcat(_predicted(g, xi_hat, v, given[-1]), e_next[list(summed), :])
+    s = [*range(n), *(n + k for k in summed)]
+    columns = (s, slice(ends[1], ends[2]), slice(ends[2], None))
+    return LinearLaw(*(np.array(M)[:, of] for M in (s_next, v) for of in columns))
 
 
 def with_slope(law: LinearLaw, slope: FloatArray) -> LinearLaw:

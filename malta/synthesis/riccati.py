@@ -34,7 +34,7 @@ REFINED = 1e-13  # the residual above which a solution is refined: rounding leav
 EPS = float(np.finfo(float).eps)
 STEPS = 8  # of Newton's at most; each squares the error
 ROUNDING = 1e-16  # couplings below this, relative to what else acts on and from both ends, are none
-BALANCED = 1e-6  # the last change of scales that are rounded to powers of two
+BALANCED = 1e-2  # the last change of scales that are rounded to powers of two
 DOUBLINGS = 64  # at most: sums of 2^64 samples
 LARGEST = 1e8  # entry of a matrix whose exponential is taken
 
@@ -361,13 +361,14 @@ def _balance(A: FloatArray, G: FloatArray, Q: FloatArray) -> FloatArray:
     Osborne's iteration, restricted to the scalings that keep it Hamiltonian.
     """
     a, g, q = ((np.abs(M) ** 2) for M in (A - np.diag(np.diag(A)), G, Q))
-    s, one = np.ones(len(A)), np.ones(len(A))  # s = t^2
+    s = np.ones(len(A))  # t^2
     for _ in range(100):
-        falls, grows = (a @ s + g @ (1 / s)) / s, ((1 / s) @ a + s @ q) * s  # sums of squares, with t
+        r = 1 / s
+        falls, grows = (a @ s + g @ r) * r, (r @ a + s @ q) * s  # sums of squares, with t
         # G_ii and Q_ii change with t_i^2, squared here: with the fourth root of off-diagonal entries they oscillate.
-        step = np.divide(falls, grows, out=one.copy(), where=(falls > 0) & (grows > 0)) ** 0.25
+        step = np.sqrt(np.sqrt(np.where((falls > 0) & (grows > 0), falls / grows, 1.0)))
         s = s * step
-        if abs(step - one).max(initial=0.0) < BALANCED:
+        if np.abs(step - 1).max(initial=0.0) < BALANCED:
             break
     t = np.sqrt(s)
     return _powers_of_two(t)

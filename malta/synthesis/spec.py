@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
@@ -525,8 +526,29 @@ def place_of(
     """
     if isinstance(law, StructuredLaw):
         raise InputError(where, field, repr(entry), "none beside [structure]: its elements have low and high")
+    if entry == "pid.filter":
+        return "filter", (), "s", False
     coordinates: Coordinates = law.coordinates if isinstance(law, Weights) else "signals"
     axes: PidAxes = law.axes if isinstance(law, Pid) else "decentralized"
+    tables = _entries(plant, coordinates, axes)
+    table, _, name = entry.rpartition(".")
+    if table not in tables:
+        raise InputError(
+            where, field, repr(entry), "an entry as bases.state.x, in one of " + " ".join(tables)
+        )
+    weight, signals, squared = tables[table]
+    names = [s.name for s in signals]
+    if name not in names:
+        raise InputError(where, field, repr(entry), f"one of {table}: {' '.join(names)}")
+    index = names.index(name)
+    return weight, index, signals[index].unit, squared
+
+
+@lru_cache(maxsize=8)  # a file names dozens of entries; plants compare by identity
+def _entries(
+    plant: Plant, coordinates: Coordinates, axes: PidAxes
+) -> dict[str, tuple[str, Sequence[Signal], bool]]:
+    """The tables of a law by name: the field of Weights or Pid, its entries, and whether they count as squares."""
     integrals = integral_signals(plant, coordinates)
     plain = [Signal(s.name, "1") for s in plant.design_states + plant.inputs + plant.outputs]
     tables: dict[str, tuple[str, Sequence[Signal], bool]] = {
@@ -545,16 +567,4 @@ def place_of(
     pairs = len(plant.inputs) == len(plant.outputs) or axes != "decentralized"
     for name, gains in pid_signals(plant, axes).items() if pairs else ():
         tables[f"pid.{name}"] = ("filter" if name == "filters" else name, gains, False)
-    if entry == "pid.filter":
-        return "filter", (), "s", False
-    table, _, name = entry.rpartition(".")
-    if table not in tables:
-        raise InputError(
-            where, field, repr(entry), "an entry as bases.state.x, in one of " + " ".join(tables)
-        )
-    weight, signals, squared = tables[table]
-    names = [s.name for s in signals]
-    if name not in names:
-        raise InputError(where, field, repr(entry), f"one of {table}: {' '.join(names)}")
-    index = names.index(name)
-    return weight, index, signals[index].unit, squared
+    return tables

@@ -158,10 +158,7 @@ def wrench_matrix(par: Parameters, model: CoilModel, p: Any, q_r: Any = None) ->
     NOTE: (33) prints F_z3 in column 2.
     """
     if isinstance(p, np.ndarray):
-        arms, levers = _arms(par)
-        at = arms + check_position(par, p)
-        K: FloatArray = (levers @ model(at[:, 0], at[:, 1], at[:, 2] - par.r_z)[..., None])[..., 0].T
-        return K
+        return _wrench_matrices(par, model, check_position(par, p))
     columns, xs, ys = [], {}, {}
     for a, b in product(STEPS, STEPS):  # parameters may be symbols here
         arm = ca.vertcat(a * par.coil_pitch, b * par.coil_pitch, par.r_z)
@@ -178,6 +175,14 @@ def wrench_matrix(par: Parameters, model: CoilModel, p: Any, q_r: Any = None) ->
         model.note_shared(list(xs.values()), list(ys.values()), z)
     note("wrench_matrix", "K: wrench of 1 A in each coil, column by column", len(columns), K=K)
     return K
+
+
+def _wrench_matrices(par: Parameters, model: CoilModel, p: FloatArray) -> FloatArray:
+    """K of level movers at positions p (..., 3): (..., 6, 16)."""
+    arms, levers = _arms(par)
+    at = arms + p[..., None, :]
+    K: FloatArray = (levers @ model(at[..., 0], at[..., 1], at[..., 2] - par.r_z)[..., None])[..., 0]
+    return K.swapaxes(-1, -2)
 
 
 def currents(K: Any, W: Any, weights: Any = None) -> Any:
@@ -237,12 +242,11 @@ def conditioning(par: Parameters, model: CoilModel, n: int = 12) -> FloatArray:
     """
     steps = np.arange(n) * 2 * par.tau_n / n
     scale = np.array([1.0] * 3 + [math.sqrt(par.m / par.I_x)] * 3)[:, None]
-    found = np.empty((n, n))
-    for a, x in enumerate(steps):
-        for b, y in enumerate(steps):
-            s = np.linalg.svd(scale * wrench_matrix(par, model, np.array([x, y, par.h])), compute_uv=False)
-            found[a, b] = s[0] / s[-1] if s[-1] > 1e-12 * s[0] else np.inf
-    return found
+    p = np.stack([*np.meshgrid(steps, steps, indexing="ij"), np.full((n, n), par.h)], axis=-1)
+    check_position(par, p[-1, -1])
+    s = np.linalg.svd(scale * _wrench_matrices(par, model, p), compute_uv=False)
+    regular = s[..., -1] > 1e-12 * s[..., 0]
+    return np.divide(s[..., 0], s[..., -1], out=np.full((n, n), np.inf), where=regular)
 
 
 def check_pitch(par: Parameters, model: CoilModel) -> float:

@@ -58,7 +58,7 @@ def plant(par: Parameters) -> Plant:
         outputs=POSITIONS,
         disturbances=WRENCH,
         uncontrolled=(),
-        f=trace("f", [x, u, w], motion(par, x, u, w)),
+        f=trace("f", [x, u, w], partial(motion, par)),
         h=lambda x, _: x[:6],
         load=lambda _: load(par),
         position_of=lambda y: y,
