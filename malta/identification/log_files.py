@@ -19,7 +19,7 @@ import numpy as np
 
 from malta.archives import read_npz
 from malta.errors import InputError
-from malta.files import read_file, replace_files
+from malta.files import read_file, replace_files, require_suffix
 from malta.gains.encodings import read_mat
 from malta.identification.dump import decode_dump
 from malta.identification.log import GROUPS, Log
@@ -66,18 +66,12 @@ def write_log(log: Log, path: str | Path) -> Path:
     'stand.npz'
     """
     path = Path(path)
-    _require_suffix(path)
+    require_suffix(path, *SUFFIXES)
     log = without_idle(log)
     encoders: dict[str, Callable[[Log], bytes]] = {".csv": _to_csv, ".npz": _to_npz, ".mat": _to_mat}
-    encode = encoders.get(path.suffix, _to_parquet)
+    encode = encoders.get(path.suffix.lower(), _to_parquet)
     replace_files({path: encode(log)})
     return path
-
-
-def _require_suffix(path: Path, *others: str) -> None:
-    known = (*SUFFIXES, *others)
-    if path.suffix not in known:
-        raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(known))
 
 
 def _headings(log: Log, group: str) -> list[str]:
@@ -202,7 +196,7 @@ def read_log(path: str | Path, groups: Collection[str] = tuple(GROUPS)) -> Log:
     2000
     """
     path = Path(path)
-    _require_suffix(path, ".dump")
+    suffix = require_suffix(path, *SUFFIXES, ".dump").suffix.lower()
     content = read_file(path, "log", Path.read_bytes, LARGEST)
     decoders: dict[str, Callable[[bytes, Path], Decoded]]
     decoders = {
@@ -211,7 +205,7 @@ def read_log(path: str | Path, groups: Collection[str] = tuple(GROUPS)) -> Log:
         ".mat": _from_mat,
         ".dump": decode_dump,
     }
-    head, t, tables, headings = decoders.get(path.suffix, _from_parquet)(content, path)
+    head, t, tables, headings = decoders.get(suffix, _from_parquet)(content, path)
     if len(t) < 2 or not ((np.diff(t) > 0).all() and np.abs(t).max() < MOST):
         raise InputError(path, "t", "times that do not rise", "the times of the samples, in order")
     columns, signals = {}, {}
@@ -284,15 +278,17 @@ def _fast_columns(content: bytes, begin: int, count: int, used: list[int]) -> li
 
     None without a compiler, and for what that does not take: numpy reads it, or says what is wrong.
     """
-    read = library((Path(__file__).parent / "cells.c").read_text(encoding="utf-8"), 1, flags=SAMPLE_LOOP_FLAGS)
+    read = library(
+        (Path(__file__).parent / "cells.c").read_text(encoding="utf-8"), 1, flags=SAMPLE_LOOP_FLAGS
+    )
     if read is None:
         return None
     wanted = np.isin(np.arange(count), used).astype(np.uint8)
     table = np.empty((content.count(b"\n", begin) + 1, len(used)))
     read.cells.restype = ctypes.c_long
-    first = ctypes.c_void_p(ctypes.cast(ctypes.c_char_p(content), ctypes.c_void_p).value + begin)
-    sizes = [ctypes.c_long(size) for size in (len(content) - begin, count, len(table))]
-    rows = read.cells(first, *sizes[:2], address_of(wanted), sizes[2], address_of(table))
+    text = address_of(np.frombuffer(content, np.uint8)[begin:])
+    size, cells, most = (ctypes.c_long(n) for n in (len(content) - begin, count, len(table)))
+    rows = read.cells(text, size, cells, address_of(wanted), most, address_of(table))
     return None if rows < 1 else list(table[:rows].T)
 
 

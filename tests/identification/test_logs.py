@@ -103,7 +103,9 @@ def test_compiled_c_reads_the_doubles_of_numpy(tmp_path: Path, monkeypatch: pyte
         assert np.array_equal(table.view(np.uint64), found[1].columns[group].view(np.uint64)), group
 
 
-@pytest.mark.parametrize("row", ["1,2", "1,2,3,4", "1,a,3", "1,1.2.3,4", "1,0x2,3", "1,-,3", "1,2e,3", "1,2 3,4"])
+@pytest.mark.parametrize(
+    "row", ["1,2", "1,2,3,4", "1,a,3", "1,1.2.3,4", "1,0x2,3", "1,-,3", "1,2e,3", "1,2 3,4"]
+)
 def test_compiled_c_leaves_to_numpy_what_is_no_table_of_numbers(row: str) -> None:
     rows = f"0,1,2\n{row}\n".encode()
     assert log_files._fast_columns(rows, 0, 3, [0, 1, 2]) is None
