@@ -127,6 +127,18 @@ def require_plain_name(name: str, where: str | Path, field: str) -> None:
         raise InputError(where, field, repr(name), expected)
 
 
+PICTURES = (".png", ".svg", ".pdf")
+"""Suffixes of figures."""
+
+
+def require_suffix(path: Path, *suffixes: str) -> Path:
+    """The same path. Raises InputError for another suffix than these, in small or large letters."""
+    if path.suffix.lower() not in suffixes:
+        expected = "one of " + ", ".join(suffixes) if suffixes[1:] else suffixes[0]
+        raise InputError(path, "", f"suffix {path.suffix!r}", expected)
+    return path
+
+
 def file_exists(path: Path) -> bool:
     """Whether there is a file or folder of a name; False for a name that no file can have."""
     try:

@@ -23,9 +23,11 @@ from malta.cli.options import (
     read_assignments,
     read_controller,
     read_uncertainty,
+    require_suffixes,
 )
 from malta.cli.output import make_console, print_document, print_note, print_text, print_written, working
 from malta.errors import CheckError, InputError
+from malta.files import PICTURES
 
 if TYPE_CHECKING:
     from malta.identification.commission import Commissioning, Step
@@ -86,6 +88,7 @@ def measure(
     Example:  malta measure design/gains/robust.json --plan --width 2%
               malta measure design/gains/robust.json log.npz --out measured.png
     """
+    require_suffixes((out, PICTURES))
     controller = read_controller(gains, machine)
     if plan:
         _require_no(logs, "a log beside --plan")

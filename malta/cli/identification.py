@@ -20,10 +20,12 @@ from malta.cli.options import (
     read_assignments,
     read_controller,
     read_uncertainty,
+    require_suffixes,
     verify_and_write,
 )
 from malta.cli.output import make_console, print_document, print_text, print_written, progress_bar, working
 from malta.errors import CheckError, InputError
+from malta.files import PICTURES, replace_files
 
 if TYPE_CHECKING:
     from malta.identification.excite import ExcitationPlan
@@ -90,6 +92,7 @@ def identify(
     from malta.model.data import plant_of
     from malta.report.tables.experiments import identified_table, in_time_table, quality_table
 
+    require_suffixes((out, (".toml",)))
     controller = read_controller(gains, machine)
     values = read_assignments("--known", known, units_of_model(plant_of(controller.parameters)))
     more = read_assignments("--added", added, units_of_model(plant_of(controller.parameters)))
@@ -187,10 +190,12 @@ def excite(
     Example:  malta excite design/gains/robust.json --motion 20um --log log.npz
     """
     from malta.identification.excite import excite as plan_excitation
+    from malta.identification.log_files import SUFFIXES
     from malta.loops.loop import loop
     from malta.model.data import plant_of
     from malta.report.tables.experiments import excitation_tables
 
+    require_suffixes((out, (".csv",)), (log, SUFFIXES))
     controller = read_controller(gains, machine)
     plant = plant_of(controller.parameters)
     units = {"force": "N", "current": "A", "motion": "m"}
@@ -247,10 +252,6 @@ def _write_forces(path: Path, Ts: float, signals: Sequence[Signal], forces: Floa
     """Write forces beside the law's at its samples, a column for each name."""
     import numpy as np
 
-    from malta.files import replace_files
-
-    if path.suffix != ".csv":
-        raise InputError(path, "", f"suffix {path.suffix!r}", ".csv")
     heading = ",".join(["t [s]", *(f"exc.{s.name} [{s.unit}]" for s in signals)])
     table = np.column_stack([Ts * np.arange(len(forces)), forces])
     rows = "\n".join(",".join(f"{x:.9g}" for x in row) for row in table.tolist())
@@ -293,6 +294,7 @@ def log(
     from malta.identification.log_files import read_log
     from malta.report.tables.experiments import log_table
 
+    require_suffixes((out, PICTURES))
     found = read_log(file)
     files = []
     if out is not None:
@@ -408,6 +410,7 @@ def _learn_from(
     from malta.identification.strokes import first_thrust, next_stroke
     from malta.model.data import plant_of
 
+    require_suffixes((following, (".csv",)))
     *earlier, log = logs
     read = read_log(log)
     found = learn_thrust(controller, read, parameter=parameter)

@@ -14,7 +14,7 @@ import typer
 
 from malta.cli.output import make_console, print_note
 from malta.errors import CheckError, InputError
-from malta.files import locate, shipped_path
+from malta.files import locate, require_suffix, shipped_path
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
@@ -143,6 +143,16 @@ def read_shares(
     own = differences(parameters) if option == "--spread" else {}
     units = dict.fromkeys(units_of(parameters), "1") | own
     return shares | read_assignments(option, named, units)
+
+
+def require_suffixes(*files: tuple[Path | None, tuple[str, ...]]) -> None:
+    """Raise InputError for a file that is to be written with another suffix, before hours of work for it.
+
+    files : each with the suffixes that it may have; None: it is not asked for
+    """
+    for path, suffixes in files:
+        if path is not None:
+            require_suffix(path, *suffixes)
 
 
 def read_uncertainty(

@@ -34,7 +34,7 @@ from malta.cli.output import (
     progress_bar,
 )
 from malta.errors import InputError
-from malta.files import locate, replace_files
+from malta.files import locate, replace_files, require_suffix
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,7 +85,7 @@ def report(
     Example:  malta report design/gains/robust.json --out build/robust.html --pdf
     """
     from malta.margins.loop_report import require_stable
-    from malta.report.page.document import SUFFIXES, pdf_of, require_suffix
+    from malta.report.page.document import SUFFIXES, pdf_of
     from malta.report.page.report import report_work
 
     controller = read_controller(gains, machine)
@@ -533,7 +533,7 @@ def compare(
     from malta.margins.loop_report import require_stable
     from malta.report.page.comparison import compare as compare_subjects
     from malta.report.page.comparison import comparison_tables, require_count
-    from malta.report.page.document import SUFFIXES, require_suffix
+    from malta.report.page.document import SUFFIXES
 
     require_count(len(gains))
     page_file = None if out is None else require_suffix(out, *SUFFIXES)

@@ -37,6 +37,7 @@ from malta.cli.output import (
     progress_bar,
 )
 from malta.errors import CheckError, InputError
+from malta.files import require_suffix
 
 if TYPE_CHECKING:
     from malta.firmware.flight import Difference
@@ -178,6 +179,10 @@ def simulate(
         print_scenarios(plant)
         raise typer.Exit
     require_controller(law, engine)
+    if log is not None:
+        from malta.identification.log_files import SUFFIXES
+
+        require_suffix(log, *SUFFIXES)
     chosen, choice = scenario or main_job(plant), _engine_choice(law, engine)
     errors = read_sensor_errors(sensor, plant)
     options = read_options(option, chosen, plant)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
-from malta.files import replace_files
+from malta.files import replace_files, require_suffix
 from malta.model.data import MachineFile, read
 from malta.model.machines import file_of
 from malta.model.parameters import twins_of, units_of, values_of
@@ -35,9 +35,7 @@ def write_data(found: Identified, path: str | Path, *, gains: str, known: Mappin
 
         write_data(found, "robust-identified.toml", gains="design/gains/robust.json", known={})
     """
-    path, par = Path(path), found.plant.parameters
-    if path.suffix != ".toml":
-        raise InputError(path, "", f"suffix {path.suffix!r}", ".toml, as data files have")
+    path, par = require_suffix(Path(path), ".toml"), found.plant.parameters
     units, values = units_of(par), values_of(par)
     module = file_of(found.plant.name)
     machine = found.plant.name if module is None else str(Path(module).resolve())

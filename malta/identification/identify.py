@@ -13,7 +13,7 @@ from scipy.special import gammainccinv, gammaincinv
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.log import Log
+from malta.identification.log import Log, require_currents
 from malta.identification.prediction import (
     Predicted,
     predict,
@@ -22,6 +22,7 @@ from malta.identification.response import (
     STEP,
     ResponseModel,
     acting,
+    axes_of,
     candidates,
     deviations,
     information,
@@ -413,6 +414,7 @@ def _require_machine(controller: Controller, plant: Plant, log: Log) -> None:
     log.table("y", [s.name for s in plant.outputs])
     if not log.names("i"):
         raise InputError(log.source, "i", "no measured currents", "a column for each axis, as i_dd1 [A]")
+    require_currents(log, [axis.name for axis in axes_of(plant)])
     found, Ts = log.survey, controller.sample_time
     if found.jitter > 0.01 * Ts:
         raise CheckError(
@@ -511,6 +513,7 @@ def _estimate(records: Sequence[_Record], log: Log, dropped: Mapping[str, float]
     """The machine that was found, and how white the residuals are. Raises CheckError where it is none."""
     theta, covariance, white, chi2, dof = found
     model, s, _ = records[0]
+    _require_told(records, found)
     outputs = (np.abs(np.concatenate(white)) ** 2).mean(axis=0).tolist()
     par, plant = model.plant.parameters, model.plant
     others = replace(model, names=tuple(n for n in acting(plant) if n not in model.names))
@@ -539,6 +542,20 @@ def _estimate(records: Sequence[_Record], log: Log, dropped: Mapping[str, float]
         dropped=dropped,
         explained=explained_at_lines(parts) if chi2 > limit else {},
     )
+
+
+def _require_told(records: Sequence[_Record], found: Found) -> None:
+    """Raise CheckError for a parameter that is not told: as a mass is not, where two logs are alike."""
+    model, added = records[0].model, records[-1].added
+    sigma = np.sqrt(np.diag(found.covariance)) / np.maximum(np.abs(found.theta), model.scale)
+    lost = {n: one for n, one in zip(model.names, sigma.tolist(), strict=True) if not one < LOST}
+    if lost:
+        name = next((n for n in added if n in lost), max(lost, key=lambda n: lost[n]))
+        source = " and ".join(r.spectrum.source for r in records)
+        raise CheckError(
+            f"{source}: {name} is not told: its standard deviation is {100 * lost[name]:.2g} % of its value"
+            + ("; is the second log that of another machine?" if added else "")
+        )
 
 
 def _covariance(slopes: FloatArray, e: FloatArray, spread: float) -> FloatArray:

@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.log import Log, reference_spline, require_same_law
+from malta.identification.log import Log, reference_spline, require_currents, require_same_law
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names
 from malta.simulation.engine.engines import evaluate
@@ -204,7 +204,8 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
 
     Returns a Learned; its controller has the new constant.
 
-    Raises InputError for a machine without a stroke, and for a log without one; CheckError for a factor out of reason.
+    Raises InputError for a machine without a stroke, and for a log without one; CheckError for a factor out of reason,
+    and a log of another machine.
 
     >>> import dataclasses, malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -221,6 +222,7 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
         raise InputError(
             "learn", "machine", f"a {believed.name}, which has no stroke", "a machine with a stroke"
         )
+    require_same_law(log, believed.name, controller.sample_time)
     name = parameter or thrust_constant(believed)
     if name not in symbolic_names(believed.parameters):
         known = " ".join(symbolic_names(believed.parameters))
@@ -290,11 +292,8 @@ def believed_thrust(believed: Plant, log: Log) -> FloatArray:
         return np.asarray(log.table("v", [believed.thrust])[:, 0])
     axes = [s.name for s in believed.drive.axes]
     whole = np.zeros((log.samples, len(axes)))
+    require_currents(log, axes)
     for k, name in enumerate(log.names("i")):
-        if name not in axes:
-            raise InputError(
-                log.source, name, "a current that the machine has not", "one of " + " ".join(axes)
-            )
         whole[:, axes.index(name)] = log.columns["i"][:, k]
     i = ca.SX.sym("i", len(axes))
     force = ca.Function("force", [i], [ca.densify(believed.drive.force(i)[believed.thrust_input])])

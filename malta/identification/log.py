@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -86,8 +86,10 @@ class Log:
         known = self.names(group)
         for name in names:
             if name not in known:
-                wanted = f"one of {group}: {' '.join(known)}" if known else f"a log with its {group}"
-                raise InputError(self.source, GROUPS[group] + name, "no such column", wanted)
+                found = f"no such column of {group}" + (f", but {' '.join(known)}" if known else "")
+                raise InputError(
+                    self.source, GROUPS[group] + name, found, f"one, as {GROUPS[group]}{name} [unit]"
+                )
         return np.asarray(self.columns[group][:, [known.index(name) for name in names]])
 
     @cached_property
@@ -301,12 +303,22 @@ def sample_excitation(Ts: float, plant: Plant, forces: FloatArray) -> Callable[[
     return sent
 
 
+def require_currents(log: Log, axes: Sequence[str]) -> None:
+    """Raise InputError for a log with a current that its machine has not.
+
+    axes : names of the machine's currents
+    """
+    for name in log.names("i"):
+        if name not in axes:
+            raise InputError(
+                log.source, name, "a current that the machine has not", "one of " + " ".join(axes)
+            )
+
+
 def require_same_law(log: Log, machine: str, sample_time: float) -> None:
     """Raise CheckError for a log of another machine than the gain file's, and of another sample time."""
     if log.machine and log.machine != machine:
-        raise CheckError(
-            f"{log.source}: a log of a {log.machine}, but the gain file's machine is a {machine}"
-        )
+        raise CheckError(f"{log.source}: a log of machine {log.machine}, but the gain file is for {machine}")
     if abs(log.sample_time / sample_time - 1) > 1e-3:
         found = f"samples of {log.sample_time:.6g} s, but the law's are {sample_time:.6g} s"
         raise CheckError(f"{log.source}: {found}")

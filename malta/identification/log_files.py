@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import io
 import math
 import re
@@ -18,11 +19,13 @@ import numpy as np
 
 from malta.archives import read_npz
 from malta.errors import InputError
-from malta.files import read_file, replace_files
+from malta.files import read_file, replace_files, require_suffix
 from malta.gains.encodings import read_mat
 from malta.identification.dump import decode_dump
 from malta.identification.log import GROUPS, Log
 from malta.model.plant import Signal
+from malta.simulation.engine.compiled import address_of, library
+from malta.simulation.engine.engines import SAMPLE_LOOP_FLAGS
 from malta.units import is_unit_of, to_si
 
 if TYPE_CHECKING:
@@ -63,18 +66,12 @@ def write_log(log: Log, path: str | Path) -> Path:
     'stand.npz'
     """
     path = Path(path)
-    _require_suffix(path)
+    require_suffix(path, *SUFFIXES)
     log = without_idle(log)
     encoders: dict[str, Callable[[Log], bytes]] = {".csv": _to_csv, ".npz": _to_npz, ".mat": _to_mat}
-    encode = encoders.get(path.suffix, _to_parquet)
+    encode = encoders.get(path.suffix.lower(), _to_parquet)
     replace_files({path: encode(log)})
     return path
-
-
-def _require_suffix(path: Path, *others: str) -> None:
-    known = (*SUFFIXES, *others)
-    if path.suffix not in known:
-        raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(known))
 
 
 def _headings(log: Log, group: str) -> list[str]:
@@ -199,7 +196,7 @@ def read_log(path: str | Path, groups: Collection[str] = tuple(GROUPS)) -> Log:
     2000
     """
     path = Path(path)
-    _require_suffix(path, ".dump")
+    suffix = require_suffix(path, *SUFFIXES, ".dump").suffix.lower()
     content = read_file(path, "log", Path.read_bytes, LARGEST)
     decoders: dict[str, Callable[[bytes, Path], Decoded]]
     decoders = {
@@ -208,7 +205,7 @@ def read_log(path: str | Path, groups: Collection[str] = tuple(GROUPS)) -> Log:
         ".mat": _from_mat,
         ".dump": decode_dump,
     }
-    head, t, tables, headings = decoders.get(path.suffix, _from_parquet)(content, path)
+    head, t, tables, headings = decoders.get(suffix, _from_parquet)(content, path)
     if len(t) < 2 or not ((np.diff(t) > 0).all() and np.abs(t).max() < MOST):
         raise InputError(path, "t", "times that do not rise", "the times of the samples, in order")
     columns, signals = {}, {}
@@ -248,7 +245,7 @@ def _from_csv(content: bytes, path: Path, groups: Collection[str]) -> Decoded:
         raise InputError(path, "", "no line of headings", 'a line as "t [s],x1 [um],..."')
     _require_times(names, path)
     used = [k for k, name in enumerate(names) if k == 0 or _group_of(name, path) in groups]
-    columns = _fast_columns(memoryview(content)[begin:], len(names), used)
+    columns = _fast_columns(content, begin, len(names), used)
     try:
         if columns is None:
             columns = _columns(content, begin, len(names), used)
@@ -276,31 +273,23 @@ def _csv_head(content: bytes) -> tuple[dict[str, Any], list[str], int]:
     return head, [], len(content)
 
 
-def _fast_columns(rows: memoryview, count: int, used: list[int]) -> list[FloatArray] | None:
-    """Columns of a .csv's rows by pyarrow, whose doubles are those of numpy to the bit; NaN for an empty cell.
+def _fast_columns(content: bytes, begin: int, count: int, used: list[int]) -> list[FloatArray] | None:
+    """Columns of a .csv from a byte on by compiled C, to the bit those of numpy; NaN for an empty cell.
 
-    None without pyarrow, and for what pyarrow does not take: numpy reads that, or says what is wrong.
+    None without a compiler, and for what that does not take: numpy reads it, or says what is wrong.
     """
-    try:
-        arrow, csv = import_module("pyarrow"), import_module("pyarrow.csv")
-    except ImportError:
+    read = library(
+        (Path(__file__).parent / "cells.c").read_text(encoding="utf-8"), 1, flags=SAMPLE_LOOP_FLAGS
+    )
+    if read is None:
         return None
-    names = [str(k) for k in range(count)]
-    wanted = [names[k] for k in used]
-    try:
-        read = csv.read_csv(
-            arrow.BufferReader(arrow.py_buffer(rows)),
-            read_options=csv.ReadOptions(column_names=names, use_threads=False),
-            parse_options=csv.ParseOptions(quote_char=False),
-            convert_options=csv.ConvertOptions(
-                column_types=dict.fromkeys(wanted, arrow.float64()),
-                null_values=[""],
-                include_columns=wanted,
-            ),
-        )
-    except arrow.ArrowException:
-        return None
-    return [np.asarray(column.to_numpy(), dtype=float) for column in read.columns]
+    wanted = np.isin(np.arange(count), used).astype(np.uint8)
+    table = np.empty((content.count(b"\n", begin) + 1, len(used)))
+    read.cells.restype = ctypes.c_long
+    text = address_of(np.frombuffer(content, np.uint8)[begin:])
+    size, cells, most = (ctypes.c_long(n) for n in (len(content) - begin, count, len(table)))
+    rows = read.cells(text, size, cells, address_of(wanted), most, address_of(table))
+    return None if rows < 1 else list(table[:rows].T)
 
 
 def _columns(content: bytes, begin: int, count: int, used: list[int]) -> list[FloatArray]:

@@ -159,7 +159,8 @@ def replay_law(controller: Controller, log: Log, *, same: bool | None = None) ->
     require_same_law(log, plant.name, controller.sample_time)
     y = log.table("y", [s.name for s in plant.outputs])
     v = log.table("v", [s.name for s in plant.inputs])
-    if not (np.isfinite(y).all() and np.isfinite(v).all()) or log.survey.gaps:
+    sent = log.columns.get("excitation", np.zeros(1))
+    if not all(np.isfinite(table).all() for table in (y, v, sent)) or log.survey.gaps:
         raise CheckError(f"{log.source}: samples are missing, and a law cannot run on")
     simulation, inputs = _inputs(controller, log)
     commands, innovation = _run(simulation, inputs, y)

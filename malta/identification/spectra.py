@@ -84,6 +84,8 @@ def whole_periods(log: Log, excitation: FloatArray, samples: int) -> tuple[int, 
             f"{log.source}: no period of the excitation is given: a line '# period 1.0 s' in a .csv"
         )
     each = round(log.period / log.sample_time)
+    if each < 2:
+        raise CheckError(f"{log.source}: a period of {log.period:g} s is shorter than two samples")
     periods = samples // each
     if periods > FEWEST:
         periods -= 1  # the first one, in which the loop settles
@@ -133,8 +135,9 @@ def require_closed_loop(log: Log, pole: float) -> None:
     """
     if pole <= 0 or not log.names("v"):
         return
-    sent = log.columns["excitation"]
-    own = log.columns["v"] - sent
+    there = np.isfinite(log.columns["v"]).any(axis=0)
+    sent = log.columns["excitation"][:, there]
+    own = log.columns["v"][:, there] - sent
     moved, size = np.nanstd(own, axis=0), np.nanstd(sent, axis=0)
     share = moved[size > 0] / size[size > 0]
     if len(share) and share.max() < FEEDBACK:

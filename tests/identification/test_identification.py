@@ -22,6 +22,7 @@ from malta.identification.prediction import Noise, predict
 from malta.identification.response import ResponseModel
 from malta.identification.spectra import spectrum_of, straightened
 from malta.machines.tubular.plant import plant as tubular
+from malta.model.plant import Signal
 from malta.simulation.inputs import interleaved_multisine
 
 if TYPE_CHECKING:
@@ -142,6 +143,14 @@ def test_a_known_mass_on_a_second_flight_gives_the_mass(plan: ExcitationPlan) ->
         malta.identification.weigh(CONTROLLER, own, loaded, {"m": 0.0})
 
 
+@pytest.mark.slow
+def test_no_mass_is_found_in_two_logs_that_are_alike(log: Log) -> None:
+    with pytest.raises(
+        malta.CheckError, match=r"m is not told: .* is the second log that of another machine"
+    ):
+        malta.identification.weigh(CONTROLLER, log, log, {"m": 0.1})
+
+
 @pytest.mark.parametrize("known", [{"I_xx": 1.45e-3, "I_yy": 1.45e-3}, {"l_S": 0.09}, {"K_D": 5.2}])
 def test_a_wrong_model_is_refused(log: Log, known: dict[str, float]) -> None:
     found = malta.identify(CONTROLLER, log, parameters=["K_A", "K_B"], known=known)
@@ -202,13 +211,17 @@ def test_logs_that_tell_nothing_are_refused(log: Log) -> None:
         "samples of y are missing": with_columns(log, y=missing),
         "too short": short,
         "nothing was excited": with_columns(log, **quiet),
-        "a log of a rotor": replace(log, machine="rotor"),
+        "a log of machine rotor": replace(log, machine="rotor"),
         "the law's are": replace(log, sample_time=1e-4),
         "has not the period": replace(log, period=0.45),
+        "shorter than two samples": replace(log, period=1e-9),
     }
     for text, bad in refused.items():
         with pytest.raises(malta.CheckError, match=text):
             malta.identify(CONTROLLER, bad, parameters=ASKED)
+    strange = replace(log, signals={**log.signals, "i": tuple(Signal(f"{k}", "A") for k in range(12))})
+    with pytest.raises(malta.InputError, match="run excited: 0: found a current that the machine has not"):
+        malta.identify(CONTROLLER, strange, parameters=ASKED)
     with pytest.raises(malta.InputError, match="unknown parameter"):
         malta.identify(CONTROLLER, log, parameters=["K_X"])
     with pytest.raises(malta.CheckError, match="R do not act"):
@@ -386,7 +399,8 @@ def test_a_replay_refuses_what_its_law_did_not_fly() -> None:
     holes[7, 1] = np.nan
     for text, bad in {
         "samples are missing": with_columns(log, y=holes),
-        "a log of a rotor": replace(log, machine="rotor"),
+        "missing, and a law": with_columns(log, excitation=log.columns["excitation"] * np.nan),
+        "a log of machine rotor": replace(log, machine="rotor"),
         "the law's are": replace(log, sample_time=1e-4),
     }.items():
         with pytest.raises(malta.CheckError, match=text):

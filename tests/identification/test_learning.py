@@ -265,5 +265,5 @@ def test_what_the_next_stroke_is_sent_needs_a_stroke_of_this_law() -> None:
         malta.identification.next_stroke(
             CONTROLLER, replace(log, columns={**log.columns, "y": holes}, sha256="")
         )
-    with pytest.raises(malta.CheckError, match="a log of a rotor"):
+    with pytest.raises(malta.CheckError, match="a log of machine rotor"):
         malta.identification.next_stroke(CONTROLLER, replace(log, machine="rotor"))

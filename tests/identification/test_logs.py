@@ -81,18 +81,34 @@ def test_columns_that_are_not_asked_for_are_not_read(log: malta.identification.L
         malta.identification.read_log(tmp_path / "short.csv", ("y",))
 
 
-def test_pyarrow_reads_the_doubles_of_numpy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("pyarrow", reason="pyarrow reads a .csv faster")
+def test_compiled_c_reads_the_doubles_of_numpy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numbers of all sizes and digits; and those half between two doubles, where rounding twice goes wrong."""
     random = np.random.default_rng(1)
-    cells = random.normal(size=(500, 4)) * 10.0 ** random.integers(-12, 3, (500, 4))
-    rows = [f"{k},{a:.17g},{b:.9g},{c!r},{d:.3f}" for k, (a, b, c, d) in enumerate(cells.tolist())]
+    cells = random.normal(size=(500, 4)) * 10.0 ** random.integers(-24, 24, (500, 4))
+    half = 2 * random.integers(2**52, 2**53, 500) + 1  # of 54 binary digits
+    rows = [
+        f"{k},{a:.17g},{b:.9g},{c!r},{int(h) * 125}e-3, {d:.2f}\r"
+        for k, ((a, b, c, d), h) in enumerate(zip(cells.tolist(), half, strict=True))
+    ]
     path = tmp_path / "log.csv"
-    path.write_text("\n".join(["t [s],x [m],y [um],f [N],i [A]", *rows, "500,,-0.0,nan,4.9e-324", ""]))
-    by_arrow = malta.identification.read_log(path)
-    monkeypatch.setattr(log_files, "_fast_columns", lambda *_: None)
-    by_numpy = malta.identification.read_log(path)
-    for group, table in by_arrow.columns.items():
-        assert np.array_equal(table, by_numpy.columns[group], equal_nan=True)
+    last = ["", "500,,-0.0,nan,4.9e-324,1e-400", "501,12345678901234567890123,.5,5.,+1E2,0"]
+    path.write_text("\n".join(["t [s],x [m],y [um],f [N],i [A],u [mV]", *rows, *last]))
+    found = []
+    for module in (log_files, None):
+        if module is None:
+            monkeypatch.setattr(log_files, "_fast_columns", lambda *_: None)
+        monkeypatch.setattr(log_files, "MOST", np.inf)
+        found.append(malta.identification.read_log(path))
+    for group, table in found[0].columns.items():
+        assert np.array_equal(table.view(np.uint64), found[1].columns[group].view(np.uint64)), group
+
+
+@pytest.mark.parametrize(
+    "row", ["1,2", "1,2,3,4", "1,a,3", "1,1.2.3,4", "1,0x2,3", "1,-,3", "1,2e,3", "1,2 3,4"]
+)
+def test_compiled_c_leaves_to_numpy_what_is_no_table_of_numbers(row: str) -> None:
+    rows = f"0,1,2\n{row}\n".encode()
+    assert log_files._fast_columns(rows, 0, 3, [0, 1, 2]) is None
 
 
 @pytest.mark.parametrize(

@@ -152,7 +152,7 @@ def test_logs_that_tell_nothing_are_refused(log: Log) -> None:
     both = np.roll(columns["excitation"], 1, axis=1) + columns["excitation"]
     refused = {
         "nothing was excited": still,
-        "a log of a rotor": replace(log, machine="rotor"),
+        "a log of machine rotor": replace(log, machine="rotor"),
         "the law's are": replace(log, sample_time=1e-4),
         "too short": short,
         "has not the period": replace(log, period=0.45),

@@ -15,7 +15,7 @@ import numpy as np
 from malta.display import micro as micro
 from malta.display import number as number
 from malta.errors import InputError
-from malta.files import replace_files
+from malta.files import PICTURES, replace_files, require_suffix
 from malta.merits import ROOTS
 from malta.model.data import published_value
 from malta.model.plant import FloatArray, Plant
@@ -168,17 +168,16 @@ def encode_figure(figure: Figure, path: Path, *, dark: bool = False) -> bytes:
 
     from malta.report.figures.inline import png_of
 
-    if path.suffix not in (".png", ".svg", ".pdf"):
-        raise InputError(path, "", f"suffix {path.suffix!r}", "one of .png, .svg, .pdf")
-    if path.suffix == ".pdf" and dark:
+    suffix = require_suffix(path, *PICTURES).suffix.lower()
+    if suffix == ".pdf" and dark:
         raise InputError(path, "", "a dark figure on paper", "a .png or .svg file, or a light figure")
-    if path.suffix == ".png":
+    if suffix == ".png":
         return png_of(figure, dark=dark)
     buffer = io.BytesIO()
-    date = {"Date": None} if path.suffix == ".svg" else {"CreationDate": None}
+    date = {"Date": None} if suffix == ".svg" else {"CreationDate": None}
     with matplotlib.rc_context({"svg.hashsalt": "malta", "svg.fonttype": "none", "pdf.fonttype": 42}):
-        figure.savefig(buffer, format=path.suffix[1:], metadata=date)
-    return with_dark_mode(buffer.getvalue(), always=dark) if path.suffix == ".svg" else buffer.getvalue()
+        figure.savefig(buffer, format=suffix[1:], metadata=date)
+    return with_dark_mode(buffer.getvalue(), always=dark) if suffix == ".svg" else buffer.getvalue()
 
 
 def with_dark_mode(svg: bytes, *, always: bool = False) -> bytes:

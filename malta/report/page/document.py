@@ -18,8 +18,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from malta.errors import InputError
-from malta.files import replace_files
+from malta.files import replace_files, require_suffix
 from malta.report.figures.drawing import BOUND_LINE, printable
 from malta.report.page.analysis import KeyFigure
 from malta.report.page.sections import Folded, Item, Picture, Section, Sheet, plain_sheet, polish
@@ -303,13 +302,6 @@ class Page:
         path = require_suffix(Path(path), *SUFFIXES)
         replace_files({path: self.content})
         return path
-
-
-def require_suffix(path: Path, *suffixes: str) -> Path:
-    """The same path. Raises InputError for another suffix."""
-    if path.suffix.lower() not in suffixes:
-        raise InputError(path, "", f"suffix {path.suffix!r}", " or ".join(suffixes[:1]))
-    return path
 
 
 @dataclass(frozen=True)
