@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.archives import read_npz
 from malta.errors import InputError
 from malta.files import read_file, replace_files
 from malta.gains.encodings import read_mat
 from malta.identification.dump import decode_dump
 from malta.identification.log import GROUPS, Log
 from malta.model.plant import Signal
+from malta.tables import read_npz
 from malta.units import is_unit_of, to_si
 
 if TYPE_CHECKING:
