@@ -25,7 +25,6 @@ import numpy as np
 from scipy.special import ndtr
 from scipy.stats import t as student
 
-from malta.archives import read_npz
 from malta.campaigns.limits import Limit
 from malta.campaigns.plan import (
     Plan,
@@ -42,6 +41,7 @@ from malta.display import Description, display
 from malta.errors import InputError
 from malta.files import file_exists, json_text, read_file, replace_files
 from malta.simulation.engine.digest import Batch, verdicts
+from malta.tables import read_npz
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from malta.archives import read_npz
 from malta.campaigns.plan import (
     PRECISIONS,
     SCHEMA,
@@ -44,6 +43,7 @@ from malta.simulation.engine.digest import LARGEST_FIGURE, Batch, verdicts
 from malta.simulation.experiments import Progress
 from malta.simulation.scenario import Scenario
 from malta.synthesis.controller import Controller
+from malta.tables import read_npz
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

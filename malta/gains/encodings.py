@@ -18,11 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from malta.archives import read_npz
 from malta.errors import InputError
 from malta.files import read_file
 from malta.synthesis.schedule import SCHEDULED
-from malta.tables import require_shallow
+from malta.tables import read_npz, require_shallow
 
 # A strict reader of MAT-files, level 5: the elements that gain files are made of, and no others.
 #

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.archives import read_npz
 from malta.errors import InputError
 from malta.files import read_file, replace_files, require_suffix
 from malta.gains.encodings import read_mat
@@ -26,6 +25,7 @@ from malta.identification.log import GROUPS, Log
 from malta.model.plant import Signal
 from malta.simulation.engine.compiled import address_of, library
 from malta.simulation.engine.engines import SAMPLE_LOOP_FLAGS
+from malta.tables import read_npz
 from malta.units import is_unit_of, to_si
 
 if TYPE_CHECKING:

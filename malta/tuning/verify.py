@@ -21,8 +21,7 @@ from malta.margins.travel import covers_travel, worst_sensitivities
 from malta.margins.verify import linear_report, staged_report
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.simulation.experiments.bounds import payload
-from malta.simulation.experiments.catalogue import experiment
+from malta.simulation.experiments.catalogue import experiment, payload
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller
 from malta.synthesis.requirements import Figure, Noise, Requirement, requirements_for

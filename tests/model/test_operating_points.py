@@ -17,7 +17,7 @@ from malta.loops.sampled_loops import loaded_model, machine_loop, machine_system
 from malta.model.equilibrium import commanded
 from malta.model.plant import OperatingPoint
 from malta.proof.parametric_plants import of_plant
-from malta.simulation.experiments.bounds import held_payload
+from malta.simulation.experiments.catalogue import held_payload
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -22,7 +22,6 @@ GROUND = (
     "errors",
     "units",
     "files",
-    "archives",
     "tables",
     "processes",
     "display",

@@ -15,7 +15,7 @@ from conftest import refusal
 
 import malta
 from malta import gains
-from malta.archives import read_npz
+from malta.tables import read_npz
 
 
 def npz(**arrays: Any) -> bytes:

@@ -6,23 +6,23 @@ import inspect
 import re
 from pathlib import Path
 
-from malta import archives, files, tables, units
+from malta import files, tables, units
 from malta.campaigns import plan
 from malta.cli import output
 from malta.gains import encodings
+from malta.identification import log_files
 from malta.model import signals
 from malta.proof.certificate import check, checked_file
 from malta.simulation import inputs, scenario
 from malta.simulation.engine import compiled
-from malta.simulation.experiments import recording
 
 TEXT = (Path(__file__).parents[2] / "SECURITY.md").read_text(encoding="utf-8")
 LIMITS = {
     "a file": files.LARGEST,
-    "a log": recording.LARGEST,
+    "a log": log_files.LARGEST,
     "a certificate": checked_file.LARGEST,
     "elements of a MAT-file, decompressed": encodings.LARGEST,
-    "members of an archive": archives.MANY,
+    "members of an archive": tables.MANY,
     "tables in tables": tables.DEEPEST,
     "a unit": units.LONGEST,
     "a delay": signals.MOST_DELAY,

@@ -13,7 +13,7 @@ from conftest import Run
 import malta
 from malta import gains
 from malta.model.data import plant_of
-from malta.simulation.experiments.bounds import STEP, flown_payload, held_payload, payload
+from malta.simulation.experiments.catalogue import FINENESS, flown_payload, held_payload, payload
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -44,7 +44,7 @@ def test_flight_is_bisected(name: str, low: float, high: float) -> None:
     found = payload(plant, c)
     assert found is not None
     assert low < found.carried < found.dropped < high < found.held
-    assert found.dropped - found.carried <= STEP * found.dropped
+    assert found.dropped - found.carried <= FINENESS * found.dropped
     picked = malta.experiment("payload", plant, c, masses=(found.carried, found.dropped))
     assert [case.run.verdict.completed for case in picked.cases] == [True, False]
 

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from malta.archives import read_npz
 from malta.display import micro, quantity
 from malta.errors import InputError
 from malta.files import read_file
 from malta.model.equations import Body, rotation
+from malta.tables import read_npz
 
 if TYPE_CHECKING:
     from PIL import Image, ImageDraw, ImageFont

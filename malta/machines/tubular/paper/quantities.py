@@ -31,8 +31,7 @@ from malta.report.ledger import Chance, bandwidth, proven_share, run_design
 from malta.simulation.current_control import link_voltage, open_loop_gain
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.experiments import Experiment, Progress
-from malta.simulation.experiments.bounds import flown_payload, held_payload, largest_mass
-from malta.simulation.experiments.catalogue import experiment
+from malta.simulation.experiments.catalogue import experiment, flown_payload, held_payload, largest_mass
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import StrokeFigures, Trajectory, stroke_figures

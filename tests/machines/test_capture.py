@@ -10,9 +10,8 @@ import pytest
 
 import malta
 from malta import references
-from malta.machines.tubular.experiments.lifting import PLANES, RAYS
+from malta.machines.tubular.experiments.lifting import PLANES, RAYS, reach, recoverable
 from malta.simulation.experiments import Experiment
-from malta.simulation.experiments.bounds import reach, recoverable
 from malta.simulation.scenario import Scenario
 
 if TYPE_CHECKING:
