@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 LONGEST = 300  # characters of a sentence
@@ -61,6 +62,34 @@ class InputError(ValueError):
         self.found = shorten(found, max(room // 2, room - whole))
         self.expected = shorten(expected, room - len(self.found))
         super().__init__(f"{subject}: found {self.found}, expected {self.expected}{hint}")
+
+
+def require_known(
+    names: Iterable[str], known: Iterable[str], where: str | Path, field: str = "{}", found: str = ""
+) -> None:
+    """Raise InputError unless all names are known ones.
+
+    field, found : of the sentence, in which {} stands for the name; "": the name itself is what was found
+
+    >>> require_known(["Kp", "Kq"], ["Kp", "Ki"], "design.toml", "pid.{}", "an unknown gain")
+    Traceback (most recent call last):
+    malta.errors.InputError: design.toml: pid.Kq: found an unknown gain, expected one of Kp Ki
+    """
+    listed = list(dict.fromkeys(known))
+    for name in names:
+        if name not in listed:
+            words = found.replace("{}", name) or repr(name)
+            raise InputError(where, field.replace("{}", name), words, f"one of {' '.join(listed) or 'none'}")
+
+
+@contextmanager
+def relocate_errors(where: str | Path, field: str = "{}") -> Iterator[None]:
+    """Within the block an InputError names this file or function, and this field, where {} stands for its own."""
+    try:
+        yield
+    except InputError as error:
+        own = field.replace("{}", error.field)
+        raise InputError(where, own, error.found, error.expected) from error
 
 
 def _names_in(expected: str) -> list[str]:

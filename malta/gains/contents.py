@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, InputError, relocate_errors, require_known
 from malta.files import require_plain_name
 from malta.gains.schema import GainFile, LinearTable, PlantTable
 from malta.model.data import parameters_record, plant_of
@@ -89,7 +89,7 @@ def linear_parameters(plant: PlantTable, given: LinearTable, path: str | Path) -
     signals = {
         key: [Signal(s.name, s.unit) for s in getattr(given, key)] for key in ("states", "inputs", "outputs")
     }
-    try:
+    with relocate_errors(path, "plant.linear.{}"):
         return linear_machine(
             **given.matrices.model_dump(),
             **cast("Any", signals),
@@ -108,8 +108,6 @@ def linear_parameters(plant: PlantTable, given: LinearTable, path: str | Path) -
             noise=given.noise,
             dead_time=given.dead_time,
         ).parameters
-    except InputError as error:
-        raise InputError(path, f"plant.linear.{error.field}", error.found, error.expected) from error
 
 
 class _Layout(NamedTuple):
@@ -207,10 +205,8 @@ def build_controller(file: GainFile, path: str | Path) -> Controller:
         else Commutation(file.commutation.lead, **arrays["commutation"]),
         schedule=_schedule(file, arrays, layout, path),
     )
-    try:
+    with relocate_errors(path, "law.{}"):  # the record does not know the file
         return Controller(**fields)
-    except InputError as error:  # the record does not know the file
-        raise InputError(path, f"law.{error.field}", error.found, error.expected) from error
 
 
 def _schedule(file: GainFile, arrays: Arrays, layout: _Layout, path: str | Path) -> Schedule | None:
@@ -223,14 +219,11 @@ def _schedule(file: GainFile, arrays: Arrays, layout: _Layout, path: str | Path)
         return None
     plant, given = layout.plant, arrays["schedule"]
     names = [s.name for s in plant.outputs]
-    if file.schedule.variable not in names:
-        raise InputError(path, "schedule.variable", repr(file.schedule.variable), "one of " + " ".join(names))
+    require_known([file.schedule.variable], names, path, "schedule.variable")
     output, places = names.index(file.schedule.variable), given["places"]
     stacked = {key: given[key].reshape(len(places), -1, given[key].shape[1]) for key in SCHEDULED}
-    try:
+    with relocate_errors(path, "schedule.places"):
         made = Schedule(file.schedule.variable, output, places, **stacked)
-    except InputError as error:
-        raise InputError(path, "schedule.places", error.found, error.expected) from error
     x = plant.point(arrays["operating_point"]["x"]).x
     here = made.at(float(outputs_at(plant, x)[output]))
     for key, M in (arrays["model"] | arrays["gains"]).items():
@@ -407,10 +400,8 @@ def _parameters(plant: PlantTable, path: str | Path) -> Parameters:
     for key, q in given.items():
         if q.unit != units[key]:
             raise InputError(path, f"plant.parameters.{key}.unit", repr(q.unit), repr(units[key]))
-    try:
+    with relocate_errors(path, "plant.parameters.{}"):
         return record(**{k: q.value for k, q in given.items()}, preset=plant.preset)  # type: ignore[call-arg]
-    except InputError as error:
-        raise InputError(path, f"plant.parameters.{error.field}", error.found, error.expected) from error
 
 
 def _array(value: list[Any], shape: tuple[int, ...], path: str | Path, field: str) -> FloatArray:

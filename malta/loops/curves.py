@@ -20,7 +20,7 @@ import numpy as np
 from scipy import linalg
 
 from malta.display import Curves, Description, display
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, require_known
 from malta.loops.classical import (
     ChannelMargins,
     Crossing,
@@ -131,8 +131,7 @@ class LoopCurves:
         at : where it is, "sensors" or "forces"
         """
         known = [s.name for s in self.channels(at)]
-        if name not in known:
-            raise InputError(self.name, "channel", repr(name), "one of " + " ".join(known))
+        require_known([name], known, self.name, "channel")
         return known.index(name)
 
     def singular_values(self, G: ComplexArray) -> FloatArray:

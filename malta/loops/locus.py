@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import optimize
 
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, InputError, require_known
 from malta.loops.linear_loops import LinearLoop, Place, linear_loop
 from malta.model.data import plant_of
 from malta.model.parameters import units_of
@@ -137,8 +137,7 @@ def _family(
     if parameter == GAIN:
         channel, at = where
         names = [s.name for s in (loop.outputs if at == "sensors" else loop.inputs)]
-        if channel is not None and channel not in names:
-            raise InputError("root locus", "channel", repr(channel), "one of " + " ".join(names))
+        require_known([] if channel is None else [channel], names, "root locus", "channel")
         chosen = np.array([channel in (None, name) for name in names])
         return cache(lambda k: eigenvalues(loop.closed_loop(np.where(chosen, k, 1.0), at).A)), 1.0, "1"
     plant, law = source if isinstance(source, tuple) else (source, controller)
@@ -147,8 +146,7 @@ def _family(
             "root locus", parameter, "a loop without a machine", f"{GAIN!r}, or a plant and its controller"
         )
     units = units_of(plant.parameters)
-    if parameter not in units:
-        raise InputError("root locus", "parameter", repr(parameter), "one of " + " ".join([GAIN, *units]))
+    require_known([parameter], [GAIN, *units], "root locus", "parameter")
     nominal = float(getattr(plant.parameters, parameter))
     return cache(lambda value: _of_machine(plant, law, parameter, value)), nominal, units[parameter]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.display import Description, display, quantity
-from malta.errors import InputError
+from malta.errors import InputError, require_known
 from malta.loops.classical import Classical, Nominal, classical_margins
 from malta.loops.sampled_loops import (
     LAST,
@@ -216,10 +216,7 @@ def loop(
     'slowest pole -6.61 rad/s'
     """
     chosen_loops(plant, controller, current_loops)
-    known = units_of(plant.parameters)
-    for name in parameters or {}:
-        if name not in known:
-            raise InputError("loop", name, "an unknown parameter", "one of " + " ".join(known))
+    require_known(parameters or (), units_of(plant.parameters), "loop", found="an unknown parameter")
     machine = with_parameters(plant, replace(plant.parameters, **parameters)) if parameters else plant
     names = [s.name for s in controller.measurements]
     if names != [s.name for s in plant.outputs]:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.display import Description, display, quantity
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, InputError, require_known
 from malta.loops.linear_loops import LinearLoop
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.loops.sampled_loops import SampledLoop
@@ -162,9 +162,7 @@ def furthest(found: Sequence[Recovery]) -> tuple[tuple[Recovery, Deviation], ...
 def load_vector(plant: Plant, name: str, load: Mapping[str, float]) -> FloatArray:
     """Return a load as a number for each of a plant's disturbances. Raises InputError for an unknown disturbance."""
     known = [s.name for s in plant.disturbances]
-    for disturbance in load:
-        if disturbance not in known:
-            raise InputError("recovery", name, repr(disturbance), "one of " + (" ".join(known) or "none"))
+    require_known(load, known, "recovery", name)
     return np.array([load.get(disturbance, 0.0) for disturbance in known])
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from malta.errors import InputError
+from malta.errors import InputError, require_known
 from malta.margins.travel import extent_of, travel_loops, travel_margin
 from malta.model.parameters import units_of
 from malta.processes import on_one_thread
@@ -99,8 +99,7 @@ def margin_map_of(
     Example: `margin_map_of(plant, controller, ("K_A", "m"), {"m": 0.2, "K_A": 0.2}).proven`
     """
     for axis, name in zip("xy", names, strict=True):
-        if name not in uncertainty:
-            raise InputError(f"--{axis}", "", repr(name), "one of " + " ".join(uncertainty))
+        require_known([name], uncertainty, f"--{axis}", "")
     x, y = names
     if x == y:
         raise InputError("--y", "", repr(y), f"another parameter than {x}")

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from flint import arb
 
-from malta.errors import InputError
+from malta.errors import InputError, require_known
 from malta.proof.expressions import KNOWN, POINTS, Arithmetic, NotAnalytic, Program, exact, program
 from malta.proof.uncertain import (
     LARGEST,
@@ -121,8 +121,7 @@ def box_of(
     down, up, fixed = np.zeros(k), np.zeros(k), np.column_stack([at, at])
     most, ends = math.inf, ""
     for name, value in (*ranges.items(), *over.items()):
-        if name not in names:
-            raise InputError(caller, name, "an unknown parameter", "one of " + " ".join(names))
+        require_known([name], names, caller, found="an unknown parameter")
         if name in ranges and name in over:
             raise InputError(caller, name, "in ranges and in over", "in one of them")
         i = names.index(name)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from malta.errors import InputError
+from malta.errors import InputError, require_known
 from malta.model.plant import readonly
 from malta.proof.box import box_of
 from malta.proof.systems import compensator_of
@@ -207,9 +207,7 @@ def interconnect(
     taken, given = ([name for one in named for name in one[k]] for k in (1, 2))
     into, out = _names_of(inputs), _names_of(outputs)
     for field, names, known in (("inputs", into, taken), ("outputs", out, given)):
-        for name in names:
-            if name not in known:
-                raise InputError(caller, field, repr(name), "one of " + " ".join(dict.fromkeys(known)))
+        require_known(names, known, caller, field)
     if len(set(given)) < len(given):
         raise InputError(caller, "systems", f"outputs {' '.join(given)}", "outputs with names that differ")
     for name in taken:

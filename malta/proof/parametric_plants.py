@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from malta.errors import InputError
+from malta.errors import InputError, require_known
 from malta.model.equilibrium import commanded
 from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant, position_in, readonly
@@ -282,9 +282,7 @@ def _check_names(plant: Plant, names: Any) -> None:
     known = [*units_of(plant.parameters), *((plant.stroke,) if plant.has_stroke else ())]
     if not isinstance(names, tuple | list):
         raise InputError("uncertain", "names", describe(names), "names of parameters, as a tuple or a list")
-    for name in names:
-        if name not in known:
-            raise InputError("uncertain", f"{name}", "an unknown parameter", "one of " + " ".join(known))
+    require_known(names, known, "uncertain", found="an unknown parameter")
     for name in set(names) & set(shape_parameters(plant.parameters)):
         raise InputError("uncertain", name, "a parameter that shapes the model", "one that enters it")
 

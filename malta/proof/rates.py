@@ -26,7 +26,7 @@ from flint import arb, arb_mat
 from scipy import linalg
 
 from malta.display import Description, display, floor_to, quantity
-from malta.errors import InputError
+from malta.errors import InputError, require_known
 from malta.processes import on_one_thread
 from malta.proof.expressions import NotAnalytic
 from malta.proof.polynomial.enclosure import precision
@@ -227,8 +227,7 @@ def rate_bound(loop: MovingLoop, name: str, begun: float, time: float) -> RateBo
 
 def _loop_of(system: UncertainSystem, law: Compensator, name: str) -> _Loop:
     """The loop in balls. Raises InputError for what the proof does not cover."""
-    if name not in system.names:
-        raise InputError(CALLER, "name", repr(name), "one of " + " ".join(system.names))
+    require_known([name], system.names, CALLER, "name")
     if law.sample_time is None or system.sample_time is not None or law.lag is not None:
         raise InputError(
             CALLER, "compensator", "another loop", "a continuous system under a sampled law without a lag"

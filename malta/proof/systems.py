@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from malta.errors import InputError
+from malta.errors import InputError, require_known
 from malta.model.plant import Plant, readonly
 from malta.proof.uncertain import (
     by_name,
@@ -107,9 +107,7 @@ def uncertain(source: Any, names: Any, **options: Any) -> UncertainSystem:
 
     made = of_plant if isinstance(source, Plant) else from_source
     known = [q.name for q in inspect.signature(made).parameters.values() if q.kind is q.KEYWORD_ONLY]
-    for option in options:
-        if option not in known:
-            raise InputError("uncertain", option, "an unknown option", "one of " + " ".join(known))
+    require_known(options, known, "uncertain", found="an unknown option")
     return made(source, names, **options)
 
 
@@ -146,15 +144,10 @@ def from_source(
 
 
 def _limits(names: tuple[str, ...], limits: Mapping[str, Any]) -> tuple[tuple[float, float], ...]:
-    for name in by_name("uncertain", "limits", limits, '{"k": (0, 2)}'):
-        _check_name("limits", name, names)
+    given = by_name("uncertain", "limits", limits, '{"k": (0, 2)}')
+    require_known(given, names, "uncertain", "limits.{}", "an unknown parameter")
     free = (-math.inf, math.inf)
     return tuple(interval("uncertain", f"limits.{name}", limits.get(name, free)) for name in names)
-
-
-def _check_name(field: str, name: str, names: tuple[str, ...]) -> None:
-    if name not in names:
-        raise InputError("uncertain", f"{field}.{name}", "an unknown parameter", "one of " + " ".join(names))
 
 
 def _evaluate(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: str) -> Any:
@@ -209,7 +202,7 @@ def _affine_matrices(source: Any, p: Any, names: tuple[str, ...], terms: Mapping
     ]
     found = [ca.SX(ca.DM(M)) for M in base]
     for name, parts in by_name("uncertain", "terms", terms, '{"k": (A1, B1, C1)}').items():
-        _check_name("terms", name, names)
+        require_known([name], names, "uncertain", "terms.{}", "an unknown parameter")
         if not isinstance(parts, tuple | list):
             raise InputError("uncertain", f"terms.{name}", describe(parts), "matrices (A1, B1, C1)")
         if len(parts) > len(base):

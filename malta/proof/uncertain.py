@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from scipy import sparse
 
-from malta.errors import InputError
+from malta.errors import InputError, require_known
 from malta.model.linearize import jacobians, linearize
 from malta.model.parameters import twins_of
 from malta.model.plant import Plant, symbolic
@@ -121,10 +121,7 @@ class UncertainSystem:
 
         p = self.nominal.copy()
         for name, value in values.items():
-            if name not in self.names:
-                raise InputError(
-                    "state_space", name, "an unknown parameter", "one of " + " ".join(self.names)
-                )
+            require_known([name], self.names, "state_space", found="an unknown parameter")
             p[self.names.index(name)] = number("state_space", name, value)
         try:
             found = [M[0] for M in self.explicit(p)]

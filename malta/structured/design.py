@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tomlkit
 
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, InputError, relocate_errors
 from malta.loops.time_domain import noise_variance
 from malta.model.linearize import linearize
 from malta.structured import goals as kinds
@@ -120,10 +120,8 @@ def design_goals(spec: Spec) -> list[Goal]:
         found += [noise_limit(sensors, f"{kind} {n}", bound, name=f"{base} {n}") for n in names]
     assert spec.structure is not None
     for given in spec.structure.goals:
-        try:
+        with relocate_errors(spec.path, f"goals.{given.name}"):
             goal = _goal(given, sensors)
-        except InputError as error:
-            raise InputError(spec.path, f"goals.{given.name}", error.found, error.expected) from error
         found.append(soft(goal) if given.soft else goal)
     return found
 

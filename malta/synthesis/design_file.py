@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, InputError, relocate_errors, require_known
 from malta.files import locate
 from malta.model.data import plant_of, published, read
 from malta.model.parameters import units_of
@@ -138,11 +138,7 @@ def spec_of(
         plant = plant_of(par)
     except CheckError as error:
         raise InputError(path, "preset", str(error), "a machine that can be controlled") from error
-    for name in content.uncertainty:
-        if name not in units_of(par):
-            raise InputError(
-                path, f"uncertainty.{name}", "an unknown parameter", "one of " + " ".join(units_of(par))
-            )
+    require_known(content.uncertainty, units_of(par), path, "uncertainty.{}", "an unknown parameter")
     spec = Spec(
         name=content.name,
         summary=content.summary,
@@ -225,8 +221,7 @@ def _schedule(given: ScheduleTable | None, plant: Plant, path: Path) -> tuple[st
     if given is None:
         return None
     units = {s.name: s.unit for s in plant.outputs}
-    if given.variable not in units:
-        raise InputError(path, "schedule.variable", repr(given.variable), "one of " + " ".join(units))
+    require_known([given.variable], units, path, "schedule.variable")
     unit = units[given.variable]
     places = [to_si(place, given.unit, unit, path, "schedule.places") for place in given.places]
     if not all(a < b for a, b in pairwise(places)):
@@ -246,13 +241,11 @@ def _sample_time(content: DesignFile, path: Path) -> float:
 
 
 def _law(content: DesignFile, plant: Plant, path: Path) -> Weights | Pid | StructuredLaw:
-    try:
+    with relocate_errors(path):  # the record does not know the file
         if content.structure is not None:
             Ts = _sample_time(content, path)
             return read_structure(content.structure, content.goals or {}, plant, Ts, path)
         return _weights(content, plant, path) if content.pid is None else _pid(content.pid, plant, path)
-    except InputError as error:  # the record does not know the file
-        raise InputError(path, error.field, error.found, error.expected) from error
 
 
 LQG = ("discretization", "delay", "weights", "bases", "noise")
@@ -402,10 +395,7 @@ def _specification(content: DesignFile, spec: Spec) -> dict[str, Any]:
         if name in known and name not in able:
             other = " or ".join(f"an {one}" if one == "LQG" else f"a {one}" for one in known[name].laws)
             raise InputError(path, f"specification.{name}", f"a requirement of {other}", " ".join(able))
-        if name not in known:
-            raise InputError(
-                path, f"specification.{name}", "an unknown requirement", "one of " + " ".join(able)
-            )
+        require_known([name], able, path, "specification.{}", "an unknown requirement")
     given = specification_table(able.values(), table, path)
     asked: dict[str, float] = {}
     recovery: dict[str, RecoveryBound] = {}

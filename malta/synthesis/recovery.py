@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field, StrictStr
 
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, InputError, require_known
 from malta.model.plant import Signal, readonly
 from malta.tables import Quantity, Record, entry
 from malta.units import is_unit_of, to_si, units_like
@@ -138,11 +138,7 @@ def order_entries(
 ) -> list[Any]:
     """The entries in the order of the signals, one for each."""
     names = [s.name for s in signals]
-    for name in entries:
-        if name not in names:
-            raise InputError(
-                where, f"{field}.{name}", f"none of the {len(names)} {what}", "one of " + " ".join(names)
-            )
+    require_known(entries, names, where, f"{field}.{{}}", f"none of the {len(names)} {what}")
     if len(entries) < len(names):
         raise InputError(
             where,
@@ -210,13 +206,10 @@ def quantities(
     entries: Mapping[str, Quantity], units: Mapping[str, str], where: Path, field: str, what: str
 ) -> dict[str, float]:
     """Quantities in SI, by names that have these units. Raises InputError for others; what: the names are of."""
-    found = {}
-    for name, q in entries.items():
-        if name not in units:
-            known = " ".join(units) or "none"
-            raise InputError(where, f"{field}.{name}", f"an unknown {what}", f"one of {known}")
-        found[name] = to_si(q.value, q.unit, units[name], where, f"{field}.{name}")
-    return found
+    require_known(entries, units, where, f"{field}.{{}}", f"an unknown {what}")
+    return {
+        name: to_si(q.value, q.unit, units[name], where, f"{field}.{name}") for name, q in entries.items()
+    }
 
 
 def positive(value: float, where: Path, field: str, unit: str) -> float:
@@ -350,9 +343,7 @@ def _by_disturbance(
 def _outputs(table: RecoveryTable, plant: Plant, path: Path, field: str) -> Sequence[Signal]:
     """The outputs that are bounded."""
     known = {s.name: s for s in plant.outputs}
-    for name in table.outputs or ():
-        if name not in known:
-            raise InputError(path, f"{field}.outputs", repr(name), "one of " + " ".join(known))
+    require_known(table.outputs or (), known, path, f"{field}.outputs")
     return [known[name] for name in table.outputs or known]
 
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from malta.display import Description, display, quantity
-from malta.errors import InputError
+from malta.errors import InputError, require_known
 from malta.model.data import plant_of
 from malta.model.parameters import box_words, fingerprint, replace_fields
 from malta.model.plant import Plant, Signal, readonly
@@ -407,9 +407,7 @@ class Spec:
         ('stiffer', 5e-05, False)
         """
         known = [name for name in self.__dataclass_fields__ if name not in ("sha256", "path", "machine_file")]
-        for name in fields:
-            if name not in known:
-                raise InputError(self.path, name, "a field that a design lacks", "one of " + " ".join(known))
+        require_known(fields, known, self.path, found="a field that a design lacks")
         law = self._law_with(numbers, "numbers") if numbers else self.law
         own = fingerprint((self.sha256, numbers or {}, fields))
         return replace(self, **({"law": law, "sha256": own} | fields))
@@ -437,8 +435,7 @@ class Spec:
         }
         changed = list(law.elements)
         for entry, si in numbers.items():
-            if entry not in own:
-                raise InputError(self.path, field, repr(entry), "one of " + " ".join(own))
+            require_known([entry], own, self.path, field)
             k, key = own[entry]
             changed[k] = replace(changed[k], numbers={**changed[k].numbers, key: float(si)})
         return replace(law, elements=tuple(changed))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, InputError, relocate_errors
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import outputs_at
@@ -126,19 +126,15 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
         plant, (variable, places) = spec.plant, spec.schedule
         points = [point_at(plant, model.operating_point.x, variable, place) for place in places]
         laws = [_law_at(spec, linearize(plant, point)) for point in points]
-        try:
+        with relocate_errors(spec.path, "schedule"):
             controller = schedule_laws(laws, variable, about=controller)
-        except InputError as error:
-            raise InputError(spec.path, "schedule", error.found, error.expected) from error
     if spec.inertia_feedforward != 1:
         old = controller.feedforward
         scaled = replace(old, inertia=spec.inertia_feedforward * np.asarray(old.inertia))
         controller = replace(controller, feedforward=scaled)
     if spec.commutation == "predicted":
-        try:
+        with relocate_errors(spec.path):
             controller = commutate_ahead(controller, model)
-        except InputError as error:
-            raise InputError(spec.path, error.field, error.found, error.expected) from error
     if spec.pause and not controller.integrating:
         raise InputError(
             spec.path, "pause", "a law without sums of errors", "one with integrals, or no pause"

@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 from scipy import linalg
 
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, InputError, relocate_errors
 from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
 from malta.synthesis.elements import CALLER, Bounds, Element, Matrices, keep_sign
@@ -210,10 +210,8 @@ def _require_fit(name: str, plant: _Model, weights: Weights) -> None:
         found = weights.coordinates if weights.coordinates != "signals" else "a drift"
         raise InputError(CALLER, f"{name}.weights", found, "weights of signals, without a drift")
     A, B, C = plant.A, plant.B, plant.C
-    try:
+    with relocate_errors(CALLER, f"{name}.{{}}"):
         check_sizes(Lagged(A, B, C, np.zeros((len(A), len(C)))), weights)
-    except InputError as error:
-        raise InputError(CALLER, f"{name}.{error.field}", error.found, error.expected) from error
     reason = out_of_reach(A, B, C, plant.states)
     if reason:
         raise InputError(CALLER, name, reason, "a plant that its inputs stabilize and its outputs show")
