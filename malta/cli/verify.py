@@ -267,8 +267,8 @@ def _box_of(gains: Path, uncertain: list[str] | None, machine: Path | None) -> d
 
 def _print(file: Path, gains: Path | None, verdict: Verdict) -> None:
     """Print what is claimed, of what and where, and whether it holds."""
+    from malta.report.tables import COLOURS
     from malta.report.tables.design import claim_share, claim_table, claim_text
-    from malta.report.tables.layout import COLOURS
 
     console, stated = make_console(), verdict.stated
     print_text(console, f"{claim_text(stated)}\n")

@@ -13,6 +13,7 @@ from malta.margins.loop_report import LoopReport, zone
 from malta.model.machines import axis_units
 from malta.model.parameters import box_words
 from malta.proof.margin import NOT_PROVEN, Margin, unproven
+from malta.report.tables import Paragraph, add_row, new_table
 from malta.report.tables.design import (
     bandwidth_table,
     loop_poles_table,
@@ -20,7 +21,6 @@ from malta.report.tables.design import (
     requirements_table,
     sensitivity_table,
 )
-from malta.report.tables.layout import Paragraph, add_row, new_table
 
 if TYPE_CHECKING:
     from malta.margins.travel import Extent
