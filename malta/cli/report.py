@@ -190,7 +190,6 @@ LOCUS, MAP = "rootlocus", "marginmap"
 GAIN = "gain"
 SUFFIXES = (".png", ".svg", ".pdf")
 Machines = Mapping[str, tuple["Plant", "Controller"]]  # by the names of their loops
-Given = Mapping[str, "str | None"]  # option -> what was given
 
 
 class Picture(NamedTuple):
