@@ -135,13 +135,10 @@ def _measured(
     from malta.identification.data_file import read_identified
     from malta.identification.log_files import read_log
     from malta.identification.measure import measure as measure_loop
-    from malta.model.data import published_figures
 
     read = [read_log(log) for log in logs]
     if identified is None:
-        par = controller.parameters
-        published = published_figures(read[0].machine) if read[0].machine else None
-        box = read_uncertainty(gains, uncertain, par, published)
+        box = read_uncertainty(gains, uncertain, controller.parameters)
         return measure_loop(controller, *read, uncertainty=box)
     _require_no(uncertain, "--uncertain beside --identified")
     data = read_identified(identified)

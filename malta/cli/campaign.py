@@ -471,7 +471,7 @@ def campaign(
     plan = Plan(
         controller,
         scenario,
-        read_shares(gains, spread, parameters, published),
+        read_shares(gains, spread, parameters),
         read_sensor_errors(sensor, plant),
         samples,
         seed,

@@ -226,7 +226,7 @@ def pil(
 
 def _print(port: str, replay: Replay) -> None:
     """Print a table of the vectors, how fast it was, and the verdict."""
-    from malta.report.tables.layout import add_row, new_table
+    from malta.report.tables import add_row, new_table
 
     console = make_console()
     title = f"The target at {port} ({replay.precision}) against the recorded vectors"

@@ -477,13 +477,13 @@ def _learn_strokes(
     """Fly strokes on the simulated machine, each taught by those before."""
     from malta.identification.convergence import contraction
     from malta.identification.strokes import learn_strokes
-    from malta.model.data import plant_of, published_figures
+    from malta.model.data import plant_of
     from malta.report.tables.experiments import strokes_table
 
     plant = plant_of(change_machine(controller.parameters, change))
     with working(f"{strokes} strokes"):
         found = learn_strokes(plant, controller, strokes=strokes)
-    box = read_uncertainty(gains, uncertain, controller.parameters, published_figures(plant.name))
+    box = read_uncertainty(gains, uncertain, controller.parameters)
     with working("proving that errors shrink"):
         shrinks = contraction(controller, box) if box else None
     files = [] if out is None else verify_and_write(found.controller, gains, out)

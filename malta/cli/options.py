@@ -115,19 +115,17 @@ def read_sensor_errors(texts: list[str] | None, plant: Plant) -> dict[str, float
 
 
 def read_shares(
-    gains: Path,
-    texts: list[str] | None,
-    parameters: Parameters,
-    published: Mapping[str, Any] | None,
-    option: str = "--spread",
+    gains: Path, texts: list[str] | None, parameters: Parameters, option: str = "--spread"
 ) -> dict[str, float]:
     """Read how far parameters vary: `SHARE` for all that are uncertain, `NAME=SHARE` for one.
 
-    Without a text these are the shares in the gain file. The spread of a difference or an offset is in its own unit.
+    Without a text these are the shares in the gain file, else those that the machine's paper names. The spread of a
+    difference or an offset is in its own unit.
 
     Raises InputError for two shares for all, and as `read_assignments` does.
     """
     from malta.campaigns.plan import box_of
+    from malta.model.data import plant_of, published_figures
     from malta.model.parameters import differences, units_of
 
     named = [text for text in texts or () if "=" in text]
@@ -136,7 +134,7 @@ def read_shares(
         raise InputError(option, "", " and ".join(general), "one share for all, others as NAME=SHARE")
     shares: dict[str, float] = {}
     if general or not named:
-        shares = box_of(gains, published, option)
+        shares = box_of(gains, published_figures(plant_of(parameters).name), option)
     if general:
         share = read_assignments(option, [f"all={general[0]}"], {"all": "1"})["all"]
         shares = dict.fromkeys(shares, share)
@@ -155,11 +153,9 @@ def require_suffixes(*files: tuple[Path | None, tuple[str, ...]]) -> None:
             require_suffix(path, *suffixes)
 
 
-def read_uncertainty(
-    gains: Path, texts: list[str] | None, parameters: Parameters, published: Mapping[str, Any] | None
-) -> dict[str, float]:
+def read_uncertainty(gains: Path, texts: list[str] | None, parameters: Parameters) -> dict[str, float]:
     """Read `--uncertain`, the box of a margin: shares above 0. Raises InputError as `read_shares`."""
-    box = read_shares(gains, texts, parameters, published, option="--uncertain")
+    box = read_shares(gains, texts, parameters, option="--uncertain")
     for name, share in box.items():
         if not 0 < share < math.inf:
             raise InputError("--uncertain", name, f"{100 * share:g} %", "a share above 0 %")

@@ -105,7 +105,7 @@ def make_console() -> Console:
 
 def print_text(console: Console, text: str) -> None:
     """Print a paragraph that folds to the console's width and parts no number from its unit."""
-    from malta.report.tables.layout import Paragraph
+    from malta.report.tables import Paragraph
 
     console.print(Paragraph(text))
 
@@ -115,7 +115,7 @@ def print_line(console: Console, text: str, style: str = "") -> None:
 
     style : on a terminal with colours, as rich has it
     """
-    from malta.report.tables.layout import Paragraph
+    from malta.report.tables import Paragraph
 
     if console.is_terminal:
         console.print(Paragraph(text, style))

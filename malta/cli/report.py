@@ -131,7 +131,6 @@ def read_subject(
 
     Raises InputError for a change, a share or a design file that does not fit.
     """
-    from malta.model.data import published_figures
     from malta.report.page.report import subject_of
 
     parameters = change_machine(controller.parameters, change)
@@ -139,8 +138,7 @@ def read_subject(
     subject = subject_of(gains, parameters=parameters, spec=spec, changes=change or ())
     if not uncertain:
         return subject
-    box = read_uncertainty(gains, uncertain, parameters, published_figures(subject.plant.name))
-    return subject._replace(box=box)
+    return subject._replace(box=read_uncertainty(gains, uncertain, parameters))
 
 
 def campaigns_of(
@@ -190,7 +188,6 @@ LOCUS, MAP = "rootlocus", "marginmap"
 GAIN = "gain"
 SUFFIXES = (".png", ".svg", ".pdf")
 Machines = Mapping[str, tuple["Plant", "Controller"]]  # by the names of their loops
-Given = Mapping[str, "str | None"]  # option -> what was given
 
 
 class Picture(NamedTuple):
@@ -388,11 +385,10 @@ def _maps(files: Sequence[Path], machines: Machines, x: str | None, y: str | Non
     """The margin map of each loop over two parameters that its gain file names as uncertain. Raises InputError."""
     from malta.cli.options import read_uncertainty
     from malta.margins.margin_map import margin_map_of
-    from malta.model.data import published_figures
 
     found = []
     for file, (name, (plant, controller)) in zip(files, machines.items(), strict=True):
-        box = read_uncertainty(file, None, plant.parameters, published_figures(plant.name))
+        box = read_uncertainty(file, None, plant.parameters)
         if len(box) < 2:
             raise InputError(file, "uncertainty", f"{len(box)} parameters", f"two at least for a {MAP}")
         free = [one for one in box if one not in (x, y)]

@@ -78,7 +78,7 @@ def compare_flights(
 
 def comparison_table(title: str, found: dict[Precision, list[Difference]]) -> Any:
     """A table of the largest difference of each signal, as a share of its range."""
-    from malta.report.tables.layout import add_row, new_table
+    from malta.report.tables import add_row, new_table
 
     table = new_table(title, "signal", "largest", "C, double", "C, float")
     for double, single in zip(found["double"], found["float"], strict=True):

@@ -108,7 +108,7 @@ def verify(
     parameters = controller.parameters if measured is None else measured.parameters
     plant = plant_of(change_machine(parameters, change))
     published = published_figures(plant.name)
-    box = measured.shares if measured else read_uncertainty(gains, uncertain, plant.parameters, published)
+    box = measured.shares if measured else read_uncertainty(gains, uncertain, plant.parameters)
     _require_options(time, certificate, proof=not no_proof)
     spec = find_design(gains, controller, design)
     try:
@@ -256,19 +256,14 @@ def check(
 
 def _box_of(gains: Path, uncertain: list[str] | None, machine: Path | None) -> dict[str, float] | None:
     """The uncertainty that was asked for; None: that of the gain file. It makes the machine's module known."""
-    from malta.model.data import plant_of, published_figures
-
     controller = read_controller(gains, machine)
-    if not uncertain:
-        return None
-    plant = plant_of(controller.parameters)
-    return read_uncertainty(gains, uncertain, plant.parameters, published_figures(plant.name))
+    return read_uncertainty(gains, uncertain, controller.parameters) if uncertain else None
 
 
 def _print(file: Path, gains: Path | None, verdict: Verdict) -> None:
     """Print what is claimed, of what and where, and whether it holds."""
+    from malta.report.tables import COLOURS
     from malta.report.tables.design import claim_share, claim_table, claim_text
-    from malta.report.tables.layout import COLOURS
 
     console, stated = make_console(), verdict.stated
     print_text(console, f"{claim_text(stated)}\n")

@@ -41,6 +41,7 @@ if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that dr
     from malta.report.plots import sigma as sigma
     from malta.report.plots import step as step
     from malta.report.plots.polar import margin_map as margin_map
+    from malta.report.tables import Paragraph as Paragraph
     from malta.report.tables.campaign import campaign_tables as campaign_tables
     from malta.report.tables.campaign import rare_event_tables as rare_event_tables
     from malta.report.tables.campaign import sensitivity_tables as sensitivity_tables
@@ -58,7 +59,6 @@ if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that dr
     from malta.report.tables.experiments import experiment_table as experiment_table
     from malta.report.tables.experiments import limits_text as limits_text
     from malta.report.tables.experiments import scenarios_table as scenarios_table
-    from malta.report.tables.layout import Paragraph as Paragraph
     from malta.report.tables.margins import chain_table as chain_table
     from malta.report.tables.margins import disk_table as disk_table
     from malta.report.tables.margins import gang_table as gang_table

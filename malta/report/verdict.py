@@ -20,7 +20,7 @@ from rich.text import Text
 from malta.display import ceil_to, floor_to, micro, number
 from malta.margins.loop_report import LoopReport, Outcome, zone
 from malta.model.parameters import box_words
-from malta.report.tables.layout import fold
+from malta.report.tables import fold
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderResult

@@ -17,7 +17,7 @@ import malta
 from malta.cli.main import Commands
 from malta.margins.loop_report import Outcome
 from malta.report.ledger import Claim, Ledger
-from malta.report.tables.layout import COLOURS, end_cell
+from malta.report.tables import COLOURS, end_cell
 
 FILES = {
     "GAINS": "gain file",

@@ -7,7 +7,7 @@ import pytest
 from conftest import assert_folds, printed
 
 from malta.cli import output
-from malta.report.tables.layout import add_row, fold, new_table
+from malta.report.tables import add_row, fold, new_table
 
 
 def _table() -> object:

@@ -142,7 +142,7 @@ def test_many_inputs_are_drawn_as_a_band() -> None:
 def campaign_of(name: str, scenario: str, samples: int, share: float = 1.0, **options: Any) -> Campaign:
     """A campaign over the box of a shipped gain file."""
     plant, c, _ = machine(name)
-    box = read_shares(ROOT / "design" / "gains" / f"{name}.json", [], plant.parameters, None)
+    box = read_shares(ROOT / "design" / "gains" / f"{name}.json", [], plant.parameters)
     spread = {key: share * value for key, value in box.items()}
     return malta.campaign(malta.campaigns.Plan(c, scenario, spread, samples=samples, **options))
 
@@ -187,7 +187,7 @@ def test_nothing_is_wrong_with_the_figures_of_a_campaign(
 @pytest.mark.parametrize("name", ["table2", "halbach"])
 def test_nothing_is_wrong_with_the_figures_of_margins_and_loads(name: str) -> None:
     plant, c, _ = machine(name)
-    box = read_shares(ROOT / "design" / "gains" / f"{name}.json", [], plant.parameters, None)
+    box = read_shares(ROOT / "design" / "gains" / f"{name}.json", [], plant.parameters)
     found = malta.verify(plant, c, box, stages=True, worst_case=False)
     assert defects(report.chain_figure(found)) == []
     assert defects(report.recovery_figure(plant, c)) == []

@@ -15,7 +15,6 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from malta.display import RADIANS, frequency
 from malta.loops.time_domain import budget_of
 from malta.merits import four_digits
 from malta.model.data import published_figures
@@ -33,7 +32,9 @@ from malta.report.tables.design import (
 )
 from malta.report.tables.experiments import experiment_table, limits_text
 from malta.report.tables.margins import (
+    DISKS,
     chain_table,
+    disk_rows,
     disk_table,
     gang_table,
     open_bounds,
@@ -341,19 +342,8 @@ def _margin_map(a: Analysis) -> Iterator[Item]:
 
 def _classical_sheet(found: LoopReport, classical: Classical) -> Sheet:
     """Disk and delay margins of a machine without uncertain parameters."""
-    Ts, rows = found.controller.sample_time, []
-    for disk in classical.disks:
-        gain = f"{1 / disk.gain:.2f} .. {disk.gain:.2f}"
-        phase = f"±{np.degrees(disk.phase):.1f}"
-        rows.append([disk.channels, f"{disk.size:.3f}", gain, phase, frequency(disk.frequency)])
-    for name, delay in classical.delay.items():
-        samples = f"{delay * 1e6:.0f} us, {delay / Ts:.1f} samples" if np.isfinite(delay) else "any"
-        rows.append([f"delay at {name} alone", samples, "", "", ""])
-    return plain_sheet(
-        "Disk and delay margins of the sampled loop",
-        ("factor in", "disk", "gain", "phase [deg]", RADIANS),
-        rows,
-    )
+    rows = disk_rows(classical.disks, classical.delay, found.controller.sample_time, joined=True)
+    return plain_sheet("Disk and delay margins of the sampled loop", DISKS, rows)
 
 
 def _loop(a: Analysis) -> Iterator[Item]:

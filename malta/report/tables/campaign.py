@@ -11,7 +11,7 @@ from rich.table import Table
 from malta.model.machines import lateral_outputs
 from malta.model.parameters import differences
 from malta.report.figures.drawing import Published, number
-from malta.report.tables.layout import Paragraph, add_row, end_cell, new_table
+from malta.report.tables import Paragraph, add_row, end_cell, new_table
 from malta.units import in_unit
 
 if TYPE_CHECKING:

@@ -22,8 +22,8 @@ from malta.model.machines import FINE
 from malta.model.parameters import box_words
 from malta.proof.certificate.checked_file import Claim, double
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
+from malta.report.tables import COLOURS, Paragraph, add_row, new_table
 from malta.report.tables.experiments import experiment_table
-from malta.report.tables.layout import COLOURS, Paragraph, add_row, new_table
 from malta.synthesis.lqg import continuous_poles
 from malta.synthesis.requirements import Trade, requirements_for
 from malta.units import in_unit

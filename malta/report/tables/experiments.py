@@ -16,7 +16,7 @@ from rich.text import Text
 
 from malta.margins.loop_report import zone
 from malta.report.figures.drawing import Published
-from malta.report.tables.layout import (
+from malta.report.tables import (
     COLOURS,
     INDENT,
     Paragraph,

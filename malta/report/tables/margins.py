@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from rich.table import Table
@@ -13,6 +13,7 @@ from malta.margins.loop_report import LoopReport, zone
 from malta.model.machines import axis_units
 from malta.model.parameters import box_words
 from malta.proof.margin import NOT_PROVEN, Margin, unproven
+from malta.report.tables import Paragraph, add_row, new_table
 from malta.report.tables.design import (
     bandwidth_table,
     loop_poles_table,
@@ -20,9 +21,9 @@ from malta.report.tables.design import (
     requirements_table,
     sensitivity_table,
 )
-from malta.report.tables.layout import Paragraph, add_row, new_table
 
 if TYPE_CHECKING:
+    from malta.loops.classical import Disk
     from malta.margins.travel import Extent
     from malta.proof.blocks.gain import Gain
     from malta.report.figures.drawing import Published
@@ -244,26 +245,26 @@ def disk_table(found: LoopReport) -> Table:
      delay at y alone     2719 µs   13.6 samples
     <BLANKLINE>
     """
-    table = new_table(
-        f"Margins of the sampled loop without parameters{_places_text(found)}",
-        "factor in",
-        "disk",
-        "gain",
-        "phase [deg]",
-        RADIANS,
-    )
-    for disk in found.disks:
-        add_row(
-            table,
-            disk.channels,
-            f"{disk.size:.3f}",
-            f"{1 / disk.gain:.2f} .. {disk.gain:.2f}",
-            f"±{math.degrees(disk.phase):.1f}",
-            frequency(disk.frequency),
-        )
-    for name, delay in found.delay.items():
-        add_row(table, f"delay at {name} alone", *_delay_cells(delay, found.controller.sample_time), "", "")
+    table = new_table(f"Margins of the sampled loop without parameters{_places_text(found)}", *DISKS)
+    for row in disk_rows(found.disks, found.delay, found.controller.sample_time):
+        add_row(table, *row)
     return table
+
+
+DISKS = ("factor in", "disk", "gain", "phase [deg]", RADIANS)
+
+
+def disk_rows(
+    disks: Iterable[Disk], delays: Mapping[str, float], Ts: float, *, joined: bool = False
+) -> Iterator[tuple[str, ...]]:
+    """Rows under the headings DISKS; joined: a delay and its samples stand in one cell."""
+    for disk in disks:
+        gain, phase = f"{1 / disk.gain:.2f} .. {disk.gain:.2f}", f"±{math.degrees(disk.phase):.1f}"
+        yield disk.channels, f"{disk.size:.3f}", gain, phase, frequency(disk.frequency)
+    for name, delay in delays.items():
+        cells = _delay_cells(delay, Ts)
+        both = (", ".join(filter(None, cells)), "") if joined else cells
+        yield f"delay at {name} alone", *both, "", ""
 
 
 def _places_text(found: LoopReport) -> str:

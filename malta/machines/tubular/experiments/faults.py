@@ -201,44 +201,22 @@ class Blow:
     held: float = math.nan
 
 
-def _lose(b: Blow, inputs: Any, _: Any) -> None:
-    view(inputs, "y")[b.sensor] = math.nan
+def change_reading(
+    name: str, at: Literal["sensor", "current", ""], new: Callable[[Blow, Any], Any]
+) -> Callable[[Blow, Any, Any], None]:
+    """What a fault does to a reading: from (fault, old value) the new one; `at` is its place, "" for all."""
+
+    def change(b: Blow, inputs: Any, _: Any) -> None:
+        values, k = view(inputs, name), getattr(b, at) if at else slice(None)
+        values[k] = new(b, values[k])
+
+    return change
 
 
-def _stick(b: Blow, inputs: Any, _: Any) -> None:
-    y = view(inputs, "y")
-    b.held = y[b.sensor] if math.isnan(b.held) else b.held
-    y[b.sensor] = b.held
-
-
-def _shift(b: Blow, inputs: Any, _: Any, size: float) -> None:
-    view(inputs, "y")[b.sensor] += b.sign * b.scale * size
-
-
-def _shake(b: Blow, inputs: Any, _: Any, size: float) -> None:
-    view(inputs, "y")[b.sensor] += b.scale * size * b.rng.normal()
-
-
-def _lose_current(b: Blow, inputs: Any, _: Any) -> None:
-    view(inputs, "i_valid")[b.current] = 0.0
-
-
-def _lose_currents(_: Blow, inputs: Any, __: Any) -> None:
-    view(inputs, "i")[:] = math.nan
-
-
-def _freeze_current(b: Blow, inputs: Any, _: Any) -> None:
-    i = view(inputs, "i")
-    b.held = i[b.current] if math.isnan(b.held) else b.held
-    i[b.current] = b.held
-
-
-def _weaken_current(b: Blow, inputs: Any, _: Any) -> None:
-    view(inputs, "i")[b.current] *= 0.7
-
-
-def _raise_link(_: Blow, inputs: Any, __: Any) -> None:
-    view(inputs, "link")[:] *= 1.3
+def freeze(b: Blow, value: float) -> float:
+    """The value at the moment of the fault."""
+    b.held = value if math.isnan(b.held) else b.held
+    return b.held
 
 
 def _cut_torque(_: Blow, __: Any, request: Any) -> None:
@@ -250,10 +228,6 @@ def _stick_gates(b: Blow, outputs: Any) -> None:
     view(outputs, "command")[b.current] = 1.0 if b.sign > 0 else 0.0
 
 
-def _miss(b: Blow, _: Plant, Ts: float, steps: int) -> tuple[Fault, ...]:
-    return (Fault("missed step", b.at - Ts / 4, b.at + (steps - 0.25) * Ts),)
-
-
 def _open(b: Blow, plant: Plant, _: float) -> tuple[Fault, ...]:
     return (Fault("open phase", b.at, math.inf, plant.drive.phases[b.current].name),)
 
@@ -262,22 +236,29 @@ def _open_all(b: Blow, plant: Plant, _: float) -> tuple[Fault, ...]:
     return tuple(Fault("open phase", b.at, math.inf, phase.name) for phase in plant.drive.phases)
 
 
-def _sag(b: Blow, _: Plant, __: float) -> tuple[Fault, ...]:
-    return (Fault("link sag", b.at, math.inf, size=0.5),)
+def _miss(b: Blow, _: Plant, Ts: float, steps: int) -> tuple[Fault, ...]:
+    return (Fault("missed step", b.at - Ts / 4, b.at + (steps - 0.25) * Ts),)
+
+
+def _shift(size: float) -> Callable[[Blow, Any, Any], None]:
+    return change_reading("y", "sensor", lambda b, y: y + b.sign * b.scale * size)
 
 
 KINDS: tuple[Kind, ...] = (
-    Kind("sensor lost", _lose),
-    Kind("sensor stuck", _stick),
-    Kind("sensor biased by 20 um", partial(_shift, size=20e-6)),
-    Kind("sensor jumps by 200 um", partial(_shift, size=200e-6)),
-    Kind("sensor noisier by 10 um", partial(_shake, size=10e-6)),
-    Kind("one current lost", _lose_current),
-    Kind("all currents lost", _lose_currents),
-    Kind("one current frozen", _freeze_current),
-    Kind("one current reads 70 %", _weaken_current),
-    Kind("link at 50 %", simulated=_sag),
-    Kind("link reads 130 %", _raise_link),
+    Kind("sensor lost", change_reading("y", "sensor", lambda _, __: math.nan)),
+    Kind("sensor stuck", change_reading("y", "sensor", freeze)),
+    Kind("sensor biased by 20 um", _shift(20e-6)),
+    Kind("sensor jumps by 200 um", _shift(200e-6)),
+    Kind(
+        "sensor noisier by 10 um",
+        change_reading("y", "sensor", lambda b, y: y + b.scale * 10e-6 * b.rng.normal()),
+    ),
+    Kind("one current lost", change_reading("i_valid", "current", lambda _, __: 0.0)),
+    Kind("all currents lost", change_reading("i", "", lambda _, __: math.nan)),
+    Kind("one current frozen", change_reading("i", "current", freeze)),
+    Kind("one current reads 70 %", change_reading("i", "current", lambda _, i: 0.7 * i)),
+    Kind("link at 50 %", simulated=lambda b, _, __: (Fault("link sag", b.at, math.inf, size=0.5),)),
+    Kind("link reads 130 %", change_reading("link", "", lambda _, link: 1.3 * link)),
     Kind("one phase open", simulated=_open),
     Kind("a half-bridge stuck", command=_stick_gates),
     Kind("safe torque off", _cut_torque, simulated=_open_all),
