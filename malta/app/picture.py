@@ -7,15 +7,16 @@ Nothing here is proven: the eigenvalue margin is an upper bound, and the proof f
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from malta.app.files import Edited
+from malta.app.linear_run import linear_run
 from malta.errors import CheckError, InputError
 from malta.loops.classical import phase_and_delay
 from malta.loops.curves import LoopCurves, loop_curves
@@ -27,21 +28,14 @@ from malta.margins.verify import machine_report
 from malta.merits import Merit, figure
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import outputs_at
 from malta.proof.loss import RayBound, ray_bound
-from malta.simulation.engine.engines import evaluate
 from malta.simulation.experiments.catalogue import cases_of, main_job, series_of, step_cases
-from malta.simulation.inputs import feedforward, motion_of, past_forces
-from malta.simulation.period import state_reference
 from malta.synthesis.synthesize import synthesize
 from malta.units import in_unit
 
 if TYPE_CHECKING:
-    from malta.loops.sampled_loops import SampledLoop
     from malta.model.plant import FloatArray, Plant, Signal
     from malta.simulation.experiments import PlannedRun
-    from malta.simulation.references import Motion
-    from malta.simulation.scenario import Scenario
     from malta.synthesis.controller import Controller
     from malta.synthesis.recovery import StepResponse
     from malta.synthesis.spec import Spec
@@ -72,100 +66,6 @@ def planned_run(plant: Plant, controller: Controller, name: str) -> tuple[str, P
     if name.startswith(STEP):
         return name, step_cases(plant, controller, output=name.removeprefix(STEP), size=0.0, time=0.0)[0]
     return name, cases_of(name, plant, controller)[0]
-
-
-# A reference followed by the linear loop of a machine: what a simulation shows, in milliseconds and without limits.
-#
-#     X+ = M X + G r,   p = C X,   v = K X + D r        X = (machine, law), r = (p*, xi*, v_ff, v0)
-#
-# The loop is `malta.loop`: hold, delay, current loops, late sensors, loads against v0(z) at the
-# trim. Forces that saturate, sums of errors that wait, and what changes along the way are left to `simulate`.
-
-
-LONGEST = 20_000  # samples
-
-
-class LinearRun(NamedTuple):
-    """A reference and its answer, one row a sample, SI."""
-
-    t: FloatArray  # s, k
-    reference: FloatArray  # k x p
-    p: FloatArray  # k x p, true outputs
-    v: FloatArray  # k x m, commanded forces beside those that hold the machine at its operating point
-
-
-def linear_run(loop: SampledLoop, controller: Controller, scenario: Scenario) -> LinearRun:
-    """Follow the reference of a scenario with the linear loop, which starts at rest on the reference.
-
-    loop : `malta.loop(machine, controller).sampled`
-
-    Raises InputError for more than LONGEST samples.
-    """
-    c, law, plant = controller, loop.control, plant_of(controller.parameters)
-    samples = max(1, round(scenario.duration / c.sample_time))
-    if samples > LONGEST:
-        raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
-    t = np.arange(samples) * c.sample_time
-    motion = motion_of(scenario, plant, c, t)
-    here = outputs_at(plant, plant.point(c.operating_point[0]).x)
-    r = _references(c, motion, here)
-    closed, driven = loop.closed, r @ np.vstack([loop.Bd @ law.D_r, law.B_r]).T
-    n, m = len(loop.Ad), len(c.forces)
-    with np.errstate(all="ignore"):  # an unstable loop runs away
-        X = _follow(closed, driven)
-        p = here + X[:, :n] @ loop.outputs.T
-        v = X @ np.hstack([law.D_y @ loop.Cd, law.C])[:m].T + r @ law.D_r[:m].T
-    return LinearRun(t, motion.p, p, v)
-
-
-BLOCK = 32  # samples that are stepped through at once
-
-
-def _follow(closed: FloatArray, driven: FloatArray) -> FloatArray:
-    """X+ = M X + d from rest, one row a sample.
-
-    The states within a block are those from zero, all blocks at once, and what its first state grows to.
-    """
-    samples, n = driven.shape
-    blocks = -(-samples // BLOCK)
-    d = np.zeros((blocks, BLOCK, n))
-    d.reshape(-1, n)[:samples] = driven
-    powers, X = [np.eye(n)], np.zeros((blocks, BLOCK, n))
-    for k in range(1, BLOCK):
-        powers.append(closed @ powers[-1])
-        X[:, k] = X[:, k - 1] @ closed.T + d[:, k - 1]
-    whole, across = closed @ powers[-1], X[:, -1] @ closed.T + d[:, -1]
-    first = np.empty((blocks, n))
-    state = _at_rest(closed, driven[0])
-    for k in range(blocks):
-        first[k] = state
-        state = whole @ state + across[k]
-    X += (first @ np.concatenate(powers).T).reshape(X.shape)
-    return np.asarray(X.reshape(-1, n)[:samples])
-
-
-def _at_rest(closed: FloatArray, driven: FloatArray) -> FloatArray:
-    """The states of which X = M X + G r, for a reference that stands still."""
-    left = np.eye(len(closed)) - closed
-    try:
-        return np.linalg.solve(left, driven)
-    except np.linalg.LinAlgError:  # an integral that nothing reads
-        return np.asarray(np.linalg.lstsq(left, driven, rcond=None)[0])
-
-
-def _references(c: Controller, motion: Motion, here: FloatArray) -> FloatArray:
-    """r = (p*, xi*, v_ff, v0) at every sample, as deviations from the operating point; v0 follows the readings."""
-    v_ff, hold = feedforward(c, motion), c.feedforward.position
-    if hold.size:  # at the operating point it is no deviation
-        v_ff = v_ff - c.operating_point[0][: hold.shape[1]] @ hold.T
-    zeros, p = np.zeros_like(v_ff), motion.p - here
-    if c.tracks == "errors":
-        return np.hstack([p, np.zeros((len(p), len(c.states))), v_ff, zeros])
-    rest, rates = state_reference(plant_of(c.parameters)), len(c.feedforward.rate)
-    states = evaluate(rest.map(len(p)), motion.p, motion.dp)[0] - np.array(rest(here, 0)).ravel()
-    if rates:
-        states[:, len(c.A) - rates :] += motion.dp @ c.feedforward.rate.T
-    return np.hstack([p, states, past_forces(c, motion, v_ff), v_ff, zeros])
 
 
 POINTS = 400  # of a curve over time, at most
@@ -228,24 +128,43 @@ def _design_model(plant: Plant, at: tuple[tuple[str, float], ...]) -> LinearMode
 
 
 def picture(problem: Problem, view: View, *, margin: bool = True) -> dict[str, Any]:
-    """Compute the document that the page draws.
+    """Compute the document that the page draws: what it opens with, and its PARTS.
 
     margin : whether the eigenvalue margin is asked for
 
     Raises CheckError where no input holds the machine.
     """
+    document = opening(problem)
+    for name in PARTS:
+        add_part(document, name, problem, view)
+    return document | {"margin": eigenvalue_margin(problem) if margin else None}
+
+
+@np.errstate(all="ignore")  # an unstable loop runs away
+def opening(problem: Problem) -> dict[str, Any]:
+    """Stability, poles, and the figures that need no curve. Raises CheckError where no input holds the machine."""
     stage = problem.report.stages[-1]
-    with np.errstate(all="ignore"):  # an unstable loop runs away
-        return {
-            "stable": stage.stable,
-            "radius": stage.spectral_radius,
-            "poles": _poles(problem),
-            "frequency": _frequency(problem.curves),
-            "run": (run := run_document(problem, view)),
-            "load": (load := _load(problem, view)),
-            "margin": eigenvalue_margin(problem) if margin else None,
-            "figures": _figures(problem, run, load),
-        }
+    figures = _figures(problem, None)
+    return {
+        "stable": stage.stable, "radius": stage.spectral_radius, "poles": _poles(problem), "figures": figures,
+    }  # fmt: skip
+
+
+Part = Callable[[Problem, View, Mapping[str, Any]], Any]
+PARTS: Mapping[
+    str, Part
+] = {  # of a picture, in the order in which they are computed, each from what is known before
+    "frequency": lambda problem, _view, _known: _frequency(problem.curves),
+    "run": lambda problem, view, _known: run_document(problem, view),
+    "load": lambda problem, view, _known: _load(problem, view),
+    "figures": lambda problem, _view, known: _figures(problem, known),
+}
+
+
+@np.errstate(all="ignore")
+def add_part(document: dict[str, Any], name: str, problem: Problem, view: View) -> None:
+    """Add one of PARTS to a document that has what comes before it."""
+    document[name] = PARTS[name](problem, view, document)
 
 
 def _poles(problem: Problem) -> dict[str, list[list[float]]]:
@@ -429,13 +348,15 @@ SHORT = {
 SIDES = {"high": 1, "low": -1, "": 0}  # of the better values
 
 
-def _figures(
-    problem: Problem, run: Mapping[str, Any] | None, load: Mapping[str, Any] | None
-) -> list[dict[str, Any]]:
-    """The figures of the picture: numbers without a value are null."""
+def _figures(problem: Problem, known: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+    """The figures of the picture: numbers without a value are null.
+
+    known : with the run and the load; None: the figures that need no curve
+    """
     merits = [*reversed([*pole_figures(problem.report.poles.closed_loop)])]
     if problem.report.stable:
-        merits = [*_loop_merits(problem), *_time_merits(problem, run, load), *merits]
+        over_time = [] if known is None else _time_merits(problem, known["run"], known["load"])
+        merits = [*_loop_merits(problem, curves=known is not None), *over_time, *merits]
     return [
         {
             "label": SHORT.get(one.key, one.label),
@@ -448,17 +369,12 @@ def _figures(
     ]
 
 
-def _loop_merits(problem: Problem) -> list[Merit]:
-    """Of the machine's loop: sensitivity, bandwidths, margins of the channels, noise."""
+def _loop_merits(problem: Problem, *, curves: bool) -> list[Merit]:
+    """Of the machine's loop: sensitivity, bandwidths, margins of the channels where there are curves, noise."""
     found = problem.report.quick_figures
     known = {one.key: one for one in found}
     peak, sensors = known["peak_sensitivity"], [one for one in found if one.kind == "peak_s_of"]
     worst = max(sensors, key=lambda one: one.value)
-    turns = [phase_and_delay(crossings) for crossings in problem.curves.crossings[0]]
-    names = [s.name for s in problem.curves.channels()]
-    phase, phase_at = min(zip((turn[0] for turn in turns), names, strict=True))
-    delay, delay_at = min(zip((turn[2] for turn in turns), names, strict=True))
-    alone = "smallest of the sensors, the others closed"
     noise = {kind: [one.value for one in found if one.kind == kind] for kind in ("motion", "command")}
     return [
         peak._replace(note=f"at {worst.signal}, zone {zone(peak.value)}"),
@@ -466,11 +382,23 @@ def _loop_merits(problem: Problem) -> list[Merit]:
             known[f"bandwidth_{key}"]._replace(note=BANDWIDTHS[key])
             for key in ("sigma_max_T", "crossover_max")
         ),
-        figure("phase_margin", "", "phase margin", phase, note=f"{phase_at}, {alone}"),
-        figure("delay_margin", "", "delay margin", delay, "s", note=f"{delay_at}, {alone}"),
+        *(_channel_margins(problem) if curves else ()),
         *_worst_by_unit("motion", "motion at rest, rms", noise["motion"], problem.plant.outputs),
         *_worst_by_unit("command", "command noise, rms", noise["command"], problem.plant.inputs),
     ]
+
+
+def _channel_margins(problem: Problem) -> tuple[Merit, Merit]:
+    """The smallest phase margin and delay margin of the sensors."""
+    turns = [phase_and_delay(crossings) for crossings in problem.curves.crossings[0]]
+    names = [s.name for s in problem.curves.channels()]
+    phase, phase_at = min(zip((turn[0] for turn in turns), names, strict=True))
+    delay, delay_at = min(zip((turn[2] for turn in turns), names, strict=True))
+    alone = "smallest of the sensors, the others closed"
+    return (
+        figure("phase_margin", "", "phase margin", phase, note=f"{phase_at}, {alone}"),
+        figure("delay_margin", "", "delay margin", delay, "s", note=f"{delay_at}, {alone}"),
+    )
 
 
 def _time_merits(

@@ -14,6 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from malta.app.answers import MARGIN, Answer, Answers
 from malta.app.fields import is_number
 from malta.app.files import (
     DesignFiles,
@@ -29,10 +30,7 @@ from malta.app.files import (
 )
 from malta.app.followers import Worker, describe_error
 from malta.app.picture import (
-    Problem,
     View,
-    eigenvalue_margin,
-    picture,
     poles_document,
     run_names,
     solve,
@@ -43,12 +41,10 @@ from malta.synthesis.requirements import requirements_for
 from malta.tuning.search import base_of
 
 if TYPE_CHECKING:
-    from malta.model.plant import Parameters
     from malta.synthesis.spec import Spec
 
 
 QUIET = 0.25  # s, after the last move until its proof begins
-SLOW = 0.08  # s of processor time of an answer: an eigenvalue margin that would take it beyond follows later
 LONGEST_WAIT = 20.0  # s, of a question for news
 KEPT = 1000  # news of one version
 
@@ -89,16 +85,14 @@ class Session:
         self._slopes: tuple[Handle, View, dict[str, tuple[float, ...]]] | None = (
             None  # of the handle that is pulled
         )
-        self._ray: tuple[int, float] | None = None  # of the last eigenvalue margin, and that margin
-        self._margin_takes = dict[bool, float]()  # s of processor time: of a new machine, of the same
-        self._traced: Parameters | None = None  # of the machine whose margin was traced last
+        self._answers = Answers()
+        self._answer: tuple[int, Answer] | None = None  # to the newest evaluation, and its number
         self._timer: threading.Timer | None = None
         self._searched = -1  # the serial of the newest search
         self._serial, self._due = 0, set[str]()  # tasks that the workers are asked for when the page rests
         self._workers = {task: Worker(self._tell) for task in ("check", "prove", "map", "search")}
         self._plane: tuple[str, str] | None = None  # of the map that the page shows
-        self._lost = 1.0  # the last eigenvalue margin, which says how wide a map is
-        self._message: Document | None = None  # of the design that the workers follow
+        self._message: Callable[[], Document] | None = None  # of the design that the workers follow
 
     # --- the door ---
 
@@ -107,6 +101,7 @@ class Session:
         doors: dict[str, Callable[[Mapping[str, Any]], Document]] = {
             "open": self.open,
             "evaluate": self.evaluate,
+            "rest": self.rest,
             "news": self.news,
             "map": self.map,
             "search": self.search,
@@ -148,7 +143,8 @@ class Session:
         }
 
     def evaluate(self, body: Mapping[str, Any]) -> Document:
-        """The picture of an edit; {"stale": true} where a newer one was asked for meanwhile."""
+        """The picture of an edit, with "missing" parts, which `rest` gives; {"stale": true} where a newer one was asked
+        for meanwhile."""
         number = body.get("number")
         if not isinstance(number, int) or isinstance(number, bool):
             raise InputError("malta app", "number", repr(number), "a whole number")
@@ -168,16 +164,26 @@ class Session:
             self.edit = self._followed = edit
             version = self._version if same else self._supersede()
             try:
-                document, problem = self._picture(edit, view)
+                answer = self._answers.begin(solve(self.files.apply(edit)), view, cpu)
             except Exception as error:
                 return {"number": number, "version": version, "error": shorten(describe_error(error))}
-            margin = document["margin"] is None and bool(problem.spec.uncertainty)
             tasks = {"check"} if same else {"check", "prove", *(["map"] if self._plane else [])}
-            self._follow_later(
-                edit, view, tasks, fingerprint(problem.spec, problem.plant.parameters), margin=margin
-            )
+            self._answer = number, answer
+            self._follow_later(edit, tasks, answer)
             spent = {"wall": time.perf_counter() - began, "cpu": time.thread_time() - cpu}
-            return {"number": number, "version": version, **document, "seconds": spent}
+            given = {**answer.document, "missing": [*answer.missing], "seconds": spent}
+            return {"number": number, "version": version, **given}
+
+    def rest(self, body: Mapping[str, Any]) -> Document:
+        """The parts that the answer to the evaluation body["number"] lacks; {"stale": true} after a newer one."""
+        number = body.get("number")
+        with self._busy:
+            if self._answer is None or number != self._answer[0] or number < self._newest:
+                return {"number": number, "stale": True}
+            try:
+                return {"number": number, **self._answers.complete(self._answer[1])}
+            except Exception as error:
+                return {"number": number, "error": shorten(describe_error(error))}
 
     def map(self, body: Mapping[str, Any]) -> Document:
         """Ask for the plane of two parameters, which follows as news; of body["at"], a point of it, the poles there."""
@@ -189,7 +195,7 @@ class Session:
             with self._state:
                 self._plane, message = (str(names[0]), str(names[1])), self._message
             if message is not None:
-                self._workers["map"].ask(message | {"task": "map", "plane": [*self._plane, self._lost]})
+                self._workers["map"].ask(message() | {"task": "map"})
             return {"version": self._version}
         if not (isinstance(at, list) and len(at) == 2 and all(map(is_number, at))):
             raise InputError("malta app", "at", repr(at), "two numbers")
@@ -214,7 +220,7 @@ class Session:
     def _begin_search(self, edit: Edit, view: View, design: str, task: str) -> int:
         """Send a search to its worker, which supersedes the one before; its serial."""
         with self._state:
-            message = self._message_of(edit, view, design) | {"version": None, "task": task}
+            message = self._message_of(edit, view) | {"version": None, "task": task, "design": design}
             self._searched = int(message["serial"])
             self._news = [one for one in self._news if one[1]["version"] is not None]
         self._workers["search"].ask(message)
@@ -283,8 +289,8 @@ class Session:
             self._begin_search(Edit(), View(), "", "stop")
             self.files, self.edit, self._followed = files, Edit(), None
             self._base += 1
-            self._ray = self._traced = self._plane = self._slopes = None
-            self._margin_takes = {}
+            self._plane = self._slopes = self._answer = None
+            self._answers = Answers()
             self._supersede()
             return {"open": self.open({})}
 
@@ -349,24 +355,6 @@ class Session:
 
     # --- what follows ---
 
-    def _picture(self, edit: Edit, view: View) -> tuple[Document, Problem]:
-        """The picture of an edit; an eigenvalue margin that would make the answer late is left to the background."""
-        began = time.thread_time()
-        problem = solve(self.files.apply(edit))
-        document = picture(problem, view, margin=False)
-        machine = problem.plant.parameters
-        new, spent = machine != self._traced, time.thread_time() - began
-        if problem.spec.uncertainty and spent + self._margin_takes.get(new, 0.0) <= SLOW:
-            document["margin"] = eigenvalue_margin(problem, self._ray)
-            if self._traced is not None:  # the first one traces the machine
-                self._margin_takes[new] = time.thread_time() - began - spent
-            self._traced = machine
-        if document["margin"] is not None:
-            ray, upper = document["margin"].get("ray"), document["margin"].get("upper")
-            self._ray = self._ray if ray is None or upper is None else (ray, upper)
-            self._lost = upper or self._lost
-        return document, problem
-
     def _supersede(self) -> int:
         """A new version: what followed the last one counts no longer."""
         with self._state:
@@ -377,11 +365,15 @@ class Session:
             self._version += 1
             return self._version
 
-    def _follow_later(self, edit: Edit, view: View, tasks: set[str], design: str, *, margin: bool) -> None:
+    def _follow_later(self, edit: Edit, tasks: set[str], answer: Answer) -> None:
         """Ask the workers for these tasks, and for those that are due, once the page rests."""
         with self._state:
-            message = self._message_of(edit, view, design)
-        message |= {"margin": margin, "plane": [*(self._plane or ()), self._lost]}
+            begun = self._message_of(edit, answer.view)
+
+        def message() -> Document:
+            plane = [*(self._plane or ()), self._answers.lost]
+            return begun | {"design": answer.design, "margin": MARGIN in answer.missing, "plane": plane}
+
         self._message = message
 
         def ask() -> None:
@@ -389,7 +381,7 @@ class Session:
                 due = [task for task in self._workers if task in self._due]
                 self._due.clear()
             for task in due:
-                self._workers[task].ask(message | {"task": task})
+                self._workers[task].ask(message() | {"task": task})
 
         with self._state:
             if self._timer is not None:
@@ -403,8 +395,8 @@ class Session:
         """The edit that a document of the page asks for."""
         return self.files.edit(body.get("values", {}), redesign=body.get("redesign", True))
 
-    def _message_of(self, edit: Edit, view: View, design: str) -> Document:
-        """A document for a worker, but for its task; design : the fingerprint of the design."""
+    def _message_of(self, edit: Edit, view: View) -> Document:
+        """A document for a worker, but for its task and the fingerprint of the design."""
         self._serial += 1
         return {
             "version": self._version,
@@ -414,7 +406,6 @@ class Session:
             "machine": None if self.machine is None else str(self.machine.resolve()),
             "values": dict(edit.values),
             "redesign": edit.redesign,
-            "design": design,
             "run": view.run,
             "load": view.load,
         }

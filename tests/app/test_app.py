@@ -374,17 +374,63 @@ def test_an_eigenvalue_margin_that_would_make_an_answer_late_is_left_out(
     mass = client.session.files.fields["machine.m"].value
     assert isinstance(mass, float | int)
     for number, (room, given) in enumerate([(0.0, False), (float("inf"), True), (0.0, False)]):
-        monkeypatch.setattr("malta.app.session.SLOW", room)
+        monkeypatch.setattr("malta.app.answers.SLOW", room)
         found = client.ask("evaluate", number=number, values={"machine.m": mass * (1 + 1e-3 * number)})
         assert found["stable"]
         assert (found["margin"] is not None) == given
+
+
+@pytest.mark.slow
+def test_the_rest_of_an_answer_makes_it_the_whole_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = Client(BALL, tmp_path)
+    values = {"machine.m": 1.1 * float(client.session.files.fields["machine.m"].value)}
+    whole = picture(solve(client.session.files.apply(client.session.files.edit(values))), View())
+    monkeypatch.setattr("malta.app.answers.SLOW", 0.0)
+    first = client.ask("evaluate", number=1, values=values)
+    assert first["missing"] == ["frequency", "run", "load", "figures", "margin"]
+    early = {one["label"]: one["value"] for one in first["figures"]}
+    assert {"peak |S|", "bandwidth, T", "bandwidth, L", "slowest pole"} <= early.keys()
+    monkeypatch.setattr(
+        "malta.app.answers.SLOW", 1e9
+    )  # of the margin, which is left to the background otherwise
+    rest = client.ask("rest", number=1)
+    given = {**first, **rest}
+    assert {key: given[key] for key in whole if key != "margin"} == {
+        key: found for key, found in whole.items() if key != "margin"
+    }
+    assert given["margin"]["upper"] == pytest.approx(whole["margin"]["upper"], rel=1e-3)
+    assert client.ask("rest", number=1) == {"number": 1}
+    client.ask("evaluate", number=2, values={})
+    assert client.ask("rest", number=1) == {"number": 1, "stale": True}
+
+
+def test_figures_of_the_first_answer_are_those_of_verify(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("malta.app.answers.SLOW", 0.0)
+    client = Client(HALBACH, tmp_path)
+    spec = client.session.files.apply(Edit()).spec
+    model = malta.linearize(spec.plant, spec.plant.at(**spec.operating_point))
+    report = malta.verify(model, malta.synthesize(spec, model))
+    found = {one["label"]: one["value"] for one in client.ask("evaluate", number=1, values={})["figures"]}
+    wanted = {one.key: one.value for one in report.figures}
+    for label, key in (
+        ("peak |S|", "peak_sensitivity"),
+        ("bandwidth, T", "bandwidth_sigma_max_T"),
+        ("bandwidth, L", "bandwidth_crossover_max"),
+        ("slowest pole", "slowest_pole"),
+        ("least damping", "smallest_damping"),
+    ):
+        assert found[label] == pytest.approx(wanted[key], rel=1e-12)
 
 
 def test_a_session_keeps_nothing_of_the_machines_that_it_leaves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "malta.app.session.SLOW", float("inf")
+        "malta.app.answers.SLOW", float("inf")
     )  # margins are traced here, whatever else the computer does
     client = Client(BALL, tmp_path)
     field = client.session.files.fields["machine.m"]

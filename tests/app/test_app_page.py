@@ -19,6 +19,7 @@ from browsing import printed
 from test_app import copied
 
 import malta
+from malta.app.answers import Answers
 from malta.app.server import Server, script
 from malta.app.session import Session
 
@@ -118,6 +119,25 @@ def test_the_margin_map_shows_the_proven_box_and_the_poles_where_it_is_clicked(p
     slider.send_keys("\ue014")  # an arrow to the right: another design, of which nothing is proven yet
     wait(lambda: not page.find_elements("css selector", ".card.poles .proven-box"))
     wait(lambda: page.find_elements("css selector", ".card.poles .proven-box"))
+
+
+def test_parts_of_a_picture_that_follow_stay_grey_until_they_come(
+    page: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate, complete = threading.Event(), Answers.complete
+    monkeypatch.setattr("malta.app.answers.SLOW", 0.0)
+    monkeypatch.setattr(Answers, "complete", lambda *found: gate.wait(60) and complete(*found))
+    row(page, "stiffness")[0].send_keys("\ue014")
+    wait(lambda: len(page.find_elements("css selector", ".card.old")) == 4)
+    page.find_elements("css selector", ".card.table .tabs button")[1].click()
+    grey = {
+        one.find_element("xpath", "./..").find_element("css selector", "th").text
+        for one in page.find_elements("css selector", ".figures td.old")
+    }
+    assert "phase margin" in grey
+    assert not grey & {"peak |S|", "bandwidth, T", "slowest pole"}
+    gate.set()
+    wait(lambda: not page.find_elements("css selector", ".card.old, td.old"))
 
 
 def test_while_a_slider_is_dragged_axes_stand_still_and_old_values_are_grey(page: Any) -> None:

@@ -12,7 +12,7 @@ import pytest
 from magnets import BENCH, MACHINES, bench, two_coils
 
 import malta
-from malta.app.picture import linear_run
+from malta.app.linear_run import linear_run
 from malta.loops.sampled_loops import loaded_model, machine_loop, machine_system
 from malta.model.equilibrium import commanded
 from malta.model.plant import OperatingPoint

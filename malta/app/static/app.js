@@ -31,7 +31,7 @@ export async function mount(root, transport) {
     description, values: {}, redesign: true, undo: [], redo: [], pins: [], pinned: 0,
     picture: null, simulated: null, requirements: {}, proof: null, version: 0, number: 0, failed: "",
     run: description.runs[0], load: description.loads[0]?.name ?? "", runGroup: "", loadGroup: "",
-    sens: "S", reach: NEAR, poles: "slow", map: null, there: null, mapX: "", mapY: "", table: "requirements", hidden: new Set(), hiddenPoles: new Set(), ties: false,
+    old: new Set(), sens: "S", reach: NEAR, poles: "slow", map: null, there: null, mapX: "", mapY: "", table: "requirements", hidden: new Set(), hiddenPoles: new Set(), ties: false,
   };
   const fresh = () => Object.fromEntries(state.description.fields.map((field) => [field.key, field.value]));
   state.values = { ...fresh(), ...description.edit.values };
@@ -229,7 +229,7 @@ export async function mount(root, transport) {
   }
 
   // --- asking: one question at a time, and the newest move wins ---
-  let busy = false, again = false;
+  let busy = false, again = false, skipped = false; // skipped: the rest of the last answer was
   let last = {}; // what followed the design before a move, which may come back to it
 
   async function ask() {
@@ -243,8 +243,14 @@ export async function mount(root, transport) {
     } catch {
       answer = { error: GONE };
     }
+    const rest = () => transport.ask({ ask: "rest", number }).catch(() => ({ error: GONE }));
+    if (answer.missing?.length && !state.picture) Object.assign(answer, await rest(), { missing: [] });
     if (answer.stale) again = true; // another page asked meanwhile: what stands here is of an older design
     else take(answer, performance.now() - began);
+    if (answer.missing?.length) { // during a drag the rest is asked for at every other move at least
+      skipped = again && !skipped;
+      if (!skipped) takeRest(await rest());
+    }
     busy = false;
     if (again) { again = false; ask(); return; }
     state.moving = false;
@@ -259,7 +265,8 @@ export async function mount(root, transport) {
       Object.assign(state, { version: answer.version, requirements: {}, proof: null, simulated: null, there: null });
     } else if (state.moving && answer.version === last.version) Object.assign(state, last);
     if (!answer.error) {
-      state.picture = answer;
+      state.old = new Set(answer.missing);
+      state.picture = withOld(answer, state.picture);
       speed.textContent = `${Math.round(milliseconds)} ms`;
       speed.title = `last move: seen after ${Math.round(milliseconds)} ms, of which ${Math.round(1e3 * answer.seconds.wall)} ms to compute`;
       root.dataset.milliseconds = milliseconds.toFixed(1);
@@ -267,6 +274,20 @@ export async function mount(root, transport) {
     root.dataset.version = String(state.version);
     root.classList.toggle("failed", Boolean(answer.error));
     if (state.failed || message.classList.contains("error")) say(state.failed, "error");
+    draw();
+  }
+
+  // Parts that follow stand as they were, grey; figures too. Of an unstable design the server leaves out nothing.
+  function withOld(answer, past) {
+    const figures = answer.missing.includes("figures") && past ? past.figures.map((one) => answer.figures.find((other) => other.label === one.label) ?? { ...one, old: true }) : answer.figures;
+    return { ...past, ...answer, figures };
+  }
+
+  function takeRest(answer) {
+    if (answer.stale) { again = true; return; }
+    if (answer.error) { say(answer.error, "error"); return; }
+    state.old = new Set();
+    Object.assign(state.picture, answer);
     draw();
   }
 
@@ -338,6 +359,7 @@ export async function mount(root, transport) {
     const { picture } = state, pins = [...state.pins, ...state.candidates.slice(-MOST_GHOSTS), ...(state.ghost ? [{ picture: state.ghost }] : [])];
     if (!picture) return;
     for (const group of [sensTabs, reachTabs, poleTabs]) group.mark();
+    for (const [key, part] of Object.entries({ sensitivity: "frequency", nyquist: "frequency", run: "run", load: "load" })) charts[key].node.parentElement.classList.toggle("old", state.old.has(part));
     const names = picture.frequency.sensors;
     show(charts.sensitivity, sensitivityView(picture, pins, state.sens, state.hidden, pull));
     show(charts.nyquist, nyquistView(picture, pins, state.reach, state.hidden, pull));
@@ -413,13 +435,13 @@ export async function mount(root, transport) {
     badge.replaceChildren(element("b", {}, text), element("small", { title: more }, more), speed);
     undo.disabled = !state.undo.length;
     redo.disabled = !state.redo.length;
-    pin.disabled = !state.picture || Boolean(state.failed);
+    pin.disabled = !state.picture || Boolean(state.failed) || state.old.size > 0;
     pins.replaceChildren(...state.pins.map((one) => element("span", { class: "pin" }, button(one.name, "go back to this design", () => commit(one)), button("×", `forget ${one.name}`, () => { state.pins = state.pins.filter((other) => other !== one); draw(); }, { "aria-label": `forget ${one.name}` }))));
   }
 
   // --- pins, saving ---
   function pinDesign() {
-    if (!state.picture || state.failed) return;
+    if (!state.picture || state.failed || state.old.size) return;
     const name = String.fromCharCode(65 + (state.pinned++ % 26));
     state.pins = [...state.pins, { name, ...snapshot(), picture: state.picture, proof: state.proof }].slice(-MOST_PINS);
     state.table = state.table === "requirements" ? "figures" : state.table;

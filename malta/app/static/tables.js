@@ -76,7 +76,7 @@ export function figureTable(state) {
     const side = cells.find(Boolean).better, best = side > 0 ? Math.max(...values) : Math.min(...values);
     return element("tr", {}, element("th", { scope: "row" }, label), ...cells.map((cell) => {
       const wins = cell && side && values.length > 1 && near(cell.value, best) && !values.every((value) => near(value, best));
-      return element("td", { class: `number${wins ? " better" : ""}`, title: cell?.note ?? "" }, cell ? (wins ? "★ " : "") + cell.text : "–");
+      return element("td", { class: `number${wins ? " better" : ""}${cell?.old ? " old" : ""}`, title: cell?.note ?? "" }, cell ? (wins ? "★ " : "") + cell.text : "–");
     }));
   });
   return element("table", { class: "figures" }, element("thead", {}, head), element("tbody", {}, ...body));
