@@ -20,6 +20,7 @@ import malta
 MODULES = tuple(name for name in malta.__all__ if isinstance(getattr(malta, name), ModuleType))
 # Packages that pass on names of their own, on the page of the package.
 LISTS = (
+    "app",
     "model",
     "synthesis",
     "proof",

@@ -86,10 +86,8 @@ class Log:
         known = self.names(group)
         for name in names:
             if name not in known:
-                found = f"no such column of {group}" + (f", but {' '.join(known)}" if known else "")
-                raise InputError(
-                    self.source, GROUPS[group] + name, found, f"one, as {GROUPS[group]}{name} [unit]"
-                )
+                expected = f"one of {' '.join(known)}" if known else f"one, as {GROUPS[group]}{name} [unit]"
+                raise InputError(self.source, GROUPS[group] + name, f"no such column of {group}", expected)
         return np.asarray(self.columns[group][:, [known.index(name) for name in names]])
 
     @cached_property
