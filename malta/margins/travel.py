@@ -2,7 +2,7 @@
 
 The course of a machine is its stroke, or the first parameter of `plant.over`, as the speed of a rotor. The position
 along it is one more interval of the proof when the model along the course is short enough. When it is not, either each
-axis is proven alone and the coupling of the axes is bounded (weak_coupling.py), or a few places stand for the travel.
+axis is proven alone and the coupling of the axes is bounded (malta.proof.weak_coupling), or a few places stand for it.
 """
 
 from __future__ import annotations
@@ -233,8 +233,8 @@ def travel_margin(
 
     The parameters of `plant.over` that are not uncertain are intervals too: a rotor is proven for every speed at once.
     Where the model along the travel is too long, as that of held currents in a planar motor, each axis is proven alone
-    with a bound of its coupling to the others (weak_coupling.py). Where that fails too, the margin is the one in the
-    middle and at the end of the travel, and its `reason` says so.
+    with a bound of its coupling to the others (malta.proof.weak_coupling). Where that fails too, the margin is the one
+    in the middle and at the end of the travel, and its `reason` says so.
 
     ranges : by parameter: 0.2 is +-20 % of the nominal value, (low, high) an interval in SI
     names : parameters of the model, a superset of `ranges`; one model can then answer several questions
