@@ -451,8 +451,8 @@ class Couplings:
 
 
 def _ratio(r: Ratio, values: list[Any]) -> Any:
-    top = value(r.num, values)
-    return finite(top if r.den is None else top / value(r.den, values))
+    top = value(r.num.to_dict(), values)
+    return finite(top if r.den is None else top / value(r.den.to_dict(), values))
 
 
 @dataclass(frozen=True, eq=False)
