@@ -2,7 +2,7 @@
 
 The course of a machine is its stroke, or the first parameter of `plant.over`, as the speed of a rotor. The position
 along it is one more interval of the proof when the model along the course is short enough. When it is not, either each
-axis is proven alone and the coupling of the axes is bounded (weak_coupling.py), or a few places stand for the travel.
+axis is proven alone and the coupling of the axes is bounded (malta.proof.weak_coupling), or a few places stand for it.
 """
 
 from __future__ import annotations
@@ -119,19 +119,74 @@ def extent_of(plant: Plant, names: Iterable[str] = (), controller: Controller | 
     return Extent(stroke, plant.travel, over, {name: units[name] for name in over})
 
 
-def machine_at(
-    plant: Plant, course: str, position: float, controller: Controller | None = None
-) -> tuple[Plant, dict[str, float]]:
-    """The plant at a position of its course (SI), and the states that are not zero there."""
-    if controller is not None and controller.schedule is not None:
-        x = plant.point(controller.operating_point[0]).x
-        return plant, position_at(plant, point_at(plant, x, course, position).x)
-    if plant.has_stroke:
-        return plant, {plant.stroke: position}
-    if not course:
-        return plant, {}
-    par: Any = plant.parameters
-    return plant.variant(replace(par, **{course: position})), {}
+@dataclass(frozen=True)
+class LoopAlong:
+    """A machine's loop along its course, in the parameters of one model; of equal ones all is computed once.
+
+    names : of the uncertain parameters, which are no course
+    """
+
+    plant: Plant
+    controller: Controller
+    names: tuple[str, ...]
+    current_loops: CurrentLoops = LAST
+
+    @property
+    def extent(self) -> Extent:
+        """The intervals beside the uncertainty, whatever the law."""
+        return extent_of(self.plant, self.names)
+
+    @property
+    def loops(self) -> list[tuple[UncertainSystem, Compensator]]:
+        """The loop with its position as a parameter; where that is too long, its loops at ENDS of the travel."""
+        return _loops_along(self)
+
+    def at(self, position: float) -> tuple[UncertainSystem, Compensator]:
+        """The loop at a position along the course (SI); equal positions return the same records."""
+        return _loop_at(self, position)
+
+    def under_load(self, position: float) -> Nominal:
+        """The loop under the machine's loads at a position along the course (SI), at nominal parameters."""
+        there, at = self.machine_at(position)
+        return loaded_loop(there, self.controller, at, self.current_loops)
+
+    def machine_at(self, position: float) -> tuple[Plant, dict[str, float]]:
+        """The plant at a position along the course (SI), and the states that are not zero there."""
+        plant, controller = self.plant, self.controller
+        x, course = (
+            plant.point(controller.operating_point[0]).x,
+            extent_of(plant, self.names, controller).course,
+        )
+        par: Any = plant.parameters
+        there, at = plant, dict[str, float]()
+        if controller.schedule is not None:
+            at = position_at(plant, point_at(plant, x, course, position).x)
+        elif plant.has_stroke:
+            at = {plant.stroke: position}
+        elif course:
+            there = plant.variant(replace(par, **{course: position}))
+        return there, at | off_stroke(plant, x)
+
+    @property
+    def covers_travel(self) -> bool:
+        """Whether one proof covers the whole travel; of a schedule, one proof between any two of its places."""
+        return self.controller.schedule is not None or len(self.loops) == 1
+
+    @property
+    def depends_on_course(self) -> bool:
+        """Whether the loop depends on the position along its course."""
+        if len(self.loops) > 1 or not self.extent.course:
+            return len(self.loops) > 1
+        system, law = self.loops[0]
+        index = system.names.index(self.extent.course)
+        return any(index in on for on in problem_of(system, law).loop.program.depends)
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """The places that a report shows: for each its position, or +position and -position (SI)."""
+        if self.controller.schedule is not None:
+            return tuple((z,) for z in self.controller.schedule.places.tolist())
+        return positions_of(self.plant, self.extent, PLACES if self.covers_travel else ENDS)
 
 
 def positions_of(plant: Plant, extent: Extent, shares: Iterable[float]) -> tuple[tuple[float, ...], ...]:
@@ -178,8 +233,8 @@ def travel_margin(
 
     The parameters of `plant.over` that are not uncertain are intervals too: a rotor is proven for every speed at once.
     Where the model along the travel is too long, as that of held currents in a planar motor, each axis is proven alone
-    with a bound of its coupling to the others (weak_coupling.py). Where that fails too, the margin is the one in the
-    middle and at the end of the travel, and its `reason` says so.
+    with a bound of its coupling to the others (malta.proof.weak_coupling). Where that fails too, the margin is the one
+    in the middle and at the end of the travel, and its `reason` says so.
 
     ranges : by parameter: 0.2 is +-20 % of the nominal value, (low, high) an interval in SI
     names : parameters of the model, a superset of `ranges`; one model can then answer several questions
@@ -190,15 +245,19 @@ def travel_margin(
 
     Example: `travel_margin(plant, controller, {"m": 0.2}).lower`
     """
-    names, begun, problem = tuple(names or ranges), clock.monotonic(), None
+    loop, begun, problem = (
+        LoopAlong(plant, controller, tuple(names or ranges), current_loops),
+        clock.monotonic(),
+        None,
+    )
     end = deadline(begun, time)
     if controller.schedule is not None:
-        return _scheduled_margin(plant, controller, ranges, current_loops, names, end, progress)
+        return _scheduled_margin(loop, ranges, end, progress)
     try:
         with time_limit(end):
-            along, over = travel_loops(plant, controller, names, current_loops)
+            along, over = travel_loops(plant, controller, loop.names, current_loops)
             if plant.has_stroke and not over:  # places of the travel, and no other interval
-                problem = margin_anywhere(plant, controller, names, current_loops)
+                problem = margin_anywhere(loop)
     except TimeUp:
         spent, why = clock.monotonic() - begun, "time was up before the model was written out"
         return Margin(None, math.inf, None, None, {}, {}, (), spent, why)
@@ -218,23 +277,15 @@ def travel_margin(
 CELLS = 0.7  # of the time, for the proofs between the places of a schedule
 
 
-def _scheduled_margin(
-    plant: Plant,
-    controller: Controller,
-    ranges: Ranges,
-    current_loops: CurrentLoops,
-    names: tuple[str, ...],
-    end: float,
-    progress: Progress | None,
-) -> Margin:
+def _scheduled_margin(loop: LoopAlong, ranges: Ranges, end: float, progress: Progress | None) -> Margin:
     """The margin at every constant reference of a schedule; where that is not proven, at its places."""
-    schedule, begun = controller.schedule, clock.monotonic()
+    schedule, begun = loop.controller.schedule, clock.monotonic()
     assert schedule is not None
-    over, until = dict(extent_of(plant, names).over), begun + CELLS * (end - begun)
+    over, until = dict(loop.extent.over), begun + CELLS * (end - begun)
     found, why = list[Margin](), ""
     try:
         with time_limit(until):
-            cells = loops_between_places(plant, controller, (*ranges, *over), current_loops)
+            cells = loops_between_places(loop.plant, loop.controller, (*ranges, *over), loop.current_loops)
     except TimeUp:
         cells = "time was up before the model was written out"
     for cell in [] if isinstance(cells, str) else cells:
@@ -248,10 +299,9 @@ def _scheduled_margin(
     spent = clock.monotonic() - begun
     if found and not why:
         return replace(smallest_margin(found), seconds=spent)
-    along, _ = travel_loops(plant, controller, names, current_loops)
     left = max(end - clock.monotonic(), BRIEFEST)
-    margin = common_margin(along, ranges, over, time=left, progress=progress)
-    here = f"at {len(along)} places of {schedule.variable}, {NOT_BETWEEN}"
+    margin = common_margin(loop.loops, ranges, over, time=left, progress=progress)
+    here = f"at {len(loop.loops)} places of {schedule.variable}, {NOT_BETWEEN}"
     return replace(margin, reason="; ".join(filter(None, (here, why or str(cells), margin.reason))))
 
 
@@ -269,68 +319,57 @@ def travel_loops(
 
     Of a schedule these are the loops at its places.
     """
-    along, extent = margin_along(plant, controller, names, current_loops), extent_of(plant, names)
-    return along, extent.intervals if len(along) == 1 else dict(extent.over)
+    whole = LoopAlong(plant, controller, names, current_loops)
+    return whole.loops, whole.extent.intervals if len(whole.loops) == 1 else dict(whole.extent.over)
 
 
 @lru_cache(maxsize=8)  # several margins need the same loops; records compare by identity
-def margin_along(
-    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops
-) -> list[tuple[UncertainSystem, Compensator]]:
-    """The machine's loop with its position as a parameter; where that is too long, its loops at ENDS of the travel."""
-    extent = extent_of(plant, names)
+def _loops_along(loop: LoopAlong) -> list[tuple[UncertainSystem, Compensator]]:
+    plant, controller, extent = loop.plant, loop.controller, loop.extent
+    every = replace(loop, names=(*loop.names, *extent.over))
     if controller.schedule is not None:
-        every = (*names, *extent.over)
-        return [
-            loop_at(plant, controller, every, z, current_loops) for z in controller.schedule.places.tolist()
-        ]
-    if not (plant.has_stroke and _is_long(plant, controller, names)):
+        return [every.at(z) for z in controller.schedule.places.tolist()]
+    if not (plant.has_stroke and _is_long(loop)):
         at = {plant.stroke: 0.0} if plant.has_stroke else {}
         at |= off_stroke(plant, plant.point(controller.operating_point[0]).x)
-        whole = machine_system(plant, controller, [*names, *extent.intervals], at, current_loops)
+        names = [*loop.names, *extent.intervals]
+        whole = machine_system(plant, controller, names, at, loop.current_loops)
         if not plant.has_stroke or whole[0].matrices.n_instructions() < LONG:
             return [whole]
-    every = (*names, *extent.over)
-    return [loop_at(plant, controller, every, share * plant.travel, current_loops) for share in ENDS]
+    return [every.at(share * plant.travel) for share in ENDS]
 
 
-def _is_long(plant: Plant, controller: Controller, names: tuple[str, ...]) -> bool:
+def _is_long(loop: LoopAlong) -> bool:
     """Whether the model along the travel is too long for an expansion."""
-    believed = plant_of(controller.parameters)
+    believed = plant_of(loop.controller.parameters)
     held = is_commutated(believed) and not believed.tabulated
-    return held and model_of(plant, believed, names).n_instructions() > LONGEST
+    return held and model_of(loop.plant, believed, loop.names).n_instructions() > LONGEST
 
 
 @lru_cache(maxsize=8)
-def margin_anywhere(
-    plant: Plant,
-    controller: Controller,
-    names: tuple[str, ...],
-    current_loops: CurrentLoops,
-    position: float | None = None,
-) -> HeldLoop | None:
+def margin_anywhere(loop: LoopAlong, position: float | None = None) -> HeldLoop | None:
     """The loop as weakly coupled axes, anywhere in the travel or at a position; None where it has not that form."""
-    law = machine_law(plant, controller, current_loops)
-    if not _is_long(plant, controller, names) or law.delay != 1 or law.lag is not None:
+    plant, controller = loop.plant, loop.controller
+    law = machine_law(plant, controller, loop.current_loops)
+    if not _is_long(loop) or law.delay != 1 or law.lag is not None:
         return None
     if plant.sensors is not None:  # the axes have no states for readings
         return None
     if off_stroke(plant, plant.point(controller.operating_point[0]).x):
         return None
-    along = margin_along(plant, controller, names, current_loops)
+    along = loop.loops
     try:
         if position is None:
             travel = (-plant.travel, plant.travel)
-            machine = held_machine(plant, plant_of(controller.parameters), names, travel)
+            machine = held_machine(plant, plant_of(controller.parameters), loop.names, travel)
         else:
-            whole = margin_anywhere(plant, controller, names, current_loops)
+            whole = margin_anywhere(loop)
             if whole is None:
                 return None
-            machine = whole.machine.at(position)
-            along = [loop_at(plant, controller, names, position, current_loops)]
+            machine, along = whole.machine.at(position), [loop.at(position)]
     except NotAnalytic:
         return None
-    places = OfSeveral(tuple(problem_of(*loop) for loop in along))
+    places = OfSeveral(tuple(problem_of(*one) for one in along))
     return HeldLoop(machine, replace(law, delay=0), places)
 
 
@@ -353,14 +392,14 @@ def place_margin(
     The other arguments are those of travel_margin; travel is its answer, where it is known. Without a proof along the
     travel the search takes EACH at most.
     """
-    names = tuple(names or ranges)
+    whole = LoopAlong(plant, controller, tuple(names or ranges), current_loops)
     if not plant.has_stroke or controller.schedule is not None:
-        return robust_margin(*loop_at(plant, controller, names, position, current_loops), ranges)
-    along, over = travel_loops(plant, controller, names, current_loops)
-    if plant.stroke in over:
-        return margin_at(*along[0], ranges, {plant.stroke: position}, tolerance=TOLERANCE, wider=travel)
-    loop = loop_at(plant, controller, names, position, current_loops)
-    if (problem := margin_anywhere(plant, controller, names, current_loops, position)) is not None:
+        return robust_margin(*whole.at(position), ranges)
+    if len(whole.loops) == 1:
+        there = {plant.stroke: position}
+        return margin_at(*whole.loops[0], ranges, there, tolerance=TOLERANCE, wider=travel)
+    loop = whole.at(position)
+    if (problem := margin_anywhere(whole, position)) is not None:
         found = margin_of(problem, _box(loop[0], ranges), Effort(time=EACH))
         if found.lower is not None:
             return found
@@ -399,62 +438,7 @@ def worst_sensitivities(
     return found
 
 
-def places_along(
-    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
-) -> tuple[tuple[float, ...], ...]:
-    """The places along the course that a report shows: for each its position, or +position and -position (SI)."""
-    if controller.schedule is not None:
-        return tuple((z,) for z in controller.schedule.places.tolist())
-    shares = PLACES if covers_travel(plant, controller, names, current_loops) else ENDS
-    return positions_of(plant, extent_of(plant, names), shares)
-
-
-def covers_travel(
-    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
-) -> bool:
-    """Whether one proof covers the whole travel; of a schedule, one proof between any two of its places."""
-    return controller.schedule is not None or len(margin_along(plant, controller, names, current_loops)) == 1
-
-
-def depends_on_course(
-    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
-) -> bool:
-    """Whether the machine's loop depends on the position along its course."""
-    along, course = margin_along(plant, controller, names, current_loops), extent_of(plant, names).course
-    if len(along) > 1:
-        return True
-    if not course:
-        return False
-    system, law = along[0]
-    index = system.names.index(course)
-    return any(index in on for on in problem_of(system, law).loop.program.depends)
-
-
 @lru_cache(maxsize=32)
-def loop_at(
-    plant: Plant,
-    controller: Controller,
-    names: tuple[str, ...],
-    position: float,
-    current_loops: CurrentLoops = LAST,
-) -> tuple[UncertainSystem, Compensator]:
-    """The machine's loop at a position along its course (SI); equal arguments return the same records."""
-    there, at = machine_at(plant, extent_of(plant, names, controller).course, position, controller)
-    at |= off_stroke(plant, plant.point(controller.operating_point[0]).x)
-    return machine_system(there, controller, names, at, current_loops)
-
-
-def loaded_loop_at(
-    plant: Plant,
-    controller: Controller,
-    names: tuple[str, ...],
-    position: float,
-    current_loops: CurrentLoops = LAST,
-) -> Nominal:
-    """The machine's loop under its loads at a position along its course (SI), at nominal parameters.
-
-    names : the uncertain parameters, which are no course
-    """
-    there, at = machine_at(plant, extent_of(plant, names, controller).course, position, controller)
-    at |= off_stroke(plant, plant.point(controller.operating_point[0]).x)
-    return loaded_loop(there, controller, at, current_loops)
+def _loop_at(loop: LoopAlong, position: float) -> tuple[UncertainSystem, Compensator]:
+    there, at = loop.machine_at(position)
+    return machine_system(there, loop.controller, loop.names, at, loop.current_loops)

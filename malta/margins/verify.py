@@ -16,7 +16,6 @@ import numpy as np
 from malta.errors import CheckError, InputError
 from malta.loops.classical import (
     Classical,
-    Nominal,
     classical_margins,
     nominal_loop,
     peak_sensitivity,
@@ -36,14 +35,10 @@ from malta.margins.loop_report import BANDWIDTHS, Link, LoopReport, Place, Poles
 from malta.margins.travel import (
     EACH,
     PLACES,
-    Extent,
-    covers_travel,
-    depends_on_course,
+    LoopAlong,
     extent_of,
-    loaded_loop_at,
     own_position,
     place_margin,
-    places_along,
     smallest_margin,
     travel_margin,
 )
@@ -300,28 +295,26 @@ def compensators(
 class _Question:
     """The arguments of `staged_report`, and results that its parts share."""
 
-    plant: Plant
-    controller: Controller
+    loop: (
+        LoopAlong  # in the uncertain parameters, and the mass for its margin: one model answers all questions
+    )
     uncertainty: Mapping[str, float]
-    current_loops: CurrentLoops
     time: float | None
     proof: bool
     report: Callable[[], None]  # called after each part
 
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """The uncertain parameters, and the mass for its margin: one model answers all questions."""
-        own = tuple(self.uncertainty)
-        return (*own, *({"m"} & set(units_of(self.plant.parameters)) - set(own)))
+    @property
+    def plant(self) -> Plant:
+        return self.loop.plant
 
-    @cached_property
-    def extent(self) -> Extent:
-        return extent_of(self.plant, self.names, self.controller)
+    @property
+    def controller(self) -> Controller:
+        return self.loop.controller
 
     @cached_property
     def whole(self) -> bool:
         """Whether one proof covers the travel."""
-        return covers_travel(self.plant, self.controller, self.names, self.current_loops)
+        return self.loop.covers_travel
 
     @cached_property
     def _place_margins(self) -> dict[float, Margin]:
@@ -331,20 +324,19 @@ class _Question:
     def _travel_margins(self) -> dict[tuple[object, float | None], Margin]:
         return {}
 
-    @cached_property
-    def _moves(self) -> bool:
-        return depends_on_course(self.plant, self.controller, self.names, self.current_loops)
-
-    def loaded_loop_at(self, position: float) -> Nominal:
-        return loaded_loop_at(self.plant, self.controller, self.names, position, self.current_loops)
-
     def margin_at(self, position: float) -> Margin:
         """The margin at a position along the course; computed once if the loop does not depend on the position."""
-        z, known = position if self._moves else 0.0, self._place_margins
+        z, known = position if self.loop.depends_on_course else 0.0, self._place_margins
         if z not in known:
             travel = self._travel_margins.get(self._key(self.uncertainty, self.time))
             known[z] = place_margin(
-                self.plant, self.controller, self.uncertainty, z, self.current_loops, self.names, travel
+                self.plant,
+                self.controller,
+                self.uncertainty,
+                z,
+                self.loop.current_loops,
+                self.loop.names,
+                travel,
             )
         return known[z]
 
@@ -356,7 +348,7 @@ class _Question:
         known, key = self._travel_margins, self._key(ranges, time)
         if key not in known:
             known[key] = travel_margin(
-                self.plant, self.controller, ranges, self.current_loops, self.names,
+                self.plant, self.controller, ranges, self.loop.current_loops, self.loop.names,
                 time=time, progress=progress,
             )  # fmt: skip
         self.report()
@@ -394,8 +386,10 @@ def staged_report(
         if progress is not None:
             progress(min(1.0, next(steps) / total))
 
-    plant, controller, current_loops = found.plant, found.controller, found.current_loops
-    question = _Question(plant, controller, uncertainty, current_loops, time, proof, report)
+    plant, names = found.plant, tuple(uncertainty)
+    names += tuple({"m"} & set(units_of(plant.parameters)) - set(names))
+    loop = LoopAlong(plant, found.controller, names, found.current_loops)
+    question = _Question(loop, uncertainty, time, proof, report)
     travel = question.margin_over(uncertainty, time, bounds) if proof else None
     links = _links(question)
     tolerance, mass = _tolerances(question) if proof else ({}, None)
@@ -405,7 +399,7 @@ def staged_report(
         found,
         uncertainty=dict(uncertainty),
         robust=travel,
-        extent=question.extent,
+        extent=extent_of(plant, names, found.controller),
         chain=links,
         disks=worst.disks if worst else (),
         delay=worst.delay if worst else dict.fromkeys(sensors, float("nan")),
@@ -421,14 +415,15 @@ def _links(q: _Question) -> tuple[Link, ...]:
     at = position_at(q.plant, q.plant.point(q.controller.operating_point[0]).x)
     believed = plant_of(q.controller.parameters)
     links = []
-    stages = compensators(q.plant, q.controller, q.current_loops)
+    stages = compensators(q.plant, q.controller, q.loop.current_loops)
     last = [*stages][-1]
     for name, (law, states) in stages.items():
         own = name in (SAMPLED, MACHINE)
         if own:
-            stage = q if name == last else replace(q, current_loops="lag")
-            position = own_position(q.plant, q.extent, at, q.controller)
-            loop = stage.loaded_loop_at(position)
+            stage = q if name == last else replace(q, loop=replace(q.loop, current_loops="lag"))
+            extent = extent_of(q.plant, q.loop.names, q.controller)
+            position = own_position(q.plant, extent, at, q.controller)
+            loop = stage.loop.under_load(position)
             margin = stage.margin_at(position) if q.proof else NOT_PROVEN
         else:
             system = of_plant(q.plant, list(q.uncertainty), states=states, at=at, believed=believed)
@@ -459,10 +454,10 @@ def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:
     sensors = [s.name for s in q.plant.outputs]
     places: list[Place] = []
     classical: list[Classical | None] = []
-    for positions in places_along(q.plant, q.controller, q.names, q.current_loops):
+    for positions in q.loop.places:
         proven_at = positions if q.whole else positions[:1]  # else a place takes as long as the whole travel
         margin = smallest_margin([q.margin_at(z) for z in proven_at]) if q.proof else NOT_PROVEN
-        loops = [q.loaded_loop_at(z) for z in positions]
+        loops = [q.loop.under_load(z) for z in positions]
         peak = float(np.max([peak_sensitivity(loop, "sensors") for loop in loops]))
         sides = [classical_margins(loop, sensors) if loop.stable else None for loop in loops]
         classical += sides

@@ -6,7 +6,7 @@ polynomial (their characteristic polynomials over a box) -> exclusion (no zero a
 uncertain, systems, box   what a user asks about: systems, compensators, ranges
 connections               uncertain systems in series, in parallel, in feedback
 robust, search            the margin: witness, proof, certificate
-machine                   a machine's model in its parameters
+parametric_plants         a machine's model in its parameters
 polynomial                characteristic polynomials over boxes
 exclusion                 branch and bound over frequency and box; witnesses; Hurwitz's determinants
 multipliers               many parameters: pencils and multipliers

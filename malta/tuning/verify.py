@@ -17,7 +17,7 @@ from malta.loops.sampled_loops import LAST
 from malta.loops.time_domain import bounded_deviation, noise_of, worst_along
 from malta.margins.loop_report import BANDWIDTHS, LoopReport, Outcome
 from malta.margins.scheduled_loops import schedule_rate
-from malta.margins.travel import covers_travel, worst_sensitivities
+from malta.margins.travel import LoopAlong, worst_sensitivities
 from malta.margins.verify import linear_report, staged_report
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
@@ -262,7 +262,7 @@ def verify(
     plant = model.plant
     if worst_case is None:
         whole = controller.schedule is None and bool(box)
-        worst_case = proof and whole and covers_travel(plant, controller, tuple(box), current_loops)
+        worst_case = proof and whole and LoopAlong(plant, controller, tuple(box), current_loops).covers_travel
     worst = worst_sensitivities(plant, controller, box, current_loops, time=time) if worst_case else {}
     reach((1 + MOST) / 2)
     carried = payload(plant, controller) if found.stable and proof else None

@@ -318,10 +318,10 @@ def test_boxes_hold_their_shares_exactly() -> None:
 @pytest.fixture
 def two_places(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Every model along a travel is too long for one proof, so that two places stand for it."""
-    travel.margin_along.cache_clear()
+    travel._loops_along.cache_clear()
     monkeypatch.setattr(travel, "LONG", 0)
     yield
-    travel.margin_along.cache_clear()
+    travel._loops_along.cache_clear()
 
 
 @pytest.mark.slow

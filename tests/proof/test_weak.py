@@ -16,7 +16,7 @@ from flint import arb
 from scipy import linalg
 
 from malta import gains
-from malta.margins.travel import NOT_BETWEEN, loop_at, margin_anywhere, travel_margin
+from malta.margins.travel import NOT_BETWEEN, LoopAlong, margin_anywhere, travel_margin
 from malta.model.data import plant_of
 from malta.proof.box import box_of
 from malta.proof.expressions import NotAnalytic, program
@@ -34,7 +34,7 @@ BOX = {"m": 0.05, "I_x": 0.1, "I_z": 0.1, "B_r": 0.05, "r_z": 0.2}
 def machine(name: str = "planar") -> tuple[Any, Any, HeldLoop]:
     controller = gains.read(f"design/gains/{name}.json")
     plant = plant_of(controller.parameters)
-    found = margin_anywhere(plant, controller, NAMES, "lag")
+    found = margin_anywhere(LoopAlong(plant, controller, NAMES, "lag"))
     assert found is not None
     return plant, controller, found
 
@@ -174,7 +174,7 @@ def test_the_loop_is_what_is_bounded() -> None:
     gamma = np.vstack([T**2 / 2 * np.eye(n), T * np.eye(n)])
     law = problem.law
     for y in (0.0, 0.031, -0.0873):
-        system, own_law = loop_at(plant, controller, NAMES, y)
+        system, own_law = LoopAlong(plant, controller, NAMES).at(y)
         p = rng.uniform(*sides.T)
         Z, E, B = sampled("planar", y, p)
         b, k = values(h.lead, p), values(h.stiff, p)
@@ -246,7 +246,7 @@ def test_the_planar_motor_is_proven_between_places() -> None:
     sides = box.sides(found.lower)
     corners = np.array(list(itertools.product(*sides)))
     for y in rng.uniform(-plant.travel, plant.travel, 3):
-        system, law = loop_at(plant, controller, NAMES, float(y))
+        system, law = LoopAlong(plant, controller, NAMES).at(float(y))
         assert (
             instability(
                 system,

@@ -1,6 +1,6 @@
 """Proofs that a characteristic polynomial has no zero for complex blocks up to a size, on boxes of parameters.
 
-With M of blocks.py, f is affine in each of the scalar blocks delta_1 .. delta_K:
+With M as in `malta.proof.blocks`, f is affine in each of the scalar blocks delta_1 .. delta_K:
 
     f(delta) = sum over sets S of the blocks: (-1)^|S| delta^S a_S,    a_S = f times the minor of M of S.
 

@@ -6,7 +6,7 @@ For every cell, an interval of frequency and a part of the box, with the channel
 2. D > 0 and D - N* D N - j (G N - N* G) > 0 for N = -C (L + R)^-1 B at every frequency of the interval,
 
 so that 1 - N Delta, and with it M, is regular. The cells tile all frequencies x the box. Nothing is shared with the
-floating-point formulas that found the multipliers (response.py) but the pencils and how their slopes are factored.
+floating-point formulas that found the multipliers but the pencils and how their slopes are factored.
 """
 
 from __future__ import annotations

@@ -331,23 +331,9 @@ class Characteristic:
             p = [acb(1) if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
             steps = self.loop.program.cells(p, BALLS)
             values += [steps[k] for k in s.atoms]
-        powers: dict[tuple[int, int], Any] = {}
-
-        def value(polynomial: dict[Any, Any]) -> Any:
-            total = acb(0)
-            for monomial, c in polynomial.items():
-                term = acb(c)
-                for i, e in enumerate(monomial):
-                    if e:
-                        if (i, e) not in powers:
-                            powers[i, e] = values[i] ** int(e)
-                        term *= powers[i, e]
-                total += term
-            return total
-
         return [
             [
-                (*at, value(num) if den is None else finite(value(num) / value(den)))
+                (*at, value(num, values) if den is None else finite(value(num, values) / value(den, values)))
                 for at, (num, den) in matrix.items()
             ]
             for matrix in self._polynomials
@@ -386,7 +372,7 @@ class Characteristic:
         scale, p = arb(1), [acb(low).union(acb(high)) for low, high in sides]
         if self.exact:
             for den in _denominators(self.loop, self.group):
-                scale *= abs(value(den, p))
+                scale *= abs(value(den.to_dict(), p))
         if self.loop.descriptor:
             scale *= self._descriptor_size(self.loop.program.run(p, BALLS)[E])
         return scale
@@ -413,7 +399,7 @@ class Characteristic:
             size *= abs((dense(acb_mat, m, m, ((i, i, 1) for i in range(m))) - w).det()).max(arb(1))
         if self.exact and self.loop.symbolic is not None:
             for den in _denominators(self.loop, self.group):
-                size *= abs(value(den, p_of_v)).max(arb(1))
+                size *= abs(value(den.to_dict(), p_of_v)).max(arb(1))
         return size
 
     @property

@@ -74,23 +74,30 @@ def driven_group(
         out = None if out is None else rows * out
         through = rows * through
         b = dense(matrix, n, len(picked), ((k, j, 1) for j, k in enumerate(picked)))
+    a, b, c, d = drive(loop, matrix, a, b, c, d)
+    a, b, c, d = add_delay(matrix, a, b, c, d, law.delay)
+    f_b = rational(law.B[list(g.own)])
+    return DrivenGroup(matrix, a, b, c, d, law_matrix(loop, g), f_b, out, through, factor)
+
+
+def drive(loop: UncertainLoop, matrix: Any, a: Any, b: Any, c: Any, d: Any) -> tuple[Any, Any, Any, Any]:
+    """A system with the loop's lag, held and sampled; in differences x+ - x where it is discrete."""
+    law = loop.law
+    if law.lag is not None:
+        a, b, c, d = add_lag(matrix, a, b, c, d, arb(law.lag) if loop.sampled else exact(law.lag))
     if loop.sampled:
-        if law.lag is not None:
-            a, b, c, d = add_lag(matrix, a, b, c, d, arb(law.lag))
         a, b = hold(matrix, a, b, arb(law.sample_time))
-        a, b, c, d = add_delay(matrix, a, b, c, d, law.delay)
-    else:
-        if law.lag is not None:
-            a, b, c, d = add_lag(matrix, a, b, c, d, exact(law.lag))
-        if law.sample_time is not None:
-            a = a - _identity(matrix, a.nrows())
-            a, b, c, d = add_delay(matrix, a, b, c, d, law.delay)
-    own = list(g.own)
-    f_a = rational(law.A[np.ix_(own, own)])
-    if law.sample_time is not None:
-        f_a = [[v - (i == j) for j, v in enumerate(row)] for i, row in enumerate(f_a)]
-    f_b = rational(law.B[own])
-    return DrivenGroup(matrix, a, b, c, d, f_a, f_b, out, through, factor)
+    elif law.sample_time is not None:
+        a = a - _identity(matrix, a.nrows())
+    return a, b, c, d
+
+
+def law_matrix(loop: UncertainLoop, g: Group) -> list[list[Any]]:
+    """The rows of the law's own A, of differences where it is discrete."""
+    rows = rational(loop.law.A[np.ix_(g.own, g.own)])
+    if loop.law.sample_time is None:
+        return rows
+    return [[v - (i == j) for j, v in enumerate(row)] for i, row in enumerate(rows)]
 
 
 def dense(matrix: Any, rows: int, columns: int, entries: Any) -> Any:
@@ -451,8 +458,8 @@ class Couplings:
 
 
 def _ratio(r: Ratio, values: list[Any]) -> Any:
-    top = value(r.num, values)
-    return finite(top if r.den is None else top / value(r.den, values))
+    top = value(r.num.to_dict(), values)
+    return finite(top if r.den is None else top / value(r.den.to_dict(), values))
 
 
 @dataclass(frozen=True, eq=False)

@@ -112,9 +112,8 @@ def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until:
         for i, side in enumerate(plan)
     ]
     points = values_within(f, list(itertools.product(*grid)), until)
-    tails = add_bounds(
-        _sum_tails(plan), f.coupling_bounds(moves, [(arb(a), arb(b)) for a, b in sides.tolist()])
-    )
+    ends = [(arb(a), arb(b)) for a, b in sides.tolist()]
+    tails = add_bounds(_sum_tails(plan), f.coupling_bounds(moves, ends))
     return family([s.degree + 1 for s in plan], [s.chebyshev for s in plan], points, tails)
 
 

@@ -21,14 +21,14 @@ from scipy import sparse
 from malta.proof.expressions import NotAnalytic, Program, exact
 from malta.proof.groups import A, B, C, E, UncertainLoop, rational
 from malta.proof.polynomial.closed_loop import (
-    add_lag,
     all_bounds,
     coefficient_bounds,
     dense,
+    drive,
     driven_bounds,
     entry_bounds,
-    hold,
     join_columns,
+    law_matrix,
     solve,
     zeros,
 )
@@ -158,12 +158,7 @@ class Minors:
     def kappa(self) -> dict[Pair, Any]:
         """d_F det F[T, S] of the compensator's own states, in s or g = z - 1: exact."""
         law, own = self.loop.law, list(self.group.own)
-        a = law.A[np.ix_(own, own)]
-        table = rational(a)
-        if law.sample_time is not None:
-            table = [[v - (i == j) for j, v in enumerate(row)] for i, row in enumerate(table)]
-        n = len(own)
-        f = fmpq_mat(table) if n else None
+        f = fmpq_mat(law_matrix(self.loop, self.group)) if own else None
         d = fmpq_poly([1]) if f is None else fmpq_poly(f.charpoly())
         entries: dict[tuple[int, int], Any] = {}
         for i, t in enumerate(self.inputs):
@@ -196,19 +191,13 @@ class Minors:
 
     def resolvent(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> Resolvent:
         """That of the first group of which this one is an image, at given p."""
-        a, law = self._square(entries[A], matrix, self.image.of.states), self.loop.law
+        a = self._square(entries[A], matrix, self.image.of.states)
         b = _unit_columns(matrix, a.nrows(), self.rows)
         factor: Any = 1
         if self.loop.descriptor:
             e = self._square(entries[E], matrix, self.image.of.states)
             factor, a = e.det(), solve(e, a)
-        rate = None if law.lag is None else arb(law.lag) if self.loop.sampled else exact(law.lag)
-        if rate is not None:
-            a, b, _, _ = add_lag(matrix, a, b, zeros(matrix, 0, a.nrows()), None, rate)
-        if self.loop.sampled:
-            a, b = hold(matrix, a, b, arb(law.sample_time))
-        elif law.sample_time is not None:
-            a = a - dense(matrix, a.nrows(), a.nrows(), ((i, i, 1) for i in range(a.nrows())))
+        a, b, _, _ = drive(self.loop, matrix, a, b, zeros(matrix, 0, a.nrows()), None)
         return _resolvent(a, b, factor)
 
     def plant(

@@ -133,11 +133,11 @@ def over_common_denominator(entries: Mapping[Any, Ratio]) -> tuple[dict[Any, Any
     }, common
 
 
-def value(polynomial: Any, p: Sequence[Any]) -> Any:
-    """The value of a polynomial at complex balls."""
+def value(polynomial: Mapping[Any, Any], p: Sequence[Any]) -> Any:
+    """The value at complex balls of a polynomial, its coefficients by exponents."""
     check_time()
     total = acb(0)
-    for monomial, c in polynomial.to_dict().items():
+    for monomial, c in polynomial.items():
         term = acb(c)
         for i, e in enumerate(monomial):
             if e:
