@@ -61,6 +61,7 @@ MEANINGS: dict[str, Meaning] = {
     "at_most": Meaning("requirements", "low", "machine"),
     "at_least": Meaning("requirements", "high", "machine"),
 }
+FREQUENCIES = ("bandwidth", "natural", "slowest_pole", "at_most", "at_least")  # kinds whose rad/s are such
 GROUPS = tuple(dict.fromkeys(meaning.group for meaning in MEANINGS.values()))
 
 
@@ -104,6 +105,11 @@ class Merit(NamedTuple):
         return MEANINGS[self.kind]
 
     @property
+    def is_frequency(self) -> bool:
+        """Whether its rad/s are those of a frequency or a pole, which stand in Hz too; not those of a turn."""
+        return self.unit == "rad/s" and self.kind in FREQUENCIES
+
+    @property
     def text(self) -> str:
         """The value in its unit, with four digits; a frequency in Hz too."""
         if self.kind == "stable":
@@ -112,7 +118,7 @@ class Merit(NamedTuple):
             return "none"
         if math.isinf(self.value):
             return "any"
-        if self.unit == "rad/s":
+        if self.is_frequency:
             return frequency(self.value)
         factor, _ = ROOTS.get(self.unit) or (in_unit(1.0, self.unit), "")
         return four_digits(factor * self.value)
@@ -120,8 +126,8 @@ class Merit(NamedTuple):
     @property
     def heading(self) -> str:
         """The label with the unit in brackets."""
-        unit = ROOTS[self.unit][1] if self.unit in ROOTS else self.unit
-        shown = {"percent": "%", "1": "", "rad/s": RADIANS}.get(unit, micro(unit))
+        unit = RADIANS if self.is_frequency else ROOTS[self.unit][1] if self.unit in ROOTS else self.unit
+        shown = {"percent": "%", "1": ""}.get(unit, micro(unit))
         return f"{self.label} [{shown}]" if shown else self.label
 
     def phrase(self, digits: int = 3) -> str:

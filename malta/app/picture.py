@@ -362,6 +362,7 @@ def _figures(problem: Problem, known: Mapping[str, Any] | None) -> list[dict[str
             "label": SHORT.get(one.key, one.label),
             "value": in_unit(one.value, one.unit) if math.isfinite(one.value) else None,
             "unit": one.unit,
+            "frequency": one.is_frequency,
             "note": one.note,
             "better": SIDES[one.better],
         }

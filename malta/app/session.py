@@ -434,6 +434,7 @@ def requirement_list(spec: Spec) -> list[Document]:
                 "name": name,
                 "asked": asked if math.isfinite(asked) else None,
                 "unit": requirement.unit_of(spec, signal),
+                "frequency": requirement.unit == "rad/s",
                 "at_least": requirement.at_least,
                 "switch": requirement.form == "switch",
             }

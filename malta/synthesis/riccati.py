@@ -34,7 +34,7 @@ REFINED = 1e-13  # the residual above which a solution is refined: rounding leav
 EPS = float(np.finfo(float).eps)
 STEPS = 8  # of Newton's at most; each squares the error
 ROUNDING = 1e-16  # couplings below this, relative to what else acts on and from both ends, are none
-BALANCED = 1e-2  # the last change of scales that are rounded to powers of two
+BALANCED = 1e-3  # the last change of scales that are rounded to powers of two
 DOUBLINGS = 64  # at most: sums of 2^64 samples
 LARGEST = 1e8  # entry of a matrix whose exponential is taken
 

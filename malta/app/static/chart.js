@@ -5,6 +5,8 @@ import { linearTicks, logTicks, tickLabel } from "./numbers.js";
 
 const NAMESPACE = "http://www.w3.org/2000/svg";
 const MARGIN = { left: 50, right: 12, top: 8, bottom: 34 };
+const BESIDE = { right: 44, top: 21 }; // of an axis that stands in Hz at the other side of the frame
+const TURN = 2 * Math.PI;
 let charts = 0;
 
 export function svg(name, attributes = {}, text = "") {
@@ -51,7 +53,7 @@ const MARKS = {
 };
 
 // A chart that fills its node. draw(view) draws
-//   x, y: {label, min, max, log}; equal: one scale for both
+//   x, y: {label, min, max, log, hertz}; equal: one scale for both; hertz: of an axis in rad/s, Hz at the other side as well
 //   lines: {name, xs, ys, color, dash, width, faint}; points: {name, xs, ys, mark, color, faint}
 //   handles: {key, x, y, color, label, value, pull(x, y, done)}: dots that can be dragged, or moved by arrow keys
 //   shapes: {kind: "circle" | "band" | "line" | "ray" | "text" | "area", ...}; pick(x, y): what a click does
@@ -75,33 +77,43 @@ export function createChart(label) {
 
   function layout() {
     const width = node.clientWidth, height = node.clientHeight;
-    const right = width - MARGIN.right, bottom = height - MARGIN.bottom;
     let { x, y } = view;
+    const right = width - (y.hertz ? BESIDE : MARGIN).right, bottom = height - MARGIN.bottom, top = (x.hertz ? BESIDE : MARGIN).top;
     if (zoom && zoom.words !== x.label + y.label) zoom = null;
     if (zoom) [x, y] = [{ ...x, min: zoom.x[0], max: zoom.x[1] }, { ...y, min: zoom.y[0], max: zoom.y[1] }];
-    if (view.equal) [x, y] = equalAxes(x, y, right - MARGIN.left, bottom - MARGIN.top);
+    if (view.equal) [x, y] = equalAxes(x, y, right - MARGIN.left, bottom - top);
     return {
-      width, height, right, bottom, x, y,
+      width, height, right, bottom, top, x, y,
       toX: axisScale(x, MARGIN.left, right),
-      toY: axisScale(y, bottom, MARGIN.top),
+      toY: axisScale(y, bottom, top),
     };
   }
 
   function drawAxes(group, s) {
-    const { x, y, toX, toY, right, bottom } = s;
+    const { x, y, toX, toY, right, bottom, top } = s;
     const ticksOf = (axis, most) => (axis.log ? logTicks(axis.min, axis.max) : { major: linearTicks(axis.min, axis.max, most), minor: [] });
-    const across = ticksOf(x, Math.max(3, (right - MARGIN.left) / 60)), up = ticksOf(y, Math.max(3, (bottom - MARGIN.top) / 36));
+    const across = ticksOf(x, Math.max(3, (right - MARGIN.left) / 60)), up = ticksOf(y, Math.max(3, (bottom - top) / 36));
     let fine = "", grid = "";
-    for (const t of across.minor) fine += `M${toX(t).toFixed(1)} ${MARGIN.top}V${bottom}`;
+    for (const t of across.minor) fine += `M${toX(t).toFixed(1)} ${top}V${bottom}`;
     for (const t of up.minor) fine += `M${MARGIN.left} ${toY(t).toFixed(1)}H${right}`;
-    for (const t of across.major) grid += `M${toX(t).toFixed(1)} ${MARGIN.top}V${bottom}`;
+    for (const t of across.major) grid += `M${toX(t).toFixed(1)} ${top}V${bottom}`;
     for (const t of up.major) grid += `M${MARGIN.left} ${toY(t).toFixed(1)}H${right}`;
     group.append(svg("path", { class: "grid fine", d: fine }), svg("path", { class: "grid", d: grid }));
     for (const t of across.major) group.append(svg("text", { class: "tick", x: toX(t), y: bottom + 14, "text-anchor": "middle" }, tickLabel(t, x.log)));
     for (const t of up.major) group.append(svg("text", { class: "tick", x: MARGIN.left - 5, y: toY(t) + 3.5, "text-anchor": "end" }, tickLabel(t, y.log)));
-    group.append(svg("rect", { class: "frame", x: MARGIN.left, y: MARGIN.top, width: Math.max(0, right - MARGIN.left), height: Math.max(0, bottom - MARGIN.top) }));
+    group.append(svg("rect", { class: "frame", x: MARGIN.left, y: top, width: Math.max(0, right - MARGIN.left), height: Math.max(0, bottom - top) }));
+    const inHertz = (axis, most) => ticksOf({ ...axis, min: axis.min / TURN, max: axis.max / TURN }, most).major;
+    const tick = (t, log, place, d) => group.append(svg("text", { class: "tick", ...place }, tickLabel(t, log)), svg("path", { class: "frame", d }));
+    if (x.hertz) {
+      for (const t of inHertz(x, (right - MARGIN.left) / 60)) tick(t, x.log, { x: toX(TURN * t), y: top - 6, "text-anchor": "middle" }, `M${toX(TURN * t)} ${top}v4`);
+      group.append(svg("text", { class: "axis", x: MARGIN.left - 8, y: top - 6, "text-anchor": "end" }, "Hz"));
+    }
+    if (y.hertz) {
+      for (const t of inHertz(y, (bottom - top) / 36)) tick(t, y.log, { x: right + 4, y: toY(TURN * t) + 3.5, "text-anchor": "start" }, `M${right} ${toY(TURN * t)}h-4`);
+      group.append(svg("text", { class: "axis", x: right + 4, y: bottom + 14, "text-anchor": "start" }, "Hz"));
+    }
     group.append(svg("text", { class: "axis", x: (MARGIN.left + right) / 2, y: bottom + 29, "text-anchor": "middle" }, x.label));
-    group.append(svg("text", { class: "axis", transform: `translate(11 ${(MARGIN.top + bottom) / 2}) rotate(-90)`, "text-anchor": "middle" }, y.label));
+    group.append(svg("text", { class: "axis", transform: `translate(11 ${(top + bottom) / 2}) rotate(-90)`, "text-anchor": "middle" }, y.label));
   }
 
   function drawShape(group, shape, s) {
@@ -118,7 +130,7 @@ export function createChart(label) {
       const top = toY(Math.min(shape.to, y.max)), low = toY(Math.max(shape.from, y.min));
       if (low > top) group.append(svg("rect", { class: shape.class, x: MARGIN.left, y: top, width: right - MARGIN.left, height: low - top }));
     } else if (shape.kind === "line") {
-      const d = shape.x !== undefined ? `M${toX(shape.x)} ${MARGIN.top}V${bottom}` : `M${MARGIN.left} ${toY(shape.y)}H${right}`;
+      const d = shape.x !== undefined ? `M${toX(shape.x)} ${shown.top}V${bottom}` : `M${MARGIN.left} ${toY(shape.y)}H${right}`;
       group.append(svg("path", { class: shape.class ?? "zero", d }));
     } else if (shape.kind === "ray") {
       const far = 2 * Math.max(Math.abs(x.min), Math.abs(x.max), Math.abs(y.min), Math.abs(y.max));
@@ -136,7 +148,7 @@ export function createChart(label) {
     picture.setAttribute("height", s.height);
     picture.setAttribute("viewBox", `0 0 ${s.width} ${s.height}`);
     const definitions = svg("defs"), cut = svg("clipPath", { id: clip });
-    cut.append(svg("rect", { x: MARGIN.left, y: MARGIN.top, width: Math.max(0, s.right - MARGIN.left), height: Math.max(0, s.bottom - MARGIN.top) }));
+    cut.append(svg("rect", { x: MARGIN.left, y: shown.top, width: Math.max(0, s.right - MARGIN.left), height: Math.max(0, s.bottom - shown.top) }));
     definitions.append(cut);
     const axes = svg("g"), inside = svg("g", { "clip-path": `url(#${clip})` });
     for (const shape of (view.shapes ?? []).filter((one) => one.kind === "band")) drawShape(inside, shape, s);
@@ -173,7 +185,7 @@ export function createChart(label) {
     for (const [key, handle] of wanted) {
       const button = handles.get(key) ?? makeHandle(key), pulled = held?.key === key;
       const left = pulled ? held.left : s.toX(handle.x), top = pulled ? held.top : s.toY(handle.y);
-      button.hidden = !(left >= MARGIN.left - 1 && left <= s.right + 1 && top >= MARGIN.top - 1 && top <= s.bottom + 1);
+      button.hidden = !(left >= MARGIN.left - 1 && left <= s.right + 1 && top >= shown.top - 1 && top <= s.bottom + 1);
       button.style.cssText = `left:${left}px;top:${top}px;--swatch:${handle.color}`;
       button.title = `pull: ${handle.label}, ${handle.value}`;
       for (const [name, value] of [["label", handle.label], ["valuetext", handle.value], ["valuenow", handle.y]]) button.setAttribute(`aria-${name}`, value);
@@ -225,7 +237,7 @@ export function createChart(label) {
       const share = (place - from) / (to - from);
       return axis.log ? axis.min * (axis.max / axis.min) ** share : axis.min + share * (axis.max - axis.min);
     };
-    return [back(shown.x, MARGIN.left, shown.right, left), back(shown.y, shown.bottom, MARGIN.top, top)];
+    return [back(shown.x, MARGIN.left, shown.right, left), back(shown.y, shown.bottom, shown.top, top)];
   }
 
   // Look at the part between two corners of the figure, in pixels; without them at the whole.
@@ -242,7 +254,7 @@ export function createChart(label) {
   // The middle stays; factor: of the range that is seen.
   function zoomBy(factor) {
     if (!shown) return;
-    const x = (MARGIN.left + shown.right) / 2, y = (MARGIN.top + shown.bottom) / 2, dx = (factor * (shown.right - MARGIN.left)) / 2, dy = (factor * (shown.bottom - MARGIN.top)) / 2;
+    const x = (MARGIN.left + shown.right) / 2, y = (shown.top + shown.bottom) / 2, dx = (factor * (shown.right - MARGIN.left)) / 2, dy = (factor * (shown.bottom - shown.top)) / 2;
     zoomTo({ left: x - dx, top: y - dy }, { left: x + dx, top: y + dy });
   }
 
@@ -270,7 +282,7 @@ export function createChart(label) {
     const found = place && nearest(place.left, place.top);
     if (!found) { readout.hidden = true; return; }
     const { set, k } = found, left = shown.toX(set.xs[k]), top = shown.toY(set.ys[k]);
-    if (view.nearest !== "xy") cursor.append(svg("path", { class: "hair", d: `M${left} ${MARGIN.top}V${shown.bottom}` }));
+    if (view.nearest !== "xy") cursor.append(svg("path", { class: "hair", d: `M${left} ${shown.top}V${shown.bottom}` }));
     cursor.append(svg("circle", { class: "dot", cx: left, cy: top, r: 4, stroke: set.color }));
     const rows = view.read(set, k);
     readout.replaceChildren(...rows.map((row) => {
@@ -290,7 +302,7 @@ export function createChart(label) {
     readout.style.top = `${Math.max(2, Math.min(place.top - 10, shown.height - readout.offsetHeight - 4))}px`;
   }
 
-  const isInside = ({ left, top }) => shown && left >= MARGIN.left && left <= shown.right && top >= MARGIN.top && top <= shown.bottom;
+  const isInside = ({ left, top }) => shown && left >= MARGIN.left && left <= shown.right && top >= shown.top && top <= shown.bottom;
   node.addEventListener("pointerdown", (event) => {
     const place = placeOf(event);
     if (view && event.button === 0 && event.pointerType !== "touch" && isInside(place)) held = { from: place };
@@ -327,7 +339,7 @@ export function createChart(label) {
     if (zooms && !event.ctrlKey && !event.metaKey) zooms();
     if (!step || !view || !shown) return;
     event.preventDefault();
-    const found = nearest(at?.left ?? (MARGIN.left + shown.right) / 2, at?.top ?? (MARGIN.top + shown.bottom) / 2);
+    const found = nearest(at?.left ?? (MARGIN.left + shown.right) / 2, at?.top ?? (shown.top + shown.bottom) / 2);
     if (!found) return;
     const k = Math.max(0, Math.min(found.set.xs.length - 1, found.k + step * (event.shiftKey ? 10 : 1)));
     point({ left: shown.toX(found.set.xs[k]), top: shown.toY(found.set.ys[k]) });

@@ -42,7 +42,7 @@ export function sensitivityView(picture, pins, which, hidden, pull) {
   const zones = [[0, 3, "A"], [3, 4, "B"], [4, 5, "C"], [5, 1e9, "D"]];
   const shapes = which === "S" ? zones.map(([from, to, name]) => ({ kind: "band", from: Math.max(from, 1e-9), to, text: name === "A" ? "zone A below 3" : name, class: `zone-${name}` })) : [];
   return {
-    x: { label: "frequency [rad/s]", min: w[0], max: w[w.length - 1], log: true },
+    x: { label: "frequency [rad/s]", min: w[0], max: w[w.length - 1], log: true, hertz: true },
     y: { label: which === "L" ? "|L|, each sensor, others closed" : `|${which}|, each sensor`, min: which === "L" ? Math.max(low, 1e-3) : 0.01, max: which === "L" ? Math.min(top, 1e3) : Math.max(8, top), log: true },
     handles: sizeHandles(picture.frequency, which, rows, hidden, pull),
     lines, shapes: [...shapes, { kind: "line", y: 1 }], nearest: "x",
@@ -112,7 +112,7 @@ export function poleView(picture, pins, all, hidden, there = null) {
   return {
     equal: true, nearest: "xy",
     x: { label: "Re s [rad/s]", min: -reach, max: 0.35 * reach },
-    y: { label: "Im s [rad/s]", min: -reach, max: reach },
+    y: { label: "Im s [rad/s]", min: -reach, max: reach, hertz: true },
     shapes: [{ kind: "line", x: 0, class: "limit" }, { kind: "line", y: 0 }, ...rays, ...labels],
     points: [...pins.flatMap((pin) => sets(pin.picture.poles, true)), ...sets(picture.poles, false), ...(there ? [{ name: "at the picked point of the map", mark: "x", color: "var(--accent)", size: 3, xs: there.poles.map((p) => p[0]), ys: there.poles.map((p) => p[1]) }] : [])],
     note: hiddenPoles ? `${hiddenPoles} faster ${hiddenPoles > 1 ? "poles" : "pole"} outside` : "",

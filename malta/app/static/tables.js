@@ -18,9 +18,8 @@ function marginLight(asked, state) {
 const wordsOf = (name) => [name.split(" ")[0].replaceAll("_", " "), ...name.split(" ").slice(1)].join(" ");
 
 const boundText = (asked, value) => (asked.switch ? (value ? "yes" : "no") : asked.name === "margin" ? percent(value) : quantity(value, asked.unit, 3));
-const isFrequency = (name, unit) => unit === "rad/s" && /bandwidth|crossover|pole/.test(name); // not the speed of a turn
 // Hz stand below rad/s: beside them they would push the bound out of a narrow panel.
-const inHertz = (asked, value) => (typeof value === "number" && isFrequency(asked.name, asked.unit) ? [element("br", {}), element("small", { class: "soft" }, quantity(value / (2 * Math.PI), "Hz"))] : []);
+const inHertz = (asked, value) => (typeof value === "number" && asked.frequency ? [element("br", {}), element("small", { class: "soft" }, quantity(value / (2 * Math.PI), "Hz"))] : []);
 
 // Failures first, then what is not known yet. A value of the last design stays, grey and without a verdict, until the new one comes.
 export function requirementRows(description, state) {
@@ -58,7 +57,7 @@ const near = (a, b) => Math.abs(a - b) <= 1e-4 * Math.max(Math.abs(a), Math.abs(
 // A single column has room for Hz beside rad/s.
 function figureRows(figures, proof, margin, alone = false) {
   const upper = proof?.upper ?? margin?.upper;
-  const rows = figures.map((one) => ({ ...one, text: alone && isFrequency(one.label, one.unit) && one.value !== null ? hertz(one.value) : quantity(one.value, one.unit, 4) }));
+  const rows = figures.map((one) => ({ ...one, text: alone && one.frequency && one.value !== null ? hertz(one.value) : quantity(one.value, one.unit, 4) }));
   if (upper !== undefined && upper !== null) rows.unshift({ label: "margin, eigenvalues", value: upper, better: 1, text: `≤ ${percent(upper)}`, note: "upper bound" });
   if (proof?.lower !== undefined && proof?.lower !== null) rows.unshift({ label: "margin, proven", value: proof.lower, better: 1, text: percent(floored(proof.lower)), note: proof.reason });
   return rows;

@@ -12,6 +12,7 @@ from malta.loops.curves import LoopCurves
 from malta.margins.loop_report import ZONES, zone
 from malta.report.figures.drawing import new_figure
 from malta.report.plots.panels import (
+    FOOT,
     PLACES,
     Sheet,
     add_legend,
@@ -349,11 +350,11 @@ def _gang_sheet(loops: Mapping[str, LoopCurves], count: int, axes: Any) -> Sheet
     if axes is not None:
         return new_sheet(("", ""), loops, 4 * count, axes)
     head = head_of(loops) + 0.2
-    height = head + 0.35 + 2.05 * count
+    height = head + FOOT - 0.15 + 2.05 * count
     told = "each channel with the force of its axis; S P: force to output, F S: reading to force"
     figure = new_figure(
         f"{title_of(loops)}: gang of four at the sensors", told,
-        size=(13.0, height), left=0.055, right=0.99, bottom=0.5 / height, top=1 - head / height,
+        size=(13.0, height), left=0.055, right=0.99, bottom=FOOT / height, top=1 - head / height,
         wspace=0.3, hspace=0.2,
     )  # fmt: skip
     add_legend(figure, loops, height)

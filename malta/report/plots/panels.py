@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from malta.display import quantity
 from malta.errors import InputError
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.report.figures.drawing import BOUND, MORE, NOTE, STYLES, draw_grid, new_figure, number
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
 
 LINE = 0.155  # inch, of text above a panel
+FOOT = 0.64  # inch, below a panel of frequency
+SECOND = 12.0  # points, from the numbers below an axis to the same in Hz
 DECADES = 3.0  # shown below the first crossing of unit gain
 MOST_LINES = 3  # loops whose margins are written above a panel
 PLACES: Mapping[str, str] = {"sensors": "at the sensors", "forces": "at the forces"}
@@ -115,7 +118,7 @@ def new_sheet(
     columns = min(count, 3) if count != 4 else 2
     blocks = math.ceil(count / columns)
     lines = 1 + min(len(loops), MOST_LINES)
-    head, foot, above = head_of(loops), 0.5, LINE * lines + 0.08
+    head, foot, above = head_of(loops), FOOT, LINE * lines + 0.08
     gap = foot + 0.1 if ticks else 0.12
     each = above + height * stacked + gap * (stacked - 1) + foot
     width, whole = {1: 7.5, 2: 9.5}.get(columns, 12.0), head + each * blocks
@@ -216,8 +219,8 @@ def seconds_text(value: float) -> str:
 
 
 def rate_text(w: float) -> str:
-    """A frequency in rad/s with few digits."""
-    return f"{w:.4g} rad/s"
+    """A frequency in rad/s and in Hz with few digits."""
+    return f"{number(w, 4)} rad/s ({quantity(w / (2 * math.pi), 'Hz')})"
 
 
 def finish_frequency(axes: Axes, loops: Iterable[LoopCurves], y: str, *, labelled: bool = True) -> None:
@@ -234,6 +237,33 @@ def finish_frequency(axes: Axes, loops: Iterable[LoopCurves], y: str, *, labelle
     axes.set_ylabel(plain(y), fontsize=8.5)
     if labelled:
         axes.set_xlabel("frequency [rad/s]", fontsize=8.5)
+        add_hertz(axes, "bottom")
+
+
+def add_hertz(axes: Axes, side: Literal["bottom", "right"]) -> None:
+    """Hz of an axis in rad/s: a second row of numbers below that of x, or numbers at the other side of y."""
+    from matplotlib.ticker import NullFormatter, NullLocator
+
+    ways: Any = (lambda w: w / (2 * math.pi), lambda f: f * 2 * math.pi)
+    if side == "bottom":
+        hertz = axes.secondary_xaxis("bottom", functions=ways)
+        hertz.spines["bottom"].set(position=("outward", SECOND), visible=False)
+        hertz.tick_params(which="both", length=0, labelsize=8, labelcolor=NOTE["color"])
+        hertz.xaxis.set_minor_formatter(NullFormatter())
+        axes.xaxis.labelpad += SECOND - 2
+        corner: dict[str, Any] = {"xy": (0, 0), "xytext": (-16, -SECOND - 4), "ha": "right", "va": "top"}
+    else:
+        hertz = axes.secondary_yaxis("right", functions=ways)
+        if axes.get_yscale() == "symlog":
+            hertz.set_yscale("symlog", linthresh=axes.yaxis.get_transform().linthresh / (2 * math.pi))
+            hertz.yaxis.set_minor_locator(NullLocator())
+        else:
+            hertz.locator_params(axis="y", nbins=5)
+        hertz.spines["right"].set_visible(False)
+        hertz.tick_params(labelsize=8, labelcolor=NOTE["color"], color=NOTE["color"])
+        corner = {"xy": (1, 0), "xytext": (6, -4), "ha": "left", "va": "top"}
+    place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 8}
+    axes.annotate("Hz", color=NOTE["color"], annotation_clip=False, **corner, **place)
 
 
 def _lowest(curves: LoopCurves) -> float:

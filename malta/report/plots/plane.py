@@ -15,7 +15,7 @@ from malta.loops.locus import DELAY, GAIN, RootLocus
 from malta.loops.locus import root_locus as locus_of
 from malta.report.figures.drawing import new_figure, number
 from malta.report.plots.frequency import title_of
-from malta.report.plots.panels import Sheet, add_legend, head_of, loops_of, plain, styles_of
+from malta.report.plots.panels import Sheet, add_hertz, add_legend, head_of, loops_of, plain, styles_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -140,7 +140,7 @@ def _plane_sheet(
         return Sheet(figure, [(panel,) for panel in given]), [*reaches, reaches[-1]][-len(given) :]
     width, height = 5.6 * len(reaches), 5.0 + head_of(loops)
     figure = new_figure(
-        *title, size=(width, height), left=0.8 / width, right=1 - 0.2 / width,
+        *title, size=(width, height), left=0.8 / width, right=1 - 0.55 / width,
         bottom=0.52 / height, top=1 - (head_of(loops) + 0.25) / height, wspace=0.2,
     )  # fmt: skip
     add_legend(figure, loops, height, MARKERS)
@@ -196,6 +196,7 @@ def _draw_plane(
         _set_logarithmic(axes, linear)
     axes.set_xlabel("real part [rad/s]", fontsize=8.5)
     axes.set_ylabel("imaginary part [rad/s]", fontsize=8.5)
+    add_hertz(axes, "right")
 
 
 def _set_logarithmic(axes: Axes, linear: float) -> None:
