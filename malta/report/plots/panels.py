@@ -255,7 +255,8 @@ def add_hertz(axes: Axes, side: Literal["bottom", "right"]) -> None:
     else:
         hertz = axes.secondary_yaxis("right", functions=ways)
         if axes.get_yscale() == "symlog":
-            hertz.set_yscale("symlog", linthresh=axes.yaxis.get_transform().linthresh / (2 * math.pi))
+            symlog: Any = axes.yaxis.get_transform()
+            hertz.set_yscale("symlog", linthresh=symlog.linthresh / (2 * math.pi))
             hertz.yaxis.set_minor_locator(NullLocator())
         else:
             hertz.locator_params(axis="y", nbins=5)
