@@ -251,7 +251,17 @@ def add_hertz(axes: Axes, side: Literal["bottom", "right"]) -> None:
         hertz.tick_params(which="both", length=0, labelsize=8, labelcolor=NOTE["color"])
         hertz.xaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.labelpad += SECOND - 2
-        corner: dict[str, Any] = {"xy": (0, 0), "xytext": (-16, -SECOND - 4), "ha": "right", "va": "top"}
+        place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 8}
+        axes.annotate(
+            "Hz",
+            (0, 0),
+            (-16, -SECOND - 4),
+            color=NOTE["color"],
+            ha="right",
+            va="top",
+            annotation_clip=False,
+            **place,
+        )
     else:
         hertz = axes.secondary_yaxis("right", functions=ways)
         if axes.get_yscale() == "symlog":
@@ -262,9 +272,8 @@ def add_hertz(axes: Axes, side: Literal["bottom", "right"]) -> None:
             hertz.locator_params(axis="y", nbins=5)
         hertz.spines["right"].set_visible(False)
         hertz.tick_params(labelsize=8, labelcolor=NOTE["color"], color=NOTE["color"])
-        corner = {"xy": (1, 0), "xytext": (6, -4), "ha": "left", "va": "top"}
-    place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 8}
-    axes.annotate("Hz", color=NOTE["color"], annotation_clip=False, **corner, **place)
+        hertz.set_ylabel("[Hz]", fontsize=8, color=NOTE["color"], rotation=0, ha="left", va="top")
+        hertz.yaxis.set_label_coords(1.02, -0.02)
 
 
 def _lowest(curves: LoopCurves) -> float:
