@@ -375,7 +375,7 @@ def test_the_figure_names_what_it_shows() -> None:
         [*(link.peak for link in found.chain), max(place.peak for place in found.places)]
     )
     assert [2.41, 2.41] in [np.asarray(line.get_ydata()).tolist() for line in figure.axes[3].lines]
-    assert "no more for any parameters of the box" in texts
+    assert "upper bound over the box, proven" in texts
     assert {"A | B", "B | C", "C | D"} <= set(texts)
     along = figure.axes[2].lines[0]
     assert along.get_xdata().tolist() == pytest.approx([-15, -10, -5, 0, 5, 10, 15])  # type: ignore[union-attr]

@@ -1,10 +1,10 @@
 // The page of `malta app`: a design under edit, seen at every move. mount(root, transport) fills a node;
 // transport: {ask(document) -> promise of a document, listen(heard)}.
 
-import { createChart } from "./chart.js";
+import { createChart, stroke } from "./chart.js";
 import { createPanel, dropDown, element } from "./controls.js";
 import { exportChart } from "./export.js";
-import { color, loadView, mapView, nyquistView, poleView, runView, sensitivityView, timeGroups } from "./figures.js";
+import { color, dash, loadView, mapView, nyquistView, poleView, runView, sensitivityView, timeGroups } from "./figures.js";
 import { digits, floored, hertz, percent, quantity } from "./numbers.js";
 import { countLights, differenceTable, figureTable, howToAsk, requirementRows } from "./tables.js";
 import { createTuner } from "./tuning.js";
@@ -334,10 +334,11 @@ export async function mount(root, transport) {
   }
 
   // --- drawing ---
-  function legendOf(chart, names, hidden, marks = {}) {
+  // indices: of the signals of these names, whose colours and dashes they have; dashed: whether the lines are
+  function legendOf(chart, names, hidden, { marks = {}, indices = names.map((_, k) => k), dashed = true } = {}) {
     chart.legend.replaceChildren(...names.map((name, k) => {
-      const swatch = element("i", {}, marks[name] ?? "");
-      swatch.style.setProperty("--swatch", color(marks[name] ? { machine: 7, "closed loop": 0, regulator: 2, filter: 4 }[name] : k));
+      const swatch = element("i", {}, marks[name] ?? stroke(dashed ? dash(indices[k]) : ""));
+      swatch.style.setProperty("--swatch", color(marks[name] ? { machine: 7, "closed loop": 0, regulator: 2, filter: 4 }[name] : indices[k]));
       return element("button", { type: "button", class: marks[name] ? "mark" : "", "aria-pressed": String(!hidden.has(name)), title: `show or hide ${name}`, onclick: () => { if (!hidden.delete(name)) hidden.add(name); draw(); } }, swatch, name);
     }));
   }
@@ -370,7 +371,7 @@ export async function mount(root, transport) {
     legendOf(charts.sensitivity, names, state.hidden);
     legendOf(charts.nyquist, names, state.hidden);
     if (mapped) charts.poles.legend.replaceChildren();
-    else legendOf(charts.poles, Object.keys(picture.poles).filter((name) => picture.poles[name].length), state.hiddenPoles, { machine: "○", "closed loop": "×", regulator: "+", filter: "□" });
+    else legendOf(charts.poles, Object.keys(picture.poles).filter((name) => picture.poles[name].length), state.hiddenPoles, { marks: { machine: "○", "closed loop": "×", regulator: "+", filter: "□" } });
     drawTimes({ ...state, pins });
     if (state.told) charts[state.told.chart].note.textContent = charts[state.told.chart].note.title = state.told.text;
     drawTables();
@@ -384,11 +385,8 @@ export async function mount(root, transport) {
     show(charts.load, loadView(seen, under, state.hidden, pull), state.description.loads.length ? "An unstable loop carries no load." : "No force acts on this machine from outside.");
     const signals = group.of === "v" ? state.description.inputs : state.description.outputs;
     const named = (of, indices) => indices.map((k) => of[k].name);
-    legendOf(charts.run, named(signals, group.indices), state.hidden);
-    legendOf(charts.load, named(state.description.outputs, under.indices), state.hidden);
-    for (const [chart, indices] of [[charts.run, group.indices], [charts.load, under.indices]]) {
-      [...chart.legend.children].forEach((one, k) => one.querySelector("i").style.setProperty("--swatch", color(indices[k])));
-    }
+    legendOf(charts.run, named(signals, group.indices), state.hidden, { indices: group.indices, dashed: false }); // dashes are of the linear loop
+    legendOf(charts.load, named(state.description.outputs, under.indices), state.hidden, { indices: under.indices });
     const { simulated } = state;
     charts.run.note.textContent = !simulated ? "linear loop; the simulation follows" : simulated.error ? `no simulation: ${simulated.error}`
       : `– – linear   —— simulated${simulated.engine === "compiled" ? "" : ` (${simulated.engine})`}${simulated.completed ? "" : `: ${simulated.verdict} at ${digits(simulated.end, 3)} s`}`;

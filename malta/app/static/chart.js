@@ -16,6 +16,13 @@ export function svg(name, attributes = {}, text = "") {
   return node;
 }
 
+// A short piece of a line, for a legend.
+export function stroke(dash) {
+  const node = svg("svg", { width: 24, height: 6 });
+  node.append(svg("path", { d: "M0 3H24", "stroke-width": 2.6, ...(dash ? { "stroke-dasharray": dash } : {}) }));
+  return node;
+}
+
 // Positions on an axis: value -> pixels.
 function axisScale(axis, from, to) {
   const [low, high] = axis.log ? [Math.log(axis.min), Math.log(axis.max)] : [axis.min, axis.max];

@@ -5,12 +5,13 @@ import { decibels, digits, floored, hertz, percent, printedUnit, quantity, scale
 
 const DASHES = ["", "7 3", "2 3", "8 3 2 3", "", "7 3", "2 3", "8 3 2 3"];
 export const color = (k) => `var(--c${k % 8})`;
+export const dash = (k) => DASHES[k % DASHES.length];
 
 function signalLines(names, rows, xs, hidden, { ghost = false, dashed = null } = {}) {
   return names.map((name, k) => ({
     name, xs, ys: rows[k] ?? [], k,
     color: color(k),
-    dash: dashed ?? DASHES[k % DASHES.length],
+    dash: dashed ?? dash(k),
     faint: ghost, silent: ghost,
   })).filter((line) => !hidden.has(line.name) && line.ys.length);
 }
@@ -60,7 +61,7 @@ export function nyquistView(picture, pins, reach, hidden, pull) {
   const { w, sensors, L } = picture.frequency;
   const curves = (frequency, ghost) => frequency.sensors.map((name, k) => ({
     name, w: frequency.w, xs: frequency.L[k][0], ys: frequency.L[k][1], color: color(k),
-    dash: DASHES[k % DASHES.length], faint: ghost, silent: ghost,
+    dash: dash(k), faint: ghost, silent: ghost,
   })).filter((line) => !hidden.has(line.name));
   // A handle stands where a loop enters the unit circle; round the circle its phase margin changes.
   const handles = sensors.flatMap((name, k) => {
@@ -185,7 +186,7 @@ export function loadView(state, group, hidden, pull) {
   const { picture, pins, description } = state, load = picture.load;
   if (!load) return null;
   const rows = (source, ghost) => group.indices.filter((k) => !hidden.has(description.outputs[k].name)).map((k) => ({
-    name: description.outputs[k].name, xs: source.t, ys: source.y[k], color: color(k), faint: ghost, silent: ghost,
+    name: description.outputs[k].name, xs: source.t, ys: source.y[k], color: color(k), dash: dash(k), faint: ghost, silent: ghost,
   }));
   const lines = [...pins.filter((pin) => pin.picture.load?.name === load.name).flatMap((pin) => rows(pin.picture.load, true)), ...rows(load, false)];
   const handles = group.indices.filter((k) => !hidden.has(description.outputs[k].name) && load.largest[k] > 0).map((k) => {

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+from malta.display import floor_to
 from malta.errors import InputError
 from malta.loops.loop import loop_along
 from malta.loops.sampled_loops import SampledLoop
@@ -114,7 +115,7 @@ def _draw_stages(left: Axes, right: Axes, found: LoopReport) -> None:
     beside: dict[str, Any] = {"xytext": (6, 0), "textcoords": "offset points", "va": "center"}
     for k, (_, margin, peak) in enumerate(rows):
         look, end = LOOKS[k >= len(found.chain) - 1], _draw_margin(left, k, margin)
-        text = "none" if margin.lower is None else f"{_percent(margin.lower):.1f} %"
+        text = "none" if margin.lower is None else f"{floor_to(_percent(margin.lower), 1):.1f} %"
         text = f"{text} or more" if margin.exhausted and margin.lower is not None else text
         left.annotate(text, (end, k), **beside, **NOTE)
         stable = not math.isnan(peak)
@@ -196,7 +197,7 @@ def _draw_along_course(left: Axes, right: Axes, found: LoopReport, bound: float)
     if math.isfinite(bound):
         right.axhline(bound, **STYLES[1])
         right.annotate(
-            "no more for any parameters of the box", (0.02, bound), xycoords=("axes fraction", "data"),
+            "upper bound over the box, proven", (0.02, bound), xycoords=("axes fraction", "data"),
             xytext=(0, 3), textcoords="offset points", va="bottom", **NOTE,
         )  # fmt: skip
     right.axhline(limit, **BOUND)
