@@ -12,6 +12,7 @@ from conftest import Run
 
 import malta
 from malta import gains
+from malta.margins.loop_report import Payload
 from malta.model.data import plant_of
 from malta.simulation.experiments.catalogue import FINENESS, flown_payload, held_payload, payload
 
@@ -80,3 +81,13 @@ def test_verify_calls_a_mass_margin_by_its_name(run: Run) -> None:
     }
     (margin,), (held,), (carried, dropped) = shown.values()
     assert carried < dropped < held < margin
+
+
+@pytest.mark.slow
+def test_a_payload_has_the_digits_that_tell_it_from_what_was_dropped() -> None:
+    spec = malta.read_design("examples/ball/design/ball.toml")
+    controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
+    for carried, dropped, shown in ((2.611, 2.614, "2.611 kg, not 2.614"), (0.73, math.inf, "0.73 kg")):
+        table = malta.report.tolerance_table(replace(found, payload=Payload(3.6, carried, dropped)))
+        assert shown in map(str, table.columns[2].cells)

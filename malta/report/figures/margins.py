@@ -198,7 +198,7 @@ def _draw_along_course(left: Axes, right: Axes, found: LoopReport, bound: float)
         right.axhline(bound, **STYLES[1])
         right.annotate(
             "upper bound over the box, proven", (0.02, bound), xycoords=("axes fraction", "data"),
-            xytext=(0, 3), textcoords="offset points", va="bottom", **NOTE,
+            xytext=(0, -3), textcoords="offset points", va="top", **NOTE | PAPER,
         )  # fmt: skip
     right.axhline(limit, **BOUND)
     where: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}

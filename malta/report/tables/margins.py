@@ -371,8 +371,17 @@ def tolerance_table(found: LoopReport) -> Table:
         held = "any" if math.isinf(payload.held) else f"{payload.held:.2g} kg"
         add_row(table, "payload held at rest", "", held, "")
         if not math.isnan(payload.carried):
-            dropped = "" if math.isinf(payload.dropped) else f", not {payload.dropped:.2g}"
-            add_row(table, "payload in flight", "", f"{payload.carried:.2g} kg{dropped}", "")
+            both = payload.carried, payload.dropped
+            carried, dropped = next(
+                a for d in range(2, 18) if len(set(a := [f"{kg:.{d}g}" for kg in both])) == 2
+            )
+            add_row(
+                table,
+                "payload in flight",
+                "",
+                f"{carried} kg{'' if dropped == 'inf' else f', not {dropped}'}",
+                "",
+            )
     return table
 
 
