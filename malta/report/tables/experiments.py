@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from malta.identification.prediction import Predicted
     from malta.identification.replay import LawReplay
     from malta.identification.strokes import LearnedStrokes
+    from malta.identification.windings import Windings
     from malta.merits import Merit
     from malta.model.plant import Plant
     from malta.report.ledger import Claim, Ledger
@@ -272,6 +273,21 @@ def in_time_table(found: Identified, in_time: Predicted) -> Table:
         add_row(table, f"innovation of {name} over its expected size", f"{value:.3g}", "1")
     add_row(table, "missing readings", str(in_time.missing), "")
     add_row(table, "outliers, beyond 6 sigma", str(in_time.outliers), "0")
+    return table
+
+
+def drive_table(found: Windings) -> Table:
+    """R, L and the dead time with their 95 % intervals, and the current loops that they make."""
+    table = new_table("The drive, from voltages to currents", "figure", "value", "half [%]", "gain file")
+    for name, (one, own) in found.estimates.items():
+        scale, unit = (1e6, "us") if one.unit == "s" else (1e3, "mH") if one.unit == "H" else (1, one.unit)
+        share = f"{100 * one.half / one.value:.2g}"
+        add_row(table, f"{name} [{unit}]", f"{scale * one.value:.5g}", share, f"{scale * own:.5g}")
+    crossover, margin = found.designed
+    add_row(table, "crossover of the current loops [rad/s]", f"{found.crossover:.4g}", "", f"{crossover:.4g}")
+    degrees = f"{math.degrees(found.phase_margin):.3g}", "", f"{math.degrees(margin):.3g}"
+    add_row(table, "their phase margin [deg]", *degrees)
+    add_row(table, f"chi2 / dof, at most {found.limit:.3g}", f"{found.chi2:.3g}", "", "")
     return table
 
 
