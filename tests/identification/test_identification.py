@@ -84,6 +84,14 @@ def test_a_multisine_has_its_lines_and_no_others() -> None:
         interleaved_multisine(0.5, 4.0, 10.0, inputs=3, lines=10)
 
 
+def test_a_flight_as_planned_stays_in_the_window(plan: ExcitationPlan, log: Log) -> None:
+    """Also of a machine that is not quite the gain file's; the window is not so wide that it says nothing."""
+    off = np.abs(log.columns["y"] - log.columns["y"].mean(axis=0)).max(axis=0)
+    window, motion = (np.array(list(one.values())) for one in (plan.window, plan.motion))
+    assert (off < window).all()
+    assert (window < 10e-6 + 3 * motion + 6 * np.array([0, 0, 0, 0, 15e-6])).all()
+
+
 def test_the_linear_loop_predicts_the_flight(plant: Plant, plan: ExcitationPlan) -> None:
     """Motion, currents and commands at the lines, against the simulation without noise."""
     run = excited(plan, {}, noise=0.0, quantize=False)

@@ -214,6 +214,9 @@ class ExciteOutput(Part):
     lines_Hz: list[float]
     crest_factor: list[Number] = Field(description="of each input")
     motion: dict[str, float] = Field(description="largest deviation of each output, SI")
+    window: dict[str, float] = Field(
+        description="of each output: a deviation beyond it should end the flight, SI"
+    )
     current_A: dict[str, float] = Field(description="largest deviation of each current from that at rest")
     command_share: dict[str, float] = Field(description="largest command of each input, of its limit")
     accuracy_share: dict[str, float] = Field(description="half of the 95 % interval of each parameter")

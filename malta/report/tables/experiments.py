@@ -233,7 +233,8 @@ def excitation_tables(plan: ExcitationPlan, plant: Plant) -> list[Table]:
     moved = new_table("What it does, by the linear loop", "signal", "largest", "of its limit")
     for signal in plant.outputs:
         scale, unit = (1e6, f"u{signal.unit}") if signal.unit in ("m", "rad") else (1.0, signal.unit)
-        add_row(moved, f"{signal.name} [{unit}]", f"{scale * plan.motion[signal.name]:.4g}", "")
+        stop = f"stop beyond {scale * plan.window[signal.name]:.3g}"
+        add_row(moved, f"{signal.name} [{unit}]", f"{scale * plan.motion[signal.name]:.4g}", stop)
     for signal, limit in zip(plant.inputs, plant.actuator.force_limit, strict=True):
         share = plan.command[signal.name]
         add_row(moved, f"{signal.name} [{signal.unit}]", f"{share * limit:.4g}", f"{100 * share:.3g} %")
