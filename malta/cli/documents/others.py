@@ -492,12 +492,16 @@ def identify_output(
     gains: Path, found: Identified, files: Iterable[Path], windings: Windings | None = None
 ) -> IdentifyOutput:
     """The document of an identification."""
-    drive = None if windings is None else {
-        name: IdentifiedParameter(
-            unit=one.unit, value=one.value, low=one.value - one.half, high=one.value + one.half, start=own
-        )
-        for name, (one, own) in windings.estimates.items()
-    }
+    drive = (
+        None
+        if windings is None
+        else {
+            name: IdentifiedParameter(
+                unit=one.unit, value=one.value, low=one.value - one.half, high=one.value + one.half, start=own
+            )
+            for name, (one, own) in windings.estimates.items()
+        }
+    )
     units = units_of_model(found.plant)
     in_time = (
         {} if found.in_time is None else dict(zip(found.names, found.in_time.values.tolist(), strict=True))
