@@ -71,6 +71,10 @@ def identify(
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="What it adds to a parameter, as m=100g. Repeatable."),
     ] = None,
+    drive: Annotated[
+        bool,
+        typer.Option("--drive", help="R, L and dead time of the drive too, from voltages in the log."),
+    ] = False,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -89,8 +93,9 @@ def identify(
     from malta.identification.identify import identify as identify_parameters
     from malta.identification.log_files import read_log
     from malta.identification.response import units_of_model
+    from malta.identification.windings import identify_windings
     from malta.model.data import plant_of
-    from malta.report.tables.experiments import identified_table, in_time_table, quality_table
+    from malta.report.tables.experiments import drive_table, identified_table, in_time_table, quality_table
 
     require_suffixes((out, (".toml",)))
     controller = read_controller(gains, machine)
@@ -103,12 +108,14 @@ def identify(
     if loaded is not None and robust:
         raise InputError("--robust", "", "two logs", "one log: two are estimated at the lines alone")
     with working(f"identifying from {log}"):
+        read = read_log(log, (*GROUPS, "u") if drive else GROUPS)
+        windings = identify_windings(controller, read) if drive else None
         if loaded is not None:
-            logs = read_log(log, GROUPS), read_log(loaded, GROUPS)
-            found = weigh(controller, *logs, more, parameters=parameters or (), known=values)
+            second = read_log(loaded, GROUPS)
+            found = weigh(controller, read, second, more, parameters=parameters or (), known=values)
         else:
             found = identify_parameters(
-                controller, read_log(log, GROUPS), parameters=parameters or (), known=values, robust=robust
+                controller, read, parameters=parameters or (), known=values, robust=robust
             )
     files = []
     if out is not None and not found.refusal:
@@ -116,20 +123,23 @@ def identify(
     if as_json:
         from malta.cli.documents.others import identify_output
 
-        print_document(identify_output(gains, found, files))
+        print_document(identify_output(gains, found, files, windings))
     else:
         console = make_console()
         console.print(identified_table(found))
         console.print(quality_table(found))
         if found.in_time is not None:
             console.print(in_time_table(found, found.in_time))
+        if windings is not None:
+            console.print(drive_table(windings))
         held = ", ".join(f"{name} = {value:.5g}" for name, value in found.held.items())
         print_text(console, f"taken as known, SI: {held or 'nothing'}")
         if found.dropped:
             print_text(console, f"act, but are not told by themselves: {' '.join(found.dropped)}")
         print_written(console, files)
-    if found.refusal:
-        raise CheckError(f"{log}: {found.refusal}")
+    refusal = found.refusal or (windings.refusal if windings is not None else "")
+    if refusal:
+        raise CheckError(f"{log}: {refusal}")
 
 
 # `malta excite`: an excitation of all axes, what it will do and find, and the log of its flight.

@@ -28,5 +28,7 @@ if TYPE_CHECKING:
     from malta.identification.strokes import LearnedStrokes as LearnedStrokes
     from malta.identification.strokes import learn_strokes as learn_strokes
     from malta.identification.strokes import next_stroke as next_stroke
+    from malta.identification.windings import Windings as Windings
+    from malta.identification.windings import identify_windings as identify_windings
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

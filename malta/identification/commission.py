@@ -27,6 +27,7 @@ from malta.identification.learn import FACTORS, learn
 from malta.identification.log import log_of
 from malta.identification.log_files import read_log, write_log
 from malta.identification.measure import SAME_LAW, measure, plan_measurement
+from malta.identification.windings import identify_windings
 from malta.loops.loop import loop
 from malta.model.data import plant_of
 from malta.model.machines import attribute_of
@@ -46,6 +47,8 @@ ENDS = ("completed", "not lifted")  # of flights in which nothing went wrong
 NOISY = 1.5  # times the noise and steps of a sensor that the gain file believes
 STILL = 0.3  # s, of a rest
 ERROR = 0.1  # of the travel: the largest error of a stroke
+DRIVE = (0.7, 1.3)  # of R and L: copper that is 75 K warmer has 1.3 times the resistance
+CURRENT_MARGIN = 0.5  # rad, least phase margin of the current loops
 WORST = 3.0  # largest |S|: the end of zone A of ISO 14839-3, which a new machine is asked for
 
 
@@ -397,7 +400,33 @@ def judge_loop(controller: Controller, log: Log, box: Mapping[str, float]) -> li
         for name, (value, high, _) in found.peaks.items()
     ]
     disk, low = found.disks[-1]
-    return [*peaks, Finding("disk margin of all sensors", Estimate(disk.size, disk.size - low), 0.2)]
+    margin = Finding("disk margin of all sensors", Estimate(disk.size, disk.size - low), 0.2)
+    return [*peaks, margin, *judge_drive(controller, log)]
+
+
+def judge_drive(controller: Controller, log: Log) -> list[Finding]:
+    """R and L of the windings over those of the gain file, the dead time, and the phase margin of the current loops.
+
+    None of a machine without windings, and where the log has no voltages.
+    """
+    if plant_of(controller.parameters).windings is None or not log.names("u"):
+        return []
+    found = identify_windings(controller, log)
+    R, L, dead_time = found.believed
+    shares = (("R", found.R, R), ("L", found.L, L))
+    half = controller.sample_time / 2
+    return [
+        *(
+            Finding(
+                f"{name} of the drive over the gain file's", Estimate(e.value / own, e.half / own), *DRIVE
+            )
+            for name, e, own in shares
+        ),
+        Finding("dead time of the drive", found.dead_time, dead_time - half, dead_time + half),
+        Finding(
+            "phase margin of the current loops", Estimate(found.phase_margin, 0.0, "rad"), CURRENT_MARGIN
+        ),
+    ]
 
 
 def _record_stroke(bench: Bench) -> Log:

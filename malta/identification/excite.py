@@ -34,6 +34,10 @@ PERIODS = 10
 SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
 QUIET = 1e-9  # m or rad: noise of a sensor that has none
 LONGEST = 5e7  # samples of a flight
+WIDE, FAR = (
+    2.0,
+    5.0,
+)  # times the largest motion, and deviations of the noise: beyond it, the machine is another one
 CURRENT = 0.1  # of the current limit: the amplitude where none is given
 
 
@@ -45,6 +49,7 @@ class ExcitationPlan:
     signal : the multisine
     periods : that are logged, after one in which the loop settles
     motion : by output: largest deviation, SI
+    window : by output: twice that and five deviations of its noise, SI: a reading beyond it should end the flight
     current : by measured current: largest deviation from the current at rest, A
     command : by input: the largest command, with the one that holds the machine, as a share of its limit
     accuracy : by parameter: half of the 95 % interval that the log will give, as a share of its value
@@ -60,6 +65,7 @@ class ExcitationPlan:
     signal: Multisine
     periods: int
     motion: Mapping[str, float]
+    window: Mapping[str, float]
     current: Mapping[str, float]
     command: Mapping[str, float]
     accuracy: Mapping[str, float]
@@ -217,8 +223,11 @@ def _plan(
     """The plan of a signal with what it does in the linear loop."""
     plant = loop.plant
     samples = round(periods * signal.period / loop.sample_time)
-    variance = np.array(plant.noise) ** 2 + np.array(plant.resolution) ** 2 / 12
-    variance = np.maximum(variance, QUIET**2)[None] / samples * np.ones((len(found.y), 1))
+    noise, motion = (
+        np.hypot(plant.noise, np.array(plant.resolution) / np.sqrt(12)),
+        _together(signal, found.y),
+    )
+    variance = np.maximum(noise, QUIET)[None] ** 2 / samples * np.ones((len(found.y), 1))
     slopes = model.slopes(model.start, 2 * np.pi * signal.frequencies)
     F = information(slopes, found.i / 2, variance)
     chosen = list(range(len(model.names))) if named else well_found(F, model.names, SHARE / 1.96)
@@ -230,7 +239,8 @@ def _plan(
     return ExcitationPlan(
         signal,
         periods,
-        motion=dict(zip(outputs, _together(signal, found.y).tolist(), strict=True)),
+        motion=dict(zip(outputs, motion.tolist(), strict=True)),
+        window=dict(zip(outputs, (WIDE * motion + FAR * noise).tolist(), strict=True)),
         current=dict(zip(model.currents, _together(signal, found.i).tolist(), strict=True)),
         command=dict(zip(inputs, most.tolist(), strict=True)),
         accuracy={model.names[k]: 1.96 * float(s) for k, s in zip(chosen, sigma, strict=True)},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -299,6 +299,25 @@ def sample_excitation(Ts: float, plant: Plant, forces: FloatArray) -> Callable[[
         return np.where(inside[..., None], table[np.clip(k, 0, len(table) - 1)], 0.0)
 
     return sent
+
+
+def in_order(log: Log, plant: Plant) -> Log:
+    """The log with readings and forces in the machine's order, whatever that of the file's columns.
+
+    A command without a column is missing, an excitation without one is zero. Without all of the readings these are left
+    as they are, for whoever needs them to refuse.
+    """
+    columns, signals = dict(log.columns), dict(log.signals)
+    forces = ("v", plant.inputs, np.nan), ("excitation", plant.inputs, 0.0)
+    for group, wanted, otherwise in (("y", plant.outputs, np.nan), *forces):
+        have, names = log.names(group), [s.name for s in wanted]
+        there = [name for name in names if name in have]
+        if have == names or not there or (group == "y" and there != names):
+            continue
+        table = np.full((log.samples, len(names)), otherwise)
+        table[:, [names.index(name) for name in there]] = log.table(group, there)
+        columns[group], signals[group] = table, tuple(wanted)
+    return log if signals == log.signals else replace(log, columns=columns, signals=signals)
 
 
 def require_currents(log: Log, axes: Sequence[str]) -> None:

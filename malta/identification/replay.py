@@ -12,7 +12,7 @@ import numpy as np
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.log import Log, reference_spline, require_same_law, sample_excitation
+from malta.identification.log import Log, in_order, reference_spline, require_same_law, sample_excitation
 from malta.identification.response import acting
 from malta.identification.spectra import FARTHEST, sentence_of
 from malta.model.data import plant_of
@@ -157,6 +157,7 @@ def replay_law(controller: Controller, log: Log, *, same: bool | None = None) ->
     """
     plant = plant_of(controller.parameters)
     require_same_law(log, plant.name, controller.sample_time)
+    log = in_order(log, plant)
     y = log.table("y", [s.name for s in plant.outputs])
     v = log.table("v", [s.name for s in plant.inputs])
     sent = log.columns.get("excitation", np.zeros(1))

@@ -20,7 +20,7 @@ import numpy as np
 
 from malta.errors import CheckError
 from malta.firmware.signals import place_of_readings
-from malta.identification.log import Log, require_same_law
+from malta.identification.log import Log, in_order, require_same_law
 from malta.identification.prediction import Noise, noise_between_lines, noise_covariances, without_spikes
 from malta.identification.response import STEP, ResponseModel, acting
 from malta.model.parameters import twins_of
@@ -205,7 +205,8 @@ def straightened(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Spectr
 
 
 def in_axes(log: Log, plant: Plant) -> Log:
-    """The log with the currents of the drive's axes, where it has those of all its phases; else the log as it is."""
+    """The log in the machine's order, with currents of the drive's axes where it has those of all phases."""
+    log = in_order(log, plant)
     if plant.windings is None or log.names("i") != [s.name for s in plant.drive.phases]:
         return log
     y, i = ca.SX.sym("y", len(plant.outputs)), ca.SX.sym("i", len(plant.drive.phases))
@@ -365,6 +366,7 @@ def lines_of(log: Log, loop: Loop) -> list[Line]:
     """The lines of the last whole periods of a log. Raises CheckError for a log that tells nothing."""
     plant = loop.plant
     require_log(log, plant.name, loop.sample_time)
+    log = in_order(log, plant)
     N, periods = whole_periods(
         log, np.nan_to_num(log.columns.get("excitation", np.zeros((1, 1)))), log.samples
     )

@@ -84,6 +84,14 @@ def test_a_multisine_has_its_lines_and_no_others() -> None:
         interleaved_multisine(0.5, 4.0, 10.0, inputs=3, lines=10)
 
 
+def test_a_flight_as_planned_stays_in_the_window(plan: ExcitationPlan, log: Log) -> None:
+    """Also of a machine that is not quite the gain file's; the window is not so wide that it says nothing."""
+    off = np.abs(log.columns["y"] - log.columns["y"].mean(axis=0)).max(axis=0)
+    window, motion = (np.array(list(one.values())) for one in (plan.window, plan.motion))
+    assert (off < window).all()
+    assert (window < 10e-6 + 3 * motion + 6 * np.array([0, 0, 0, 0, 15e-6])).all()
+
+
 def test_the_linear_loop_predicts_the_flight(plant: Plant, plan: ExcitationPlan) -> None:
     """Motion, currents and commands at the lines, against the simulation without noise."""
     run = excited(plan, {}, noise=0.0, quantize=False)
@@ -155,6 +163,22 @@ def test_no_mass_is_found_in_two_logs_that_are_alike(log: Log) -> None:
 def test_a_wrong_model_is_refused(log: Log, known: dict[str, float]) -> None:
     found = malta.identify(CONTROLLER, log, parameters=["K_A", "K_B"], known=known)
     assert "does not explain the log" in found.refusal
+
+
+@pytest.mark.slow
+def test_the_order_of_columns_does_not_matter(log: Log, found: Identified) -> None:
+    """A bench's file has columns in an order of its own, and no column for an axis that was not excited."""
+    turned = {
+        group: np.roll(np.arange(log.columns[group].shape[1]), 2) for group in ("y", "v", "i", "excitation")
+    }
+    columns = {group: log.columns[group][:, order] for group, order in turned.items()}
+    signals = {group: tuple(log.signals[group][k] for k in order) for group, order in turned.items()}
+    other = replace(log, columns={**log.columns, **columns}, signals={**log.signals, **signals})
+    same = malta.identify(CONTROLLER, other, parameters=ASKED, in_time=False)
+    assert same.values == pytest.approx(found.values, rel=1e-6)
+    assert malta.identification.replay_law(CONTROLLER, other).same
+    lines = malta.measure(CONTROLLER, other).w
+    assert len(lines) == len(malta.measure(CONTROLLER, log).w)
 
 
 @pytest.mark.slow
@@ -531,3 +555,49 @@ def test_intervals_cover(plant: Plant) -> None:
         late += int((np.abs(found.in_time.values - list(values.values())) < half).sum())
     assert 36 <= inside <= 42
     assert 36 <= late <= 42
+
+
+@pytest.fixture(scope="module")
+def warm(plan: ExcitationPlan) -> Log:
+    """The log of a machine with warm windings, and voltages that act a sample later than the gain file says."""
+    return malta.identification.log_of(excited(plan, {**TRUE, "R": 2.6, "L": 2.5e-3}, delay=2))
+
+
+@pytest.mark.slow
+def test_the_drive_is_identified_from_voltages_and_currents(warm: Log) -> None:
+    found = malta.identification.identify_windings(CONTROLLER, warm)
+    assert found.refusal == ""
+    assert found.chi2 == pytest.approx(1, abs=0.2)
+    truth = {"R": 2.6, "L": 2.5e-3, "dead time": 125e-6}
+    for name, (one, believed) in found.estimates.items():
+        assert abs(one.value - truth[name]) < 2 * one.half < 1e-3 * truth[name]
+        assert believed == {"R": 2.2, "L": 2.8e-3, "dead time": 75e-6}[name]
+    # |Kp + Ki/(jw)| / |R + jwL| = 1, and 50 us more of dead time take off w 50 us
+    loop, w = CONTROLLER.current_loop, found.crossover
+    assert loop is not None
+    s = 1j * w
+    gain = (loop.Kp + loop.Ki / s) / (2.6 + 2.5e-3 * s) * np.exp(-s * 125e-6)
+    assert (abs(gain), np.angle(gain) + np.pi) == pytest.approx((1, found.phase_margin), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_voltages_that_do_not_act_as_logged_are_refused(warm: Log) -> None:
+    """Half-bridges that lose a share of each voltage at its sign, as by dead time."""
+    u = warm.columns["u"]
+    lossy = with_columns(warm, u=u + 0.2 * np.sign(u))
+    found = malta.identification.identify_windings(CONTROLLER, lossy)
+    assert found.refusal.startswith("chi2 / dof of the currents is")
+    with pytest.raises(
+        malta.InputError, match=r"run excited: u: found no voltages .* expected columns as u_0d1"
+    ):
+        malta.identification.identify_windings(
+            CONTROLLER,
+            replace(
+                warm,
+                signals={**warm.signals, "u": ()},
+                columns={**warm.columns, "u": warm.columns["u"][:, :0]},
+            ),
+        )
+    planar = malta.gains.read("design/gains/planar.json")
+    with pytest.raises(malta.InputError, match="windings: found a planar"):
+        malta.identification.identify_windings(planar, warm)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from malta.identification.measure import Curve, Measurement, MeasurementPlan
     from malta.identification.replay import LawReplay
     from malta.identification.strokes import LearnedStrokes
+    from malta.identification.windings import Windings
     from malta.proof.blocks.gain import Gain
     from malta.proof.certificate.checked_file import Claim
     from malta.synthesis.spec import Spec
@@ -213,6 +214,9 @@ class ExciteOutput(Part):
     lines_Hz: list[float]
     crest_factor: list[Number] = Field(description="of each input")
     motion: dict[str, float] = Field(description="largest deviation of each output, SI")
+    window: dict[str, float] = Field(
+        description="of each output: a deviation beyond it should end the flight, SI"
+    )
     current_A: dict[str, float] = Field(description="largest deviation of each current from that at rest")
     command_share: dict[str, float] = Field(description="largest command of each input, of its limit")
     accuracy_share: dict[str, float] = Field(description="half of the 95 % interval of each parameter")
@@ -257,8 +261,12 @@ class IdentifiedParameter(Part):
     low: float = Field(description="end of the 95 % interval")
     high: float
     start: float = Field(description="value of the gain file")
-    in_time: Number | None = Field(description="from prediction errors in time; null: not estimated")
-    apart_sigma: Number | None = Field(description="of the two estimates, in standard deviations")
+    in_time: Number | None = Field(
+        default=None, description="from prediction errors in time; null: not estimated"
+    )
+    apart_sigma: Number | None = Field(
+        default=None, description="of the two estimates, in standard deviations"
+    )
 
 
 class IdentifyOutput(Part):
@@ -279,6 +287,9 @@ class IdentifyOutput(Part):
     whiteness: float = Field(description="correlation of neighbouring lines, in standard deviations")
     distortion: Number = Field(description="power where nothing was excited, over the noise")
     refusal: str = Field(description='why the model does not explain the log; "": it does')
+    drive: dict[str, IdentifiedParameter] | None = Field(
+        default=None, description="R, L and dead time of the drive; null: not asked for"
+    )
     files: Files
 
 
@@ -477,8 +488,20 @@ def log_output(log: Log, files: Iterable[Path]) -> LogOutput:
     return LogOutput.of(log, signals=signals, files=files)
 
 
-def identify_output(gains: Path, found: Identified, files: Iterable[Path]) -> IdentifyOutput:
+def identify_output(
+    gains: Path, found: Identified, files: Iterable[Path], windings: Windings | None = None
+) -> IdentifyOutput:
     """The document of an identification."""
+    drive = (
+        None
+        if windings is None
+        else {
+            name: IdentifiedParameter(
+                unit=one.unit, value=one.value, low=one.value - one.half, high=one.value + one.half, start=own
+            )
+            for name, (one, own) in windings.estimates.items()
+        }
+    )
     units = units_of_model(found.plant)
     in_time = (
         {} if found.in_time is None else dict(zip(found.names, found.in_time.values.tolist(), strict=True))
@@ -495,7 +518,10 @@ def identify_output(gains: Path, found: Identified, files: Iterable[Path]) -> Id
         )
         for k, name in enumerate(found.names)
     }
-    return IdentifyOutput.of(found, gains=gains, parameters=parameters, files=files)
+    refusal = found.refusal or ("" if windings is None else windings.refusal)
+    return IdentifyOutput.of(
+        found, gains=gains, parameters=parameters, refusal=refusal, drive=drive, files=files
+    )
 
 
 def learned_strokes_output(

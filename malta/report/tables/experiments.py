@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from malta.identification.prediction import Predicted
     from malta.identification.replay import LawReplay
     from malta.identification.strokes import LearnedStrokes
+    from malta.identification.windings import Windings
     from malta.merits import Merit
     from malta.model.plant import Plant
     from malta.report.ledger import Claim, Ledger
@@ -232,7 +233,8 @@ def excitation_tables(plan: ExcitationPlan, plant: Plant) -> list[Table]:
     moved = new_table("What it does, by the linear loop", "signal", "largest", "of its limit")
     for signal in plant.outputs:
         scale, unit = (1e6, f"u{signal.unit}") if signal.unit in ("m", "rad") else (1.0, signal.unit)
-        add_row(moved, f"{signal.name} [{unit}]", f"{scale * plan.motion[signal.name]:.4g}", "")
+        stop = f"stop beyond {scale * plan.window[signal.name]:.3g}"
+        add_row(moved, f"{signal.name} [{unit}]", f"{scale * plan.motion[signal.name]:.4g}", stop)
     for signal, limit in zip(plant.inputs, plant.actuator.force_limit, strict=True):
         share = plan.command[signal.name]
         add_row(moved, f"{signal.name} [{signal.unit}]", f"{share * limit:.4g}", f"{100 * share:.3g} %")
@@ -272,6 +274,21 @@ def in_time_table(found: Identified, in_time: Predicted) -> Table:
         add_row(table, f"innovation of {name} over its expected size", f"{value:.3g}", "1")
     add_row(table, "missing readings", str(in_time.missing), "")
     add_row(table, "outliers, beyond 6 sigma", str(in_time.outliers), "0")
+    return table
+
+
+def drive_table(found: Windings) -> Table:
+    """R, L and the dead time with their 95 % intervals, and the current loops that they make."""
+    table = new_table("The drive, from voltages to currents", "figure", "value", "half [%]", "gain file")
+    for name, (one, own) in found.estimates.items():
+        scale, unit = (1e6, "us") if one.unit == "s" else (1e3, "mH") if one.unit == "H" else (1, one.unit)
+        share = f"{100 * one.half / one.value:.2g}"
+        add_row(table, f"{name} [{unit}]", f"{scale * one.value:.5g}", share, f"{scale * own:.5g}")
+    crossover, margin = found.designed
+    add_row(table, "crossover of the current loops [rad/s]", f"{found.crossover:.4g}", "", f"{crossover:.4g}")
+    degrees = f"{math.degrees(found.phase_margin):.3g}", "", f"{math.degrees(margin):.3g}"
+    add_row(table, "their phase margin [deg]", *degrees)
+    add_row(table, f"chi2 / dof, at most {found.limit:.3g}", f"{found.chi2:.3g}", "", "")
     return table
 
 
