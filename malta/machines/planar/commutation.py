@@ -246,7 +246,7 @@ def conditioning(par: Parameters, model: CoilModel, n: int = 12) -> FloatArray:
     check_position(par, p[-1, -1])
     s = np.linalg.svd(scale * _wrench_matrices(par, model, p), compute_uv=False)
     regular = s[..., -1] > 1e-12 * s[..., 0]
-    return np.divide(s[..., 0], s[..., -1], out=np.full((n, n), np.inf), where=regular)
+    return np.asarray(np.divide(s[..., 0], s[..., -1], out=np.full((n, n), np.inf), where=regular))
 
 
 def check_pitch(par: Parameters, model: CoilModel) -> float:
