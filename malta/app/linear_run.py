@@ -48,7 +48,7 @@ def linear_run(loop: SampledLoop, controller: Controller, scenario: Scenario) ->
     c, law, plant = controller, loop.control, plant_of(controller.parameters)
     samples = max(1, round(scenario.duration / c.sample_time))
     if samples > LONGEST:
-        raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
+        raise InputError(scenario.where, "duration", f"{samples} samples", f"at most {LONGEST}")
     t = np.arange(samples) * c.sample_time
     motion = motion_of(scenario, plant, c, t)
     here = outputs_at(plant, plant.point(c.operating_point[0]).x)

@@ -233,9 +233,7 @@ def _require_exported(scenario: Scenario, s: Setup) -> None:
         ("open_loop", s.open_loop),
     ):
         if found:
-            raise InputError(
-                f"scenario {scenario.name}", name, "a law that is not exported", "the gain file's own law"
-            )
+            raise InputError(scenario.where, name, "a law that is not exported", "the gain file's own law")
 
 
 class _Machine(NamedTuple):

@@ -40,7 +40,7 @@ from malta.simulation.layout import (
 )
 from malta.simulation.period import Period, initial_state, period_of, state_reference
 from malta.simulation.readings import COSINE, LOGARITHM, SINE
-from malta.simulation.scenario import Scenario, setup_of, substeps_of
+from malta.simulation.scenario import Scenario, Simulation, simulation_of, substeps_of
 
 TINY = 1e-6  # share of a substep that rounding may add, see engines.substeps_until
 WAVES = {"logarithm": LOGARITHM, "cosine": COSINE, "sine": SINE}  # polynomials of the noise
@@ -58,12 +58,12 @@ class Machine:
         return self.target.believed
 
     @cached_property
-    def scenario(self) -> Scenario:
-        """The scenario whose functions the machine consists of: a wrench and touchdown bearings where it has them."""
+    def simulation(self) -> Simulation:
+        """The simulation whose functions the machine consists of: a wrench and touchdown bearings where it has them."""
         wrench = (
             (lambda t: np.zeros((len(t), len(self.plant.disturbances)))) if self.plant.disturbances else None
         )
-        return Scenario(
+        scenario = Scenario(
             "machine",
             1.0,
             references.hold,
@@ -71,10 +71,11 @@ class Machine:
             disturbance=wrench,
             bearing=any(self.plant.cushioned),
         )
+        return simulation_of(self.plant, self.target.controller, scenario)
 
-    @cached_property
+    @property
     def setup(self) -> Setup:
-        return setup_of(self.plant, self.target.controller, self.scenario)
+        return self.simulation.setup
 
     @cached_property
     def sizes(self) -> Layout:
@@ -83,7 +84,7 @@ class Machine:
     @cached_property
     def substeps(self) -> float:
         """Substeps in a sample, which may be no whole number."""
-        return substeps_of(self.plant, self.target.controller, self.setup, self.scenario)
+        return substeps_of(self.plant, self.target.controller, self.setup, self.simulation.scenario)
 
     @cached_property
     def state_size(self) -> int:
@@ -103,7 +104,9 @@ class Machine:
     def _sets_substeps(self, name: str) -> bool:
         par: Any = self.plant.parameters
         other = self.plant.variant(symbolic(par, {name: 1.01 * getattr(par, name)}))
-        return substeps_of(other, self.target.controller, self.setup, self.scenario) != self.substeps
+        return (
+            substeps_of(other, self.target.controller, self.setup, self.simulation.scenario) != self.substeps
+        )
 
     @cached_property
     def variable(self) -> Plant:

@@ -25,7 +25,7 @@ from malta.simulation.layout import electronics_of, layout_of, noise_scales
 from malta.simulation.period import state_reference
 from malta.simulation.readings import keys, normals, normals_of_parts
 from malta.simulation.references import Motion
-from malta.simulation.scenario import Fault, FeedforwardChoice, Scenario, Simulation
+from malta.simulation.scenario import FeedforwardChoice, Scenario, Simulation
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import holding_gain
 
@@ -233,7 +233,7 @@ def inputs_of(run: Simulation) -> Inputs:
     scenario, Ts = run.scenario, run.controller.sample_time
     samples = scenario.samples(Ts)
     if samples > LONGEST:
-        raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
+        raise InputError(scenario.where, "duration", f"{samples} samples", f"at most {LONGEST}")
     before = scenario.settling_samples(Ts)
     t = np.arange(-before, samples - before) * Ts
     motion = motion_of(scenario, run.plant, run.controller, np.maximum(t, 0.0))
@@ -269,11 +269,11 @@ def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> 
         parts["v_past"] = past
     sizes = layout_of(plant, c, setup).given
     if scenario.excitation is not None:  # after v_past: the filter knows these forces, the reference does not
-        parts["v_ff"] = v_ff + _excitation(plant, scenario, t)
+        parts["v_ff"] = v_ff + _forces(scenario, "excitation", t, len(plant.inputs))
     if scenario.disturbance is not None:
-        parts["w"] = _wrench(plant, scenario, "disturbance", t)
+        parts["w"] = _forces(scenario, "disturbance", t, len(plant.disturbances))
     if scenario.anticipated is not None:
-        known = _wrench(plant, scenario, "anticipated", t)
+        known = _forces(scenario, "anticipated", t, len(plant.disturbances))
         parts["v_known"] = countering_forces(plant_of(c.parameters), motion, known)
     if setup.faulty:
         parts |= _fault_flags(plant, scenario, sizes, t)
@@ -340,39 +340,22 @@ def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardCho
     return v_ff
 
 
-def _wrench(
-    plant: Plant, scenario: Scenario, name: Literal["disturbance", "anticipated"], t: FloatArray
+def _forces(
+    scenario: Scenario, name: Literal["disturbance", "anticipated", "excitation"], t: FloatArray, width: int
 ) -> FloatArray:
-    """One of the scenario's wrenches at t, k x disturbances. Raises InputError for another shape, or NaN."""
-    wrench = np.asarray(getattr(scenario, name)(t), dtype=float)
-    shape = (len(t), len(plant.disturbances))
-    if wrench.shape != shape or not np.isfinite(wrench).all():
-        found = f"shape {wrench.shape}"
-        raise InputError(f"scenario {scenario.name}", name, found, f"finite, shape {shape}")
-    return wrench
-
-
-def _excitation(plant: Plant, scenario: Scenario, t: FloatArray) -> FloatArray:
-    """The scenario's excitation at t, k x inputs. Raises InputError for another shape, or NaN."""
-    assert scenario.excitation is not None
-    forces = np.asarray(scenario.excitation(t), dtype=float)
-    shape = (len(t), len(plant.inputs))
+    """Forces of the scenario at t, k x width. Raises InputError for another shape, or NaN."""
+    forces = np.asarray(getattr(scenario, name)(t), dtype=float)
+    shape = (len(t), width)
     if forces.shape != shape or not np.isfinite(forces).all():
-        found = f"shape {forces.shape}"
-        raise InputError(f"scenario {scenario.name}", "excitation", found, f"finite, shape {shape}")
+        raise InputError(scenario.where, name, f"shape {forces.shape}", f"finite, shape {shape}")
     return forces
-
-
-def _active_samples(fault: Fault, t: FloatArray) -> FloatArray:
-    """True at the samples during which a fault lasts."""
-    return np.asarray((t >= fault.at) & (t < fault.until))
 
 
 def _signal_index(scenario: Scenario, kind: str, name: str, known: tuple[Any, ...]) -> int:
     """The index of a signal by its name; InputError for an unknown one."""
     names = [signal.name for signal in known]
     if name not in names:
-        raise InputError(f"scenario {scenario.name}", kind, repr(name), "one of " + " ".join(names))
+        raise InputError(scenario.where, kind, repr(name), "one of " + " ".join(names))
     return names.index(name)
 
 
@@ -384,7 +367,7 @@ def _fault_flags(
         name: np.zeros((len(t), sizes[name])) for name in ("stuck", "missed", "sag", "open")
     }
     for fault in scenario.faults:
-        during = _active_samples(fault, t)
+        during = (t >= fault.at) & (t < fault.until)
         if fault.kind == "lost sample":
             flags["stuck"][during] = 1
         elif fault.kind == "stuck sensor":
@@ -393,9 +376,7 @@ def _fault_flags(
             flags["missed"][during] = 1
         elif fault.kind == "link sag":
             if not 0 <= fault.size < 1:
-                raise InputError(
-                    f"scenario {scenario.name}", fault.kind, f"{fault.size:g}", "a share from 0 to 1"
-                )
+                raise InputError(scenario.where, fault.kind, f"{fault.size:g}", "a share from 0 to 1")
             flags["sag"][during] = fault.size
         elif fault.kind == "open phase":
             flags["open"][during, _signal_index(scenario, fault.kind, fault.what, plant.drive.phases)] = 1
@@ -419,7 +400,7 @@ def sensor_noise(run: Simulation, stages: list[tuple[int, Plant]], t: FloatArray
     for fault in scenario.faults:
         if fault.kind in ("biased sensor", "noisy sensor"):
             column = _signal_index(scenario, fault.kind, fault.what, plant.outputs)
-            during = _active_samples(fault, t)
+            during = (t >= fault.at) & (t < fault.until)
             if fault.kind == "noisy sensor":
                 drawn[during, column] *= fault.size
             else:

@@ -152,10 +152,15 @@ class Scenario:
         >>> malta.Scenario.stroke(10e-3).replace(noise=1.0, seed=3).seed
         3
         """
-        return replace_fields(self, f"scenario {self.name}", fields)
+        return replace_fields(self, self.where, fields)
+
+    @property
+    def where(self) -> str:
+        """The scenario, as errors name it."""
+        return f"scenario {self.name}"
 
     def __post_init__(self) -> None:
-        where = f"scenario {self.name}"
+        where = self.where
         for name, low, whole in (
             ("duration", 1e-12, False),
             ("settle", 0, False),
@@ -301,43 +306,43 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
     kinds = {fault.kind for fault in s.faults}
     if "open phase" in kinds and s.fidelity != "phase":
         found = f"an open phase at fidelity {s.fidelity}"
-        raise InputError(f"scenario {s.name}", "faults", found, "fidelity phase")
+        raise InputError(s.where, "faults", found, "fidelity phase")
     able = fidelities(plant)
     if s.fidelity not in able:
         expected = "one of " + ", ".join(able) + f" for a {plant.name}"
-        raise InputError(f"scenario {s.name}", "fidelity", s.fidelity, expected)
+        raise InputError(s.where, "fidelity", s.fidelity, expected)
     own = plant.electronics is not None and s.fidelity == "phase"
     if s.electronics is not None and not own:
         found = f"options of electronics at fidelity {s.fidelity}"
-        raise InputError(f"scenario {s.name}", "electronics", found, "a machine that has some, at phase")
+        raise InputError(s.where, "electronics", found, "a machine that has some, at phase")
     if own and s.estimator != "steady-state":
         found = f"{s.estimator} with electronics of their own pace"
-        raise InputError(f"scenario {s.name}", "estimator", found, "steady-state, or fidelity force")
+        raise InputError(s.where, "estimator", found, "steady-state, or fidelity force")
     if own and (s.real_pwm or s.bearing_axes == "turning" or "open phase" in kinds or "link sag" in kinds):
-        raise InputError(f"scenario {s.name}", "fidelity", "options of a drive", "those of the electronics")
+        raise InputError(s.where, "fidelity", "options of a drive", "those of the electronics")
     if s.anticipated is not None and s.estimator != "steady-state":
-        raise InputError(f"scenario {s.name}", "anticipated", f"estimator {s.estimator}", "steady-state")
+        raise InputError(s.where, "anticipated", f"estimator {s.estimator}", "steady-state")
     if s.scheduled and c.tracks == "errors":
-        raise InputError(f"scenario {s.name}", "scheduled", "a law of errors", "one with a filter of states")
+        raise InputError(s.where, "scheduled", "a law of errors", "one with a filter of states")
     if c.schedule is not None and (s.scheduled or s.estimator != "steady-state"):
         field, found = ("scheduled", "C of the reading") if s.scheduled else ("estimator", s.estimator)
         expected = "the filter of the gain file, beside a law that is scheduled"
-        raise InputError(f"scenario {s.name}", field, found, expected)
+        raise InputError(s.where, field, found, expected)
     known = [signal.name for signal in plant.sensor_errors]
     for name, value in (s.sensor_errors or {}).items():
         if name not in known:
-            where = f"scenario {s.name}"
+            where = s.where
             raise InputError(where, f"sensor_errors.{name}", "an unknown error", "one of " + " ".join(known))
         if not math.isfinite(value):
-            raise InputError(f"scenario {s.name}", f"sensor_errors.{name}", repr(value), "a finite number")
+            raise InputError(s.where, f"sensor_errors.{name}", repr(value), "a finite number")
     driven, machines = s.fidelity != "force" and not own, machines_of(plant, s)
     dead_time = 0.0 if plant.sensors is None else plant.sensors.dead_time
     if dead_time and own:
         found = "sensors with a dead time beside electronics of their own pace"
-        raise InputError(f"scenario {s.name}", "fidelity", found, "force, or sensors without dead time")
+        raise InputError(s.where, "fidelity", found, "force, or sensors without dead time")
     late = split_dead_time(dead_time, c.sample_time)[0] if dead_time else None
     delay = plant.actuator.delay(c.sample_time) if s.delay is None else s.delay
-    require_short(f"scenario {s.name}", "delay", delay)
+    require_short(s.where, "delay", delay)
     return Setup(
         fidelity=s.fidelity,
         delay=delay,
@@ -394,5 +399,5 @@ def steps_of(plant: Plant, c: Controller, s: Scenario) -> int:
 
 def _require_few(count: float, s: Scenario, what: str) -> float:
     if count > MOST_SUBSTEPS:
-        raise InputError(f"scenario {s.name}", "substeps", f"{count:.3g} {what}", f"at most {MOST_SUBSTEPS}")
+        raise InputError(s.where, "substeps", f"{count:.3g} {what}", f"at most {MOST_SUBSTEPS}")
     return count

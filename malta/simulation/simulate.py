@@ -49,6 +49,7 @@ from malta.simulation.scenario import (
     MOST_SUBSTEPS,
     Scenario,
     Simulation,
+    machines_of,
     simulation_of,
     steps_of,
     substeps_of,
@@ -316,24 +317,17 @@ def stages_of(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Pl
 
     Raises InputError for unknown parameters, and for those that shape the machine's functions.
     """
-    stages = [(0, plant)]
-    for at, values in sorted(scenario.changes, key=lambda change: change[0]):
-        known = units_of(plant.parameters)
-        for name in values:
-            if name not in known:
-                expected = "one of " + " ".join(known)
-                raise InputError(
-                    f"scenario {scenario.name}", f"changes.{name}", "an unknown parameter", expected
-                )
-            if name in shape_parameters(plant.parameters):
-                found = "a parameter that shapes the machine's functions"
-                raise InputError(
-                    f"scenario {scenario.name}", f"changes.{name}", found, "one that enters them"
-                )
-        before = stages[-1][1]
-        par: Any = replace(before.parameters, **values)
-        stages.append((max(0, round(at / Ts) + scenario.settling_samples(Ts)), before.variant(par)))
-    return stages
+    known, shaping = units_of(plant.parameters), shape_parameters(plant.parameters)
+    for name in (name for _, values in scenario.changes for name in values):
+        if name not in known:
+            expected = "one of " + " ".join(known)
+            raise InputError(scenario.where, f"changes.{name}", "an unknown parameter", expected)
+        if name in shaping:
+            found = "a parameter that shapes the machine's functions"
+            raise InputError(scenario.where, f"changes.{name}", found, "one that enters them")
+    before = scenario.settling_samples(Ts)
+    firsts = [max(0, round(at / Ts) + before) for at in sorted(at for at, _ in scenario.changes)]
+    return list(zip([0, *firsts], machines_of(plant, scenario), strict=True))
 
 
 EngineOf = Callable[[Prepared, Plant, float], Engine]  # (what a run begins with, machine, substeps) -> engine
@@ -406,10 +400,10 @@ def _portions(
     Between portions the machine's parameters may change, and an outer loop may correct the reference.
     """
     simulation, (t, _, given), state, stages, steps, noise, fast = ready
-    _, controller, scenario, setup = simulation
-    samples = len(t)
-    observer = _observer(simulation) if setup.outside else None
-    every = _samples_between_stops(scenario, controller.sample_time)
+    plant, controller, scenario, setup = simulation
+    samples, correction = len(t), scenario.correction
+    watching = observer(simulation, steps_of(plant, controller, scenario)) if setup.outside else None
+    every = PORTION if correction is None else max(1, round(correction.every / controller.sample_time))
     longest = max(1, min(PORTION, int(WORK / steps)))
     done = 0
     for stop in _stops(every, longest, samples, [first for first, _ in stages]):
@@ -419,18 +413,18 @@ def _portions(
         else:
             engine = engine_of(now, controller, setup, steps, sensor_errors_of(scenario), choice)
         part = slice(done, stop)
-        if observer is None:
+        if watching is None:
             jitter = fast[substeps_until(done, steps) : substeps_until(stop, steps)]
             state, rows = engine.run(done, state, given[part], noise[part], jitter)
         else:
-            state, rows = observer(engine, now, state, given[part], noise[part])
-        ended = observer is None and engine.kind == "compiled"
+            state, rows = watching(engine, now, state, given[part], noise[part])
+        ended = watching is None and engine.kind == "compiled"
         rows, verdict = judge(simulation, rows, t[part], ended)
         done += len(rows)
         yield rows, verdict, engine.kind
-        if scenario.correction is not None and done < samples and done % every == 0:
+        if correction is not None and done < samples and done % every == 0:
             p = columns_of(simulation, rows[-1], "p")
-            offset = np.asarray(scenario.correction.update(float(t[done]), p), dtype=float)
+            offset = np.asarray(correction.update(float(t[done]), p), dtype=float)
             _correct(simulation, ready.inputs, slice(done, done + every), offset)
 
 
@@ -438,7 +432,7 @@ def _correct(simulation: Simulation, inputs: Inputs, ahead: slice, offset: Float
     """Add an outer loop's offset to the reference of the samples `ahead`, in place. Raises InputError for its shape."""
     t, motion, given = inputs
     if offset.shape != motion.p.shape[1:]:
-        where, expected = f"scenario {simulation.scenario.name}", f"{motion.p.shape[1]} numbers"
+        where, expected = simulation.scenario.where, f"{motion.p.shape[1]} numbers"
         raise InputError(where, "correction", f"shape {offset.shape}", expected)
     # The feedforward that is under way needs the samples before, with the reference that they had.
     before = min(ahead.start, samples_of_memory(simulation.controller))
@@ -466,17 +460,6 @@ def integration_error(run: Trajectory) -> float:
 def sensor_errors_of(scenario: Scenario) -> tuple[tuple[str, float], ...]:
     """Errors of the sensors by name, as a key of `engine_of`'s memory."""
     return tuple(sorted((scenario.sensor_errors or {}).items()))
-
-
-def _observer(simulation: Simulation) -> Observer:
-    """The Kalman filter of a scenario that asks for one."""
-
-    return observer(simulation, steps_of(simulation.plant, simulation.controller, simulation.scenario))
-
-
-def _samples_between_stops(scenario: Scenario, Ts: float) -> int:
-    """Samples from one correction of the reference to the next, or PORTION without corrections."""
-    return PORTION if scenario.correction is None else max(1, round(scenario.correction.every / Ts))
 
 
 def _stops(every: int, longest: int, samples: int, changes: list[int]) -> list[int]:

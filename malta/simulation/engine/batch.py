@@ -161,7 +161,7 @@ def simulate_many(
     """
     for name in ("faults", "changes", "correction"):
         if getattr(scenario, name):
-            raise InputError(f"scenario {scenario.name}", name, "some", "none in a campaign")
+            raise InputError(scenario.where, name, "some", "none in a campaign")
     simulation = simulation_of(plant, controller, _with_sensor_errors(scenario, sensor_errors))
     _check(simulation, workers)
     variation = _variation(plant, changes, sensor_errors, starts, first, noise)
@@ -378,7 +378,7 @@ def _with_sensor_errors(scenario: Scenario, sensor_errors: Mapping[str, FloatArr
 def _check(simulation: Simulation, workers: int | None) -> None:
     """InputError for a setup that a batch cannot simulate, or for no workers."""
     plant, _, scenario, setup = simulation
-    where = f"scenario {scenario.name}"
+    where = scenario.where
     if setup.outside:
         raise InputError(where, "estimator", scenario.estimator, "steady-state in a campaign")
     if electronics_of(plant, setup) is not None:

@@ -173,7 +173,7 @@ def fly_all(
     samples = sum(one.scenario.samples(controller.sample_time) for _, controller, one in flights)
     if samples > LONGEST:
         where, found = (
-            f"scenario {flights[0][2].scenario.name}",
+            flights[0][2].scenario.where,
             f"{len(flights)} of {samples:.4g} samples in all",
         )
         raise InputError(where, "runs", found, f"at most {LONGEST} samples")

@@ -42,7 +42,7 @@ from malta.model.data import plant_of
 from malta.model.equilibrium import balance
 from malta.model.machines import FINE
 from malta.model.parameters import units_of
-from malta.model.plant import FloatArray, Plant, Signal
+from malta.model.plant import FloatArray, Plant, Signal, placed
 from malta.simulation import references
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import (
@@ -158,10 +158,8 @@ def default_step(plant: Plant, output: int) -> float:
     probe = max(10 * plant.noise[output], SIZE)
     y[output] = probe
     if plant.contacts:
-        x = plant.at().x.copy()
-        positions = np.array(ca.DM(plant.position_of(ca.DM(y)))).ravel()
-        x[list(plant.controlled)[: len(positions)]] = positions
-        used = float(np.max(np.array(ca.DM(plant.contact(ca.DM(x))))))
+        x = placed(plant, ca.DM(plant.position_of(ca.DM(y))))
+        used = float(np.max(np.array(ca.DM(plant.contact(x)))))
         if used > 0:
             return probe * CLEARANCE / used
     return probe
