@@ -383,6 +383,7 @@ def _estimate_straightened(records: Sequence[_Record], log: Log, dropped: Mappin
     for _ in range(STRAIGHTENED):
         straight = [r._replace(spectrum=straightened(r.model, r.spectrum, r.at(theta))) for r in records]
         found = _search(straight, theta)
+        _require_told(straight, found)
         moved = np.abs(found.theta - theta) / np.sqrt(np.diag(found.covariance))
         theta = found.theta
         if (moved < SETTLED).all():
@@ -513,7 +514,6 @@ def _estimate(records: Sequence[_Record], log: Log, dropped: Mapping[str, float]
     """The machine that was found, and how white the residuals are. Raises CheckError where it is none."""
     theta, covariance, white, chi2, dof = found
     model, s, _ = records[0]
-    _require_told(records, found)
     outputs = (np.abs(np.concatenate(white)) ** 2).mean(axis=0).tolist()
     par, plant = model.plant.parameters, model.plant
     others = replace(model, names=tuple(n for n in acting(plant) if n not in model.names))
