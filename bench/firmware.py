@@ -24,7 +24,7 @@ from malta.firmware.cost import CLOCK, FLAGS, PROCESSORS, Processor, cost_on
 from malta.firmware.ctext import c_name, c_number, function_text, signature
 from malta.firmware.period_functions import decide, named_function, sense
 from malta.firmware.program import Precision, build_program, evaluate, lower
-from malta.firmware.signals import Target, input_fields, reference_fields, state_fields
+from malta.firmware.signals import Target
 from malta.firmware.sources import sources
 from malta.firmware.step import look_up, programs_of, started_state, step_function
 from malta.firmware.vectors import record_vectors
@@ -278,7 +278,7 @@ def cases(t: Target) -> list[Case]:
 def readings(t: Target) -> dict[str, Any]:
     """State, reference, readings and v0 at the thirtieth sample of a stroke."""
     vector = record_vectors(t)[0]
-    fields = [*reference_fields(t), *input_fields(t)]
+    fields = [*t.reference_fields, *t.input_fields]
     ends = np.cumsum([field.size for field in fields])[:-1]
     rows = [
         dict(zip((field.name for field in fields), np.split(row, ends), strict=True))
@@ -287,7 +287,7 @@ def readings(t: Target) -> dict[str, Any]:
     state, step = started_state(t, rows[0]), step_function(t)
     for row in rows[:29]:
         state, _ = step(state, row, row)
-    none = {field.name: np.zeros(0) for field in state_fields(t) if not field.size}
+    none = {field.name: np.zeros(0) for field in t.state_fields if not field.size}
     z = rows[29]["y"][t.believed.stroke_output]
     return {**none, **state, **rows[29], "v0": look_up(t, z)}
 

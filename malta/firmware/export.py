@@ -39,17 +39,7 @@ from malta.firmware.ctext import c_name, c_number
 from malta.firmware.fmu import Part, build_fmu
 from malta.firmware.period_functions import LINK_RANGE
 from malta.firmware.program import Precision
-from malta.firmware.signals import (
-    Field,
-    Target,
-    current_readings,
-    fidelity_of,
-    input_fields,
-    output_fields,
-    reading_ranges,
-    reference_fields,
-    state_fields,
-)
+from malta.firmware.signals import Field, Target, fidelity_of, reading_ranges
 from malta.firmware.sources import (
     RISES,
     comment,
@@ -174,7 +164,7 @@ def _outputs(t: Target) -> Iterator[Entry]:
         "v": np.asarray(c.limits.force, dtype=float),
         "current": np.broadcast_to(c.limits.current, len(t.believed.actuator.coils)),
     }
-    for field in output_fields(t):
+    for field in t.output_fields:
         limits = np.minimum(most.get(field.name, np.full(field.size, WIDE)), WIDE)
         for label, signal, limit in zip(_labels(field), field.signals, limits, strict=True):
             unit = "" if signal.unit in ("SI", "1") else signal.unit
@@ -226,7 +216,7 @@ def folder_files(
         "c_files": " ".join(c_files),
         "driven": t.driven,
         "logged": t.logged > 0,
-        "currents": len(current_readings(t)) if t.driven else 0,
+        "currents": len(t.current_readings) if t.driven else 0,
         **stand_in_context(t, name),
         **_example_context(t),
     }
@@ -270,10 +260,10 @@ def _test_context(t: Target) -> dict[str, Any]:
         "last_field": "command" if t.driven or t.has_set_points else "current",
         "fnv_start": FNV_START,
         "fnv_factor": FNV_FACTOR,
-        "reference_all": reference_fields(t),
-        "input_all": input_fields(t),
-        "output_all": _filled(output_fields(t)),
-        "state_all": _filled(state_fields(t)),
+        "reference_all": t.reference_fields,
+        "input_all": t.input_fields,
+        "output_all": _filled(t.output_fields),
+        "state_all": _filled(t.state_fields),
         "vectors": [_vector_text(v, t.precision) for v in vectors],
     }
 

@@ -19,14 +19,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.firmware.ctext import c_name
 from malta.firmware.program import Precision
-from malta.firmware.signals import (
-    Field,
-    Target,
-    input_fields,
-    output_fields,
-    reference_fields,
-    state_fields,
-)
+from malta.firmware.signals import Field, Target
 from malta.firmware.sources import sources
 from malta.model.plant import FloatArray, Plant
 from malta.simulation.engine.compiled import library
@@ -80,17 +73,17 @@ def compile_controller(t: Target) -> Native:
     def record(title: str, fields: list[Field], more: tuple[tuple[str, Any], ...] = ()) -> Any:
         return record_type(title, (*((f.name, real * f.size) for f in fields if f.size), *more))
 
-    Reference = record("Reference", reference_fields(t))
+    Reference = record("Reference", t.reference_fields)
     addresses = ("z", "v0", "parameters") if t.tunable else ("z", "v0")
     table = (*((key, ctypes.c_void_p) for key in addresses), ("points", ctypes.c_int32))
     return Native(
         t,
         lib,
         name,
-        record("State", state_fields(t), (("reference", Reference), *table)),
+        record("State", t.state_fields, (("reference", Reference), *table)),
         Reference,
-        record("Inputs", input_fields(t)),
-        record("Outputs", output_fields(t)),
+        record("Inputs", t.input_fields),
+        record("Outputs", t.output_fields),
     )
 
 
@@ -324,11 +317,11 @@ def _first_state(native: Native, sizes: Layout, ready: Prepared) -> Any:
         view(state.reference, name)[:] = values
     call(native, "start", state)
     known = places_of(sizes.controller, sum(sizes.machine.values()))
-    for field in state_fields(native.target):
+    for field in native.target.state_fields:
         if field.name in known and field.size:
             view(state, field.name)[:] = start[known[field.name]]
     machine = places_of(sizes.machine)
-    if "i_last" in {f.name for f in state_fields(native.target)}:
+    if "i_last" in {f.name for f in native.target.state_fields}:
         view(state, "i_last")[:] = start[machine["i_phase" if "i_phase" in machine else "i"]]
     return state
 

@@ -47,7 +47,7 @@ from malta.firmware.machine import (
     state_field,
     wrench_fields,
 )
-from malta.firmware.signals import Field, Target, input_fields, output_fields, reference_fields
+from malta.firmware.signals import Field, Target
 from malta.firmware.sources import comment, head_context, render, sources
 from malta.firmware.supervisor import STATES
 from malta.firmware.supervisor_text import request_members, supervisor_sources
@@ -166,12 +166,12 @@ def unit_of(t: Target, part: Part) -> Unit:
 def _groups(t: Target, part: Part, m: Machine | None) -> Iterator[Group]:
     """The fields of a part in the order of their value references: inputs, parameters, outputs, what is inside."""
     if part != "machine":
-        for f in reference_fields(t):
+        for f in t.reference_fields:
             yield Group(f._replace(name=f"{f.name}_ref"), "input", "continuous", 0.0)
     if part == "supervised":
         yield Group(request_field(), "input", "discrete", 0.0)
     if m is None:
-        for f in input_fields(t):
+        for f in t.input_fields:
             valid = f.name.endswith("_valid")
             start = 1.0 if valid else t.believed.drive.link_voltage if f.name == "link" else 0.0
             yield Group(f, "input", "discrete" if valid else "continuous", start)
@@ -188,7 +188,7 @@ def _groups(t: Target, part: Part, m: Machine | None) -> Iterator[Group]:
     for p in parameters_of(t):
         yield Group(p.field, "parameter", "tunable", p.values, p.least, p.most)
     if part != "machine":
-        for f in output_fields(t):
+        for f in t.output_fields:
             yield Group(f, "output", "discrete")
     if part == "supervised":
         yield Group(supervision_field(), "output", "discrete")
@@ -288,7 +288,7 @@ def _library_context(u: Unit, token: str) -> dict[str, Any]:
     t, c, m = u.target, u.target.controller, u.machine
     roles = "".join(v.role for v in u.variables)
     starts = [c_number(v.start or 0.0, "double") for v in u.variables]
-    inputs = [f for f in input_fields(t) if f.size]
+    inputs = [f for f in t.input_fields if f.size]
 
     def places(fields: list[Field], suffix: str = "") -> list[dict[str, Any]]:
         return [
@@ -320,9 +320,9 @@ def _library_context(u: Unit, token: str) -> dict[str, Any]:
             "roles": [roles[k : k + 80] for k in range(0, len(roles), 80)],
             "starts": ",\n".join("  " + ", ".join(starts[k : k + 8]) for k in range(0, len(starts), 8)),
             "one": c_number(1.0, t.precision),
-            "reference": places(reference_fields(t), "_ref"),
+            "reference": places(t.reference_fields, "_ref"),
             "inputs": places(inputs),
-            "outputs": places(output_fields(t)),
+            "outputs": places(t.output_fields),
             "readings": [] if m is None else places(reading_fields(m)),
             "checked": places(checked),
             "states": len(t.believed.states),

@@ -24,7 +24,7 @@ import numpy as np
 from malta.firmware.ctext import c_number, c_numbers, function_text, signature
 from malta.firmware.period_functions import named_function, symbols
 from malta.firmware.program import Program, build_program, lower
-from malta.firmware.signals import Field, Target, current_readings, output_fields
+from malta.firmware.signals import Field, Target
 from malta.firmware.sources import call_text, comment, head_context, number_rows, render, root_context
 from malta.model.parameters import acting_names, twins_of, units_of
 from malta.model.plant import Plant, Signal, symbolic
@@ -138,7 +138,7 @@ class Machine:
 
 def command_field(t: Target) -> Field:
     """What the controller commands and the machine takes: duty cycles, shares, set points, or currents of coils."""
-    fields = {f.name: f for f in output_fields(t)}
+    fields = {f.name: f for f in t.output_fields}
     return fields.get("command", fields["current"])
 
 
@@ -169,7 +169,7 @@ def reading_fields(m: Machine) -> list[Field]:
     fields = [Field("p", plant.outputs, "true outputs"), Field("y", plant.outputs, "readings of the sensors")]
     if m.target.driven:
         fields += [
-            Field("i", current_readings(m.target), "currents as they are read"),
+            Field("i", m.target.current_readings, "currents as they are read"),
             Field("link", (Signal("V_link", "V"),), "voltage of the DC link"),
         ]
     else:

@@ -19,15 +19,7 @@ import numpy as np
 from malta.firmware.blocks import Staged, staged_function
 from malta.firmware.calibration import law_arguments, law_symbols
 from malta.firmware.program import as_written
-from malta.firmware.signals import (
-    Field,
-    Target,
-    input_fields,
-    output_fields,
-    reading_ranges,
-    reference_fields,
-    state_fields,
-)
+from malta.firmware.signals import Field, Target, reading_ranges
 from malta.model.equations import note, recorded_equations, recorded_look_ups
 from malta.model.plant import FloatArray, placed
 from malta.simulation.current_control import control_currents
@@ -75,9 +67,9 @@ def sense(t: Target) -> Staged:
     c = t.controller
     a = symbols(
         [
-            *(f for f in state_fields(t) if f.name == "xi_pred"),
-            *(f for f in reference_fields(t) if f.name == "p" or (f.name == "dp" and t.look_ups)),
-            *(f for f in input_fields(t) if f.name in ("y", "y_valid")),
+            *(f for f in t.state_fields if f.name == "xi_pred"),
+            *(f for f in t.reference_fields if f.name == "p" or (f.name == "dp" and t.look_ups)),
+            *(f for f in t.input_fields if f.name in ("y", "y_valid")),
         ]
     )
     reach = reading_ranges(t.believed)
@@ -115,8 +107,8 @@ def decide(t: Target) -> Staged:
 
     It consists of the functions of synthesis/controller.py and simulation/current_control.py, as a simulation does.
     """
-    state, reference = symbols(state_fields(t)), symbols(reference_fields(t))
-    read = symbols([f for f in input_fields(t) if f.name in ("i", "i_valid", "link", "excitation")])
+    state, reference = symbols(t.state_fields), symbols(t.reference_fields)
+    read = symbols([f for f in t.input_fields if f.name in ("i", "i_valid", "link", "excitation")])
     y, v0 = ca.SX.sym("y_used", len(t.controller.measurements)), ca.SX.sym("v0", len(t.controller.forces))
     table = ca.SX.sym("table", table_size(t))
     with recorded_equations() as equations:
@@ -133,8 +125,8 @@ def decide(t: Target) -> Staged:
             out["command"], electric = drive_currents(t, numbers(t), state, read, out["current"], known, sums)
             after |= electric
     after |= sums.rests
-    results = {f.name: after.get(f.name, state[f.name]) for f in state_fields(t)}
-    results |= {f.name: out[f.name] for f in output_fields(t) if f.name in out}
+    results = {f.name: after.get(f.name, state[f.name]) for f in t.state_fields}
+    results |= {f.name: out[f.name] for f in t.output_fields if f.name in out}
     arguments = {
         **state,
         **reference,
@@ -367,7 +359,7 @@ def drive_currents(
 
 def state_at(t: Target) -> Staged:
     """(p, dp, ddp, v0) -> state: the filter knows the machine to follow the reference, which has been so before."""
-    reference = symbols(reference_fields(t))
+    reference = symbols(t.reference_fields)
     v0 = ca.SX.sym("v0", len(t.controller.forces))
     with recorded_equations() as equations:
         state = _state_on_reference(t, reference, v0)
@@ -380,7 +372,7 @@ def state_at(t: Target) -> Staged:
 def _state_on_reference(t: Target, reference: dict[str, Any], v0: Any) -> dict[str, Any]:
     """The state by name, on a reference that has been so before."""
     c, plant = t.controller, t.believed
-    state: dict[str, Any] = {f.name: ca.SX.zeros(f.size) for f in state_fields(t)}
+    state: dict[str, Any] = {f.name: ca.SX.zeros(f.size) for f in t.state_fields}
     p, dp = reference["p"], reference["dp"]
     if c.tracks == "states":
         v_ff = feedforward(t, p, dp, reference["ddp"])

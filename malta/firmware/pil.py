@@ -25,7 +25,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.files import locate
 from malta.firmware.program import Precision
-from malta.firmware.signals import Target, fidelity_of, input_fields, reference_fields
+from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.vectors import SAMPLES, Vector, record_vectors
 from malta.gains.file import content_of, read
 from malta.model.data import plant_of
@@ -362,7 +362,7 @@ def _target_of(line: Line, path: Path, sha256: str) -> Target:
     c = read(path)
     depth: Fidelity = fidelity_of(plant_of(c.parameters)) if h.commands else "force"
     t = Target(c, "double" if h.real_bytes == 8 else "float", depth)
-    read_at_once = sum(f.size for f in (*reference_fields(t), *input_fields(t)))
+    read_at_once = sum(f.size for f in (*t.reference_fields, *t.input_fields))
     return replace(t, excited=h.readings > read_at_once)
 
 

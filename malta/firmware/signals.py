@@ -129,116 +129,120 @@ class Target:
         """Whether sums keep what rounding took from them: in single precision they would stop moving."""
         return self.precision == "float"
 
+    @cached_property
+    def state_fields(self) -> list[Field]:
+        """What the controller remembers from one sample to the next."""
+        c, m = self.controller, self.controller.forces
+        errors = tuple(Signal(f"sum of {s.name}* - {s.name}", f"{s.unit} s") for s in c.measurements)
+        fields = [
+            Field("xi_pred", c.states, "what the filter expects of the states at the next sample"),
+            Field("e", errors, "sums of the errors p* - y"),
+            Field("frozen", signals_after("waits ", c.measurements, "1"), "1 where the sum of errors waits"),
+        ]
+        if self.compensated:
+            fields.append(Field("e_rest", errors, "what rounding took from the sums of errors"))
+            if self.summing_states:
+                fields.append(Field("xi_rest", c.states, "the same, of states that sum up"))
+        if c.tracks == "states" and (c.lagging or c.delay):
+            ages = range(c.delay, 0, -1)
+            stored = [Signal(f"{s.name}*[k-{age}]", s.unit) for age in ages for s in m]
+            lag = [Signal(f"{s.name}*[i]", s.unit) for s in m] if c.lagging else []
+            forward = (
+                [Signal(f"{s.name}_ff[k-{age}]", s.unit) for age in ages for s in m] if c.lagging else []
+            )
+            fields.append(
+                Field("memory", (*lag, *stored, *forward), "references of forces that are under way")
+            )
+        if self.driven:
+            drive = self.believed.drive
+            volts = tuple(Signal(s.name.replace("i_", "u_"), "V") for s in drive.axes)
+            fields.append(Field("u_integral", volts, "integrals of the current loops"))
+            fields.append(
+                Field(
+                    "u_limited",
+                    signals_after("limited ", drive.axes, "1"),
+                    "1 where a half-bridge was at its limit",
+                )
+            )
+            if self.compensated:
+                fields.append(Field("u_rest", volts, "what rounding took from the integrals"))
+            fields.append(Field("i_last", self.current_readings, "the last valid readings of currents"))
+            fields.append(Field("link_last", (Signal("V_link", "V"),), "the last valid reading of the link"))
+        return fields
+
+    @cached_property
+    def reference_fields(self) -> list[Field]:
+        """The reference of a sample."""
+        outputs = self.controller.measurements
+        return [
+            Field("p", signals_after("", outputs, "", "*"), "reference"),
+            Field("dp", tuple(Signal(f"{s.name}*'", f"{s.unit}/s") for s in outputs), "its rate"),
+            Field("ddp", tuple(Signal(f"{s.name}*''", f"{s.unit}/s^2") for s in outputs), "its acceleration"),
+        ]
+
+    @cached_property
+    def input_fields(self) -> list[Field]:
+        """What is read at a sample."""
+        outputs = self.controller.measurements
+        fields = [
+            Field("y", outputs, "measured outputs"),
+            Field("y_valid", signals_after("valid ", outputs, "1"), "1 where a reading may be used, else 0"),
+        ]
+        if self.driven:
+            fields += [
+                Field("i", self.current_readings, "measured currents"),
+                Field(
+                    "i_valid",
+                    signals_after("valid ", self.current_readings, "1"),
+                    "1 where a reading may be used, else 0",
+                ),
+                Field("link", (Signal("V_link", "V"),), "measured voltage of the DC link"),
+            ]
+        if self.excited:
+            meaning = "forces beside those of the law, which the filter knows as sent"
+            fields.append(Field("excitation", signals_after("exc ", self.controller.forces, ""), meaning))
+        return fields
+
+    @cached_property
+    def output_fields(self) -> list[Field]:
+        """What is commanded at a sample, and what else a supervisor or a log wants of it."""
+        c, plant = self.controller, self.believed
+        outputs = c.measurements
+        fields = [
+            Field("y_used", outputs, "readings, or what the filter expected in place of refused ones"),
+            Field("refused", signals_after("refused ", outputs, "1"), "1 where a reading was refused"),
+            Field("xi_hat", c.states, "estimated states"),
+            Field("v", c.forces, "commanded forces, within their limits"),
+            Field("saturated", signals_after("limited ", c.forces, "1"), "1 where a force is at its limit"),
+            Field("current", plant.actuator.coils, "commanded currents"),
+            Field("met", (Signal("current limit", "1"),), "1 where a current is at its limit"),
+        ]
+        if self.has_set_points:
+            electronics = electronics_of(plant, self.setup)
+            points = () if electronics is None else electronics.set_points
+            fields.append(Field("command", points, "set points of the electronics"))
+        elif self.driven:
+            phases = plant.drive.phases if self.fidelity == "phase" else plant.drive.axes
+            sign = "d_" if self.fidelity == "phase" else "m_"
+            meaning = (
+                "duty cycles of the half-bridges"
+                if sign == "d_"
+                else "voltages of the axes as shares of the link's"
+            )
+            fields.append(
+                Field("command", tuple(Signal(s.name.replace("i_", sign), "1") for s in phases), meaning)
+            )
+        return fields
+
+    @property
+    def current_readings(self) -> tuple[Signal, ...]:
+        """The currents that the current loops read."""
+        return self.believed.drive.phases if self.fidelity == "phase" else self.believed.drive.axes
+
 
 def fidelity_of(plant: Plant) -> Fidelity:
     """How far down a machine's controller can be exported."""
     return fidelities(plant)[-1]
-
-
-def state_fields(t: Target) -> list[Field]:
-    """What the controller remembers from one sample to the next."""
-    c, m = t.controller, t.controller.forces
-    errors = tuple(Signal(f"sum of {s.name}* - {s.name}", f"{s.unit} s") for s in c.measurements)
-    fields = [
-        Field("xi_pred", c.states, "what the filter expects of the states at the next sample"),
-        Field("e", errors, "sums of the errors p* - y"),
-        Field("frozen", signals_after("waits ", c.measurements, "1"), "1 where the sum of errors waits"),
-    ]
-    if t.compensated:
-        fields.append(Field("e_rest", errors, "what rounding took from the sums of errors"))
-        if t.summing_states:
-            fields.append(Field("xi_rest", c.states, "the same, of states that sum up"))
-    if c.tracks == "states" and (c.lagging or c.delay):
-        ages = range(c.delay, 0, -1)
-        stored = [Signal(f"{s.name}*[k-{age}]", s.unit) for age in ages for s in m]
-        lag = [Signal(f"{s.name}*[i]", s.unit) for s in m] if c.lagging else []
-        forward = [Signal(f"{s.name}_ff[k-{age}]", s.unit) for age in ages for s in m] if c.lagging else []
-        fields.append(Field("memory", (*lag, *stored, *forward), "references of forces that are under way"))
-    if t.driven:
-        drive = t.believed.drive
-        volts = tuple(Signal(s.name.replace("i_", "u_"), "V") for s in drive.axes)
-        fields.append(Field("u_integral", volts, "integrals of the current loops"))
-        fields.append(
-            Field(
-                "u_limited",
-                signals_after("limited ", drive.axes, "1"),
-                "1 where a half-bridge was at its limit",
-            )
-        )
-        if t.compensated:
-            fields.append(Field("u_rest", volts, "what rounding took from the integrals"))
-        fields.append(Field("i_last", current_readings(t), "the last valid readings of currents"))
-        fields.append(Field("link_last", (Signal("V_link", "V"),), "the last valid reading of the link"))
-    return fields
-
-
-def reference_fields(t: Target) -> list[Field]:
-    """The reference of a sample."""
-    outputs = t.controller.measurements
-    return [
-        Field("p", signals_after("", outputs, "", "*"), "reference"),
-        Field("dp", tuple(Signal(f"{s.name}*'", f"{s.unit}/s") for s in outputs), "its rate"),
-        Field("ddp", tuple(Signal(f"{s.name}*''", f"{s.unit}/s^2") for s in outputs), "its acceleration"),
-    ]
-
-
-def input_fields(t: Target) -> list[Field]:
-    """What is read at a sample."""
-    outputs = t.controller.measurements
-    fields = [
-        Field("y", outputs, "measured outputs"),
-        Field("y_valid", signals_after("valid ", outputs, "1"), "1 where a reading may be used, else 0"),
-    ]
-    if t.driven:
-        fields += [
-            Field("i", current_readings(t), "measured currents"),
-            Field(
-                "i_valid",
-                signals_after("valid ", current_readings(t), "1"),
-                "1 where a reading may be used, else 0",
-            ),
-            Field("link", (Signal("V_link", "V"),), "measured voltage of the DC link"),
-        ]
-    if t.excited:
-        meaning = "forces beside those of the law, which the filter knows as sent"
-        fields.append(Field("excitation", signals_after("exc ", t.controller.forces, ""), meaning))
-    return fields
-
-
-def output_fields(t: Target) -> list[Field]:
-    """What is commanded at a sample, and what else a supervisor or a log wants of it."""
-    c, plant = t.controller, t.believed
-    outputs = c.measurements
-    fields = [
-        Field("y_used", outputs, "readings, or what the filter expected in place of refused ones"),
-        Field("refused", signals_after("refused ", outputs, "1"), "1 where a reading was refused"),
-        Field("xi_hat", c.states, "estimated states"),
-        Field("v", c.forces, "commanded forces, within their limits"),
-        Field("saturated", signals_after("limited ", c.forces, "1"), "1 where a force is at its limit"),
-        Field("current", plant.actuator.coils, "commanded currents"),
-        Field("met", (Signal("current limit", "1"),), "1 where a current is at its limit"),
-    ]
-    if t.has_set_points:
-        electronics = electronics_of(plant, t.setup)
-        points = () if electronics is None else electronics.set_points
-        fields.append(Field("command", points, "set points of the electronics"))
-    elif t.driven:
-        phases = plant.drive.phases if t.fidelity == "phase" else plant.drive.axes
-        sign = "d_" if t.fidelity == "phase" else "m_"
-        meaning = (
-            "duty cycles of the half-bridges"
-            if sign == "d_"
-            else "voltages of the axes as shares of the link's"
-        )
-        fields.append(
-            Field("command", tuple(Signal(s.name.replace("i_", sign), "1") for s in phases), meaning)
-        )
-    return fields
-
-
-def current_readings(t: Target) -> tuple[Signal, ...]:
-    """The currents that the current loops read."""
-    return t.believed.drive.phases if t.fidelity == "phase" else t.believed.drive.axes
 
 
 def signals_after(before: str, signals: tuple[Signal, ...], unit: str, after: str = "") -> tuple[Signal, ...]:

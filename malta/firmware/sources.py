@@ -29,15 +29,7 @@ from malta.firmware.ctext import (
 )
 from malta.firmware.period_functions import table_size
 from malta.firmware.program import TYPES, Precision, Program, build_program, lower
-from malta.firmware.signals import (
-    Field,
-    Target,
-    input_fields,
-    output_fields,
-    place_of_readings,
-    reference_fields,
-    state_fields,
-)
+from malta.firmware.signals import Field, Target, place_of_readings
 from malta.firmware.step import programs_of
 from malta.firmware.supervisor import JUMP, MOST_RATE, bounds_of, reading_deviations, reference_limits
 from malta.model.plant import FloatArray, Signal, placed
@@ -109,8 +101,8 @@ def template_context(t: Target, programs: Mapping[str, Program], name: str, sha2
         "period": f"{c.sample_time * 1e6:g} us",
         "sample_time": c_number(c.sample_time, t.precision),
         "records": _records(t, name),
-        "state": state_fields(t),
-        "reference": reference_fields(t),
+        "state": t.state_fields,
+        "reference": t.reference_fields,
         "sums": _sums(t),
         "forces": len(c.forces),
         "outputs": len(c.measurements),
@@ -161,11 +153,11 @@ def _function_context(t: Target, programs: Mapping[str, Program], name: str) -> 
 def step_places(t: Target, name: str) -> dict[str, Place]:
     """Where the vectors of a step are: in the records of the header; v0 and the table's values are the step's own."""
     state, given, out = f"{name}_state", f"{name}_inputs", f"{name}_outputs"
-    places = {f.name: member_place(state, "s", f.name) for f in state_fields(t)}
+    places = {f.name: member_place(state, "s", f.name) for f in t.state_fields}
     places |= {f"{key}_next": place for key, place in places.items()}
-    places |= {f.name: member_place(state, "s", f"reference.{f.name}") for f in reference_fields(t)}
-    places |= {f.name: member_place(given, "in", f.name) for f in input_fields(t)}
-    places |= {f.name: member_place(out, "out", f.name) for f in output_fields(t)}
+    places |= {f.name: member_place(state, "s", f"reference.{f.name}") for f in t.reference_fields}
+    places |= {f.name: member_place(given, "in", f.name) for f in t.input_fields}
+    places |= {f.name: member_place(out, "out", f.name) for f in t.output_fields}
     places |= {f.name: member_place(state, "s", f"parameters->{f.name}") for f in law_fields(t)}
     sizes = {"v0": len(t.controller.forces), "table_at": 2 * len(t.look_ups), "table": table_size(t)}
     return places | {key: array_place(key, size, name) for key, size in sizes.items()}
@@ -303,10 +295,10 @@ def _records(t: Target, n: str) -> list[dict[str, Any]]:
     remembered = "What the controller remembers from one sample to the next."
     found: list[tuple[str, str, list[Field], list[str]]] = [
         *([_parameter_record(t)] if t.tunable else []),
-        ("reference", "The reference of a sample.", reference_fields(t), []),
-        ("state", remembered, state_fields(t), beside),
-        ("inputs", "What is read at a sample.", input_fields(t), []),
-        ("outputs", commanded, output_fields(t), []),
+        ("reference", "The reference of a sample.", t.reference_fields, []),
+        ("state", remembered, t.state_fields, beside),
+        ("inputs", "What is read at a sample.", t.input_fields, []),
+        ("outputs", commanded, t.output_fields, []),
     ]
     if t.believed.has_stroke:
         reals = (("start", "m"), ("end", "m"), ("rise", "s, 10 to 90 %"))
@@ -352,7 +344,7 @@ def comment(text: str) -> str:
 def _sums(t: Target) -> list[dict[str, Any]]:
     """The fields that `reset_integrators` sets to zero."""
     c = t.controller
-    sizes = {f.name: f.size for f in state_fields(t)}
+    sizes = {f.name: f.size for f in t.state_fields}
     whole = ("e", "e_rest", "frozen", "xi_rest", "u_integral", "u_limited", "u_rest")
     found = [{"name": key, "first": 0, "end": sizes[key]} for key in whole if sizes.get(key)]
     if c.observed:
@@ -509,10 +501,10 @@ def ring_of(t: Target, sha256: str) -> Ring:
     ring_of(Target(controller, logged=0.1), sha256).memory
     """
     c = t.controller
-    parts = {"reference": reference_fields(t), "in": input_fields(t), "out": output_fields(t)}
+    parts = {"reference": t.reference_fields, "in": t.input_fields, "out": t.output_fields}
     sample = tuple((f"{part}.{f.name}", f) for part, fields in parts.items() for f in fields if f.size)
     sample += (("flown", FLOWN),)
-    state = tuple(f for f in state_fields(t) if f.size)
+    state = tuple(f for f in t.state_fields if f.size)
     # Of a huge time the block is not computed: its memory is refused.
     block = math.ceil(min(t.logged / c.sample_time, LARGEST) / SHARE - 1e-9)
     head = {
@@ -562,7 +554,7 @@ def ring_sources(t: Target, sha256: str, name: str) -> dict[str, str]:
         "members": MEMBERS,
         "magic": ", ".join(f"'{letter}'" for letter in MAGIC.decode()),
         "placed_state": list(zip(ring.state, starts, strict=False)),
-        "reference": reference_fields(t),
+        "reference": t.reference_fields,
         "outputs": len(t.controller.measurements),
         "zero": c_number(0.0, t.precision),
     }

@@ -27,7 +27,7 @@ from malta.firmware.period_functions import (
     table_size,
 )
 from malta.firmware.program import Program, evaluate
-from malta.firmware.signals import Field, Target, input_fields, reference_fields, state_fields
+from malta.firmware.signals import Field, Target
 from malta.model.equations import interpolate, note, recorded_equations
 from malta.model.plant import Plant
 from malta.simulation import references
@@ -74,7 +74,7 @@ def _law_pieces(t: Target) -> list[Staged]:
     n, m, outputs = len(c.states), len(c.forces), len(c.measurements)
     sizes = dict.fromkeys(("raw", "gain", "offset", "y", "e", "frozen"), outputs)
     sizes |= {"xi_pred": n, "xi_hat": n, "xi_ref": n, "v_ff": m, "v0": m}
-    reference = symbols(reference_fields(t))
+    reference = symbols(t.reference_fields)
 
     def some(*names: str) -> dict[str, Any]:
         return {
@@ -145,8 +145,8 @@ def _current_pieces(t: Target) -> list[Staged]:
 def _current_control(t: Target, current: Any) -> Staged:
     """The PI current loops alone; `states` are those of the machine's design model, estimated or of the readings."""
     names = ("u_integral", "u_limited", "i_last", "link_last", "u_rest")
-    state = symbols(_chosen(state_fields(t), names))
-    read = symbols(_chosen(input_fields(t), ("i", "i_valid", "link")))
+    state = symbols(_chosen(t.state_fields, names))
+    read = symbols(_chosen(t.input_fields, ("i", "i_valid", "link")))
     known = ca.SX.sym("states", len(t.controller.A))
 
     def control(**_: Any) -> dict[str, Any]:
@@ -260,7 +260,7 @@ def read_table(t: Target, places: Any) -> Any:
 def first_state(t: Target) -> Vectors:
     """The state that `init` leaves: at rest, knowing nothing."""
     real = t.real
-    state = {f.name: np.zeros(f.size, dtype=real) for f in state_fields(t) if f.size}
+    state = {f.name: np.zeros(f.size, dtype=real) for f in t.state_fields if f.size}
     if t.driven:
         state["link_last"] = np.array([t.believed.drive.link_voltage], dtype=real)
     return state
@@ -275,7 +275,7 @@ def started_state(t: Target, reference: Mapping[str, Any]) -> Vectors:
 def step_function(t: Target) -> Step:
     """(state, reference, readings) -> (state, outputs): one step, by the names of signals.py."""
     sense, decide = programs_of(t)["sense"], programs_of(t)["decide"]
-    none = {f.name: np.zeros(0) for f in state_fields(t) if not f.size}
+    none = {f.name: np.zeros(0) for f in t.state_fields if not f.size}
     law = law_values(t)
 
     def step(
@@ -297,4 +297,4 @@ def step_function(t: Target) -> Step:
 
 def zero_reference(t: Target) -> Vectors:
     """A reference at rest at zero."""
-    return {f.name: np.zeros(f.size) for f in reference_fields(t)}
+    return {f.name: np.zeros(f.size) for f in t.reference_fields}

@@ -24,13 +24,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.firmware.signals import (
-    Target,
-    current_readings,
-    place_of_readings,
-    reading_ranges,
-    used_clearances,
-)
+from malta.firmware.signals import Target, place_of_readings, reading_ranges, used_clearances
 from malta.model.plant import FloatArray, Plant, placed
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import noise_input
@@ -500,7 +494,7 @@ def current_deviations(t: Target) -> ca.Function:
     Readings of phases are turned to axes where the filter expects the machine.
     """
     plant, drive = t.believed, t.believed.drive
-    i, current = ca.SX.sym("i", len(current_readings(t))), ca.SX.sym("current", len(plant.actuator.coils))
+    i, current = ca.SX.sym("i", len(t.current_readings)), ca.SX.sym("current", len(plant.actuator.coils))
     y = ca.SX.sym("expected", len(plant.outputs))
     axes = drive.to_axes(place_of_readings(plant, y)) @ i if t.fidelity == "phase" else i
     command = drive.command(current)

@@ -31,7 +31,7 @@ from malta.firmware.flight import (
     view,
 )
 from malta.firmware.program import Precision, Program, build_program, lower
-from malta.firmware.signals import Target, current_readings, input_fields, output_fields
+from malta.firmware.signals import Target
 from malta.firmware.sources import arithmetic_context, head_context, render, sources
 from malta.firmware.supervisor import (
     FLYING,
@@ -150,10 +150,10 @@ def supervisor_members(t: Target) -> list[Member]:
     if t.tunable:
         members.append(Member("parameters", "parameters", 0, "those of the controller's last step"))
     if t.driven:
-        members.append(Member("real", "offset", len(current_readings(t)), "A, of the current sensors"))
+        members.append(Member("real", "offset", len(t.current_readings), "A, of the current sensors"))
         members.append(Member("real", "current", len(t.believed.actuator.coils), "A, commanded"))
         members.append(Member("int32_t", "commanded", 0, "1 where the last command was another one"))
-        members.append(Member("real", "i_before", len(current_readings(t)), "A, last readings"))
+        members.append(Member("real", "i_before", len(t.current_readings), "A, last readings"))
         members.append(
             Member("real", "off_mean", len(t.believed.drive.axes), "A, of axes off their commands")
         )
@@ -205,9 +205,9 @@ def _context(t: Target, name: str) -> dict[str, Any]:
         "outputs": len(c.measurements),
         "forces": len(c.forces),
         "estimated": len(c.states),
-        "input_fields": input_fields(t),
-        "output_fields": [f for f in output_fields(t) if f.size],
-        "currents": len(current_readings(t)) if t.driven else 0,
+        "input_fields": t.input_fields,
+        "output_fields": [f for f in t.output_fields if f.size],
+        "currents": len(t.current_readings) if t.driven else 0,
         "link": _number(plant.drive.link_voltage, t) if t.driven else "",
         "coils": len(plant.actuator.coils),
         "axes": len(plant.drive.axes) if t.driven else 0,
@@ -328,7 +328,7 @@ def _off_command(t: Target) -> list[float]:
         return [float(v) for v in np.array(ca.evalf(ca.densify(held))).ravel()]
     if not t.driven:
         return []
-    return [0.5] * len(current_readings(t)) if t.fidelity == "phase" else [0.0] * len(current_readings(t))
+    return [0.5] * len(t.current_readings) if t.fidelity == "phase" else [0.0] * len(t.current_readings)
 
 
 def _records(t: Target, name: str) -> list[dict[str, Any]]:

@@ -18,14 +18,7 @@ import numpy as np
 from malta.firmware.calibration import FNV_FACTOR, FNV_START
 from malta.firmware.ctext import c_number, c_numbers
 from malta.firmware.program import Program, evaluate
-from malta.firmware.signals import (
-    Target,
-    input_fields,
-    output_fields,
-    reading_ranges,
-    reference_fields,
-    state_fields,
-)
+from malta.firmware.signals import Target, reading_ranges
 from malta.firmware.sources import FUSED, call_text, piece_records, readings_at_rest
 from malta.firmware.step import first_state, programs_of, started_state, step_function, zero_reference
 from malta.firmware.supervisor import (
@@ -136,7 +129,7 @@ def _damage(t: Target, flight: dict[str, FloatArray]) -> dict[str, FloatArray]:
 def _answered(t: Target, name: str, flight: dict[str, FloatArray], *, warm: bool) -> Vector:
     """A vector with the controller's answers."""
     real, step = t.real, step_function(t)
-    order = [*(f.name for f in reference_fields(t)), *(f.name for f in input_fields(t))]
+    order = [*(f.name for f in t.reference_fields), *(f.name for f in t.input_fields)]
     rows = {key: np.asarray(flight[key], dtype=real) for key in order}
     first = {key: rows[key][0] for key in zero_reference(t)}
     state = started_state(t, first) if warm else first_state(t)
@@ -146,8 +139,8 @@ def _answered(t: Target, name: str, flight: dict[str, FloatArray], *, warm: bool
         state, out = step(state, sample, sample)
         last = out["command"] if "command" in out else out["current"]
         expected.append(np.concatenate([out["v"], last]))
-        outputs = [out[f.name] for f in output_fields(t) if f.size]
-        remembered = [state[f.name] for f in state_fields(t) if f.size]
+        outputs = [out[f.name] for f in t.output_fields if f.size]
+        remembered = [state[f.name] for f in t.state_fields if f.size]
         checksums.append(checksum(np.concatenate([*outputs, *remembered])))
     return Vector(name, warm, np.hstack([rows[key] for key in order]), np.array(expected), checksums)
 

@@ -242,9 +242,13 @@ class Plant:
     @property
     def stroke_output(self) -> int:
         """The index of the stroke among the outputs. Raises InputError for a machine without a stroke."""
-        if not self.stroke:
-            raise InputError(self.name, "stroke", "none", "a machine with a stroke")
-        return [s.name for s in self.outputs].index(self.stroke)
+        return self._index("stroke", self.outputs)
+
+    def _index(self, field: str, signals: tuple[Signal, ...]) -> int:
+        """The index of the stroke or the thrust among signals."""
+        if not getattr(self, field):
+            raise InputError(self.name, field, "none", "a machine with a stroke")
+        return [s.name for s in signals].index(getattr(self, field))
 
     @property
     def leading_output(self) -> int:
@@ -259,16 +263,12 @@ class Plant:
     @property
     def stroke_state(self) -> int:
         """The index of the stroke among the states. Raises InputError for a machine without a stroke."""
-        if not self.stroke:
-            raise InputError(self.name, "stroke", "none", "a machine with a stroke")
-        return [s.name for s in self.states].index(self.stroke)
+        return self._index("stroke", self.states)
 
     @property
     def thrust_input(self) -> int:
         """The index of the thrust among the inputs. Raises InputError for a machine without a stroke."""
-        if not self.thrust:
-            raise InputError(self.name, "thrust", "none", "a machine with a stroke")
-        return [s.name for s in self.inputs].index(self.thrust)
+        return self._index("thrust", self.inputs)
 
     def nlsys(self) -> Any:
         """The machine as a continuous control.NonlinearIOSystem with named signals, evaluated by CasADi.

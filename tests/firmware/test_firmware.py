@@ -24,7 +24,7 @@ from malta.firmware.flight import (
 )
 from malta.firmware.fmu import build_fmu
 from malta.firmware.program import Precision, evaluate
-from malta.firmware.signals import Target, reading_ranges, reference_fields, state_fields
+from malta.firmware.signals import Target, reading_ranges
 from malta.firmware.sources import sources
 from malta.firmware.step import look_up, programs_of, started_state, step_function, zero_reference
 from malta.simulation.engine.compiled import compiler
@@ -65,9 +65,9 @@ def test_steps_compute_the_bits_of_their_expressions(name: str, precision: Preci
     native, rng, reach = compile_controller(t), np.random.default_rng(4), reading_ranges(t.believed)
     model = step_function(t)
     state, given, out = new_state(native), native.Inputs(), native.Outputs()
-    reference = {f.name: np.zeros(f.size) for f in reference_fields(t)}
+    reference = {f.name: np.zeros(f.size) for f in t.reference_fields}
     for k in range(12):
-        before = {f.name: view(state, f.name).copy() for f in state_fields(t) if f.size}
+        before = {f.name: view(state, f.name).copy() for f in t.state_fields if f.size}
         read: dict[str, Any] = {"y": rng.normal(size=len(reach)) * reach / 10, "y_valid": np.ones(len(reach))}
         if k == 5:
             read["y"][0] = np.nan

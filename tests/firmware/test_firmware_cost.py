@@ -16,7 +16,6 @@ from malta.firmware.cost import CLOCK
 from malta.firmware.flight import call, compile_controller, new_state, view, write
 from malta.firmware.period_functions import decide
 from malta.firmware.program import Precision
-from malta.firmware.signals import input_fields, output_fields, reference_fields, state_fields
 from malta.firmware.step import look_up
 from malta.firmware.vectors import record_vectors
 
@@ -51,23 +50,23 @@ def test_casadi_generates_the_same_step(name: str, tmp_path: Path) -> None:
     require("gcc")
     t = target(name, "double")
     native, theirs = compile_controller(t), generated(decide(t).plain, tmp_path)
-    names = [f.name for f in (*reference_fields(t), *input_fields(t))]
-    ends = np.cumsum([f.size for f in (*reference_fields(t), *input_fields(t))])[:-1]
+    names = [f.name for f in (*t.reference_fields, *t.input_fields)]
+    ends = np.cumsum([f.size for f in (*t.reference_fields, *t.input_fields)])[:-1]
     largest: dict[str, float] = {}
     apart: dict[str, float] = {}
     for vector in record_vectors(t):
         state, given, out = new_state(native), native.Inputs(), native.Outputs()
         for row in vector.readings:
             known = dict(zip(names, np.split(row, ends), strict=True))
-            write(state.reference, {f.name: known[f.name] for f in reference_fields(t)})
-            write(given, {f.name: known[f.name] for f in input_fields(t)})
-            known |= {f.name: view(state, f.name).copy() if f.size else np.zeros(0) for f in state_fields(t)}
+            write(state.reference, {f.name: known[f.name] for f in t.reference_fields})
+            write(given, {f.name: known[f.name] for f in t.input_fields})
+            known |= {f.name: view(state, f.name).copy() if f.size else np.zeros(0) for f in t.state_fields}
             call(native, "step", state, given, out)
             known["y_used"] = view(out, "y_used")
             z = known["y_used"][t.believed.stroke_output]
             expected = theirs({**known, "v0": look_up(t, z)})
-            found = {f"{f.name}_next": view(state, f.name) for f in state_fields(t) if f.size}
-            found |= {f.name: view(out, f.name) for f in output_fields(t) if f.name in expected}
+            found = {f"{f.name}_next": view(state, f.name) for f in t.state_fields if f.size}
+            found |= {f.name: view(out, f.name) for f in t.output_fields if f.name in expected}
             for key, values in found.items():
                 apart[key] = max(apart.get(key, 0.0), float(np.abs(values - expected[key]).max()))
                 largest[key] = max(largest.get(key, 0.0), float(np.abs(values).max()))

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import malta
 from malta.firmware.flight import Native, call, compile_controller, engine_of_c, new_state, view, write
 from malta.firmware.program import TYPES, Precision
-from malta.firmware.signals import Target, input_fields, state_fields
+from malta.firmware.signals import Target
 from malta.firmware.sources import sources
 from malta.simulation import references
 from malta.simulation.engine.compiled import compiler
@@ -46,7 +46,7 @@ class Run:
             self.native.Inputs(),
             self.native.Outputs(),
         )
-        self.width = sum(f.size for f in state_fields(t))
+        self.width = sum(f.size for f in t.state_fields)
         call(self.native, "start", self.state)
 
     def step(self, readings: dict[str, Any]) -> None:
@@ -65,7 +65,7 @@ class Run:
 def at_rest(r: Run) -> dict[str, Any]:
     """Readings of a machine where the reference is, without noise."""
     t = r.native.target
-    readings: dict[str, Any] = {f.name: np.ones(f.size) for f in input_fields(t)}
+    readings: dict[str, Any] = {f.name: np.ones(f.size) for f in t.input_fields}
     readings["y"] = np.zeros(len(t.controller.measurements))
     if t.driven:
         readings |= {"i": view(r.state, "i_last").copy(), "link": view(r.state, "link_last").copy()}

@@ -15,7 +15,7 @@ from reference_law import REACH, Drive, Law
 import malta
 from malta.firmware import period_functions
 from malta.firmware.flight import call, compile_controller, new_state, view, write
-from malta.firmware.signals import Target, reading_ranges, state_fields
+from malta.firmware.signals import Target, reading_ranges
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.references import Motion
 
@@ -53,7 +53,7 @@ def step_of_engine(t: Target) -> Step:
     """The expressions of every simulation, as CasADi computes them; no text of C, none of its forms of functions."""
     sense, decide = period_functions.sense(t).plain, period_functions.decide(t).plain
     ff = t.controller.feedforward
-    state = {f.name: np.zeros(f.size) for f in state_fields(t)}
+    state = {f.name: np.zeros(f.size) for f in t.state_fields}
     if t.driven:
         state["link_last"] += t.believed.drive.link_voltage
 
