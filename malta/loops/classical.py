@@ -29,11 +29,14 @@ class Nominal(NamedTuple):
     response : frequencies w (rad/s) -> P, k x p x m, and F, k x m x p
     stable : whether the loop is stable
     sample_time : s; None: continuous
+    forces : how many of the inputs u, the first ones, are forces of the law; None: all. The others, as currents that
+        are held for a sample, hang on readings: at the forces they are part of the machine
     """
 
     response: Response
     stable: bool
     sample_time: float | None
+    forces: int | None = None
 
     @property
     def frequencies(self) -> FloatArray:
@@ -104,7 +107,7 @@ def classical_margins(loop: Nominal, sensors: Sequence[str]) -> Classical:
     return Classical(
         tuple(disks),
         dict(zip(sensors, delays, strict=True)),
-        dict(zip(sensors, gang_of_four(P, F), strict=True)),
+        dict(zip(sensors, gang_of_four(P, F, loop.forces), strict=True)),
     )
 
 
@@ -136,16 +139,30 @@ def disk_margin(loop: Nominal, kind: Literal["forces", "sensors", "forces and se
     def sizes(w: FloatArray) -> FloatArray:
         P, F = loop.response(w)
         if kind == "forces":
-            Q = F @ P
+            Q = _around_forces(P, F, loop.forces)
         elif kind == "sensors":
             Q = P @ F
         else:
-            zero = np.zeros((len(w), P.shape[1], P.shape[1])), np.zeros((len(w), F.shape[1], F.shape[1]))
-            Q = np.block([[zero[0], P], [F, zero[1]]])
+            P_m, F_m, held = _divided(P, F, loop.forces)
+            Q = np.block([[held, P_m], [F_m, np.zeros((len(w), F_m.shape[1], F_m.shape[1]))]])
         return np.asarray(balanced_norm(_disk_matrix(Q))[:, None])
 
     (mu,), (at,) = find_peaks(sizes, loop.frequencies)
     return Disk(kind, float(1 / mu), float(at))
+
+
+def _divided(
+    P: ComplexArray, F: ComplexArray, forces: int | None
+) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+    """P and F of the forces alone, and what readings do to outputs besides."""
+    m = P.shape[-1] if forces is None else forces
+    return P[..., :m], F[:, :m], P[..., m:] @ F[:, m:]
+
+
+def _around_forces(P: ComplexArray, F: ComplexArray, forces: int | None) -> ComplexArray:
+    """The loop from forces to forces."""
+    P_m, F_m, held = _divided(P, F, forces)
+    return np.asarray(F_m @ np.linalg.solve(np.eye(P.shape[1]) - held, P_m))
 
 
 def disk_margins_alone(loop: Nominal, sensors: Sequence[str]) -> list[Disk]:
@@ -216,18 +233,22 @@ def peak_sensitivity(loop: Nominal, at: Literal["forces", "sensors"]) -> float:
 
     def sizes(w: FloatArray) -> FloatArray:
         P, F = loop.response(w)
-        Q = F @ P if at == "forces" else P @ F
+        Q = _around_forces(P, F, loop.forces) if at == "forces" else P @ F
         S = np.linalg.inv(np.eye(Q.shape[-1]) - Q)
         return np.asarray(np.abs(np.einsum("kii->ki", S)))
 
     return float(find_peaks(sizes, loop.frequencies)[0].max())
 
 
-def gang_of_four(P: ComplexArray, F: ComplexArray) -> list[tuple[float, ...]]:
-    """For each sensor i the largest |S_ii|, |T_ii|, |(S P)_ij| (m/N) and |(F S)_ji| (N/m) over frequency."""
+def gang_of_four(P: ComplexArray, F: ComplexArray, forces: int | None = None) -> list[tuple[float, ...]]:
+    """For each sensor i the largest |S_ii|, |T_ii|, |(S P)_ij| (m/N) and |(F S)_ji| (N/m) over frequency.
+
+    forces : how many of the inputs are forces, as in `Nominal`
+    """
     S = np.linalg.inv(np.eye(P.shape[1]) - P @ F)
     T = np.eye(P.shape[1]) - S
-    compliance, noise = np.abs(S @ P), np.abs(F @ S)
+    P_m, F_m, _ = _divided(P, F, forces)
+    compliance, noise = np.abs(S @ P_m), np.abs(F_m @ S)
     return [
         (
             float(np.abs(S[:, i, i]).max()),

@@ -484,7 +484,7 @@ def loaded_loop(
         s = (np.expm1(1j * np.asarray(w) * T) / T)[:, None, None]
         return _response(s, loop.Ad, B, loop.Cd, T), _response(s, law.A, law.B_y, law.C, T) + law.D_y
 
-    return Nominal(response, bool(np.abs(eigenvalues(loop.closed)).max() < 1), T)
+    return Nominal(response, bool(np.abs(eigenvalues(loop.closed)).max() < 1), T, m)
 
 
 def _response(s: ComplexArray, A: FloatArray, B: FloatArray, C: FloatArray, T: float) -> ComplexArray:

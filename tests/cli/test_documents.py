@@ -87,11 +87,11 @@ def test_verify_as_json_and_as_tables_has_the_figures_of_the_record(run: Run) ->
     assert peaks == pytest.approx([link.peak for link in record.chain], rel=1e-9)
     assert peaks == pytest.approx([1.0, 1.278983, 1.3213626, 1.8511865], rel=1e-6)
     assert [link["stage"] for link in robust["chain"]] == ["LQR", "LQG", "+ current loops", "sampled"]
-    disk = {"size": 0.2645143, "gain": 1.3048303, "phase_rad": 0.2629880, "frequency_rad_per_s": 7.819372}
+    disk = {"size": 0.7671829, "gain": 2.2446013, "phase_rad": 0.7325631, "frequency_rad_per_s": 20.590642}
     assert robust["disks"][0] == {"channels": "forces"} | {
         k: pytest.approx(v, rel=1e-5) for k, v in disk.items()
     }
-    gang = {"S": 1.8509999, "T": 1.0, "SP": 2.2279695, "FS": 4396.68}
+    gang = {"S": 1.8509999, "T": 1.0, "SP": 0.00211209889, "FS": 4396.68}
     assert robust["gang_of_four"]["x"] == {"unit": "m"} | {
         k: pytest.approx(v, rel=1e-5) for k, v in gang.items()
     }
@@ -100,7 +100,7 @@ def test_verify_as_json_and_as_tables_has_the_figures_of_the_record(run: Run) ->
     assert (moved["settled_s"], moved["largest"]) == pytest.approx((0.825, 1.44345e-3), rel=1e-4)
     assert moved["left"][1] == {"after_s": 0.3, "value": pytest.approx(9.5567e-4, rel=1e-4)}
     tables = run("verify", gains, "--no-proof").out
-    for text in ("21.5", "1.28", "0.265", "73158 µs", "0.825"):
+    for text in ("21.5", "1.28", "0.767", "73158 µs", "0.825"):
         assert text in tables
 
 

@@ -198,6 +198,22 @@ def test_what_a_loop_leaves_out_is_said() -> None:
     assert "`braking`" in malta.loop(*shipped("planar")).left_out
 
 
+@pytest.mark.parametrize("name", ["halbach_pid", "planar_pid"])
+def test_held_currents_are_no_forces_of_the_classical_figures(name: str) -> None:
+    """What hangs on a reading besides the forces belongs to the machine: as in the curves, which are computed alone."""
+    one = malta.loop(*shipped(name))
+    found, responses = one.classical, malta.loops.loop_curves(one).responses
+    for i, sizes in enumerate(found.gang.values()):
+        curves = (responses.S[:, i, i], responses.T[:, i, i], responses.SP[:, i], responses.FS[:, :, i])
+        assert sizes == pytest.approx([np.abs(curve).max() for curve in curves], rel=2e-2)
+    m = responses.S_forces.shape[-1]
+    disk = 1 / np.linalg.norm(responses.S_forces - np.eye(m) / 2, 2, axis=(1, 2)).max()
+    assert disk <= 1.001 * found.disks[0].size  # a balanced norm is no larger
+    if m == 1:
+        assert found.disks[0].size == pytest.approx(disk, rel=1e-3)
+    assert found.disks[2].size <= min(one.size for one in found.disks[:2])
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
