@@ -262,7 +262,7 @@ def forces_of(log: Log, plant: Plant) -> ForceLog:
         if len(missing):
             found = f"no finite number in row {missing[0] + 1}"
             raise InputError(log.source, name, found, "a number in every row")
-    return ForceLog(log.source, log.t, z[:, 0], v)
+    return ForceLog(log.source, log.t, z[:, 0].copy(), np.ascontiguousarray(v))  # in memory as a run has them
 
 
 class Recorded(NamedTuple):
