@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from malta.display import floor_to
 from malta.errors import InputError
 from malta.files import file_exists, locate, replace_files
 from malta.firmware.calibration import (
@@ -474,7 +475,7 @@ def _margin_text(t: Target, uncertainty: dict[str, float], *, proof: bool) -> st
     proven = (
         f"nothing is proven ({margin.reason})"
         if margin.lower is None
-        else f"{100 * margin.lower:.2f} % is proven"
+        else f"{floor_to(100 * margin.lower, 2):.2f} % is proven"
     )
     lost = (
         f"lost at {100 * margin.upper:.2f} %"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from malta.display import Description, display, quantity
+from malta.display import Description, display, floor_to, quantity
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -85,7 +85,7 @@ class Margin:
         return sum(proof.cells for proof in self.certificate)
 
     def __str__(self) -> str:
-        low = f"proven {100 * self.lower:.2f} %" if self.lower else unproven(self.reason)
+        low = f"proven {floor_to(100 * self.lower, 2):.2f} %" if self.lower else unproven(self.reason)
         if self.exhausted:
             return f"{low}; no unstable machine found {self.searched}".rstrip()
         where = "" if self.frequency is None else f" at {self.frequency:.4g} rad/s"

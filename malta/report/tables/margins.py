@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from malta.display import RADIANS, frequency
+from malta.display import RADIANS, floor_to, frequency
 from malta.margins.loop_report import LoopReport, zone
 from malta.model.machines import axis_units
 from malta.model.parameters import box_words
@@ -203,7 +203,7 @@ def _margin_cells(margin: Margin) -> tuple[str, str, str]:
     """Proven share, share at which the loop is lost, frequency in rad/s."""
     if margin is NOT_PROVEN:
         return "not asked", "", ""
-    low = "nothing" if margin.lower is None else f"{100 * margin.lower:.2f} %"
+    low = "nothing" if margin.lower is None else f"{floor_to(100 * margin.lower, 2):.2f} %"
     if margin.time_up:
         low += " so far"
     high = "not found" if margin.exhausted else f"{100 * margin.upper:.2f} %"
