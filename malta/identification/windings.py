@@ -68,11 +68,13 @@ class Windings:
     >>> from malta.identification.windings import identify_windings
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
-    >>> plan = malta.excite(malta.loop(plant, controller), period=0.5, periods=4, band=(4, 400))
-    >>> warm = plant.variant(dataclasses.replace(plant.parameters, R=1.2 * plant.parameters.R))
-    >>> run = malta.simulate(warm, controller, malta.Scenario.excited(plan.signal, plan.duration))
+    >>> loop, R = malta.loop(plant, controller), plant.parameters.R
+    >>> plan = malta.excite(loop, period=0.5, periods=4, band=(4, 400))
+    >>> warm = plant.variant(dataclasses.replace(plant.parameters, R=1.2 * R))
+    >>> excited = malta.Scenario.excited(plan.signal, plan.duration)
+    >>> run = malta.simulate(warm, controller, excited)
     >>> found = identify_windings(controller, malta.identification.log_of(run))
-    >>> found.refusal, f"{found.R.value / plant.parameters.R:.2f}"
+    >>> found.refusal, f"{found.R.value / R:.2f}"
     ('', '1.20')
     """
 
