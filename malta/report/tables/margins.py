@@ -126,9 +126,9 @@ def chain_table(found: LoopReport) -> Table:
                                                  to   peak
      stage       proven     lost at   rad/s    give    |S|   zone                of
      ──────────────────────────────────────────────────────────────────────────────
-     LQR       499.95 %   not found                   1.00                   forces
-     LQI       499.95 %   not found                   1.00                   forces
-     LQG       390.34 %    390.34 %    1006      m-   1.60      A           sensors
+     LQR       499.94 %   not found                   1.00                   forces
+     LQI       499.94 %   not found                   1.00                   forces
+     LQG       390.33 %    390.34 %    1006      m-   1.60      A           sensors
      LQGI      386.27 %    386.27 %    1010      m-   1.64      A           sensors
      sampled   390.69 %    390.69 %    1047      m-   1.57      A   sensors, loaded
     <BLANKLINE>
