@@ -17,6 +17,7 @@ from malta.report.figures.drawing import BOUND, MORE, NOTE, STYLES, draw_grid, n
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.transforms import Transform
 
     from malta.loops.classical import ChannelMargins
     from malta.loops.linear_loops import Place
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 LINE = 0.155  # inch, of text above a panel
 FOOT = 0.64  # inch, below a panel of frequency
-SECOND = 12.0  # points, from the numbers below an axis to the same in Hz
+SECOND = 16.0  # points, from the numbers below an axis to the same in Hz
 DECADES = 3.0  # shown below the first crossing of unit gain
 MOST_LINES = 3  # loops whose margins are written above a panel
 PLACES: Mapping[str, str] = {"sensors": "at the sensors", "forces": "at the forces"}
@@ -251,17 +252,8 @@ def add_hertz(axes: Axes, side: Literal["bottom", "right"]) -> None:
         hertz.tick_params(which="both", length=0, labelsize=8, labelcolor=NOTE["color"])
         hertz.xaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.labelpad += SECOND - 2
-        place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 8}
-        axes.annotate(
-            "Hz",
-            (0, 0),
-            (-16, -SECOND - 4),
-            color=NOTE["color"],
-            ha="right",
-            va="top",
-            annotation_clip=False,
-            **place,
-        )
+        hertz.set_xlabel("[Hz]", fontsize=8, color=NOTE["color"], ha="right", va="top")
+        hertz.xaxis.set_label_coords(0, 0, axes.transAxes + _points(axes, -16, -SECOND - 4))
     else:
         hertz = axes.secondary_yaxis("right", functions=ways)
         if axes.get_yscale() == "symlog":
@@ -273,7 +265,14 @@ def add_hertz(axes: Axes, side: Literal["bottom", "right"]) -> None:
         hertz.spines["right"].set_visible(False)
         hertz.tick_params(labelsize=8, labelcolor=NOTE["color"], color=NOTE["color"])
         hertz.set_ylabel("[Hz]", fontsize=8, color=NOTE["color"], rotation=0, ha="left", va="top")
-        hertz.yaxis.set_label_coords(1.02, -0.02)
+        hertz.yaxis.set_label_coords(1, 0, axes.transAxes + _points(axes, 14, -6))
+
+
+def _points(axes: Axes, x: float, y: float) -> Transform:
+    """A shift by so many points."""
+    from matplotlib.transforms import ScaledTranslation
+
+    return ScaledTranslation(x / 72, y / 72, axes.figure.dpi_scale_trans)
 
 
 def _lowest(curves: LoopCurves) -> float:
