@@ -350,18 +350,21 @@ def test_a_claim_shows_its_figures(found: Found, published: dict[str, Any]) -> N
     assert claim() == Claim(
         "rise [ms]", "16.2", ("16.20", "–"), "table2: reproduced; calibrated: not reproduced", "partly"
     )
-    at_most = claim(relation="at most", published="figure_13.radial_deviation", unit="um", form="{:.0f}")
+    at_most = claim(relation="at most", published="figure_13.radial_deviation", shown="{:.0f} um")
     assert at_most == Claim(
         "rise [µm]", "≤ 20", ("17000", "17000"), "not reproduced: larger, x 850", "differs"
     )
     values = iter([0.5, 0.25] * 3)
-    assert claim(published=None, unit="percent", note="so") == Claim(
+    assert claim(published=None, shown="{:.2f} percent", note="so") == Claim(
         "rise [%]", "–", ("50.00", "25.00"), "ours: so", "ours"
     )
-    assert claim(published=0.5, unit="1", relation="equal", form="±{:.1f}") == Claim(
+    assert claim(published=0.5, relation="equal", shown="±{:.1f}") == Claim(
         "rise", "±0.5", ("±0.5", "±0.2"), "table2: reproduced; calibrated: not reproduced", "partly"
     )
-    assert claim(published=None, unit="deg").ours == (f"{math.degrees(0.5):.2f}", f"{math.degrees(0.25):.2f}")
+    assert claim(published=None, shown="{:.2f} deg").ours == (
+        f"{math.degrees(0.5):.2f}",
+        f"{math.degrees(0.25):.2f}",
+    )
 
 
 @pytest.mark.slow
