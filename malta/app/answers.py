@@ -44,9 +44,7 @@ class Answers:
     def __init__(self) -> None:
         self.lost = 1.0  # the last eigenvalue margin
         self._ray: tuple[int, float] | None = None  # of it
-        self._takes = dict[
-            tuple[str, bool], float
-        ]()  # s of processor time of a part; of a new machine, of the same
+        self._takes = dict[tuple[str, bool], float]()  # s of processor time of a part, new machine or not
         self._traced: Parameters | None = None  # of the machine of the last answer
 
     def begin(self, problem: Problem, view: View, began: float) -> Answer:

@@ -151,9 +151,8 @@ def opening(problem: Problem) -> dict[str, Any]:
 
 
 Part = Callable[[Problem, View, Mapping[str, Any]], Any]
-PARTS: Mapping[
-    str, Part
-] = {  # of a picture, in the order in which they are computed, each from what is known before
+# Of a picture, in the order in which they are computed, each from what is known before.
+PARTS: Mapping[str, Part] = {
     "frequency": lambda problem, _view, _known: _frequency(problem.curves),
     "run": lambda problem, view, _known: run_document(problem, view),
     "load": lambda problem, view, _known: _load(problem, view),

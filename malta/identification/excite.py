@@ -37,7 +37,7 @@ LONGEST = 5e7  # samples of a flight
 WIDE, FAR = (
     2.0,
     5.0,
-)  # times the largest motion, and deviations of the noise: beyond it, the machine is another one
+)  # times the largest motion, and deviations of the noise: beyond both another machine flies
 CURRENT = 0.1  # of the current limit: the amplitude where none is given
 
 
@@ -223,10 +223,8 @@ def _plan(
     """The plan of a signal with what it does in the linear loop."""
     plant = loop.plant
     samples = round(periods * signal.period / loop.sample_time)
-    noise, motion = (
-        np.hypot(plant.noise, np.array(plant.resolution) / np.sqrt(12)),
-        _together(signal, found.y),
-    )
+    noise = np.hypot(plant.noise, np.array(plant.resolution) / np.sqrt(12))
+    motion = _together(signal, found.y)
     variance = np.maximum(noise, QUIET)[None] ** 2 / samples * np.ones((len(found.y), 1))
     slopes = model.slopes(model.start, 2 * np.pi * signal.frequencies)
     F = information(slopes, found.i / 2, variance)

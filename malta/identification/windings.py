@@ -37,6 +37,7 @@ from malta.identification.spectra import (
     whole,
 )
 from malta.model.data import plant_of
+from malta.model.plant import placed
 from malta.simulation.current_control import open_loop_gain
 from malta.simulation.engine.engines import evaluate
 
@@ -65,7 +66,6 @@ class Windings:
     limit : of chi2, above which it is refused
 
     >>> import dataclasses, malta
-    >>> from malta.identification.windings import identify_windings
     >>> controller = malta.gains.read("design/gains/robust.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> loop, R = malta.loop(plant, controller), plant.parameters.R
@@ -73,7 +73,8 @@ class Windings:
     >>> warm = plant.variant(dataclasses.replace(plant.parameters, R=1.2 * R))
     >>> excited = malta.Scenario.excited(plan.signal, plan.duration)
     >>> run = malta.simulate(warm, controller, excited)
-    >>> found = identify_windings(controller, malta.identification.log_of(run))
+    >>> log = malta.identification.log_of(run)
+    >>> found = malta.identification.identify_windings(controller, log)
     >>> found.refusal, f"{found.R.value / R:.2f}"
     ('', '1.20')
     """
@@ -155,9 +156,15 @@ def identify_windings(controller: Controller, log: Log) -> Windings:
     Raises InputError for a machine without windings, and for a log without voltages; CheckError as `malta.identify`.
 
     >>> import malta
-    >>> from malta.identification.windings import identify_windings
-    >>> identify_windings.__annotations__["return"]
-    'Windings'
+    >>> controller = malta.gains.read("design/gains/halbach.json")
+    >>> hold = malta.Scenario("hold", 0.2, malta.references.hold, fidelity="force")
+    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, hold)
+    >>> log = malta.identification.log_of(run)
+    >>> malta.identification.identify_windings(controller, log)
+    Traceback (most recent call last):
+        ...
+    malta.errors.InputError: identify: windings: found a halbach, which has no model of them, expected a machine
+    with windings
     """
     plant = plant_of(controller.parameters)
     if plant.windings is None or controller.current_loop is None:
@@ -208,9 +215,8 @@ def _moved(plant: Plant, used: list[str], s: Spectrum, i: FloatArray, Ts: float)
     y = np.fft.irfft(s.outputs[:, :count] * slow[:, None] * N, N, axis=0)
     speed = np.fft.irfft(1j * w[:, None] * s.outputs[:, :count] * slow[:, None] * N, N, axis=0)
     read, moving, flowing = (ca.SX.sym("signal", size) for size in (count, count, len(used)))
-    x, axes = ca.SX.zeros(len(plant.states)), [axis.name for axis in plant.drive.axes]
-    q = plant.position_of(read)
-    x[list(plant.controlled)] = ca.vertcat(q, ca.jtimes(q, read, moving))
+    axes, q = [axis.name for axis in plant.drive.axes], plant.position_of(read)
+    x = placed(plant, ca.vertcat(q, ca.jtimes(q, read, moving)))
     whole_i, places = ca.SX.zeros(len(axes)), [axes.index(name) for name in used]
     whole_i[places] = flowing
     added = plant.drive.emf(x), plant.drive.coupling(x, whole_i)

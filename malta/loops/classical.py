@@ -139,7 +139,7 @@ def disk_margin(loop: Nominal, kind: Literal["forces", "sensors", "forces and se
     def sizes(w: FloatArray) -> FloatArray:
         P, F = loop.response(w)
         if kind == "forces":
-            Q = _around_forces(P, F, loop.forces)
+            Q = loop_at_forces(P, F, loop.forces)
         elif kind == "sensors":
             Q = P @ F
         else:
@@ -159,10 +159,12 @@ def _divided(
     return P[..., :m], F[:, :m], P[..., m:] @ F[:, m:]
 
 
-def _around_forces(P: ComplexArray, F: ComplexArray, forces: int | None) -> ComplexArray:
-    """The loop from forces to forces."""
+def loop_at_forces(P: ComplexArray, F: ComplexArray, forces: int | None) -> ComplexArray:
+    """The loop from forces to forces, positive feedback: what else hangs on readings belongs to the machine."""
     P_m, F_m, held = _divided(P, F, forces)
-    return np.asarray(F_m @ np.linalg.solve(np.eye(P.shape[1]) - held, P_m))
+    if F_m.shape[1] < F.shape[1]:
+        P_m = np.linalg.solve(np.eye(P.shape[1]) - held, P_m)
+    return np.asarray(F_m @ P_m)
 
 
 def disk_margins_alone(loop: Nominal, sensors: Sequence[str]) -> list[Disk]:
@@ -233,7 +235,7 @@ def peak_sensitivity(loop: Nominal, at: Literal["forces", "sensors"]) -> float:
 
     def sizes(w: FloatArray) -> FloatArray:
         P, F = loop.response(w)
-        Q = _around_forces(P, F, loop.forces) if at == "forces" else P @ F
+        Q = loop_at_forces(P, F, loop.forces) if at == "forces" else P @ F
         S = np.linalg.inv(np.eye(Q.shape[-1]) - Q)
         return np.asarray(np.abs(np.einsum("kii->ki", S)))
 

@@ -28,6 +28,7 @@ from malta.loops.classical import (
     Seen,
     find_crossings,
     find_tops,
+    loop_at_forces,
     margins_of_channel,
 )
 from malta.loops.linear_loops import LinearLoop, Place, linear_loop
@@ -262,10 +263,7 @@ def respond(loop: LinearLoop, w: FloatArray) -> Responses:
         whole, F = (response(s) for response in loop.responses)
         P, P_w = whole[:, :p, :u], whole[:, :p, u:]
         L, S = _at_sensors(loop, whole, F)
-        P_m = P[..., :m]
-        if u > m:  # held currents hang on readings: at the forces that is part of the machine
-            P_m = np.linalg.solve(np.eye(p) - P[..., m:] @ F[:, m:], P_m)
-        L_m = -F[:, :m] @ P_m
+        L_m = -loop_at_forces(P, F, m)
         S_m = _inverse(np.eye(m) + L_m)
         read = S @ P_w
         compliance = read if len(loop.plant.C) == p else whole[:, p:, u:] + whole[:, p:, :u] @ F @ read

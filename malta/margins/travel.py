@@ -137,6 +137,11 @@ class LoopAlong:
         return extent_of(self.plant, self.names)
 
     @property
+    def whole_extent(self) -> Extent:
+        """The intervals of the machine and of its law, whose schedule is the course."""
+        return extent_of(self.plant, self.names, self.controller)
+
+    @property
     def loops(self) -> list[tuple[UncertainSystem, Compensator]]:
         """The loop with its position as a parameter; where that is too long, its loops at ENDS of the travel."""
         return _loops_along(self)
@@ -153,10 +158,7 @@ class LoopAlong:
     def machine_at(self, position: float) -> tuple[Plant, dict[str, float]]:
         """The plant at a position along the course (SI), and the states that are not zero there."""
         plant, controller = self.plant, self.controller
-        x, course = (
-            plant.point(controller.operating_point[0]).x,
-            extent_of(plant, self.names, controller).course,
-        )
+        x, course = plant.point(controller.operating_point[0]).x, self.whole_extent.course
         par: Any = plant.parameters
         there, at = plant, dict[str, float]()
         if controller.schedule is not None:
@@ -245,11 +247,8 @@ def travel_margin(
 
     Example: `travel_margin(plant, controller, {"m": 0.2}).lower`
     """
-    loop, begun, problem = (
-        LoopAlong(plant, controller, tuple(names or ranges), current_loops),
-        clock.monotonic(),
-        None,
-    )
+    loop = LoopAlong(plant, controller, tuple(names or ranges), current_loops)
+    begun, problem = clock.monotonic(), None
     end = deadline(begun, time)
     if controller.schedule is not None:
         return _scheduled_margin(loop, ranges, end, progress)

@@ -295,9 +295,7 @@ def compensators(
 class _Question:
     """The arguments of `staged_report`, and results that its parts share."""
 
-    loop: (
-        LoopAlong  # in the uncertain parameters, and the mass for its margin: one model answers all questions
-    )
+    loop: LoopAlong  # in uncertain parameters, and the mass for its margin: one model answers all questions
     uncertainty: Mapping[str, float]
     time: float | None
     proof: bool
@@ -399,7 +397,7 @@ def staged_report(
         found,
         uncertainty=dict(uncertainty),
         robust=travel,
-        extent=extent_of(plant, names, found.controller),
+        extent=loop.whole_extent,
         chain=links,
         disks=worst.disks if worst else (),
         delay=worst.delay if worst else dict.fromkeys(sensors, float("nan")),
@@ -421,8 +419,7 @@ def _links(q: _Question) -> tuple[Link, ...]:
         own = name in (SAMPLED, MACHINE)
         if own:
             stage = q if name == last else replace(q, loop=replace(q.loop, current_loops="lag"))
-            extent = extent_of(q.plant, q.loop.names, q.controller)
-            position = own_position(q.plant, extent, at, q.controller)
+            position = own_position(q.plant, q.loop.whole_extent, at, q.controller)
             loop = stage.loop.under_load(position)
             margin = stage.margin_at(position) if q.proof else NOT_PROVEN
         else:

@@ -293,9 +293,7 @@ def _search(
 STILL = 1e-9  # m/s, rad/s, m/s2 or rad/s2: a machine that changes by less is at rest
 SHARE = 1e-10  # of the rates that the inputs make: rounding
 LIMIT_ROUNDING = 1e-9  # of a limit
-MANY = (
-    32  # states at rest from which on a function of those entries alone that are not zero is worth its trace
-)
+MANY = 32  # states at rest, from which on a function of the entries that are not zero is worth its trace
 STARTS = (1.0, 0.3, 0.1, 0.01)  # of the limits of the commands, from where a balance is searched at last
 
 

@@ -155,9 +155,8 @@ class Row(NamedTuple):
     subject: str
     shown: str  # form and unit of both figures: "{:.2f} mm", "{:.1f}" of a number
     value: Callable[[Any], float]  # of the machine's evidence; SI
-    published: str | float | None = (
-        None  # key of data/published/, or a figure that the text implies; None: ours
-    )
+    # key of data/published/, or a figure that the text implies; None: ours
+    published: str | float | None = None
     # "equal" to the printed digits, "at most", "at least", "about"; "beside": not compared
     relation: str = "about"
     note: str = ""  # where the paper leaves a definition open, or what explains the figures
