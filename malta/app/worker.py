@@ -39,6 +39,7 @@ from malta.errors import CheckError, InputError, shorten
 from malta.margins.loop_report import Outcome
 from malta.margins.travel import travel_loops, travel_margin
 from malta.proof.loss import ray_bound
+from malta.proof.work import metered
 from malta.simulation.simulate import simulate
 from malta.synthesis.requirements import judge_figure, proven_margin, ratio_of, requirements_for
 from malta.synthesis.spec import Spec, Variable
@@ -64,7 +65,7 @@ PRICES = (
     "command noise",
     "moved by",
 )  # of a margin, as the figures of the picture are named: of an LQG, of a PID
-LONGEST_SEARCH = 20.0  # s, of the proof of a point of the front
+POINT_WORK = 20.0  # of the proof of a point of the front
 
 
 class Search(NamedTuple):
@@ -144,13 +145,13 @@ def front(search: Search) -> Iterator[dict[str, Any]]:
         seen.add(trial.values)
         design = apply_trial(spec, trial)
         problem = solve(Edited(design, search.edited.truth))
-        margin = travel_margin(
-            problem.plant,
-            problem.controller,
-            design.uncertainty,
-            time=LONGEST_SEARCH,
-            progress=lambda *_: search.progress(0.0),
-        )
+        with metered(POINT_WORK):
+            margin = travel_margin(
+                problem.plant,
+                problem.controller,
+                design.uncertainty,
+                progress=lambda *_: search.progress(0.0),
+            )
         name, ratio = nearest_limit(spec, trial, free)
         misses = {"limit": name, "ratio": ratio} if ratio > 1 + SLACK else {}
         found = {"margin": margin.lower, "reason": margin.reason, "price": PRICES[spec.pid is not None]}
@@ -213,8 +214,6 @@ def _document(search: Search, spec: Spec, trial: Trial, problem: Problem) -> dic
 
 TASKS = {"tune": candidates, "front": front}
 
-
-LONGEST = 120.0  # s, of a proof
 
 Message = Mapping[str, Any]
 Newer = Callable[[], bool]
@@ -279,7 +278,7 @@ def _proof(problem: Problem, newer: Newer) -> Iterator[dict[str, Any]]:
     if not box:
         yield {"kind": "proof", "lower": None, "reason": "the design file has no uncertainty"}
         return
-    margin = travel_margin(problem.plant, problem.controller, box, time=LONGEST, progress=_end_if(newer))
+    margin = travel_margin(problem.plant, problem.controller, box, progress=_end_if(newer))
     upper = margin.upper if math.isfinite(margin.upper) else None
     asked = problem.spec.specification.get("margin")
     yield {

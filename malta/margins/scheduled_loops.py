@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import keyword
 import math
-import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, make_dataclass, replace
 from functools import lru_cache, partial
@@ -71,19 +70,18 @@ Interval = tuple[float, float]
 
 @on_one_thread
 def rate_of_cells(
-    cells: Sequence[tuple[UncertainSystem, Compensator, Interval]], *, time: float = 60.0
+    cells: Sequence[tuple[UncertainSystem, Compensator, Interval]], *, time: float | None = None
 ) -> RateBound:
     """Prove how fast the only parameter of some loops may vary along their intervals.
 
     cells : continuous systems in one parameter, perhaps with D, without E; sampled laws without delay and lag, whose
         first outputs are the inputs that D does not lead back; and intervals that follow each other
-    time : s, longest search
+    time : s, longest search; None: as long as 60 units of work take
 
     Returns a RateBound; its rate is None, with the reason, where nothing is proven.
 
     Raises InputError for other systems and laws.
     """
-    begun = clock.monotonic()
     for system, law, _ in cells:
         plain = law.sample_time is not None and law.lag is None and not law.delay
         if len(system.names) != 1 or system.matrices.n_out() > 4 or not plain:
@@ -95,10 +93,9 @@ def rate_of_cells(
             own = _cells_of(cells)
             along = tuple(CellOfLoop(cell.at, cell.low, cell.high) for cell in own)
             loop = MovingLoop(along, partial(_MovingNorms, own), own[0].T)
-            return rate_bound(loop, name, begun, time)
+            return rate_bound(loop, name, time)
         except NotAnalytic as error:
-            spent, why = clock.monotonic() - begun, f"no enclosure: {error}"
-            return RateBound(name, low, high, None, None, 0, spent, why)
+            return RateBound(name, low, high, None, None, 0, 0.0, f"no enclosure: {error}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,7 +384,7 @@ def _with_channels(
     return replace(system, nominal=readonly(nominal), matrices=ca.Function("matrices", [p], matrices))
 
 
-def schedule_rate(plant: Plant, controller: Controller, *, time: float = 60.0) -> RateBound:
+def schedule_rate(plant: Plant, controller: Controller, *, time: float | None = None) -> RateBound:
     """Prove how fast the reference of a schedule may move while the loop stays exponentially stable.
 
     The machine has its nominal parameters and is where its reference is; deviations from there are small. The bound is
@@ -395,7 +392,7 @@ def schedule_rate(plant: Plant, controller: Controller, *, time: float = 60.0) -
 
     plant : the machine
     controller : its controller, with a schedule
-    time : s, longest search
+    time : s, longest search; None: as long as 60 units of work take
 
     Returns a RateBound of the scheduled output, per second; its rate is None, with the reason, where nothing is proven.
 

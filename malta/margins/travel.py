@@ -7,11 +7,10 @@ axis is proven alone and the coupling of the axes is bounded (malta.proof.weak_c
 
 from __future__ import annotations
 
-import math
 import time as clock
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 from malta.errors import InputError
@@ -24,24 +23,24 @@ from malta.model.plant import off_stroke, outputs_at, position_at
 from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of
 from malta.proof.expressions import NotAnalytic
-from malta.proof.margin import Margin, Progress, Ranges
+from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.parametric_plants import LONGEST
 from malta.proof.problem import OfSeveral
 from malta.proof.robust import (
     TOLERANCE,
     Effort,
     common_margin,
-    deadline,
     margin_at,
     margin_of,
     problem_of,
+    rank_of,
     robust_margin,
 )
-from malta.proof.time_limit import TimeUp, time_limit
 from malta.proof.uncertain import Compensator, UncertainSystem, is_commutated, model_of
 from malta.proof.weak_coupling import HeldLoop
 from malta.proof.weak_coupling.held_currents import held_machine
 from malta.proof.windings import CurrentLoops
+from malta.proof.work import MORE, Budget, WorkUp, in_rounds, metered
 from malta.synthesis.schedule import point_at
 
 if TYPE_CHECKING:
@@ -214,10 +213,10 @@ def own_position(
 NOT_BETWEEN = "not between them"  # what a margin of several places says
 LONG = 5000  # operations of matrices that are not enclosed over an interval of positions
 PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel, either way
-EACH = 6.0  # s, of the margin at a position for itself
+EACH = 6.0  # work, of the margin at a position for itself
 ENDS = (0.0, 1.0)  # of those, where no interval is enclosed
-AXES = 0.6  # of the time, for the proof of each axis alone
-BRIEFEST = 1e-3  # s, of a search that begins when the time is up
+AXES = 0.6  # of the work, for the proof of each axis alone
+NOT_WRITTEN = f"the clock ended the search before the model was written out, more time {MORE}"
 
 
 @on_one_thread
@@ -229,6 +228,7 @@ def travel_margin(
     names: Sequence[str] = (),
     *,
     time: float | None = None,
+    budget: Budget | None = None,
     progress: Progress | None = None,
 ) -> Margin:
     """The margin of the machine's loop anywhere in its travel: the position is one more interval of the proof.
@@ -240,7 +240,7 @@ def travel_margin(
 
     ranges : by parameter: 0.2 is +-20 % of the nominal value, (low, high) an interval in SI
     names : parameters of the model, a superset of `ranges`; one model can then answer several questions
-    time : s, longest search; None: 120
+    time, budget : s, longest search, and its work, as of `malta.robust_margin`
     progress : called with the lower and upper bound so far
 
     Raises InputError for unknown parameters and empty ranges.
@@ -248,58 +248,63 @@ def travel_margin(
     Example: `travel_margin(plant, controller, {"m": 0.2}).lower`
     """
     loop = LoopAlong(plant, controller, tuple(names or ranges), current_loops)
-    begun, problem = clock.monotonic(), None
-    end = deadline(begun, time)
-    if controller.schedule is not None:
-        return _scheduled_margin(loop, ranges, end, progress)
+    effort = Effort(None, time, budget, progress, "travel_margin")
+    along = _margin_along if controller.schedule is None else _scheduled_margin
+    begun = clock.monotonic()
+    found, ended = in_rounds(effort.limits, partial(along, loop, ranges, progress), rank_of)
+    return replace(found, seconds=clock.monotonic() - begun, work=ended.work)
+
+
+def _margin_along(
+    loop: LoopAlong, ranges: Ranges, progress: Progress | None, work: float, patient: bool
+) -> Margin:
+    """The margin along the travel that is found with some work."""
+    budget, plant, controller, problem = Budget(patient=patient), loop.plant, loop.controller, None
     try:
-        with time_limit(end):
-            along, over = travel_loops(plant, controller, loop.names, current_loops)
-            if plant.has_stroke and not over:  # places of the travel, and no other interval
-                problem = margin_anywhere(loop)
-    except TimeUp:
-        spent, why = clock.monotonic() - begun, "time was up before the model was written out"
-        return Margin(None, math.inf, None, None, {}, {}, (), spent, why)
+        along, over = travel_loops(plant, controller, loop.names, loop.current_loops)
+        if plant.has_stroke and not over:  # places of the travel, and no other interval
+            problem = margin_anywhere(loop)
+    except WorkUp:
+        return replace(NOT_PROVEN, reason=NOT_WRITTEN)
     if problem is not None:
-        effort = Effort(time=max(AXES * (end - clock.monotonic()), BRIEFEST), progress=progress)
-        found = margin_of(problem, _box(along[0][0], ranges), effort)
+        with metered(AXES * work):
+            found = margin_of(problem, _box(along[0][0], ranges), Effort(budget=budget, progress=progress))
         if found.lower is not None:
             return found
-    left = max(end - clock.monotonic(), BRIEFEST)
-    found = common_margin(along, ranges, over, time=left, progress=progress)
+    found = common_margin(along, ranges, over, budget=budget, progress=progress)
     if len(along) == 1:
         return found
     here = f"at {len(along)} places of the travel, {NOT_BETWEEN}"
     return replace(found, reason=f"{here}; {found.reason}" if found.reason else here)
 
 
-CELLS = 0.7  # of the time, for the proofs between the places of a schedule
+CELLS = 0.7  # of the work, for the proofs between the places of a schedule
 
 
-def _scheduled_margin(loop: LoopAlong, ranges: Ranges, end: float, progress: Progress | None) -> Margin:
+def _scheduled_margin(
+    loop: LoopAlong, ranges: Ranges, progress: Progress | None, work: float, patient: bool
+) -> Margin:
     """The margin at every constant reference of a schedule; where that is not proven, at its places."""
-    schedule, begun = loop.controller.schedule, clock.monotonic()
+    schedule, over, budget = loop.controller.schedule, dict(loop.extent.over), Budget(patient=patient)
     assert schedule is not None
-    over, until = dict(loop.extent.over), begun + CELLS * (end - begun)
     found, why = list[Margin](), ""
     try:
-        with time_limit(until):
-            cells = loops_between_places(loop.plant, loop.controller, (*ranges, *over), loop.current_loops)
-    except TimeUp:
-        cells = "time was up before the model was written out"
-    for cell in [] if isinstance(cells, str) else cells:
-        left = max(until - clock.monotonic(), BRIEFEST)
-        outside = over | {schedule.variable: cell.interval}
-        found.append(robust_margin(cell.system, cell.law, ranges, outside, time=left, progress=progress))
-        if found[-1].lower is None:
-            low, high = cell.interval
-            why = f"between {low:g} and {high:g}: {found[-1].reason}"
-            break
-    spent = clock.monotonic() - begun
+        cells = loops_between_places(loop.plant, loop.controller, (*ranges, *over), loop.current_loops)
+    except WorkUp:
+        cells = NOT_WRITTEN
+    with metered(CELLS * work):
+        for cell in [] if isinstance(cells, str) else cells:
+            outside = over | {schedule.variable: cell.interval}
+            found.append(
+                robust_margin(cell.system, cell.law, ranges, outside, budget=budget, progress=progress)
+            )
+            if found[-1].lower is None:
+                low, high = cell.interval
+                why = f"between {low:g} and {high:g}: {found[-1].reason}"
+                break
     if found and not why:
-        return replace(smallest_margin(found), seconds=spent)
-    left = max(end - clock.monotonic(), BRIEFEST)
-    margin = common_margin(loop.loops, ranges, over, time=left, progress=progress)
+        return smallest_margin(found)
+    margin = common_margin(loop.loops, ranges, over, budget=budget, progress=progress)
     here = f"at {len(loop.loops)} places of {schedule.variable}, {NOT_BETWEEN}"
     return replace(margin, reason="; ".join(filter(None, (here, why or str(cells), margin.reason))))
 
@@ -399,10 +404,12 @@ def place_margin(
         return margin_at(*whole.loops[0], ranges, there, tolerance=TOLERANCE, wider=travel)
     loop = whole.at(position)
     if (problem := margin_anywhere(whole, position)) is not None:
-        found = margin_of(problem, _box(loop[0], ranges), Effort(time=EACH))
+        with metered(EACH):
+            found = margin_of(problem, _box(loop[0], ranges), Effort())
         if found.lower is not None:
             return found
-    return robust_margin(*loop, ranges, time=EACH)
+    with metered(EACH):
+        return robust_margin(*loop, ranges)
 
 
 @on_one_thread

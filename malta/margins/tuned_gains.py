@@ -28,6 +28,7 @@ from malta.proof.margin import Ranges
 from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator, UncertainSystem, is_commutated
 from malta.proof.windings import chosen_loops, current_control, force_modes, windings_of
+from malta.proof.work import Budget
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 FACTOR = "gain factor"  # the name of the further parameter
 MOST = 0.2  # share by which gains may scatter at most: nothing beyond is looked at
 FAST = 50.0  # a Ts
-TIME = 600.0  # s, longest search
+WORK = 600.0  # of the search
 TOLERANCE = 0.02  # relative distance between the proven bound and the witness
 
 
@@ -87,7 +88,9 @@ def gain_box(plant: Plant, controller: Controller, uncertainty: Ranges) -> GainB
         for name, v, down, up in zip(sides.names, sides.nominal, sides.down, sides.up, strict=True)
         if name in uncertainty
     }
-    found = robust_margin(system, law, {FACTOR: MOST}, {**over, **box}, tolerance=TOLERANCE, time=TIME)
+    found = robust_margin(
+        system, law, {FACTOR: MOST}, {**over, **box}, tolerance=TOLERANCE, budget=Budget(WORK)
+    )
     if found.lower is None:
         return GainBox(None, (), found.reason or "the loop is not stable for the whole uncertainty")
     forces, first = len(controller.forces), system.matrices.size1_out(0) - len(controller.forces)

@@ -319,14 +319,14 @@ class _Question:
         return {}
 
     @cached_property
-    def _travel_margins(self) -> dict[tuple[object, float | None], Margin]:
+    def _travel_margins(self) -> dict[tuple[object, bool], Margin]:
         return {}
 
     def margin_at(self, position: float) -> Margin:
         """The margin at a position along the course; computed once if the loop does not depend on the position."""
         z, known = position if self.loop.depends_on_course else 0.0, self._place_margins
         if z not in known:
-            travel = self._travel_margins.get(self._key(self.uncertainty, self.time))
+            travel = self._travel_margins.get((tuple(self.uncertainty.items()), False))
             known[z] = place_margin(
                 self.plant,
                 self.controller,
@@ -338,17 +338,21 @@ class _Question:
             )
         return known[z]
 
-    def _key(self, ranges: Ranges, time: float | None) -> tuple[object, float | None]:
-        return tuple(ranges.items()), time
+    def margin_over(
+        self, ranges: Ranges, *, brief: bool = False, progress: Progress | None = None
+    ) -> Margin:
+        """The margin anywhere in the extent; computed once for equal ranges: +1 kg may be the range of the mass.
 
-    def margin_over(self, ranges: Ranges, time: float | None, progress: Progress | None = None) -> Margin:
-        """The margin anywhere in the extent; computed once for equal ranges: +1 kg may be the range of the mass."""
-        known, key = self._travel_margins, self._key(ranges, time)
+        brief : whether it may take the work of one place
+        """
+        known, key = self._travel_margins, (tuple(ranges.items()), brief)
         if key not in known:
-            known[key] = travel_margin(
-                self.plant, self.controller, ranges, self.loop.current_loops, self.loop.names,
-                time=time, progress=progress,
-            )  # fmt: skip
+            budget = Budget(time=self.time, patient=False if brief else None)
+            with metered(EACH if brief else math.inf):
+                known[key] = travel_margin(
+                    self.plant, self.controller, ranges, self.loop.current_loops, self.loop.names,
+                    budget=budget, progress=progress,
+                )  # fmt: skip
         self.report()
         return known[key]
 
@@ -388,7 +392,7 @@ def staged_report(
     names += tuple({"m"} & set(units_of(plant.parameters)) - set(names))
     loop = LoopAlong(plant, found.controller, names, found.current_loops)
     question = _Question(loop, uncertainty, time, proof, report)
-    travel = question.margin_over(uncertainty, time, bounds) if proof else None
+    travel = question.margin_over(uncertainty, progress=bounds) if proof else None
     links = _links(question)
     tolerance, mass = _tolerances(question) if proof else ({}, None)
     places, worst = _places(question)
@@ -434,16 +438,15 @@ def _links(q: _Question) -> tuple[Link, ...]:
 
 def _tolerances(q: _Question) -> tuple[dict[str, tuple[Margin, Margin]], Margin | None]:
     """How far each parameter alone may go, down and up; and the mass margin of a machine with a mass m, kg."""
-    time = q.time if q.whole else min(q.time or EACH, EACH)
-    tolerance = {}
+    over, tolerance = partial(q.margin_over, brief=not q.whole), {}
     for name, share in q.uncertainty.items():
         nominal = getattr(q.plant.parameters, name)
-        down = q.margin_over({name: (nominal * (1 - share), nominal)}, time)
-        tolerance[name] = down, q.margin_over({name: (nominal, nominal * (1 + share))}, time)
+        down = over({name: (nominal * (1 - share), nominal)})
+        tolerance[name] = down, over({name: (nominal, nominal * (1 + share))})
     if "m" not in units_of(q.plant.parameters):
         return tolerance, None
     m: float = getattr(q.plant.parameters, "m")  # noqa: B009  a machine's own field
-    return tolerance, q.margin_over({"m": (m, m + 1.0)}, time)
+    return tolerance, over({"m": (m, m + 1.0)})
 
 
 def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:

@@ -33,8 +33,10 @@ if TYPE_CHECKING:
     from malta.proof.margin import Margin as Margin
     from malta.proof.rates import RateBound as RateBound
     from malta.proof.rates import varying as varying
+    from malta.proof.robust import Interrupted as Interrupted
     from malta.proof.robust import margin_of_polynomial as margin_of_polynomial
     from malta.proof.uncertain import Compensator as Compensator
     from malta.proof.uncertain import UncertainSystem as UncertainSystem
+    from malta.proof.work import Budget as Budget
 
 __all__, __getattr__, __dir__ = contents(__name__, __file__)

@@ -14,8 +14,8 @@ import numpy as np
 from malta.errors import CheckError
 from malta.proof.exclusion.witness import gradients
 from malta.proof.expressions import NotAnalytic
-from malta.proof.time_limit import is_late
 from malta.proof.uncertain import Compensator, UncertainSystem, critical_frequency, instability
+from malta.proof.work import is_past
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 STEP = 1e-6  # of a range, for slopes of the worst root
 NARROW = 2.0**-40  # of a step of the grid, to which a loss is narrowed down
 ROUNDS = 6  # from corner to corner
+CALL = 2e-4  # work of a call for poles, beside that of each row
 
 
 CORNERS = 64  # of a box that are looked at before its families are made
@@ -37,7 +38,7 @@ CORNERS = 64  # of a box that are looked at before its families are made
 def corner_loss(problem: Problem, box: Box, reach: float) -> float | None:
     """The first t up to `reach` at which a corner of the box is unstable, by the poles.
 
-    The estimate comes from above; infinite without a loss. None where the box has more than CORNERS, and where the time
+    The estimate comes from above; infinite without a loss. None where the box has more than CORNERS, and where the work
     is up.
     """
     sides = [
@@ -51,7 +52,7 @@ def corner_loss(problem: Problem, box: Box, reach: float) -> float | None:
     low, high = 0.0, reach
     for steps in (np.geomspace(1e-2, 1, 10), *[np.linspace(0, 1, 6)[1:]] * 3):
         for t in (low + (high - low) * steps).tolist():
-            if is_late():
+            if is_past():
                 return None
             rows = np.array([place + t * corner for place, corner in rays])
             bad = _instability(problem, rows, -math.inf) >= 0
@@ -68,7 +69,7 @@ def corner_loss(problem: Problem, box: Box, reach: float) -> float | None:
 def first_loss(problem: Problem, box: Box, reach: float) -> Loss:
     """The first loss of stability along the diagonals of the box, by the poles: t, w (rad/s) and p; else infinity.
 
-    The nearest that is found by the time that is up.
+    The nearest that is found until the work is up.
     """
     free = [i for i in range(len(box.names)) if box.down[i] + box.up[i] > 0]
     signs = np.array(list(itertools.islice(itertools.product((-1, 1), repeat=len(free)), 256)))
@@ -77,7 +78,7 @@ def first_loss(problem: Problem, box: Box, reach: float) -> Loss:
         best = _nearer(problem, place, _uphill(problem, box, place), reach, best)
         best = _improve_corner(problem, box, place, best)
         for sign in signs:
-            if is_late():
+            if is_past():
                 return best
             d = np.zeros(len(box.names))
             d[free] = np.where(sign > 0, box.up[free], -box.down[free])
@@ -112,7 +113,7 @@ def _improve_corner(problem: Problem, box: Box, place: FloatArray, best: Loss, p
     """Move a loss to the corner that the slopes of the worst root point to, as long as t decreases."""
     for _ in range(ROUNDS):
         t, _, p = best
-        if p is None or not np.isfinite(t) or is_late():
+        if p is None or not np.isfinite(t) or is_past():
             break
         d = _uphill(problem, box, p)
         nearer = _along(problem, place, d, t, proven)
@@ -154,6 +155,7 @@ def _critical(problem: Problem, p: FloatArray, place: FloatArray) -> float | Non
 
 def _instability(problem: Problem, rows: FloatArray, unknown: float) -> FloatArray:
     """The distance of the worst root beyond the boundary; `unknown` for all rows when one of them has no loop."""
+    is_past(price=CALL + problem.traits.poles * len(rows))
     try:
         return np.asarray(problem.instability(rows))
     except (CheckError, np.linalg.LinAlgError, NotAnalytic):
@@ -178,7 +180,7 @@ def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float, proven:
         return math.inf
     k = int(bad.argmax())
     low, high = (float(grid[k - 1]) if k else 0.0), float(grid[k])
-    if is_late():
+    if is_past():
         return high
     return _narrow_loss(lambda t: float(rates(np.array([t]))[0]), low, high, NARROW * (high - low))
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from malta.display import Description, display, floor_to, quantity
+from malta.proof.work import MORE
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -47,6 +48,7 @@ class Margin:
     certificate : cells and directions of the proof, which `malta.proof.certificate.check` checks again; or multipliers,
         of which `malta.proof.certificate.checked_multipliers` does
     seconds : s, time of the search
+    work : units of work that the search took, which do not depend on the computer
     reason : why nothing, or less than asked for, is proven
     searched : how far no unstable parameters were found, where `upper` is infinite
 
@@ -68,11 +70,12 @@ class Margin:
     seconds: float
     reason: str = ""
     searched: str = ""
+    work: float = 0.0
 
     @property
     def time_up(self) -> bool:
-        """Whether the search ended as its time was up, before anything was proven: more time may prove more."""
-        return self.lower is None and self.reason.rpartition("; ")[2].startswith(TIME_UP)
+        """Whether the search ended with its work or its time, before anything was proven: more may prove more."""
+        return self.lower is None and self.reason.endswith(MORE)
 
     @property
     def exhausted(self) -> bool:
@@ -111,5 +114,4 @@ def unproven(reason: str) -> str:
     return f"nothing proven ({reason})" if reason else "nothing proven"
 
 
-TIME_UP = "time w"  # begins reasons of a search that was or would be too long
 NOT_PROVEN = Margin(None, math.inf, None, None, {}, {}, (), 0.0, "not asked")

@@ -20,9 +20,9 @@ from malta.proof.expressions import NotAnalytic, program
 from malta.proof.polynomial import rational
 from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge
 from malta.proof.polynomial.rational import symbolic as rational_functions
-from malta.proof.time_limit import check_time
 from malta.proof.uncertain import UncertainSystem, describe, in_symbols, is_commutated, limits_of, model_of
 from malta.proof.windings import Windings, with_windings
+from malta.proof.work import check_clock
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -219,7 +219,7 @@ def of_plant(
     position = position_in(plant, x0)
     own_states = tuple((name, x) for name, x in (at or {}).items() if name != plant.stroke)
     of = model_of(plant, believed or plant, tuple(name for name in names if name != plant.stroke), own_states)
-    check_time()
+    check_clock()
     p = ca.SX.sym("p", len(names))
     own = [k for k, name in enumerate(names) if name != plant.stroke]
     symbols = {names[k]: p[k] for k in own}
@@ -228,7 +228,7 @@ def of_plant(
     short, positive, why = None, None, ""
     if is_commutated(plant) or not program(of).rational:
         short = _expanded_matrices(of, p, z, np.array(nominal, dtype=float), held)
-    check_time()
+    check_clock()
     if short is not None:
         A, B, C, above = short
         positive = ca.Function("positive", [p], [above]) if above.numel() else None

@@ -31,7 +31,6 @@ from malta.proof.polynomial.closed_loop import Couplings, closed_loop, driven_gr
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.polynomial.family import binary
 from malta.proof.polynomial.rational import Symbolic, TooLarge, over_common_denominator, symbolic
-from malta.proof.time_limit import TimeUp
 from malta.proof.uncertain import (
     Compensator,
     Group,
@@ -161,6 +160,10 @@ def _exact(x: float, like: Any) -> Any:
     return int(x) if isinstance(like, int) else type(like)(*x.as_integer_ratio())
 
 
+POLES = 6e-7  # work of poles in doubles, times the square of the states
+ROW = 6e-4  # work of a row in balls
+EXACT_STEP = 1e-6  # work of an operation in exact numbers
+STEP, CUBED = 4e-6, 1e-6  # work of an operation of the model in balls, and times the cube of the states
 SHORT = 300  # operations of matrices whose exact expressions take no time
 FEW_ROWS = 2  # of parameters, at which the poles of the whole loop take less time than those of its groups
 
@@ -172,12 +175,14 @@ class Traits:
     approximate : why its matrices are no exact functions of p, so that nothing is proven of them; "" where they are
     is_cheap : whether cells of its polynomials take little time
     is_held : whether families take long, as those of loops under a hold
+    poles : work of the poles at one row of parameters
     enclose : the families over box(t) where couplings between groups are bounded, and no part of their polynomials
     """
 
     approximate: str = ""
     is_cheap: bool = False
     is_held: bool = False
+    poles: float = 1e-4
     enclose: Callable[[Box, float], list[Part]] | None = None
 
     @property
@@ -223,7 +228,10 @@ class OfLoop:
 
     @property
     def traits(self) -> Traits:
-        return Traits(self.loop.system.approximate, is_held=self.loop.sampled)
+        size = self.loop.states + len(self.loop.law.A)
+        dear = ROW + STEP * len(self.loop.program.steps) + CUBED * size**3
+        poles = POLES * size**2 if self._plain else dear
+        return Traits(self.loop.system.approximate, is_held=self.loop.sampled, poles=poles)
 
     @property
     def loops(self) -> tuple[UncertainLoop | None, ...]:
@@ -249,9 +257,7 @@ class OfLoop:
         """The states that close loops by themselves, where these are found at once; else none."""
         if len(self.loop.program.steps) > SHORT:
             return ()
-        with suppress(TimeUp):
-            return groups(self.loop)
-        return ()
+        return groups(self.loop)
 
     @property
     def _plain(self) -> bool:
@@ -314,7 +320,9 @@ class OfSeveral:
 
     @property
     def traits(self) -> Traits:
-        return Traits(next(filter(None, (problem.traits.approximate for problem in self.problems)), ""))
+        each = [problem.traits for problem in self.problems]
+        why = next((traits.approximate for traits in each if traits.approximate), "")
+        return Traits(why, poles=sum(traits.poles for traits in each))
 
     @property
     def loops(self) -> tuple[UncertainLoop | None, ...]:
@@ -367,6 +375,10 @@ class CoefficientPolynomial:
     @property
     def foreign(self) -> tuple[str, ...]:
         return self.program.foreign
+
+    @property
+    def price(self) -> float:
+        return EXACT_STEP * len(self.program.steps)
 
     @property
     def inverted(self) -> tuple[bool, ...]:

@@ -32,6 +32,7 @@ from malta.proof.expressions import NotAnalytic
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.robust import law_of
 from malta.proof.uncertain import Compensator, UncertainSystem, interval, positive
+from malta.proof.work import is_past, metered, work_limit
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,6 +44,8 @@ BITS = 128
 NEAR = 1e-3  # relative size of what rounding may leave of units
 LEAST = 2.0**-12  # part of the interval that one piece has at least
 SHARES = (0.8, 0.5, 0.2)  # of the slowest decay, which V has at the nodes
+WORK = 60.0  # units of work, of a search
+PIECE = 1e-5  # work of a piece, times the cube of its states
 
 
 @display
@@ -171,7 +174,7 @@ def varying(
     name: str,
     over: tuple[float, float],
     *,
-    time: float = 60.0,
+    time: float | None = None,
 ) -> RateBound:
     """Prove how fast one parameter may vary within an interval while the sampled loop stays exponentially stable.
 
@@ -182,7 +185,7 @@ def varying(
     compensator : a sampled law u = F y (positive feedback), perhaps with a delay, without a lag
     name : of the parameter
     over : its interval, SI
-    time : s, longest search
+    time : s, longest search; None: as long as 60 units of work take
 
     Returns a RateBound; its rate is None, with the reason, where nothing is proven.
 
@@ -200,22 +203,23 @@ def varying(
     >>> found.rate > 2.0, found.rate < 3.0  # N/m/s
     (True, True)
     """
-    begun = clock.monotonic()
     low, high = interval(CALLER, "over", over)
-    positive(CALLER, "time", time)
+    if time is not None:
+        positive(CALLER, "time", time)
     with precision(BITS):
         loop = _loop_of(system, law_of(system, compensator, CALLER), name)
         norms = partial(_Units, loop, max(abs(low), abs(high)))
-        return rate_bound(MovingLoop((CellOfLoop(loop.at, low, high),), norms, loop.T), name, begun, time)
+        return rate_bound(MovingLoop((CellOfLoop(loop.at, low, high),), norms, loop.T), name, time)
 
 
-def rate_bound(loop: MovingLoop, name: str, begun: float, time: float) -> RateBound:
-    """The bound of a loop over all its cells, in a search that began at a time and may last another."""
-    low, high = loop.cells[0].low, loop.cells[-1].high
-    with precision(BITS):
+def rate_bound(loop: MovingLoop, name: str, time: float | None) -> RateBound:
+    """The bound of a loop over all its cells, in a search of WORK, or of a time (s)."""
+    low, high, begun = loop.cells[0].low, loop.cells[-1].high, clock.monotonic()
+    work = WORK if time is None else math.inf
+    with precision(BITS), metered(work, time), work_limit(work):
         reason = "the loop is unstable at a frozen value"
         for share in SHARES:
-            found = _pieces(loop, low, high, share, begun + time)
+            found = _pieces(loop, low, high, share)
             if not isinstance(found, str):
                 pieces, norms = found
                 rate = _rate(pieces, loop, norms)
@@ -350,9 +354,7 @@ class _Choice:
         return ball((P + P.T) / 2)
 
 
-def _pieces(
-    loop: MovingLoop, low: float, high: float, share: float, until: float
-) -> tuple[list[_Piece], Norms] | str:
+def _pieces(loop: MovingLoop, low: float, high: float, share: float) -> tuple[list[_Piece], Norms] | str:
     """The pieces of the interval, each proven; else why not."""
     choice = _Choice.of(loop, low, high, share)
     if choice is None:
@@ -369,9 +371,9 @@ def _pieces(
     norms = loop.norms(choice.at(loop.at((low + high) / 2)))
     found, stack = list[_Piece](), [(cell, cell.low, cell.high) for cell in reversed(loop.cells)]
     while stack:
-        if clock.monotonic() > until:
-            return "time was up"
         cell, a, b = stack.pop()
+        if is_past(price=PIECE * node(cell, a)[0].nrows() ** 3):
+            return "the work was up"
         piece = _prove(norms, g, (a, b), node(cell, a), node(cell, b))
         if piece is not None:
             found.append(piece)

@@ -15,8 +15,8 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -32,8 +32,8 @@ from malta.proof.groups import A, B, C, E, UncertainLoop, loop_of
 from malta.proof.loss import first_loss, loss_beside
 from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.polynomial.rational import Ratio, Symbolic, product
-from malta.proof.problem import CoefficientPolynomial, OfLoop, OfSeveral, Problem
-from malta.proof.search import Question, search
+from malta.proof.problem import CoefficientPolynomial, OfLoop, OfSeveral, Problem, is_nominal_stable
+from malta.proof.search import Question, Standing, search
 from malta.proof.systems import compensator_of, polynomial_of
 from malta.proof.uncertain import (
     Compensator,
@@ -45,6 +45,7 @@ from malta.proof.uncertain import (
     number,
     positive,
 )
+from malta.proof.work import Budget, in_rounds, is_past
 
 # A loop in the coordinates in which its parameters act apart: x = S x', exactly, found from how the parameters enter.
 #
@@ -165,8 +166,8 @@ def _range(parts: list[Any], n: int) -> list[list[Any]]:
     values = np.array([[float(arb(c / top)) for c in x] for x in columns])
     _, s, V = np.linalg.svd(values)
     rank = int((s > ROUNDING * s[0]).sum())
-    reduced, exact_rank = fmpq_mat(columns).rref()
-    if rank == int(exact_rank):
+    reduced, exactrank_of = fmpq_mat(columns).rref()
+    if rank == int(exactrank_of):
         return [list(row) for row in reduced.tolist()[:rank]]
     _, _, pivots = linalg.qr(V[:rank], pivoting=True)
     echelon = np.linalg.solve(V[:rank][:, np.sort(pivots[:rank])], V[:rank])
@@ -238,8 +239,7 @@ def _program(matrices: list[dict[tuple[int, int], Ratio]], old: Program) -> Prog
 
 
 TOLERANCE = 9e-4  # relative distance between the proven bound and the witness
-MOST_CELLS = 300_000
-LONGEST = 120.0  # s, default time of a search
+UNSTABLE = "the nominal loop is unstable"
 PLACES = 64  # nominal places of a box whose poles are computed at once
 
 
@@ -252,7 +252,7 @@ def robust_margin(
     *,
     tolerance: float | None = None,
     time: float | None = None,
-    most_cells: int = MOST_CELLS,
+    budget: Budget | None = None,
     progress: Progress | None = None,
 ) -> Margin:
     """Prove how far the parameters may deviate together, in multiples of their ranges, before the loop is unstable.
@@ -265,13 +265,16 @@ def robust_margin(
     ranges : by name; 0.2 is +-20 % of the nominal value, (low, high) an interval in SI
     over : intervals that do not grow with t, in SI: the bound holds anywhere in them (`z` over the travel)
     tolerance : relative distance between the proven bound and the witness; None: 9e-4, and less where that is cheap
-    time : s, longest search, which then returns the bounds found so far; None: 120
-    most_cells : number of cells after which the proof is given up
+    time : s, longest search, which then returns the bounds found so far; None: the clock ends none
+    budget : what the search may take; None: 120 units of work, each about a second of one core
     progress : called with the lower and upper bound so far
+
+    Work is counted and not timed: without `time` the answer is the same on every computer, however busy it is.
 
     Returns a Margin: proven lower bound, and a witness at the upper one.
 
-    Raises InputError for names that the system does not have, ranges that are not valid, and shapes that do not fit.
+    Raises InputError for names that the system does not have, ranges that are not valid, and shapes that do not fit;
+    Interrupted, with the bounds found so far, on Ctrl-C.
 
     >>> import malta
     >>> def cart(m, k):
@@ -282,7 +285,7 @@ def robust_margin(
     >>> f"{found.lower:.2f} {found.upper:.2f} {found.witness['k']:.2f}"
     '5.00 5.00 2.00'
     """
-    effort = Effort(tolerance, time, most_cells, progress)
+    effort = Effort(tolerance, time, budget, progress)
     law = law_of(system, compensator)
     box = box_of(system.names, system.nominal, system.limits, ranges, {} if over is None else over)
     return margin_of(problem_of(system, law), within_branches(box, system.positive), effort)
@@ -295,7 +298,7 @@ def common_margin(
     over: Mapping[str, tuple[float, float]] | None = None,
     *,
     tolerance: float | None = None,
-    time: float | None = None,
+    budget: Budget | None = None,
     progress: Progress | None = None,
 ) -> Margin:
     """The margin within which several loops in the same parameters all stay stable, as one machine at several places.
@@ -306,7 +309,7 @@ def common_margin(
 
     Raises InputError for loops that differ in parameters or sample times.
     """
-    effort = Effort(tolerance, time, MOST_CELLS, progress, "margin")
+    effort = Effort(tolerance, None, budget, progress, "margin")
     loops = [(system, law_of(system, law, "margin")) for system, law in _pairs(places)]
     first, law = loops[0]
     for system, other in loops[1:]:
@@ -337,7 +340,6 @@ def margin_at(
     at: Mapping[str, float],
     *,
     tolerance: float | None = None,
-    time: float | None = None,
     wider: Margin | None = None,
 ) -> Margin:
     """The margin with some parameters fixed at the values `at` in place of the nominal ones.
@@ -351,15 +353,14 @@ def margin_at(
     box = within_branches(box_of(system.names, nominal, system.limits, ranges, {}), system.positive)
     problem = problem_of(system, compensator)
     if wider is not None and wider.lower and wider.witness is not None:
-        begun, reach = clock.monotonic(), wider.lower * (1 + (tolerance or TOLERANCE))
+        reach = wider.lower * (1 + (tolerance or TOLERANCE))
         witness = np.array([at.get(name, wider.witness[name]) for name in box.names])
         t, frequency, p = loss_beside(problem, box, witness, wider.lower, min(reach, box.limit))
         if p is not None and t >= wider.lower:
             named = dict(zip(box.names, p.tolist(), strict=True))
             moved = dict(zip(box.names, (p - box.nominal).tolist(), strict=True))
-            spent = clock.monotonic() - begun
-            return Margin(wider.lower, t, frequency, named, moved, wider.sensitivity, (), spent)
-    return margin_of(problem, box, Effort(tolerance, time))
+            return Margin(wider.lower, t, frequency, named, moved, wider.sensitivity, (), 0.0)
+    return margin_of(problem, box, Effort(tolerance))
 
 
 def law_of(system: UncertainSystem, compensator: Any, caller: str = "robust_margin") -> Compensator:
@@ -400,8 +401,7 @@ def margin_of_polynomial(
     over : intervals that do not grow with t, in SI
     discrete : whether stable roots lie in the unit disc, in place of the left half plane
     tolerance : relative distance between the proven bound and the witness; None: 9e-4, and less where that is cheap
-    time : s, longest search, which then returns the bounds found so far; None: 120
-    progress : called with the lower and upper bound so far
+    time, progress : as of `malta.robust_margin`
 
     Returns a Margin.
 
@@ -415,7 +415,7 @@ def margin_of_polynomial(
     '7.00, 7.00'
     """
     caller = "margin_of_polynomial"
-    effort = Effort(tolerance, time, MOST_CELLS, progress, caller)
+    effort = Effort(tolerance, time, None, progress, caller)
     outside = by_name(caller, "over", {} if over is None else over, '{"k": (1, 2)}')
     values = _middles({**by_name(caller, "box", box, '{"k": (1, 2)}'), **outside}, nominal)
     names = tuple(values)
@@ -446,13 +446,21 @@ def _middles(ranges: Mapping[str, Any], nominal: Any) -> dict[str, float]:
     return values
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C while a margin is searched. `margin` is what is known by then: a Margin with its reason."""
+
+    def __init__(self, margin: Margin) -> None:
+        super().__init__(f"interrupted: {margin}")
+        self.margin = margin
+
+
 @dataclass(frozen=True)
 class Effort:
-    """The limits of a search. Raises InputError for an invalid tolerance or time."""
+    """The tolerance of a search and what it may take. Raises InputError for an invalid tolerance or time."""
 
     tolerance: float | None = None
     time: float | None = None
-    most_cells: int = MOST_CELLS
+    budget: Budget | None = None
     progress: Progress | None = None
     caller: str = "robust_margin"
 
@@ -462,32 +470,57 @@ class Effort:
         if self.time is not None:
             positive(self.caller, "time", self.time, endless=True)
 
-
-def deadline(begun: float, time: float | None) -> float:
-    """The end of a search that began at `begun` and may take `time` seconds; None: LONGEST."""
-    return begun + (LONGEST if time is None else time)
+    @property
+    def limits(self) -> Budget:
+        """The budget with the time."""
+        budget = self.budget or Budget()
+        return budget if self.time is None else replace(budget, time=self.time)
 
 
 def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
-    """The margin of a problem over a box; zero when the nominal loop is unstable."""
-    begun = clock.monotonic()
-    until = deadline(begun, effort.time)
+    """The margin of a problem over a box; zero when the nominal loop is unstable. Raises Interrupted on Ctrl-C."""
+    begun, standing = clock.monotonic(), Standing(effort.progress)
     if not box.most > 0:
         return Margin(None, math.inf, None, None, {}, {}, (), 0.0, box.ends, box.searched)
+    ask = partial(_ask, problem, box, effort, standing)
+    try:
+        found, ended = in_rounds(effort.limits, ask, rank_of)
+    except KeyboardInterrupt as stop:
+        raise Interrupted(_interrupted(problem, box, standing, clock.monotonic() - begun)) from stop
+    is_open = bool(found.reason) and found.reason not in (UNSTABLE, problem.traits.approximate)
+    reason = ended.explain(found.reason) if is_open else found.reason
+    return replace(found, seconds=clock.monotonic() - begun, work=ended.work, reason=reason)
+
+
+def rank_of(found: Margin) -> float:
+    """The proven bound, infinite where nothing is open."""
+    return found.lower or 0.0 if found.reason and found.reason != UNSTABLE else math.inf
+
+
+def _ask(
+    problem: Problem, box: Box, effort: Effort, standing: Standing, work: float, patient: bool
+) -> Margin:
+    """The margin that is found with some work."""
     places = box.nominal_places()
     for k in range(0, len(places), PLACES):
-        if clock.monotonic() > until:
+        if is_past(work, problem.traits.poles * min(PLACES, len(places))):
             break
         unstable = problem.instability(places[k : k + PLACES]) >= 0
         if unstable.any():
             where = dict(zip(box.names, places[k + int(unstable.argmax())].tolist(), strict=True))
-            spent = clock.monotonic() - begun
-            return Margin(0.0, 0.0, None, where, {}, {}, (), spent, "the nominal loop is unstable")
+            return Margin(0.0, 0.0, None, where, {}, {}, (), 0.0, UNSTABLE)
     if why := problem.traits.approximate:
         upper, frequency, witness = first_loss(problem, box, box.limit)
-        found = None if witness is None else dict(zip(box.names, witness.tolist(), strict=True))
-        return Margin(None, upper, frequency, found, {}, {}, (), clock.monotonic() - begun, why)
+        named = None if witness is None else dict(zip(box.names, witness.tolist(), strict=True))
+        return Margin(None, upper, frequency, named, {}, {}, (), 0.0, why)
     tolerance, fixed = effort.tolerance or TOLERANCE, effort.tolerance is not None
-    question = Question(problem, box, tolerance, fixed, begun, until, effort.most_cells, effort.progress)
+    question = Question(problem, box, tolerance, fixed, work, effort.limits.cells, patient, standing)
     with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
         return search(question)
+
+
+def _interrupted(problem: Problem, box: Box, standing: Standing, seconds: float) -> Margin:
+    """What is known of a margin whose search was interrupted."""
+    lower = standing.lower if standing.lower > 0 and is_nominal_stable(problem, box) else None
+    reason = f"interrupted after {seconds:.3g} s{standing.where(problem)}"
+    return Margin(lower, standing.upper, None, None, {}, {}, (), seconds, reason)

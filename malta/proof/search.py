@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import time as clock
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -19,11 +18,11 @@ from malta.proof.exclusion.hurwitz import Signs, raise_bound, signs_over
 from malta.proof.exclusion.witness import Zero, from_cell, nearest, starts
 from malta.proof.expressions import NotAnalytic
 from malta.proof.loss import confirm, contributions, corner_loss, first_loss
-from malta.proof.margin import TIME_UP, Certificate, Margin, Progress
+from malta.proof.margin import Certificate, Margin, Progress
 from malta.proof.multipliers.structured import Proof, Structured, rows_of
-from malta.proof.polynomial.enclosure import Unproven, family_over
+from malta.proof.polynomial.enclosure import NO_COEFFICIENTS, Unproven, family_over
 from malta.proof.problem import Problem, is_nominal_stable
-from malta.proof.time_limit import TimeUp, time_limit
+from malta.proof.work import WorkUp, is_past, is_stopped, spent, work_limit
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -34,8 +33,8 @@ if TYPE_CHECKING:
 FIRST = 3.97  # the first box that is searched, in multiples of the modelled one
 CHEAP = 4000  # cells below which the proof is brought closer to the witness than the tolerance
 FINEST = 3e-7  # how close, relative
-DEAR = 3.0  # s that families take beyond which their boxes grow in small steps
-BRIEF, SMALL = 0.5, 0.015  # s, and share of the time, that a wider box may take at least
+DEAR = 3.0  # work of families beyond which their boxes grow in small steps
+BRIEF, SMALL = 0.5, 0.015  # work, and share of it, that a wider box may take at least
 PATIENCE = 20_000  # cells without progress after which the proof is given up
 HARD = 4000  # cells after which smaller boxes are proven first
 FEW = 100  # cells of many parameters, of which each may be dear, before multipliers take their turn
@@ -43,19 +42,20 @@ CHEAP_NODES = 128_000  # coefficients of polynomials on these cells, where each 
 NEAR = 1.005  # box of couplings, in multiples of where axes by themselves are lost
 LEVELS = 5  # of these boxes, each half of the next
 SMALLER = 4  # boxes, each half of the last one, that Hurwitz's determinant is tried on
-# of the time for families, by the number of parameters, the last for MANY
+# of the work for families, by the number of parameters, the last for MANY
 SHARES = (0.6, 0.6, 0.6, 0.6, 0.4, 0.3)
+PATIENT = 0.8  # of the work, for families of a patient search
 OF_HOLDS = 0.12  # of many parameters under a hold, where each family takes long
 MANY = 5  # parameters from which on multipliers come before many cells
 MANY_OF_POLYNOMIALS = 11  # whose cells are cheap
-LOOK = 0.2  # share of the time for a first look at the poles of corners
-LOOK_AGAIN = 0.3  # share of what is left for another, or GRACE and LATE of the time beyond its end
-GRACE, LATE = 0.4, 0.1  # s, share
-LAST = 20.0  # s that they may take at the end where cells have proven something
+LOOK = 0.2  # share of the work for a first look at the poles of corners
+LOOK_AGAIN = 0.3  # share of what is left for another, or GRACE and LATE of the work beyond its end
+GRACE, LATE = 0.4, 0.1  # work, share
+LAST = 20.0  # work that they may take at the end where cells have proven something
 SIGNS = (
-    0.5  # share of the time that is left for Hurwitz's determinant where cells of frequency do not settle it
+    0.5  # share of the work that is left for Hurwitz's determinant where cells of frequency do not settle it
 )
-TURN, TURN_AFTER = 0.5, 4.0  # their share of the time in that turn, and how many times what was spent before
+TURN, TURN_AFTER = 0.5, 4.0  # their share of the work in that turn, and how many times what was spent before
 ALONE = 0.8  # their share where there are no families
 
 BOUNDED = "what the position does is bounded, not followed"
@@ -63,21 +63,49 @@ BOUNDED = "what the position does is bounded, not followed"
 Searches = list[tuple[Part, Search]]
 
 
+@dataclass(eq=False)
+class Standing:
+    """What is known of a margin while it is searched: its bounds, and the cells that are left. It changes in place."""
+
+    progress: Progress | None
+    lower: float = 0.0
+    upper: float = math.inf
+    searches: Searches = field(default_factory=list)
+
+    def report(self, lower: float, upper: float) -> None:
+        self.lower, self.upper = max(self.lower, lower), min(self.upper, upper)
+        if self.progress is not None:
+            self.progress(self.lower, self.upper)
+
+    def where(self, problem: Problem) -> str:
+        """The frequency of the cell that resists, in words."""
+        if not self.searches:
+            return ""
+        worst = min((s for _, s in self.searches), key=lambda s: s.lower)
+        cell = worst.hardest() or worst.first()
+        if cell is None:
+            return ""
+        x = Zero(0.0, cell.branch, sum(cell.interval) / 2, np.zeros(0)).frequency(worst.family)
+        return f", near {problem.physical(x):.6g} rad/s"
+
+
 @dataclass(frozen=True, eq=False)
 class Question:
     """The margin that is asked for, and what its search may take.
 
-    fixed : whether the tolerance was asked for; begun, end : of time.monotonic()
+    fixed : whether the tolerance was asked for; end : of the work of the question
+    patient : whether all of the work is used, where no earlier round settled the question
+    standing : what is known so far, for whoever stops the search
     """
 
     problem: Problem
     box: Box
     tolerance: float
     fixed: bool
-    begun: float
     end: float
     most_cells: int
-    progress: Progress | None
+    patient: bool
+    standing: Standing
 
     @property
     def _count(self) -> int:
@@ -91,12 +119,14 @@ class Question:
 
     @property
     def share(self) -> float:
-        """The share of the time that families may take where there are multipliers beside them."""
+        """The share of the work that families may take where there are multipliers beside them."""
+        if self.patient:
+            return PATIENT
         is_dear = self.is_many and self.problem.traits.is_held
         return OF_HOLDS if is_dear else SHARES[min(self._count, MANY)]
 
     def is_late(self) -> bool:
-        return clock.monotonic() > self.end
+        return is_past(self.end)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,28 +176,27 @@ class Findings:
     def report(self, q: Question, t: float) -> Findings:
         """box(t) is proven: the caller is told of it."""
         stands = max(self.stands, t)
-        if q.progress is not None:
-            q.progress(stands, self.upper)
+        q.standing.report(stands, self.upper)
         return replace(self, stands=stands)
 
 
 def search(q: Question) -> Margin:
     """The margin that is asked for."""
     rows = None
-    with suppress(TimeUp), time_limit(q.end):
+    with suppress(WorkUp), work_limit(q.end):
         rows = rows_of(q.problem)
     known = Findings(q.tolerance, None if rows is None else Structured(rows, q.box, q.most_cells))
-    # families may take all the time there is, and not come to be
-    until = q.end if rows is None else q.begun + q.share * (q.end - q.begun)
-    with time_limit(until):
+    # families may take all the work there is, and not come to be
+    until = q.end if rows is None else q.share * q.end
+    with work_limit(until):
         known, parts, reach = _families(q, known, until)
     if not parts:
         return _by_poles(q, known)
-    with time_limit(q.end):
+    with work_limit(q.end):
         known, lower, searches = _prove_all(q, known, parts, reach)
     known, loss = _loss(q, known, reach)
     if max(lower, known.beside) < min(q.box.limit, loss[0]) * (1 - 2 * q.tolerance):
-        most = max(LAST, 0.5 * (clock.monotonic() - q.begun)) if lower > 0 else math.inf
+        most = max(LAST, 0.5 * spent()) if lower > 0 and not q.patient else math.inf
         known = _multiply(q, known, min(q.box.limit, loss[0] * (1 - known.tolerance)), 1.0, most)
     return _margin(q, known, lower, loss, [_certificate(q, part, s) for part, s in searches])
 
@@ -181,29 +210,29 @@ def _families(q: Question, known: Findings, until: float) -> tuple[Findings, lis
     Returns the parts of the box and its size t.
     """
     parts, reach, done, refused = list[Part](), _first_reach(q), 0.0, math.inf
-    why, begun = "", clock.monotonic()
+    why, begun = "", spent()
     while True:
-        now = clock.monotonic()
-        spent = now - begun
-        hurried = why.startswith(TIME_UP)  # a smaller box takes as long
+        now = spent()
+        taken = now - begun
+        hurried = why == NO_COEFFICIENTS  # a smaller box takes as much
         last = now + (1.0 if hurried else 0.3) * (q.end - now)
         if done or FIRST < reach >= q.box.limit:
-            last = min(last, now + max(BRIEF, SMALL * (q.end - q.begun), 2 * spent))
+            last = min(last, now + max(BRIEF, SMALL * q.end, 2 * taken))
         try:
             parts = parts_over(q.problem, q.box, reach, min(until, last))
         except Unproven as error:
             refused, why = reach, str(error)
-            if clock.monotonic() > until or reach < 1e-3 or (done and spent > DEAR):
+            if is_past(until) or reach < 1e-3 or (done and taken > DEAR):
                 break
             reach = done + 0.6 * (reach - done) if done else FIRST if reach > 2 * FIRST else 0.5 * reach
         else:
             done = reach
             for part in parts:
                 known = _descend(known, part, until)
-            spent = clock.monotonic() - begun
-            if known.upper <= done or done >= q.box.limit or spent > min(0.3 * (until - begun), 4 * DEAR):
+            taken = spent() - begun
+            if known.upper <= done or done >= q.box.limit or taken > min(0.3 * (until - begun), 4 * DEAR):
                 break
-            wanted = (6 if spent < DEAR else 1.5) * done
+            wanted = (6 if taken < DEAR else 1.5) * done
             wanted = max(wanted, 1.01 * known.upper if math.isfinite(known.upper) else 0)
             reach = min(q.box.limit, wanted, 0.5 * (done + refused))
         if done and refused - done < EDGE * done:
@@ -211,7 +240,7 @@ def _families(q: Question, known: Findings, until: float) -> tuple[Findings, lis
     if known.upper > done and (why or done < q.box.limit):
         known = known.because(why or f"nothing beyond {done:.3g} was looked at: the model is dear to enclose")
     room = NEAR if q.problem.traits.is_bounded else 1.05  # couplings grow with the box
-    if known.upper < done / (3 if room > NEAR else room) and not clock.monotonic() > until:
+    if known.upper < done / (3 if room > NEAR else room) and not is_past(until):
         with suppress(Unproven):  # narrower families over a smaller box; the larger ones remain valid
             parts = parts_over(q.problem, q.box, room * known.upper, until)
             done = room * known.upper
@@ -221,27 +250,27 @@ def _families(q: Question, known: Findings, until: float) -> tuple[Findings, lis
 def parts_over(problem: Problem, box: Box, reach: float, last: float) -> list[Part]:
     """The families of all groups over box(reach), cut into parts where one expansion does not do.
 
-    last : time.monotonic() at which the search gives up
+    last : of the work, at which the search gives up
 
-    Raises Unproven when a matrix has no value on the box, or when time is up.
+    Raises Unproven when a matrix has no value on the box, or when the work is up.
     """
     sides = box.sides(reach)
     parts: list[Part] = []
     try:
-        with time_limit(last):
+        with work_limit(last):
             if (enclose := problem.traits.enclose) is not None:
                 return enclose(box, reach)
             for polynomial, moves in problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
-                parts += cut(sides, box.nominal, last, partial(_part_over, polynomial, moves, box, last))
+                parts += cut(sides, box.nominal, partial(_part_over, polynomial, moves, box))
     except NotAnalytic as error:
         raise Unproven(f"the matrices have no value on the box: {error}") from error
-    except TimeUp as error:
-        raise Unproven("time was up before the coefficients were found") from error
+    except WorkUp as error:
+        raise Unproven(NO_COEFFICIENTS) from error
     return merge_twins(parts)
 
 
-def _part_over(f: Polynomial, moves: tuple[Any, ...], box: Box, last: float, sides: FloatArray) -> list[Part]:
-    return [Part(f, sides, family_over(f, sides, moves, last), growth_over(sides, f.inverted, box))]
+def _part_over(f: Polynomial, moves: tuple[Any, ...], box: Box, sides: FloatArray) -> list[Part]:
+    return [Part(f, sides, family_over(f, sides, moves), growth_over(sides, f.inverted, box))]
 
 
 def _first_reach(q: Question) -> float:
@@ -251,8 +280,8 @@ def _first_reach(q: Question) -> float:
     """
     one = np.count_nonzero(q.box.down) + np.count_nonzero(q.box.up) == 1
     most = q.box.limit if one else min(q.box.limit, FIRST)
-    now = clock.monotonic()
-    with time_limit(now + LOOK * (q.end - now)):
+    now = spent()
+    with work_limit(now + LOOK * (q.end - now)):
         t = corner_loss(q.problem, q.box, most)
     return most if t is None else min(most, 1.02 * t)
 
@@ -260,7 +289,7 @@ def _first_reach(q: Question) -> float:
 def _descend(known: Findings, part: Part, until: float) -> Findings:
     misses = 0
     for distance, branch, x, u in starts(part.family, part.growth):
-        if clock.monotonic() > until or misses > 4 or (misses > 1 and distance > 3 * known.upper):
+        if is_past(until) or misses > 4 or (misses > 1 and distance > 3 * known.upper):
             break
         found = known.nearer(part, nearest(part.family, part.growth, branch, x, u, known.upper))
         known, misses = found, misses + 1 if found is known else 0
@@ -299,7 +328,7 @@ def _prove(q: Question, known: Findings, parts: list[Part], reach: float) -> tup
     best, kept = 0.0, searches
     if _is_open(searches) and not known.is_near(final, q):
         if q.is_many:
-            known = _multiply(q, known, known.target(reach), TURN, TURN_AFTER * (clock.monotonic() - q.begun))
+            known = _multiply(q, known, known.target(reach), TURN, TURN_AFTER * spent())
         if not known.is_covered(q, reach):
             known = _compare_signs(q, known, final)
         if q.is_many and not known.is_covered(q, reach) and known.beside > final:
@@ -328,12 +357,12 @@ def _first_cells(q: Question, parts: list[Part]) -> int:
 
 
 def _multiply(q: Question, known: Findings, target: float, share: float, most: float = math.inf) -> Findings:
-    """Raise the proven bound by multipliers, for a share of the time that is left, and `most` seconds."""
-    now = clock.monotonic()
+    """Raise the proven bound by multipliers, for a share of the work that is left, and at most `most`."""
+    now = spent()
     if known.structured is None or not now < q.end:
         return known
     until = now + min(share * (q.end - now), most)
-    with suppress(TimeUp), time_limit(until):
+    with suppress(WorkUp), work_limit(until):
         known.structured.raise_bound(target, until, lambda t: known.report(q, t))
     return replace(known, stands=max(known.stands, known.structured.lower))
 
@@ -341,26 +370,26 @@ def _multiply(q: Question, known: Findings, target: float, share: float, most: f
 def _compare_signs(q: Question, known: Findings, proven: float = 0.0) -> Findings:
     """Raise the proven bound by Hurwitz's determinant, which needs no cells of frequency for light damping.
 
-    Where the cells have proven as much as was asked for, it may take half as long as they did.
+    Where the cells have proven as much as was asked for, it may take half as much as they did.
     """
     if known.signs is not None or q.problem.traits.is_bounded:
         return known
-    now = clock.monotonic()
+    now = spent()
     until = now + SIGNS * (q.end - now) if math.isfinite(q.end) else now + LAST
     if proven >= min(known.upper, q.box.limit) * (1 - q.tolerance):
-        until = min(until, now + SIGNS * (now - q.begun))
+        until = min(until, now + SIGNS * now)
     t, signs = min(q.box.limit, 1.05 * known.upper), None
     for _ in range(SMALLER):
-        with suppress(Unproven, TimeUp), time_limit(until):
-            signs = signs_over(q.problem, q.box, t, until)
+        with suppress(Unproven, WorkUp), work_limit(until):
+            signs = signs_over(q.problem, q.box, t)
             break
         t /= 2
     if signs is None:
         return known
-    with suppress(TimeUp), time_limit(until):
+    with suppress(WorkUp), work_limit(until):
         if not q.fixed:
-            raise_bound(signs, FINEST, until, CHEAP)
-        raise_bound(signs, q.tolerance, until, q.most_cells)
+            raise_bound(signs, FINEST, CHEAP)
+        raise_bound(signs, q.tolerance, q.most_cells)
     return replace(known, signs=signs, upper=min(known.upper, signs.upper)).report(q, signs.lower)
 
 
@@ -386,19 +415,20 @@ def _advance(
 ) -> tuple[Findings, float, Searches]:
     """Exclude zero from cell after cell, and return the t for which that proves stability.
 
-    It ends when all cells are excluded, after `most` cells, or after the share `rest` of the remaining time.
+    It ends when all cells are excluded, after `most` cells, or after the share `rest` of the remaining work.
     """
     tried, stood, since, searches = 0, -1.0, 0, list(searches)
-    now = clock.monotonic()
+    now = spent()
     until = q.end if math.isinf(q.end) else now + rest * (q.end - now)
     while True:
         lower = min((s.lower for _, s in searches), default=reach)
+        q.standing.searches = searches
         known = known.report(q, lower)
         count = sum(s.count for _, s in searches)
         if lower > stood * (1 + known.tolerance / 10):
             stood, since = lower, count
-        patience = PATIENCE if known.tolerance == q.tolerance else CHEAP
-        over = clock.monotonic() > until or count >= most or count - since > patience
+        patience = CHEAP if known.tolerance != q.tolerance else math.inf if q.patient else PATIENCE
+        over = is_past(until) or count >= most or count - since > patience
         if over or _is_blocked(searches):
             return known, lower, searches
         n = min(range(len(searches)), key=lambda n: (searches[n][1].finished, searches[n][1].lower))
@@ -434,12 +464,8 @@ def _explain_rest(q: Question, known: Findings, searches: Searches) -> Findings:
     if q.problem.traits.is_bounded:
         return known.because(BOUNDED)
     count = sum(s.count for _, s in searches)
-    why = "not settled in time" if q.is_late() else f"not settled within {count} cells"
-    cell = worst.hardest() or worst.first()
-    if cell is not None:
-        x = Zero(0.0, cell.branch, sum(cell.interval) / 2, np.zeros(0)).frequency(worst.family)
-        why += f", near {q.problem.physical(x):.6g} rad/s"
-    return known.because(why)
+    why = "not settled within the work" if q.is_late() else f"not settled within {count} cells"
+    return known.because(why + replace(q.standing, searches=searches).where(q.problem))
 
 
 # result
@@ -468,7 +494,7 @@ def _margin(q: Question, known: Findings, lower: float, loss: Loss, proofs: list
     return Margin(
         lower if lower > 0 else None, upper, frequency, found, moved,
         {} if known.zero is None or witness is None else contributions(*known.zero, names),
-        tuple(proofs), clock.monotonic() - q.begun, "; ".join(dict.fromkeys(reasons)),
+        tuple(proofs), 0.0, "; ".join(dict.fromkeys(reasons)),
         q.box.searched if math.isinf(upper) else "",
     )  # fmt: skip
 
@@ -504,10 +530,10 @@ def _loss(q: Question, known: Findings, reach: float) -> tuple[Findings, Loss]:
 
 
 def _first_loss(q: Question) -> Loss:
-    """The first loss along the box's diagonals that is found in LOOK_AGAIN of the time left, or a little more."""
-    now = clock.monotonic()
-    longest = max(LOOK_AGAIN * (q.end - now), GRACE + LATE * (q.end - q.begun))
-    with time_limit(now + longest):
+    """The first loss along the box's diagonals that is found in LOOK_AGAIN of the work left, or a little more."""
+    now = spent()
+    late = GRACE if is_stopped() else GRACE + LATE * q.end
+    with work_limit(now + max(LOOK_AGAIN * (q.end - now), late)):
         return first_loss(q.problem, q.box, q.box.limit)
 
 

@@ -20,7 +20,7 @@ from malta.errors import InputError, require_known
 from malta.model.linearize import jacobians, linearize
 from malta.model.parameters import twins_of
 from malta.model.plant import Plant, symbolic
-from malta.proof.time_limit import check_time
+from malta.proof.work import check_clock
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ class Compensator:
 
 def held_gain(plant: Plant, states: Mapping[str, float]) -> FloatArray:
     """The gain H of held currents at these states, from E = B H: v + H y acts (forces x sensors)."""
-    check_time()
+    check_clock()
     model = linearize(plant, plant.at(**states))
     return np.asarray(np.linalg.lstsq(model.B, model.E, rcond=None)[0])
 
@@ -199,9 +199,9 @@ def model_of(
     if plant.has_stroke:
         point[plant.stroke_state] = z
     preload = ca.SX(machine.preload(point))
-    check_time()
+    check_clock()
     found = jacobians(machine, believed, x, u, v, ca.SX.zeros(len(plant.disturbances)))
-    check_time()
+    check_clock()
     A, B, C, E, made, ratio = ca.substitute(list(found), [x, u], [point, preload])
     keep = list(plant.controlled)
     parts = [A[keep, keep], B[keep, :], C[:, keep], E[keep, :], made, ratio, preload]

@@ -178,7 +178,6 @@ def _load_errors(design: SynthesizedDesign) -> list[Outcome]:
     return outcomes
 
 
-RATE = 60.0  # s, of the search for how fast the reference of a schedule may move
 MOST = 0.5  # of the time of a verification, which the margins take
 
 
@@ -276,7 +275,7 @@ def _schedule_note(plant: Plant, controller: Controller, time: float | None, *, 
     of += "figures without a place those of the operating point"
     if not proof:
         return of
-    bound = schedule_rate(plant, controller, time=RATE if time is None else time)
+    bound = schedule_rate(plant, controller, time=time)
     unit = next(s.unit for s in plant.outputs if s.name == bound.name)
     if bound.rate is None:
         return f"{of}; nothing is proven of a reference that moves ({bound.reason})"

@@ -17,7 +17,7 @@ import malta
 from malta.margins.travel import travel_margin
 from malta.proof.expressions import program
 from malta.proof.polynomial.rational import symbolic
-from malta.proof.time_limit import TimeUp, check_time, is_late, time_limit
+
 
 LIMIT = 0.3  # s
 ALLOWED = 1.2 * LIMIT + 1  # s of processor time, which other processes do not lengthen

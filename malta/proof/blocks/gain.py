@@ -48,11 +48,11 @@ from malta.proof.box import Box, box_of, within_branches
 from malta.proof.groups import loop_of
 from malta.proof.loss import first_loss
 from malta.proof.margin import Margin, unproven
-from malta.proof.polynomial.enclosure import Unproven
+from malta.proof.polynomial.enclosure import NO_COEFFICIENTS, Unproven
 from malta.proof.problem import OfLoop, is_nominal_stable
-from malta.proof.robust import deadline, law_of, problem_of
-from malta.proof.time_limit import TimeUp, time_limit
+from malta.proof.robust import law_of, problem_of
 from malta.proof.uncertain import Compensator, UncertainSystem, positive, responses
+from malta.proof.work import Budget, WorkUp, in_rounds, is_past, work_limit
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -80,7 +80,7 @@ DYNAMIC_STEPS = (
 )  # bounds that are tried, in multiples of the tolerance
 ROUNDS = 3
 ROUNDS_OF_SECANT = 40
-SEARCH = 0.4  # share of the time for the search of a loss; the rest is for the proof
+SEARCH = 0.4  # share of the work for the search of a loss; the rest is for the proof
 
 
 @on_one_thread
@@ -104,7 +104,7 @@ def dynamic_margin(
     dynamic : a block, or up to four that act in this order, at most one of them full
     over : intervals that do not grow with t, in SI
     tolerance : relative distance between the proven bound and the loss that was found
-    time : s, longest search, which then returns the bounds found so far; None: 120
+    time : s, longest search, which then returns the bounds found so far; None: as long as 120 units of work take
 
     Returns a Margin. `witness` holds the parameters; the blocks' sizes there are `t |W|` at `frequency`.
 
@@ -126,17 +126,22 @@ def dynamic_margin(
     if asked.unstable():
         reason = "the nominal loop is unstable"
         return Margin(0.0, 0.0, None, None, {}, {}, (), clock.monotonic() - begun, reason)
-    until = deadline(begun, time)
-    with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
-        lost = _loss(asked, begun + SEARCH * (until - begun))
+
+    def ask(until: float, _: bool) -> tuple[Peak | None, float | None, str]:
+        lost = _loss(asked, SEARCH * until)
         t = math.inf if lost is None else _size(asked, lost)
-        lower, reason = _prove_dynamic(asked, min(t, asked.box.limit), tolerance, until)
-    spent, names = clock.monotonic() - begun, box.names
+        return lost, *_prove_dynamic(asked, min(t, asked.box.limit), tolerance, until)
+
+    with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
+        (lost, lower, reason), ended = in_rounds(
+            Budget(time=time), ask, lambda x: x[1] or 0.0 if x[-1] else math.inf
+        )
+    took, names, reason = clock.monotonic() - begun, box.names, ended.explain(reason)
     if lost is None:
-        return Margin(lower, math.inf, None, None, {}, {}, (), spent, reason, box.searched)
-    witness = dict(zip(names, lost.p.tolist(), strict=True))
+        return Margin(lower, math.inf, None, None, {}, {}, (), took, reason, box.searched, ended.work)
+    t, witness = _size(asked, lost), dict(zip(names, lost.p.tolist(), strict=True))
     moved = dict(zip(names, (lost.p - box.nominal).tolist(), strict=True))
-    return Margin(lower, t, lost.frequency, witness, moved, {}, (), spent, reason)
+    return Margin(lower, t, lost.frequency, witness, moved, {}, (), took, reason, "", ended.work)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,11 +213,11 @@ class Blocks:
         """
         most = [share * b.weight.most for share, b in zip(shares, self.blocks, strict=True)]
         try:
-            with time_limit(until):
+            with work_limit(until):
                 blocks = list(zip(self.blocks, self.entries, strict=True))
-                return parts_of(self.with_blocks, blocks, self.box, reach, most, until)
-        except TimeUp as error:
-            raise Unproven("time was up before the coefficients were found") from error
+                return parts_of(self.with_blocks, blocks, self.box, reach, most)
+        except WorkUp as error:
+            raise Unproven(NO_COEFFICIENTS) from error
 
     def starts(self, t: float, chosen: FloatArray) -> list[FloatArray]:
         """The parameters in box(t) at relative places `chosen` (rows, -1 to 1)."""
@@ -292,14 +297,14 @@ def _loss(asked: Blocks, until: float) -> Peak | None:
     if (box.down + box.up).any():
         high = min(_size(asked, nearest()), asked.box.limit)
         if (asked.problem.instability(np.array(asked.starts(high, every))) >= 0).any():
-            with time_limit(until):
+            with work_limit(until):
                 t, w, p = first_loss(asked.problem, box, high)  # by the parameters alone
             if p is not None and w is not None:
                 seen.append(Peak(1 / t, w, p))
                 high = t
         top = peak(high, every)
         for _ in range(ROUNDS):
-            if top.value * high < 1 or clock.monotonic() > until:
+            if top.value * high < 1 or is_past(until):
                 break
             _narrow(peak, high, _pattern(box, high, top.p), until)
             high = _size(asked, nearest())
@@ -319,12 +324,12 @@ def _narrow(peak: Callable[[float, FloatArray], Peak], high: float, chosen: Floa
     above = math.log(high)
     below = above - math.log(2)
     at_above, at_below = excess(above), excess(below)
-    while at_below >= 0 and clock.monotonic() < until:
+    while at_below >= 0 and not is_past(until):
         above, at_above = below, at_below
         below -= math.log(2)
         at_below = excess(below)
     for _ in range(ROUNDS_OF_SECANT):
-        if not at_below < 0 <= at_above or above - below < 1e-11 or clock.monotonic() > until:
+        if not at_below < 0 <= at_above or above - below < 1e-11 or is_past(until):
             return
         share = min(max(at_above / (at_above - at_below), 0.02), 0.98)
         x = above - share * (above - below)
@@ -350,7 +355,7 @@ def _prove_dynamic(asked: Blocks, upper: float, tolerance: float, until: float) 
     parts: list[Part] = []
     reason = ""
     for step in DYNAMIC_STEPS:
-        if clock.monotonic() > until:
+        if is_past(until):
             break
         t = upper / (1 + step * tolerance)
         try:
@@ -444,7 +449,7 @@ def worst_case_gain(
         (sensors, forces), of effort (forces, sensors)
     dynamics : blocks of unmodelled dynamics, of their full size, beside the parameters
     tolerance : relative distance between the proven bound and the gain that was found
-    time : s, longest search, which then returns the bounds found so far; None: 120
+    time : s, longest search, which then returns the bounds found so far; None: as long as 120 units of work take
 
     Returns a Gain: a number for S and T, output units over input units for compliance and effort.
 
@@ -467,13 +472,18 @@ def worst_case_gain(
     if asked.unstable():
         reason = "the nominal loop is unstable"
         return Gain(math.inf, None, math.nan, {}, 0, clock.monotonic() - begun, reason)
-    until = deadline(begun, time)
+
+    def ask(until: float, _: bool) -> tuple[Peak, float | None, int, str]:
+        found = _largest(asked, SEARCH * until)
+        return found, *_prove(asked, found.value, tolerance, until)
 
     with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
-        lower, w, p = _largest(asked, begun + SEARCH * (until - begun))
-        upper, cells, reason = _prove(asked, lower, tolerance, until)
-    named = dict(zip(box.names, p.tolist(), strict=True))
-    return Gain(lower, upper, w, named, cells, clock.monotonic() - begun, reason)
+        budget = Budget(time=time)
+        ((lower, w, p), upper, cells, reason), ended = in_rounds(
+            budget, ask, lambda x: 0.0 if x[-1] else math.inf
+        )
+    named, took = dict(zip(box.names, p.tolist(), strict=True)), clock.monotonic() - begun
+    return Gain(lower, upper, w, named, cells, took, ended.explain(reason))
 
 
 def _performance_block(system: UncertainSystem, of: Of, at: At, channel: Any) -> Block:
@@ -498,7 +508,7 @@ def _performance_block(system: UncertainSystem, of: Of, at: At, channel: Any) ->
 
 
 def _largest(asked: Blocks, until: float) -> Peak:
-    """The largest gain that a search until a time finds; infinite at an unstable plant of the box."""
+    """The largest gain that a search finds until the work is up; infinite at an unstable plant of the box."""
 
     def value(p: FloatArray, w: FloatArray) -> FloatArray:
         return performance(asked.transfer(p, w), asked.blocks)
@@ -530,6 +540,6 @@ def _prove(asked: Blocks, lower: float, tolerance: float, until: float) -> tuple
                 if asked.stable()
                 else (None, count, "the nominal loop is not proven stable")
             )
-        if clock.monotonic() > until:
+        if is_past(until):
             break
     return None, count, "not settled: the box may hold an unstable loop"

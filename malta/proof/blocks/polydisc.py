@@ -17,7 +17,6 @@ largest singular value of the matrix that its entries give.
 from __future__ import annotations
 
 import math
-import time as clock
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -40,6 +39,7 @@ from malta.proof.exclusion import (
 )
 from malta.proof.polynomial.enclosure import family_over
 from malta.proof.polynomial.family import Family, align, combine
+from malta.proof.work import is_past
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -78,7 +78,6 @@ def parts_of(
     box: Box,
     reach: float,
     most: Sequence[float],
-    until: float,
 ) -> list[Part]:
     """The groups' polynomials over parts of box(reach).
 
@@ -86,7 +85,7 @@ def parts_of(
     most : the largest size of each block, if it is known; couplings of the size of rounding are then taken as zero and
         bounded
 
-    Raises Unproven when a polynomial cannot be enclosed.
+    Raises Unproven when a polynomial cannot be enclosed; WorkUp within a work_limit.
     """
     sides = box.sides(reach)
     known = all(
@@ -107,8 +106,8 @@ def parts_of(
     for (f, moves), acting in zip(groups, owners, strict=True):
         scaled = tuple(arb(grown) * c for c in moves)
         own = [(k, *blocks[k]) for k in acting]
-        made = partial(_part, f, moves=scaled, acting=own, box=box, until=until)
-        found += cut(sides, box.nominal, until, made, PATCHES - len(found))
+        made = partial(_part, f, moves=scaled, acting=own, box=box)
+        found += cut(sides, box.nominal, made, PATCHES - len(found))
     return found
 
 
@@ -130,7 +129,6 @@ def _part(
     moves: tuple[Any, ...],
     acting: list[tuple[int, Block, list[int]]],
     box: Box,
-    until: float,
 ) -> list[Part]:
     """The families of one group, from its values with entries at zero and at -unit."""
     known: dict[frozenset[int], Family] = {}
@@ -143,7 +141,7 @@ def _part(
             for _, b, pins in acting:
                 for i in pins:
                     fixed[i - len(sides)] = -b.unit if i in at else 0.0
-            made = family_over(f, np.vstack([sides, fixed]), () if at else moves, until)
+            made = family_over(f, np.vstack([sides, fixed]), () if at else moves)
             known[at] = replace(made, shape=made.shape[: len(sides)])  # entries are pinned
         return known[at]
 
@@ -233,6 +231,7 @@ def _widen(growth: Growth, phases: int) -> Growth:
 
 
 MOST_CELLS = 200_000
+CIRCLES = 3e-7  # work of each coefficient of each family on a cell
 Size = Callable[["FloatArray", int], Expanded]  # of a block, on cells of a scale
 
 
@@ -264,7 +263,7 @@ def _level(part: Part, level: int, target: float, sizes: Sequence[Size], until: 
     if part.scalars or part.full is not None:
         search = replace(search, around=_Circles(part, level, axes, sizes).on)
     while not search.finished:
-        if search.count > MOST_CELLS or clock.monotonic() > until:
+        if search.count > MOST_CELLS or is_past(until):
             return False, search.count
         search = advance(search)
     return True, search.count
@@ -281,6 +280,7 @@ class _Circles:
 
     def on(self, cells: FloatArray, boxes: FloatArray) -> CellBounds:
         part, level = self.part, self.level
+        is_past(price=CIRCLES * len(cells) * len(part.sets) * part.sets[0].values.shape[1])
         phases = boxes[:, self.axes :]
         on_circles = [self.sizes[k](cells, part.scale) for k in part.scalars[:level]]
         circle = _circle(on_circles, phases, None)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import time as clock
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -25,6 +24,7 @@ import numpy as np
 from malta.model.plant import readonly
 from malta.proof.blocks import Block
 from malta.proof.uncertain import Responses
+from malta.proof.work import is_past
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -35,6 +35,7 @@ STEPS = 24  # of the power iteration
 STARTS = 3
 ROUNDS = 40
 ZOOMS = 7
+CALL, VALUE = 9e-4, 5e-6  # work of values, and of each of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,14 +269,14 @@ def _top(problem: OfLoop) -> float:
 
 
 def climb(
-    value: Value, problem: OfLoop, sides: FloatArray, starts: Sequence[FloatArray], until: float = math.inf
+    value: Value, problem: OfLoop, sides: FloatArray, starts: Sequence[FloatArray], until: float
 ) -> Peak:
-    """The largest value found within the sides of a box (P x 2) until a time, from the best places of some starts."""
+    """The largest value found within the sides of a box (P x 2) until the work is up, from the best of some starts."""
     places: list[Peak] = []
     for p in starts:
-        if places and clock.monotonic() > until:
-            break
         w = frequencies(problem, p)
+        if is_past(until, CALL + VALUE * len(w)) and places:
+            break
         v = value(p, w)
         inner = np.flatnonzero((v >= np.append(v[1:], -np.inf)) & (v >= np.append(-np.inf, v[:-1])))
         places += [Peak(float(v[k]), float(w[k]), p) for k in inner[np.argsort(v[inner])[-3:]]]
@@ -285,7 +286,7 @@ def climb(
     top = _top(problem)
     best = places[0]
     for place in places[: min(PLACES, len(starts))]:
-        if clock.monotonic() > until:
+        if is_past(until):
             break
         best = max(best, _uphill(value, place, sides, top, until), key=lambda found: found.value)
     return best
@@ -305,6 +306,7 @@ def _uphill(value: Value, place: Peak, sides: FloatArray, top: float, until: flo
         p = np.tile(place.p, (len(z), 1))
         p[:, free] = np.clip(low + width * np.clip(z[:, :-1], 0, 1), *sides[free].T)
         w = np.minimum(place.frequency * np.exp(z[:, -1]), top)
+        is_past(price=CALL + VALUE * len(w))
         found = value(p, w)
         k = int(np.where(np.isnan(found), -np.inf, found).argmax())
         if found[k] > best.value:
@@ -324,7 +326,7 @@ def _uphill(value: Value, place: Peak, sides: FloatArray, top: float, until: flo
 
     def stop(z: Any) -> None:
         del z
-        if clock.monotonic() > until:
+        if is_past(until):
             raise StopIteration
 
     optimize.minimize(

@@ -3,12 +3,11 @@
 A cell is an interval of frequency and a part of the box. On it f lies in the convex hull of the Bernstein coefficients
 of its expansion, widened by radii; where all of that lies in an open half plane Re(conj(c) f) > 0, zero is excluded,
 c is the cell's witness. Other cells are split. Cells are taken in the order of the smallest margin t of any point in
-them, so that `lower`, the smallest t of a cell that is still open, only grows: it is true whenever the clock stops.
+them, so that `lower`, the smallest t of a cell that is still open, only grows: it is true whenever a search stops.
 """
 
 from __future__ import annotations
 
-import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,6 +19,7 @@ import numpy as np
 from malta.proof.box import Box, smallest_t
 from malta.proof.polynomial.enclosure import Polynomial, TooWide, Unproven
 from malta.proof.polynomial.family import EPS, Family, restrict, restriction_rounding
+from malta.proof.work import is_past
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -117,6 +117,7 @@ def _product(weight: FloatArray, turn: ComplexArray, values: FloatArray) -> Comp
 
 GUARD = 1e-9  # rad that a half plane must have to spare
 BATCH = 1024
+CALL, CELL, NODE = 1.2e-3, 5e-6, 5e-7  # work of a batch, of each cell, and of each coefficient on it
 NARROW = 1e-4  # of an interval of frequency, whose expansion leaves out less than rounding
 HOPELESS = 0.1  # variation of f on a cell, in radii, below which smaller cells exclude no more
 FEW, MANY = 24, 96  # cells up to which they are cut thrice, and twice, at once
@@ -299,6 +300,7 @@ def advance(s: Search) -> Search:
         batch = np.zeros(len(s.cells), dtype=bool)
         batch[order[:most]] = True
     cells, boxes, depth = s.cells[batch], s.boxes[batch], s.depth[batch]
+    is_past(price=CALL + CELL * len(cells) + NODE * len(cells) * s.family.values.shape[1])
     found = _expanded(s, cells, boxes)
     terms, radius = found.terms, found.radius
     c = half_plane([*terms, found.discs], radius)
@@ -465,19 +467,16 @@ class Part:
 def cut(
     sides: FloatArray,
     nominal: FloatArray,
-    until: float,
     made: Callable[[FloatArray], list[Any]],
     most: int = PATCHES,
 ) -> list[Any]:
     """Apply `made` to a box, or to parts of it where the box is too wide; `most` parts at most.
 
-    Raises Unproven when the parts are too many or time is up.
+    Raises Unproven when the parts are too many, and what `made` raises.
     """
     todo, found = [sides], list[Any]()
     while todo:
         own = todo.pop()
-        if clock.monotonic() > until:
-            raise Unproven("time was up before the coefficients were found")
         try:
             found += made(own)
         except TooWide as error:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import heapq
 import itertools
 import math
-import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -28,6 +27,7 @@ from malta.proof.polynomial.characteristic import pair
 from malta.proof.polynomial.enclosure import Disc, TooWide, Unproven, discs_of, ends_of, precision
 from malta.proof.polynomial.family import nodes, scale_of
 from malta.proof.problem import hurwitz
+from malta.proof.work import check_clock, spend
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 BITS = 640  # of balls: Bernstein coefficients of degree d lose about 2 d of them
 LARGEST = 14  # degree in s
+DETERMINANT, HALVING = 3e-7, 4e-6  # work of a determinant, by its order cubed; of a cell, by its coefficients
 MOST_PLACES = 4000  # at which a_k, or H, is evaluated
 HIGHEST = 40  # degree of an interpolation along one parameter
 TAIL = -70.0  # log2 of what an interpolation may leave out, relative to each coefficient
@@ -147,9 +148,7 @@ def determinant(a: Sequence[Any]) -> Any:
     return arb_mat(n - 1, n - 1, entries).det() if n > 1 else arb(1)
 
 
-def functions_over(
-    f: Polynomial, box: Box, moves: Sequence[Any], until: float, sides: FloatArray
-) -> list[Function]:
+def functions_over(f: Polynomial, box: Box, moves: Sequence[Any], sides: FloatArray) -> list[Function]:
     """a_0, a_n and H of a polynomial over a part of the box (P x 2, of p).
 
     Raises Unproven where they are too large, or one of them is zero at the nominal values.
@@ -161,7 +160,7 @@ def functions_over(
     here = _values(f, [axes.middle(i) for i in range(len(nominal))])
     if len(here) - 1 > LARGEST:
         raise Unproven(f"a polynomial of degree {len(here) - 1} in s")
-    powers, tails = _enclose(f, axes, until)
+    powers, tails = _enclose(f, axes)
     for k, bound in enumerate(f.coupling_bounds(moves, [(arb(a), arb(b)) for a, b in sides.tolist()]) or ()):
         tails[k] += arb(bound[0]) * arb(2) ** bound[1]
     while len(powers) > 1 and all(x == 0 for x in powers[-1].values) and tails[len(powers) - 1] == 0:
@@ -174,7 +173,7 @@ def functions_over(
     found = [(here[0], ends[0], tails[0]), (here[-1], ends[-1], tails[-1])]
     if len(powers) > 2:
         slack = _determinant_slack([_largest(tensor) for tensor in ends], tails)
-        found.append((determinant(here), _to_bernstein(_expand(powers, until)), slack))
+        found.append((determinant(here), _to_bernstein(_expand(powers)), slack))
     made = []
     for value, tensor, slack in found:
         sign = 1 if value > 0 else -1 if value < 0 else 0
@@ -192,7 +191,7 @@ def _values(f: Polynomial, v: list[Any]) -> list[Any]:
         raise Unproven(f"the matrices have no value on the box: {error}") from error
 
 
-def _enclose(f: Polynomial, axes: Axes, until: float) -> tuple[list[Tensor], list[Any]]:
+def _enclose(f: Polynomial, axes: Axes) -> tuple[list[Tensor], list[Any]]:
     """The coefficients a_k as polynomials of u, by powers, and bounds of what these leave out."""
     known = f.degrees
     free = [i for i, d in enumerate(known) if d is None and axes.low[i] < axes.high[i]]
@@ -212,9 +211,9 @@ def _enclose(f: Polynomial, axes: Axes, until: float) -> tuple[list[Tensor], lis
         for i, d in enumerate(degrees)
     ]
     places = []
+    spend(f.price * math.prod(map(len, grids)))
     for u in itertools.product(*grids):
-        if clock.monotonic() > until:
-            raise Unproven("time was up before the coefficients were found")
+        check_clock()
         places.append(_values(f, axes.place(u)))
     shape = tuple(d + 1 for d in degrees)
     found = [Tensor(shape, [a[k] for a in places]) for k in range(len(places[0]))]
@@ -274,7 +273,7 @@ def _largest(bernstein: Tensor) -> Any:
     return top
 
 
-def _expand(powers: list[Tensor], until: float) -> Tensor:
+def _expand(powers: list[Tensor]) -> Tensor:
     """H by powers of u: evaluated on a grid."""
     orders = [_degrees(tensor) for tensor in powers]
     axes = range(len(powers[0].shape))
@@ -288,9 +287,9 @@ def _expand(powers: list[Tensor], until: float) -> Tensor:
             tensor = tensor.along(i, _powers_at(grid, tensor.shape[i] - 1))
         values.append(tensor.values)
     found = []
+    spend(DETERMINANT * len(powers) ** 3 * len(values[0]))
     for a in zip(*values, strict=True):
-        if clock.monotonic() > until:
-            raise Unproven("time was up before the coefficients were found")
+        check_clock()
         found.append(determinant(a))
     made = Tensor(tuple(d + 1 for d in degrees), found)
     for i, grid in enumerate(grids):
@@ -357,7 +356,7 @@ class Cell(NamedTuple):
 class Signs:
     """The functions of all groups, and the cells that are left. `lower`: all are positive on every smaller box(t).
 
-    It changes in place: time that is up may end any step of it, and what was found before then stands.
+    It changes in place: work that is up may end any step of it, and what was found before then stands.
     """
 
     reach: Any  # the box that the functions cover
@@ -382,6 +381,7 @@ class Signs:
 
     def advance(self) -> None:
         """Take the open cell of the smallest t: try its corners as witnesses, and halve it."""
+        spend(HALVING * len(self.cells[0].tensor.values))
         cell = heapq.heappop(self.cells)
         if float(cell.t) >= self.upper:
             return
@@ -459,18 +459,18 @@ def _halves(n: int) -> tuple[Any, Any]:
     return fmpq_mat(left), fmpq_mat(right)
 
 
-def signs_over(problem: Problem, box: Box, reach: float, until: float) -> Signs:
+def signs_over(problem: Problem, box: Box, reach: float) -> Signs:
     """The search over box(reach).
 
-    Raises Unproven where the determinant has too many coefficients or a matrix has no value, or when time is up.
+    Raises Unproven where the determinant has too many coefficients or a matrix has no value; WorkUp as spend does.
     """
     sides = box.sides(reach)
     found = Signs(_covered(box, sides))
     try:
         with precision(BITS):
             for f, moves in problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
-                made = partial(functions_over, f, box, moves, until)
-                for function in cut(sides, box.nominal, until, made, SIGN_PARTS):
+                made = partial(functions_over, f, box, moves)
+                for function in cut(sides, box.nominal, made, SIGN_PARTS):
                     whole = [(fmpq(0), fmpq(1))] * len(box.names)
                     found.add(function, function.tensor, whole)
     except NotAnalytic as error:
@@ -489,10 +489,10 @@ def _covered(box: Box, sides: FloatArray) -> Any:
     return t
 
 
-def raise_bound(s: Signs, tolerance: float, until: float, most: int) -> None:
-    """Halve cells until the bound is as near to the witness as `tolerance` says, or the time or the cells are over."""
+def raise_bound(s: Signs, tolerance: float, most: int) -> None:
+    """Halve cells until the bound is as near to the witness as `tolerance` says, or the work or the cells are over."""
     with precision(BITS):
-        while s.cells and not s.blocked and s.count < most and clock.monotonic() < until:
+        while s.cells and not s.blocked and s.count < most:
             if s.lower >= s.upper * (1 - tolerance):
                 return
             s.advance()

@@ -11,7 +11,7 @@ import numpy as np
 
 from malta.proof.exclusion import Cell, Growth, cover
 from malta.proof.polynomial.family import Family, basis
-from malta.proof.time_limit import is_late
+from malta.proof.work import is_past
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -21,6 +21,9 @@ STEPS = 8  # of the frequency grid in an octave
 SPACING = 0.6 / STEPS  # half a step and more, in ln w
 HALVINGS = 6  # of the way to a corner, of which the descent follows the rest
 STARTS = 6  # of descents, of each kind
+DESCENT, POINT = 9e-4, 1.4e-5  # work of a step of a descent, and of linear distances at a frequency
+ROOTS = 6e-5  # work of the roots at a place
+VALUE = 2e-8  # work of each coefficient of the family at a place
 ENDS = ((0, 0.0), (1, 0.0))  # w = 0 and w = infinity
 
 
@@ -117,7 +120,7 @@ def starts(f: Family, g: Growth) -> list[tuple[float, int, float, FloatArray]]:
     places = [np.array(place) for place in itertools.islice(itertools.product(*fixed), 27)]
     x = np.geomspace(inner[0, 1], inner[-1, 2], STEPS * len(inner)) if len(inner) else np.ones(1)
     for u in places:
-        if is_late():
+        if is_past(price=POINT * len(x) + VALUE * f.values.size):
             break
         at = coefficients_at(f, u)
         t = linear_distance(f, g, u, 0, x, at)
@@ -145,7 +148,7 @@ def _corners(f: Family, g: Growth) -> list[tuple[float, int, float, FloatArray]]
     centre, grows = g.shares(g.nominal), g.grows
     found = []
     for row in signs:
-        if is_late():
+        if is_past(price=(HALVINGS + 2) * (ROOTS + VALUE * f.values.size)):
             break
         end = centre.copy()
         end[free] = row
@@ -215,7 +218,7 @@ def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: f
     trust, widest, best = 0.5, 1.0, None
     for k in range(MOST if here is not None else 0):
         assert here is not None
-        if is_late():
+        if is_past(price=DESCENT + 3 * VALUE * f.values.size):
             break
         found = _smallest_step(f, g, here, trust)
         if found is None:  # nothing within the trust region solves the equation
@@ -386,6 +389,7 @@ def from_cell(f: Family, g: Growth, cell: Cell, below: float) -> Zero | None:
     low, high = cell.interval
     u, best = cell.box.mean(axis=1), None
     for x in ((low + high) / 2, *([0.0] if low == 0 else [])):
+        is_past(price=DESCENT + 5 * VALUE * f.values.size)
         near = project(f, g, cell.branch, x, u)
         if near is not None and near.t < (best.t if best is not None else below):
             best = near

@@ -27,7 +27,7 @@ import numpy as np
 from scipy import linalg
 
 from malta.proof.multipliers.pencil import EPS, Expansion
-from malta.proof.time_limit import check_time
+from malta.proof.work import spend
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -40,7 +40,7 @@ SHARE = 0.3  # of the way from the level reached to the one that stands
 FLAT = 0.01  # relative progress below which the level is the best there is
 STEP = 1e-6  # of N, for the slopes of a centre
 SLACK = 1e-6  # what keeps G within thousands of D where nothing else does
-SECONDS = 3e-11  # that a Newton step takes, about, times the cube of its coordinates
+NEWTON, SQUARED = 1.5e-4, 8e-8  # work of a Newton step, and times the square of its coordinates
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def multiplier(
     along : slopes of N along frequency, for the slopes of D and G
     hasty : whether to stop at `first` when its beta is not below `wanted`
 
-    Raises TimeUp within a time_limit.
+    Raises WorkUp within a work_limit.
     """
     scale = units(N, blocks)
     turn = scale[:, None] / scale
@@ -241,7 +241,7 @@ class _Centres:
     def centre(self, x: FloatArray, b: float) -> FloatArray:
         """Newton steps towards the centre for b."""
         for _ in range(INNER):
-            check_time(SECONDS * len(x) ** 3)
+            spend(NEWTON + SQUARED * len(x) ** 2)
             try:
                 inverses = self._inverses(x, b)
                 g = self._gradient(x, b, *inverses)

@@ -10,7 +10,6 @@ multipliers of one interval are continued to the next, by their slopes.
 from __future__ import annotations
 
 import math
-import time as clock
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -29,7 +28,7 @@ from malta.proof.multipliers import (
 )
 from malta.proof.multipliers.pencil import TERMS, Rows
 from malta.proof.polynomial.rational import TooLarge
-from malta.proof.time_limit import check_time
+from malta.proof.work import is_past, spend, spent
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,7 +50,8 @@ FIRST_STEP, LAST_STEP = 1.2, 1.003  # from one box to the next
 NOT_FAR = 1.3  # times what stands: boxes up to that are tried at once
 WIDER = 1.3  # the next interval of frequency than the last one
 HASTY = 0.4  # share of the last interval's width from which on a failure means that it was too wide
-PATIENCE = 0.4  # share of the time that is left for one box
+PATIENCE = 0.4  # share of the work that is left for one box
+LEVEL = 3.5e-6  # work of a cell beside Newton steps, times the square of its rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class Proof:
 
 
 class Attempt(NamedTuple):
-    """The result for cells: beta of one that was not excluded, if any, and the cells left when time was up."""
+    """The result for cells: beta of one that was not excluded, if any, and the cells left when the work was up."""
 
     beta: float
     cell: Cell | None
@@ -129,7 +129,7 @@ class Step(NamedTuple):
 class Structured:
     """The groups of loops, and the largest t for which box(t) is proven as stable as the nominal values.
 
-    It changes in place: time that is up may end any step of it, and what was proven before then stands.
+    It changes in place: work that is up may end any step of it, and what was proven before then stands.
     """
 
     rows: list[Rows]
@@ -147,16 +147,16 @@ class Structured:
     _branches: dict[Any, tuple[Pencil | None, dict[Any, Branch]]] = field(default_factory=dict, repr=False)
 
     def _is_late(self, until: float) -> bool:
-        return clock.monotonic() > until or self.count >= self.most
+        return is_past(until) or self.count >= self.most
 
     def raise_bound(
         self, target: float, until: float = math.inf, report: Callable[[float], object] = lambda _: None
     ) -> float:
         """Prove box(target), or smaller boxes when that takes too long; a further call continues the work.
 
-        until : time.monotonic() at which it ends; report : called with each t that is proven
+        until : of the work, at which it ends; report : called with each t that is proven
 
-        Raises TimeUp within a time_limit.
+        Raises WorkUp within a work_limit.
         """
         if not self.lower:
             self._order = self._prove_whole(target, until, report)
@@ -166,7 +166,7 @@ class Structured:
                 t, cells = begun
             else:
                 cells = self._begin(self._order or self.cover(t), t)
-            begun, now = None, clock.monotonic()
+            begun, now = None, spent()
             found = self._prove(cells, now + PATIENCE * (until - now), self._shown[t], split=True)
             if found.cell is None:
                 self._raise_to(t, report)
@@ -209,7 +209,7 @@ class Structured:
             t /= 2
             beta, cells = self._survey(t, until)
         t *= min(1.0, 0.95 / max(beta, 1e-9)) if math.isfinite(beta) else 0.1
-        now = clock.monotonic()
+        now = spent()
         last = now + 0.7 * (until - now)
         while cells and not self._is_late(last) and t > SMALLEST * target:
             found = self._prove(self._begin(cells, t), last, self._shown[t], split=False)
@@ -225,7 +225,7 @@ class Structured:
         found, near = [], None
         for cell in self.cover(t):
             for part in [cell] if cell.low == 0 else across_frequency(cell):
-                check_time()
+                spend(LEVEL * self.rows[cell.rows].size ** 2)
                 own = self._branch(part)
                 if own is None:
                     return math.inf, []
@@ -300,6 +300,7 @@ class Structured:
     def _level(self, cell: Cell, *, hasty: bool = False) -> tuple[float, Multiplier | None, bool]:
         """The beta in the middle of a cell, its multiplier, and whether the cell is excluded."""
         self.count += 1
+        spend(LEVEL * self.rows[cell.rows].size ** 2)
         own = self._branch(cell)
         if own is None:
             return math.inf, None, False

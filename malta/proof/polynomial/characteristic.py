@@ -135,6 +135,8 @@ def _rank(rows: list[dict[Any, Any]], i: int) -> int:
 
 
 MOST = 20_000  # places that are remembered
+PLACE = 2.5e-4  # work of a place
+STEP, CUBED = 2e-6, 1e-6  # work of an operation of the model, and times the cube of the states
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,6 +236,11 @@ class Characteristic:
     @cached_property
     def minors(self) -> Minors | None:
         return minors(self.loop, self.group)
+
+    @cached_property
+    def price(self) -> float:
+        """The work of the coefficients at one place."""
+        return PLACE + STEP * len(self.loop.program.steps) + CUBED * len(self.group.states) ** 3
 
     # values
 

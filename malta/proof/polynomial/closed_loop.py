@@ -28,6 +28,7 @@ from malta.proof.groups import (
 )
 from malta.proof.polynomial.rational import Ratio, Symbolic, value
 from malta.proof.uncertain import Group
+from malta.proof.work import spend
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -395,6 +396,7 @@ def _heights(full: FloatArray) -> FloatArray:
 
 
 SMALL = 1e-11  # relative size below which a coupling may be rounding
+TERM = 4e-6  # work of a term in balls
 
 
 @dataclass(frozen=True, eq=False)
@@ -428,9 +430,16 @@ class Couplings:
                 add(measured, (i, j), q, float(law.B[i, b]))
         return own, held, measured
 
+    @cached_property
+    def terms(self) -> int:
+        """The number of terms of all entries."""
+        ratios = [r for table in self.entries for r in table.values()]
+        return sum(len(r.num) + (0 if r.den is None else len(r.den)) for r in ratios)
+
     @np.errstate(over="ignore", invalid="ignore")  # bounds that overflow are refused
     def bounds(self, p: Sequence[Any]) -> FloatArray:
         """Entrywise bounds of M without its diagonal s (or g) over real balls p; the states x come first."""
+        spend(TERM * self.terms)
         loop, law = self.loop, self.loop.law
         n, k = loop.states, len(law.A)
         values = [acb(x) for x in p]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from flint import acb, arb, ctx, fmpq
 from malta.proof.expressions import NotAnalytic, exact
 from malta.proof.polynomial.characteristic import pair
 from malta.proof.polynomial.family import Family, family, nodes
-from malta.proof.time_limit import check_time
+from malta.proof.work import check_clock, remembered, spend
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -37,7 +36,7 @@ RADII = tuple(2.0**k for k in (0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20
 MIDDLE = RADII.index(2.0**12)  # where the search of discs begins
 BITS = 128  # of ball arithmetic, in which numbers of up to 128 bits take the least time
 MOST_BITS = 640  # beyond which a coefficient is taken as the ball that it is
-HOPE = 0.4  # of what the first place took, at least, the others take
+DISC = 5.0  # times the work of a place, that of a disc
 
 
 class Polynomial(Protocol):
@@ -53,11 +52,16 @@ class Polynomial(Protocol):
     def inverted(self) -> tuple[bool, ...]: ...
     @property
     def degrees(self) -> tuple[int | None, ...]: ...
+    @property
+    def price(self) -> float: ...  # work of the coefficients at one place
     def at(self, v: Sequence[Any]) -> list[Any]: ...
     def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]: ...
     def coupling_bounds(
         self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
     ) -> list[tuple[float, int]] | None: ...
+
+
+NO_COEFFICIENTS = "the work was up before the coefficients were found"
 
 
 class Unproven(Exception):
@@ -90,10 +94,10 @@ class Side:
     tails: tuple[tuple[float, int], ...] | None
 
 
-def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until: float = math.inf) -> Family:
+def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = ()) -> Family:
     """The family over a box (P x 2, of p); moves: bounds of the effect of neglected couplings (closed_loop.py).
 
-    Raises TooWide when a narrower box may have an enclosure, else Unproven.
+    Raises TooWide when a narrower box may have an enclosure, else Unproven; WorkUp within a work_limit.
     """
     if f.foreign:
         raise Unproven(f"the model has {f.foreign[0]}, which has no enclosure")
@@ -111,26 +115,24 @@ def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until:
         [low[i] + (high[i] - low[i]) * _share(side, k) for k in range(side.degree + 1)]
         for i, side in enumerate(plan)
     ]
-    points = values_within(f, list(itertools.product(*grid)), until)
+    points = values_within(f, list(itertools.product(*grid)))
     ends = [(arb(a), arb(b)) for a, b in sides.tolist()]
     tails = add_bounds(_sum_tails(plan), f.coupling_bounds(moves, ends))
     return family([s.degree + 1 for s in plan], [s.chebyshev for s in plan], points, tails)
 
 
-FAMILIES: WeakKeyDictionary[Polynomial, dict[Any, Family]] = WeakKeyDictionary()
+FAMILIES: WeakKeyDictionary[Polynomial, dict[Any, tuple[Family, Sequence[float]]]] = WeakKeyDictionary()
 REMEMBERED = 4_000_000  # numbers in the families of a polynomial, beyond which the oldest are forgotten
 
 
-def family_over(f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> Family:
+def family_over(f: Polynomial, sides: FloatArray, moves: tuple[Any, ...]) -> Family:
     """The family of a polynomial over `sides`, remembered: several margins need it over the same box."""
     known = FAMILIES.setdefault(f, {})
     key = (sides.tobytes(), tuple(pair(m) for m in moves))
-    if key not in known:
-        family = over_box(f, sides, moves, last)
-        while sum(other.values.size for other in known.values()) > REMEMBERED:
-            known.pop(next(iter(known)))
-        known[key] = family
-    return known[key]
+    found = remembered(known, key, lambda: over_box(f, sides, moves))
+    while len(known) > 1 and sum(other.values.size for other, _ in known.values()) > REMEMBERED:
+        known.pop(next(iter(known)))
+    return found
 
 
 def add_bounds(
@@ -164,23 +166,19 @@ def _share(side: Side, k: int) -> Any:
     return exact(nodes(side.degree, chebyshev=True)[k]) if side.chebyshev else fmpq(k, side.degree)
 
 
-def values_within(f: Polynomial, places: list[tuple[Any, ...]], until: float = math.inf) -> list[list[Any]]:
+def values_within(f: Polynomial, places: list[tuple[Any, ...]]) -> list[list[Any]]:
     """The coefficients at the places, as balls accurate to 60 bits."""
 
     def evaluate(place: tuple[Any, ...]) -> list[Any]:
-        if time.monotonic() > until:
-            raise Unproven("time was up before the coefficients were found")
+        check_clock()
         return f.at(place)
 
+    spend(f.price * len(places))
     bits = BITS
     while True:
         try:
             with precision(bits):
-                begun = time.monotonic()
                 first = f.at(places[len(places) // 2])
-                spent = time.monotonic() - begun
-                if time.monotonic() + HOPE * spent * len(places) > until:
-                    raise Unproven("time would be up before the coefficients were found")
                 if f.exact or bits >= MOST_BITS or all(_is_accurate(c) for c in first):
                     return [evaluate(place) for place in places]
         except NotAnalytic as error:
@@ -238,7 +236,7 @@ def discs_of(
         if len(found) > 1 and least < _wanted_degree(found[0], TAILS[0]):
             break  # larger discs are the better ones
         for radius in radii:
-            check_time()
+            spend(DISC * f.price)
             try:
                 disc = _disc(f, i, low, high, size, radius)
             except NotAnalytic as error:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.proof.time_limit import check_time
+from malta.proof.work import spend
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -24,6 +24,11 @@ EPS = 2.0**-52
 WIDE = 8  # nodes of the following axes from which on values are multiplied in place
 FEW = 6  # degree up to which a restriction is one product of matrices
 COLUMNS = 4096  # of a product of exact matrices at once
+ROUND, ENTRY, BIT = (
+    4e-6,
+    5e-8,
+    1.3e-9,
+)  # work of rounding, of a product of entries, and of each bit of exact ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +179,7 @@ def combine(f: Family, g: Family, a: float, b: float) -> Family:
 def _round_to_doubles(shape: Sequence[int], table: Any, tails: Any) -> Family:
     """Bernstein coefficients (nodes x k, exact or balls) as a family."""
     each, count = table.shape
+    spend(ROUND * each * count)
     mantissas, radii, powers = (np.zeros((count, each)) for _ in range(3))
     for (b, k), x in np.ndenumerate(table):
         mantissas[k, b], radii[k, b], powers[k, b] = binary(x)
@@ -204,8 +210,11 @@ def _transform(table: Any, shape: tuple[int, ...], axis: int, M: Any) -> Any:
     rest = array.shape[1:]
     flat = array.reshape(n, -1)
     own, made = kind(M), np.empty(flat.shape, dtype=object)
+    first = table.ravel()[0]
+    bits = int(first.p).bit_length() + int(first.q).bit_length() if kind is fmpq_mat else 0
+    price = n * (ENTRY + BIT * bits)
     for k in range(0, flat.shape[1], COLUMNS):
-        check_time()
+        spend(price * flat[:, k : k + COLUMNS].size)
         some = flat[:, k : k + COLUMNS]
         product = own * kind(n, some.shape[1], some.ravel().tolist())
         made[:, k : k + COLUMNS] = np.array(product.entries(), dtype=object).reshape(some.shape)

@@ -22,7 +22,7 @@ from malta.proof.expressions import (
     exact,
     program,
 )
-from malta.proof.time_limit import check_time
+from malta.proof.work import check_clock
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -45,7 +45,7 @@ class Ratio:
         self.num, self.den = num, den
         if len(num) > LARGEST:
             raise TooLarge
-        check_time()
+        check_clock()
 
     def __add__(self, other: Ratio) -> Ratio:
         if self.den is None and other.den is None:
@@ -135,7 +135,7 @@ def over_common_denominator(entries: Mapping[Any, Ratio]) -> tuple[dict[Any, Any
 
 def value(polynomial: Mapping[Any, Any], p: Sequence[Any]) -> Any:
     """The value at complex balls of a polynomial, its coefficients by exponents."""
-    check_time()
+    check_clock()
     total = acb(0)
     for monomial, c in polynomial.items():
         term = acb(c)

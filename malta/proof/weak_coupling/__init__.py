@@ -37,6 +37,7 @@ from malta.proof.polynomial.family import Family, scale_of
 from malta.proof.problem import Problem, Traits, physical
 from malta.proof.weak_coupling.axes import Axes, axes_of, members_of, state_matrix, stiff_axes
 from malta.proof.weak_coupling.held_currents import Bounds, HeldMachine, dominating_solution
+from malta.proof.work import is_past, spend
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -56,6 +57,7 @@ TERMS = 10  # of series in the stiffness
 SAFE = 1 + 1e-9
 GRID = 8  # parts of each side of a box on which couplings are bounded
 MOST = 4000  # such parts
+BOUNDS, PERRON = 1.6e-3, 1.4e-2  # work of the bounds over a part, and of a try of weights
 CORNERS = 6  # parameters whose corners are all looked at for weights
 
 
@@ -234,6 +236,7 @@ class HeldLoop:
             if (key := inside.tobytes()) not in known:
                 found = known[sides.tobytes()]
                 if len(known) < MOST:
+                    is_past(price=BOUNDS)
                     with suppress(NotAnalytic):
                         W, V, _ = self._bounds(inside)
                         found = replace(found, W=W, V=V)
@@ -287,6 +290,7 @@ class HeldLoop:
         if rho >= LIMIT:
             return best
         for _ in range(HALVINGS):
+            spend(PERRON)
             t = (low + high) / 2 if high < reach or low else reach
             found, rho = self._perron(box.sides(t), LIMIT)
             if rho < LIMIT:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.proof.expressions import NotAnalytic, Program
-from malta.proof.time_limit import check_time
+from malta.proof.work import check_clock
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -200,11 +200,11 @@ class Evaluation:
     def run(self, program: Program, inputs: Sequence[Value]) -> list[list[tuple[int, int, Value]]]:
         """The entries (row, column, value) of each matrix.
 
-        Raises NotAnalytic for expressions without this form, TimeUp within a time_limit.
+        Raises NotAnalytic for expressions without this form, WorkUp where the clock ends the question.
         """
         cells: list[Value] = []
         for name, target, operands, x in program.steps:
-            check_time()
+            check_clock()
             if name == "input":
                 cells.append(inputs[target])
             elif name == "const":
