@@ -6,9 +6,10 @@ The loops and their signals are those of loops.py; at the sensors S = (I - P F)^
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -52,6 +53,7 @@ from malta.proof.parametric_plants import of_plant
 from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator, crossing_frequency, find_peaks
 from malta.proof.windings import CurrentLoops, chosen_loops
+from malta.proof.work import Budget, metered
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import gain_at_rest
 from malta.synthesis.lqg import integrals_of, kalman, lqi, lqr, weights_of
@@ -338,9 +340,7 @@ class _Question:
             )
         return known[z]
 
-    def margin_over(
-        self, ranges: Ranges, *, brief: bool = False, progress: Progress | None = None
-    ) -> Margin:
+    def margin_over(self, ranges: Ranges, *, brief: bool = False, progress: Progress | None = None) -> Margin:
         """The margin anywhere in the extent; computed once for equal ranges: +1 kg may be the range of the mass.
 
         brief : whether it may take the work of one place
