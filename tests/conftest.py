@@ -206,7 +206,7 @@ def _question(problem: Problem, box: Box, effort: robust.Effort) -> bytes | None
         if not isinstance(one, OfLoop):
             return None
         loops.append(_loop(one.loop.system, one.loop.law))
-    return pickle.dumps((loops, vars(box), effort.tolerance, effort.time, effort.most_cells))
+    return pickle.dumps((loops, vars(box), effort.tolerance, effort.limits))
 
 
 @contextmanager

@@ -40,6 +40,7 @@ from malta.proof.uncertain import (
     worst_frequency,
 )
 from malta.proof.uncertain import closed_loop as closed_matrices
+from malta.proof.work import WorkUp
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -257,7 +258,9 @@ class OfLoop:
         """The states that close loops by themselves, where these are found at once; else none."""
         if len(self.loop.program.steps) > SHORT:
             return ()
-        return groups(self.loop)
+        with suppress(WorkUp):
+            return groups(self.loop)
+        return ()
 
     @property
     def _plain(self) -> bool:

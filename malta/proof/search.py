@@ -22,7 +22,7 @@ from malta.proof.margin import Certificate, Margin, Progress
 from malta.proof.multipliers.structured import Proof, Structured, rows_of
 from malta.proof.polynomial.enclosure import NO_COEFFICIENTS, Unproven, family_over
 from malta.proof.problem import Problem, is_nominal_stable
-from malta.proof.work import WorkUp, is_past, is_stopped, spent, work_limit
+from malta.proof.work import WorkUp, is_past, is_stopped, refuse, spent, work_limit
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -44,7 +44,7 @@ LEVELS = 5  # of these boxes, each half of the next
 SMALLER = 4  # boxes, each half of the last one, that Hurwitz's determinant is tried on
 # of the work for families, by the number of parameters, the last for MANY
 SHARES = (0.6, 0.6, 0.6, 0.6, 0.4, 0.3)
-PATIENT = 0.8  # of the work, for families of a patient search
+PATIENT, PATIENT_DEAR = 0.8, 0.1  # of the work, for families of a patient search
 OF_HOLDS = 0.12  # of many parameters under a hold, where each family takes long
 MANY = 5  # parameters from which on multipliers come before many cells
 MANY_OF_POLYNOMIALS = 11  # whose cells are cheap
@@ -124,6 +124,11 @@ class Question:
             return PATIENT
         is_dear = self.is_many and self.problem.traits.is_held
         return OF_HOLDS if is_dear else SHARES[min(self._count, MANY)]
+
+    @property
+    def dear(self) -> float:
+        """Work of families beyond which their boxes grow in small steps."""
+        return max(DEAR, PATIENT_DEAR * self.end) if self.patient else DEAR
 
     def is_late(self) -> bool:
         return is_past(self.end)
@@ -222,7 +227,7 @@ def _families(q: Question, known: Findings, until: float) -> tuple[Findings, lis
             parts = parts_over(q.problem, q.box, reach, min(until, last))
         except Unproven as error:
             refused, why = reach, str(error)
-            if is_past(until) or reach < 1e-3 or (done and taken > DEAR):
+            if is_past(until) or reach < 1e-3 or (done and taken > q.dear):
                 break
             reach = done + 0.6 * (reach - done) if done else FIRST if reach > 2 * FIRST else 0.5 * reach
         else:
@@ -230,15 +235,16 @@ def _families(q: Question, known: Findings, until: float) -> tuple[Findings, lis
             for part in parts:
                 known = _descend(known, part, until)
             taken = spent() - begun
-            if known.upper <= done or done >= q.box.limit or taken > min(0.3 * (until - begun), 4 * DEAR):
+            if known.upper <= done or done >= q.box.limit or taken > min(0.3 * (until - begun), 4 * q.dear):
                 break
-            wanted = (6 if taken < DEAR else 1.5) * done
+            wanted = (6 if taken < q.dear else 1.5) * done
             wanted = max(wanted, 1.01 * known.upper if math.isfinite(known.upper) else 0)
             reach = min(q.box.limit, wanted, 0.5 * (done + refused))
         if done and refused - done < EDGE * done:
             break
     if known.upper > done and (why or done < q.box.limit):
         known = known.because(why or f"nothing beyond {done:.3g} was looked at: the model is dear to enclose")
+        refuse()
     room = NEAR if q.problem.traits.is_bounded else 1.05  # couplings grow with the box
     if known.upper < done / (3 if room > NEAR else room) and not is_past(until):
         with suppress(Unproven):  # narrower families over a smaller box; the larger ones remain valid

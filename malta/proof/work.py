@@ -127,8 +127,8 @@ def in_rounds(
 ) -> tuple[Answer, Ended]:
     """The best answer of a search that is asked with its work and whether it is to be patient, and how it ended.
 
-    A patient budget is used: where the first round leaves work undone and its answer is open, patient ones follow, until
-    one of them leaves work undone as well.
+    A patient budget is used: where the first round leaves work undone and its answer is open, patient ones follow,
+    until one of them leaves work undone as well.
 
     rank : of an answer, the higher the better; infinite for one that is decided
     """
@@ -184,6 +184,13 @@ def spent() -> float:
     """The work of the question so far."""
     own = _meter.get()
     return 0.0 if own is None else own.work
+
+
+def refuse() -> None:
+    """Note that a step was left undone as it would take too much: more work may find more."""
+    own = _meter.get()
+    if own is not None:
+        own.refused = True
 
 
 def is_stopped() -> bool:

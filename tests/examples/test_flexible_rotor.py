@@ -169,6 +169,8 @@ def test_force_constants_may_be_off_at_every_speed(example: Any, plant: malta.mo
     whole = example("law").continuous(plant)
     law = malta.proof.Compensator(whole.A, -whole.B, whole.C, -whole.D, lag=1 / par.T_d)
     system = malta.uncertain(plant, ["k_i", "Omega"])
-    found = malta.robust_margin(system, law, {"k_i": 0.1}, over={"Omega": (0.0, par.Omega_max)}, time=300)
+    found = malta.robust_margin(
+        system, law, {"k_i": 0.1}, over={"Omega": (0.0, par.Omega_max)}, budget=malta.proof.Budget(300)
+    )
     assert found.lower == pytest.approx(2.2905, rel=2e-3)
     assert found.upper == pytest.approx(found.lower, rel=2e-3)

@@ -123,7 +123,9 @@ def _polynomial(entries: Any, descriptor: bool) -> list[Any]:
 def test_the_margin_of_a_gyroscopic_rotor_is_found_in_any_coordinates() -> None:
     """At rest two planes reach k_i gain = k_s together: (1 - t / 10) 2.5 = 1 + t / 10."""
     truth, where = 1.5 / 0.35, coordinates()[-1]
-    found = malta.robust_margin(rotor(where), derivative_law(), RANGES, {"Omega": (0, FASTEST)}, time=60)
+    found = malta.robust_margin(
+        rotor(where), derivative_law(), RANGES, {"Omega": (0, FASTEST)}, budget=malta.proof.Budget(60)
+    )
     assert found.lower is not None
     assert found.lower <= truth
     assert found.lower == pytest.approx(truth, rel=0.01)

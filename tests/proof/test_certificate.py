@@ -167,7 +167,7 @@ def test_a_diagonal_descriptor(tmp_path: Path) -> None:
 def test_a_mass_that_may_vanish_is_refused(tmp_path: Path) -> None:
     # (p s + p) x: stable, but at p = 0 it is no equation at all; E and A cancel in E^-1 A
     system = malta.uncertain(lambda p: ([[-p]], [[p]], [[1]], [[0]], [[p]]), {"p": 1.0})
-    margin = malta.robust_margin(system, gain(-1.0), {"p": 0.1}, time=1)
+    margin = malta.robust_margin(system, gain(-1.0), {"p": 0.1}, budget=malta.proof.Budget(1))
     path = certificate.write(tmp_path / "c.json", [(system, gain(-1.0))], {"p": 0.1}, None, margin)
     assert check(path).ok
     content = json.loads(path.read_text())
@@ -208,7 +208,7 @@ def test_many_parameters_are_said_to_be_too_many(tmp_path: Path) -> None:
         terms={name: ([[-0.1]], None, None) for name in names},
     )
     box = dict.fromkeys(names, 0.1)
-    margin = replace(malta.robust_margin(system, gain(-1.0), box, time=0.1), lower=1.0)
+    margin = replace(malta.robust_margin(system, gain(-1.0), box, budget=malta.proof.Budget(0.1)), lower=1.0)
     with pytest.raises(InputError, match="found 14 that act on one group, expected at most 13"):
         certificate.write(tmp_path / "c.json", [(system, gain(-1.0))], box, None, margin)
 

@@ -45,7 +45,7 @@ def motor(**options: Any) -> UncertainSystem:
 def test_functions_that_overflow_far_from_the_axis_are_enclosed_on_smaller_discs(f: Any, sign: int) -> None:
     """-1 - f(k) / 2 < 0 as far as is looked: each of them stays above -2."""
     system = malta.uncertain(lambda k: ([[-1.0]], [[f(sign * k)]], [[1.0]]), {"k": 1.0})
-    m = malta.robust_margin(system, [[-0.5]], {"k": 0.3}, time=10)
+    m = malta.robust_margin(system, [[-0.5]], {"k": 0.3}, budget=malta.proof.Budget(10))
     assert m.lower is not None
     assert m.lower > 1  # how far it comes takes time
 
@@ -98,14 +98,19 @@ def test_numbers_that_overflow_prove_nothing(decades: int, power: int) -> None:
     )
     assert m.lower is None or m.lower * R <= 8 ** (1 / power) * (1 + 1e-9)
     system = malta.uncertain(lambda k: ([[-1.0, 0], [0, -2]], [[k**power], [1]], [[1.0, 1]]), {"k": 0.0})
-    m = malta.robust_margin(system, [[-2.0]], {"k": (-R, R)}, time=0.4)
+    m = malta.robust_margin(system, [[-2.0]], {"k": (-R, R)}, budget=malta.proof.Budget(0.4))
     # s^2 + (5 + 2 k^n) s + 4 + 4 k^n: an even power leaves it stable for every k, an odd one until k = -1.
     assert power == 2 or m.lower is None or m.lower * R <= 1 + 1e-9
 
 
 def test_what_overflows_at_the_ends_of_an_interval_is_not_proven() -> None:
     system = malta.uncertain(lambda k, c: ([[-1.0 - c**3]], [[k]], [[1.0]]), {"k": 1.0, "c": 1.0})
-    assert malta.robust_margin(system, [[-2.0]], {"k": 0.1}, {"c": (0.5, 1e120)}, time=0.4).upper > 0
+    assert (
+        malta.robust_margin(
+            system, [[-2.0]], {"k": 0.1}, {"c": (0.5, 1e120)}, budget=malta.proof.Budget(0.4)
+        ).upper
+        > 0
+    )
 
 
 def test_roots_of_coefficients_beyond_floating_point() -> None:

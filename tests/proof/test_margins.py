@@ -218,7 +218,7 @@ def test_random_loops_are_stable_in_the_proven_box(seed: int) -> None:
         return float(np.abs(np.linalg.eigvals(sys.A + gain * sys.B @ sys.C)).max() - 1)
 
     assume(worst(np.zeros(k)) < -1e-3)
-    m = malta.robust_margin(system, law, dict.fromkeys(terms, (-0.1, 0.1)), time=2.0)
+    m = malta.robust_margin(system, law, dict.fromkeys(terms, (-0.1, 0.1)), budget=malta.proof.Budget(2.0))
     assert m.lower is None or m.lower <= m.upper
     u = rng.uniform(-1, 1, (200, k))
     u[::2] = np.sign(u[::2])

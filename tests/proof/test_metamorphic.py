@@ -40,8 +40,8 @@ def chain(mass: float, *, explicit: bool) -> tuple[Any, Any]:
 @pytest.mark.parametrize("mass", [1e-5, 1.0, 1e5, 1e9])
 def test_masses_may_stand_in_E(mass: float) -> None:
     """The coefficients of det(s E - A) carry det E, and so do their bounds."""
-    divided = malta.robust_margin(*chain(1.0, explicit=False), {"k": 0.5}, time=10.0)
-    there = malta.robust_margin(*chain(mass, explicit=True), {"k": 0.5}, time=10.0)
+    divided = malta.robust_margin(*chain(1.0, explicit=False), {"k": 0.5}, budget=malta.proof.Budget(10.0))
+    there = malta.robust_margin(*chain(mass, explicit=True), {"k": 0.5}, budget=malta.proof.Budget(10.0))
     assert divided.lower is not None
     assert there.lower is not None
     assert there.lower <= divided.upper * (1 + 1e-9)
@@ -63,7 +63,7 @@ def test_an_uncertain_mass_in_E(unit: float) -> None:
         np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[0.2]]), sample_time=0.5
     )
     system = malta.uncertain(matrices, {"m": unit, "k": unit})
-    found = malta.robust_margin(system, law, {"m": 0.2, "k": 0.2}, time=10.0)
+    found = malta.robust_margin(system, law, {"m": 0.2, "k": 0.2}, budget=malta.proof.Budget(10.0))
     assert found.lower is not None
     assert found.witness is not None
     assert found.lower <= found.upper <= found.lower * 1.01
@@ -96,7 +96,9 @@ def weakly_coupled(E: Any, sample_time: float | None) -> tuple[Any, Any]:
 )
 def test_neglected_couplings_carry_the_descriptor(E: Any, sample_time: float | None) -> None:
     """The coefficients of a sampled loop carry det E as those of a continuous one do, and E may mix the rows."""
-    found = malta.robust_margin(*weakly_coupled(E, sample_time), {"k": (0.5, 1.5)}, time=0.7)
+    found = malta.robust_margin(
+        *weakly_coupled(E, sample_time), {"k": (0.5, 1.5)}, budget=malta.proof.Budget(0.7)
+    )
     assert found.lower is None or found.lower < 18.5
 
 
@@ -112,8 +114,8 @@ def test_neglected_couplings_carry_denominators() -> None:
             A[i, 2 - i] = 1e-13 * k
         return A, ca.DM.zeros(4, 1), ca.DM.zeros(1, 4)
 
-    system = malta.uncertain(matrices, {"k": 1.0, "p": 1000.0}, sample_time=1.0)
-    found = malta.robust_margin(system, [[0.0]], {"k": (0.0, 2.0)}, time=0.7)
+    system = malta.uncertain(matrices, {"k": 1.0, "p": 1000.0}, sample_budget=malta.proof.Budget(1.0))
+    found = malta.robust_margin(system, [[0.0]], {"k": (0.0, 2.0)}, budget=malta.proof.Budget(0.7))
     assert found.lower is None or found.lower < 4.01
 
 
@@ -132,7 +134,9 @@ def test_a_nominal_loop_is_stable_with_all_its_couplings() -> None:
         return np.kron(np.eye(2), [[-1, 1 - damping], [1, -1]]), B, np.eye(4)[[0, 2]]
 
     gain = 1.5 * damping * np.array([[0, 1.0], [1, 0]])
-    found = malta.robust_margin(malta.uncertain(matrices, {"k": 1.0}), gain, {"k": (0.9, 1e6)}, time=1.0)
+    found = malta.robust_margin(
+        malta.uncertain(matrices, {"k": 1.0}), gain, {"k": (0.9, 1e6)}, budget=malta.proof.Budget(1.0)
+    )
     assert not found.lower
 
 
@@ -148,7 +152,7 @@ def test_units_of_a_sampled_system(unit: float) -> None:
         law = malta.proof.Compensator(
             np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[0.3]]), sample_time=0.5
         )
-        return malta.robust_margin(system, law, {"k": 0.2}, time=10.0).lower
+        return malta.robust_margin(system, law, {"k": 0.2}, budget=malta.proof.Budget(10.0)).lower
 
     assert proven(1.0) is not None
     assert proven(unit) == pytest.approx(proven(1.0), rel=1e-6)

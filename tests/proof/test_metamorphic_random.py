@@ -68,7 +68,7 @@ class Case:
     def margin(self, seconds: float = 3.0) -> malta.proof.Margin:
         low, high = self.over
         over = (1 / high, 1 / low) if self.inverse else self.over
-        return malta.robust_margin(*self.loop(), {"k": 0.3}, {"p": over}, time=seconds)
+        return malta.robust_margin(*self.loop(), {"k": 0.3}, {"p": over}, budget=malta.proof.Budget(seconds))
 
 
 def random_case(seed: int) -> Case:

@@ -20,6 +20,7 @@ from malta.loops.sampled_loops import machine_law, machine_system
 from malta.margins.travel import travel_margin
 from malta.margins.verify import compensators
 from malta.model.data import plant_of
+from malta.proof import Budget
 from malta.proof.robust import robust_margin
 from malta.proof.systems import uncertain
 from malta.proof.uncertain import Compensator, UncertainSystem, critical_frequency, instability, responses
@@ -125,7 +126,7 @@ def test_two_masses_and_a_spring(two_masses: tuple[UncertainSystem, Compensator]
     assert m.frequency == pytest.approx(575.034, abs=0.01)
     assert m.witness is not None
     assert m.witness["k"] == pytest.approx(1.5773, abs=1e-4)
-    assert m.seconds < 5
+    assert m.work < 5
     assert at_witness(s, c, m) > 0
     assert (instability(s, c, samples(s, m, dict.fromkeys(s.names, 0.2), {}, 2000)) < 0).all()
     tight = robust_margin(s, c, dict.fromkeys(s.names, 0.2), tolerance=1e-5)
@@ -370,7 +371,7 @@ def test_no_machine_of_a_proven_box_is_unstable(seed: int) -> None:
     s, c = handmade(seed)
     assume(instability(s, c, s.nominal)[0] < -1e-3)
     ranges = {name: (-1.0, 0.5 + 0.4 * i) for i, name in enumerate(s.names)}
-    m = robust_margin(s, c, ranges, most_cells=4000, time=2.0)
+    m = robust_margin(s, c, ranges, budget=Budget(2.0, cells=4000))
     if m.lower is None:
         assert m.reason
         return
@@ -524,7 +525,7 @@ def test_bad_ranges_get_one_sentence(ranges: Any, over: Any, part: str) -> None:
 @pytest.mark.slow
 def test_a_proof_that_is_given_up_says_where() -> None:
     s, c = _machine("calibrated")
-    m = robust_margin(s, c, BOX, most_cells=3)
+    m = robust_margin(s, c, BOX, budget=Budget(cells=3))
     assert m.lower is None or m.lower < 0.9 * m.upper
     assert re.search(r"not settled within \d+ cells, near", m.reason)
     assert not m.exhausted

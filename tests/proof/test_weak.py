@@ -272,6 +272,7 @@ def test_couplings_are_bounded_where_a_cell_is() -> None:
 def test_a_stronger_coupling_proves_less() -> None:
     """The bound follows what couples the axes: ten times the stiffness of held currents costs some of it."""
     from malta.proof.robust import Effort, margin_of
+    from malta.proof.work import Budget
 
     _, _, problem = machine()
     h = problem.machine
@@ -282,7 +283,7 @@ def test_a_stronger_coupling_proves_less() -> None:
         }
 
     stiff = replace(problem, machine=replace(h, Z=grown(h.Z), E=grown(h.E)))
-    one, ten = (margin_of(x, box_at(problem), Effort(time=20)).lower for x in (problem, stiff))
+    one, ten = (margin_of(x, box_at(problem), Effort(budget=Budget(20))).lower for x in (problem, stiff))
     assert one is not None
     assert ten is not None
     assert 0.5 * one < ten < 0.99 * one

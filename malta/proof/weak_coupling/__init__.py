@@ -37,7 +37,7 @@ from malta.proof.polynomial.family import Family, scale_of
 from malta.proof.problem import Problem, Traits, physical
 from malta.proof.weak_coupling.axes import Axes, axes_of, members_of, state_matrix, stiff_axes
 from malta.proof.weak_coupling.held_currents import Bounds, HeldMachine, dominating_solution
-from malta.proof.work import is_past, spend
+from malta.proof.work import is_past
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -290,7 +290,8 @@ class HeldLoop:
         if rho >= LIMIT:
             return best
         for _ in range(HALVINGS):
-            spend(PERRON)
+            if is_past(price=PERRON):
+                break
             t = (low + high) / 2 if high < reach or low else reach
             found, rho = self._perron(box.sides(t), LIMIT)
             if rho < LIMIT:
