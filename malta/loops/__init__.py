@@ -7,8 +7,6 @@ curves, locus         responses, poles, zeros; root loci
 time_domain           answers to references and loads, and what noise leaves at rest
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from malta.contents import contents
@@ -22,4 +20,10 @@ if TYPE_CHECKING:
     from malta.loops.time_domain import Recovery as Recovery
     from malta.loops.time_domain import recovery as recovery
 
-__all__, __getattr__, __dir__ = contents(__name__, __file__)
+_NAMES = {
+    "malta.loops.curves": "LoopCurves loop_curves",
+    "malta.loops.linear_loops": "LoopSystems loop_systems",
+    "malta.loops.loop": "Loop",
+    "malta.loops.time_domain": "Recovery recovery",
+}
+__all__, __getattr__, __dir__ = contents(__name__, _NAMES)
