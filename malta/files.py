@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import atexit
 import glob
 import math
 import os
 import re
+import shutil
 import signal
 import stat
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from types import FrameType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from malta.errors import InputError
+
+if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable
 
 # Ctrl-C: noted where libraries may drop the KeyboardInterrupt, and put off where files are renamed into place.
 
@@ -104,8 +111,44 @@ def shipped_path(*parts: str) -> Path:
     An installed package holds data/, design/, notebooks/ and examples/ in its folder `shipped`; in a checkout they
     stand beside the package.
     """
-    inside = PACKAGE / "shipped"
+    inside = PACKAGE / "shipped" if PACKAGE.is_dir() else _unpacked("shipped")
     return (inside if inside.is_dir() else PACKAGE.parent).joinpath(*parts)
+
+
+def packaged(name: str) -> bytes:
+    """A file beside the modules, as `packaged("report/page/style.css")`: of a folder or of a zip."""
+    from importlib.resources import files
+
+    return files("malta").joinpath(name).read_bytes()
+
+
+@cache
+def _unpacked(name: str) -> Path:
+    """A folder of the package in a zip, as files of this process."""
+    from importlib.resources import files
+
+    def copy(source: Traversable, target: Path) -> None:
+        if source.is_file():
+            target.write_bytes(source.read_bytes())
+        elif source.is_dir():
+            target.mkdir()
+            for part in source.iterdir():
+                copy(part, target / part.name)
+
+    folder = Path(tempfile.mkdtemp(prefix="malta-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    copy(files("malta").joinpath(name), folder / name)
+    return folder / name
+
+
+def version() -> str:
+    """The version of malta; "unknown" of one without metadata, as its folder alone in a zip."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("malta")
+    except metadata.PackageNotFoundError:
+        return "unknown"
 
 
 def locate(path: str | Path) -> Path:
