@@ -852,6 +852,26 @@ def test_a_compiler_that_does_not_exist_is_no_compiler(monkeypatch: pytest.Monke
     assert compiled.library("", 1) is None
 
 
+@needs_compiler
+def test_a_compiler_may_refuse_the_flags_of_gcc(
+    fresh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As clang does: the rest of the flags is kept."""
+    own, cc = compiled.compiler(), tmp_path / "cc"
+    assert own is not None
+    cc.write_text(
+        f'#!/bin/sh\ncase "$*" in *-fsched*) exit 1;; esac\necho "$@" > {tmp_path}/said\nexec {own[0]} "$@"\n'
+    )
+    cc.chmod(0o700)
+    compiled.compiler.cache_clear()
+    monkeypatch.setenv("CC", str(cc))
+    found = compiled.library("int two(void) { return 2; }\n", 1)
+    assert found is not None
+    assert found.two() == 2
+    assert {"-ffp-contract=fast", "-march=native"} < set((tmp_path / "said").read_text().split())
+    assert len(list(fresh.rglob("*.so"))) == 1
+
+
 @pytest.mark.parametrize("hangs_at", ["--version", "-shared"])
 def test_a_compiler_that_hangs_is_stopped_with_all_that_it_started(
     hangs_at: str,
