@@ -19,12 +19,9 @@ from functools import cache
 from itertools import islice
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from malta.errors import InputError
-
-if TYPE_CHECKING:
-    from importlib.resources.abc import Traversable
 
 # Ctrl-C: noted where libraries may drop the KeyboardInterrupt, and put off where files are renamed into place.
 
@@ -108,10 +105,10 @@ _Content = TypeVar("_Content", str, bytes)
 def shipped_path(*parts: str) -> Path:
     """A file or folder that comes with malta, as `shipped_path("data", "tubular.toml")`.
 
-    An installed package holds data/, design/, notebooks/ and examples/ in its folder `shipped`; in a checkout they
-    stand beside the package.
+    An installed package holds data/, design/, notebooks/ and examples/ in its folder `shipped`, which may lie in a zip;
+    in a checkout they stand beside the package.
     """
-    inside = PACKAGE / "shipped" if PACKAGE.is_dir() else _unpacked("shipped")
+    inside = _unpacked() if PACKAGE.parent.is_file() else PACKAGE / "shipped"
     return (inside if inside.is_dir() else PACKAGE.parent).joinpath(*parts)
 
 
@@ -123,22 +120,15 @@ def packaged(name: str) -> bytes:
 
 
 @cache
-def _unpacked(name: str) -> Path:
-    """A folder of the package in a zip, as files of this process."""
-    from importlib.resources import files
-
-    def copy(source: Traversable, target: Path) -> None:
-        if source.is_file():
-            target.write_bytes(source.read_bytes())
-        elif source.is_dir():
-            target.mkdir()
-            for part in source.iterdir():
-                copy(part, target / part.name)
+def _unpacked() -> Path:
+    """What comes with malta, from the zip that the package lies in, as files of this process."""
+    import zipfile
 
     folder = Path(tempfile.mkdtemp(prefix="malta-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    copy(files("malta").joinpath(name), folder / name)
-    return folder / name
+    with zipfile.ZipFile(PACKAGE.parent) as archive:
+        archive.extractall(folder, [name for name in archive.namelist() if name.startswith("malta/shipped/")])
+    return folder / "malta" / "shipped"
 
 
 def version() -> str:
