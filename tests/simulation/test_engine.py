@@ -522,6 +522,7 @@ def test_an_operation_without_a_form_is_refused() -> None:
             translate.translate(ca.Function("f", [state, theta], [unknown(state)]), [])
 
 
+@needs_compiler
 def test_constants_are_any_numbers(tmp_path: Path) -> None:
     """Infinity, which is how an expression says "no limit", the smallest numbers and the largest."""
     numbers = [np.inf, -np.inf, 5e-324, -1.7976931348623157e308, 0.1, -3.0, 1e22]
