@@ -79,9 +79,39 @@ _OLD = {
     "Margins": "malta.margins.LoopReport",
     "Robustness": "malta.margins.LoopReport",
 }
-_MODULES = (*_NOW_OF, "gains", "references", "report", "schemas", "structured")
 
-__all__, _load, __dir__ = contents(__name__, __file__, _MODULES, _OLD)
+_NAMES = {
+    "malta": "app campaigns firmware gains identification loops margins model proof report schemas simulation"
+    " structured synthesis",
+    "malta.campaigns.run": "campaign",
+    "malta.errors": "CheckError InputError",
+    "malta.firmware.export": "export_c export_fmu",
+    "malta.identification.excite": "excite",
+    "malta.identification.identify": "identify",
+    "malta.identification.learn": "learn",
+    "malta.identification.measure": "measure",
+    "malta.loops.loop": "loop",
+    "malta.model.data": "plant_of read",
+    "malta.model.equilibrium": "trim",
+    "malta.model.linear": "linear_machine",
+    "malta.model.linearize": "linearize",
+    "malta.model.machines": "machine",
+    "malta.proof.blocks.gain": "dynamic_margin worst_case_gain",
+    "malta.proof.robust": "robust_margin",
+    "malta.proof.systems": "uncertain",
+    "malta.report.ledger": "ledger",
+    "malta.simulation": "references",
+    "malta.simulation.experiments.catalogue": "experiment",
+    "malta.simulation.scenario": "Scenario",
+    "malta.simulation.simulate": "simulate",
+    "malta.synthesis.design_file": "read_design",
+    "malta.synthesis.lqg": "lqg",
+    "malta.synthesis.spec": "Spec",
+    "malta.synthesis.synthesize": "synthesize",
+    "malta.tuning.tune": "tune",
+    "malta.tuning.verify": "verify",
+}
+__all__, _load, __dir__ = contents(__name__, _NAMES, _OLD)
 
 
 def __getattr__(name: str) -> Any:

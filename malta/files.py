@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import atexit
 import glob
 import math
 import os
 import re
+import shutil
 import signal
 import stat
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from types import FrameType
@@ -101,11 +105,40 @@ _Content = TypeVar("_Content", str, bytes)
 def shipped_path(*parts: str) -> Path:
     """A file or folder that comes with malta, as `shipped_path("data", "tubular.toml")`.
 
-    An installed package holds data/, design/, notebooks/ and examples/ in its folder `shipped`; in a checkout they
-    stand beside the package.
+    An installed package holds data/, design/, notebooks/ and examples/ in its folder `shipped`, which may lie in a zip;
+    in a checkout they stand beside the package.
     """
-    inside = PACKAGE / "shipped"
+    inside = _unpacked() if PACKAGE.parent.is_file() else PACKAGE / "shipped"
     return (inside if inside.is_dir() else PACKAGE.parent).joinpath(*parts)
+
+
+def packaged(name: str) -> bytes:
+    """A file beside the modules, as `packaged("report/page/style.css")`: of a folder or of a zip."""
+    from importlib.resources import files
+
+    return files("malta").joinpath(name).read_bytes()
+
+
+@cache
+def _unpacked() -> Path:
+    """What comes with malta, from the zip that the package lies in, as files of this process."""
+    import zipfile
+
+    folder = Path(tempfile.mkdtemp(prefix="malta-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    with zipfile.ZipFile(PACKAGE.parent) as archive:
+        archive.extractall(folder, [name for name in archive.namelist() if name.startswith("malta/shipped/")])
+    return folder / "malta" / "shipped"
+
+
+def version() -> str:
+    """The version of malta; "unknown" of one without metadata, as its folder alone in a zip."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("malta")
+    except metadata.PackageNotFoundError:
+        return "unknown"
 
 
 def locate(path: str | Path) -> Path:

@@ -135,7 +135,7 @@ class Drive:
         error = asked - axes @ self.i
         self.integral = self.integral + np.where(self.waits, 0, self.loop["Ki"] * self.Ts * error)
         u = phases @ (self.loop["Kp"] * error + self.integral + emf)
-        share = min(self.V / 2, self.par["V_max"], *(self.limits["voltage"] or [np.inf])) / self.V
+        share = min(0.5, min(self.par["V_max"], *(self.limits["voltage"] or [np.inf])) / self.V)
         duty = np.clip(0.5 + u / self.V, 0.5 - share, 0.5 + share)
         self.waits = np.repeat((duty != 0.5 + u / self.V).reshape(2, 9).any(axis=1), 6)
         return {"current": current, "met": (current != wanted).any(), "command": duty}

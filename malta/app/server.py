@@ -13,14 +13,13 @@ import secrets
 import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from malta.app.session import Document, Session
 from malta.errors import InputError
-from malta.files import locate
+from malta.files import locate, packaged
 from malta.synthesis.spec import Spec
 
 ADDRESS = "127.0.0.1"
@@ -95,7 +94,7 @@ class _Handler(BaseHTTPRequestHandler):
             )
             return
         name, kind = PAGES[address.path]
-        self._send(HTTPStatus.OK, kind, files("malta.app").joinpath("static", name).read_bytes())
+        self._send(HTTPStatus.OK, kind, packaged(f"app/static/{name}"))
 
     def do_POST(self) -> None:
         """A document of the page."""
@@ -227,7 +226,7 @@ def _widget_class() -> Any:
         """A design under edit; `session` answers its messages."""
 
         _esm = script()
-        _css = files("malta.app").joinpath("static", "app.css").read_text(encoding="utf-8")
+        _css = packaged("app/static/app.css").decode()
         height = traitlets.Int(HEIGHT).tag(sync=True)
 
         def __init__(self, path: Path, folder: Path, height: int) -> None:
@@ -256,7 +255,6 @@ def _widget_class() -> Any:
 
 def script() -> str:
     """The modules of the page as one module of JavaScript, without their imports of each other."""
-    folder = files("malta.app").joinpath("static")
-    parts = [folder.joinpath(f"{name}.js").read_text(encoding="utf-8") for name in SCRIPTS]
+    parts = [packaged(f"app/static/{name}.js").decode() for name in SCRIPTS]
     plain = [re.sub(r"^import .*\n", "", part, flags=re.MULTILINE) for part in parts]
     return "\n".join(re.sub(r"^export (?!default)", "", part, flags=re.MULTILINE) for part in plain)

@@ -4,20 +4,11 @@ plan -> store -> result -> summary -> run, with dask.py for a cluster: all figur
 limits -> rare, studies: rare events, sensitivities and tolerances on the box of a plan
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from malta.contents import contents
-
-if TYPE_CHECKING:
-    from malta.campaigns.limits import limit_of as limit_of
-    from malta.campaigns.plan import Plan as Plan
-    from malta.campaigns.rare import rare_event as rare_event
-    from malta.campaigns.result import Campaign as Campaign
-    from malta.campaigns.run import summarize as summarize
-    from malta.campaigns.studies import sensitivity as sensitivity
-    from malta.campaigns.studies import tolerances as tolerances
-    from malta.campaigns.summary import Summary as Summary
-
-__all__, __getattr__, __dir__ = contents(__name__, __file__)
+from malta.campaigns.limits import limit_of as limit_of
+from malta.campaigns.plan import Plan as Plan
+from malta.campaigns.rare import rare_event as rare_event
+from malta.campaigns.result import Campaign as Campaign
+from malta.campaigns.run import summarize as summarize
+from malta.campaigns.studies import sensitivity as sensitivity
+from malta.campaigns.studies import tolerances as tolerances
+from malta.campaigns.summary import Summary as Summary

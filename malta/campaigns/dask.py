@@ -9,13 +9,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
-from importlib.metadata import version
+from importlib import metadata
 from pkgutil import resolve_name
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from malta.campaigns.store import Block, fly
 from malta.errors import InputError
+from malta.files import version
 from malta.model.machines import load_sources, sources_of
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[
         client = _connect(dask, address)
         try:
             if left:
-                require_malta(client, version("malta"))
+                require_malta(client, version())
             yield from collect_blocks(dask, client, address, plan, left)
         finally:
             client.close(timeout=2)
@@ -67,7 +68,7 @@ def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[
 def collect_blocks(
     dask: Any, client: Any, address: str, plan: Plan, left: Mapping[int, int]
 ) -> Iterator[tuple[int, Block]]:
-    task = task_of(plan, version("malta"))
+    task = task_of(plan, version())
     parts, alone = deque(left.items()), 0.0  # s
     waiting: dict[Any, int] = {}
     while waiting or parts:
@@ -120,11 +121,11 @@ def require_malta(client: Any, expected: str) -> None:
 
     The questions are functions of the standard library: any Python can answer. Who is lost meanwhile is no failure.
     """
-    for question, name in ((resolve_name, "malta.campaigns:__doc__"), (version, "malta")):
+    for question, name in ((resolve_name, "malta.campaigns:__doc__"), (metadata.version, "malta")):
         for who, answer in _ask_all(client, question, name).items():
             if isinstance(answer, ImportError):  # PackageNotFoundError is one
                 raise InputError("--cluster", who, "a Python without malta", f"malta {expected} there")
-            if question is version and answer != expected and isinstance(answer, str):
+            if question is metadata.version and answer != expected and isinstance(answer, str):
                 raise InputError("--cluster", who, f"malta {answer}", f"malta {expected}")
 
 
@@ -193,7 +194,7 @@ def _describe(error: BaseException) -> str:
 
 def simulate_at_worker(task: _Task, first: int, count: int) -> Block | tuple[str, str, str, str]:
     """Simulate a block on a worker: the block, or the arguments of an InputError, which does not pickle."""
-    here = version("malta")
+    here = version()
     if here != task.version:
         return "--cluster", "a worker", f"malta {here}", f"malta {task.version}"
     try:

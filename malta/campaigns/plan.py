@@ -13,16 +13,16 @@ import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
-from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from zipimport import zipimporter
 
 import numpy as np
 
 from malta.display import display
 from malta.errors import InputError
-from malta.files import read_file
+from malta.files import read_file, version
 from malta.firmware.program import Precision
 from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import decode
@@ -191,7 +191,7 @@ def _package_parts(packages: tuple[str, ...]) -> list[bytes]:
     parts: list[bytes] = []
     for package in packages:
         for file in sorted(files("malta").joinpath(package).iterdir(), key=lambda file: file.name):
-            if file.name.endswith((".py", ".c", ".h")):
+            if file.name.endswith((".py", ".pyc", ".c", ".h")):
                 parts += [f"{package}/{file.name}".encode(), file.read_bytes()]
     return parts
 
@@ -201,11 +201,15 @@ def _module_parts(name: str) -> list[bytes]:
 
     The name alone where a module has no file, as in a notebook, and for a script: `law` covers their models.
     """
-    found = getattr(sys.modules.get(name), "__file__", None)
-    if name == "__main__" or found is None:
+    module = sys.modules.get(name)
+    found = getattr(module, "__file__", None)
+    if name == "__main__" or module is None or found is None:
         return [name.encode()]
     path = Path(found)
-    paths = sorted(path.parent.glob("*.py")) if path.name == "__init__.py" else [path]
+    if isinstance(module.__loader__, zipimporter):  # of the whole folder, for a module as well
+        beside = sorted(files(str(module.__package__)).iterdir(), key=lambda file: file.name)
+        return [name.encode(), *(file.read_bytes() for file in beside if file.is_file())]
+    paths = sorted(path.parent.glob(f"*{path.suffix}")) if path.stem == "__init__" else [path]
     return [name.encode(), *(read_file(p, "module of a machine", Path.read_bytes) for p in paths)]
 
 
@@ -380,7 +384,7 @@ def _manifest(plan: Plan) -> dict[str, Any]:
     tables = {
         "schema": SCHEMA,
         "version": VERSION,
-        "malta": version("malta"),
+        "malta": version(),
         "revision": revision_of(plan.plant, plan.controller, planned_run(plan).scenario),
         "gains": {"name": plan.controller.name, "sha256": fingerprint(plan.controller)},
         "machine": {

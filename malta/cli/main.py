@@ -30,7 +30,7 @@ from malta.cli.report import compare, plot, report
 from malta.cli.simulate import simulate
 from malta.cli.verify import check, verify
 from malta.errors import CheckError, InputError, shorten
-from malta.files import is_interrupt, noting_files
+from malta.files import is_interrupt, noting_files, version
 
 # The class of all commands: help in panels, and the options of the version before, which say what replaces them.
 
@@ -223,9 +223,7 @@ app = typer.Typer(
 
 def _print_version(asked: bool) -> None:
     if asked:
-        from importlib.metadata import version
-
-        print(f"malta {version('malta')}")
+        print(f"malta {version()}")
         raise typer.Exit
 
 

@@ -1,7 +1,5 @@
 """Firmware: the control law as C that computes the same bits on every processor, its tests, and FMUs."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from malta.contents import contents
@@ -11,4 +9,8 @@ if TYPE_CHECKING:
     from malta.firmware.pil import Replay as Replay
     from malta.firmware.pil import replay_on_target as replay_on_target
 
-__all__, __getattr__, __dir__ = contents(__name__, __file__)
+_NAMES = {
+    "malta.firmware.flight": "engine_of_c",
+    "malta.firmware.pil": "Replay replay_on_target",
+}
+__all__, __getattr__, __dir__ = contents(__name__, _NAMES)

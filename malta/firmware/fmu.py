@@ -23,8 +23,6 @@ import sys
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
-from importlib.metadata import version
-from importlib.resources import files as resources
 from importlib.util import find_spec
 from typing import Any, Literal, NamedTuple, get_args
 from xml.sax.saxutils import quoteattr
@@ -33,6 +31,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError, on_one_line
+from malta.files import packaged, version
 from malta.firmware.calibration import parameters_of
 from malta.firmware.ctext import c_name, c_number
 from malta.firmware.flight import FLAGS
@@ -506,9 +505,7 @@ def _texts(u: Unit, sha256: str, fmi: int) -> dict[str, str]:
     context |= {"files": sorted(name for name in own if name.endswith(".c"))}
     texts = {f"sources/{name}": text for name, text in own.items()}
     for name in HEADERS[fmi]:
-        texts[f"sources/{name}"] = (
-            (resources("malta.firmware") / "templates" / "fmi" / name).read_bytes().decode()
-        )
+        texts[f"sources/{name}"] = packaged(f"firmware/templates/fmi/{name}").decode()
     if fmi == 3:
         texts["sources/buildDescription.xml"] = render("fmu_build.xml", context)
     texts["documentation/index.html"] = render("fmu_index.html", context)
@@ -526,7 +523,7 @@ def _context(u: Unit, sha256: str) -> dict[str, Any]:
     return {
         "title": comment(f"{c.name} {u.part}"),
         "description": f"{words[u.part]} of a {t.believed.name}, sampled every {c.sample_time * 1e6:g} us",
-        "version": version("malta"),
+        "version": version(),
         "sha256": sha256,
         "token": TOKEN,
         "part": u.part,

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
+from malta.files import version
 from malta.firmware.blocks import unrolled
 from malta.firmware.calibration import counts_of, gain_lines, law_fields, parameter_context, parameters_of
 from malta.firmware.ctext import (
@@ -122,7 +122,7 @@ def template_context(t: Target, programs: Mapping[str, Program], name: str, sha2
 def head_context(t: Target, name: str) -> dict[str, str]:
     """What the head of a file is filled with. name : of what the file declares, as a C identifier"""
     title = comment(t.controller.name)
-    return {"name": name, "NAME": name.upper(), "title": title, "version": version("malta")}
+    return {"name": name, "NAME": name.upper(), "title": title, "version": version()}
 
 
 def _function_context(t: Target, programs: Mapping[str, Program], name: str) -> dict[str, Any]:

@@ -33,14 +33,14 @@ import math
 import platform
 from collections.abc import Mapping
 from contextlib import suppress
-from importlib.metadata import version
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.files import locate, replace_files, require_plain_name
+from malta.files import locate, replace_files, require_plain_name, version
 from malta.gains.contents import LINEAR, build_controller, linear_table, signal_tables
 from malta.gains.encodings import SUFFIXES as SUFFIXES
 from malta.gains.encodings import content_sha256, decode, encode
@@ -122,8 +122,8 @@ def document(controller: Controller, margins: LoopReport) -> dict[str, Any]:
             "peak_sensitivity": dict(margins.peak_sensitivity),
             "robust": _robust(margins),
         },
-        "provenance": {"malta": version("malta"), "python": platform.python_version()}
-        | {name: version(name) for name in ("numpy", "scipy", "control", "casadi")},
+        "provenance": {"malta": version(), "python": platform.python_version()}
+        | {name: metadata.version(name) for name in ("numpy", "scipy", "control", "casadi")},
     }
     for key, limit in tables["limits"].items():
         if not np.isfinite(limit).all():

@@ -1,7 +1,5 @@
 """From the bench back to the design: logs, excitation, parameters with intervals, and what a stroke teaches."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from malta.contents import contents
@@ -31,4 +29,17 @@ if TYPE_CHECKING:
     from malta.identification.windings import Windings as Windings
     from malta.identification.windings import identify_windings as identify_windings
 
-__all__, __getattr__, __dir__ = contents(__name__, __file__)
+_NAMES = {
+    "malta.identification.convergence": "contraction",
+    "malta.identification.dump": "ExactReplay replay_dump",
+    "malta.identification.excite": "ExcitationPlan",
+    "malta.identification.identify": "Identified weigh",
+    "malta.identification.learn": "Learned LearnedV0 learn_v0",
+    "malta.identification.log": "Log log_of",
+    "malta.identification.log_files": "read_log write_log",
+    "malta.identification.measure": "Measurement MeasurementPlan plan_measurement",
+    "malta.identification.replay": "LawReplay replay_law",
+    "malta.identification.strokes": "LearnedStrokes learn_strokes next_stroke",
+    "malta.identification.windings": "Windings identify_windings",
+}
+__all__, __getattr__, __dir__ = contents(__name__, _NAMES)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
-from malta.files import read_file, replace_files, require_suffix
+from malta.files import packaged, read_file, replace_files, require_suffix
 from malta.gains.encodings import read_mat
 from malta.identification.dump import decode_dump
 from malta.identification.log import GROUPS, Log
@@ -278,9 +278,7 @@ def _fast_columns(content: bytes, begin: int, count: int, used: list[int]) -> li
 
     None without a compiler, and for what that does not take: numpy reads it, or says what is wrong.
     """
-    read = library(
-        (Path(__file__).parent / "cells.c").read_text(encoding="utf-8"), 1, flags=SAMPLE_LOOP_FLAGS
-    )
+    read = library(packaged("identification/cells.c").decode(), 1, flags=SAMPLE_LOOP_FLAGS)
     if read is None:
         return None
     wanted = np.isin(np.arange(count), used).astype(np.uint8)

@@ -7,19 +7,10 @@ curves, locus         responses, poles, zeros; root loci
 time_domain           answers to references and loads, and what noise leaves at rest
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from malta.contents import contents
-
-if TYPE_CHECKING:
-    from malta.loops.curves import LoopCurves as LoopCurves
-    from malta.loops.curves import loop_curves as loop_curves
-    from malta.loops.linear_loops import LoopSystems as LoopSystems
-    from malta.loops.linear_loops import loop_systems as loop_systems
-    from malta.loops.loop import Loop as Loop
-    from malta.loops.time_domain import Recovery as Recovery
-    from malta.loops.time_domain import recovery as recovery
-
-__all__, __getattr__, __dir__ = contents(__name__, __file__)
+from malta.loops.curves import LoopCurves as LoopCurves
+from malta.loops.curves import loop_curves as loop_curves
+from malta.loops.linear_loops import LoopSystems as LoopSystems
+from malta.loops.linear_loops import loop_systems as loop_systems
+from malta.loops.loop import Loop as Loop
+from malta.loops.time_domain import Recovery as Recovery
+from malta.loops.time_domain import recovery as recovery

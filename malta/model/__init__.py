@@ -1,7 +1,5 @@
 """Machines as records: parameters, plants in CasADi, rigid bodies, linearization, signals and units."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from malta.contents import contents
@@ -21,4 +19,13 @@ if TYPE_CHECKING:
     from malta.model.signals import LateSensors as LateSensors
     from malta.units import in_unit as in_unit
 
-__all__, __getattr__, __dir__ = contents(__name__, __file__)
+_NAMES = {
+    "malta.model.coils": "Allocation allocation",
+    "malta.model.data": "published",
+    "malta.model.linearize": "LinearModel",
+    "malta.model.parameters": "check_parameters si",
+    "malta.model.plant": "Actuator OperatingPoint Plant Signal",
+    "malta.model.signals": "InverseCheck LateSensors",
+    "malta.units": "in_unit",
+}
+__all__, __getattr__, __dir__ = contents(__name__, _NAMES)

@@ -28,6 +28,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from pkgutil import iter_modules
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -182,8 +183,9 @@ def require_part(part: Part, name: str) -> ModuleType:
 
 @cache
 def _installed() -> dict[str, str]:
-    """The machines of installed packages: names and modules."""
-    return {point.name: point.value for point in entry_points(group=GROUP)}
+    """The machines of installed packages, malta's own also without its metadata: names and modules."""
+    own = {found.name: f"{GROUP}.{found.name}.plant" for found in iter_modules(import_module(GROUP).__path__)}
+    return own | {point.name: point.value for point in entry_points(group=GROUP)}
 
 
 def _from_file(path: Path) -> ModuleType:

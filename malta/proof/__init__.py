@@ -15,8 +15,6 @@ blocks                    unmodelled dynamics and worst-case gains
 certificate               the proof as a file, and the checker of its own
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from malta.contents import contents
@@ -39,4 +37,13 @@ if TYPE_CHECKING:
     from malta.proof.uncertain import UncertainSystem as UncertainSystem
     from malta.proof.work import Budget as Budget
 
-__all__, __getattr__, __dir__ = contents(__name__, __file__)
+_NAMES = {
+    "malta.proof.blocks": "Dynamic",
+    "malta.proof.blocks.gain": "Gain",
+    "malta.proof.connections": "append feedback interconnect parallel random_systems series",
+    "malta.proof.margin": "Margin",
+    "malta.proof.rates": "RateBound varying",
+    "malta.proof.robust": "margin_of_polynomial",
+    "malta.proof.uncertain": "Compensator UncertainSystem",
+}
+__all__, __getattr__, __dir__ = contents(__name__, _NAMES)

@@ -88,7 +88,26 @@ _INNER = {  # others, which are parts of what prints them
     ),
 }
 
-__all__, _load, __dir__ = contents(__name__, __file__)
+_NAMES = {
+    "malta.report.figures": "experiment_figure stroke_figure",
+    "malta.report.figures.campaign": "CAMPAIGN_FILES CampaignFigures campaign distributions_figure"
+    " sensitivity_figure worst_figure yield_figure",
+    "malta.report.figures.drawing": "STYLES encode_figure new_figure save",
+    "malta.report.figures.margins": "chain_figure front_figure recovery_figure",
+    "malta.report.page.report": "compare_gains comparison_page gain_page",
+    "malta.report.plots": "bode gang_of_four load_response nichols nyquist pzmap root_locus"
+    " sensitivity_curves sigma step",
+    "malta.report.plots.polar": "margin_map",
+    "malta.report.tables": "Paragraph",
+    "malta.report.tables.campaign": "campaign_tables rare_event_tables sensitivity_tables spreads_table",
+    "malta.report.tables.design": "bandwidth_table design_page front_markdown front_table loop_poles_table"
+    " poles_table recovery_table requirements_table sensitivity_table",
+    "malta.report.tables.experiments": "claims_table experiment_table limits_text scenarios_table",
+    "malta.report.tables.margins": "chain_table disk_table gang_table loop_tables open_bounds places_table"
+    " tolerance_table worst_case_table",
+    "malta.report.verdict": "verdict_html verdict_lines verdict_text",
+}
+__all__, _load, __dir__ = contents(__name__, _NAMES)
 
 
 def __getattr__(name: str) -> Any:

@@ -7,8 +7,6 @@ engine                                   the period as C or in CasADi, on one ma
 experiments                              scenarios with figures of merit, the fastest stroke among them
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from malta.contents import contents
@@ -24,4 +22,13 @@ if TYPE_CHECKING:
     from malta.simulation.trajectory import Trajectory as Trajectory
     from malta.simulation.trajectory import stroke_figures as stroke_figures
 
-__all__, __getattr__, __dir__ = contents(__name__, __file__)
+_NAMES = {
+    "malta.simulation.engine.batch": "replayed simulate_many",
+    "malta.simulation.engine.digest": "Batch",
+    "malta.simulation.experiments": "Experiment",
+    "malta.simulation.experiments.time_optimal": "fastest_stroke",
+    "malta.simulation.inputs": "Multisine",
+    "malta.simulation.scenario": "Fault",
+    "malta.simulation.trajectory": "Trajectory stroke_figures",
+}
+__all__, __getattr__, __dir__ = contents(__name__, _NAMES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from functools import reduce
 from typing import Any
 
 import casadi as ca
@@ -25,23 +26,19 @@ def open_loop_gain(actuator: Actuator, Kp: float, Ki: float, delay: float, w: Fl
     return (Kp + Ki / s) * np.exp(-s * delay) / (actuator.L * s + actuator.R)
 
 
-def largest_voltage(V: Any, *limits: Any) -> Any:
-    """The largest voltage of a phase, V/2 of the link or the smallest of the limits (V); infinite ones are none."""
-    most = V / 2
-    for limit in limits:
-        if not (isinstance(limit, float) and math.isinf(limit)):
-            most = ca.fmin(most, limit)
-    return most
+def voltage_limit(*limits: Any) -> Any:
+    """The smallest of the limits of a phase (V), of which infinite ones are none; None without any."""
+    finite = [limit for limit in limits if not (isinstance(limit, float) and math.isinf(limit))]
+    return reduce(ca.fmin, finite) if finite else None
 
 
-def modulation(drive: Drive, u: Any, V: Any, most: Any = None) -> tuple[Any, Any]:
+def modulation(drive: Drive, u: Any, V: Any, limit: Any = None) -> tuple[Any, Any]:
     """Axis voltages u as shares of the link voltage V within the limits of the half-bridges, and 1 for limited axes.
 
-    Where the largest phase voltage of a group of axes exceeds `most`, the whole group is scaled: its direction stays.
-
-    most : V, see `largest_voltage`; None: V/2
+    Where the largest phase voltage of a group of axes exceeds V/2 or the limit (V), the whole group is scaled: its
+    direction stays.
     """
-    most = largest_voltage(V) if most is None else most
+    most = V / 2 if limit is None else ca.fmin(V / 2, limit)
     peak = drive.peak(u)
     m, limited = ca.SX(u / V), ca.SX.zeros(len(drive.axes))
     for k, group in enumerate(drive.groups):
@@ -53,15 +50,16 @@ def modulation(drive: Drive, u: Any, V: Any, most: Any = None) -> tuple[Any, Any
 
 
 def duty_cycles(
-    drive: Drive, u_phase: Any, V: Any, i_phase: Any, *, real_pwm: bool, most: Any = None
+    drive: Drive, u_phase: Any, V: Any, i_phase: Any, *, real_pwm: bool, limit: Any = None
 ) -> tuple[Any, Any]:
-    """Duty cycles of the half-bridges, d = 1/2 + u / V with |u| at most `most`, and 1 for limited phases.
+    """Duty cycles of the half-bridges, d = 1/2 + u / V within 0 and 1 and with |u| <= limit (V), and 1 for limited
+    phases.
 
-    most : V, see `largest_voltage`; None: V/2
     real_pwm : with the resolution of the modulator's counter, and with the loss of voltage by dead time, dead_share V
         against the direction of the current
     """
-    wanted, share = 0.5 + u_phase / V, (largest_voltage(V) if most is None else most) / V
+    # Of V/2 the share is 1/2, never (V/2) / V: the engine multiplies by a reciprocal, and 0 and 1 are limits.
+    wanted, share = 0.5 + u_phase / V, 0.5 if limit is None else ca.fmin(0.5, limit / V)
     d = ca.fmax(ca.fmin(wanted, 0.5 + share), 0.5 - share)
     limited = d != wanted
     if real_pwm:
@@ -138,10 +136,10 @@ def control_currents(
     integral = add(controller["u_integral"], step)
     u = g["Kp"] * error + Q.T @ integral + believed.drive.emf(estimate)
     note("current_law", "u = Kp epsilon + u_integral + emf, of the axes", u=u)
-    most = largest_voltage(V, plant.actuator.voltage_limit, g["voltage_limit"])
+    limit = voltage_limit(plant.actuator.voltage_limit, g["voltage_limit"])
     row: dict[str, Any] = {"link": V, "i": i}
     if s.fidelity == "dq":
-        command, limited = modulation(drive, u, V, most)
+        command, limited = modulation(drive, u, V, limit)
         meaning = "command = u / link_last, scaled with its group where a phase would be beyond its limit"
         note("modulate", meaning, command=command, u_limited=limited)
         command = keep_if_missed(s, signals, command)
@@ -149,7 +147,7 @@ def control_currents(
     else:
         u_phase = believed.drive.to_phases(estimate) @ u
         note("phase_voltages", "u_phase = T_phases u", u_phase=u_phase)
-        command, limits = duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm, most=most)
+        command, limits = duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm, limit=limit)
         limited = ca.vertcat(*_limited_axes(drive, limits))
         meaning = (
             "command = 1/2 + u_phase / link_last within 1/2 +- sigma; u_limited: its group has one at a limit"

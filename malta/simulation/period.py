@@ -404,8 +404,12 @@ def _control_law(
 
 
 def limited_currents(plant: Plant, wanted: Any, limit: Any) -> Any:
-    """Coil currents within the machine's own limits and those of a gain file."""
-    return ca.fmax(ca.fmin(plant.limited(wanted), limit), -limit)
+    """Coil currents within the machine's own limits and those of a gain file.
+
+    A machine may scale its currents together, which ends within its limit but for the last digit.
+    """
+    most = ca.fmin(limit, plant.actuator.current_limit)
+    return ca.fmax(ca.fmin(plant.limited(wanted), most), -most)
 
 
 def law_reference(c: Controller, believed: Plant, g: Mapping[str, Any], given: Mapping[str, Any]) -> Any:

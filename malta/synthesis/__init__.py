@@ -1,7 +1,5 @@
 """Controllers: design files, Riccati equations, LQG, and the law that all else consumes."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from malta.contents import contents
@@ -17,4 +15,12 @@ if TYPE_CHECKING:
     from malta.synthesis.synthesize import schedule_laws as schedule_laws
     from malta.synthesis.tunable_lqg import calibrate as calibrate
 
-__all__, __getattr__, __dir__ = contents(__name__, __file__)
+_NAMES = {
+    "malta.synthesis.controller": "Controller",
+    "malta.synthesis.lqg": "kalman lqi lqr weights",
+    "malta.synthesis.spec": "Weights",
+    "malta.synthesis.state_space": "controller_of",
+    "malta.synthesis.synthesize": "schedule_laws",
+    "malta.synthesis.tunable_lqg": "calibrate",
+}
+__all__, __getattr__, __dir__ = contents(__name__, _NAMES)

@@ -115,6 +115,11 @@ def test_spreads_are_for_all_or_by_name(
     assert json.loads((tmp_path / "campaign.json").read_text(encoding="utf-8"))["spread"] == box
 
 
+def _beside_the_engine(err: str) -> list[str]:
+    """The notes but for that of a computer without a C compiler."""
+    return [line for line in err.splitlines() if not line.startswith("malta: no C compiler")]
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_each_campaign_has_a_folder_of_its_own(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -123,7 +128,7 @@ def test_each_campaign_has_a_folder_of_its_own(
     monkeypatch.chdir(tmp_path)
     for seed in ("0", "1", "1"):
         code, out, err = run("campaign", gains, "--samples", "2", *QUICK, "--seed", seed)
-        assert (code, err) == (0, "")
+        assert (code, _beside_the_engine(err)) == (0, [])
         assert "published" not in out  # of another rise
     assert len(list((tmp_path / "build" / "campaigns").iterdir())) == 2
 
@@ -218,7 +223,7 @@ def test_a_damaged_block_is_named(run: Run, tmp_path: Path) -> None:
     block.write_bytes(whole[:-9])
     code, again, err = run(*arguments)
     assert (code, again) == (0, first)
-    assert _sentence(err) == f"{block}: a damaged block, flown again"
+    assert _beside_the_engine(err) == [f"malta: {block}: a damaged block, flown again"]
     assert block.read_bytes() == whole
 
 

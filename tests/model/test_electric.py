@@ -319,20 +319,20 @@ def test_the_link_settles_where_the_supply_gives_what_is_drawn(plant: Plant) -> 
 @given(u=EIGHTEEN, V=st.floats(5, 60), limit=st.floats(0.01, 40))
 def test_voltages_keep_the_smaller_limit(plant: Plant, u: list[float], V: float, limit: float) -> None:
     """Of half-bridges, machine and gain file: by axes and by phases."""
-    most = current_control.largest_voltage(V, limit, math.inf)
-    assert float(most) == min(V / 2, limit)
-    assert current_control.largest_voltage(V, math.inf) == V / 2
+    assert current_control.voltage_limit(limit, math.inf, 41.0) == limit
+    assert current_control.voltage_limit(math.inf) is None
+    most = min(V / 2, limit)
     d, limited = (
         _flat(value)
         for value in current_control.duty_cycles(
-            plant.drive, ca.DM(u), V, ca.DM(u), real_pwm=False, most=most
+            plant.drive, ca.DM(u), V, ca.DM(u), real_pwm=False, limit=limit
         )
     )
     np.testing.assert_allclose((d - 0.5) * V, np.clip(u, -most, most), rtol=0, atol=1e-12)
     assert np.array_equal(limited == 0, d == 0.5 + np.array(u) / V)
     axes = ca.DM(u[: len(plant.drive.axes)])
-    m, _ = current_control.modulation(plant.drive, axes, V, most)
-    assert float(ca.mmax(plant.drive.peak(ca.DM(m) * V))) <= float(most) * (1 + 1e-12)
+    m, _ = current_control.modulation(plant.drive, axes, V, limit)
+    assert float(ca.mmax(plant.drive.peak(ca.DM(m) * V))) <= most * (1 + 1e-12)
 
 
 @given(u=EIGHTEEN, i=EIGHTEEN, V=st.floats(5, 60))

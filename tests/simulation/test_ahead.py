@@ -20,6 +20,7 @@ from malta.loops.sampled_loops import machine_law, machine_loop
 from malta.machines.planar import motions
 from malta.model.data import plant_of
 from malta.model.parameters import fingerprint
+from malta.simulation.engine.compiled import compiler
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Commutation, linear_law
@@ -173,6 +174,7 @@ def test_the_margin_is_the_same(pairs: dict[str, Pair]) -> None:
     assert one.robust.lower == pytest.approx(other.robust.lower, rel=1e-3)
 
 
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
 def test_compiled_is_the_virtual_machine(pairs: dict[str, Pair]) -> None:
     p = pairs["halbach"]
     distance: dict[str, Any] = {"speeds": (20e-3,), "fidelity": "force", "noise": 0.0}

@@ -522,6 +522,7 @@ def test_an_operation_without_a_form_is_refused() -> None:
             translate.translate(ca.Function("f", [state, theta], [unknown(state)]), [])
 
 
+@needs_compiler
 def test_constants_are_any_numbers(tmp_path: Path) -> None:
     """Infinity, which is how an expression says "no limit", the smallest numbers and the largest."""
     numbers = [np.inf, -np.inf, 5e-324, -1.7976931348623157e308, 0.1, -3.0, 1e22]
@@ -850,6 +851,26 @@ def test_a_compiler_that_does_not_exist_is_no_compiler(monkeypatch: pytest.Monke
     monkeypatch.setenv("CC", "/nowhere/cc")
     assert compiled.compiler() is None
     assert compiled.library("", 1) is None
+
+
+@needs_compiler
+def test_a_compiler_may_refuse_the_flags_of_gcc(
+    fresh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As clang does: the rest of the flags is kept."""
+    own, cc = compiled.compiler(), tmp_path / "cc"
+    assert own is not None
+    cc.write_text(
+        f'#!/bin/sh\ncase "$*" in *-fsched*) exit 1;; esac\necho "$@" > {tmp_path}/said\nexec {own[0]} "$@"\n'
+    )
+    cc.chmod(0o700)
+    compiled.compiler.cache_clear()
+    monkeypatch.setenv("CC", str(cc))
+    found = compiled.library("int two(void) { return 2; }\n", 1)
+    assert found is not None
+    assert found.two() == 2
+    assert {"-ffp-contract=fast", "-march=native"} < set((tmp_path / "said").read_text().split())
+    assert len(list(fresh.rglob("*.so"))) == 1
 
 
 @pytest.mark.parametrize("hangs_at", ["--version", "-shared"])

@@ -205,11 +205,11 @@ def modulate(par: Parameters, V: Any, pwm: Pwm, dead_ends: int = 0) -> tuple[Any
     if pwm == "exact":
         return d, limited
     step = pwm_step(par, pwm) / par.V_dc
-    stepped = ca.fmin(_round_half_up(d / step) * step, 1)
+    stepped = _round_half_up(d / step) * step
     if pwm == "fine" and dead_ends:
         coarse = _round_half_up(d * par.counts) / par.counts
         stepped = ca.if_else(ca.fmin(d, 1 - d) * par.counts < dead_ends, coarse, stepped)
-    return stepped, limited
+    return ca.fmin(stepped, 1), limited
 
 
 def largest_fine_force(par: Parameters, dead_ends: int = DEAD_ENDS) -> float:

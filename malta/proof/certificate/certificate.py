@@ -10,7 +10,6 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ from flint import arb, ctx
 from scipy import linalg, sparse
 
 from malta.errors import CheckError, InputError
-from malta.files import replace_files
+from malta.files import replace_files, version
 from malta.proof.box import Box, below, box_of
 from malta.proof.certificate import checked_file
 from malta.proof.certificate.check import BITS, MOST_NODES, balls, bernstein, interpolated, within
@@ -230,7 +229,7 @@ def certificate_of(
     content: dict[str, Any] = {
         "format": checked_file.FORMAT,
         "version": checked_file.VERSION,
-        "malta": version("malta"),
+        "malta": version(),
         "claim": {
             "lower": lower,
             **_origin(origin),

@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from malta.files import replace_files, require_suffix
+from malta.files import packaged, replace_files, require_suffix
 from malta.report.figures.drawing import BOUND_LINE, printable
 from malta.report.page.analysis import KeyFigure
 from malta.report.page.sections import Folded, Item, Picture, Section, Sheet, plain_sheet, polish
@@ -345,7 +345,7 @@ def render(
         for section in sections
     ]
     title = f"{front.heading}: {front.kind.lower()}"
-    policy, script = script_of(Path(__file__).with_name("figures.js").read_text(encoding="utf-8"))
+    policy, script = script_of(packaged("report/page/figures.js").decode())
     text = render_template(
         "page.html.jinja", title=title, kind=front.kind, heading=front.heading, about=front.about,
         figures=front.figures, foot=front.foot, verdict=Markup(front.verdict),
@@ -413,7 +413,7 @@ def script_of(text: str) -> tuple[str, str]:
 @cache
 def page_style() -> str:
     """The style of all pages."""
-    return Path(__file__).with_name("style.css").read_text(encoding="utf-8")
+    return packaged("report/page/style.css").decode()
 
 
 # The page of a commissioning for the lab's binder: steps, findings with limits, logs, signature.

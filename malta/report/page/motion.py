@@ -18,7 +18,7 @@ import numpy as np
 
 from malta.display import micro, quantity
 from malta.errors import InputError
-from malta.files import read_file
+from malta.files import packaged, read_file
 from malta.model.equations import Body, rotation
 from malta.tables import read_npz
 
@@ -309,7 +309,7 @@ def motion_page(found: Motion | Sequence[Motion], about: str = "") -> Page:
     while len(data := json_in_page(_page_data(runs, every))) > LARGEST and every < FRAMES:
         every *= 2
     title = runs[0].title if len(runs) == 1 else f"{len(runs)} runs"
-    policy, script = script_of(Path(__file__).with_name("motion.js").read_text(encoding="utf-8"))
+    policy, script = script_of(packaged("report/page/motion.js").decode())
     page = render_template(
         "motion.html.jinja", title=title, about=about, style=Markup(page_style()), script=Markup(script),
         policy=policy, data=Markup(data),

@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from malta.files import version
 from malta.loops.time_domain import budget_of
 from malta.merits import four_digits
 from malta.model.data import published_figures
@@ -494,7 +494,7 @@ def _provenance(a: Analysis) -> Iterator[Item]:
         ["machine", a.plant.name],
         ["preset of its data", a.subject.parameters.preset],
         *([[key, value] for key, value in a.subject.provenance]),
-        ["this page: malta", version("malta")],
+        ["this page: malta", version()],
         ["this page: Python", platform.python_version()],
     ]
     sheet = plain_sheet("Where the numbers come from", ("what", "which"), [row for row in rows if row[1]])

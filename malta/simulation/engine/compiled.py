@@ -120,6 +120,7 @@ FLAGS = (
     *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),
     "-fno-tree-slp-vectorize",  # which may compute a number twice, rounded in two ways: v != w then means nothing
 )
+GCC_ALONE = ("-fschedule-insns", "-fsched-pressure")  # clang does not know them
 NATIVE = ("-march=native", "-mtune=generic")  # tuned for a compiler's guess of a processor, text is slower
 
 
@@ -249,9 +250,9 @@ def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path, flags: tupl
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         c, so = Path(scratch) / "engine.c", Path(scratch) / "engine.so"
         c.write_text(text, encoding="utf-8")
-        for native in (NATIVE, ()):
-            command = [*cc, *flags, *native, f"-DLANES={lanes}"]
-            found = _answer([*command, str(c), "-o", str(so), "-lm"])
+        common = [flag for flag in flags if flag not in GCC_ALONE]
+        for tried in ((*flags, *NATIVE), (*common, *NATIVE), common):
+            found = _answer([*cc, *tried, f"-DLANES={lanes}", str(c), "-o", str(so), "-lm"])
             if found is None:
                 return False
             if found[0] == 0:

@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache, partial
-from importlib.resources import files
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
@@ -15,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
+from malta.files import packaged
 from malta.model.data import plant_of
 from malta.model.parameters import acting_names, shape_parameters, twins_of
 from malta.model.plant import FloatArray, Plant
@@ -102,8 +102,7 @@ def source(p: Period, digest: ca.Function | None, cruise: Sequence[ca.Function] 
     prepare = _once("prepare(const real *theta, real *c, double *d)", [text.prepare for text in texts])
     ahead = _once("foresee(const double *d, const double *given, double *g)", [x.foresee for x in texts])
     numbers, noise, loop = (
-        files("malta.simulation.engine").joinpath(f"{name}.c").read_text(encoding="utf-8")
-        for name in ("numbers", "noise", "engine")
+        packaged(f"simulation/engine/{name}.c").decode() for name in ("numbers", "noise", "engine")
     )
     noise = f"#if LANES > 1\n{noise}#endif\n"
     return "".join([defines, numbers, prepare, ahead, *functions, noise, loop])

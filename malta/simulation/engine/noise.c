@@ -8,7 +8,7 @@ typedef float half_singles __attribute__((vector_size(4 * LANES)));
 enum { TOGETHER = 4 }; /* samples whose noise is drawn at once */
 
 static bits64 split_mix(bits64 key, uint64_t count) {
-  bits64 x = key + count * 0x9e3779b97f4a7c15ULL;
+  bits64 x = key + (uint64_t)(count * 0x9e3779b97f4a7c15ULL); /* clang takes no long long beside uint64_t */
   x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9ULL;
   x = (x ^ (x >> 27)) * 0x94d049bb133111ebULL;
   return x ^ (x >> 31);
