@@ -43,7 +43,8 @@ _NAMES = {
     "malta.proof.connections": "append feedback interconnect parallel random_systems series",
     "malta.proof.margin": "Margin",
     "malta.proof.rates": "RateBound varying",
-    "malta.proof.robust": "margin_of_polynomial",
+    "malta.proof.robust": "Interrupted margin_of_polynomial",
     "malta.proof.uncertain": "Compensator UncertainSystem",
+    "malta.proof.work": "Budget",
 }
 __all__, __getattr__, __dir__ = contents(__name__, _NAMES)
