@@ -121,6 +121,7 @@ FLAGS = (
     "-fno-tree-slp-vectorize",  # which may compute a number twice, rounded in two ways: v != w then means nothing
 )
 GCC_ALONE = ("-fschedule-insns", "-fsched-pressure")  # clang does not know them
+OTHERWISE = {"-ffp-contract=fast": "-ffp-contract=off"}  # clang contracts a lane by itself otherwise than many
 NATIVE = ("-march=native", "-mtune=generic")  # tuned for a compiler's guess of a processor, text is slower
 
 
@@ -250,7 +251,7 @@ def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path, flags: tupl
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         c, so = Path(scratch) / "engine.c", Path(scratch) / "engine.so"
         c.write_text(text, encoding="utf-8")
-        common = [flag for flag in flags if flag not in GCC_ALONE]
+        common = [OTHERWISE.get(flag, flag) for flag in flags if flag not in GCC_ALONE]
         for tried in ((*flags, *NATIVE), (*common, *NATIVE), common):
             found = _answer([*cc, *tried, f"-DLANES={lanes}", str(c), "-o", str(so), "-lm"])
             if found is None:

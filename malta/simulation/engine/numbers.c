@@ -96,12 +96,21 @@ static inline real inverse(real x) { return 1.0 / x; }
 #define ELEVEN -2.505188203572492e-08
 #define THIRTEEN 1.6048170941500553e-10
 #define FIFTEEN -7.37441787774225e-13
+#if defined(__GNUC__) && !defined(__clang__) && (defined(__FMA__) || defined(__aarch64__))
+static inline real less_turns(real x, real n) { /* x - n pi; products are contracted, so that none is rounded */
+  return (x - n * 3.14159265358979311600) - n * 1.22464679914735317723e-16;
+}
+#else
+static inline real less_turns(real x, real n) { /* x - n pi; products of n, up to 16 bits, with 36 bits of pi are exact */
+  return ((x - n * 3.1415926535846666) - n * 5.1266883031679116e-12) - n * 2.1125998133974855e-23;
+}
+#endif
 static inline real sine_of_part(real x, int halves) { /* sin of x + halves pi / 2; halves is 0 or 1 */
   const double shift = 6755399441055744.0; /* 1.5 * 2^52: its last bits are the nearest whole number */
   real turns = x * 0.31830988618379067154;
   real counted = (halves ? turns + 0.5 : turns) + shift, n = counted - shift;
   if (halves) n -= 0.5;
-  real r = (x - n * 3.14159265358979311600) - n * 1.22464679914735317723e-16;
+  real r = less_turns(x, n);
   real t = r * r;
 #if LANES == 1
   real t2 = t * t, a = ONE + t * THREE, b = FIVE + t * SEVEN, c = NINE + t * ELEVEN, d = THIRTEEN + t * FIFTEEN;
