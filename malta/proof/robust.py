@@ -45,7 +45,7 @@ from malta.proof.uncertain import (
     number,
     positive,
 )
-from malta.proof.work import Budget, in_rounds, is_past
+from malta.proof.work import AGAIN, MORE, Budget, in_rounds, is_past
 
 # A loop in the coordinates in which its parameters act apart: x = S x', exactly, found from how the parameters enter.
 #
@@ -522,5 +522,6 @@ def _ask(
 def _interrupted(problem: Problem, box: Box, standing: Standing, seconds: float) -> Margin:
     """What is known of a margin whose search was interrupted."""
     lower = standing.lower if standing.lower > 0 and is_nominal_stable(problem, box) else None
-    reason = f"interrupted after {seconds:.3g} s{standing.where(problem)}"
-    return Margin(lower, standing.upper, None, None, {}, {}, (), seconds, reason)
+    done = standing.work
+    reason = f"interrupted after {done:.3g} units of work{standing.where(problem)}; {AGAIN * done:.3g} {MORE}"
+    return Margin(lower, standing.upper, None, None, {}, {}, (), seconds, reason, "", done)

@@ -65,15 +65,16 @@ Searches = list[tuple[Part, Search]]
 
 @dataclass(eq=False)
 class Standing:
-    """What is known of a margin while it is searched: its bounds, and the cells that are left. It changes in place."""
+    """What is known of a margin while it is searched: bounds, work, and the cells that are left. It changes in place."""
 
     progress: Progress | None
     lower: float = 0.0
     upper: float = math.inf
+    work: float = 0.0
     searches: Searches = field(default_factory=list)
 
     def report(self, lower: float, upper: float) -> None:
-        self.lower, self.upper = max(self.lower, lower), min(self.upper, upper)
+        self.lower, self.upper, self.work = max(self.lower, lower), min(self.upper, upper), spent()
         if self.progress is not None:
             self.progress(self.lower, self.upper)
 
