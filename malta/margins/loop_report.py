@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from malta.bound import at_least, at_most
 from malta.display import Curves, Description, display
 from malta.errors import CheckError
 from malta.loops.loop import Loop, loop_of_model
@@ -142,6 +143,11 @@ class Outcome(NamedTuple):
         return ratio_of(asked, self.found, at_least=self.at_least)
 
     @property
+    def nearness(self) -> str:
+        """How near its limit, as a share of it that is never less."""
+        return at_most(self.ratio).percent()
+
+    @property
     def verdict(self) -> Verdict:
         """Whether the bound holds; "undecided" where the interval of a simulated figure has the bound within."""
         return judge_figure(Figure(self.found, self.how, self.interval), self.asked, at_least=self.at_least)
@@ -159,16 +165,16 @@ class Outcome(NamedTuple):
 
     @property
     def _scale(self) -> tuple[float, str]:
-        """Factor from SI and unit that readers see: margins in percent, bandwidths in Hz, deviations in um."""
-        if self.name == "margin":
-            return 100.0, "%"
+        """Factor from SI and unit that readers see: bandwidths in Hz, deviations in um."""
         if self.unit == "rad/s":
             return 1 / (2 * math.pi), "Hz"
         fine = FINE.get(self.unit)
         return (1e6, fine) if fine else ROOTS.get(self.unit, (1.0, self.unit))
 
     def text(self, value: float) -> str:
-        """A value of it in the unit that readers see; a bandwidth has rad/s beside Hz."""
+        """A value of it in the unit that readers see; a bandwidth has rad/s beside Hz, a margin is proven."""
+        if self.name == "margin":
+            return at_least(value).percent()
         factor, unit = self._scale
         more = f" ({value:.4g} rad/s)" if unit == "Hz" else ""
         return f"{value * factor:.4g} {unit}".removesuffix(" 1") + more
@@ -178,7 +184,11 @@ class Outcome(NamedTuple):
         """Its bound; "as little as possible" without one."""
         if self.asked is None:
             return "as little as possible"
-        return f"{'>=' if self.at_least else '<='} {self.text(self.asked)}"
+        return f"{'>=' if self.at_least else '<='} {self._as_asked(self.asked)}"
+
+    def _as_asked(self, bound: float) -> str:
+        """A bound of it as the design file has it."""
+        return f"{100 * bound:.10g} %" if self.name == "margin" else self.text(bound)
 
     @property
     def found_text(self) -> str:
@@ -194,7 +204,7 @@ class Outcome(NamedTuple):
         if self.asked is None:
             return f"{found}, asked for little"
         bound = "at least" if self.at_least else "at most"
-        text = f"{found}, asked for {bound} {self.text(self.asked)}"
+        text = f"{found}, asked for {bound} {self._as_asked(self.asked)}"
         if self.verdict != "undecided" or self.interval is None:
             return text
         low, high = map(self.text, self.interval)
@@ -483,6 +493,7 @@ def _requirements(a: LoopReport) -> Iterator[Merit]:
         name, words = f"requirement {one.name}", one.words
         if several:
             name, words = f"{name} {one.how}", f"{words}, {one.how}"
-        kind = "at_least" if one.at_least else "at_most"
-        unit = "percent" if one.name == "margin" else FINE.get(one.unit, one.unit)
+        proven = one.name == "margin"
+        kind = "proven" if proven else "at_least" if one.at_least else "at_most"
+        unit = "percent" if proven else FINE.get(one.unit, one.unit)
         yield figure(kind, name, words, one.found, unit, bound=one.asked)

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rich.text import Text
 
-from malta.display import ceil_to, floor_to, micro, number
+from malta.bound import at_least, at_most
+from malta.display import micro, number
 from malta.margins.loop_report import LoopReport, Outcome, zone
 from malta.model.parameters import box_words
 from malta.report.tables import fold
@@ -105,13 +106,9 @@ def _margin(found: LoopReport) -> VerdictLine:
         return VerdictLine("margin", "not proven", "the proof was left out (--no-proof)")
     if margin.lower is None:
         return VerdictLine("margin", "nothing proven", f"{margin.reason}; {of}", "bad", stairs)
-    lost = (
-        "no unstable machine found" if margin.exhausted else f"lost at {ceil_to(100 * margin.upper, 1):.1f} %"
-    )
+    lost = "no unstable machine found" if margin.exhausted else f"lost at {margin.lost.percent()}"
     state = "good" if margin.lower >= 1 else "bad"
-    return VerdictLine(
-        "margin", f"{floor_to(100 * margin.lower, 1):.1f} % proven", f"{lost} {of}", state, stairs
-    )
+    return VerdictLine("margin", f"{margin.proven.percent()} proven", f"{lost} {of}", state, stairs)
 
 
 def _stairs(found: LoopReport) -> tuple[Stair, ...]:
@@ -133,7 +130,7 @@ def _peak(found: LoopReport) -> VerdictLine:
     bounds = [gain.upper for gain in found.worst.values()]
     if bounds and None not in bounds:
         highest = max(bound for bound in bounds if bound is not None)
-        note += f"; over the uncertainty at most {ceil_to(highest, 2):.2f}, zone {zone(highest)}"
+        note += f"; over the uncertainty at most {at_most(highest).text()}, zone {zone(highest)}"
     return VerdictLine("peak |S|", f"{peaks[name]:.2f}, zone {found_zone}", note, state)
 
 
@@ -149,7 +146,7 @@ def _requirements(outcomes: Sequence[Outcome]) -> VerdictLine:
     more = len(failed) + len(undecided) - len(notes)
     notes += [f"{more} more"] if more else []
     if not failed and not undecided:
-        near = ", ".join(f"{one.words} {100 * one.ratio:.0f} %" for one in held[:NEAREST])
+        near = ", ".join(f"{one.words} {one.nearness}" for one in held[:NEAREST])
         return VerdictLine("requirements", f"all {len(asked)} hold", f"nearest their limits: {near}", "good")
     parts = [f"{len(failed)} of {len(asked)} {'FAILS' if len(failed) == 1 else 'FAIL'}"] if failed else []
     parts += [f"{len(undecided)} undecided"] if undecided else []
@@ -261,7 +258,7 @@ def stairs_html(stairs: Sequence[Stair]) -> str:
         return ""
     bars = (
         f'<span class="{"" if s.proven >= 1 else "bad"}"><i style="height:{2.4 * s.proven / largest:.2f}rem"></i>'
-        f"<em>{html.escape(s.name)}</em><em>{100 * s.proven:.0f} %</em></span>"
+        f"<em>{html.escape(s.name)}</em><em>{at_least(s.proven).percent()}</em></span>"
         for s in stairs
     )
     return f'<span class="stairs">{"".join(bars)}</span>'

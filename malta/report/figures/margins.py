@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from malta.display import floor_to
+from malta.bound import at_least
 from malta.errors import InputError
 from malta.loops.loop import loop_along
 from malta.loops.sampled_loops import SampledLoop
@@ -115,7 +115,7 @@ def _draw_stages(left: Axes, right: Axes, found: LoopReport) -> None:
     beside: dict[str, Any] = {"xytext": (6, 0), "textcoords": "offset points", "va": "center"}
     for k, (_, margin, peak) in enumerate(rows):
         look, end = LOOKS[k >= len(found.chain) - 1], _draw_margin(left, k, margin)
-        text = "none" if margin.lower is None else f"{floor_to(_percent(margin.lower), 1):.1f} %"
+        text = "none" if margin.lower is None else margin.proven.percent()
         text = f"{text} or more" if margin.exhausted and margin.lower is not None else text
         left.annotate(text, (end, k), **beside, **NOTE)
         stable = not math.isnan(peak)
@@ -373,7 +373,7 @@ def front_figure(tuned: Tuned, path: str | Path | None = None) -> Figure:
     kept = (
         "keeps all that is asked for" if tuned.reached else f"misses {tuned.binding.name.replace('_', ' ')}"
     )
-    share = f"{100 * taken.figures['margin']:.0f} %"
+    share = at_least(taken.figures["margin"]).percent()
     found = f"{tuned.trials} trials; open marks: taken, margin {share}, which {kept}; "
     found += "filled: least force noise, or least motion, at a margin"
     figure = new_figure(f"{tuned.spec.name}: margin against noise", found, size=(9.0, 4.6), left=0.1)

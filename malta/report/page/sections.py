@@ -260,7 +260,7 @@ def _requirements(a: Analysis) -> Iterator[Item]:
     ranked = sorted(a.report.requirements, key=lambda one: (RANKS[one.verdict], one.asked is None))
     for one in ranked:  # failures first
         state, word = _light(one)
-        of = "" if one.asked is None else f"{100 * one.ratio:.1f} %"
+        of = "" if one.asked is None else one.nearness
         rows.append([word, one.words, one.asked_text, one.found_text, of, one.how])
         marks.append((state, "", "", "", "", ""))
     heads = ("", "requirement", "asked", "found", "of the limit", "from")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.display import ceil_to, floor_to
+from malta.bound import at_least
 from malta.errors import InputError
 from malta.margins.margin_map import MarginMap, margin_map_of
 from malta.report.figures.drawing import BOUND, LEGEND, NOTE, draw_grid, new_figure
@@ -379,8 +379,8 @@ def _titles(found: MarginMap) -> tuple[str, str]:
         return title, f"nothing proven: {found.margin.reason}"[:110]
     others = [name for name in found.parameters if name not in (found.x, found.y)]
     beside = f", with {' '.join(others)} anywhere in the box" if others else ""
-    lost = "" if found.margin.exhausted else f", lost at {ceil_to(100 * found.margin.upper, 1):g} %"
-    text = f"proven {floor_to(100 * found.proven, 1):g} % of the box{lost} {found.where}{beside}"
+    lost = "" if found.margin.exhausted else f", lost at {found.margin.lost.percent()}"
+    text = f"proven {found.margin.proven.percent()} of the box{lost} {found.where}{beside}"
     return title, plain(" ".join(text.split()))
 
 
@@ -396,7 +396,7 @@ def _draw_map(axes: Axes, found: MarginMap) -> list[Any]:
             axes.contour(X, Y, growth, levels=[0.0], colors=["#000000"], linewidths=1.4, zorder=3)
     handles: list[Any] = []
     for share, look, label in (
-        (found.proven, PROVEN, f"proven, {floor_to(100 * found.proven, 1):g} %"),
+        (found.proven, PROVEN, f"proven, {at_least(found.proven).percent()}"),
         (1.0, BOX, "box, 100 %"),
     ):
         if share:
