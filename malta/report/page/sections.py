@@ -335,8 +335,8 @@ def _margin_map(a: Analysis) -> Iterator[Item]:
     drawn = margin_map_of(a.plant, a.subject.controller, (x, y), found.uncertainty, margin=found.robust)
     yield Picture(
         lambda: plots.margin_map(drawn, campaigns=a.campaigns),
-        f"Margin map over {x} and {y}: every machine in the blue box is proven stable. The line is the boundary of "
-        "stability by eigenvalues, the other parameters being nominal: another route, which proves nothing.",
+        f"Margin map over {x} and {y}{drawn.beside_text and f', {drawn.beside_text}'}: every machine in the blue "
+        "box is proven stable. The line is the boundary of stability by eigenvalues, which prove nothing.",
     )
 
 
