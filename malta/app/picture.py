@@ -22,7 +22,7 @@ from malta.errors import CheckError, InputError
 from malta.loops.classical import phase_and_delay
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.loop import Loop, loop_of_model
-from malta.margins.loop_report import BANDWIDTHS, LoopReport, pole_figures, zone
+from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, LoopReport, pole_figures, zone
 from malta.margins.margin_map import margin_map_of, plane_of
 from malta.margins.travel import travel_loops
 from malta.margins.verify import machine_report
@@ -351,8 +351,8 @@ def poles_document(problem: Problem, at: Mapping[str, float]) -> dict[str, Any]:
 
 SHORT = {
     "peak_sensitivity": "peak |S|",
-    "bandwidth_sigma_max_T": "bandwidth, T",
-    "bandwidth_crossover_max": "bandwidth, L",
+    f"bandwidth_{BANDWIDTH}": "bandwidth, T",
+    "bandwidth_crossover_max": "crossover, L",
     "smallest_damping": "least damping",
     "slowest_pole": "slowest pole",
 }
@@ -390,10 +390,7 @@ def _loop_merits(problem: Problem, *, curves: bool) -> list[Merit]:
     noise = {kind: [one.value for one in found if one.kind == kind] for kind in ("motion", "command")}
     return [
         peak._replace(note=f"at {worst.signal}, zone {zone(peak.value)}"),
-        *(
-            known[f"bandwidth_{key}"]._replace(note=BANDWIDTHS[key])
-            for key in ("sigma_max_T", "crossover_max")
-        ),
+        *(known[f"bandwidth_{key}"]._replace(note=BANDWIDTHS[key]) for key in (BANDWIDTH, "crossover_max")),
         *(_channel_margins(problem) if curves else ()),
         *_worst_by_unit("motion", "motion at rest, rms", noise["motion"], problem.plant.outputs),
         *_worst_by_unit("command", "command noise, rms", noise["command"], problem.plant.inputs),

@@ -262,8 +262,7 @@ def plot(
     outside, and compliance. rootlocus: poles over the loop gain or a parameter. marginmap: the proven box in the plane
     of two uncertain parameters, the others anywhere in it, and the boundary of stability by eigenvalues.
 
-    The loop is the machine's: sampled, with hold, delay and current loops. The machine is the one in the file, with
-    the changes given by --set.
+    The loop is the machine's, sampled. The machine is the one in the file, with the changes given by --set.
 
     \b
     Examples:  malta plot design/gains/robust.json bode nyquist

@@ -44,6 +44,7 @@ BANDWIDTHS = {
     "w_n_max": "regulator's fastest natural frequency",
     "w_n_min": "regulator's slowest natural frequency",
 }
+BANDWIDTH = "sigma_max_T"  # the one that is meant where a tile shows one
 
 
 def zone(peak: float) -> str:
@@ -347,7 +348,7 @@ class LoopReport:
         return tuple(found for part in parts for found in part(self))
 
     def __str__(self) -> str:
-        lines = [f"{'stable' if self.stable else 'UNSTABLE'} with hold, delay and current loops"]
+        lines = [f"{'stable' if self.stable else 'UNSTABLE'} {self.loop.contents}"]
         for stage in self.stages:
             own = {k: v for k, v in stage.peak_sensitivity.items() if k != "sigma_max"}
             peaks = "  ".join(f"{k} {v:.2f}" for k, v in own.items()) + f", zone {zone(max(own.values()))}"
@@ -374,9 +375,8 @@ class LoopReport:
         rows = [("margin", f"{self.robust} of {box}")] if self.robust is not None else []
         shown = sorted(self.figures[1:], key=lambda one: one.kind not in FIRST)
         rows += [(one.heading, one.text) for one in shown]
-        return Description(
-            f"Loop of {at}: {state} with hold, delay and current loops", tuple(rows), self._curves
-        )
+        rows = [("contents", self.loop.contents), *rows]
+        return Description(f"Loop of {at}: {state}", tuple(rows), self._curves)
 
     @property
     def _curves(self) -> Curves | None:

@@ -84,8 +84,8 @@ def verdict_lines(found: LoopReport, campaigns: Sequence[Summary] = ()) -> tuple
 
 def _loop(found: LoopReport) -> VerdictLine:
     if found.stable:
-        return VerdictLine("loop", "stable", "with hold, delay and current loops", "good")
-    note = f"a pole at |lambda| = {found.stages[-1].spectral_radius:.6f}"
+        return VerdictLine("loop", "stable", found.loop.contents, "good")
+    note = f"a pole at |lambda| = {found.stages[-1].spectral_radius:.6f}, {found.loop.contents}"
     return VerdictLine("loop", "UNSTABLE", note, "bad")
 
 
