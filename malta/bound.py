@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 DIGITS = 4  # of a bound that is no share
 PLACES = 2  # behind the point of a share in percent
-PLAIN = range(-5, 7)  # powers of ten that are written out
 EXACT = Context(prec=700)  # holds the product of any two numbers
 
 
@@ -38,8 +37,7 @@ class Bound(NamedTuple):
         if word := self._word:
             return word
         number = self._times(factor)
-        shown = self._rounded(number, number.adjusted() + 1 - digits).normalize(EXACT)
-        return f"{shown:f}" if shown.adjusted() in PLAIN else f"{shown:e}"
+        return f"{float(self._rounded(number, number.adjusted() + 1 - digits)):.{digits}g}"
 
     @property
     def _word(self) -> str:

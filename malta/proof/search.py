@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from flint import arb
 
+from malta.bound import at_least
 from malta.errors import CheckError
 from malta.proof.box import EDGE, Box
 from malta.proof.exclusion import Part, Search, advance, cut, growth_over, merge_twins, start
@@ -209,7 +210,9 @@ def _families(q: Question, known: Findings, until: float) -> tuple[Findings, lis
         if done and refused - done < EDGE * done:
             break
     if known.upper > done and (why or done < q.box.limit):
-        known = known.because(why or f"nothing beyond {done:.3g} was looked at: the model is dear to enclose")
+        known = known.because(
+            why or f"nothing beyond {at_least(done).text()} was looked at: the model is dear to enclose"
+        )
     room = NEAR if q.problem.traits.is_bounded else 1.05  # couplings grow with the box
     if known.upper < done / (3 if room > NEAR else room) and not clock.monotonic() > until:
         with suppress(Unproven):  # narrower families over a smaller box; the larger ones remain valid

@@ -68,7 +68,7 @@ def verdict_lines(found: LoopReport, campaigns: Sequence[Summary] = ()) -> tuple
     >>> for line in malta.report.verdict_lines(found):
     ...     print(f"{line.label}: {line.value}")
     loop: stable
-    margin: 390.6 % proven
+    margin: 390.69 % proven
     peak |S|: 1.57, zone A
     requirements: not judged
     yield: not sampled
@@ -182,7 +182,12 @@ def staircase(stairs: Sequence[Stair]) -> str:
     largest = max((stair.proven for stair in stairs), default=0.0)
     if len(stairs) < 2 or not largest > 0:
         return ""
-    return "".join(BLOCKS[max(math.ceil(len(BLOCKS) * s.proven / largest), 1) - 1] for s in stairs)
+    return "".join(BLOCKS[max(math.ceil(len(BLOCKS) * _height(s, largest)), 1) - 1] for s in stairs)
+
+
+def _height(stair: Stair, largest: float) -> float:
+    """A margin as a share of the largest, which may be without end."""
+    return 1.0 if stair.proven == largest else stair.proven / largest
 
 
 @dataclass(frozen=True)
@@ -257,7 +262,7 @@ def stairs_html(stairs: Sequence[Stair]) -> str:
     if len(stairs) < 2 or not largest > 0:
         return ""
     bars = (
-        f'<span class="{"" if s.proven >= 1 else "bad"}"><i style="height:{2.4 * s.proven / largest:.2f}rem"></i>'
+        f'<span class="{"" if s.proven >= 1 else "bad"}"><i style="height:{2.4 * _height(s, largest):.2f}rem"></i>'
         f"<em>{html.escape(s.name)}</em><em>{at_least(s.proven).percent()}</em></span>"
         for s in stairs
     )

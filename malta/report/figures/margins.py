@@ -175,10 +175,10 @@ def _draw_along_course(left: Axes, right: Axes, found: LoopReport, bound: float)
         return np.concatenate([array[:0:-1], array]) if even else array
 
     left.plot(both, mirrored([_percent(p.margin.lower) for p in places]), **DOT | {"markersize": 4})
-    if found.travel.lower is not None:
-        left.axhline(100 * found.travel.lower, **STYLES[1])
+    if level := _percent(found.travel.lower):
+        left.axhline(level, **STYLES[1])
         left.annotate(
-            "proven for all of it at once", (0.02, 100 * found.travel.lower), xycoords=("axes fraction", "data"),
+            "proven for all of it at once", (0.02, level), xycoords=("axes fraction", "data"),
             xytext=(0, -3), textcoords="offset points", va="top", **NOTE,
         )  # fmt: skip
     left.set_ylim(0, 1.25 * max([_percent(p.margin.lower) for p in places] + [1.0]))
@@ -215,8 +215,8 @@ def _bound(worst: Mapping[str, Gain]) -> float:
 
 
 def _percent(t: float | None) -> float:
-    """A share in percent; 0 for None."""
-    return 0.0 if t is None else 100 * t
+    """A share in percent; 0 for None, and for one without end, which no axis holds."""
+    return 100 * t if t is not None and math.isfinite(t) else 0.0
 
 
 def _legend(axes: Axes, bottom: float = 1.0, handles: Sequence[Artist] | None = None) -> None:

@@ -402,7 +402,7 @@ def _draw_map(axes: Axes, found: MarginMap) -> list[Any]:
         (found.proven, PROVEN, f"proven, {at_least(found.proven).percent()}"),
         (1.0, BOX, "box, 100 %"),
     ):
-        if share:
+        if share and math.isfinite(share):
             corner = [m - share * h for m, h in zip(found.nominal, found.half, strict=True)]
             axes.add_patch(Rectangle((corner[0], corner[1]), *(2 * share * h for h in found.half), **look))
             handles.append(Patch(label=label, **look))

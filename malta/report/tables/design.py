@@ -385,9 +385,10 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
     >>> rich.print(malta.report.requirements_table([margin]))
     Requirements
     <BLANKLINE>
-     requirement      asked   found   of the limit                             from
-     ──────────────────────────────────────────────────────────────────────────────
-     margin        >= 300 %   360 %         83.3 %   holds   proven over the travel
+                                           of the
+     requirement      asked      found     limit                             from
+     ────────────────────────────────────────────────────────────────────────────
+     margin        >= 300 %   360.00 %   83.34 %   holds   proven over the travel
     <BLANKLINE>
     """
     table = new_table("Requirements", "requirement", "asked", "found", "of the limit", "", "from")
@@ -453,8 +454,8 @@ def front_table(tuned: Tuned) -> Table:
     <BLANKLINE>
      margin, proven [%]   f [N rms]   y motion [µm rms]
      ──────────────────────────────────────────────────────
-     328                     0.0122               0.523
-     363                     0.0414               0.501   *
+     328.00                  0.0122               0.523
+     363.00                  0.0414               0.501   *
     <BLANKLINE>
     """
     heads, rows = front_rows(tuned)
@@ -482,8 +483,8 @@ def front_markdown(tuned: Tuned) -> str:
     >>> print(malta.report.front_markdown(tuned))
     | margin, proven [%] | f [N rms] | y motion [um rms] |  |
     | ---: | ---: | ---: | ---: |
-    | 328 | 0.0122 | 0.523 |  |
-    | 363 | 0.0414 | 0.501 | * |
+    | 328.00 | 0.0122 | 0.523 |  |
+    | 363.00 | 0.0414 | 0.501 | * |
     <BLANKLINE>
     """
     heads, rows = front_rows(tuned)
