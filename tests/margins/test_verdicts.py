@@ -154,7 +154,7 @@ def test_the_verdict_names_failures_first_and_says_the_same_everywhere() -> None
     lines = verdict_lines(found)
     assert [line.label for line in lines] == ["loop", "margin", "peak |S|", "requirements", "yield"]
     assert (lines[1].value, lines[1].state) == ("99.99 % proven", "bad")
-    assert "lost at 100.1 %" in lines[1].note
+    assert "lost at 100.01 %" in lines[1].note
     assert lines[3].value == "1 of 3 FAILS, 1 undecided"
     assert lines[3].note.startswith("margin 200.00 %, asked >= 300 %; error")
     assert held.found_text == "63.93 Hz (401.7 rad/s)"

@@ -7,7 +7,7 @@ const SIGNS = { true: ["✓", "met"], false: ["✗", "not met"], null: ["…", "
 
 // Whether a margin is reached: by the verdict on the proof, or refuted by eigenvalues before it. Bounds come as text: who proves rounds.
 function marginLight(asked, state) {
-  const { proof, picture } = state, upper = proof?.upper ?? picture.margin?.upper, text = proof?.lost ?? picture.margin?.lost;
+  const { proof, picture } = state, upper = proof?.upper ?? picture.margin?.upper, text = proof?.upper ? proof.lost : picture.margin?.lost;
   if (!picture.stable) return { holds: false, found: 0, how: "unstable loop" };
   if (proof?.holds !== undefined && proof?.holds !== null) return { holds: proof.holds, found: proof.lower ?? 0, text: proof.proven, how: proof.reason || "proven over the travel" };
   if (upper !== undefined && upper !== null && upper < asked) return { holds: false, found: upper, text, how: "lost there, by eigenvalues" };
