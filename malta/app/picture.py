@@ -338,7 +338,7 @@ def poles_document(problem: Problem, at: Mapping[str, float]) -> dict[str, Any]:
     worst = found.poles[np.argmax(found.poles.real)]
     return {
         "at": dict(at),
-        "beside": {name: found.values[name] for name in plane.others},
+        "beside": {name: found.values[name] for name in plane.names[2:]},
         "poles": [[float(s.real), float(s.imag)] for s in found.poles],
         "worst": [float(worst.real), float(worst.imag)],
         "stable": found.growth < 0,

@@ -13,7 +13,7 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from operator import itemgetter
 from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -46,33 +46,18 @@ Others = Literal["box", "nominal"]  # what the parameters are that are not drawn
 class Plane:
     """The machines that the points of a plane stand for: values of x and y, and of what is not drawn.
 
-    names : x and y
-    uncertainty : relative half range of each parameter that is drawn or varies beside
+    names : x and y, then the parameters that vary and are not drawn
+    loops : of the machine in these names, and in `over`, whose intervals do not grow with the multiple
+    nominal, half, low, high : by name, SI: values, half widths of the box, ends of what is looked at
     """
 
-    plant: Plant
-    controller: Controller
-    names: tuple[str, str]
-    uncertainty: Mapping[str, float]
-
-    @cached_property
-    def loops(self) -> tuple[list[tuple[UncertainSystem, Compensator]], dict[str, tuple[float, float]]]:
-        """The loops, and the intervals that do not grow with the multiple."""
-        return travel_loops(self.plant, self.controller, (*self.names, *self.others))
-
-    @property
-    def others(self) -> tuple[str, ...]:
-        """The parameters that vary and are not drawn."""
-        return tuple(name for name in self.uncertainty if name not in self.names)
-
-    def nominal(self, names: tuple[str, ...]) -> FloatArray:
-        """Nominal values, SI."""
-        return np.array([float(getattr(self.plant.parameters, name)) for name in names])
-
-    def half(self, names: tuple[str, ...]) -> FloatArray:
-        """Half widths of the box, SI."""
-        shares: FloatArray = np.array([self.uncertainty[name] for name in names])
-        return np.abs(self.nominal(names)) * shares
+    names: tuple[str, ...]
+    loops: list[tuple[UncertainSystem, Compensator]]
+    over: Mapping[str, tuple[float, float]]
+    nominal: FloatArray
+    half: FloatArray
+    low: FloatArray
+    high: FloatArray
 
     def growth(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """The growth of the worst pole of all machines on a grid, len(y) x len(x), 1/s.
@@ -81,7 +66,7 @@ class Plane:
         """
         some, every = (_points(x[::step], y[::step]) for step in (COARSE, 1))
         worst = np.full(len(every), -math.inf)
-        for system, law in self.loops[0]:
+        for system, law in self.loops:
             ends = self._ends(system)
             found = np.array([instability(system, law, self._rows(system, some, *end)) for end in ends])
             for k in np.unique(found.argmax(axis=0)):
@@ -90,42 +75,35 @@ class Plane:
 
     def worst(self, x: float, y: float) -> Lost:
         """The machine at a point whose worst pole grows fastest, and the poles of its loop."""
-        point, found = np.array([[x, y]]), []
-        for system, law in self.loops[0]:
-            each = (self._rows(system, point, *end) for end in self._ends(system))
-            found += [(instability(system, law, rows).item(), system, law, rows) for rows in each]
-        growth, system, law, rows = max(found, key=lambda one: one[0])
+        each = (
+            (system, law, self._rows(system, np.array([[x, y]]), *end))
+            for system, law in self.loops
+            for end in self._ends(system)
+        )
+        growth, (system, law, rows) = max(
+            ((instability(*one).item(), one) for one in each), key=itemgetter(0)
+        )
         (poles,) = np.linalg.eigvals(closed_loop(system, law, rows))
         if law.sample_time is not None:
             poles = continuous_poles(1 + law.sample_time * poles, law.sample_time)
         return Lost(dict(zip(system.names, rows[0].tolist(), strict=True)), growth, poles)
 
-    def limits(self, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
-        """The lowest and the highest values that are looked at."""
-        system = self.loops[0][0][0]
-        known = system.limits or [(-math.inf, math.inf)] * len(system.names)
-        ends = np.array([known[system.names.index(name)] for name in names]).reshape(-1, 2)
-        room = ROOM * np.abs(self.nominal(names))
-        return ends[:, 0] + room, ends[:, 1] - room
-
     def _ends(self, system: UncertainSystem) -> list[tuple[tuple[float, ...], FloatArray]]:
         """Ends and middles of the intervals that do not grow, each with all sides of the box of the others."""
-        ranges = [ends for name, ends in self.loops[1].items() if name in system.names]
+        ranges = [ends for name, ends in self.over.items() if name in system.names]
         places = itertools.product(*((low, high, (low + high) / 2) for low, high in ranges))
-        return [*itertools.product(itertools.islice(places, MOST_PLACES), _sides(len(self.others)))]
+        return [*itertools.product(itertools.islice(places, MOST_PLACES), _sides(len(self.names) - 2))]
 
     def _rows(
         self, system: UncertainSystem, points: FloatArray, place: tuple[float, ...], side: FloatArray
     ) -> FloatArray:
         """The parameters of a system at points of the plane: one machine for each."""
-        known = list(system.names)
-        off = np.abs(points - self.nominal(self.names)) / self.half(self.names)
-        reach = off.max(axis=1)[:, None] * self.half(self.others)
+        known, multiple = list(system.names), (np.abs(points - self.nominal[:2]) / self.half[:2]).max(axis=1)
+        beside = self.nominal[2:] + multiple[:, None] * side * self.half[2:]
         rows = np.tile(system.nominal, (len(points), 1))
-        rows[:, [known.index(name) for name in self.loops[1] if name in known]] = place
-        rows[:, [known.index(name) for name in self.names]] = points
-        rows[:, [known.index(name) for name in self.others]] = np.clip(
-            self.nominal(self.others) + side * reach, *self.limits(self.others)
+        rows[:, [known.index(name) for name in self.over if name in known]] = place
+        rows[:, [known.index(name) for name in self.names]] = np.hstack(
+            [points, np.clip(beside, self.low[2:], self.high[2:])]
         )
         return rows
 
@@ -145,11 +123,9 @@ def _points(x: FloatArray, y: FloatArray) -> FloatArray:
 
 def _sides(count: int) -> Iterator[FloatArray]:
     """The middle and the ends of so many intervals: also on edges and faces while these are few, else the corners."""
-    if 3**count <= MOST_SIDES:
-        yield from map(np.array, itertools.product((-1.0, 0.0, 1.0), repeat=count))
-        return
+    few = 3**count <= MOST_SIDES
     yield np.zeros(count)
-    yield from map(np.array, itertools.product((-1.0, 1.0), repeat=count))
+    yield from map(np.array, itertools.product((-1.0, 0.0, 1.0) if few else (-1.0, 1.0), repeat=count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +167,8 @@ class MarginMap:
     @property
     def beside_text(self) -> str:
         """What the parameters are that are not drawn: "m K_D anywhere in the box"; "": all are drawn."""
-        return beside_text(self.beside, self.others)
+        words = {"box": "anywhere in the box", "nominal": "nominal"}
+        return f"{' '.join(self.beside)} {words[self.others]}" if self.beside else ""
 
     @property
     def witness(self) -> tuple[float, float] | None:
@@ -204,16 +181,6 @@ class MarginMap:
         at = self.margin.witness[self.x], self.margin.witness[self.y]
         off = max(abs(v - m) / h for v, m, h in zip(at, self.nominal, self.half, strict=True))
         return at if off >= EDGE * self.margin.upper else None
-
-
-def beside_text(names: tuple[str, ...], others: Others) -> str:
-    """What parameters are that a map does not draw.
-
-    >>> beside_text(("m", "K_D"), "box"), beside_text(("m",), "nominal"), beside_text((), "box")
-    ('m K_D anywhere in the box', 'm nominal', '')
-    """
-    words = {"box": "anywhere in the box", "nominal": "nominal"}
-    return f"{' '.join(names)} {words[others]}" if names else ""
 
 
 @on_one_thread
@@ -242,13 +209,17 @@ def margin_map_of(
     Example: `margin_map_of(plant, controller, ("K_A", "m"), {"m": 0.2, "K_A": 0.2}).proven`
     """
     plane = plane_of(plant, controller, names, uncertainty, others)
+    box = {name: uncertainty[name] for name in plane.names}
     if margin is None and proof:
-        margin = travel_margin(plant, controller, plane.uncertainty)
+        margin = travel_margin(plant, controller, box)
     if margin is not None:
         lost = margin.upper if math.isfinite(margin.upper) else LEAST
     reach = min(max(BEYOND * lost, LEAST), WIDEST)
-    nominal, half, (least, most) = plane.nominal(names), plane.half(names), plane.limits(names)
-    low, high = np.maximum(nominal - reach * half, least), np.minimum(nominal + reach * half, most)
+    nominal, half = plane.nominal[:2], plane.half[:2]
+    low, high = (
+        np.maximum(nominal - reach * half, plane.low[:2]),
+        np.minimum(nominal + reach * half, plane.high[:2]),
+    )
     proven = 0.0 if margin is None else margin.lower or 0.0
     values = [_values(*of, proven) for of in zip(low, high, nominal, half, strict=True)]
     x, y = names
@@ -256,14 +227,14 @@ def margin_map_of(
     return MarginMap(
         controller.name, x, y, (units[x], units[y]), (float(nominal[0]), float(nominal[1])),
         (float(half[0]), float(half[1])), values[0], values[1], plane.growth(*values), margin,
-        tuple(name for name in uncertainty if name not in names), others, str(extent_of(plant, plane.uncertainty)),
+        tuple(name for name in uncertainty if name not in names), others, str(extent_of(plant, box)),
     )  # fmt: skip
 
 
 def plane_of(
     plant: Plant,
     controller: Controller,
-    names: tuple[str, str],
+    names: tuple[str, ...],
     uncertainty: Mapping[str, float],
     others: Others = "box",
 ) -> Plane:
@@ -274,8 +245,15 @@ def plane_of(
         raise InputError("--y", "", repr(names[1]), f"another parameter than {names[0]}")
     if others not in get_args(Others):
         raise InputError("--others", "", repr(others), "box or nominal")
-    drawn = {name: uncertainty[name] for name in names}
-    return Plane(plant, controller, names, dict(uncertainty) if others == "box" else drawn)
+    if others == "box":
+        names = (*names, *(name for name in uncertainty if name not in names))
+    loops, over = travel_loops(plant, controller, names)
+    nominal: FloatArray = np.array([float(getattr(plant.parameters, name)) for name in names])
+    system = loops[0][0]
+    limits = system.limits or [(-math.inf, math.inf)] * len(system.names)
+    low, high = np.array([limits[system.names.index(name)] for name in names]).T
+    room, shares = ROOM * np.abs(nominal), np.array([uncertainty[name] for name in names])
+    return Plane(names, loops, over, nominal, np.abs(nominal) * shares, low + room, high - room)
 
 
 def _values(low: float, high: float, nominal: float, half: float, proven: float) -> FloatArray:

@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 CLOSE, NEAR = 0.05, 0.2  # largest relative differences that are "reproduced" and "within x %"
 FACTOR, FAR = ", x ", 1000.0  # in front of a factor from a bound, and the largest one that is shown
 ROUNDING = 1e-9
-PROVEN = "proven percent"  # form of a proven share, which is a bound
 OTHER = "of another design"  # no design of the ledger is meant to reproduce the row
 LQG_ONLY = "of an LQG only"
 Word = Literal["reproduced", "near", "kept", "input", "differs", "partly", "beside", "ours", "other"]
@@ -155,7 +154,7 @@ class Row(NamedTuple):
     """A figure that the paper publishes, and the function of a design's evidence that computes ours."""
 
     subject: str
-    shown: str  # form and unit of both figures: "{:.2f} mm", "{:.1f}" of a number; PROVEN
+    shown: str  # form and unit of both figures: "{:.2f} mm", "{:.1f}" of a number; or "proven percent"
     value: Callable[[Any], float]  # of the machine's evidence; SI
     # key of data/published/, or a figure that the text implies; None: ours
     published: str | float | None = None
@@ -257,7 +256,7 @@ def _shown(row: Row, figure: float) -> str:
     """A figure in the row's form, with its interval if it is one of chance; "–" for none."""
     if math.isnan(figure):
         return "–"
-    if row.shown == PROVEN:
+    if row.form == "proven":
         return at_least(figure).percent(unit="")
     text = row.form.format(in_unit(figure, row.unit))
     half = in_unit(figure.half, row.unit) if isinstance(figure, Chance) else None

@@ -190,10 +190,8 @@ def test_a_margin_map_proves_no_unstable_machine_and_meets_its_witness() -> None
     figure = report.margin_map(found)
     assert defects(figure) == []
     assert found.margin is not None
-    assert (
-        f"proven {found.margin.proven.percent()} of the box, lost at {found.margin.lost.percent()}"
-        in " ".join(texts_of(figure))
-    )
+    low, high = found.margin.proven.percent(), found.margin.lost.percent()
+    assert f"proven {low} of the box, lost at {high}" in " ".join(texts_of(figure))
     for names, what in ((("m", "q"), "--y"), (("m", "m"), "--y")):
         with pytest.raises(malta.InputError, match=what):
             margin_map_of(plant, controller, names, box)

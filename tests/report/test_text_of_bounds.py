@@ -33,7 +33,7 @@ from malta.proof.loss import RayBound
 from malta.proof.margin import NOT_PROVEN, Margin
 from malta.proof.rates import RateBound
 from malta.report.figures.margins import chain_figure
-from malta.report.ledger import PROVEN, Row, claim_of
+from malta.report.ledger import Row, claim_of
 from malta.report.tables.design import front_markdown, requirements_table
 from malta.report.tables.margins import loop_tables, open_bounds, worst_case_table
 from malta.report.verdict import verdict_html, verdict_lines, verdict_text
@@ -170,7 +170,7 @@ def claim_text(lower: float | None) -> str:
         spec = ball()[1]
 
     figure = math.nan if lower is None else lower
-    return claim_of(Row("share", PROVEN, lambda _: figure), [OfBall()], {}, ()).ours[0] + " %"  # type: ignore[list-item]
+    return claim_of(Row("share", "proven percent", lambda _: figure), [OfBall()], {}, ()).ours[0] + " %"  # type: ignore[list-item]
 
 
 def merits_text(lower: float | None) -> str:
