@@ -16,7 +16,6 @@ import casadi as ca
 import numpy as np
 from flint import arb
 
-from malta.bound import at_least
 from malta.errors import InputError, require_known
 from malta.proof.expressions import KNOWN, POINTS, Arithmetic, NotAnalytic, Program, exact, program
 from malta.proof.uncertain import (
@@ -65,7 +64,7 @@ class Box:
         """How far a search goes, in words."""
         if self.most * (1 - EDGE) > FAR:
             return f"up to t = {FAR:g}"
-        return f"up to t = {at_least(self.most).text()}, where {self.ends}"
+        return f"up to t = {self.most:.4g}, where {self.ends}"
 
     def margin(self, p: FloatArray) -> FloatArray:
         """The smallest t with p in box(t): ... -> ..."""

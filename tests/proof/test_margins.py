@@ -114,7 +114,7 @@ def test_what_cannot_be_enclosed_is_not_proven() -> None:
     assert m.lower is None
     assert m.upper == pytest.approx(2, rel=1e-6)
     assert "if_else" in m.reason
-    assert str(m).startswith(f"nothing proven ({m.reason}), lost at 200.00 %")
+    assert str(m).startswith(f"nothing proven ({m.reason}), lost at 200.0")
 
 
 def test_the_end_of_a_search_is_named() -> None:
