@@ -236,7 +236,7 @@ export function mapView(state, pick) {
     x: { label: `${map.x}${unit(0)}`, min: map.reach[0][0], max: map.reach[0][1] }, y: { label: `${map.y}${unit(1)}`, min: map.reach[1][0], max: map.reach[1][1] },
     shapes: [...map.unstable.map((rings) => ({ kind: "area", rings, class: "forbidden" })), ...(lower > 0 ? [{ kind: "area", rings: box(lower), class: "proven-box" }] : []), { kind: "area", rings: box(1), class: "asked-box" }],
     lines: map.boundary.map(([xs, ys]) => ({ name: "boundary", xs, ys, color: "var(--ink)", silent: true })), points,
-    note: `${map.version !== state.version ? "of the last design" : lower > 0 ? `blue: proven, ${proof.proven} of the dashed box` : picture.margin ? "not proven (yet)" : ""}${map.beside ? `, ${map.beside}` : ""}; ${told}`,
+    note: `${[map.version !== state.version ? "of the last design" : lower > 0 ? `blue: proven, ${proof.proven} of the dashed box` : picture.margin ? "not proven (yet)" : "", map.beside].filter(Boolean).join(", ")}; ${told}`,
     summary: `${map.x} and ${map.y}${map.beside ? `, ${map.beside}` : ""}; ${told}`,
     read: (set, k) => [{ text: set.name, strong: true, color: set.color }, { text: `${map.x} ${digits(set.xs[k], 4)}` }, { text: `${map.y} ${digits(set.ys[k], 4)}` }],
   };

@@ -382,7 +382,8 @@ def _titles(found: MarginMap) -> tuple[str, str]:
         return title, f"nothing proven: the proof was left out{beside}"
     if not found.proven:
         return title, f"nothing proven: {found.margin.reason}"[:110] + beside
-    lost = "" if found.margin.exhausted else f", lost at {found.margin.lost.percent()}"
+    by = "" if found.witness is not None else " by others"
+    lost = "" if found.margin.exhausted else f", lost at {found.margin.lost.percent()}{by}"
     text = f"proven {found.margin.proven.percent()} of the box{lost} {found.where}{beside}"
     return title, plain(" ".join(text.split()))
 
