@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from conftest import ROOT
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
@@ -26,7 +26,7 @@ from malta.cli.identification import _proven_contraction
 from malta.cli.output import _bounds_text
 from malta.firmware import export
 from malta.firmware.signals import Target
-from malta.margins.loop_report import LoopReport, Outcome
+from malta.margins.loop_report import Link, LoopReport, Outcome, Place
 from malta.margins.margin_map import MarginMap
 from malta.proof.blocks.gain import Gain
 from malta.proof.loss import RayBound
@@ -46,6 +46,7 @@ BOX = ("100 % is the box", "box, 100 %", "100 %: ")  # no bounds
 FAR = 7.3  # of the upper bound in multiples of the lower one: no number of the one is taken for the other
 
 
+@settings(max_examples=40)
 @given(st.floats(1e-9, 1e9), st.sampled_from([1.0, 0.2, 1 / (2 * math.pi)]))
 def test_a_bound_that_is_read_back_never_says_more(value: float, factor: float) -> None:
     exact = Decimal(value) * Decimal(factor)
@@ -70,7 +71,7 @@ def test_a_bound_keeps_the_digits_that_a_user_typed() -> None:
 def ball() -> tuple[LoopReport, Spec]:
     spec = malta.read_design(ROOT / "examples/ball/design/ball.toml")
     controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    return malta.verify(spec.plant, controller, {"m": 0.2}, stages=True, spec=spec), spec
+    return malta.verify(spec.plant, controller), spec
 
 
 def margin_of(lower: float | None) -> Margin:
@@ -87,13 +88,12 @@ def spoiled(lower: float | None) -> LoopReport:
     """The report of a ball with this margin everywhere."""
     found, _ = ball()
     margin = margin_of(lower)
-    known = [replace(one, margin=margin) for one in found.chain]
     asked = Outcome("margin", 2.0, lower or 0.0, "1", "proof", at_least=True)
     return replace(
         found,
         robust=margin,
-        chain=tuple(known),
-        places=tuple(replace(one, margin=margin) for one in found.places),
+        chain=(Link("LQR", margin, 1.0, "forces"), Link("sampled", margin, 1.6, "sensors", loaded=True)),
+        places=(Place(0.0, margin, 1.6, 0.4, 1e-3),),
         tolerance={"m": (margin, margin)},
         mass=margin,
         worst={"y": gain_of(lower)},
@@ -225,9 +225,14 @@ def near(text: str, value: float, pattern: str) -> list[str]:
     return [one for one in found if abs(Decimal(one) * scale / Decimal(value) - 1) < Decimal("0.01")]
 
 
-@pytest.mark.parametrize("value", VALUES)
 @pytest.mark.parametrize("place", PLACES)
-def test_no_place_says_more_than_is_proven(place: str, value: float | None) -> None:
+def test_no_place_says_more_than_is_proven(place: str) -> None:
+    drawn = place in ("front of a search", "chain figure", "margin map")  # which take longest
+    for value in VALUES[1::2] if drawn else VALUES:  # a number, one with another last digit, none
+        check(place, value)
+
+
+def check(place: str, value: float | None) -> None:
     text = PLACES[place](value)
     for words in BOX:
         text = text.replace(words, "")
@@ -259,7 +264,7 @@ def test_no_place_says_more_than_is_proven(place: str, value: float | None) -> N
 def formatted(path: Path) -> Iterator[tuple[int, str]]:
     """The places of a module that format or round `.lower` or `.upper`, by themselves or by a name that is one."""
     text = path.read_text(encoding="utf-8")
-    tree = ast.parse(text if re.search(rf"\.({'|'.join(BOUNDS)})\b", text) else "")
+    tree = ast.parse(text if re.search(rf"\.({'|'.join(BOUNDS)})\b(?!\()", text) else "")
     for scope in ast.walk(tree):
         if not isinstance(scope, ast.FunctionDef):
             continue
