@@ -224,12 +224,12 @@ def verdict_text(found: LoopReport, campaigns: Sequence[Summary] = ()) -> Verdic
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True, spec=spec)
     >>> rich.print(malta.report.verdict_text(found))
-    loop          stable, with hold, delay and current loops
-    margin        ██▇▇▇ 390.6 % proven, lost at 390.7 % of m ±20 %
+    loop          stable, with hold
+    margin        ██▇▇▇ 390.69 % proven, lost at 390.70 % of m ±20 %
     peak |S|      1.57, zone A, of ISO 14839-3, worst at y; over the uncertainty at
                   most 1.75, zone A
-    requirements  all 4 hold, nearest their limits: peak sensitivity 98 %, margin
-                  94 %
+    requirements  all 4 hold, nearest their limits: peak sensitivity 98.38 %, margin
+                  93.58 %
     yield         not sampled, see malta campaign
     """
     return VerdictText(verdict_lines(found, campaigns))

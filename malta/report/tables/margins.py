@@ -53,7 +53,7 @@ def loop_tables(
     >>> tables = list(malta.report.loop_tables(found, None, spec))
     >>> rich.print(tables[-1])
     Requirements of examples/ball/design/ball.toml: 4 of 4 hold; nearest their
-    limits peak sensitivity 98.4 %, margin 93.6 %, motion y 54.3 %.
+    limits peak sensitivity 98.38 %, margin 93.58 %, motion y 54.32 %.
     <BLANKLINE>
     """
     yield loop_poles_table(found)
@@ -130,8 +130,8 @@ def chain_table(found: LoopReport) -> Table:
      LQR       499.94 %   not found                   1.00                   forces
      LQI       499.94 %   not found                   1.00                   forces
      LQG       390.33 %    390.34 %    1006      m-   1.60      A           sensors
-     LQGI      386.27 %    386.27 %    1010      m-   1.64      A           sensors
-     sampled   390.69 %    390.69 %    1047      m-   1.57      A   sensors, loaded
+     LQGI      386.27 %    386.28 %    1010      m-   1.64      A           sensors
+     sampled   390.69 %    390.70 %    1047      m-   1.57      A   sensors, loaded
     <BLANKLINE>
     """
     proven = any(link.margin is not NOT_PROVEN for link in found.chain)
@@ -337,11 +337,11 @@ def tolerance_table(found: LoopReport) -> Table:
     >>> rich.print(malta.report.tolerance_table(found))
     One at a time, proven
     <BLANKLINE>
-     parameter                  down to       up to   share in the margin
-     ────────────────────────────────────────────────────────────────────
-     m                          -78.1 %   +1663.9 %                 100 %
-     mass margin, linear loop               1.66 kg
-     payload held at rest                   0.63 kg
+     parameter                   down to        up to   share in the margin
+     ──────────────────────────────────────────────────────────────────────
+     m                          -78.13 %   +1663.93 %                 100 %
+     mass margin, linear loop                1.663 kg
+     payload held at rest                   0.6339 kg
     <BLANKLINE>
     """
     anywhere = ["anywhere in the travel"] if found.extent.stroke else []
@@ -426,7 +426,7 @@ def places_table(found: LoopReport) -> Table:
                                             peak        disk,
      at            proven   lost at  rad/s   |S|  zone    all         delay
      ──────────────────────────────────────────────────────────────────────
-     its values  390.69 %  390.69 %   1047  1.57     A  0.400      2719 µs,
+     its values  390.69 %  390.70 %   1047  1.57     A  0.400      2719 µs,
                                                                13.6 samples
     <BLANKLINE>
     """
