@@ -5,7 +5,6 @@ from __future__ import annotations
 import html as markup
 import io
 import json
-import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -212,7 +211,7 @@ def test_the_margins_in_a_report_are_those_of_verify(tmp_path: Path, run: Run) -
     html = out.read_text(encoding="utf-8")
     read_page(html)
     lower = verified["robust"]["travel"]["lower"]
-    assert f"{math.floor(1000 * lower) / 10:.1f} % proven" in html
+    assert f"{at_least(lower).percent()} proven" in html
     chain = {row[0]: row[1] for row in cells_of(html, "Where the margin goes")[1:]}
     for link in verified["robust"]["chain"]:
         assert chain[link["stage"]] == at_least(link["lower"]).percent()
