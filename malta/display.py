@@ -188,21 +188,3 @@ def svg(curves: Curves) -> str:
     file = io.StringIO()
     figure.savefig(file, format="svg")
     return file.getvalue().partition("\n<svg")[2].join(("<svg", ""))
-
-
-def floor_to(value: float, digits: int) -> float:
-    """A proven lower bound with so many decimals, never more than it is.
-
-    >>> floor_to(99.996, 1)
-    99.9
-    """
-    return math.floor(value * 10.0**digits) / 10.0**digits
-
-
-def ceil_to(value: float, digits: int) -> float:
-    """A proven upper bound with so many decimals, never less than it is.
-
-    >>> ceil_to(162.01, 1)
-    162.1
-    """
-    return math.ceil(value * 10.0**digits) / 10.0**digits

@@ -7,10 +7,11 @@ comparisons and the live page render. Nothing else says which of two values is b
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, fields
 from typing import Any, Literal, NamedTuple
 
+from malta.bound import Bound, at_least, at_most
 from malta.display import RADIANS, display, frequency, micro, number
 from malta.units import distinct, identifier, in_unit
 
@@ -29,18 +30,19 @@ class Meaning(NamedTuple):
     better: Better
     scope: Scope
     unit: str = "1"  # for display
+    bound: Callable[[float], Bound] | None = None  # of a figure that is one
 
 
 MEANINGS: dict[str, Meaning] = {
     "stable": Meaning("stability and margins", "high", "loop"),
-    "margin_proven": Meaning("stability and margins", "high", "box", "percent"),
-    "margin_lost_at": Meaning("stability and margins", "high", "box", "percent"),
+    "margin_proven": Meaning("stability and margins", "high", "box", "percent", at_least),
+    "margin_lost_at": Meaning("stability and margins", "high", "box", "percent", at_most),
     "disk": Meaning("stability and margins", "high", "loop"),
     "disk_of": Meaning("stability and margins", "high", "machine"),
     "phase_margin": Meaning("stability and margins", "high", "loop", "deg"),
     "delay_margin": Meaning("stability and margins", "high", "loop", "us"),
-    "mass_margin": Meaning("stability and margins", "high", "machine", "kg"),
-    "payload": Meaning("stability and margins", "high", "machine", "kg"),
+    "mass_margin": Meaning("stability and margins", "high", "machine", "kg", at_least),
+    "payload": Meaning("stability and margins", "high", "machine", "kg", at_least),
     "peak_s": Meaning("sensitivity", "low", "loop"),
     "peak_s_of": Meaning("sensitivity", "low", "machine"),
     "peak_t": Meaning("sensitivity", "low", "loop"),
@@ -60,6 +62,7 @@ MEANINGS: dict[str, Meaning] = {
     "undecided": Meaning("requirements", "", "machine"),
     "at_most": Meaning("requirements", "low", "machine"),
     "at_least": Meaning("requirements", "high", "machine"),
+    "proven": Meaning("requirements", "high", "machine", "percent", at_least),
 }
 FREQUENCIES = ("bandwidth", "natural", "slowest_pole", "at_most", "at_least")  # kinds whose rad/s are such
 GROUPS = tuple(dict.fromkeys(meaning.group for meaning in MEANINGS.values()))
@@ -114,6 +117,9 @@ class Merit(NamedTuple):
         """The value in its unit, with four digits; a frequency in Hz too."""
         if self.kind == "stable":
             return "yes" if self.value else "NO"
+        if self.meaning.bound is not None:
+            shown = self.meaning.bound(self.value)
+            return shown.percent(unit="") if self.unit == "percent" else shown.text()
         if math.isnan(self.value):
             return "none"
         if math.isinf(self.value):
@@ -131,9 +137,10 @@ class Merit(NamedTuple):
         return f"{self.label} [{shown}]" if shown else self.label
 
     def phrase(self, digits: int = 3) -> str:
-        """The value with its unit, for a sentence."""
+        """The value with its unit, for a sentence; so many digits unless it is a bound."""
         unit = {"percent": " %", "1": ""}.get(self.unit, f" {micro(self.unit)}")
-        return number(in_unit(self.value, self.unit), digits) + unit
+        bound = self.meaning.bound is not None
+        return (self.text if bound else number(in_unit(self.value, self.unit), digits)) + unit
 
     def __str__(self) -> str:
         unit = "%" if self.unit == "percent" else self.unit

@@ -89,7 +89,7 @@ assert robust is not None
 assert robust.lower is not None
 assert robust.witness is not None
 share = ", ".join(f"{name} +-{100 * one:g} %" for name, one in spec.uncertainty.items())
-print(f"proven {100 * robust.lower:.2f} % of {share}, lost at {100 * robust.upper:.2f} %")
+print(f"proven {robust.proven.percent()} of {share}, lost at {robust.lost.percent()}")
 print("a machine that is lost:", {name: float(f"{value:.4g}") for name, value in robust.witness.items()})
 assert robust.lower > 0.999 * robust.upper
 

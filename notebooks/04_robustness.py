@@ -149,8 +149,8 @@ assert campaign.completed.all()
 
 # %% [markdown]
 # ## The plane of two parameters
-# Blue: proven stable anywhere in the travel. Line: where eigenvalues become unstable, computed another way. Dots: the
-# machines of the campaign, all within the dashed box.
+# Blue: proven stable anywhere in the travel, with the other parameters anywhere in the box. Line: where eigenvalues
+# become unstable, computed another way. Dots: the machines of the campaign, all within the dashed box.
 
 # %%
 plant = malta.plant_of(controllers["calibrated"].parameters)

@@ -97,7 +97,7 @@ assert margin.lower is not None
 noise = rounding_noise(Target(c, "float", "phase"))
 share = float((noise.rounding / noise.sensors).max())
 print(
-    f"proven with rounded coefficients: {100 * margin.lower:.2f} % of the box, lost at {100 * margin.upper:.2f} %"
+    f"proven with rounded coefficients: {margin.proven.percent()} of the box, lost at {margin.lost.percent()}"
 )
 print(f"noise of rounding in the forces: at most {share:.0e} of what the sensors' noise makes")
 print(f"a plain sum at 1e-4 m s stands still for errors below {1e9 * smallest_error(c, 1e-4):.0f} nm")

@@ -64,7 +64,7 @@ assert margin.lower is not None
 assert margin.lower > 10 * found.joint
 display(
     Markdown(
-        f"**Judgement.** Proven stable at least at {margin.lower:.0f} times these intervals, where "
+        f"**Judgement.** Proven stable at {margin.proven.text()} times these intervals, where "
         f"{found.joint:.2f} times hold all parameters together."
     )
 )

@@ -52,7 +52,7 @@ assert round(margin.lower, 3) == 3.078
 assert max(found.tuned.reached.values()) <= 1
 
 # %% [markdown]
-# **Judgement.** 307.8 % with three states an axis, |S| below 2 in the middle of the travel and at its ends. Noise of
+# **Judgement.** 307.79 % with three states an axis, |S| below 2 in the middle of the travel and at its ends. Noise of
 # a bearing force and of the thrust are at their bounds: they, not the margin, stop the stiffness.
 
 # %% [markdown]
@@ -95,7 +95,7 @@ assert 3.2 < truncations[18] < 3.4
 assert truncations[16] == 0
 
 # %% [markdown]
-# **Judgement.** Truncation leaves 329 % with 18 states, and an unstable loop with 16. It does not know what the
+# **Judgement.** Truncation leaves 328 % with 18 states, and an unstable loop with 16. It does not know what the
 # margin is lost at, so `robust` cannot be made smaller this way.
 
 # %% [markdown]

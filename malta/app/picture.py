@@ -17,12 +17,13 @@ import numpy as np
 
 from malta.app.files import Edited
 from malta.app.linear_run import linear_run
+from malta.bound import at_most
 from malta.errors import CheckError, InputError
 from malta.loops.classical import phase_and_delay
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.loop import Loop, loop_of_model
-from malta.margins.loop_report import BANDWIDTHS, LoopReport, pole_figures, zone
-from malta.margins.margin_map import margin_map_of
+from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, LoopReport, pole_figures, zone
+from malta.margins.margin_map import margin_map_of, plane_of
 from malta.margins.travel import travel_loops
 from malta.margins.verify import machine_report
 from malta.merits import Merit, figure
@@ -280,13 +281,21 @@ def eigenvalue_margin(problem: Problem, first: tuple[int, float] | None = None) 
 
 
 def margin_document(bound: RayBound) -> dict[str, Any]:
-    """An eigenvalue margin for the page; no upper bound is null."""
+    """An eigenvalue margin for the page, as a number and as it is shown; no upper bound is null."""
     upper = bound.upper if math.isfinite(bound.upper) else None
-    return {"upper": upper, "at": dict(bound.at), "frequency": bound.frequency, "ray": bound.ray}
+    return {
+        "upper": upper,
+        "lost": at_most(bound.upper).percent(),
+        "at": dict(bound.at),
+        "frequency": bound.frequency,
+        "ray": bound.ray,
+    }
 
 
 def map_document(problem: Problem, names: tuple[str, str], lost: float) -> dict[str, Any]:
     """The plane of two uncertain parameters: where eigenvalues are unstable on a grid, which proves nothing.
+
+    The other uncertain parameters are anywhere in the box, as in the proof.
 
     names : of the parameters along x and y
     lost : where about stability is lost, in multiples of the box
@@ -308,28 +317,31 @@ def map_document(problem: Problem, names: tuple[str, str], lost: float) -> dict[
     return {
         "x": found.x, "y": found.y, "units": found.units, "nominal": found.nominal, "half": found.half,
         "reach": [round_values(values[[0, -1]]) for values in (found.x_values, found.y_values)],
-        "unstable": areas, "boundary": boundary, "others": len(box) > 2,
+        "unstable": areas, "boundary": boundary, "beside": found.beside_text,
     }  # fmt: skip
 
 
 def poles_document(problem: Problem, at: Mapping[str, float]) -> dict[str, Any]:
-    """Poles of the closed loop of a machine with other parameters, rad/s, under the same controller.
+    """Poles of the closed loop at a point of the map, rad/s: of the worst machine that the point stands for.
+
+    at : values of x and of y
 
     Raises InputError for values that are none of a machine.
     """
-    plant = problem.plant
+    plant, (x, y) = problem.plant, at
     try:
-        other = plant_of(replace(plant.parameters, **at))
+        plant_of(replace(plant.parameters, **at))
     except CheckError as error:
         raise InputError("malta app", "map", str(error), "a machine") from error
-    place = dict(problem.spec.operating_point)
-    poles = loop_of_model(linearize(other, other.at(**place)), problem.controller).poles
-    worst = poles[np.argmax(poles.real)]
+    plane = plane_of(plant, problem.controller, (x, y), problem.spec.uncertainty)
+    found = plane.worst(at[x], at[y])
+    worst = found.poles[np.argmax(found.poles.real)]
     return {
         "at": dict(at),
-        "poles": [[float(s.real), float(s.imag)] for s in poles],
+        "beside": {name: found.values[name] for name in plane.names[2:]},
+        "poles": [[float(s.real), float(s.imag)] for s in found.poles],
         "worst": [float(worst.real), float(worst.imag)],
-        "stable": bool(worst.real < 0),
+        "stable": found.growth < 0,
     }
 
 
@@ -339,8 +351,8 @@ def poles_document(problem: Problem, at: Mapping[str, float]) -> dict[str, Any]:
 
 SHORT = {
     "peak_sensitivity": "peak |S|",
-    "bandwidth_sigma_max_T": "bandwidth, T",
-    "bandwidth_crossover_max": "bandwidth, L",
+    f"bandwidth_{BANDWIDTH}": "bandwidth, T",
+    "bandwidth_crossover_max": "crossover, L",
     "smallest_damping": "least damping",
     "slowest_pole": "slowest pole",
 }
@@ -378,10 +390,7 @@ def _loop_merits(problem: Problem, *, curves: bool) -> list[Merit]:
     noise = {kind: [one.value for one in found if one.kind == kind] for kind in ("motion", "command")}
     return [
         peak._replace(note=f"at {worst.signal}, zone {zone(peak.value)}"),
-        *(
-            known[f"bandwidth_{key}"]._replace(note=BANDWIDTHS[key])
-            for key in ("sigma_max_T", "crossover_max")
-        ),
+        *(known[f"bandwidth_{key}"]._replace(note=BANDWIDTHS[key]) for key in (BANDWIDTH, "crossover_max")),
         *(_channel_margins(problem) if curves else ()),
         *_worst_by_unit("motion", "motion at rest, rms", noise["motion"], problem.plant.outputs),
         *_worst_by_unit("command", "command noise, rms", noise["command"], problem.plant.inputs),

@@ -154,7 +154,12 @@ def front(search: Search) -> Iterator[dict[str, Any]]:
             )
         name, ratio = nearest_limit(spec, trial, free)
         misses = {"limit": name, "ratio": ratio} if ratio > 1 + SLACK else {}
-        found = {"margin": margin.lower, "reason": margin.reason, "price": PRICES[spec.pid is not None]}
+        found = {
+            "margin": margin.lower,
+            "proven": margin.proven.percent(),
+            "reason": margin.reason,
+            "price": PRICES[spec.pid is not None],
+        }
         yield _document(search, spec, trial, problem) | found | misses
 
 
@@ -284,6 +289,8 @@ def _proof(problem: Problem, newer: Newer) -> Iterator[dict[str, Any]]:
     yield {
         "kind": "proof",
         "lower": margin.lower,
+        "proven": margin.proven.percent(),
+        "lost": margin.lost.percent(),
         "holds": None
         if asked is None
         else judge_figure(proven_margin(margin), asked, at_least=True) == "holds",

@@ -519,12 +519,12 @@ def _proven_contraction(found: Gain) -> str:
     if found.upper is None:
         return f"that errors shrink over the box is not proven: {found.reason}"
     at = ", ".join(f"{name} = {value:.4g}" for name, value in found.witness.items())
-    left = f"a gain of 0.8 leaves at most {100 * found.upper:.3g} % of an error that thrust can make"
+    left = f"a gain of 0.8 leaves at most {found.proven.percent()} of an error that thrust can make"
     if found.upper <= 1:
         left += ", and smaller gains of some patterns let the error, weighted by them, not grow"
     verdict = f"proven over the box: {left}" if found.upper < 1 else "errors may grow within the box"
     return (
-        f"{verdict}; found: {100 * found.lower:.3g} % at {found.frequency / (2 * math.pi):.3g} Hz with {at}. Not "
+        f"{verdict}; found: {found.reached.percent()} at {found.frequency / (2 * math.pi):.3g} Hz with {at}. Not "
         "covered: loads along the stroke and saturation (the loop is linear), noise that differs from stroke to "
         "stroke, and responses that outlast the log"
     )

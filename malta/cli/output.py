@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
-from malta.display import floor_to
+from malta.bound import at_least, at_most
 from malta.errors import CheckError, InputError, shorten
 from malta.files import is_interrupt, json_text, press_again, watch_interrupts
 
@@ -282,5 +282,4 @@ def interruption(stands: str) -> typer.Exit:
 
 def _bounds_text(lower: float, upper: float) -> str:
     """The bounds of a margin as shares of the uncertainty."""
-    high = "not found" if math.isinf(upper) else f"{100 * upper:.2f} %"
-    return f"proven {floor_to(100 * max(lower, 0), 2):.2f} %, lost at {high}"
+    return f"proven {at_least(max(lower, 0)).percent()}, lost at {at_most(upper).percent()}"

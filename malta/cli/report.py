@@ -231,6 +231,14 @@ def plot(
         str | None,
         typer.Option("--y", metavar="NAME", help="Margin map: the parameter along y. [the second]"),
     ] = None,
+    beside: Annotated[
+        str | None,
+        typer.Option(
+            "--others",
+            metavar="WORD",
+            help="Margin map: the other parameters are anywhere in the box, or nominal. [box]",
+        ),
+    ] = None,
     change: Changes = None,
     machine: MachineFile = None,
     out: Annotated[
@@ -252,17 +260,18 @@ def plot(
     bode, nyquist, nichols: loop gain with margins. sigma: singular values of L, S, T. sensitivity: |S|, |T| with the
     zones of ISO 14839-3. gang: gang of four. pzmap: poles and zeros. step: references. load: 1 N or 1 N m from
     outside, and compliance. rootlocus: poles over the loop gain or a parameter. marginmap: the proven box in the plane
-    of two uncertain parameters, and the boundary of stability by eigenvalues.
+    of two uncertain parameters, the others anywhere in it, and the boundary of stability by eigenvalues.
 
-    The loop is the machine's: sampled, with hold, delay and current loops. The machine is the one in the file, with
-    the changes given by --set.
+    The loop is the machine's, sampled. The machine is the one in the file, with the changes given by --set.
 
     \b
     Examples:  malta plot design/gains/robust.json bode nyquist
                malta plot design/gains/robust.json marginmap --x K_A --y m
                malta plot design/gains/robust.json rootlocus --parameter m
     """
-    _require_kinds(kinds, at, out, {"--parameter": parameter, "--range": span}, {"--x": x, "--y": y})
+    _require_kinds(
+        kinds, at, out, {"--parameter": parameter, "--range": span}, {"--x": x, "--y": y, "--others": beside}
+    )
     machines = _read_machines([gains, *(locate(path) for path in others or ())], machine, change)
     from malta.loops.curves import loop_curves
 
@@ -270,7 +279,7 @@ def plot(
     loops = {name: loop_curves(*pair, name=name) for name, pair in machines.items()}
     channels = _channels(loops, kinds, channel, place)
     loci = _loci(machines, parameter or GAIN, span, channels, place) if LOCUS in kinds else ()
-    maps = _maps([gains, *(others or ())], machines, x, y) if MAP in kinds else ()
+    maps = _maps([gains, *(others or ())], machines, (x, y), beside or "box") if MAP in kinds else ()
     names = [*dict.fromkeys(kinds)]
     shown, note = _distinct(loops, names, place) if channels is None else (channels, "")
     pictures = _draw(loops, names, shown, place, (*loci, *maps), named=channels is not None)
@@ -381,12 +390,14 @@ def _loci(
     return found
 
 
-def _maps(files: Sequence[Path], machines: Machines, x: str | None, y: str | None) -> Sequence[MarginMap]:
+def _maps(
+    files: Sequence[Path], machines: Machines, axes: tuple[str | None, str | None], beside: str
+) -> Sequence[MarginMap]:
     """The margin map of each loop over two parameters that its gain file names as uncertain. Raises InputError."""
     from malta.cli.options import read_uncertainty
-    from malta.margins.margin_map import margin_map_of
+    from malta.margins.margin_map import Others, margin_map_of
 
-    found = []
+    (x, y), others, found = axes, cast("Others", beside), []
     for file, (name, (plant, controller)) in zip(files, machines.items(), strict=True):
         box = read_uncertainty(file, None, plant.parameters)
         if len(box) < 2:
@@ -394,7 +405,7 @@ def _maps(files: Sequence[Path], machines: Machines, x: str | None, y: str | Non
         free = [one for one in box if one not in (x, y)]
         names = x or free.pop(0), y or free.pop(0)
         with progress_bar(f"margin map of {name}"):
-            found.append(replace(margin_map_of(plant, controller, names, box), name=name))
+            found.append(replace(margin_map_of(plant, controller, names, box, others=others), name=name))
     return found
 
 

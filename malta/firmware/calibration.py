@@ -57,7 +57,7 @@ def proven_share(t: Target) -> float | None:
     """The share by which the factors of the axes' gains may differ from 1, in whole per mille; None: nothing proven."""
     if t.gains is None or t.gains.share is None:
         return None
-    return math.floor(1000 * t.gains.share + 1e-9) / 1000
+    return math.floor(1000 * t.gains.share) / 1000
 
 
 def axes_of_rows(t: Target, name: str) -> list[int]:

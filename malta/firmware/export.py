@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from malta.display import floor_to
 from malta.errors import InputError
 from malta.files import file_exists, locate, replace_files
 from malta.firmware.calibration import (
@@ -475,13 +474,9 @@ def _margin_text(t: Target, uncertainty: dict[str, float], *, proof: bool) -> st
     proven = (
         f"nothing is proven ({margin.reason})"
         if margin.lower is None
-        else f"{floor_to(100 * margin.lower, 2):.2f} % is proven"
+        else f"{margin.proven.percent()} is proven"
     )
-    lost = (
-        f"lost at {100 * margin.upper:.2f} %"
-        if math.isfinite(margin.upper)
-        else f"not lost {margin.searched}"
-    )
+    lost = f"not lost {margin.searched}" if margin.exhausted else f"lost at {margin.lost.percent()}"
     return (
         f"With the coefficients that single precision holds, of {box} {proven} for the sampled loop over the whole "
         f"travel; it is {lost}."

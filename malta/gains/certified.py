@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from malta.bound import at_least
 from malta.errors import CheckError, InputError, shorten
 from malta.files import locate
 from malta.gains.contents import uncertainty_of
@@ -147,7 +148,7 @@ def _less(claim: Claim, plant: Plant, ranges: Ranges, own: Origin, gains: str) -
     intervals = dict(extent.over) if own.places else extent.intervals
     for name, value in (*ranges.items(), *intervals.items()):
         low, high = sides_of(_nominal(plant, name), value)
-        at = f"at {100 * double(claim.lower):.7g} % of the uncertainty"
+        at = f"at {at_least(double(claim.lower)).percent()} of the uncertainty"
         if name not in intervals:
             middle = exact(_nominal(plant, name))
             low, high = middle - claim.lower * (middle - low), middle + claim.lower * (high - middle)

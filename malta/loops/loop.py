@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -124,6 +125,22 @@ class Loop:
         """What the machine has and this loop has not, in words; "": nothing."""
         return left_out(self.plant, self.controller, self.current_loops)
 
+    @property
+    def contents(self) -> str:
+        """What stands between the law and the machine, and what is left out, in words."""
+        actuator, sensors = self.plant.actuator, self.plant.sensors
+        pi = chosen_loops(self.plant, self.controller, self.current_loops) == "pi"
+        stands = {
+            "delay": actuator.delay(self.sample_time) > 0,
+            "current loops": pi,
+            "lag of the current loops": not pi and math.isfinite(actuator.crossover),
+            "lag of the sensors": sensors is not None and bool(sensors.lagging),
+            "dead time of the sensors": sensors is not None and sensors.dead_time > 0,
+        }
+        *first, last = ["hold", *(words for words, there in stands.items() if there)]
+        text = f"with {', '.join(first)} and {last}" if first else f"with {last}"
+        return f"{text}; left out: {self.left_out}" if self.left_out else text
+
     def loop_gain(self, w: FloatArray) -> ComplexArray:
         """L = -P F at the sensors: k x p x p.
 
@@ -181,7 +198,7 @@ class Loop:
             ("law", f"{self.controller.name!r}, every {quantity(self.sample_time, 's')}"),
             ("closed loop", f"{len(self.matrix)} states, {'stable' if self.stable else 'UNSTABLE'}"),
             ("poles", f"{rate.min():.4g} .. {rate.max():.4g} rad/s"),
-            ("left out", self.left_out or "nothing"),
+            ("contents", self.contents),
         )
         return Description(f"Loop of {self.controller.name!r} at {place}", rows)
 

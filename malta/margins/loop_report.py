@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from malta.bound import at_least, at_most
 from malta.display import Curves, Description, display
 from malta.errors import CheckError
 from malta.loops.loop import Loop, loop_of_model
@@ -43,6 +44,7 @@ BANDWIDTHS = {
     "w_n_max": "regulator's fastest natural frequency",
     "w_n_min": "regulator's slowest natural frequency",
 }
+BANDWIDTH = "sigma_max_T"  # the one that is meant where a tile shows one
 
 
 def zone(peak: float) -> str:
@@ -142,6 +144,11 @@ class Outcome(NamedTuple):
         return ratio_of(asked, self.found, at_least=self.at_least)
 
     @property
+    def nearness(self) -> str:
+        """How near its limit, as a share of it that is never less."""
+        return at_most(self.ratio).percent()
+
+    @property
     def verdict(self) -> Verdict:
         """Whether the bound holds; "undecided" where the interval of a simulated figure has the bound within."""
         return judge_figure(Figure(self.found, self.how, self.interval), self.asked, at_least=self.at_least)
@@ -159,16 +166,16 @@ class Outcome(NamedTuple):
 
     @property
     def _scale(self) -> tuple[float, str]:
-        """Factor from SI and unit that readers see: margins in percent, bandwidths in Hz, deviations in um."""
-        if self.name == "margin":
-            return 100.0, "%"
+        """Factor from SI and unit that readers see: bandwidths in Hz, deviations in um."""
         if self.unit == "rad/s":
             return 1 / (2 * math.pi), "Hz"
         fine = FINE.get(self.unit)
         return (1e6, fine) if fine else ROOTS.get(self.unit, (1.0, self.unit))
 
     def text(self, value: float) -> str:
-        """A value of it in the unit that readers see; a bandwidth has rad/s beside Hz."""
+        """A value of it in the unit that readers see; a bandwidth has rad/s beside Hz, a margin is proven."""
+        if self.name == "margin":
+            return at_least(value).percent()
         factor, unit = self._scale
         more = f" ({value:.4g} rad/s)" if unit == "Hz" else ""
         return f"{value * factor:.4g} {unit}".removesuffix(" 1") + more
@@ -178,7 +185,11 @@ class Outcome(NamedTuple):
         """Its bound; "as little as possible" without one."""
         if self.asked is None:
             return "as little as possible"
-        return f"{'>=' if self.at_least else '<='} {self.text(self.asked)}"
+        return f"{'>=' if self.at_least else '<='} {self._as_asked(self.asked)}"
+
+    def _as_asked(self, bound: float) -> str:
+        """A bound of it as the design file has it."""
+        return f"{100 * bound:.10g} %" if self.name == "margin" else self.text(bound)
 
     @property
     def found_text(self) -> str:
@@ -194,7 +205,7 @@ class Outcome(NamedTuple):
         if self.asked is None:
             return f"{found}, asked for little"
         bound = "at least" if self.at_least else "at most"
-        text = f"{found}, asked for {bound} {self.text(self.asked)}"
+        text = f"{found}, asked for {bound} {self._as_asked(self.asked)}"
         if self.verdict != "undecided" or self.interval is None:
             return text
         low, high = map(self.text, self.interval)
@@ -337,7 +348,7 @@ class LoopReport:
         return tuple(found for part in parts for found in part(self))
 
     def __str__(self) -> str:
-        lines = [f"{'stable' if self.stable else 'UNSTABLE'} with hold, delay and current loops"]
+        lines = [f"{'stable' if self.stable else 'UNSTABLE'} {self.loop.contents}"]
         for stage in self.stages:
             own = {k: v for k, v in stage.peak_sensitivity.items() if k != "sigma_max"}
             peaks = "  ".join(f"{k} {v:.2f}" for k, v in own.items()) + f", zone {zone(max(own.values()))}"
@@ -364,9 +375,8 @@ class LoopReport:
         rows = [("margin", f"{self.robust} of {box}")] if self.robust is not None else []
         shown = sorted(self.figures[1:], key=lambda one: one.kind not in FIRST)
         rows += [(one.heading, one.text) for one in shown]
-        return Description(
-            f"Loop of {at}: {state} with hold, delay and current loops", tuple(rows), self._curves
-        )
+        rows = [("contents", self.loop.contents), *rows]
+        return Description(f"Loop of {at}: {state}", tuple(rows), self._curves)
 
     @property
     def _curves(self) -> Curves | None:
@@ -483,6 +493,7 @@ def _requirements(a: LoopReport) -> Iterator[Merit]:
         name, words = f"requirement {one.name}", one.words
         if several:
             name, words = f"{name} {one.how}", f"{words}, {one.how}"
-        kind = "at_least" if one.at_least else "at_most"
-        unit = "percent" if one.name == "margin" else FINE.get(one.unit, one.unit)
+        proven = one.name == "margin"
+        kind = "proven" if proven else "at_least" if one.at_least else "at_most"
+        unit = "percent" if proven else FINE.get(one.unit, one.unit)
         yield figure(kind, name, words, one.found, unit, bound=one.asked)

@@ -402,7 +402,7 @@ def schedule_rate(plant: Plant, controller: Controller, *, time: float | None = 
     >>> spec = malta.read_design("examples/magnet/design/scheduled.toml")
     >>> law = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> print(malta.margins.schedule_rate(spec.plant, law))  # m/s
-    y in -0.003 .. 0.003: proven for every course with |dy/dt| up to 0.00333
+    y in -0.003 .. 0.003: proven for every course with |dy/dt| up to 0.003339
     """
     schedule = controller.schedule
     if schedule is None:

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from malta.display import Description, display, floor_to, quantity
+from malta.bound import Bound, at_least, at_most
+from malta.display import Description, display, quantity
 from malta.proof.work import MORE
 
 if TYPE_CHECKING:
@@ -73,6 +74,16 @@ class Margin:
     work: float = 0.0
 
     @property
+    def proven(self) -> Bound:
+        """`lower` as it is shown."""
+        return at_least(self.lower)
+
+    @property
+    def lost(self) -> Bound:
+        """`upper` as it is shown."""
+        return at_most(self.upper)
+
+    @property
     def time_up(self) -> bool:
         """Whether the search ended with its work or its time, before anything was proven: more may prove more."""
         return self.lower is None and self.reason.endswith(MORE)
@@ -88,11 +99,11 @@ class Margin:
         return sum(proof.cells for proof in self.certificate)
 
     def __str__(self) -> str:
-        low = f"proven {floor_to(100 * self.lower, 2):.2f} %" if self.lower else unproven(self.reason)
+        low = f"proven {self.proven.percent()}" if self.lower else unproven(self.reason)
         if self.exhausted:
             return f"{low}; no unstable machine found {self.searched}".rstrip()
         where = "" if self.frequency is None else f" at {self.frequency:.4g} rad/s"
-        return f"{low}, lost at {100 * self.upper:.2f} %{where}"
+        return f"{low}, lost at {self.lost.percent()}{where}"
 
     @property
     def description(self) -> Description:

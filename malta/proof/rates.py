@@ -25,7 +25,8 @@ import numpy as np
 from flint import arb, arb_mat
 from scipy import linalg
 
-from malta.display import Description, display, floor_to, quantity
+from malta.bound import at_least
+from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
 from malta.processes import on_one_thread
 from malta.proof.expressions import NotAnalytic
@@ -79,21 +80,15 @@ class RateBound:
         head = f"{self.name} in {self.low:g} .. {self.high:g}: "
         if self.rate is None:
             return head + f"nothing proven ({self.reason})"
-        return head + f"proven for every course with |d{self.name}/dt| up to {_rounded(self.rate):g}"
+        return head + f"proven for every course with |d{self.name}/dt| up to {at_least(self.rate).text()}"
 
     @property
     def description(self) -> Description:
         """The bound, the decay and how it was found."""
         rows = [("pieces", f"{self.pieces}"), ("found in", quantity(self.seconds, "s"))]
         if self.decay is not None:
-            rows.insert(0, ("decay when frozen", quantity(floor_to(self.decay, 3), "1/s")))
+            rows.insert(0, ("decay when frozen", f"{at_least(self.decay).text()} 1/s"))
         return Description(str(self), tuple(rows))
-
-
-def _rounded(rate: float) -> float:
-    """A proven bound to three decimals, or three digits where it is small; never more than it is."""
-    digits = 3 if rate >= 1 or not rate > 0 else 2 - math.floor(math.log10(rate))
-    return floor_to(rate, max(digits, 3))
 
 
 @dataclass(frozen=True, eq=False)

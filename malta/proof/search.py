@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from flint import arb
 
+from malta.bound import at_least
 from malta.errors import CheckError
 from malta.proof.box import EDGE, Box
 from malta.proof.exclusion import Part, Search, advance, cut, growth_over, merge_twins, start
@@ -65,7 +66,7 @@ Searches = list[tuple[Part, Search]]
 
 @dataclass(eq=False)
 class Standing:
-    """What is known of a margin while it is searched: bounds, work, and the cells that are left. It changes in place."""
+    """What is known of a margin while it is searched: bounds, work, the cells that are left. It changes in place."""
 
     progress: Progress | None
     lower: float = 0.0
@@ -244,7 +245,9 @@ def _families(q: Question, known: Findings, until: float) -> tuple[Findings, lis
         if done and refused - done < EDGE * done:
             break
     if known.upper > done and (why or done < q.box.limit):
-        known = known.because(why or f"nothing beyond {done:.3g} was looked at: the model is dear to enclose")
+        known = known.because(
+            why or f"nothing beyond {at_least(done).text()} was looked at: the model is dear to enclose"
+        )
         refuse()
     room = NEAR if q.problem.traits.is_bounded else 1.05  # couplings grow with the box
     if known.upper < done / (3 if room > NEAR else room) and not is_past(until):

@@ -29,6 +29,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
+from malta.bound import at_least
 from malta.errors import InputError
 from malta.margins.loop_report import ZONES, LoopReport
 from malta.margins.verify import linear_report
@@ -153,7 +154,7 @@ class Row(NamedTuple):
     """A figure that the paper publishes, and the function of a design's evidence that computes ours."""
 
     subject: str
-    shown: str  # form and unit of both figures: "{:.2f} mm", "{:.1f}" of a number
+    shown: str  # form and unit of both figures: "{:.2f} mm", "{:.1f}" of a number; or "proven percent"
     value: Callable[[Any], float]  # of the machine's evidence; SI
     # key of data/published/, or a figure that the text implies; None: ours
     published: str | float | None = None
@@ -255,6 +256,8 @@ def _shown(row: Row, figure: float) -> str:
     """A figure in the row's form, with its interval if it is one of chance; "–" for none."""
     if math.isnan(figure):
         return "–"
+    if row.form == "proven":
+        return at_least(figure).percent(unit="")
     text = row.form.format(in_unit(figure, row.unit))
     half = in_unit(figure.half, row.unit) if isinstance(figure, Chance) else None
     return text if half is None else f"{text} ±{row.form.format(half)}"

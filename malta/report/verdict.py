@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rich.text import Text
 
-from malta.display import ceil_to, floor_to, micro, number
+from malta.bound import at_least, at_most
+from malta.display import micro, number
 from malta.margins.loop_report import LoopReport, Outcome, zone
 from malta.model.parameters import box_words
 from malta.report.tables import fold
@@ -67,7 +68,7 @@ def verdict_lines(found: LoopReport, campaigns: Sequence[Summary] = ()) -> tuple
     >>> for line in malta.report.verdict_lines(found):
     ...     print(f"{line.label}: {line.value}")
     loop: stable
-    margin: 390.6 % proven
+    margin: 390.69 % proven
     peak |S|: 1.57, zone A
     requirements: not judged
     yield: not sampled
@@ -83,8 +84,8 @@ def verdict_lines(found: LoopReport, campaigns: Sequence[Summary] = ()) -> tuple
 
 def _loop(found: LoopReport) -> VerdictLine:
     if found.stable:
-        return VerdictLine("loop", "stable", "with hold, delay and current loops", "good")
-    note = f"a pole at |lambda| = {found.stages[-1].spectral_radius:.6f}"
+        return VerdictLine("loop", "stable", found.loop.contents, "good")
+    note = f"a pole at |lambda| = {found.stages[-1].spectral_radius:.6f}, {found.loop.contents}"
     return VerdictLine("loop", "UNSTABLE", note, "bad")
 
 
@@ -105,13 +106,9 @@ def _margin(found: LoopReport) -> VerdictLine:
         return VerdictLine("margin", "not proven", "the proof was left out (--no-proof)")
     if margin.lower is None:
         return VerdictLine("margin", "nothing proven", f"{margin.reason}; {of}", "bad", stairs)
-    lost = (
-        "no unstable machine found" if margin.exhausted else f"lost at {ceil_to(100 * margin.upper, 1):.1f} %"
-    )
+    lost = "no unstable machine found" if margin.exhausted else f"lost at {margin.lost.percent()}"
     state = "good" if margin.lower >= 1 else "bad"
-    return VerdictLine(
-        "margin", f"{floor_to(100 * margin.lower, 1):.1f} % proven", f"{lost} {of}", state, stairs
-    )
+    return VerdictLine("margin", f"{margin.proven.percent()} proven", f"{lost} {of}", state, stairs)
 
 
 def _stairs(found: LoopReport) -> tuple[Stair, ...]:
@@ -133,7 +130,7 @@ def _peak(found: LoopReport) -> VerdictLine:
     bounds = [gain.upper for gain in found.worst.values()]
     if bounds and None not in bounds:
         highest = max(bound for bound in bounds if bound is not None)
-        note += f"; over the uncertainty at most {ceil_to(highest, 2):.2f}, zone {zone(highest)}"
+        note += f"; over the uncertainty at most {at_most(highest).text()}, zone {zone(highest)}"
     return VerdictLine("peak |S|", f"{peaks[name]:.2f}, zone {found_zone}", note, state)
 
 
@@ -149,7 +146,7 @@ def _requirements(outcomes: Sequence[Outcome]) -> VerdictLine:
     more = len(failed) + len(undecided) - len(notes)
     notes += [f"{more} more"] if more else []
     if not failed and not undecided:
-        near = ", ".join(f"{one.words} {100 * one.ratio:.0f} %" for one in held[:NEAREST])
+        near = ", ".join(f"{one.words} {one.nearness}" for one in held[:NEAREST])
         return VerdictLine("requirements", f"all {len(asked)} hold", f"nearest their limits: {near}", "good")
     parts = [f"{len(failed)} of {len(asked)} {'FAILS' if len(failed) == 1 else 'FAIL'}"] if failed else []
     parts += [f"{len(undecided)} undecided"] if undecided else []
@@ -185,7 +182,12 @@ def staircase(stairs: Sequence[Stair]) -> str:
     largest = max((stair.proven for stair in stairs), default=0.0)
     if len(stairs) < 2 or not largest > 0:
         return ""
-    return "".join(BLOCKS[max(math.ceil(len(BLOCKS) * s.proven / largest), 1) - 1] for s in stairs)
+    return "".join(BLOCKS[max(math.ceil(len(BLOCKS) * _height(s, largest)), 1) - 1] for s in stairs)
+
+
+def _height(stair: Stair, largest: float) -> float:
+    """A margin as a share of the largest, which may be without end."""
+    return 1.0 if stair.proven == largest else stair.proven / largest
 
 
 @dataclass(frozen=True)
@@ -222,12 +224,12 @@ def verdict_text(found: LoopReport, campaigns: Sequence[Summary] = ()) -> Verdic
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True, spec=spec)
     >>> rich.print(malta.report.verdict_text(found))
-    loop          stable, with hold, delay and current loops
-    margin        ██▇▇▇ 390.6 % proven, lost at 390.7 % of m ±20 %
+    loop          stable, with hold
+    margin        ██▇▇▇ 390.69 % proven, lost at 390.70 % of m ±20 %
     peak |S|      1.57, zone A, of ISO 14839-3, worst at y; over the uncertainty at
                   most 1.75, zone A
-    requirements  all 4 hold, nearest their limits: peak sensitivity 98 %, margin
-                  94 %
+    requirements  all 4 hold, nearest their limits: peak sensitivity 98.38 %, margin
+                  93.58 %
     yield         not sampled, see malta campaign
     """
     return VerdictText(verdict_lines(found, campaigns))
@@ -260,8 +262,8 @@ def stairs_html(stairs: Sequence[Stair]) -> str:
     if len(stairs) < 2 or not largest > 0:
         return ""
     bars = (
-        f'<span class="{"" if s.proven >= 1 else "bad"}"><i style="height:{2.4 * s.proven / largest:.2f}rem"></i>'
-        f"<em>{html.escape(s.name)}</em><em>{100 * s.proven:.0f} %</em></span>"
+        f'<span class="{"" if s.proven >= 1 else "bad"}"><i style="height:{2.4 * _height(s, largest):.2f}rem"></i>'
+        f"<em>{html.escape(s.name)}</em><em>{at_least(s.proven).percent()}</em></span>"
         for s in stairs
     )
     return f'<span class="stairs">{"".join(bars)}</span>'

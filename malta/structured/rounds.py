@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.display import Description, ceil_to, display, floor_to, quantity
+from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.loops.loop import loop
 from malta.loops.sampled_loops import LAST, SampledLoop, sampled_loop
@@ -275,21 +275,22 @@ class Tuned:
             )
         low, but = self.margin.lower, f" ({self.margin.reason})" if self.margin.reason else ""
         found = [
-            f"Proven: the loop is stable for all parameters within {floor_to(low, 3):g} times their ranges{but}."
+            f"Proven: the loop is stable for all parameters within {self.margin.proven.percent()} of their ranges{but}."
             if low
             else f"Not proven: stability over the ranges ({self.margin.reason or 'the nominal loop is lost'})."
         ]
         if self.asked is not None and (low or 0.0) < self.asked:
             why = f" {self.against}." if self.against else ""
-            found.append(f"Asked for were {self.asked:g} times: the proof does not close.{why}")
+            found.append(f"Asked for were {100 * self.asked:.10g} %: the proof does not close.{why}")
         for (goal, channel), gain in self.peaks.items():
             if gain.upper is None:
                 found.append(
-                    f"Not proven: {goal} of {channel} over the ranges ({gain.reason}); {gain.lower:.4g} is reached."
+                    f"Not proven: {goal} of {channel} over the ranges ({gain.reason}); "
+                    f"{gain.reached.text()} is reached."
                 )
             else:
                 found.append(
-                    f"Proven: |S| of {channel} is below {ceil_to(gain.upper, 3):g} over the ranges ({goal})."
+                    f"Proven: |S| of {channel} is below {gain.proven.text()} over the ranges ({goal})."
                 )
         return "\n".join(found)
 

@@ -224,7 +224,7 @@ def verify(
     >>> model = malta.linearize(spec.plant, spec.plant.at())
     >>> controller = malta.synthesize(spec, model)
     >>> print(malta.verify(model, controller, spec.uncertainty))
-    stable with hold, delay and current loops
+    stable with hold
     peak |S|, sampled: y 1.71, zone A  all 1.71 (4.7 dB)
     peak |S|, + current loops: y 1.71, zone A  all 1.71 (4.7 dB)
     peak |S|, machine: y 1.57, zone A  all 1.57 (3.9 dB)

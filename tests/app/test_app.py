@@ -391,7 +391,7 @@ def test_the_rest_of_an_answer_makes_it_the_whole_picture(
     first = client.ask("evaluate", number=1, values=values)
     assert first["missing"] == ["frequency", "run", "load", "figures", "margin"]
     early = {one["label"]: one["value"] for one in first["figures"]}
-    assert {"peak |S|", "bandwidth, T", "bandwidth, L", "slowest pole"} <= early.keys()
+    assert {"peak |S|", "bandwidth, T", "crossover, L", "slowest pole"} <= early.keys()
     monkeypatch.setattr(
         "malta.app.answers.SLOW", 1e9
     )  # of the margin, which is left to the background otherwise
@@ -419,7 +419,7 @@ def test_figures_of_the_first_answer_are_those_of_verify(
     for label, key in (
         ("peak |S|", "peak_sensitivity"),
         ("bandwidth, T", "bandwidth_sigma_max_T"),
-        ("bandwidth, L", "bandwidth_crossover_max"),
+        ("crossover, L", "bandwidth_crossover_max"),
         ("slowest pole", "slowest_pole"),
         ("least damping", "smallest_damping"),
     ):

@@ -91,7 +91,7 @@ def test_a_slider_moves_the_design_and_its_proof_follows(page: Any) -> None:
     from selenium.webdriver.common.keys import Keys
 
     first = badge(page)
-    assert first == "✓ proven 288.7 %"
+    assert first == "✓ proven 288.79 %"
     slider, number = row(page, "stiffness")
     assert number.get_attribute("value") == "647.02"
     page.execute_script("arguments[0].focus()", slider)

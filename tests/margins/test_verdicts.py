@@ -9,7 +9,8 @@ import math
 import re
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -17,11 +18,15 @@ from conftest import ROOT
 from rich.console import Console
 
 import malta
+from malta.app.files import Edit, open_design
+from malta.app.picture import _figures, solve
 from malta.app.worker import outcome_document
+from malta.display import number
 from malta.gains.file import read
-from malta.margins.loop_report import Outcome
+from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, Outcome
 from malta.model.data import plant_of
 from malta.proof.margin import NOT_PROVEN
+from malta.report.page.analysis import key_figures
 from malta.report.tables.design import requirements_table
 from malta.report.verdict import verdict_html, verdict_lines, verdict_text
 from malta.synthesis.requirements import (
@@ -153,10 +158,10 @@ def test_the_verdict_names_failures_first_and_says_the_same_everywhere() -> None
     )
     lines = verdict_lines(found)
     assert [line.label for line in lines] == ["loop", "margin", "peak |S|", "requirements", "yield"]
-    assert (lines[1].value, lines[1].state) == ("99.9 % proven", "bad")
-    assert "lost at 100.1 %" in lines[1].note
+    assert (lines[1].value, lines[1].state) == ("99.99 % proven", "bad")
+    assert "lost at 100.01 %" in lines[1].note
     assert lines[3].value == "1 of 3 FAILS, 1 undecided"
-    assert lines[3].note.startswith("margin 200 %, asked >= 300 %; error")
+    assert lines[3].note.startswith("margin 200.00 %, asked >= 300 %; error")
     assert held.found_text == "63.93 Hz (401.7 rad/s)"
     console = Console(width=200, file=io.StringIO(), color_system=None)
     console.print(verdict_text(found))
@@ -214,3 +219,55 @@ LARGE = ("robust_observer", "tubular_pid")
 )
 def test_all_tools_give_one_figure_and_one_verdict(name: str) -> None:
     compare_verdicts(ROOT / "design" / f"{name}.toml", ROOT / "design" / "gains" / f"{name}.json")
+
+
+def test_the_first_line_says_what_stands_in_the_loop_and_what_is_left_out() -> None:
+    """Of a machine without windings no line names current loops; what `left_out` names is named."""
+    said = {}
+    for name in ("robust", "halbach", "planar_pid"):
+        controller = malta.gains.read(ROOT / f"design/gains/{name}.json")
+        plant = plant_of(controller.parameters)
+        found = malta.verify(malta.linearize(plant, plant.at()), controller)
+        said[name] = next(iter(verdict_lines(found))).note
+        assert said[name] == found.loop.contents
+        assert found.loop.left_out in said[name]
+        assert str(found).startswith(f"stable {said[name]}\n")
+        assert ("contents", said[name]) in found.description.rows
+    assert said["robust"] == "with hold, delay and current loops"
+    assert said["halbach"].startswith(
+        "with hold and lag of the current loops; left out: the electronics' own"
+    )
+    assert said["planar_pid"].startswith("with hold and delay; left out: the limited speed")
+    cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
+    weights = malta.synthesis.weights(q=[1e4, 0], r=[1], w=[1], v=[1e-8])
+    law = malta.lqg(malta.linearize(cart, cart.at()), weights, Ts=1e-3)
+    late = replace(cart, sensors=malta.model.LateSensors((2e-3,), dead_time=1e-3))
+    assert malta.loop(cart, law).contents == "with hold"
+    assert malta.loop(late, law).contents == "with hold, lag of the sensors and dead time of the sensors"
+
+
+@pytest.mark.parametrize("name", ["robust", "structured"])
+def test_a_tile_has_one_bandwidth_with_its_name(name: str) -> None:
+    """The same definition whether the design file bounds a bandwidth or not; the page of the theory has all of them."""
+    controller = malta.gains.read(ROOT / f"design/gains/{name}.json")
+    plant = plant_of(controller.parameters)
+    report = malta.verify(malta.linearize(plant, plant.at()), controller)
+    asked = Outcome("bandwidth", 400.0, 401.7, "rad/s", BANDWIDTHS["w_n_min"], at_least=True)
+    analysis: Any = SimpleNamespace(report=replace(report, requirements=(asked,)), job=None, plant=plant)
+    tile = next(one for one in key_figures(analysis) if one.label == "Bandwidth")
+    value = report.bandwidth[BANDWIDTH]
+    assert tile.value == f"{number(value / (2 * math.pi), 3)} Hz"
+    assert tile.note.endswith(BANDWIDTHS[BANDWIDTH])
+    shown = {
+        one["label"]: one
+        for one in _figures(solve(open_design(ROOT / f"design/{name}.toml").apply(Edit())), None)
+    }
+    assert shown["bandwidth, T"]["value"] == pytest.approx(value)
+    assert shown["bandwidth, T"]["note"] == BANDWIDTHS[BANDWIDTH]
+    assert [label for label in shown if "bandwidth" in label] == ["bandwidth, T"]
+
+
+def test_all_definitions_of_bandwidth_stand_in_one_table() -> None:
+    page = (ROOT / "docs/theory/loop.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (.+?) \| .+ \| `(\w+)` \|$", page, re.M)
+    assert [(key, name) for name, key in rows] == list(BANDWIDTHS.items())

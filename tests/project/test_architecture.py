@@ -24,6 +24,7 @@ GROUND = (
     "files",
     "tables",
     "processes",
+    "bound",
     "display",
     "merits",
 )

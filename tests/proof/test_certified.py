@@ -495,12 +495,12 @@ def test_check_prints_the_box_and_whose_it_is(run: Run, document: Content, tmp_p
     assert re.search(r"^ m +3\.75 +2\.2515 +5\.2485 +kg *$", out, re.M)
     assert re.search(r"^ x +0 +-0\.05 +0\.05 +m *$", out, re.M)
     own = "in the certificate's own box above, compared with no gain file"
-    assert out.splitlines()[-1] == f"{path}: stable in 399.600 % of the uncertainty, {own}: holds"
+    assert out.splitlines()[-1] == f"{path}: stable in 399.60 % of the uncertainty, {own}: holds"
     code, out, err = run("check", str(path), "--gains", str(HALBACH))
     assert (code, err) == (0, "")
-    assert out.splitlines()[-1] == f"{path}: stable in 399.600 % of the uncertainty: holds"
+    assert out.splitlines()[-1] == f"{path}: stable in 399.60 % of the uncertainty: holds"
     code, out, err = run("check", str(path), "--gains", str(HALBACH), "--uncertain", "12%")
-    assert (code, "its box is too small: m from 2.2515 to 5.2485 kg at 399.6 %" in err) == (1, True)
+    assert (code, "its box is too small: m from 2.2515 to 5.2485 kg at 399.60 %" in err) == (1, True)
     found = json.loads(run("check", str(path), "--gains", str(HALBACH), "--json").out)
     assert (found["compared"], found["holds"], found["claim"]["law"]) == (True, True, "halbach")
     assert found["claim"]["parameters"][0]["unit"] == "kg"
@@ -512,7 +512,7 @@ def test_digits_are_cut_towards_less(document: Content, tmp_path: Path, run: Run
     content = copy.deepcopy(document)
     claiming(content, 3.9399999)
     path = written(content, tmp_path)
-    assert claim_share(check(path).stated) == "393.999 %"
+    assert claim_share(check(path).stated) == "393.99 %"
     found = re.search(r"^ A +1\.6067 +(\S+) +(\S+) +N/A", run("check", str(path)).out, re.M)
     assert found is not None
     low, high = row(content, "A")["interval"]

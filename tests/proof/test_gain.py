@@ -213,6 +213,6 @@ def test_a_peak_without_a_proof_has_the_zone_that_it_reached() -> None:
     table = malta.report.worst_case_table({"x": reached, "y": lost})
     rows = list(zip(*(map(str, column.cells) for column in table.columns), strict=True))
     assert rows == [
-        ("x", "2.220", "3.000 (0.477)", "nothing proven", "A or worse"),
+        ("x", "2.22", "3.000 (0.477)", "nothing proven", "A or worse"),
         ("y", "unstable", "", "nothing proven", "D"),
     ]

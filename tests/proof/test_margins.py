@@ -13,7 +13,6 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta.display import floor_to
 from malta.errors import InputError
 from malta.proof.problem import hurwitz
 from malta.proof.uncertain import Compensator, UncertainSystem
@@ -115,7 +114,7 @@ def test_what_cannot_be_enclosed_is_not_proven() -> None:
     assert m.lower is None
     assert m.upper == pytest.approx(2, rel=1e-6)
     assert "if_else" in m.reason
-    assert str(m).startswith(f"nothing proven ({m.reason}), lost at 200.00 %")
+    assert str(m).startswith(f"nothing proven ({m.reason}), lost at 200.0")
 
 
 def test_the_end_of_a_search_is_named() -> None:
@@ -136,7 +135,7 @@ def test_the_end_of_a_search_is_named() -> None:
         assert m.exhausted
         assert m.lower is not None
         assert m.lower == pytest.approx(float(searched.split()[4].strip(",")), rel=2e-4)
-        assert str(m) == f"proven {floor_to(100 * m.lower, 2):.2f} %; no unstable machine found {searched}"
+        assert str(m) == f"proven {m.proven.percent()}; no unstable machine found {searched}"
 
 
 def test_algebraic_equations_are_solved_for_their_states() -> None:

@@ -189,7 +189,9 @@ def test_a_margin_map_proves_no_unstable_machine_and_meets_its_witness() -> None
     assert found.growth[near].min() < 0 < found.growth[near].max()
     figure = report.margin_map(found)
     assert defects(figure) == []
-    assert f"proven {math.floor(1000 * found.proven) / 10:g} %" in " ".join(texts_of(figure))
+    assert found.margin is not None
+    low, high = found.margin.proven.percent(), found.margin.lost.percent()
+    assert f"proven {low} of the box, lost at {high}" in " ".join(texts_of(figure))
     for names, what in ((("m", "q"), "--y"), (("m", "m"), "--y")):
         with pytest.raises(malta.InputError, match=what):
             margin_map_of(plant, controller, names, box)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import html as markup
 import io
 import json
-import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +17,8 @@ from conftest import ROOT, Run
 from page_checks import cells_of, read_page
 
 import malta
+from malta.bound import at_least
 from malta.cli.report import campaigns_of, read_subject
-from malta.display import floor_to
 from malta.margins.verify import linear_report
 from malta.report.figures.drawing import STYLES, new_figure, printable
 from malta.report.page.analysis import Subject, analyse, key_figures
@@ -212,10 +211,10 @@ def test_the_margins_in_a_report_are_those_of_verify(tmp_path: Path, run: Run) -
     html = out.read_text(encoding="utf-8")
     read_page(html)
     lower = verified["robust"]["travel"]["lower"]
-    assert f"{math.floor(1000 * lower) / 10:.1f} % proven" in html
+    assert f"{at_least(lower).percent()} proven" in html
     chain = {row[0]: row[1] for row in cells_of(html, "Where the margin goes")[1:]}
     for link in verified["robust"]["chain"]:
-        assert chain[link["stage"]] == f"{floor_to(100 * link['lower'], 2):.2f} %"
+        assert chain[link["stage"]] == at_least(link["lower"]).percent()
     delays = {row[0]: row[1] for row in cells_of(html, "Margins of the sampled loop")[1:]}
     for sensor, delay in verified["robust"]["delay_s"].items():
         assert delays[f"delay at {sensor} alone"] == f"{1e6 * delay:.0f} µs"

@@ -5,7 +5,7 @@ import { createChart, stroke } from "./chart.js";
 import { createPanel, dropDown, element } from "./controls.js";
 import { exportChart } from "./export.js";
 import { color, dash, loadView, mapView, nyquistView, poleView, runView, sensitivityView, timeGroups } from "./figures.js";
-import { digits, floored, hertz, percent, quantity } from "./numbers.js";
+import { digits, hertz, quantity } from "./numbers.js";
 import { countLights, differenceTable, figureTable, howToAsk, requirementRows } from "./tables.js";
 import { createTuner } from "./tuning.js";
 
@@ -219,7 +219,7 @@ export async function mount(root, transport) {
   function refresh() {
     state.told = null;
     // Nothing that was proven or measured of the last design is shown beside the numbers of the next.
-    state.past = { ...state.past, ...state.requirements, ...(state.proof?.lower ? { margin: { found: state.proof.lower } } : {}) };
+    state.past = { ...state.past, ...state.requirements, ...(state.proof?.lower ? { margin: { found: state.proof.lower, text: state.proof.proven } } : {}) };
     if (!state.moving) last = { version: state.version, proof: state.proof, requirements: state.requirements, simulated: state.simulated };
     Object.assign(state, { moving: true, proof: null, requirements: {}, simulated: null });
     panel.show(state.values);
@@ -414,13 +414,13 @@ export async function mount(root, transport) {
     if (!picture) return ["open", "…", ""];
     if (!picture.stable && !state.moving) return ["broken", "✗ unstable", `spectral radius ${digits(picture.radius, 6)}`];
     const upper = picture.margin?.upper;
-    const found = picture.margin === null ? "" : picture.margin.reason ? `no eigenvalue margin: ${picture.margin.reason}` : upper === null || upper === undefined ? "no loss found by eigenvalues" : `≤ ${percent(upper)} by eigenvalues`;
+    const found = picture.margin === null ? "" : picture.margin.reason ? `no eigenvalue margin: ${picture.margin.reason}` : upper === null || upper === undefined ? "no loss found by eigenvalues" : `≤ ${picture.margin.lost} by eigenvalues`;
     if (!Object.keys(state.description.parameters).length) return ["open", "✓ stable", "no uncertainty in the file, so no margin"];
     if (state.moving) return ["open", `… ${found}`, "of the last design"];
     if (!proof) return ["open", `✓ stable  ${found}`, "not proven yet: the proof follows"];
-    const lost = proof.upper === null || proof.upper === undefined ? "" : `lost at ${percent(proof.upper)}${proof.frequency === null ? "" : `, ${hertz(proof.frequency)}`}`;
+    const lost = proof.upper === null || proof.upper === undefined ? "" : `lost at ${proof.lost}${proof.frequency === null ? "" : `, ${hertz(proof.frequency)}`}`;
     if (proof.lower === null || proof.lower === undefined) return ["unknown", "nothing proven", [proof.reason, found].filter(Boolean).join("; ")];
-    return ["proven", `✓ proven ${percent(floored(proof.lower))}`, [lost, proof.reason].filter(Boolean).join("; ")];
+    return ["proven", `✓ proven ${proof.proven}`, [lost, proof.reason].filter(Boolean).join("; ")];
   }
 
   function drawHeader() {

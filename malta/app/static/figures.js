@@ -1,7 +1,7 @@
 // What the charts show: documents of the session as views of chart.js.
 
 import { rangeOf } from "./chart.js";
-import { decibels, digits, floored, hertz, percent, printedUnit, quantity, scaleFor } from "./numbers.js";
+import { decibels, digits, hertz, printedUnit, quantity, scaleFor } from "./numbers.js";
 
 const DASHES = ["", "7 3", "2 3", "8 3 2 3", "", "7 3", "2 3", "8 3 2 3"];
 export const color = (k) => `var(--c${k % 8})`;
@@ -215,7 +215,8 @@ function timeView(lines, { unit, words }, times, title, handles) {
   };
 }
 
-// The plane of two parameters: the proven box, the boundary by eigenvalues, the witness; a click asks for the poles there.
+// The plane of two parameters, the others anywhere in the box: the proven box, the boundary by eigenvalues, the machine that is lost; a click asks
+// for the poles of the worst machine there. A machine that is lost by other parameters than these two has no point in the plane.
 export function mapView(state, pick) {
   const { map, proof, there, picture } = state;
   if (!map || map.error) return null;
@@ -223,17 +224,20 @@ export function mapView(state, pick) {
   const box = (share) => [[[cx - share * hx, cx + share * hx, cx + share * hx, cx - share * hx], [cy - share * hy, cy - share * hy, cy + share * hy, cy + share * hy]]];
   const unit = (k) => (map.units[k] === "1" ? "" : ` [${printedUnit(map.units[k])}]`);
   const points = [{ name: "nominal", xs: [cx], ys: [cy], mark: "+", size: 6, color: "var(--ink)" }];
-  const witness = proof?.at ?? {};
-  if (witness[map.x] !== undefined && witness[map.y] !== undefined) points.push({ name: map.others ? "witness, other parameters moved too" : "witness", xs: [witness[map.x]], ys: [witness[map.y]], mark: "x", size: 6, color: "var(--bad)" });
+  const at = [proof?.at?.[map.x], proof?.at?.[map.y]], off = Math.max(Math.abs(at[0] - cx) / hx, Math.abs(at[1] - cy) / hy);
+  const witness = off >= (1 - 1e-6) * (proof?.upper ?? Infinity) ? at : null;
+  if (witness) points.push({ name: map.beside ? "lost, other parameters moved too" : "lost", xs: [witness[0]], ys: [witness[1]], mark: "x", size: 6, color: "var(--bad)" });
+  const near = (x, y) => witness && [x, y].every((value, k) => Math.abs(value - witness[k]) < 0.015 * (map.reach[k][1] - map.reach[k][0]));
   if (there) points.push({ name: `picked: ${there.stable ? "stable" : "unstable"}`, xs: [there.at[map.x]], ys: [there.at[map.y]], mark: "o", size: 6, color: "var(--accent)" });
-  const told = there ? `there ${there.stable ? "stable" : "UNSTABLE"}, slowest pole ${digits(there.worst[0], 4)}${there.worst[1] ? ` ± ${digits(Math.abs(there.worst[1]), 4)} j` : ""} rad/s` : "click for the poles there";
+  const moved = there ? Object.entries(there.beside).map(([name, value]) => ` ${name} ${digits(value, 3)}`).join("") : "";
+  const told = there ? `there ${there.stable ? "stable" : "UNSTABLE"}${moved ? `, worst with${moved}` : ""}, slowest pole ${digits(there.worst[0], 4)}${there.worst[1] ? ` ± ${digits(Math.abs(there.worst[1]), 4)} j` : ""} rad/s` : "click for the poles there";
   return {
-    nearest: "xy", pick,
+    nearest: "xy", pick: (x, y) => pick(...(near(x, y) ? witness : [x, y])),
     x: { label: `${map.x}${unit(0)}`, min: map.reach[0][0], max: map.reach[0][1] }, y: { label: `${map.y}${unit(1)}`, min: map.reach[1][0], max: map.reach[1][1] },
     shapes: [...map.unstable.map((rings) => ({ kind: "area", rings, class: "forbidden" })), ...(lower > 0 ? [{ kind: "area", rings: box(lower), class: "proven-box" }] : []), { kind: "area", rings: box(1), class: "asked-box" }],
     lines: map.boundary.map(([xs, ys]) => ({ name: "boundary", xs, ys, color: "var(--ink)", silent: true })), points,
-    note: `${map.version !== state.version ? "of the last design" : lower > 0 ? `blue: proven, ${percent(floored(lower))} of the dashed box` : picture.margin ? "not proven (yet)" : ""}; ${told}`,
-    summary: `${map.x} and ${map.y}; ${told}`,
+    note: `${[map.version !== state.version ? "of the last design" : lower > 0 ? `blue: proven, ${proof.proven} of the dashed box` : picture.margin ? "not proven (yet)" : "", map.beside].filter(Boolean).join(", ")}; ${told}`,
+    summary: `${map.x} and ${map.y}${map.beside ? `, ${map.beside}` : ""}; ${told}`,
     read: (set, k) => [{ text: set.name, strong: true, color: set.color }, { text: `${map.x} ${digits(set.xs[k], 4)}` }, { text: `${map.y} ${digits(set.ys[k], 4)}` }],
   };
 }

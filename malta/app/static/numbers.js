@@ -42,9 +42,6 @@ export const hertz = (w, count = 4) => `${digits(w, count)} rad/s (${quantity(w 
 
 export const percent = (share) => (share === null || share === undefined ? "–" : `${digits(100 * share, 4)} %`);
 
-// A proven share to four digits, never above itself.
-export const floored = (share) => (share > 0 ? Math.floor(share / 10 ** (Math.floor(Math.log10(share)) - 3)) * 10 ** (Math.floor(Math.log10(share)) - 3) : 0);
-
 export const decibels = (size) => `${(20 * Math.log10(size)).toFixed(1)} dB`;
 
 // Ticks of a linear axis: steps of 1, 2 or 5.

@@ -1,29 +1,29 @@
 // The tables beside the charts: requirements as lights, figures of pinned designs, and what differs.
 
 import { element } from "./controls.js";
-import { digits, floored, hertz, percent, printedUnit, quantity } from "./numbers.js";
+import { digits, hertz, printedUnit, quantity } from "./numbers.js";
 
 const SIGNS = { true: ["✓", "met"], false: ["✗", "not met"], null: ["…", "not known yet"] };
 
-// Whether a margin is reached: by the verdict on the proof, or refuted by eigenvalues before it.
+// Whether a margin is reached: by the verdict on the proof, or refuted by eigenvalues before it. Bounds come as text: who proves rounds.
 function marginLight(asked, state) {
-  const { proof, picture } = state, upper = proof?.upper ?? picture.margin?.upper;
+  const { proof, picture } = state, upper = proof?.upper ?? picture.margin?.upper, text = proof?.upper ? proof.lost : picture.margin?.lost;
   if (!picture.stable) return { holds: false, found: 0, how: "unstable loop" };
-  if (proof?.holds !== undefined && proof?.holds !== null) return { holds: proof.holds, found: floored(proof.lower ?? 0), how: proof.reason || "proven over the travel" };
-  if (upper !== undefined && upper !== null && upper < asked) return { holds: false, found: upper, how: "lost there, by eigenvalues" };
-  return { holds: null, found: upper ?? null, how: "eigenvalues; the proof follows" };
+  if (proof?.holds !== undefined && proof?.holds !== null) return { holds: proof.holds, found: proof.lower ?? 0, text: proof.proven, how: proof.reason || "proven over the travel" };
+  if (upper !== undefined && upper !== null && upper < asked) return { holds: false, found: upper, text, how: "lost there, by eigenvalues" };
+  return { holds: null, found: upper ?? null, text, how: "eigenvalues; the proof follows" };
 }
 
 // "peak_sensitivity" as words; what follows the first space are names of signals and loads.
 const wordsOf = (name) => [name.split(" ")[0].replaceAll("_", " "), ...name.split(" ").slice(1)].join(" ");
 
-const boundText = (asked, value) => (asked.switch ? (value ? "yes" : "no") : asked.name === "margin" ? percent(value) : quantity(value, asked.unit, 3));
+const boundText = (asked, value) => (asked.switch ? (value ? "yes" : "no") : asked.name === "margin" ? `${digits(100 * value, 10)} %` : quantity(value, asked.unit, 3));
 // Hz stand below rad/s: beside them they would push the bound out of a narrow panel.
 const inHertz = (asked, value) => (typeof value === "number" && asked.frequency ? [element("br", {}), element("small", { class: "soft" }, quantity(value / (2 * Math.PI), "Hz"))] : []);
 
 // Failures first, then what is not known yet. A value of the last design stays, grey and without a verdict, until the new one comes.
 export function requirementRows(description, state) {
-  const past = (asked) => ({ holds: null, found: state.past?.[asked.name]?.found ?? null, how: "of the last design", old: true });
+  const past = (asked) => ({ holds: null, found: state.past?.[asked.name]?.found ?? null, text: state.past?.[asked.name]?.text, how: "of the last design", old: true });
   const judged = description.requirements.map((asked) => {
     const found = asked.name === "margin" ? marginLight(asked.asked, state) : state.requirements[asked.name];
     return { asked, found: found && (found.found !== null || found.holds !== null) ? found : past(asked) };
@@ -31,7 +31,7 @@ export function requirementRows(description, state) {
   const rank = ({ found }) => (found.holds === false ? 0 : 1);
   return judged.sort((one, other) => rank(one) - rank(other)).map(({ asked, found }) => {
     const [sign, words] = SIGNS[found.holds ?? null];
-    const value = found.found === null || found.found === undefined ? (found.holds === false ? "none" : "") : boundText(asked, found.found);
+    const value = found.found === null || found.found === undefined ? (found.holds === false ? "none" : "") : found.text ?? boundText(asked, found.found);
     const bound = asked.switch ? "" : `${asked.at_least ? "≥" : "≤"} ${boundText(asked, asked.asked)}`;
     return element("tr", { class: `light ${found.holds ?? "open"}${found.old ? " old" : ""}`, title: found.how ?? "" },
       element("td", { class: "sign", role: "img", "aria-label": words }, sign),
@@ -56,10 +56,10 @@ const near = (a, b) => Math.abs(a - b) <= 1e-4 * Math.max(Math.abs(a), Math.abs(
 
 // A single column has room for Hz beside rad/s.
 function figureRows(figures, proof, margin, alone = false) {
-  const upper = proof?.upper ?? margin?.upper;
+  const upper = proof?.upper ?? margin?.upper, lost = proof?.upper ? proof.lost : margin?.lost;
   const rows = figures.map((one) => ({ ...one, text: alone && one.frequency && one.value !== null ? hertz(one.value) : quantity(one.value, one.unit, 4) }));
-  if (upper !== undefined && upper !== null) rows.unshift({ label: "margin, eigenvalues", value: upper, better: 1, text: `≤ ${percent(upper)}`, note: "upper bound" });
-  if (proof?.lower !== undefined && proof?.lower !== null) rows.unshift({ label: "margin, proven", value: proof.lower, better: 1, text: percent(floored(proof.lower)), note: proof.reason });
+  if (upper !== undefined && upper !== null) rows.unshift({ label: "margin, eigenvalues", value: upper, better: 1, text: `≤ ${lost}`, note: "upper bound" });
+  if (proof?.lower !== undefined && proof?.lower !== null) rows.unshift({ label: "margin, proven", value: proof.lower, better: 1, text: proof.proven, note: proof.reason });
   return rows;
 }
 

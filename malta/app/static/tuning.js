@@ -1,7 +1,7 @@
 // Designs from where the page stands: candidates of a search, and the front of margin against noise under one slider.
 
 import { element } from "./controls.js";
-import { digits, floored, percent, quantity } from "./numbers.js";
+import { digits, percent, quantity } from "./numbers.js";
 
 const SHOWN = 6; // candidates at once, the newest
 const STARTS = { tune: "tuning from here…", front: "computing the front…" };
@@ -18,7 +18,7 @@ export function undominated(points) {
 
 export const pointText = (point) => {
   const price = priceOf(point), missed = point.limit ? `, misses ${boundWords(point.limit)} by ${digits(100 * (point.ratio - 1), 2)} %` : "";
-  return `${percent(floored(point.margin))} proven · ${quantity(price.value, price.unit)} ${price.label.split(" [")[0]}${missed}`;
+  return `${point.proven} proven · ${quantity(price.value, price.unit)} ${price.label.split(" [")[0]}${missed}`;
 };
 
 // state.candidates are drawn beside the design. ask(document) -> promise; place(values, done) moves the design to others.

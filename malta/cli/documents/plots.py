@@ -164,8 +164,12 @@ class MapPart(Part):
     units: list[str] = Field(description="SI units of x and y")
     nominal: list[float]
     half: list[float] = Field(description="half widths of the uncertainty box")
-    proven: float = Field(description="margin in multiples of the box that is proven for x and y; 0: nothing")
-    witness: list[float] | None = Field(description="values of x and y at the limit of stability")
+    others: Literal["box", "nominal"] = Field(description="what the parameters are that are not drawn")
+    beside: list[str] = Field(description="uncertain parameters that are not drawn")
+    proven: float = Field(description="margin in multiples of the box that is proven; 0: nothing")
+    witness: list[float] | None = Field(
+        description="x and y at the limit of stability; null where others reach it first"
+    )
     x_values_si: list[float]
     y_values_si: list[float]
     growth_per_s: list[list[Number]] = Field(description="a row for each y, positive where unstable")

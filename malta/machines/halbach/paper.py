@@ -461,7 +461,7 @@ CLOSED_LOOP: tuple[Row, ...] = (
     ),
     Row(
         "share of the box of m, A, b, R",
-        "{:.0f} percent",
+        "proven percent",
         machine_share,
         note="proven; 10 % of m and A, 20 % of b and R; k makes waves along the travel and is flown in campaigns",
     ),

@@ -563,7 +563,7 @@ LOOP: tuple[Row, ...] = (
     Row("peak sensitivity, worst sensor", "{:.1f}", peak_sensitivity, note=ZONE_NOTE),
     Row(
         "share of the design's box that is proven",
-        "{:.0f} percent",
+        "proven percent",
         machine_share,
         note="anywhere in the travel",
     ),

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from malta.bound import Bound, at_least, at_most
 from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.processes import on_one_thread
@@ -405,9 +406,19 @@ class Gain:
     seconds: float
     reason: str = ""
 
+    @property
+    def reached(self) -> Bound:
+        """`lower` as it is shown."""
+        return at_least(self.lower)
+
+    @property
+    def proven(self) -> Bound:
+        """`upper` as it is shown."""
+        return at_most(self.upper)
+
     def __str__(self) -> str:
-        high = unproven(self.reason) if self.upper is None else f"proven below {self.upper:.4g}"
-        return f"{self.lower:.4g} at {self.frequency:.4g} rad/s, {high}"
+        high = unproven(self.reason) if self.upper is None else f"proven below {self.proven.text()}"
+        return f"{self.reached.text()} at {self.frequency:.4g} rad/s, {high}"
 
     @property
     def description(self) -> Description:

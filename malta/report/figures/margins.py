@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from malta.display import floor_to
+from malta.bound import at_least
 from malta.errors import InputError
 from malta.loops.loop import loop_along
 from malta.loops.sampled_loops import SampledLoop
@@ -115,7 +115,7 @@ def _draw_stages(left: Axes, right: Axes, found: LoopReport) -> None:
     beside: dict[str, Any] = {"xytext": (6, 0), "textcoords": "offset points", "va": "center"}
     for k, (_, margin, peak) in enumerate(rows):
         look, end = LOOKS[k >= len(found.chain) - 1], _draw_margin(left, k, margin)
-        text = "none" if margin.lower is None else f"{floor_to(_percent(margin.lower), 1):.1f} %"
+        text = "none" if margin.lower is None else margin.proven.percent()
         text = f"{text} or more" if margin.exhausted and margin.lower is not None else text
         left.annotate(text, (end, k), **beside, **NOTE)
         stable = not math.isnan(peak)
@@ -175,10 +175,10 @@ def _draw_along_course(left: Axes, right: Axes, found: LoopReport, bound: float)
         return np.concatenate([array[:0:-1], array]) if even else array
 
     left.plot(both, mirrored([_percent(p.margin.lower) for p in places]), **DOT | {"markersize": 4})
-    if found.travel.lower is not None:
-        left.axhline(100 * found.travel.lower, **STYLES[1])
+    if level := _percent(found.travel.lower):
+        left.axhline(level, **STYLES[1])
         left.annotate(
-            "proven for all of it at once", (0.02, 100 * found.travel.lower), xycoords=("axes fraction", "data"),
+            "proven for all of it at once", (0.02, level), xycoords=("axes fraction", "data"),
             xytext=(0, -3), textcoords="offset points", va="top", **NOTE,
         )  # fmt: skip
     left.set_ylim(0, 1.25 * max([_percent(p.margin.lower) for p in places] + [1.0]))
@@ -215,8 +215,8 @@ def _bound(worst: Mapping[str, Gain]) -> float:
 
 
 def _percent(t: float | None) -> float:
-    """A share in percent; 0 for None."""
-    return 0.0 if t is None else 100 * t
+    """A share in percent; 0 for None, and for one without end, which no axis holds."""
+    return 100 * t if t is not None and math.isfinite(t) else 0.0
 
 
 def _legend(axes: Axes, bottom: float = 1.0, handles: Sequence[Artist] | None = None) -> None:
@@ -373,7 +373,7 @@ def front_figure(tuned: Tuned, path: str | Path | None = None) -> Figure:
     kept = (
         "keeps all that is asked for" if tuned.reached else f"misses {tuned.binding.name.replace('_', ' ')}"
     )
-    share = f"{100 * taken.figures['margin']:.0f} %"
+    share = at_least(taken.figures["margin"]).percent()
     found = f"{tuned.trials} trials; open marks: taken, margin {share}, which {kept}; "
     found += "filled: least force noise, or least motion, at a margin"
     figure = new_figure(f"{tuned.spec.name}: margin against noise", found, size=(9.0, 4.6), left=0.1)

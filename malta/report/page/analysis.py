@@ -14,7 +14,7 @@ import numpy as np
 from malta.errors import CheckError, InputError
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.sampled_loops import LAST
-from malta.margins.loop_report import BANDWIDTHS, LoopReport
+from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, LoopReport
 from malta.merits import Merit, in_groups
 from malta.model.data import plant_of
 from malta.model.linear import is_linear
@@ -363,14 +363,9 @@ def key_figures(a: Analysis) -> list[KeyFigure]:
 
 
 def _bandwidth(a: Analysis) -> Iterator[KeyFigure]:
-    """By the definition that the [specification] bounds, so that a page has one bandwidth; else that of T."""
-    key = "sigma_max_T"
-    value, definition = a.report.bandwidth.get(key, math.nan), BANDWIDTHS[key]
-    for one in a.report.requirements:
-        if one.name == "bandwidth":
-            value, definition = one.found, one.how
+    value = a.report.bandwidth.get(BANDWIDTH, math.nan)
     if math.isfinite(value):
-        note = f"{number(value)} rad/s, {definition}"
+        note = f"{number(value)} rad/s, {BANDWIDTHS[BANDWIDTH]}"
         yield KeyFigure("Bandwidth", f"{number(value / (2 * math.pi), 3)} Hz", note)
 
 

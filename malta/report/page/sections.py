@@ -260,7 +260,7 @@ def _requirements(a: Analysis) -> Iterator[Item]:
     ranked = sorted(a.report.requirements, key=lambda one: (RANKS[one.verdict], one.asked is None))
     for one in ranked:  # failures first
         state, word = _light(one)
-        of = "" if one.asked is None else f"{100 * one.ratio:.1f} %"
+        of = "" if one.asked is None else one.nearness
         rows.append([word, one.words, one.asked_text, one.found_text, of, one.how])
         marks.append((state, "", "", "", "", ""))
     heads = ("", "requirement", "asked", "found", "of the limit", "from")
@@ -335,8 +335,8 @@ def _margin_map(a: Analysis) -> Iterator[Item]:
     drawn = margin_map_of(a.plant, a.subject.controller, (x, y), found.uncertainty, margin=found.robust)
     yield Picture(
         lambda: plots.margin_map(drawn, campaigns=a.campaigns),
-        f"Margin map over {x} and {y}: every machine in the blue box is proven stable. The line is the boundary of "
-        "stability by eigenvalues, the other parameters being nominal: another route, which proves nothing.",
+        f"Margin map over {x} and {y}{drawn.beside_text and f', {drawn.beside_text}'}: every machine in the blue "
+        "box is proven stable. The line is the boundary of stability by eigenvalues, which prove nothing.",
     )
 
 

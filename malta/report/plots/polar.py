@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.display import ceil_to, floor_to
+from malta.bound import at_least
 from malta.errors import InputError
-from malta.margins.margin_map import MarginMap, margin_map_of
+from malta.margins.margin_map import MarginMap, Others, margin_map_of
 from malta.report.figures.drawing import BOUND, LEGEND, NOTE, draw_grid, new_figure
 from malta.report.plots.frequency import ALONE, Channel, phase_of, title_of
 from malta.report.plots.panels import (
@@ -314,18 +314,22 @@ def margin_map(
     x: str = "",
     y: str = "",
     uncertainty: Mapping[str, float] | None = None,
+    others: Others = "box",
     campaigns: Sequence[Campaign | Summary] = (),
     axes: Any = None,
 ) -> Figure:
-    """Draw the plane of two parameters: the proven box, the boundary of stability by eigenvalues, the witness.
+    """Draw the plane of two parameters: the proven box, the boundary of stability by eigenvalues, the lost machine.
 
     Every machine in the blue box is proven stable, anywhere in the travel. Grey: unstable, by eigenvalues on a grid,
-    which prove nothing. The box of 100 % is dashed. The cross is the witness, a machine at the limit of stability.
+    which prove nothing. The box of 100 % is dashed. The cross is a machine at the limit of stability. At each point
+    the other uncertain parameters are anywhere in the box, times the multiple at which the point lies.
 
     source : a plant, or a MarginMap
     controller : of the plant
     x, y : parameters of the axes; "": the first two of `uncertainty`
     uncertainty : relative half range of each parameter, as {"m": 0.2, "K_A": 0.2}
+    others : what the parameters are that are not drawn: "box", anywhere in the box as `malta.verify` proves, or
+        "nominal"
     campaigns : whose runs are dots, where they vary x or y; of a summary those that it keeps
     axes : one; None: a new figure
 
@@ -350,7 +354,7 @@ def margin_map(
         first = [name for name in box if name not in (x, y)]
         x = x or first.pop(0)
         y = y or next((name for name in first if name != x), "")
-        found = margin_map_of(source, controller, (x, y), box)
+        found = margin_map_of(source, controller, (x, y), box, others=others)
     if axes is None:
         figure = new_figure(
             *_titles(found), size=(7.2, 6.1), left=0.115, right=0.975, bottom=0.095, top=0.795
@@ -373,14 +377,14 @@ def margin_map(
 def _titles(found: MarginMap) -> tuple[str, str]:
     """The title, and the margin in words."""
     title = plain(f"{found.name}: margin map over {found.x} and {found.y}")
+    beside = plain(found.beside_text and f", {found.beside_text}")
     if found.margin is None:
-        return title, "nothing proven: the proof was left out"
+        return title, f"nothing proven: the proof was left out{beside}"
     if not found.proven:
-        return title, f"nothing proven: {found.margin.reason}"[:110]
-    others = [name for name in found.parameters if name not in (found.x, found.y)]
-    beside = f", with {' '.join(others)} anywhere in the box" if others else ""
-    lost = "" if found.margin.exhausted else f", lost at {ceil_to(100 * found.margin.upper, 1):g} %"
-    text = f"proven {floor_to(100 * found.proven, 1):g} % of the box{lost} {found.where}{beside}"
+        return title, f"nothing proven: {found.margin.reason}"[:110] + beside
+    by = "" if found.witness is not None else " by others"
+    lost = "" if found.margin.exhausted else f", lost at {found.margin.lost.percent()}{by}"
+    text = f"proven {found.margin.proven.percent()} of the box{lost} {found.where}{beside}"
     return title, plain(" ".join(text.split()))
 
 
@@ -396,10 +400,10 @@ def _draw_map(axes: Axes, found: MarginMap) -> list[Any]:
             axes.contour(X, Y, growth, levels=[0.0], colors=["#000000"], linewidths=1.4, zorder=3)
     handles: list[Any] = []
     for share, look, label in (
-        (found.proven, PROVEN, f"proven, {floor_to(100 * found.proven, 1):g} %"),
+        (found.proven, PROVEN, f"proven, {at_least(found.proven).percent()}"),
         (1.0, BOX, "box, 100 %"),
     ):
-        if share:
+        if share and math.isfinite(share):
             corner = [m - share * h for m, h in zip(found.nominal, found.half, strict=True)]
             axes.add_patch(Rectangle((corner[0], corner[1]), *(2 * share * h for h in found.half), **look))
             handles.append(Patch(label=label, **look))
@@ -407,10 +411,8 @@ def _draw_map(axes: Axes, found: MarginMap) -> list[Any]:
     handles.append(Patch(facecolor="#b0b0b0", label="unstable"))
     handles += axes.plot(*found.nominal, label="nominal", **NOMINAL)
     if found.witness is not None:
-        others = [name for name in found.parameters if name not in (found.x, found.y)]
-        label = f"witness ({' '.join(others)} moved too)" if others else "witness"
-        hollow = {"markerfacecolor": "none", "markeredgecolor": "#c1440e"} if others else {}
-        handles += axes.plot(*found.witness, label=label, **WITNESS | hollow)
+        moved = " (others moved too)" if found.beside and found.others == "box" else ""
+        handles += axes.plot(*found.witness, label=f"lost{moved}", **WITNESS)
     return handles
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from decimal import ROUND_CEILING, ROUND_FLOOR, Context
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 from rich.console import Group
@@ -13,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy import sparse
 
+from malta.bound import at_least, at_most
 from malta.display import RADIANS, frequency
 from malta.loops.time_domain import SHARE, Recovery, furthest
 from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, Outcome, zone
@@ -20,7 +20,7 @@ from malta.model.data import published_value
 from malta.model.linearize import LinearModel
 from malta.model.machines import FINE
 from malta.model.parameters import box_words
-from malta.proof.certificate.checked_file import Claim, double
+from malta.proof.certificate.checked_file import Claim, double, inside
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
 from malta.report.tables import COLOURS, Paragraph, add_row, new_table
 from malta.report.tables.experiments import experiment_table
@@ -302,29 +302,19 @@ def claim_text(claim: Claim) -> str:
 
 def claim_share(claim: Claim) -> str:
     """The multiple of the uncertainty that is claimed, in percent, cut."""
-    lower = double(claim.lower)
-    near = round(100_000 * lower)
-    return f"{(near if near / 100_000 <= lower else near - 1) / 1000:.3f} %"
+    return at_least(double(claim.lower)).percent()
 
 
 def claim_table(claim: Claim) -> Table:
     """The box of a certificate: each parameter with its nominal value and its interval at the claim, cut inwards."""
     table = new_table(f"The box at {claim_share(claim)}", "parameter", "nominal", "from", "to", "unit")
     for p in claim.parameters:
-        low, high = _cut(p.interval[0], ROUND_CEILING), _cut(p.interval[1], ROUND_FLOOR)
-        ends = [f"{x:.{DIGITS}g}" for x in (low, high)]
-        if not low <= double(p.nominal) <= high:  # narrower than the digits
-            ends = [repr(double(x)) for x in p.interval]
+        low, high = inside(*p.interval)
+        ends = [at_most(low).text(DIGITS), at_least(high).text(DIGITS)]
+        if not float(ends[0]) <= double(p.nominal) <= float(ends[1]):  # narrower than the digits
+            ends = [repr(low), repr(high)]
         add_row(table, p.name, f"{double(p.nominal):.{DIGITS}g}", *ends, p.unit or "")
     return table
-
-
-def _cut(x: Any, towards: str) -> float:
-    """An end with some digits: the nearest number, unless that is beyond the end."""
-    end = double(x)
-    near = float(f"{end:.{DIGITS}g}")
-    within = near >= end if towards == ROUND_CEILING else near <= end
-    return near if within else float(Context(prec=DIGITS, rounding=towards).create_decimal(end))
 
 
 # The table of constant loads from outside: how far they move a machine, and how fast it comes back.
@@ -395,16 +385,17 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
     >>> rich.print(malta.report.requirements_table([margin]))
     Requirements
     <BLANKLINE>
-     requirement      asked   found   of the limit                             from
-     ──────────────────────────────────────────────────────────────────────────────
-     margin        >= 300 %   360 %         83.3 %   holds   proven over the travel
+                                           of the
+     requirement      asked      found     limit                             from
+     ────────────────────────────────────────────────────────────────────────────
+     margin        >= 300 %   360.00 %   83.34 %   holds   proven over the travel
     <BLANKLINE>
     """
     table = new_table("Requirements", "requirement", "asked", "found", "of the limit", "", "from")
     for r in requirements:
         ratio, verdict = "", ""
         if r.asked is not None:
-            ratio, verdict = f"{100 * r.ratio:.1f} %", "FAILS" if r.verdict == "fails" else r.verdict
+            ratio, verdict = r.nearness, "FAILS" if r.verdict == "fails" else r.verdict
         cells = [Text(cell) for cell in (r.words, r.asked_text, r.found_text, ratio, verdict, r.how)]
         cells[4].style = COLOURS[r.verdict]
         table.add_row(*cells)
@@ -414,7 +405,7 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
 def _front_columns(tuned: Tuned) -> dict[str, tuple[str, float, str]]:
     """Columns of the front by figure: heading, factor from SI to the unit shown, unit."""
     names = dict.fromkeys(name for one in tuned.front for name in one.figures)
-    columns = {"margin": ("margin, proven", 100.0, "%")}
+    columns = {"margin": ("margin, proven", 1.0, "%")}
     sides: tuple[tuple[Trade, str], ...] = (("force", ""), ("motion", " motion"))
     for trade, what in sides:
         for name, label, scale, unit in front_lines(tuned.spec.plant, names, trade):
@@ -431,11 +422,16 @@ def front_rows(tuned: Tuned) -> tuple[list[str], list[list[str]]]:
     shown = [name for name in columns if any(name in one.figures for one in tuned.front)]
     heads = [f"{columns[k][0]} [{columns[k][2]}]".removesuffix(" []") for k in shown]
     rows = [
-        [f"{one.figures[k] * columns[k][1]:.4g}" if k in one.figures else "" for k in shown]
+        [_front_cell(k, one.figures[k] * columns[k][1]) if k in one.figures else "" for k in shown]
         + ["*" if one.values == tuned.trial.values else ""]
         for one in tuned.front
     ]
     return [*heads, ""], rows
+
+
+def _front_cell(name: str, value: float) -> str:
+    """A figure in the unit of its column: a proven margin is cut, others are rounded."""
+    return at_least(value).percent(unit="") if name == "margin" else f"{value:.4g}"
 
 
 def front_table(tuned: Tuned) -> Table:
@@ -458,8 +454,8 @@ def front_table(tuned: Tuned) -> Table:
     <BLANKLINE>
      margin, proven [%]   f [N rms]   y motion [µm rms]
      ──────────────────────────────────────────────────────
-     328                     0.0122               0.523
-     363                     0.0414               0.501   *
+     328.00                  0.0122               0.523
+     363.00                  0.0414               0.501   *
     <BLANKLINE>
     """
     heads, rows = front_rows(tuned)
@@ -487,8 +483,8 @@ def front_markdown(tuned: Tuned) -> str:
     >>> print(malta.report.front_markdown(tuned))
     | margin, proven [%] | f [N rms] | y motion [um rms] |  |
     | ---: | ---: | ---: | ---: |
-    | 328 | 0.0122 | 0.523 |  |
-    | 363 | 0.0414 | 0.501 | * |
+    | 328.00 | 0.0122 | 0.523 |  |
+    | 363.00 | 0.0414 | 0.501 | * |
     <BLANKLINE>
     """
     heads, rows = front_rows(tuned)

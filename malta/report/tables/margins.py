@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from malta.display import RADIANS, floor_to, frequency
+from malta.bound import at_least, at_most
+from malta.display import RADIANS, frequency
 from malta.margins.loop_report import LoopReport, zone
 from malta.model.machines import axis_units
 from malta.model.parameters import box_words
@@ -52,7 +53,7 @@ def loop_tables(
     >>> tables = list(malta.report.loop_tables(found, None, spec))
     >>> rich.print(tables[-1])
     Requirements of examples/ball/design/ball.toml: 4 of 4 hold; nearest their
-    limits peak sensitivity 98.4 %, margin 93.6 %, motion y 54.3 %.
+    limits peak sensitivity 98.38 %, margin 93.58 %, motion y 54.32 %.
     <BLANKLINE>
     """
     yield loop_poles_table(found)
@@ -92,7 +93,7 @@ def _requirements(found: LoopReport, spec: Spec) -> Iterator[Table | Paragraph]:
     if failed:
         yield requirements_table(failed)
     held = sorted((one for one in asked if one.holds), key=lambda one: -one.ratio)
-    near = ", ".join(f"{one.name.replace('_', ' ')} {100 * one.ratio:.1f} %" for one in held[:NEAREST])
+    near = ", ".join(f"{one.name.replace('_', ' ')} {one.nearness}" for one in held[:NEAREST])
     text = f"Requirements of {spec.path}: {len(held)} of {len(asked)} hold"
     if held:
         text += f"; nearest their limits {near}"
@@ -129,8 +130,8 @@ def chain_table(found: LoopReport) -> Table:
      LQR       499.94 %   not found                   1.00                   forces
      LQI       499.94 %   not found                   1.00                   forces
      LQG       390.33 %    390.34 %    1006      m-   1.60      A           sensors
-     LQGI      386.27 %    386.27 %    1010      m-   1.64      A           sensors
-     sampled   390.69 %    390.69 %    1047      m-   1.57      A   sensors, loaded
+     LQGI      386.27 %    386.28 %    1010      m-   1.64      A           sensors
+     sampled   390.69 %    390.70 %    1047      m-   1.57      A   sensors, loaded
     <BLANKLINE>
     """
     proven = any(link.margin is not NOT_PROVEN for link in found.chain)
@@ -203,11 +204,8 @@ def _margin_cells(margin: Margin) -> tuple[str, str, str]:
     """Proven share, share at which the loop is lost, frequency in rad/s."""
     if margin is NOT_PROVEN:
         return "not asked", "", ""
-    low = "nothing" if margin.lower is None else f"{floor_to(100 * margin.lower, 2):.2f} %"
-    if margin.time_up:
-        low += " so far"
-    high = "not found" if margin.exhausted else f"{100 * margin.upper:.2f} %"
-    return low, high, "" if margin.frequency is None else f"{margin.frequency:.4g}"
+    low = f"{margin.proven.percent()} so far" if margin.time_up else margin.proven.percent()
+    return low, margin.lost.percent(), "" if margin.frequency is None else f"{margin.frequency:.4g}"
 
 
 def _limiting_parameters(margin: Margin) -> str:
@@ -339,11 +337,11 @@ def tolerance_table(found: LoopReport) -> Table:
     >>> rich.print(malta.report.tolerance_table(found))
     One at a time, proven
     <BLANKLINE>
-     parameter                  down to       up to   share in the margin
-     ────────────────────────────────────────────────────────────────────
-     m                          -78.1 %   +1663.9 %                 100 %
-     mass margin, linear loop               1.66 kg
-     payload held at rest                   0.63 kg
+     parameter                   down to        up to   share in the margin
+     ──────────────────────────────────────────────────────────────────────
+     m                          -78.13 %   +1663.93 %                 100 %
+     mass margin, linear loop                1.663 kg
+     payload held at rest                   0.6339 kg
     <BLANKLINE>
     """
     anywhere = ["anywhere in the travel"] if found.extent.stroke else []
@@ -356,32 +354,22 @@ def tolerance_table(found: LoopReport) -> Table:
     shares = found.chain[-1].margin.sensitivity
     for name, (down, up) in found.tolerance.items():
         cells = []
-        for margin, sign in ((down, -1), (up, 1)):
-            t = margin.lower
-            change = "nothing proven" if t is None else f"{100 * sign * t * found.uncertainty[name]:+.1f} %"
-            cells.append(f"{change} and further" if t is not None and margin.exhausted else change)
+        for margin, sign in ((down, "-"), (up, "+")):
+            proven = margin.lower is not None
+            change = f"{sign}{margin.proven.percent(found.uncertainty[name])}" if proven else "nothing proven"
+            cells.append(f"{change} and further" if proven and margin.exhausted else change)
         add_row(table, name, *cells, f"{100 * shares.get(name, 0):.0f} %")
     if found.mass is not None:
-        t = found.mass.lower
         more = " and more" if found.mass.exhausted else ""
-        shown = "nothing proven" if t is None else f"{t:.3g} kg{more}"
+        shown = "nothing proven" if found.mass.lower is None else f"{found.mass.proven.text()} kg{more}"
         add_row(table, "mass margin, linear loop", "", shown, "")
     payload = found.payload
     if payload is not None:
-        held = "any" if math.isinf(payload.held) else f"{payload.held:.2g} kg"
-        add_row(table, "payload held at rest", "", held, "")
+        held = at_least(payload.held).text()
+        add_row(table, "payload held at rest", "", held if held == "any" else f"{held} kg", "")
         if not math.isnan(payload.carried):
-            both = payload.carried, payload.dropped
-            carried, dropped = next(
-                a for d in range(2, 18) if len(set(a := [f"{kg:.{d}g}" for kg in both])) == 2
-            )
-            add_row(
-                table,
-                "payload in flight",
-                "",
-                f"{carried} kg{'' if dropped == 'inf' else f', not {dropped}'}",
-                "",
-            )
+            dropped = "" if math.isinf(payload.dropped) else f", not {at_most(payload.dropped).text()}"
+            add_row(table, "payload in flight", "", f"{at_least(payload.carried).text()} kg{dropped}", "")
     return table
 
 
@@ -410,9 +398,9 @@ def worst_case_table(gains: Mapping[str, Gain]) -> Table:
     table = new_table(title, "sensor", "found", f"at {RADIANS}", "proven below", "zone")
     for name, gain in gains.items():
         found, at = (
-            ("unstable", "") if math.isinf(gain.lower) else (f"{gain.lower:.3f}", frequency(gain.frequency))
+            ("unstable", "") if math.isinf(gain.lower) else (gain.reached.text(), frequency(gain.frequency))
         )
-        proven = "nothing proven" if gain.upper is None else f"{gain.upper:.3f}"
+        proven = "nothing proven" if gain.upper is None else gain.proven.text()
         reached = zone(gain.lower if gain.upper is None else gain.upper)
         worse = " or worse" if gain.upper is None and reached != zone(math.inf) else ""
         add_row(table, name, found, at, proven, reached + worse)
@@ -438,7 +426,7 @@ def places_table(found: LoopReport) -> Table:
                                             peak        disk,
      at            proven   lost at  rad/s   |S|  zone    all         delay
      ──────────────────────────────────────────────────────────────────────
-     its values  390.69 %  390.69 %   1047  1.57     A  0.400      2719 µs,
+     its values  390.69 %  390.70 %   1047  1.57     A  0.400      2719 µs,
                                                                13.6 samples
     <BLANKLINE>
     """

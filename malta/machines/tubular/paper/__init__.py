@@ -96,7 +96,7 @@ POLES_AND_LQR: tuple[Row, ...] = (
     ),
     Row(
         "LQR: share of the 20 % box",
-        "{:.0f} percent",
+        "proven percent",
         full_state_share,
         "position_controller.margin",
         note="proven for all of m, K_A, K_D, K_B at once; full state feedback; K1/k = 4 is 300 %",
@@ -106,7 +106,7 @@ POLES_AND_LQR: tuple[Row, ...] = (
     ),
     Row(
         "the same, sampled, with observer, delay and current loops",
-        "{:.0f} percent",
+        "proven percent",
         machine_share,
         note="proven anywhere in the travel, without loads; the paper's is of full state feedback",
     ),
