@@ -61,7 +61,8 @@ def duty_cycles(
     real_pwm : with the resolution of the modulator's counter, and with the loss of voltage by dead time, dead_share V
         against the direction of the current
     """
-    wanted, share = 0.5 + u_phase / V, (largest_voltage(V) if most is None else most) / V
+    # A compiler may contract 1/2 - most / V to an ulp below 0; it does not look through a minimum.
+    wanted, share = 0.5 + u_phase / V, ca.fmin((largest_voltage(V) if most is None else most) / V, 0.5)
     d = ca.fmax(ca.fmin(wanted, 0.5 + share), 0.5 - share)
     limited = d != wanted
     if real_pwm:
