@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import casadi as ca
 import numpy as np
 import pytest
+from conditions import EPS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,8 +26,7 @@ from malta.simulation.references import Motion
 from malta.simulation.scenario import Correction, Fault, Scenario, Simulation, setup_of, steps_of
 
 if TYPE_CHECKING:
-    from conditions import EPS
-from conftest import Design
+    from conftest import Design
 
     from malta.model.plant import FloatArray, Plant
     from malta.synthesis.controller import Controller

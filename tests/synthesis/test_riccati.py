@@ -106,7 +106,7 @@ def test_scipy_and_slycot_agree_where_both_are_right(model: LinearModel, designs
 def test_slycot_in_the_environment_changes_nothing(
     model: LinearModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """control prefers slycot when it is installed, whose filter may be off by a thousandth at 1e-13 m2: none is asked."""
+    """control prefers slycot when it is installed, whose filter may be off by a thousandth at 1e-13 m2."""
     slycot = pytest.importorskip("slycot", reason="slycot is not installed")
     for solver in ("sb02md", "sb02mt", "sb02od", "sg02ad", "sb03md57"):
         monkeypatch.delattr(slycot, solver)
