@@ -3,10 +3,10 @@
     PYTHONPATH=tests python -m processors                       # all that this processor can do
     PYTHONPATH=tests python -m processors Prescott:fast Sandybridge:linear
 
-Each run is KERNEL:TESTS. A kernel is one of OpenBLAS, with the features of numpy that such processors have, or `own`, what
-OpenBLAS chooses itself. Tests are `fast`, those of `make test`, or `linear`, the longer ones of linear algebra. What runs
-is asked of the libraries, not of the variables: OpenBLAS takes another kernel where it has to, and says nothing. The
-wheels of numpy and scipy have no kernels for Zen, which takes Haswell's.
+Each run is KERNEL:TESTS. A kernel is one of OpenBLAS, with the features of numpy that such processors have, or `own`,
+what OpenBLAS chooses itself. Tests are `fast`, those of `make test`, or `linear`, the longer ones of linear algebra.
+What runs is asked of the libraries, not of the variables: OpenBLAS takes another kernel where it has to, and says
+nothing. The wheels of numpy and scipy have no kernels for Zen, which takes Haswell's.
 """
 
 from __future__ import annotations
