@@ -4,9 +4,9 @@
     PYTHONPATH=tests python -m processors Prescott:fast Sandybridge:linear
 
 Each run is KERNEL:TESTS. A kernel is one of OpenBLAS, with the features of numpy that such processors have, or `own`,
-what OpenBLAS chooses itself. Tests are `fast`, those of `make test`, or `linear`, the longer ones of linear algebra.
-What runs is asked of the libraries, not of the variables: OpenBLAS takes another kernel where it has to, and says
-nothing. The wheels of numpy and scipy have no kernels for Zen, which takes Haswell's.
+what OpenBLAS chooses itself, or `rounded`, which no processor has (rounded.py). Tests are `fast`, those of `make test`,
+or `linear`, the longer ones of linear algebra. What runs is asked of the libraries, not of the variables: OpenBLAS
+takes another kernel where it has to, and says nothing. Wheels of numpy and scipy have none for Zen: Haswell's run there.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FOLDERS = ("tests/synthesis", "tests/proof", "tests/loops", "tests/margins")
 TESTS = {"fast": ("-m", "not slow"), "linear": ("-m", "slow", *FOLDERS)}
 ALL = (
     *("own:fast", "Prescott:fast", "Sandybridge:fast", "Haswell:fast", "Zen:fast", "SkylakeX:fast"),
-    *("own:linear", "Prescott:linear", "Sandybridge:linear", "SkylakeX:linear"),
+    *("rounded:fast", "own:linear", "Prescott:linear", "Sandybridge:linear", "SkylakeX:linear"),
 )
 
 
@@ -69,7 +69,7 @@ def probed(environment: Mapping[str, str]) -> Any:
 def environment_of(kernel: str, own: Mapping[str, Any]) -> dict[str, str]:
     """The variables under which a kernel is taken, beside the features of numpy that its processors have."""
     found = {name: value for name, value in os.environ.items() if name not in VARIABLES}
-    if kernel != "own":
+    if kernel in KERNELS:
         newer = [name for name in own["dispatched"] if name not in own["baseline"]]
         found["OPENBLAS_CORETYPE"] = kernel
         found["NPY_DISABLE_CPU_FEATURES"] = " ".join(
@@ -80,7 +80,7 @@ def environment_of(kernel: str, own: Mapping[str, Any]) -> dict[str, str]:
 
 def why_not(kernel: str, own: Mapping[str, Any]) -> str:
     """Why this processor cannot run a kernel; "" where it can."""
-    if kernel == "own" or KERNELS[kernel].needs in own["features"]:
+    if kernel not in KERNELS or KERNELS[kernel].needs in own["features"]:
         return ""
     return f"this processor has no {KERNELS[kernel].needs}"
 
@@ -92,19 +92,20 @@ def run_tests(asked: str, own: Mapping[str, Any]) -> tuple[str, bool]:
         return f"{asked}: skipped, {reason}", True
     environment = environment_of(kernel, own)
     has = probed(environment)
-    if has is None or (kernel != "own" and not set(has["kernels"]) <= {kernel, KERNELS[kernel].called}):
+    if has is None or (kernel in KERNELS and not set(has["kernels"]) <= {kernel, KERNELS[kernel].called}):
         ran = "nothing" if has is None else " ".join(has["kernels"])
         return f"{asked}: skipped, where {kernel} is asked for {ran} runs", True
     said = f"{asked}: kernels {' '.join(has['kernels'])}, numpy with {' '.join(has['dispatched'])}"
     print(said, flush=True)
     command = (sys.executable, "-m", "pytest", "-q", "-n", "auto", "--dist", "loadfile", *TESTS[tests])
+    command += ("-p", "rounded") if kernel == "rounded" else ()
     passed = subprocess.run(command, cwd=ROOT, env=environment).returncode == 0
     return f"{said}: {'passed' if passed else 'FAILED'}", passed
 
 
 def main(asked: Sequence[str]) -> int:
     """Run what is asked for, or all, and say what ran."""
-    known = {f"{kernel}:{tests}" for kernel in ("own", *KERNELS) for tests in TESTS}
+    known = {f"{kernel}:{tests}" for kernel in ("own", "rounded", *KERNELS) for tests in TESTS}
     if unknown := set(asked) - known:
         print(
             f"processors: found {min(unknown)}, expected some of {' '.join(sorted(known))}", file=sys.stderr
