@@ -6,7 +6,7 @@
 Each run is KERNEL:TESTS. A kernel is one of OpenBLAS, with the features of numpy that such processors have, or `own`,
 what OpenBLAS chooses itself, or `rounded`, which no processor has (rounded.py). Tests are `fast`, those of `make test`,
 or `linear`, the longer ones of linear algebra. What runs is asked of the libraries, not of the variables: OpenBLAS
-takes another kernel where it has to, and says nothing. Wheels of numpy and scipy have none for Zen: Haswell's run there.
+takes another kernel where it has to, and says nothing. Wheels of numpy and scipy have none for Zen: Haswell's run.
 """
 
 from __future__ import annotations
