@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("tests/synthesis", "tests/proof", "tests/loops", "tests/margins")
-TESTS = {"fast": ("-m", "not slow"), "linear": ("-m", "slow", *FOLDERS)}
+# Proofs that ask numpy and scipy: responses, multipliers, bounds of couplings. Others are of exact and ball arithmetic.
+PROOFS = ("blocks", "checked_multipliers", "gain", "held", "robust", "weak")
+LINEAR = ("synthesis", "loops", "margins", *(f"proof/test_{name}.py" for name in PROOFS))
+TESTS = {"fast": ("-m", "not slow"), "linear": ("-m", "slow", *(f"tests/{name}" for name in LINEAR))}
 ALL = (
     *("own:fast", "Prescott:fast", "Sandybridge:fast", "Haswell:fast", "Zen:fast", "SkylakeX:fast"),
     *("rounded:fast", "own:linear", "Prescott:linear", "Sandybridge:linear", "SkylakeX:linear"),
