@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 gc.set_threshold(200_000, 50, 50)
 
 # A loaded computer fails no test; `make test` tries fewer cases than all tests together, and always the same ones.
-hypothesis.settings.register_profile("untimed", deadline=None, max_examples=500)
+hypothesis.settings.register_profile("untimed", deadline=None, max_examples=200)
 hypothesis.settings.register_profile("fast", deadline=None, max_examples=30, derandomize=True)
 
 os.environ.pop("COLUMNS", None)  # which workers of pytest may have: tables have the width of a file
