@@ -377,7 +377,6 @@ def lqg(
         found = gains(model, weights, Ts, discretization, delay, lag)
     except CheckError as error:
         reason = obstacle(model, weights, Ts)
-        # Which check refuses what cannot be, rounding decides: the reason stands alone.
         said = f"{str(error).partition(': ')[0]}: no sound solution: {reason}" if reason else str(error)
         raise CheckError(said) from error
     if not all(np.isfinite(M).all() for M in found):
