@@ -1,11 +1,12 @@
 # make design   set up ./.venv and run the main job: every design, verified, exported, simulated, reported
 # make test     set up ./.venv and run the tests that take seconds
 # make slow     the tests that take longer
+# make processors   the tests with other kernels of OpenBLAS, and features of numpy, than this processor's own
 # make fuzz     damaged input of every kind, for FUZZ_SECONDS (600): see tests/fuzz
 # make mutants  faults in the code that refuses, proves, seals and limits: tests have to notice each; see tests/mutants
 # make docs     the pages of docs/ to docs/_build: warnings are errors; `make links` asks the addresses they point to
 # make architecture, make coverage   who imports whom; which lines the tests run
-# make check    what CI runs: lint, format, types, pages, both kinds of tests
+# make check    what CI runs: lint, format, types, pages, both kinds of tests, some of them as on other processors
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -17,19 +18,22 @@ export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export OPENBLAS_NUM_THREADS ?= 1
 export MPLCONFIGDIR ?= $(CURDIR)/$(VENV)/matplotlib
 
-.PHONY: design test slow times fuzz mutants check lint types notebooks docs links bench figures architecture coverage clean
+.PHONY: design test slow processors times fuzz mutants check lint types notebooks docs links bench figures architecture coverage clean
 
 design: $(VENV)/runtime
 	$(BIN)/malta design
 
 # One thread of linear algebra for each worker, as the command line has it: more get into each other's way.
-test slow: export OPENBLAS_NUM_THREADS = 1
+test slow processors: export OPENBLAS_NUM_THREADS = 1
 
 test: $(VENV)/dev
 	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow"
 
 slow: $(VENV)/dev
 	$(BIN)/python -m pytest -n auto --dist loadfile -m slow
+
+processors: $(VENV)/dev  # RUNS="Prescott:fast Sandybridge:linear" for some of them
+	PYTHONPATH=tests $(BIN)/python -m processors $(RUNS)
 
 times: $(VENV)/dev  # measures the fast tests, and lists those that take long as slow
 	PYTHONPATH=tests $(BIN)/python -m seconds
@@ -40,7 +44,10 @@ fuzz: $(VENV)/dev
 mutants: $(VENV)/dev
 	PYTHONPATH=tests $(BIN)/python -m mutants
 
-check: lint types docs test slow
+# With the kernels that OpenBLAS chooses itself, then with others: an old processor's, and where there is AVX-512 its own.
+check:
+	env -u OPENBLAS_CORETYPE -u NPY_DISABLE_CPU_FEATURES $(MAKE) lint types docs test slow
+	$(MAKE) processors RUNS="Prescott:fast Sandybridge:linear SkylakeX:linear"
 
 lint: $(VENV)/dev
 	$(BIN)/ruff check .

@@ -9,6 +9,7 @@ import math
 import os
 import pickle
 import re
+import secrets
 import shutil
 import sys
 from collections import Counter
@@ -43,19 +44,29 @@ if TYPE_CHECKING:
 # As in the program: numeric libraries make many lasting objects, and going through them again and again costs time.
 gc.set_threshold(200_000, 50, 50)
 
-# A loaded computer fails no test; `make test` tries fewer cases than all tests together.
-hypothesis.settings.register_profile("untimed", deadline=None, max_examples=500)
-hypothesis.settings.register_profile("fast", deadline=None, max_examples=30)
+# A loaded computer fails no test; `make test` tries fewer cases than all tests together, and always the same ones.
+hypothesis.settings.register_profile("untimed", deadline=None, max_examples=200)
+hypothesis.settings.register_profile("fast", deadline=None, max_examples=30, derandomize=True)
 
 os.environ.pop("COLUMNS", None)  # which workers of pytest may have: tables have the width of a file
 ROOT = Path(__file__).parents[1]
 DESIGNS = ("table2", "calibrated")
 
 
+@pytest.hookimpl(tryfirst=True)  # before hypothesis reads the seed, which workers have from here
 def pytest_configure(config: pytest.Config) -> None:
-    hypothesis.settings.load_profile("fast" if "not slow" in config.option.markexpr else "untimed")
+    fast = "not slow" in config.option.markexpr
+    hypothesis.settings.load_profile("fast" if fast else "untimed")
+    if not fast and config.option.hypothesis_seed is None:
+        config.option.hypothesis_seed = secrets.randbits(32)
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False  # pytest-xdist keeps the order below
+
+
+def pytest_report_header(config: pytest.Config) -> str | None:
+    """Cases of the longer tests are drawn anew each time: what repeats them."""
+    seed = config.option.hypothesis_seed
+    return None if seed is None else f"cases drawn with --hypothesis-seed={seed}"
 
 
 # Modules whose tests take longest: parallel workers, which take whole modules, begin with them, so that none of them is

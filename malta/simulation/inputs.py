@@ -9,11 +9,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy import linalg
 from scipy.special import erf
 
 from malta.errors import InputError
@@ -288,9 +288,9 @@ def past_forces(c: Controller, motion: references.Motion, v_ff: FloatArray) -> F
         n, m = len(c.A), len(c.forces)
         newest = n + m * (c.lagging + c.delay - 1)
         states = evaluate(state_reference(plant_of(c.parameters)).map(len(v_ff)), motion.p, motion.dp)[0]
-        stored = v_ff + states @ c.Ad[newest : newest + m, :n].T
+        stored = v_ff + _in_order(c.Ad[newest : newest + m, :n], states)
         if c.commutation is not None:
-            stored += motion.dp @ (c.commutation.lead * c.commutation.pull).T
+            stored += _in_order(c.commutation.lead * c.commutation.pull, motion.dp)
     past = [np.vstack([np.repeat(stored[:1], age, axis=0), stored[:-age]]) for age in range(c.delay, 0, -1)]
     if c.lagging:
         past.insert(0, lagging_references(c, v_ff))
@@ -304,9 +304,9 @@ def lagging_references(c: Controller, v_ff: FloatArray) -> FloatArray:
     decay = _decay(c)
     acting = np.vstack([np.repeat(v_ff[:1], c.delay, axis=0), v_ff])[: len(v_ff) - 1]
     given = np.vstack([v_ff[:1], (1 - decay) * acting])
-    # lagging_k - decay lagging_(k-1) = given_k
-    rows = np.array([np.ones(len(given)), np.full(len(given), -decay)])
-    return np.asarray(linalg.solve_banded((1, 0), rows, given))
+    # One by one, as in the exported C: a solver of LAPACK rounds as the kernels of BLAS do.
+    columns = (accumulate(column, lambda last, now: now + decay * last) for column in given.T.tolist())
+    return np.array([list(column) for column in columns]).T
 
 
 def _decay(c: Controller) -> float:
@@ -329,15 +329,20 @@ def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardCho
     K1 = 2 k, until the integrals correct it.
     """
     believed = plant_of(c.parameters)
-    v_ff = motion.ddp @ c.feedforward.inertias.T + motion.dp @ c.feedforward.speed.T
+    v_ff = _in_order(c.feedforward.inertias, motion.ddp) + _in_order(c.feedforward.speed, motion.dp)
     hold = c.feedforward.position
     if choice == "attraction":
         believed.require_second_order("feedforward attraction")
         hold = holding_gain(c.A, c.B)
     if hold.size and choice != "axial":
         states = evaluate(state_reference(believed).map(len(motion.p)), motion.p, motion.dp)[0]
-        v_ff += states[:, : hold.shape[1]] @ hold.T
+        v_ff += _in_order(hold, states)
     return v_ff
+
+
+def _in_order(M: FloatArray, rows: FloatArray) -> FloatArray:
+    """M x of each row x, whose terms are added one by one, as in the exported C: kernels of BLAS round otherwise."""
+    return np.asarray(sum((rows[:, [k]] * M[:, k] for k in range(M.shape[1])), np.zeros((len(rows), len(M)))))
 
 
 def _forces(

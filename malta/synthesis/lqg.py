@@ -377,7 +377,8 @@ def lqg(
         found = gains(model, weights, Ts, discretization, delay, lag)
     except CheckError as error:
         reason = obstacle(model, weights, Ts)
-        raise CheckError(f"{str(error).partition(' (')[0]}: {reason}" if reason else str(error)) from error
+        said = f"{str(error).partition(': ')[0]}: no sound solution: {reason}" if reason else str(error)
+        raise CheckError(said) from error
     if not all(np.isfinite(M).all() for M in found):
         raise CheckError("lqg: the gains overflow")
     plant = model.plant

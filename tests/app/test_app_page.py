@@ -46,7 +46,7 @@ def page(browser: Any, tmp_path: Path) -> Iterator[Any]:
             session.close()
 
 
-def wait(is_so: Callable[[], Any], seconds: float = 60.0) -> Any:
+def wait(is_so: Callable[[], Any], seconds: float = 600.0) -> Any:
     """Wait until a condition holds, and return what it gave."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
@@ -271,7 +271,7 @@ def test_the_page_fits_its_window(page: Any, width: int, height: int) -> None:
     size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
     page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     try:
-        time.sleep(0.3)
+        wait(lambda: page.execute_script("return window.innerWidth") == width)
         wide, high = page.execute_script(
             "const r = document.documentElement; return [r.scrollWidth, r.scrollHeight]"
         )

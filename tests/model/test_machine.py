@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import casadi as ca
 import numpy as np
 import pytest
+from conditions import EPS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -227,7 +228,8 @@ def test_half_the_link_is_all_there_is_and_the_drive_lives_with_it(
     else:
         largest = np.abs(run.duty - 0.5).max(axis=1) * run.link[:, 0]
         assert largest.max() <= 6.0
-        assert (run.duty.min(), run.duty.max()) == (0.0, 1.0)
+        assert 0 <= run.duty.min() < 4 * EPS
+        assert 1 - 4 * EPS < run.duty.max() <= 1
     assert largest.max() > 5
     assert run.verdict.completed
     assert np.abs(run.p - run.reference)[:, 4].max() > 1e-3

@@ -70,6 +70,13 @@ def test_outputs_are_written_anew_where_they_differ() -> None:
     assert renew(shell) == shell.replace("old", "a b").replace("cat\n", "cat\n1\n")
 
 
+def test_numbers_that_are_drawn_are_only_numbers() -> None:
+    page = "<!-- drawn -->\n```console\n$ echo found -0.5 to 17 mm\nfound 0.03 to 2 mm\n```\n"
+    assert renew(page) == page
+    assert "-0.5" in renew(page.replace("<!-- drawn -->\n", ""))
+    assert "-0.5" in renew(page.replace("found 0.03", "seen 0.03"))
+
+
 def test_tables_are_shown_by_their_titles() -> None:
     page = "<!-- only: Two -->\n```console\n$ cd /; X=1; export X; printf 'One\\n\\na\\n\\nTwo\\n\\nb\\n\\nend'\n```\n"
     shown = renew(page + "\n```console\n$ pwd; echo $X\n```\n")

@@ -101,10 +101,10 @@ def assert_serves(program: Path, folder: Path, *command: str) -> None:
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(whole, cwd=folder, env=own_environment(), **pipes) as server:
         assert server.stdout is not None
-        with urlopen(server.stdout.readline().strip(), timeout=60) as page:
+        with urlopen(server.stdout.readline().strip(), timeout=600) as page:
             assert page.status == 200
         server.send_signal(signal.SIGINT)
-        assert server.wait(timeout=60) == 0
+        assert server.wait(timeout=600) == 0
 
 
 def test_the_readmes_lines_and_all_commands(program: Path, tmp_path: Path) -> None:

@@ -883,19 +883,17 @@ def test_a_compiler_that_hangs_is_stopped_with_all_that_it_started(
 ) -> None:
     started = tmp_path / "started"
     cc = tmp_path / "cc"
-    cc.write_text(f'#!/bin/sh\ncase "$*" in *{hangs_at}*) sleep 60 & echo $! > {started}; wait;; esac\n')
+    cc.write_text(f'#!/bin/sh\ncase "$*" in *{hangs_at}*) sleep 3600 & echo $! > {started}; wait;; esac\n')
     cc.chmod(0o700)
     monkeypatch.setenv("CC", str(cc))
     monkeypatch.setattr(compiled, "PATIENCE", 0.3)
-    begun = time.monotonic()
     assert compiled.library("", 1) is None
-    assert time.monotonic() - begun < 10
     assert [r.getMessage() for r in caplog.records] == [
         f"malta: found {cc} without an answer for 0.3 s, expected a C compiler"
     ]
     assert not list(fresh.rglob("*.so"))
     child = Path(f"/proc/{started.read_text().strip()}/stat")
-    for _ in range(100):
+    for _ in range(3000):  # a minute
         if not child.exists() or child.read_text().split()[2] == "Z":
             break
         time.sleep(0.02)
@@ -942,7 +940,7 @@ def test_two_processes_may_compile_at_once(small: tuple[Period, str], fresh: Pat
         subprocess.Popen([sys.executable, "-c", compiling, str(tmp_path / "text.c")], env=environment)
         for _ in range(2)
     ]
-    assert [process.wait(timeout=60) for process in both] == [0, 0]
+    assert [process.wait(timeout=600) for process in both] == [0, 0]
     assert (tmp_path / "calls").read_text().splitlines() in ([""], ["", ""])
     assert [path.suffix for path in fresh.iterdir()] == [".so"]
 

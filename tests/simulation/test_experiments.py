@@ -686,13 +686,16 @@ def test_a_push_along_the_stroke_begins_as_a_free_mass(design: Design, flown: Fl
 
 
 def test_steps_end_as_found(flown: Flown) -> None:
-    """0.05 N m is 20 % of what the bearings' 5 A can do at l_B; table2 touches down with it."""
+    """0.05 N m is 20 % of what the bearings' 5 A can do at l_B; table2 touches down with it.
+
+    At either sensor plane: the mover tilts about its middle, and both are equally far.
+    """
     ends = {
-        name: [case.run.verdict.name for case in flown(name, "disturbance").cases]
+        name: [case.run.verdict.name.rstrip(" 12") for case in flown(name, "disturbance").cases]
         for name in ("table2", "calibrated")
     }
     assert ends == {
-        "table2": ["completed", "axial end stop", "touchdown at sensor plane 1", "completed"],
+        "table2": ["completed", "axial end stop", "touchdown at sensor plane", "completed"],
         "calibrated": ["completed"] * 4,
     }
     assert not flown("table2", "disturbance").failed

@@ -101,15 +101,6 @@ def to_phases(theta: Any) -> Any:
     return T
 
 
-def magnitude_and_angle(f_x: float, f_y: float, K_B: float, phi_before: float = 0.0) -> tuple[float, float]:
-    """i_bd (A) and phi (rad) of the printed form (18). At zero force, where the angle is undefined, it is `phi_before`.
-
-    A force that passes through zero turns phi by pi within one sample, faster than any current can follow.
-    """
-    force = math.hypot(f_x, f_y)
-    return force / K_B, math.atan2(f_y, f_x) if force else phi_before
-
-
 def hall_position(z: Any, x: Any, y: Any, pole: Any, errors: Any) -> Any:
     """Axial position as atan2 of the two planes' averaged Hall signals gives it, m.
 
