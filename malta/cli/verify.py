@@ -57,7 +57,7 @@ def verify(
     ] = "pi",
     time: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", help="Longest search of a margin over the travel. [120]"),
+        typer.Option(metavar="SECONDS", help="The clock ends the search of a margin after it; time that is left is used. [none]"),
     ] = None,
     no_proof: Annotated[
         bool, typer.Option("--no-proof", help="A first look: no proof of the margins over the travel.")

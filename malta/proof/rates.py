@@ -46,7 +46,7 @@ NEAR = 1e-3  # relative size of what rounding may leave of units
 LEAST = 2.0**-12  # part of the interval that one piece has at least
 SHARES = (0.8, 0.5, 0.2)  # of the slowest decay, which V has at the nodes
 WORK = 60.0  # units of work, of a search
-PIECE = 1e-5  # work of a piece, times the cube of its states
+PIECE = 7e-7  # work of a piece, times the cube of its states
 
 
 @display

@@ -139,7 +139,7 @@ class MarginPart(Part):
     cells: int = Field(description="of the proof")
     reason: str = Field(description="why nothing, or less than found, is proven")
     searched: str = Field(description="how far no unstable loop was found, where upper is null")
-    time_up: bool = Field(description="the search ended as its time was up: more time may prove more")
+    time_up: bool = Field(description="the search ended with its work or its time: more may prove more")
 
 
 OF_MARGIN = {key: f"margin.{UNIT.sub('', key)}" for key in MarginPart.model_fields}
