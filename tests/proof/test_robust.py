@@ -11,6 +11,7 @@ import casadi as ca
 import control
 import numpy as np
 import pytest
+from conditions import EPS
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
@@ -371,14 +372,14 @@ def test_no_machine_of_a_proven_box_is_unstable(seed: int) -> None:
     s, c = handmade(seed)
     assume(instability(s, c, s.nominal)[0] < -1e-3)
     ranges = {name: (-1.0, 0.5 + 0.4 * i) for i, name in enumerate(s.names)}
-    m = robust_margin(s, c, ranges, budget=Budget(2.0, cells=4000))
+    m = robust_margin(s, c, ranges, budget=Budget(cells=4000))
     if m.lower is None:
         assert m.reason
         return
     assert m.lower <= m.upper
     assert (instability(s, c, samples(s, m, ranges, {}, 400, seed)) < 0).all()
     if not m.exhausted:
-        assert at_witness(s, c, m) > 0
+        assert at_witness(s, c, m) >= -50 * EPS  # on the boundary a pole is zero, to rounding
         assert m.witness is not None
         p = np.array(list(m.witness.values()))
         low, high = np.array([ranges[name] for name in s.names]).T
