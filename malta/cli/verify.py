@@ -57,7 +57,7 @@ def verify(
     ] = "pi",
     time: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", help="The clock ends the search of a margin after it; time that is left is used. [none]"),
+        typer.Option(metavar="SECONDS", help="Longest search of a margin, ended by the clock. [none]"),
     ] = None,
     no_proof: Annotated[
         bool, typer.Option("--no-proof", help="A first look: no proof of the margins over the travel.")
