@@ -447,7 +447,16 @@ def _middles(ranges: Mapping[str, Any], nominal: Any) -> dict[str, float]:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C while a margin is searched. `margin` is what is known by then: a Margin with its reason."""
+    """Ctrl-C while a margin is searched.
+
+    margin : what is known by then, a Margin with its reason
+
+    >>> import malta
+    >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
+    >>> known = malta.robust_margin(motor, [[0.5]], {"k": 0.1})  # lost at k = 2
+    >>> f"{malta.proof.Interrupted(known).margin.lower:.2f}"
+    '10.00'
+    """
 
     def __init__(self, margin: Margin) -> None:
         super().__init__(f"interrupted: {margin}")

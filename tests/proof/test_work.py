@@ -152,6 +152,8 @@ def bits(found: Any) -> tuple[Any, ...]:
 
 def asked(which: str) -> malta.proof.Margin:
     """A fresh loop each time: by cells of frequency, by multipliers, of functions, and one that is left open."""
+    if which == "cubic":
+        return malta.proof.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": 0.5}, {"k": 1})
     if which == "polynomial":
         return malta.proof.margin_of_polynomial(
             named(coefficients, 3), dict.fromkeys(["q0", "q1", "q2"], (-0.1, 0.1))
@@ -161,7 +163,7 @@ def asked(which: str) -> malta.proof.Margin:
     return malta.robust_margin(system, law, box, budget=Budget(0.5, patient=False))
 
 
-@pytest.mark.parametrize("which", ["polynomial", "chain", "functions", "sampled"])
+@pytest.mark.parametrize("which", ["cubic", "polynomial", "chain", "functions", "sampled"])
 def test_a_clock_fifty_times_as_fast_changes_nothing(which: str, hasty: Callable[[float], None]) -> None:
     one = asked(which)
     hasty(50.0)
