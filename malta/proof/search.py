@@ -248,7 +248,8 @@ def _families(q: Question, known: Findings, until: float) -> tuple[Findings, lis
         known = known.because(
             why or f"nothing beyond {at_least(done).text()} was looked at: the model is dear to enclose"
         )
-        refuse()
+        if why in ("", NO_COEFFICIENTS):
+            refuse()
     room = NEAR if q.problem.traits.is_bounded else 1.05  # couplings grow with the box
     if known.upper < done / (3 if room > NEAR else room) and not is_past(until):
         with suppress(Unproven):  # narrower families over a smaller box; the larger ones remain valid
