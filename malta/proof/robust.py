@@ -166,8 +166,8 @@ def _range(parts: list[Any], n: int) -> list[list[Any]]:
     values = np.array([[float(arb(c / top)) for c in x] for x in columns])
     _, s, V = np.linalg.svd(values)
     rank = int((s > ROUNDING * s[0]).sum())
-    reduced, exactrank_of = fmpq_mat(columns).rref()
-    if rank == int(exactrank_of):
+    reduced, exact_rank = fmpq_mat(columns).rref()
+    if rank == int(exact_rank):
         return [list(row) for row in reduced.tolist()[:rank]]
     _, _, pivots = linalg.qr(V[:rank], pivoting=True)
     echelon = np.linalg.solve(V[:rank][:, np.sort(pivots[:rank])], V[:rank])
