@@ -114,7 +114,7 @@ def test_neglected_couplings_carry_denominators() -> None:
             A[i, 2 - i] = 1e-13 * k
         return A, ca.DM.zeros(4, 1), ca.DM.zeros(1, 4)
 
-    system = malta.uncertain(matrices, {"k": 1.0, "p": 1000.0}, sample_budget=malta.proof.Budget(1.0))
+    system = malta.uncertain(matrices, {"k": 1.0, "p": 1000.0}, sample_time=1.0)
     found = malta.robust_margin(system, [[0.0]], {"k": (0.0, 2.0)}, budget=malta.proof.Budget(0.7))
     assert found.lower is None or found.lower < 4.01
 
