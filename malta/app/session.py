@@ -29,12 +29,7 @@ from malta.app.files import (
     save_gains,
 )
 from malta.app.followers import Worker, describe_error
-from malta.app.picture import (
-    View,
-    poles_document,
-    run_names,
-    solve,
-)
+from malta.app.picture import View, poles_document, run_names, solve
 from malta.app.pull import Handle, Pull, compare_numbers, pull_to
 from malta.errors import InputError, shorten
 from malta.synthesis.requirements import requirements_for

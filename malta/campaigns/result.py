@@ -233,10 +233,7 @@ def every_figure(found: Campaign, published: Mapping[str, Any] | None = None) ->
         finding(name.removeprefix("touchdown at "), CLEARANCE, "percent", batch.contact[:, k])
         for k, name in enumerate(plant.contacts)
     ]
-    return [
-        *listed,
-        finding("", "limited commands", "percent", batch.saturated.max(axis=1, initial=0.0)),
-    ]
+    return [*listed, finding("", "limited commands", "percent", batch.saturated.max(axis=1, initial=0.0))]
 
 
 def bounds_of(plan: Plan) -> Mapping[str, str]:
@@ -319,7 +316,5 @@ def yields_of(
         return None if within is None else rate(int(within.sum()), runs)
 
     return Yields(
-        found.rate,
-        share(runs_within_bounds(found, published)),
-        share(runs_within_specification(found, spec)),
+        found.rate, share(runs_within_bounds(found, published)), share(runs_within_specification(found, spec))
     )

@@ -427,10 +427,7 @@ class Status:
 
 
 def status(
-    folder: str | Path,
-    controller: Controller,
-    bounds: Bounds = UNBOUNDED,
-    progress: Progress | None = None,
+    folder: str | Path, controller: Controller, bounds: Bounds = UNBOUNDED, progress: Progress | None = None
 ) -> Status:
     """The status of the campaign in a folder. Every block is read and its seal checked; nothing is written.
 

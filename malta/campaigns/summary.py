@@ -489,8 +489,6 @@ def _join_runs(one: Runs, other: Runs) -> Runs:
         for name in Batch.__dataclass_fields__
     }
     joined = Runs(
-        np.concatenate([one.index, other.index]),
-        np.concatenate([one.values, other.values]),
-        Batch(**columns),
+        np.concatenate([one.index, other.index]), np.concatenate([one.values, other.values]), Batch(**columns)
     )
     return joined.take(np.argsort(joined.index))

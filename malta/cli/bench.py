@@ -239,8 +239,7 @@ def commission(
     from malta.cli.options import read_sensor_errors
     from malta.files import replace_files
     from malta.gains.file import content_of
-    from malta.identification.commission import JOURNAL, steps_of
-    from malta.identification.commission import commission as commission_machine
+    from malta.identification.commission import JOURNAL, commission as commission_machine, steps_of
     from malta.model.data import plant_of
     from malta.report.page.document import binder_page, binder_text
 

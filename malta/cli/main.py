@@ -24,8 +24,7 @@ from malta.cli.design import design, new, tune
 from malta.cli.export import export, pil, schema
 from malta.cli.identification import excite, identify, learn, log, replay
 from malta.cli.output import interruption, print_error, print_note, silence
-from malta.cli.pages import app as live_page
-from malta.cli.pages import claims, motion
+from malta.cli.pages import app as live_page, claims, motion
 from malta.cli.report import compare, plot, report
 from malta.cli.simulate import simulate
 from malta.cli.verify import check, verify

@@ -365,11 +365,7 @@ def _distinct(
 
 
 def _loci(
-    machines: Machines,
-    parameter: str,
-    span: str | None,
-    channels: list[str] | None,
-    at: Place,
+    machines: Machines, parameter: str, span: str | None, channels: list[str] | None, at: Place
 ) -> Sequence[RootLocus]:
     """The root locus of each loop, behind a progress bar."""
     from malta.loops.locus import root_locus
@@ -538,8 +534,7 @@ def compare(
     Example:  malta compare design/gains/table2.json design/gains/robust.json
     """
     from malta.margins.loop_report import require_stable
-    from malta.report.page.comparison import compare as compare_subjects
-    from malta.report.page.comparison import comparison_tables, require_count
+    from malta.report.page.comparison import compare as compare_subjects, comparison_tables, require_count
     from malta.report.page.document import SUFFIXES
 
     require_count(len(gains))

@@ -147,8 +147,7 @@ def simulate(
     log: Annotated[
         Path | None,
         typer.Option(
-            metavar="LOG",
-            help="Write what a bench would log of the first run: .csv, .npz, .mat, .parquet.",
+            metavar="LOG", help="Write what a bench would log of the first run: .csv, .npz, .mat, .parquet."
         ),
     ] = None,
     replay: Annotated[

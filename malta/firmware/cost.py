@@ -253,9 +253,7 @@ class Processor(NamedTuple):
 PROCESSORS = (
     Processor("this computer", "", ()),
     Processor(
-        "Cortex-A9",
-        "arm-linux-gnueabihf-",
-        ("-mcpu=cortex-a9", "-mfpu=vfpv3", "-mfloat-abi=hard", "-marm"),
+        "Cortex-A9", "arm-linux-gnueabihf-", ("-mcpu=cortex-a9", "-mfpu=vfpv3", "-mfloat-abi=hard", "-marm")
     ),
     Processor(
         "Cortex-M4F",

@@ -26,8 +26,16 @@ from malta.model.data import plant_of, published_figures
 from malta.model.parameters import units_of
 from malta.proof.box import box_of, sides_of
 from malta.proof.certificate.certificate import Origin, loops_of
-from malta.proof.certificate.checked_file import LONG, Claim, Document, Loop, Parameter, Places, double
-from malta.proof.certificate.checked_file import Origin as Named
+from malta.proof.certificate.checked_file import (
+    LONG,
+    Claim,
+    Document,
+    Loop,
+    Origin as Named,
+    Parameter,
+    Places,
+    double,
+)
 from malta.proof.expressions import NotAnalytic, exact
 from malta.proof.windings import chosen_loops
 

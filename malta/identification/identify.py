@@ -14,10 +14,7 @@ from scipy.special import gammainccinv, gammaincinv
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.identification.log import Log, require_currents
-from malta.identification.prediction import (
-    Predicted,
-    predict,
-)
+from malta.identification.prediction import Predicted, predict
 from malta.identification.response import (
     STEP,
     ResponseModel,

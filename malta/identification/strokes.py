@@ -123,10 +123,7 @@ class NextStroke:
 
 
 def next_stroke(
-    controller: Controller,
-    log: Log,
-    patterns: ThrustPatterns | None = None,
-    before: NextStroke | None = None,
+    controller: Controller, log: Log, patterns: ThrustPatterns | None = None, before: NextStroke | None = None
 ) -> NextStroke:
     """What the next stroke is sent beside the law's thrust, from the log of the one before.
 

@@ -166,12 +166,7 @@ class SampledLoop:
     def closed(self) -> FloatArray:
         """State matrix of the closed loop, states of the machine first."""
         c = self.control
-        return np.block(
-            [
-                [self.Ad + self.Bd @ c.D_y @ self.Cd, self.Bd @ c.C],
-                [c.B_y @ self.Cd, c.A],
-            ]
-        )
+        return np.block([[self.Ad + self.Bd @ c.D_y @ self.Cd, self.Bd @ c.C], [c.B_y @ self.Cd, c.A]])
 
     def loop_gain(self, w: FloatArray) -> ComplexArray:
         """The loop gain at the sensors, L = -P F, at the frequencies w (rad/s): k x p x p."""

@@ -15,13 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.loops.classical import (
-    Classical,
-    classical_margins,
-    nominal_loop,
-    peak_sensitivity,
-    worst_of,
-)
+from malta.loops.classical import Classical, classical_margins, nominal_loop, peak_sensitivity, worst_of
 from malta.loops.loop import loop_of_model
 from malta.loops.sampled_loops import (
     LAST,

@@ -18,13 +18,7 @@ from flint import arb
 
 from malta.errors import InputError, require_known
 from malta.proof.expressions import KNOWN, POINTS, Arithmetic, NotAnalytic, Program, exact, program
-from malta.proof.uncertain import (
-    LARGEST,
-    by_name,
-    describe,
-    is_number,
-    is_pair,
-)
+from malta.proof.uncertain import LARGEST, by_name, describe, is_number, is_pair
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

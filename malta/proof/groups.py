@@ -17,18 +17,8 @@ from flint import arb, arb_mat
 from scipy import linalg, sparse
 
 from malta.errors import InputError
-from malta.proof.expressions import (
-    NotAnalytic,
-    Program,
-    exact,
-    program,
-)
-from malta.proof.polynomial.rational import (
-    Ratio,
-    Symbolic,
-    TooLarge,
-    symbolic,
-)
+from malta.proof.expressions import NotAnalytic, Program, exact, program
+from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge, symbolic
 from malta.proof.uncertain import Compensator, Group, UncertainSystem, plural
 
 if TYPE_CHECKING:

@@ -18,8 +18,7 @@ from malta.model.signals import LateSensors, with_lags
 from malta.proof.box import without_branches
 from malta.proof.expressions import NotAnalytic, program
 from malta.proof.polynomial import rational
-from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge
-from malta.proof.polynomial.rational import symbolic as rational_functions
+from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge, symbolic as rational_functions
 from malta.proof.uncertain import UncertainSystem, describe, in_symbols, is_commutated, limits_of, model_of
 from malta.proof.windings import Windings, with_windings
 from malta.proof.work import check_clock

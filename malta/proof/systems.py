@@ -18,16 +18,7 @@ import numpy as np
 
 from malta.errors import InputError, require_known
 from malta.model.plant import Plant, readonly
-from malta.proof.uncertain import (
-    by_name,
-    describe,
-    interval,
-    is_number,
-    matrix,
-    number,
-    plural,
-    positive,
-)
+from malta.proof.uncertain import by_name, describe, interval, is_number, matrix, number, plural, positive
 
 if TYPE_CHECKING:
     from malta.proof.uncertain import Compensator, UncertainSystem

@@ -409,12 +409,7 @@ def estimated(g: Mapping[str, Any], xi_pred: Any, y: Any, C: Any = None, add: Ad
 
 
 def commanded(
-    g: Mapping[str, Any],
-    xi_hat: Any,
-    e: Any,
-    xi_ref: Any,
-    v_ff: Any,
-    v0: Any,
+    g: Mapping[str, Any], xi_hat: Any, e: Any, xi_ref: Any, v_ff: Any, v0: Any
 ) -> tuple[Any, Any, Any]:
     """Steps 3, 4 and 6: (xi_pred, forces that saturate, v) from the estimate and the sums of errors."""
     wanted = _wanted(g, xi_hat, e, xi_ref, v_ff, v0)

@@ -69,9 +69,7 @@ if TYPE_CHECKING:
 
 
 def read_design(
-    path: str | Path,
-    parameters: Mapping[str, float] | None = None,
-    entries: Mapping[str, Any] | None = None,
+    path: str | Path, parameters: Mapping[str, float] | None = None, entries: Mapping[str, Any] | None = None
 ) -> Spec:
     """Read a design file, and the data of the machine that it names.
 

@@ -13,13 +13,7 @@ from malta.errors import CheckError, InputError
 from malta.model.equilibrium import holding_commands, load_balance
 from malta.model.linearize import LinearModel
 from malta.model.plant import Actuator, Plant, off_stroke
-from malta.synthesis.controller import (
-    Commutation,
-    Controller,
-    CurrentLoop,
-    Feedforward,
-    Limits,
-)
+from malta.synthesis.controller import Commutation, Controller, CurrentLoop, Feedforward, Limits
 from malta.synthesis.filters import between_samples
 from malta.synthesis.riccati import sample
 

@@ -20,14 +20,7 @@ from scipy import linalg
 
 from malta.errors import InputError
 from malta.processes import on_one_thread
-from malta.synthesis.riccati import (
-    add_lags,
-    care,
-    dare,
-    delay_inputs,
-    sample,
-    sample_noise,
-)
+from malta.synthesis.riccati import add_lags, care, dare, delay_inputs, sample, sample_noise
 from malta.synthesis.spec import Coordinates, Weights
 
 if TYPE_CHECKING:

@@ -33,37 +33,20 @@ from scipy import linalg
 from malta.errors import CheckError, InputError
 from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
-from malta.synthesis.controller import (
-    Controller,
-    Cost,
-    Noise,
-    disturbances,
-    lagging_forces,
-    stored_forces,
-)
+from malta.synthesis.controller import Controller, Cost, Noise, disturbances, lagging_forces, stored_forces
 from malta.synthesis.feedforward import machine_part
 from malta.synthesis.filters import (
     Gains,
     Linear,
     between_samples,
+    kalman as kalman,
     positions_from,
     sampled_filter,
     sampled_model,
     with_lags,
 )
-from malta.synthesis.filters import kalman as kalman
-from malta.synthesis.riccati import (
-    add_integrals,
-    care,
-    dare,
-    eigenvalues,
-    sample,
-    sample_cost,
-)
-from malta.synthesis.spec import (
-    Discretization,
-    Weights,
-)
+from malta.synthesis.riccati import add_integrals, care, dare, eigenvalues, sample, sample_cost
+from malta.synthesis.spec import Discretization, Weights
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -386,11 +369,7 @@ def lqg(
     lagging = lagging_forces(plant.inputs) if current_lag else ()
     return Controller(
         **machine_part(
-            model,
-            Ts,
-            delay,
-            current_loop_delay=current_loop_delay,
-            position_feedforward=position_feedforward,
+            model, Ts, delay, current_loop_delay=current_loop_delay, position_feedforward=position_feedforward
         ),
         **found._asdict(),
         name=name,

@@ -161,14 +161,7 @@ def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: 
 
 # A slider moves one weight: the equations of other axes, and the filter's, are the same.
 @lru_cache(maxsize=64)
-def _solution_of(
-    shape: tuple[int, int],
-    a: bytes,
-    b: bytes,
-    q: bytes,
-    what: str,
-    discrete: bool,
-) -> _Found:
+def _solution_of(shape: tuple[int, int], a: bytes, b: bytes, q: bytes, what: str, discrete: bool) -> _Found:
     A, B, Q = (np.frombuffer(entries).reshape(shape[0], -1) for entries in (a, b, q))
     candidates: list[_Found] = []
     failures: list[Exception] = []

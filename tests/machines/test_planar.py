@@ -16,16 +16,12 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import malta
-from malta.machines.planar import commutation
-from malta.machines.planar import field as planar_field
-from malta.machines.planar import plant as planar
+from malta.machines.planar import commutation, field as planar_field, plant as planar
 from malta.machines.planar.field import ODD_X, ODD_Y, Series
-from malta.model.data import published as read_published
-from malta.model.data import published_value
+from malta.model.data import published as read_published, published_value
 from malta.model.equations import rotation
 from malta.model.plant import symbolic
 from malta.simulation.engine.engines import translate

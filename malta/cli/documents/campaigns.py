@@ -447,11 +447,7 @@ def _stroke(experiment: Experiment) -> StrokePart:
 def flights(found: Mapping[str, Mapping[Precision, Sequence[Difference]]]) -> list[FlightPart]:
     """The differences of the exported C's flights, by case and precision."""
     return [
-        FlightPart(
-            case=label,
-            precision=precision,
-            signals={d.name: SignalPart.of(d) for d in rows},
-        )
+        FlightPart(case=label, precision=precision, signals={d.name: SignalPart.of(d) for d in rows})
         for label, by_precision in found.items()
         for precision, rows in by_precision.items()
     ]

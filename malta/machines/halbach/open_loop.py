@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.machines.halbach import electronics
-from malta.machines.halbach import electronics as motor
+from malta.machines.halbach import electronics, electronics as motor
 from malta.machines.halbach.electronics import IDEAL, Options, Pwm
 from malta.model.plant import FloatArray, Plant
 from malta.simulation import references

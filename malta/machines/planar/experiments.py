@@ -24,8 +24,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.machines.planar import commutation, field
-from malta.machines.planar import plant as planar
+from malta.machines.planar import commutation, field, plant as planar
 from malta.machines.planar.motions import (
     CELLS,
     FORCES,

@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.machines.planar import commutation
-from malta.machines.planar import field as planar_field
-from malta.machines.planar import plant as planar
+from malta.machines.planar import commutation, field as planar_field, plant as planar
 from malta.machines.planar.experiments import CURRENT, coil_wrench
 from malta.machines.planar.motions import AHEAD, DESIGNED, LINEAR, SOFT, jump, steps_ahead
 from malta.margins.loop_report import LoopReport

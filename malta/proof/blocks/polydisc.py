@@ -27,16 +27,7 @@ from flint import acb, arb
 
 from malta.proof.blocks import Block, Expanded
 from malta.proof.box import Box
-from malta.proof.exclusion import (
-    PATCHES,
-    CellBounds,
-    Growth,
-    advance,
-    cut,
-    growth_over,
-    on_boxes,
-    start,
-)
+from malta.proof.exclusion import PATCHES, CellBounds, Growth, advance, cut, growth_over, on_boxes, start
 from malta.proof.polynomial.enclosure import family_over
 from malta.proof.polynomial.family import Family, align, combine
 from malta.proof.work import is_past
@@ -73,11 +64,7 @@ class Part:
 
 
 def parts_of(
-    problem: OfLoop,
-    blocks: Sequence[tuple[Block, list[int]]],
-    box: Box,
-    reach: float,
-    most: Sequence[float],
+    problem: OfLoop, blocks: Sequence[tuple[Block, list[int]]], box: Box, reach: float, most: Sequence[float]
 ) -> list[Part]:
     """The groups' polynomials over parts of box(reach).
 

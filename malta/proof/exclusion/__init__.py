@@ -384,13 +384,7 @@ def half_plane(terms: list[ComplexArray], radius: FloatArray) -> ComplexArray:
     return c
 
 
-def _split(
-    s: Search,
-    cells: FloatArray,
-    boxes: FloatArray,
-    depth: FloatArray,
-    found: CellBounds,
-) -> Search:
+def _split(s: Search, cells: FloatArray, boxes: FloatArray, depth: FloatArray, found: CellBounds) -> Search:
     """Split each cell in two across the axis that moves f most: frequency, a parameter or a further axis."""
     shape, terms, radius = s.family.shape, found.terms, found.radius
     count = terms[0].shape[1]
@@ -465,10 +459,7 @@ class Part:
 
 
 def cut(
-    sides: FloatArray,
-    nominal: FloatArray,
-    made: Callable[[FloatArray], list[Any]],
-    most: int = PATCHES,
+    sides: FloatArray, nominal: FloatArray, made: Callable[[FloatArray], list[Any]], most: int = PATCHES
 ) -> list[Any]:
     """Apply `made` to a box, or to parts of it where the box is too wide; `most` parts at most.
 

@@ -18,14 +18,7 @@ import numpy as np
 from scipy import linalg
 
 from malta.proof.groups import groups
-from malta.proof.multipliers import (
-    Blocks,
-    Branch,
-    Multiplier,
-    excludes_zero,
-    multiplier,
-    response,
-)
+from malta.proof.multipliers import Blocks, Branch, Multiplier, excludes_zero, multiplier, response
 from malta.proof.multipliers.pencil import TERMS, Rows
 from malta.proof.polynomial.rational import TooLarge
 from malta.proof.work import is_past, spend, spent

@@ -186,10 +186,7 @@ def add_delay(matrix: Any, phi: Any, gamma: Any, c: Any, d: Any, delay: int) -> 
         matrix, stored, stored,
         [(i, i, -1) for i in range(stored)] + [(i, i + m, 1) for i in range(stored - m)],
     )  # fmt: skip
-    a = _stack(
-        matrix,
-        [[phi, gamma, zeros(matrix, n, stored - m)], [zeros(matrix, stored, n), shift]],
-    )
+    a = _stack(matrix, [[phi, gamma, zeros(matrix, n, stored - m)], [zeros(matrix, stored, n), shift]])
     b = dense(matrix, n + stored, m, ((n + stored - m + j, j, 1) for j in range(m)))
     late = join_columns(
         matrix, c, *([d] if d is not None else [zeros(matrix, p, m)]), zeros(matrix, p, stored - m)

@@ -280,12 +280,7 @@ class Minors:
 
         Raises NotAnalytic when numbers overflow.
         """
-        a, b, c, diagonal = entry_bounds(
-            entries,
-            self.group.states,
-            self.inputs,
-            self.outputs,
-        )
+        a, b, c, diagonal = entry_bounds(entries, self.group.states, self.inputs, self.outputs)
         b = b[list(self.rows)]
         parts = a, b, c, diagonal
         known, key = self.resolvents, tuple((part.shape, part.tobytes()) for part in parts)

@@ -15,13 +15,7 @@ import numpy as np
 from flint import Ordering, acb, fmpq_mpoly_ctx
 
 from malta.proof.box import resolve_branches
-from malta.proof.expressions import (
-    FIELD,
-    NotAnalytic,
-    Program,
-    exact,
-    program,
-)
+from malta.proof.expressions import FIELD, NotAnalytic, Program, exact, program
 from malta.proof.work import check_clock
 
 if TYPE_CHECKING:

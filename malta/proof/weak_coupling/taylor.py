@@ -179,11 +179,7 @@ class Laurent:
 
 
 Value = float | Taylor | Laurent  # a constant, of y alone, of p and y
-FUNCTIONS: dict[str, Callable[[Taylor], Taylor]] = {
-    "sin": sine,
-    "cos": cosine,
-    "sqrt": root,
-}
+FUNCTIONS: dict[str, Callable[[Taylor], Taylor]] = {"sin": sine, "cos": cosine, "sqrt": root}
 
 
 class Evaluation:

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from malta.display import micro as micro
-from malta.display import number as number
+from malta.display import micro as micro, number as number
 from malta.errors import InputError
 from malta.files import PICTURES, replace_files, require_suffix
 from malta.merits import ROOTS
@@ -255,12 +254,7 @@ def end_of(run: Trajectory) -> int:
 
 
 def draw_published(
-    axes: Axes,
-    published: Published | None,
-    key: str,
-    unit: str,
-    text: str = "published bound",
-    **drawn: Any,
+    axes: Axes, published: Published | None, key: str, unit: str, text: str = "published bound", **drawn: Any
 ) -> None:
     """`draw_bound` at a published value; nothing without published figures."""
     if published is not None:

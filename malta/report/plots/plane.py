@@ -11,8 +11,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.loops.curves import LoopCurves, loop_curves
-from malta.loops.locus import DELAY, GAIN, RootLocus
-from malta.loops.locus import root_locus as locus_of
+from malta.loops.locus import DELAY, GAIN, RootLocus, root_locus as locus_of
 from malta.report.figures.drawing import new_figure, number
 from malta.report.plots.frequency import title_of
 from malta.report.plots.panels import Sheet, add_hertz, add_legend, head_of, loops_of, plain, styles_of

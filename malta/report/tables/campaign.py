@@ -43,10 +43,7 @@ def box_text(plan: Plan) -> str:
 
 
 def campaign_tables(
-    found: Campaign | Summary,
-    published: Published | None = None,
-    worst: int = 5,
-    spec: Spec | None = None,
+    found: Campaign | Summary, published: Published | None = None, worst: int = 5, spec: Spec | None = None
 ) -> Group:
     """Tabulate how the runs of a campaign end, their figures of merit beside the published bounds, and the worst runs.
 
@@ -117,11 +114,7 @@ def _findings_table(found: Summary) -> Table:
     bounds = any(m.merit.bound is not None for m in found.merits)
     heads = [*(f"{p} %" for p in PERCENTILES), "largest", *(["published", "kept [%]"] if bounds else [])]
     accuracy = "" if found.exact else f", within {100 * ACCURACY:.1g} % of their values"
-    table = new_table(
-        f"Figures of merit: percentiles of the completed runs{accuracy}",
-        "figure",
-        *heads,
-    )
+    table = new_table(f"Figures of merit: percentiles of the completed runs{accuracy}", "figure", *heads)
     for m in found.merits:
         if not m.sketch.count:
             continue

@@ -19,21 +19,7 @@ from malta.errors import CheckError
 
 _BINARY = {"ADD": "+", "SUB": "-", "MUL": "*"}
 _TRUTH = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
-_EACH = [
-    "sqrt",
-    "floor",
-    "ceil",
-    "exp",
-    "log",
-    "tan",
-    "tanh",
-    "asin",
-    "acos",
-    "atan",
-    "sinh",
-    "cosh",
-    "sign",
-]
+_EACH = ["sqrt", "floor", "ceil", "exp", "log", "tan", "tanh", "asin", "acos", "atan", "sinh", "cosh", "sign"]
 _FORMS = (
     {f"OP_{name}": f"{{0}} {sign} {{1}}" for name, sign in _BINARY.items()}
     | {f"OP_{name.upper()}": f"each_{name}({{0}})" for name in _EACH}
