@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import tomlkit
 
@@ -24,16 +24,12 @@ from malta.errors import CheckError, InputError
 from malta.files import file_exists, replace_files
 from malta.gains import SUFFIXES
 from malta.model.parameters import check_range, fingerprint as record_fingerprint
+from malta.model.plant import Parameters
 from malta.processes import environment, python_module
 from malta.synthesis.design_file import resolve_published, spec_of
-from malta.synthesis.spec import integral_signals
+from malta.synthesis.spec import Spec, integral_signals
 from malta.tables import load_toml
 from malta.units import to_si
-
-if TYPE_CHECKING:
-    from malta.model.plant import Parameters
-    from malta.synthesis.spec import Spec
-
 
 Value = float | int | bool | str
 

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from malta.app.answers import MARGIN, Answer, Answers
 from malta.app.fields import is_number
@@ -33,11 +33,8 @@ from malta.app.picture import View, poles_document, run_names, solve
 from malta.app.pull import Handle, Pull, compare_numbers, pull_to
 from malta.errors import InputError, shorten
 from malta.synthesis.requirements import requirements_for
+from malta.synthesis.spec import Spec
 from malta.tuning.search import base_of
-
-if TYPE_CHECKING:
-    from malta.synthesis.spec import Spec
-
 
 QUIET = 0.25  # s, after the last move until its proof begins
 LONGEST_WAIT = 20.0  # s, of a question for news

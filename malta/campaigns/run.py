@@ -15,9 +15,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Protocol, get_args
+from typing import NamedTuple, Protocol, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from malta.campaigns.plan import PRECISIONS, Machines, Plan, draw_machines, planned_run
 from malta.campaigns.result import Campaign, gather
@@ -43,13 +44,8 @@ from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import Experiment, Progress
 from malta.simulation.experiments.catalogue import main_job, settling, single_run
 from malta.simulation.simulate import EngineOf
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.synthesis.controller import Controller
-    from malta.synthesis.spec import Spec
-
+from malta.synthesis.controller import Controller
+from malta.synthesis.spec import Spec
 
 BLOCK = 1024  # runs in a block: a fraction of a second of work
 LARGE_BLOCK = (

@@ -13,9 +13,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from malta.campaigns.plan import Plan, half_width, middle_of
 from malta.campaigns.result import (
@@ -32,15 +33,10 @@ from malta.campaigns.result import (
 )
 from malta.display import Description, display
 from malta.merits import Merit, figure
+from malta.model.plant import FloatArray
 from malta.simulation.engine.digest import LARGEST_FIGURE, Batch, verdicts
+from malta.synthesis.spec import Spec
 from malta.units import in_unit
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import FloatArray
-    from malta.synthesis.spec import Spec
-
 
 # Sketches: the distribution of a figure over any number of runs, in memory that does not grow with them.
 #

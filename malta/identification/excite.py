@@ -21,12 +21,11 @@ from malta.identification.response import (
     well_found,
 )
 from malta.model.equilibrium import trim
-from malta.model.plant import outputs_at
+from malta.model.plant import ComplexArray, FloatArray, outputs_at
 from malta.simulation.inputs import Multisine, interleaved_multisine
 
 if TYPE_CHECKING:
     from malta.loops.loop import Loop
-    from malta.model.plant import ComplexArray, FloatArray
 
 BAND = (2.0, 400.0)  # Hz
 LINES = 12  # of each input

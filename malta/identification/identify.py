@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import gammainccinv, gammaincinv
 
@@ -51,14 +52,10 @@ from malta.identification.spectra import (
     windowed_covariances,
 )
 from malta.model.data import plant_of
+from malta.model.plant import ComplexArray, FloatArray, Plant
+from malta.synthesis.controller import Controller
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import ComplexArray, FloatArray, Plant
-    from malta.synthesis.controller import Controller
-
-    IntArray = NDArray[np.integer[Any]]
+IntArray = NDArray[np.integer[Any]]
 
 GROUPS = ("y", "v", "i", "excitation")  # of a log, which are used
 SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from malta.errors import InputError, require_known
 from malta.model.equilibrium import commanded
 from malta.model.parameters import shape_parameters, units_of
-from malta.model.plant import Plant, position_in, readonly
+from malta.model.plant import FloatArray, Plant, position_in, readonly
 from malta.model.signals import LateSensors, with_lags
 from malta.proof.box import without_branches
 from malta.proof.expressions import NotAnalytic, program
@@ -22,10 +22,6 @@ from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge, symbolic 
 from malta.proof.uncertain import UncertainSystem, describe, in_symbols, is_commutated, limits_of, model_of
 from malta.proof.windings import Windings, with_windings
 from malta.proof.work import check_clock
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # The command at which a machine's preload acts, as a function of its parameters.
 #

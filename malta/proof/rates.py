@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import math
 import time as clock
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import casadi as ca
 import numpy as np
@@ -28,17 +29,13 @@ from scipy import linalg
 from malta.bound import at_least
 from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
+from malta.model.plant import FloatArray
 from malta.processes import on_one_thread
 from malta.proof.expressions import NotAnalytic
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.robust import law_of
 from malta.proof.uncertain import Compensator, UncertainSystem, interval, positive
 from malta.proof.work import is_past, metered, work_limit
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from malta.model.plant import FloatArray
 
 CALLER = "varying"
 BITS = 128

@@ -11,18 +11,25 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from malta.errors import InputError, require_known
 from malta.model.plant import Plant, readonly
-from malta.proof.uncertain import by_name, describe, interval, is_number, matrix, number, plural, positive
-
-if TYPE_CHECKING:
-    from malta.proof.uncertain import Compensator, UncertainSystem
-
+from malta.proof.uncertain import (
+    Compensator,
+    UncertainSystem,
+    by_name,
+    describe,
+    interval,
+    is_number,
+    matrix,
+    number,
+    plural,
+    positive,
+)
 
 # Algebraic equations of a descriptor system: zero rows of E, solved for the states of its zero columns.
 #

@@ -56,11 +56,10 @@ import numpy as np
 from malta.display import display
 from malta.errors import InputError
 from malta.model.equations import note
-from malta.model.plant import Parameters, Plant, Signal, outputs_at, readonly
+from malta.model.plant import FloatArray, Parameters, Plant, Signal, outputs_at, readonly
 from malta.synthesis.schedule import SCHEDULED, Schedule, interpolate
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
     from malta.synthesis.filters import Gains
     from malta.synthesis.spec import Coordinates
 

@@ -25,13 +25,15 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import linalg
 
 from malta.errors import CheckError, InputError
 from malta.model.linearize import LinearModel
+from malta.model.plant import ComplexArray, FloatArray
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, Cost, Noise, disturbances, lagging_forces, stored_forces
 from malta.synthesis.feedforward import machine_part
@@ -47,12 +49,6 @@ from malta.synthesis.filters import (
 )
 from malta.synthesis.riccati import add_integrals, care, dare, eigenvalues, sample, sample_cost
 from malta.synthesis.spec import Discretization, Weights
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from malta.model.plant import ComplexArray, FloatArray
-
 
 # Why a linear model has no stabilizing controller, in words: modes that nothing moves or sees, zeros, slow samples.
 

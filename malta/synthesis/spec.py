@@ -21,11 +21,10 @@ from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
 from malta.model.data import plant_of
 from malta.model.parameters import box_words, fingerprint, replace_fields
-from malta.model.plant import Plant, Signal, readonly
+from malta.model.plant import FloatArray, Parameters, Plant, Signal, readonly
 from malta.units import to_si
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Parameters
     from malta.synthesis.recovery import RecoveryBound
 
 Discretization = Literal["backward-euler", "zoh", "sampled-data"]

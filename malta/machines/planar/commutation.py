@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from itertools import product
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -27,12 +27,9 @@ from malta.machines.planar.field import (
     shape_of,
     simulation_model,
 )
+from malta.machines.planar.parameters import Parameters
 from malta.model.equations import Equation, note, recorded_equations, recording, rotation
 from malta.model.plant import FloatArray, readonly
-
-if TYPE_CHECKING:
-    from malta.machines.planar.parameters import Parameters
-
 
 STEPS = (-1.5, -0.5, 0.5, 1.5)  # coil pitches from the mover's centre, along x and y
 WORST = 10.0  # largest accepted condition of K(p): 2.4 with a pitch of 16/3 tau_n, 20 and more with a bad one

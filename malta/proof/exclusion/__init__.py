@@ -12,18 +12,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from malta.model.plant import ComplexArray, FloatArray
 from malta.proof.box import Box, smallest_t
 from malta.proof.polynomial.enclosure import Polynomial, TooWide, Unproven
 from malta.proof.polynomial.family import EPS, Family, restrict, restriction_rounding
 from malta.proof.work import is_past
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
-
 
 # A family along s = jw: Taylor expansions on intervals of frequency, from zero to infinity.
 #

@@ -5,17 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from malta.model.plant import ComplexArray, FloatArray
 from malta.proof.exclusion import Cell, Growth, cover
 from malta.proof.polynomial.family import Family, basis
 from malta.proof.work import is_past
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
-
 
 STEPS = 8  # of the frequency grid in an octave
 SPACING = 0.6 / STEPS  # half a step and more, in ln w

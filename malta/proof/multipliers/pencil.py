@@ -14,19 +14,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import linalg
 
+from malta.model.plant import FloatArray
 from malta.proof.groups import C, UncertainLoop
 from malta.proof.polynomial.characteristic import clear_denominators
 from malta.proof.polynomial.rational import TooLarge
 from malta.proof.uncertain import Group
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # Matrices over a box of parameters to first order: M(p) = M_0 + sum_i delta_i M_i + rest, with |delta_i| <= 1.
 

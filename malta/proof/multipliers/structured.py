@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
-from malta.proof.groups import groups
+from malta.proof.groups import UncertainLoop, groups
 from malta.proof.multipliers import Blocks, Branch, Multiplier, excludes_zero, multiplier, response
-from malta.proof.multipliers.pencil import TERMS, Rows
+from malta.proof.multipliers.pencil import TERMS, Pencil, Rows
 from malta.proof.polynomial.rational import TooLarge
 from malta.proof.work import is_past, spend, spent
 
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     from malta.model.plant import FloatArray
     from malta.proof.box import Box
-    from malta.proof.groups import UncertainLoop
-    from malta.proof.multipliers.pencil import Pencil
     from malta.proof.problem import Problem
 
 NEAR = 0.98  # beta up to which splitting frequency is expected to do

@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from flint import acb, acb_mat, arb
 from scipy import linalg, sparse
 
+from malta.model.plant import FloatArray
 from malta.proof.expressions import BALLS, NotAnalytic, exact, finite
 from malta.proof.groups import (
     A,
@@ -29,9 +30,6 @@ from malta.proof.groups import (
 from malta.proof.polynomial.rational import Ratio, Symbolic, value
 from malta.proof.uncertain import Group
 from malta.proof.work import spend
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 
 class DrivenGroup(NamedTuple):
