@@ -17,9 +17,7 @@ from malta.synthesis.design_tables import DesignFile
 from malta.synthesis.spec import Discretization, Place, Spec
 from malta.units import to_si
 
-MACHINE = (
-    "machine."  # the keys of machine parameters; those of the design file are its own, as "bases.state.x"
-)
+MACHINE = "machine."  # begins keys of machine parameters; those of the design file are its own
 DECADES = 2.0  # of a slider, either way of the file's number
 HUGE = 1e300  # what no number of a design comes near
 NARROW = 4.0  # factor, either way, of a machine's parameters and of the sample time

@@ -74,9 +74,7 @@ class Session:
         self._newest, self._version, self._base = 0, 0, 0
         self._news: list[tuple[int, Document]] = []  # numbered
         self._count = 0
-        self._slopes: tuple[Handle, View, dict[str, tuple[float, ...]]] | None = (
-            None  # of the handle that is pulled
-        )
+        self._slopes: tuple[Handle, View, dict[str, tuple[float, ...]]] | None = None  # of a pull
         self._answers = Answers()
         self._answer: tuple[int, Answer] | None = None  # to the newest evaluation, and its number
         self._timer: threading.Timer | None = None

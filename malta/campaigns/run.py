@@ -48,9 +48,7 @@ from malta.synthesis.controller import Controller
 from malta.synthesis.spec import Spec
 
 BLOCK = 1024  # runs in a block: a fraction of a second of work
-LARGE_BLOCK = (
-    16_384  # of a large campaign: seconds of work, 5 MB in a file and some 50 MB while it is simulated
-)
+LARGE_BLOCK = 16_384  # of a large campaign: seconds of work, 5 MB in a file, some 50 MB while it is simulated
 SLOW_BLOCK = 32  # without a C compiler
 FILES = 256  # blocks that a campaign has before they grow
 IN_MEMORY = 10_000_000  # runs whose figures `campaign` returns: 3 GB

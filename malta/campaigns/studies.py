@@ -63,9 +63,7 @@ class Sensitivity:
     runs: int  # simulated
     within: Rate  # of the independent runs: share within the limit
     of_yield: tuple[Index, ...]  # by factor; empty where all runs, or none, are within the limit
-    of_merits: Mapping[
-        str, tuple[Index, ...]
-    ]  # by label; empty where a run has no value, or all have the same
+    of_merits: Mapping[str, tuple[Index, ...]]  # by label; empty where a run has no value, or all the same
 
     @property
     def description(self) -> Description:

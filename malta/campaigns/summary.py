@@ -65,9 +65,7 @@ class Sketch:
     smallest: float = math.inf
     largest: float = -math.inf
     values: tuple[FloatArray, ...] = ()  # all of them, in any order, while they are at most EXACT
-    counts: Mapping[int, NDArray[np.int64]] = field(
-        default_factory=dict
-    )  # sign and exponent -> count of each bucket
+    counts: Mapping[int, NDArray[np.int64]] = field(default_factory=dict)  # (sign, exponent) -> counts
 
     @property
     def exact(self) -> bool:
@@ -79,9 +77,7 @@ def sketch_of(values: FloatArray) -> Sketch:
     """The sketch of some finite values."""
     if not len(values):
         return Sketch()
-    values = (
-        np.asarray(values, dtype=float) + 0.0
-    )  # -0.0 is 0.0: of the two, sorting and merging may find either
+    values = np.asarray(values, dtype=float) + 0.0  # -0.0 is 0.0: sorting and merging may find either
     return _count_if_many(Sketch(len(values), float(values.min()), float(values.max()), (values,)))
 
 

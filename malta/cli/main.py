@@ -130,9 +130,7 @@ def renew(args: list[str]) -> list[str]:
     return found
 
 
-UsageError: Any = (
-    typer.BadParameter.__base__
-)  # of click, or of the copy of click that newer versions of typer have
+UsageError: Any = typer.BadParameter.__base__  # of click, or of the copy of it in newer versions of typer
 
 
 class Commands(Mapping[str, Any]):

@@ -390,7 +390,6 @@ def _maps(
     files: Sequence[Path], machines: Machines, axes: tuple[str | None, str | None], beside: str
 ) -> Sequence[MarginMap]:
     """The margin map of each loop over two parameters that its gain file names as uncertain. Raises InputError."""
-    from malta.cli.options import read_uncertainty
     from malta.margins.margin_map import Others, margin_map_of
 
     (x, y), others, found = axes, cast("Others", beside), []
@@ -487,7 +486,6 @@ def _draw(
 
 def _save(pictures: Sequence[Picture], out: Path | None, *, dark: bool) -> list[Path]:
     """Write the pictures to the file that was named, or to a folder as NAME_KIND.png, all or none."""
-    from malta.files import replace_files
     from malta.report import encode_figure
 
     one = out is not None and out.suffix in SUFFIXES and not out.is_dir()

@@ -66,9 +66,7 @@ WHITE = 5.0  # standard deviations of the correlation between neighbouring lines
 STRAIGHTENED = 12  # estimates at most, each with the curvature and the weights of the one before
 SETTLED = 0.01  # standard deviations: what moves by less is settled
 DIFFERENT = 3.0  # standard deviations between the estimates at the lines and in time
-QUIET = (
-    4.0  # power at the lines over the noise, of the output that moves most, without which nothing was excited
-)
+QUIET = 4.0  # power at the lines over the noise, of the output that moves most: below, nothing was excited
 
 
 @display

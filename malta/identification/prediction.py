@@ -441,9 +441,7 @@ def _result(
     predicted = s.y - flight.e
     gone = (s.there == 0) | off
     spread = max(1.0, float(np.nanmean(kept**2)))
-    if (
-        s.nu < NORMAL
-    ):  # of weights that depend on e: the mean of score^2 over that of the score's slope, squared
+    if s.nu < NORMAL:  # of weights that depend on e: mean score^2 over the squared mean of the score's slope
         w = flight.w
         slope = (w * (1 - 2 * w * size**2 / (s.nu + 1))).sum() / w.sum()
         spread = float((w**2 * size**2).sum() / w.sum() / slope**2)

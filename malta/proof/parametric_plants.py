@@ -311,9 +311,7 @@ def _expanded_matrices(
     if not all((slope[at] - r).is_zero() for at, r in ratio.items()):
         return None  # one step finds the command of a chain that is affine in it, and of no other
     ratio = slope
-    moved = rational.solution(
-        s, ratio, left, m
-    )  # what has to be wanted beyond the preload so that the preload acts
+    moved = rational.solution(s, ratio, left, m)  # what is wanted beyond the preload for it to act
     wanted = {k + i: acting[k + i] + moved[i] for i in range(m)}
     A, B, C, E = ({at: rational.substitute(s, r, wanted) for at, r in t.items()} for t in (A, B, C, E))
     n, outputs = of.size1_out(0), of.size1_out(2)

@@ -333,9 +333,7 @@ class _Choice:
             return None
         _, V = np.linalg.eig(frozen[len(frozen) // 2])
         back = np.linalg.pinv(V)
-        acts = np.abs(
-            back @ (frozen[-1] - frozen[0]) @ V
-        )  # of p on the modes, which are scaled so that it is small
+        acts = np.abs(back @ (frozen[-1] - frozen[0]) @ V)  # of p on modes, scaled so that it is small
         _, (size, _) = linalg.matrix_balance(acts + 1e-9 * acts.max() + 1e-300, permute=False, separate=True)
         back = back / size[:, None]
         return cls(loop, (back.conj().T @ back).real, radius**-share)

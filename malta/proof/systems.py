@@ -122,7 +122,6 @@ def from_source(
     terms : None in the place of a matrix: zeros
     limits : infinite for parameters without
     """
-    from malta.proof.uncertain import UncertainSystem
 
     names = tuple(by_name("uncertain", "nominal", nominal, '{"k": 1.5}'))
     if not names:
@@ -277,7 +276,6 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
 
     Raises InputError when its inputs and outputs do not fit the system, or its sample time is unspecified.
     """
-    from malta.proof.uncertain import Compensator
 
     wanted = "a Compensator, a proper control.StateSpace or TransferFunction, or a gain matrix"
     if hasattr(law, "num_list") or hasattr(law, "num_array"):

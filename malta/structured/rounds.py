@@ -111,9 +111,7 @@ class Machine:
     plant: Plant
     sample_time: float
     places: tuple[Values, ...]
-    zero: Controller = field(
-        repr=False
-    )  # a law of errors that does nothing, with the machine's current loops
+    zero: Controller = field(repr=False)  # a law that does nothing, with the machine's current loops
 
     @property
     def nominal(self) -> list[Model]:

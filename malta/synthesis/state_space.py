@@ -195,9 +195,7 @@ class System(NamedTuple):
         """The function `response`, for several calls: what does not depend on the frequencies is computed once."""
         A, B, C, D = self.balanced
         label = sparse.csgraph.connected_components(A != 0, directed=False)[1] if len(A) else np.zeros(0)
-        states = [
-            np.flatnonzero(label == k) for k in np.unique(label)
-        ]  # sets of states that nothing joins to each other
+        states = [np.flatnonzero(label == k) for k in np.unique(label)]  # sets that nothing joins
         parts = [_JoinedStates(A[np.ix_(i, i)], B[i], C[:, i]) for i in states]
 
         def response(s: ComplexArray) -> ComplexArray:

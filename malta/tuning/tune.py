@@ -93,9 +93,7 @@ class Merit(NamedTuple):
         return point.f + self.steep * max(self.floor, float(point.r.max()))
 
 
-Look = Callable[
-    ["FloatArray"], tuple[float, "FloatArray"] | None
-]  # (f, r) of a place; None: an unstable loop
+Look = Callable[["FloatArray"], tuple[float, "FloatArray"] | None]  # (f, r) of a place; None: unstable
 
 
 def descend(look: Look, u: FloatArray, merit: Merit, trials: int) -> FloatArray:

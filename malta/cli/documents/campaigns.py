@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
@@ -21,9 +23,6 @@ from malta.cli.documents.loops import (
 from malta.units import distinct, identifier
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
     from malta.campaigns.rare import RareEvent
     from malta.campaigns.run import Status
     from malta.campaigns.studies import Index, Sensitivity, Tolerances

@@ -273,9 +273,7 @@ EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "delay": delay,
     "timing": timing,
 }
-CASES: dict[str, Callable[..., list[PlannedRun]]] = {
-    "step": step_cases
-}  # with the controller's own coil model
+CASES: dict[str, Callable[..., list[PlannedRun]]] = {"step": step_cases}  # with the controller's coil model
 FINDINGS = ("delay",)
 WORDS = {
     "stroke": "y",

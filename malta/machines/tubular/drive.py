@@ -8,6 +8,7 @@ Both are the paper's measured constants and kept as such: electrical and mechani
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +19,6 @@ from malta.model.plant import Signal
 from malta.model.signals import CurrentSensors, Drive
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from malta.machines.tubular.parameters import Parameters
 
 

@@ -220,9 +220,7 @@ class CellBounds(NamedTuple):
     lasting: FloatArray  # what of the radius narrower intervals of frequency leave
     discs: ComplexArray  # cells x nodes
     moves: list[FloatArray]
-    sure: ComplexArray | None = (
-        None  # directions of cells that are excluded for reasons of their own, zero elsewhere
-    )
+    sure: ComplexArray | None = None  # directions of cells that are excluded for other reasons, else zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,9 +235,7 @@ class Search:
     depth: FloatArray
     target: float
     count: int = 0
-    around: Callable[[FloatArray, FloatArray], CellBounds] | None = (
-        None  # f by more than its family, on cells and boxes
-    )
+    around: Callable[[FloatArray, FloatArray], CellBounds] | None = None  # f by more than its family
     hasty: bool = False  # whether few cells are cut several times at once
     # the smallest t of a cell that no splitting frees of zero, as the radius is larger than f
     blocked: float = np.inf

@@ -367,7 +367,7 @@ def _grow_box(
     with np.errstate(all="ignore"):
         full = np.where(
             s > 0, (high - middle) / above, (middle - low) / below
-        )  # t at which an axis reaches the trust region
+        )  # t to the trust region's ends
         rate = np.where(grows & (s != 0), np.abs(s) * np.where(s > 0, above, below), 0)
     for stop in [*np.sort(full[(rate > 0) & (full > t)]).tolist(), np.inf]:
         pull = float(rate[full > t].sum())

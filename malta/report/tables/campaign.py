@@ -12,6 +12,7 @@ from malta.model.machines import lateral_outputs
 from malta.model.parameters import differences
 from malta.report.figures.drawing import Published, number
 from malta.report.tables import Paragraph, add_row, end_cell, new_table
+from malta.simulation.engine.digest import verdicts
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -138,7 +139,6 @@ def _worst_table(found: Summary, count: int) -> Table:
     """The worst runs, each with its parameters relative to the middle of the box and its sensor errors."""
     from malta.campaigns.plan import varied_names
     from malta.campaigns.summary import worst_runs
-    from malta.simulation.engine.digest import verdicts
 
     plan, runs = found.plan, worst_runs(found, count)
     ends, groups = verdicts(plan.plant), lateral_outputs(plan.plant)
