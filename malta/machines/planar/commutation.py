@@ -263,12 +263,6 @@ def check_pitch(par: Parameters, model: CoilModel) -> float:
     return worst
 
 
-def hover(par: Parameters, model: CoilModel, p: FloatArray) -> FloatArray:
-    """The coil currents, A, whose wrench balances the weight of the level mover at p."""
-    weight = np.array([0, 0, par.m * par.g, 0, 0, 0])
-    return np.asarray(currents(wrench_matrix(par, model, check_position(par, p)), weight))
-
-
 def decoupling(par: Parameters, model: CoilModel) -> ca.Function:
     """(p, W) -> i, eqs (31)-(35) as one CasADi function, to be called, compiled or written as C.
 

@@ -64,11 +64,6 @@ def K_L(theta: Any) -> Any:
     return 2 / 3 * ca.horzcat(cosines, -sines)
 
 
-def K_R_inverse(phi: Any) -> Any:
-    """3 x 2, Moore-Penrose: K_R' with its orthogonal rows scaled by 1 / |row|^2 = 3 and 3/2."""
-    return K_R(phi).T @ ca.diag(ca.DM([3, 1.5]))
-
-
 def K_L_inverse(theta: Any) -> Any:
     """2 x 3, Moore-Penrose: K_L' with its orthogonal columns scaled by 1 / |column|^2 = 3/2."""
     return 1.5 * K_L(theta).T
