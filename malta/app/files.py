@@ -221,11 +221,7 @@ def inside(root: Path, relative: str) -> Path:
     try:
         if usable and target.resolve() == target:
             return target
-    except (
-        OSError,
-        RuntimeError,
-        UnicodeError,
-    ):  # a loop of links, a folder that may not be looked into, half a letter
+    except (OSError, RuntimeError, UnicodeError):  # links in a loop, no permission, half a letter
         pass
     raise InputError(
         "save", "file", repr(relative), "a file inside the folder that malta app was started in, no link"

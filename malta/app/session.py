@@ -227,10 +227,7 @@ class Session:
             view = _view_of(body)
             one = Pull(self.files, edit, view, handle)
             known = self._slopes is not None and self._slopes[:2] == (handle, view)
-            for fresh in (
-                not known,
-                True,
-            ):  # numbers that were compared for another design may be the wrong ones
+            for fresh in (not known, True):  # numbers compared for another design may be wrong ones
                 if fresh:
                     self._slopes = (handle, view, compare_numbers(one))
                 assert self._slopes is not None

@@ -143,13 +143,8 @@ def _whole(points: FloatArray) -> NDArray[np.uint64]:
 # Runs of two revisions differ, so a folder keeps the runs of one revision only.
 
 
-PACKAGES = (
-    "model",
-    "synthesis",
-    "simulation",
-    "simulation/engine",
-    "simulation/experiments",
-)  # whose modules decide a run
+# Packages whose modules decide a run.
+PACKAGES = ("model", "synthesis", "simulation", "simulation/engine", "simulation/experiments")
 
 
 @lru_cache(maxsize=8)

@@ -47,11 +47,7 @@ STUDIES = {
 }
 
 
-KINDS = {
-    "integer": "N",
-    "integer range": "N",
-    "text": "WORD",
-}  # of a value that its option names nothing better for
+KINDS = {"integer": "N", "integer range": "N", "text": "WORD"}  # of a value without a name
 
 
 class Command(TyperCommand):

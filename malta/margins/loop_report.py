@@ -50,14 +50,8 @@ def zone(peak: float) -> str:
 
 
 CURVE = 120  # points of a curve in a notebook
-FIRST = (
-    "disk",
-    "delay_margin",
-    "peak_s",
-    "peak_t",
-    "damping",
-    "requirements",
-)  # kinds that a reader looks for
+# Kinds that a reader looks for.
+FIRST = ("disk", "delay_margin", "peak_s", "peak_t", "damping", "requirements")
 
 
 @display

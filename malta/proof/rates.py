@@ -247,9 +247,8 @@ def _loop_of(system: UncertainSystem, law: Compensator, name: str) -> _Loop:
         )
     n, own = len(A), len(A) + law.delay * B.shape[1]
     x, u, s = t[:n], 2.0 ** np.round(np.log2(t[n:own]).mean()) if own > n else 1.0, t[own:]
-    law = replace(
-        law, A=law.A * s / s[:, None], B=law.B / s[:, None], C=law.C * s / u, D=law.D / u
-    )  # powers of two: exact
+    # Powers of two: exact.
+    law = replace(law, A=law.A * s / s[:, None], B=law.B / s[:, None], C=law.C * s / u, D=law.D / u)
     return _closed(A * x / x[:, None], A1 * x / x[:, None], B * u / x[:, None], C * x, law)
 
 

@@ -184,12 +184,8 @@ def _or_published(node: Schema) -> Schema:
     return node
 
 
-NUMERIC = (
-    "Quantity",
-    "BoundsTable",
-    "RecoveryTable",
-    "Specification",
-)  # tables of quantities, and quantities
+# Tables of quantities, and quantities.
+NUMERIC = ("Quantity", "BoundsTable", "RecoveryTable", "Specification")
 
 
 def _is_numeric(node: Schema) -> bool:

@@ -35,15 +35,8 @@ STEPS = (-1.5, -0.5, 0.5, 1.5)  # coil pitches from the mover's centre, along x 
 WORST = 10.0  # largest accepted condition of K(p): 2.4 with a pitch of 16/3 tau_n, 20 and more with a bad one
 
 
-_FACTORS = (
-    "coil_pitch",
-    "r_z",
-    "h",
-    "N_c",
-    "B_r",
-    "B_z",
-    "C",
-)  # parameters of K(p) that harmonics do not depend on
+# Parameters of K(p) that harmonics do not depend on.
+_FACTORS = ("coil_pitch", "r_z", "h", "N_c", "B_r", "B_z", "C")
 
 
 def factors_of(par: Parameters) -> Any:

@@ -22,9 +22,7 @@ class Parameters:
     N_c: float = si("1", above=0)  # turns
     h_m: float = si("m", above=0, shapes=True)  # thickness of the magnets
     B_r: float = si("T", above=0)  # their remanence, relative permeability 1
-    upright: float = si(
-        "1", above=0, shapes=True
-    )  # width of upright blocks over their pole pitch, sqrt(2) tau_n
+    upright: float = si("1", above=0, shapes=True)  # upright blocks' width over sqrt(2) tau_n
     h: float = si("m", above=0)  # air gap: the working height
     B_z: float = si("T", above=0)  # flux density that (17)-(24) count with, at the working height
     C: float = si("1", above=0)  # harmonic compensation factor of (23), (24)

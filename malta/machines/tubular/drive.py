@@ -10,17 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 
+from malta.machines.tubular.parameters import Parameters
 from malta.model.equations import note
 from malta.model.plant import Signal
 from malta.model.signals import CurrentSensors, Drive
-
-if TYPE_CHECKING:
-    from malta.machines.tubular.parameters import Parameters
-
 
 # Windings: the two-directional dq transformation, and position sensing by Hall sensors.
 #

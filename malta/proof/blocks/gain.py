@@ -64,17 +64,8 @@ from malta.proof.work import Budget, WorkUp, in_rounds, is_past, work_limit
 
 
 DYNAMIC_TOLERANCE = 1e-3
-DYNAMIC_STEPS = (
-    1,
-    3,
-    10,
-    30,
-    100,
-    300,
-    1000,
-    3000,
-    10_000,
-)  # bounds that are tried, in multiples of the tolerance
+# Bounds that are tried, in multiples of the tolerance.
+DYNAMIC_STEPS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10_000)
 ROUNDS = 3
 ROUNDS_OF_SECANT = 40
 SEARCH = 0.4  # share of the work for the search of a loss; the rest is for the proof

@@ -365,9 +365,7 @@ def _grow_box(
     """The smallest t whose box contains a du with s du = h; infinite when the trust region ends before."""
     (low, high), (grows, middle, below, above) = room, sides
     with np.errstate(all="ignore"):
-        full = np.where(
-            s > 0, (high - middle) / above, (middle - low) / below
-        )  # t to the trust region's ends
+        full = np.where(s > 0, (high - middle) / above, (middle - low) / below)  # t of the trust region
         rate = np.where(grows & (s != 0), np.abs(s) * np.where(s > 0, above, below), 0)
     for stop in [*np.sort(full[(rate > 0) & (full > t)]).tolist(), np.inf]:
         pull = float(rate[full > t].sum())

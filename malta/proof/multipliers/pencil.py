@@ -275,10 +275,8 @@ def _sum(Y: FloatArray, slopes: FloatArray, b: Sequence[float], even: bool) -> t
 TERMS = 20_000  # of all entries, beyond which they are not expanded
 LIFTED = 8  # states up to which the fraction of a hold has rows of its own
 WIDEST = 40  # rows of a pencil with these, beyond the first level
-LESS = (
-    0.2,
-    0.05,
-)  # largest ratio of bounds with and without these rows: where they cost little, and one level else
+# Largest ratio of bounds with and without these rows: where they cost little, and one level else.
+LESS = (0.2, 0.05)
 MORE = 2  # times the coordinates of multipliers without these rows, that cost little
 
 

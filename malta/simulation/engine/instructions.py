@@ -271,14 +271,7 @@ def needed_nodes(nodes: list[Node], roots: list[int]) -> list[int]:
 # g   once a sample for all lanes: depends on these and on the inputs of the sample, as K xi* + v_ff does
 
 
-PLAIN = (
-    "OP_ADD",
-    "OP_SUB",
-    "OP_MUL",
-    "OP_SQ",
-    "OP_NEG",
-    "OP_TWICE",
-)  # the same text for one number and for lanes
+PLAIN = ("OP_ADD", "OP_SUB", "OP_MUL", "OP_SQ", "OP_NEG", "OP_TWICE")  # same text for lanes
 
 
 class Counts(NamedTuple):

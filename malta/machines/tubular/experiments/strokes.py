@@ -155,10 +155,8 @@ def _limit_strokes(
     plant: Plant, distance: float, current_share: float, voltage_share: float
 ) -> tuple[FastestStroke, SigmoidStroke]:
     """The fastest stroke within shares of current and voltage, and the sigmoid of the same peak current."""
-    from malta.simulation.experiments.time_optimal import (
-        fastest_stroke,  # with scipy's integrators, for these experiments alone
-        sigmoid_at_peak_current,
-    )
+    # With scipy's integrators, for these experiments alone.
+    from malta.simulation.experiments.time_optimal import fastest_stroke, sigmoid_at_peak_current
 
     shares: dict[str, Any] = {"voltage_share": voltage_share, "current_share": current_share}
     emf = induced_per_speed(plant)
