@@ -24,7 +24,8 @@ EPS = 2.0**-52
 WIDE = 8  # nodes of the following axes from which on values are multiplied in place
 FEW = 6  # degree up to which a restriction is one product of matrices
 COLUMNS = 4096  # of a product of exact matrices at once
-ROUND, ENTRY, BIT = 4e-6, 5e-8, 1.3e-9  # work of rounding, a product of entries, each bit of exact ones
+ROUND = 4e-6  # work of rounding an entry
+ENTRY, BIT = 5e-8, 1.3e-9  # work of a product of entries, and of each bit of exact ones
 
 
 @dataclass(frozen=True, eq=False)
