@@ -40,8 +40,7 @@ from timing import Result, medians, optional
 
 import malta
 from malta.machines.halbach.experiments import steps_reference
-from malta.machines.planar import commutation, field
-from malta.machines.planar import plant as planar
+from malta.machines.planar import commutation, field, plant as planar
 from malta.machines.planar.experiments import compile_function
 from malta.machines.planar.motions import CELLS
 from malta.machines.tubular import plant as tubular

@@ -55,13 +55,7 @@ def finish(axes: Axes, x: str, y: str, title: str = "") -> None:
 
 def handbook(q1: Any, q2: Any, q3: Any) -> list[Any]:
     """Coefficients of the polynomial, highest power first."""
-    return [
-        16,
-        16 * q1 - 24,
-        78 - 9.625 * q1 - 16 * q2,
-        19 * q1 + 8 * q2 + q3 - 44,
-        12 - 4 * q1 - q2 + q3,
-    ]
+    return [16, 16 * q1 - 24, 78 - 9.625 * q1 - 16 * q2, 19 * q1 + 8 * q2 + q3 - 44, 12 - 4 * q1 - q2 + q3]
 
 
 def handbook_values(w: FloatArray, u: FloatArray, t: float) -> ComplexArray:

@@ -12,38 +12,36 @@ from typing import TYPE_CHECKING, Any
 from malta.contents import contents
 
 if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
-    from malta import app as app
-    from malta import campaigns as campaigns
-    from malta import firmware as firmware
-    from malta import gains as gains
-    from malta import identification as identification
-    from malta import loops as loops
-    from malta import margins as margins
-    from malta import model as model
-    from malta import proof as proof
-    from malta import report as report
-    from malta import schemas as schemas
-    from malta import simulation as simulation
-    from malta import structured as structured
-    from malta import synthesis as synthesis
+    from malta import (
+        app as app,
+        campaigns as campaigns,
+        firmware as firmware,
+        gains as gains,
+        identification as identification,
+        loops as loops,
+        margins as margins,
+        model as model,
+        proof as proof,
+        report as report,
+        schemas as schemas,
+        simulation as simulation,
+        structured as structured,
+        synthesis as synthesis,
+    )
     from malta.campaigns.run import campaign as campaign
-    from malta.errors import CheckError as CheckError
-    from malta.errors import InputError as InputError
-    from malta.firmware.export import export_c as export_c
-    from malta.firmware.export import export_fmu as export_fmu
+    from malta.errors import CheckError as CheckError, InputError as InputError
+    from malta.firmware.export import export_c as export_c, export_fmu as export_fmu
     from malta.identification.excite import excite as excite
     from malta.identification.identify import identify as identify
     from malta.identification.learn import learn as learn
     from malta.identification.measure import measure as measure
     from malta.loops.loop import loop as loop
-    from malta.model.data import plant_of as plant_of
-    from malta.model.data import read as read
+    from malta.model.data import plant_of as plant_of, read as read
     from malta.model.equilibrium import trim as trim
     from malta.model.linear import linear_machine as linear_machine
     from malta.model.linearize import linearize as linearize
     from malta.model.machines import machine as machine
-    from malta.proof.blocks.gain import dynamic_margin as dynamic_margin
-    from malta.proof.blocks.gain import worst_case_gain as worst_case_gain
+    from malta.proof.blocks.gain import dynamic_margin as dynamic_margin, worst_case_gain as worst_case_gain
     from malta.proof.robust import robust_margin as robust_margin
     from malta.proof.systems import uncertain as uncertain
     from malta.report.ledger import ledger as ledger

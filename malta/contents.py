@@ -26,9 +26,8 @@ def contents(
 
     def load(name: str) -> Any:
         if name in gone:
-            warnings.warn(
-                f"{package}.{name} goes: write {gone[name]}", DeprecationWarning, stacklevel=3
-            )  # of the caller of the package's own `__getattr__`
+            told = f"{package}.{name} goes: write {gone[name]}"
+            warnings.warn(told, DeprecationWarning, stacklevel=3)  # of who calls the package's `__getattr__`
             return attrgetter(gone[name].partition(".")[2])(import_module(package))
         if name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")

@@ -16,9 +16,7 @@ from malta.display import RADIANS, display, frequency, micro, number
 from malta.units import distinct, identifier, in_unit
 
 Better = Literal["high", "low", ""]  # "": neither
-Scope = Literal[
-    "loop", "box", "machine"
-]  # what two designs share for a comparison of the figure to make sense
+Scope = Literal["loop", "box", "machine"]  # what two designs share where a comparison makes sense
 PLAIN = (1e-2, 1e6)  # sizes of numbers that are written without a power of ten
 ROOTS = {"m s^0.5": (1e6, "um s^0.5"), "rad s^0.5": (1e6, "urad s^0.5")}  # no products of whole powers
 

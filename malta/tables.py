@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, StrictStr, ValidationError
-from pydantic import Field as Checked
+from pydantic import BaseModel, ConfigDict, Field as Checked, StrictStr, ValidationError
 
 from malta.errors import InputError
 from malta.files import read_file
@@ -148,10 +147,7 @@ MANY = 2000  # members; a gain file has about 60
 ENTRY = b"PK\x01\x02"  # opens the entry of a member in the table of an archive
 SUFFIX = ".npy"
 KINDS = "biufcU"  # of arrays: truth values, numbers, text
-HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
+HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def read_npz(data: bytes) -> dict[str, Any]:

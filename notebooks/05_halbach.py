@@ -16,9 +16,7 @@ import numpy as np
 from IPython.display import display
 
 import malta
-from malta.machines.halbach import electronics
-from malta.machines.halbach import electronics as motor
-from malta.machines.halbach import plant as halbach
+from malta.machines.halbach import electronics, electronics as motor, plant as halbach
 from malta.synthesis.filters import sampled_model
 
 # The project's root, wherever Jupyter was started.

@@ -18,10 +18,7 @@ import numpy as np
 from IPython.display import display
 
 import malta
-from malta.machines.planar import commutation
-from malta.machines.planar import field as coils
-from malta.machines.planar import field as planar_field
-from malta.machines.planar import plant as planar
+from malta.machines.planar import commutation, field as coils, field as planar_field, plant as planar
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

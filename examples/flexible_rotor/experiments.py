@@ -19,10 +19,10 @@ from malta.simulation.experiments import (
     PlannedRun,
     Progress,
     amplitude,
+    catalogue as generic,
     fly_all,
     scenario_of,
 )
-from malta.simulation.experiments import catalogue as generic
 
 from . import analysis, flexible_rotor
 

@@ -29,11 +29,11 @@ from malta.simulation.experiments import (
     PlannedRun,
     Progress,
     amplitude,
+    catalogue as generic,
     fly,
     fly_all,
     scenario_of,
 )
-from malta.simulation.experiments import catalogue as generic
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 

@@ -132,10 +132,7 @@ def motion(par: Parameters, x: Any, wrench: Any) -> Any:
     """x' under F_x, F_y, T_x, T_y: Newton, and Euler for small angles."""
     spin = par.I_p * par.Omega
     return ca.vertcat(
-        x[4:8],
-        wrench[:2] / par.m,
-        (wrench[2] - spin * x[7]) / par.I_t,
-        (wrench[3] + spin * x[6]) / par.I_t,
+        x[4:8], wrench[:2] / par.m, (wrench[2] - spin * x[7]) / par.I_t, (wrench[3] + spin * x[6]) / par.I_t
     )
 
 

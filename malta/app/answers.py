@@ -9,13 +9,11 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from malta.app.files import fingerprint
 from malta.app.picture import PARTS, Problem, View, add_part, eigenvalue_margin, opening
-
-if TYPE_CHECKING:
-    from malta.model.plant import Parameters
+from malta.model.plant import Parameters
 
 SLOW = 0.07  # s of processor time, beyond which no answer is taken by a further part
 FADING = 0.9  # of what a part took, at each answer that goes without it: a busy computer is so no longer

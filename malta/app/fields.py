@@ -9,20 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeGuard, get_args
+from typing import Any, Literal, Protocol, TypeGuard, get_args
 
 from malta.errors import InputError
 from malta.proof.uncertain import is_commutated
 from malta.synthesis.design_tables import DesignFile
-from malta.synthesis.spec import Discretization, Place
+from malta.synthesis.spec import Discretization, Place, Spec
 from malta.units import to_si
 
-if TYPE_CHECKING:
-    from malta.synthesis.spec import Spec
-
-MACHINE = (
-    "machine."  # the keys of machine parameters; those of the design file are its own, as "bases.state.x"
-)
+MACHINE = "machine."  # begins keys of machine parameters; those of the design file are its own
 DECADES = 2.0  # of a slider, either way of the file's number
 HUGE = 1e300  # what no number of a design comes near
 NARROW = 4.0  # factor, either way, of a machine's parameters and of the sample time

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import tomlkit
 
@@ -23,18 +23,13 @@ from malta.app.fields import MACHINE, Field, check_value, fields_of
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, replace_files
 from malta.gains import SUFFIXES
-from malta.model.parameters import check_range
-from malta.model.parameters import fingerprint as record_fingerprint
+from malta.model.parameters import check_range, fingerprint as record_fingerprint
+from malta.model.plant import Parameters
 from malta.processes import environment, python_module
 from malta.synthesis.design_file import resolve_published, spec_of
-from malta.synthesis.spec import integral_signals
+from malta.synthesis.spec import Spec, integral_signals
 from malta.tables import load_toml
 from malta.units import to_si
-
-if TYPE_CHECKING:
-    from malta.model.plant import Parameters
-    from malta.synthesis.spec import Spec
-
 
 Value = float | int | bool | str
 
@@ -226,11 +221,7 @@ def inside(root: Path, relative: str) -> Path:
     try:
         if usable and target.resolve() == target:
             return target
-    except (
-        OSError,
-        RuntimeError,
-        UnicodeError,
-    ):  # a loop of links, a folder that may not be looked into, half a letter
+    except (OSError, RuntimeError, UnicodeError):  # links in a loop, no permission, half a letter
         pass
     raise InputError(
         "save", "file", repr(relative), "a file inside the folder that malta app was started in, no link"

@@ -8,23 +8,20 @@ trim. Forces that saturate, sums of errors that wait, and what changes along the
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from malta.errors import InputError
+from malta.loops.sampled_loops import SampledLoop
 from malta.model.data import plant_of
-from malta.model.plant import outputs_at
+from malta.model.plant import FloatArray, outputs_at
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.inputs import feedforward, motion_of, past_forces
 from malta.simulation.period import state_reference
-
-if TYPE_CHECKING:
-    from malta.loops.sampled_loops import SampledLoop
-    from malta.model.plant import FloatArray
-    from malta.simulation.references import Motion
-    from malta.simulation.scenario import Scenario
-    from malta.synthesis.controller import Controller
+from malta.simulation.references import Motion
+from malta.simulation.scenario import Scenario
+from malta.synthesis.controller import Controller
 
 LONGEST = 20_000  # samples
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -29,18 +29,15 @@ from malta.margins.verify import machine_report
 from malta.merits import Merit, figure
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
+from malta.model.plant import FloatArray, Plant, Signal
 from malta.proof.loss import RayBound, ray_bound
+from malta.simulation.experiments import PlannedRun
 from malta.simulation.experiments.catalogue import cases_of, main_job, series_of, step_cases
+from malta.synthesis.controller import Controller
+from malta.synthesis.recovery import StepResponse
+from malta.synthesis.spec import Spec
 from malta.synthesis.synthesize import synthesize
 from malta.units import in_unit
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant, Signal
-    from malta.simulation.experiments import PlannedRun
-    from malta.synthesis.controller import Controller
-    from malta.synthesis.recovery import StepResponse
-    from malta.synthesis.spec import Spec
-
 
 # The runs that the page can show: the machine's main job, and a step of each output.
 

@@ -180,17 +180,8 @@ class _Handler(BaseHTTPRequestHandler):
 # anywidget carries the messages; it comes with the extra `notebooks`.
 
 
-SCRIPTS = (
-    "numbers",
-    "chart",
-    "controls",
-    "export",
-    "figures",
-    "tables",
-    "tuning",
-    "app",
-    "widget",
-)  # each after what it imports
+# Each after what it imports.
+SCRIPTS = ("numbers", "chart", "controls", "export", "figures", "tables", "tuning", "app", "widget")
 HEIGHT = 820  # px
 
 

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from malta.app.answers import MARGIN, Answer, Answers
 from malta.app.fields import is_number
@@ -29,20 +29,12 @@ from malta.app.files import (
     save_gains,
 )
 from malta.app.followers import Worker, describe_error
-from malta.app.picture import (
-    View,
-    poles_document,
-    run_names,
-    solve,
-)
+from malta.app.picture import View, poles_document, run_names, solve
 from malta.app.pull import Handle, Pull, compare_numbers, pull_to
 from malta.errors import InputError, shorten
 from malta.synthesis.requirements import requirements_for
+from malta.synthesis.spec import Spec
 from malta.tuning.search import base_of
-
-if TYPE_CHECKING:
-    from malta.synthesis.spec import Spec
-
 
 QUIET = 0.25  # s, after the last move until its proof begins
 LONGEST_WAIT = 20.0  # s, of a question for news
@@ -82,9 +74,7 @@ class Session:
         self._newest, self._version, self._base = 0, 0, 0
         self._news: list[tuple[int, Document]] = []  # numbered
         self._count = 0
-        self._slopes: tuple[Handle, View, dict[str, tuple[float, ...]]] | None = (
-            None  # of the handle that is pulled
-        )
+        self._slopes: tuple[Handle, View, dict[str, tuple[float, ...]]] | None = None  # of a pull
         self._answers = Answers()
         self._answer: tuple[int, Answer] | None = None  # to the newest evaluation, and its number
         self._timer: threading.Timer | None = None
@@ -237,10 +227,7 @@ class Session:
             view = _view_of(body)
             one = Pull(self.files, edit, view, handle)
             known = self._slopes is not None and self._slopes[:2] == (handle, view)
-            for fresh in (
-                not known,
-                True,
-            ):  # numbers that were compared for another design may be the wrong ones
+            for fresh in (not known, True):  # numbers compared for another design may be wrong ones
                 if fresh:
                     self._slopes = (handle, view, compare_numbers(one))
                 assert self._slopes is not None

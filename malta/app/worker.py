@@ -48,23 +48,13 @@ from malta.tuning.search import Effort, Journal, Progress, Trial, apply_trial, a
 from malta.tuning.tune import cluster_search, clusters_of, frugal_trials, search_weights
 from malta.tuning.verify import SynthesizedDesign, outcomes_of
 
-POLISH = (
-    0,
-    1,
-    2,
-    4,
-    8,
-    16,
-    40,
-)  # trials for each number, of one search after the other: the page's own, then better ones
+# Trials for each number, of one search after the other: the page's own, then better ones.
+POLISH = (0, 1, 2, 4, 8, 16, 40)
 LEAST_GAIN = 1e-3  # of the logarithm that a search makes small, from one candidate to the next
 ALONG = 4  # trials for each number, of a point of the front
 EASED = (1.4, 1.2, 1.1, 1.0, 0.9, 0.8, 0.7)  # of the peak sensitivity that a PID may have, along its front
 SLACK = 0.005  # of a requirement, beyond which a point of the front misses it
-PRICES = (
-    "command noise",
-    "moved by",
-)  # of a margin, as the figures of the picture are named: of an LQG, of a PID
+PRICES = ("command noise", "moved by")  # of a margin, named as figures of the picture: of an LQG, of a PID
 POINT_WORK = 20.0  # of the proof of a point of the front
 
 

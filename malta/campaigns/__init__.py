@@ -9,6 +9,5 @@ from malta.campaigns.plan import Plan as Plan
 from malta.campaigns.rare import rare_event as rare_event
 from malta.campaigns.result import Campaign as Campaign
 from malta.campaigns.run import summarize as summarize
-from malta.campaigns.studies import sensitivity as sensitivity
-from malta.campaigns.studies import tolerances as tolerances
+from malta.campaigns.studies import sensitivity as sensitivity, tolerances as tolerances
 from malta.campaigns.summary import Summary as Summary

@@ -12,15 +12,13 @@ from functools import lru_cache
 from importlib import metadata
 from pkgutil import resolve_name
 from threading import Thread
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from malta.campaigns.plan import Plan
 from malta.campaigns.store import Block, fly
 from malta.errors import InputError
 from malta.files import version
 from malta.model.machines import load_sources, sources_of
-
-if TYPE_CHECKING:
-    from malta.campaigns.plan import Plan
 
 ANSWER = 3.0  # s, within which a scheduler answers
 AHEAD = 4  # blocks under way for each thread of the workers

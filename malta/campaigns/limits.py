@@ -14,7 +14,6 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,11 +24,9 @@ from malta.campaigns.summary import UNBOUNDED, Bounds
 from malta.display import display
 from malta.errors import InputError
 from malta.model.machines import outputs_of
+from malta.model.plant import FloatArray
+from malta.simulation.engine.digest import Batch
 from malta.units import in_unit
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-    from malta.simulation.engine.digest import Batch
 
 EVENTS = ("touchdown", "published", "specification")  # limits without a bound of the user's own
 BELOW = float(np.nextafter(1, 0))  # the largest severity of a run within its limit

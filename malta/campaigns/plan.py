@@ -15,10 +15,11 @@ from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 from zipimport import zipimporter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from malta.display import display
 from malta.errors import InputError
@@ -34,13 +35,8 @@ from malta.simulation.engine.batch import functions_text
 from malta.simulation.experiments import PlannedRun
 from malta.simulation.experiments.catalogue import cases_of
 from malta.simulation.readings import GAMMA, keys, mix
+from malta.simulation.scenario import Scenario
 from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.simulation.scenario import Scenario
-
 
 # Points of a design in the unit box, any consecutive ones of them without the others.
 #
@@ -147,13 +143,8 @@ def _whole(points: FloatArray) -> NDArray[np.uint64]:
 # Runs of two revisions differ, so a folder keeps the runs of one revision only.
 
 
-PACKAGES = (
-    "model",
-    "synthesis",
-    "simulation",
-    "simulation/engine",
-    "simulation/experiments",
-)  # whose modules decide a run
+# Packages whose modules decide a run.
+PACKAGES = ("model", "synthesis", "simulation", "simulation/engine", "simulation/experiments")
 
 
 @lru_cache(maxsize=8)

@@ -19,9 +19,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import t as student
 
@@ -40,17 +41,12 @@ from malta.campaigns.store import seal, simulate_machines
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.files import file_exists, json_text, read_file, replace_files
+from malta.model.plant import FloatArray
 from malta.simulation.engine.digest import Batch, verdicts
+from malta.simulation.engine.engines import EngineChoice
+from malta.simulation.experiments import Experiment, Progress
+from malta.simulation.simulate import EngineOf
 from malta.tables import read_npz
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import FloatArray
-    from malta.simulation.engine.engines import EngineChoice
-    from malta.simulation.experiments import Experiment, Progress
-    from malta.simulation.simulate import EngineOf
-
 
 # Subset simulation: small probabilities as a product of larger ones, each by Markov chains on the runs before.
 #

@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from malta.campaigns.plan import Plan, half_width, varied_names
@@ -21,13 +22,8 @@ from malta.model.parameters import differences, units_of
 from malta.model.plant import FloatArray, readonly
 from malta.simulation.engine.digest import Batch, verdicts
 from malta.simulation.experiments import setting
+from malta.synthesis.spec import Spec
 from malta.units import in_unit
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.synthesis.spec import Spec
-
 
 CONFIDENCE = 0.95  # of the interval about a share
 
@@ -233,10 +229,7 @@ def every_figure(found: Campaign, published: Mapping[str, Any] | None = None) ->
         finding(name.removeprefix("touchdown at "), CLEARANCE, "percent", batch.contact[:, k])
         for k, name in enumerate(plant.contacts)
     ]
-    return [
-        *listed,
-        finding("", "limited commands", "percent", batch.saturated.max(axis=1, initial=0.0)),
-    ]
+    return [*listed, finding("", "limited commands", "percent", batch.saturated.max(axis=1, initial=0.0))]
 
 
 def bounds_of(plan: Plan) -> Mapping[str, str]:
@@ -319,7 +312,5 @@ def yields_of(
         return None if within is None else rate(int(within.sum()), runs)
 
     return Yields(
-        found.rate,
-        share(runs_within_bounds(found, published)),
-        share(runs_within_specification(found, spec)),
+        found.rate, share(runs_within_bounds(found, published)), share(runs_within_specification(found, spec))
     )

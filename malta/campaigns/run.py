@@ -15,9 +15,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Protocol, get_args
+from typing import NamedTuple, Protocol, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from malta.campaigns.plan import PRECISIONS, Machines, Plan, draw_machines, planned_run
 from malta.campaigns.result import Campaign, gather
@@ -43,18 +44,11 @@ from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import Experiment, Progress
 from malta.simulation.experiments.catalogue import main_job, settling, single_run
 from malta.simulation.simulate import EngineOf
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.synthesis.controller import Controller
-    from malta.synthesis.spec import Spec
-
+from malta.synthesis.controller import Controller
+from malta.synthesis.spec import Spec
 
 BLOCK = 1024  # runs in a block: a fraction of a second of work
-LARGE_BLOCK = (
-    16_384  # of a large campaign: seconds of work, 5 MB in a file and some 50 MB while it is simulated
-)
+LARGE_BLOCK = 16_384  # of a large campaign: seconds of work, 5 MB in a file, some 50 MB while it is simulated
 SLOW_BLOCK = 32  # without a C compiler
 FILES = 256  # blocks that a campaign has before they grow
 IN_MEMORY = 10_000_000  # runs whose figures `campaign` returns: 3 GB
@@ -427,10 +421,7 @@ class Status:
 
 
 def status(
-    folder: str | Path,
-    controller: Controller,
-    bounds: Bounds = UNBOUNDED,
-    progress: Progress | None = None,
+    folder: str | Path, controller: Controller, bounds: Bounds = UNBOUNDED, progress: Progress | None = None
 ) -> Status:
     """The status of the campaign in a folder. Every block is read and its seal checked; nothing is written.
 

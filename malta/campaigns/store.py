@@ -19,9 +19,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from malta.campaigns.plan import (
     PRECISIONS,
@@ -37,6 +38,7 @@ from malta.errors import InputError
 from malta.files import file_exists, read_file, remove_leftovers, replace_files, writer
 from malta.firmware.flight import engine_of_c
 from malta.model.parameters import fingerprint
+from malta.model.plant import FloatArray
 from malta.simulation.engine.batch import is_compiled, simulate_many
 from malta.simulation.engine.compiled import MOST_LANES
 from malta.simulation.engine.digest import LARGEST_FIGURE, Batch, verdicts
@@ -44,12 +46,6 @@ from malta.simulation.experiments import Progress
 from malta.simulation.scenario import Scenario
 from malta.synthesis.controller import Controller
 from malta.tables import read_npz
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import FloatArray
-
 
 # A block: some consecutive runs of a plan, simulated together.
 

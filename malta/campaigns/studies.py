@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import qmc, sobol_indices
@@ -33,11 +33,8 @@ from malta.campaigns.store import simulate_machines
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.model.parameters import differences
+from malta.model.plant import FloatArray
 from malta.simulation.experiments import Progress, progress_of_part
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 NOISE = "noise"  # the name of its factor
 LEAST = 16  # points of each of the two samples
@@ -66,9 +63,7 @@ class Sensitivity:
     runs: int  # simulated
     within: Rate  # of the independent runs: share within the limit
     of_yield: tuple[Index, ...]  # by factor; empty where all runs, or none, are within the limit
-    of_merits: Mapping[
-        str, tuple[Index, ...]
-    ]  # by label; empty where a run has no value, or all have the same
+    of_merits: Mapping[str, tuple[Index, ...]]  # by label; empty where a run has no value, or all the same
 
     @property
     def description(self) -> Description:

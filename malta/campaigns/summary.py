@@ -13,9 +13,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from malta.campaigns.plan import Plan, half_width, middle_of
 from malta.campaigns.result import (
@@ -32,15 +33,10 @@ from malta.campaigns.result import (
 )
 from malta.display import Description, display
 from malta.merits import Merit, figure
+from malta.model.plant import FloatArray
 from malta.simulation.engine.digest import LARGEST_FIGURE, Batch, verdicts
+from malta.synthesis.spec import Spec
 from malta.units import in_unit
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import FloatArray
-    from malta.synthesis.spec import Spec
-
 
 # Sketches: the distribution of a figure over any number of runs, in memory that does not grow with them.
 #
@@ -69,9 +65,7 @@ class Sketch:
     smallest: float = math.inf
     largest: float = -math.inf
     values: tuple[FloatArray, ...] = ()  # all of them, in any order, while they are at most EXACT
-    counts: Mapping[int, NDArray[np.int64]] = field(
-        default_factory=dict
-    )  # sign and exponent -> count of each bucket
+    counts: Mapping[int, NDArray[np.int64]] = field(default_factory=dict)  # (sign, exponent) -> counts
 
     @property
     def exact(self) -> bool:
@@ -83,9 +77,7 @@ def sketch_of(values: FloatArray) -> Sketch:
     """The sketch of some finite values."""
     if not len(values):
         return Sketch()
-    values = (
-        np.asarray(values, dtype=float) + 0.0
-    )  # -0.0 is 0.0: of the two, sorting and merging may find either
+    values = np.asarray(values, dtype=float) + 0.0  # -0.0 is 0.0: sorting and merging may find either
     return _count_if_many(Sketch(len(values), float(values.min()), float(values.max()), (values,)))
 
 
@@ -489,8 +481,6 @@ def _join_runs(one: Runs, other: Runs) -> Runs:
         for name in Batch.__dataclass_fields__
     }
     joined = Runs(
-        np.concatenate([one.index, other.index]),
-        np.concatenate([one.values, other.values]),
-        Batch(**columns),
+        np.concatenate([one.index, other.index]), np.concatenate([one.values, other.values]), Batch(**columns)
     )
     return joined.take(np.argsort(joined.index))

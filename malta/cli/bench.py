@@ -22,12 +22,13 @@ from malta.cli.options import (
     change_machine,
     read_assignments,
     read_controller,
+    read_sensor_errors,
     read_uncertainty,
     require_suffixes,
 )
 from malta.cli.output import make_console, print_document, print_note, print_text, print_written, working
 from malta.errors import CheckError, InputError
-from malta.files import PICTURES
+from malta.files import PICTURES, replace_files
 
 if TYPE_CHECKING:
     from malta.identification.commission import Commissioning, Step
@@ -236,11 +237,8 @@ def commission(
     \b
     Example:  malta commission design/gains/robust.json --set K_A=9000
     """
-    from malta.cli.options import read_sensor_errors
-    from malta.files import replace_files
     from malta.gains.file import content_of
-    from malta.identification.commission import JOURNAL, steps_of
-    from malta.identification.commission import commission as commission_machine
+    from malta.identification.commission import JOURNAL, commission as commission_machine, steps_of
     from malta.model.data import plant_of
     from malta.report.page.document import binder_page, binder_text
 

@@ -410,27 +410,17 @@ def campaign(
     ] = None,
     workers: Annotated[int | None, typer.Option(metavar="N", help="Threads. [one for each core]")] = None,
     cluster: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Workers of a Dask scheduler: tcp://host:8786."),
+        str | None, typer.Option(metavar="ADDRESS", help="Workers of a Dask scheduler: tcp://host:8786.")
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Folder of blocks and figures. [build/campaigns/]"),
+        Path | None, typer.Option(metavar="FOLDER", help="Folder of blocks and figures. [build/campaigns/]")
     ] = None,
     design: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DESIGN",
-            help="Design file whose [specification] counts too.",
-        ),
+        Path | None, typer.Option(metavar="DESIGN", help="Design file whose [specification] counts too.")
     ] = None,
     worst: Annotated[int, typer.Option(metavar="N", min=0, max=1000, help="Runs to list.")] = 5,
     status: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Show how far the campaign in a folder is.",
-        ),
+        Path | None, typer.Option(metavar="FOLDER", help="Show how far the campaign in a folder is.")
     ] = None,
     yes: Yes = False,
     as_json: AsJson = False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +29,7 @@ from malta.cli.output import (
     working,
 )
 from malta.errors import CheckError, InputError
-from malta.files import replace_files, shipped_path
+from malta.files import file_exists, replace_files, shipped_path
 
 if TYPE_CHECKING:
     from malta.cli.documents.campaigns import DesignPart
@@ -156,9 +157,7 @@ def _run_design(
     unchanged = gains.agrees(controller, margins, *paths)
     if not unchanged:
         contents |= gains.file_contents(controller, margins, *paths)
-    replace_files(
-        contents
-    )  # last, and all at once: whatever fails leaves the old gain files and their figure
+    replace_files(contents)  # last, all at once: whatever fails leaves the old gain files and their figure
     return Made(spec.name, page, margins, result, paths, picture, unchanged)
 
 
@@ -191,7 +190,6 @@ def _simulate_gain_file(
 
     Raises CheckError, naming the design file, when a run ends early; KeyboardInterrupt when Ctrl-C cut it short.
     """
-    import tempfile
 
     from malta import gains
     from malta.simulation.experiments.catalogue import experiment
@@ -331,7 +329,6 @@ def tune(
     \b
     Example:  malta tune design/robust.toml --out build/tuned
     """
-    from malta.files import file_exists
     from malta.synthesis.design_file import read_design
     from malta.tuning.search import Effort
 
@@ -419,7 +416,6 @@ def _search(spec: Spec, journal: Path, effort: Effort, *, restart: bool) -> Tune
 def _write(spec: Spec, tuned: Tuned, target: Path) -> list[Path]:
     """Write the design file that was found; beside it the Pareto front where there is one."""
     from malta import report
-    from malta.files import replace_files
     from malta.tuning.tune import design_text
 
     files = {target: design_text(spec, tuned.trial, target).encode()}

@@ -72,8 +72,7 @@ def identify(
         typer.Option(metavar="NAME=VALUE", help="What it adds to a parameter, as m=100g. Repeatable."),
     ] = None,
     drive: Annotated[
-        bool,
-        typer.Option("--drive", help="R, L and dead time of the drive too, from voltages in the log."),
+        bool, typer.Option("--drive", help="R, L and dead time of the drive too, from voltages in the log.")
     ] = False,
     machine: MachineFile = None,
     as_json: AsJson = False,
@@ -89,8 +88,7 @@ def identify(
     Example:  malta identify design/gains/robust.json log.npz -o found.toml
     """
     from malta.identification.data_file import write_data
-    from malta.identification.identify import GROUPS, weigh
-    from malta.identification.identify import identify as identify_parameters
+    from malta.identification.identify import GROUPS, identify as identify_parameters, weigh
     from malta.identification.log_files import read_log
     from malta.identification.response import units_of_model
     from malta.identification.windings import identify_windings

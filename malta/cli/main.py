@@ -24,8 +24,7 @@ from malta.cli.design import design, new, tune
 from malta.cli.export import export, pil, schema
 from malta.cli.identification import excite, identify, learn, log, replay
 from malta.cli.output import interruption, print_error, print_note, silence
-from malta.cli.pages import app as live_page
-from malta.cli.pages import claims, motion
+from malta.cli.pages import app as live_page, claims, motion
 from malta.cli.report import compare, plot, report
 from malta.cli.simulate import simulate
 from malta.cli.verify import check, verify
@@ -48,11 +47,7 @@ STUDIES = {
 }
 
 
-KINDS = {
-    "integer": "N",
-    "integer range": "N",
-    "text": "WORD",
-}  # of a value that its option names nothing better for
+KINDS = {"integer": "N", "integer range": "N", "text": "WORD"}  # of a value without a name
 
 
 class Command(TyperCommand):
@@ -131,9 +126,7 @@ def renew(args: list[str]) -> list[str]:
     return found
 
 
-UsageError: Any = (
-    typer.BadParameter.__base__
-)  # of click, or of the copy of click that newer versions of typer have
+UsageError: Any = typer.BadParameter.__base__  # of click, or of the copy of it in newer versions of typer
 
 
 class Commands(Mapping[str, Any]):

@@ -22,7 +22,7 @@ from malta.cli.options import (
 )
 from malta.cli.output import make_console, print_document, print_note, print_written, progress_bar
 from malta.errors import InputError
-from malta.files import locate
+from malta.files import locate, read_file, replace_files
 
 if TYPE_CHECKING:
     from malta.app.session import Session
@@ -65,9 +65,7 @@ def app(
         machine(machine_file)
     session = Session(design, Path.cwd(), machine_file)
     gc.freeze()
-    gc.set_threshold(
-        20_000, 5, 5
-    )  # a page runs for hours: expressions of past machines go, the libraries stay
+    gc.set_threshold(20_000, 5, 5)  # a page runs for hours: past machines' expressions go, the libraries stay
     with Server(session, port) as server:
         print(server.url, flush=True)
         if not no_browser and not (_has_screen() and webbrowser.open(server.url)):
@@ -149,7 +147,6 @@ def motion(
     Examples:  malta motion design/gains/robust.json build/robust_stroke.npz
                malta motion design/gains/robust.json --scenario faults --witness
     """
-    from malta.files import replace_files
     from malta.gains.file import content_of
     from malta.model.data import plant_of
     from malta.report.page.motion import motion_gif, motion_of, motion_page, read_motion
@@ -270,7 +267,6 @@ def _update(file: Path, designs: Sequence[Path]) -> None:
 
     Raises InputError for designs beside the file, a table of a design that is not there, and a file without tables.
     """
-    from malta.files import read_file, replace_files
     from malta.report.ledger import find_tables, replace_tables
     from malta.synthesis.design_file import read_design
 

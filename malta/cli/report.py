@@ -365,11 +365,7 @@ def _distinct(
 
 
 def _loci(
-    machines: Machines,
-    parameter: str,
-    span: str | None,
-    channels: list[str] | None,
-    at: Place,
+    machines: Machines, parameter: str, span: str | None, channels: list[str] | None, at: Place
 ) -> Sequence[RootLocus]:
     """The root locus of each loop, behind a progress bar."""
     from malta.loops.locus import root_locus
@@ -394,7 +390,6 @@ def _maps(
     files: Sequence[Path], machines: Machines, axes: tuple[str | None, str | None], beside: str
 ) -> Sequence[MarginMap]:
     """The margin map of each loop over two parameters that its gain file names as uncertain. Raises InputError."""
-    from malta.cli.options import read_uncertainty
     from malta.margins.margin_map import Others, margin_map_of
 
     (x, y), others, found = axes, cast("Others", beside), []
@@ -491,7 +486,6 @@ def _draw(
 
 def _save(pictures: Sequence[Picture], out: Path | None, *, dark: bool) -> list[Path]:
     """Write the pictures to the file that was named, or to a folder as NAME_KIND.png, all or none."""
-    from malta.files import replace_files
     from malta.report import encode_figure
 
     one = out is not None and out.suffix in SUFFIXES and not out.is_dir()
@@ -538,8 +532,7 @@ def compare(
     Example:  malta compare design/gains/table2.json design/gains/robust.json
     """
     from malta.margins.loop_report import require_stable
-    from malta.report.page.comparison import compare as compare_subjects
-    from malta.report.page.comparison import comparison_tables, require_count
+    from malta.report.page.comparison import compare as compare_subjects, comparison_tables, require_count
     from malta.report.page.document import SUFFIXES
 
     require_count(len(gains))

@@ -147,8 +147,7 @@ def simulate(
     log: Annotated[
         Path | None,
         typer.Option(
-            metavar="LOG",
-            help="Write what a bench would log of the first run: .csv, .npz, .mat, .parquet.",
+            metavar="LOG", help="Write what a bench would log of the first run: .csv, .npz, .mat, .parquet."
         ),
     ] = None,
     replay: Annotated[
@@ -189,9 +188,7 @@ def simulate(
     options |= {"sensor_errors": errors} if errors else {}
     options |= {} if seed is None else {"seed": seed}
     substeps = options.get("substeps")
-    times = (3.0 if substeps else 1.0) * (
-        10.0 if law == "c" else 1.0
-    )  # own law, double and float: see simulate.py
+    times = (3.0 if substeps else 1.0) * (10.0 if law == "c" else 1.0)  # own law, double, float: simulate.py
     with progress_bar(chosen, insists=False) as bar:
         # With substeps a second run, with twice as many, follows for the estimate of the error.
         progress = limit_time(bar, chosen, agreed=yes, times=times)

@@ -6,11 +6,7 @@ from malta.contents import contents
 
 if TYPE_CHECKING:
     from malta.firmware.flight import engine_of_c as engine_of_c
-    from malta.firmware.pil import Replay as Replay
-    from malta.firmware.pil import replay_on_target as replay_on_target
+    from malta.firmware.pil import Replay as Replay, replay_on_target as replay_on_target
 
-_NAMES = {
-    "malta.firmware.flight": "engine_of_c",
-    "malta.firmware.pil": "Replay replay_on_target",
-}
+_NAMES = {"malta.firmware.flight": "engine_of_c", "malta.firmware.pil": "Replay replay_on_target"}
 __all__, __getattr__, __dir__ = contents(__name__, _NAMES)

@@ -39,9 +39,7 @@ class Parameter(NamedTuple):
     values: FloatArray
     least: FloatArray
     most: FloatArray
-    shown: tuple[float, str] | None = (
-        None  # what a calibration tool shows: factor and unit; None: the number itself
-    )
+    shown: tuple[float, str] | None = None  # factor and unit of a calibration tool; None: the number itself
 
 
 @lru_cache(maxsize=16)

@@ -253,9 +253,7 @@ class Processor(NamedTuple):
 PROCESSORS = (
     Processor("this computer", "", ()),
     Processor(
-        "Cortex-A9",
-        "arm-linux-gnueabihf-",
-        ("-mcpu=cortex-a9", "-mfpu=vfpv3", "-mfloat-abi=hard", "-marm"),
+        "Cortex-A9", "arm-linux-gnueabihf-", ("-mcpu=cortex-a9", "-mfpu=vfpv3", "-mfloat-abi=hard", "-marm")
     ),
     Processor(
         "Cortex-M4F",
@@ -358,11 +356,7 @@ def _listing(p: Processor, folder: Path, name: str) -> str | None:
     return None if done is None else _run([f"{p.prefix}objdump", *LISTING, f"{name}.apart"], folder)
 
 
-SELDOM = (
-    "begin_block",
-    "stop_after",
-    "count_down",
-)  # functions of a ring: at a block's begin, at and after a trigger
+SELDOM = ("begin_block", "stop_after", "count_down")  # of a ring: at a block's begin, at a trigger, after
 
 
 class LogCost(NamedTuple):

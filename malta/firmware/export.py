@@ -52,14 +52,7 @@ from malta.firmware.sources import (
     template_context,
 )
 from malta.firmware.step import programs_of
-from malta.firmware.supervisor import (
-    MONITORS,
-    STATES,
-    TIMES,
-    ReferenceLimits,
-    monitors_of,
-    reference_limits,
-)
+from malta.firmware.supervisor import MONITORS, STATES, TIMES, ReferenceLimits, monitors_of, reference_limits
 from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
 from malta.firmware.vectors import SAMPLES, Vector, record_vectors, trial_context, watch_lines
 from malta.gains.file import content_of, read

@@ -442,12 +442,7 @@ class Fmu(NamedTuple):
 
 
 def build_fmu(
-    t: Target,
-    sha256: str,
-    *,
-    part: Part = "controller",
-    fmi: int = 2,
-    platforms: Sequence[str] | None = None,
+    t: Target, sha256: str, *, part: Part = "controller", fmi: int = 2, platforms: Sequence[str] | None = None
 ) -> Fmu:
     """An FMU.
 

@@ -301,9 +301,7 @@ def currents(t: Target, place: Any, v: Any, table: Any) -> tuple[Any, Any]:
 
     table : the values that are read at `places_in_table`; none for most machines
     """
-    unread = (
-        recorded_equations() if t.look_ups else nullcontext()
-    )  # notes of values before they are looked up
+    unread = recorded_equations() if t.look_ups else nullcontext()  # values before they are looked up
     with recorded_look_ups() as found, unread:
         wanted = ca.SX(t.believed.currents(place, v))
     if found:

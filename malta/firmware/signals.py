@@ -24,9 +24,7 @@ if TYPE_CHECKING:
 
 
 SLOW = 0.1  # share that a state changes by in a sample without anything added, at most: it is then a sum
-UNBOUNDED = (
-    1e6  # of its unit, an output's range where nothing is known of it: beyond, single precision has no room
-)
+UNBOUNDED = 1e6  # of its unit, an output's range where none is known: beyond, single precision has no room
 
 
 class Field(NamedTuple):
@@ -47,9 +45,7 @@ class Target:
 
     controller: Controller
     precision: Precision = "double"
-    fidelity: Fidelity = (
-        "phase"  # "force" ends with currents, "dq" with voltages of axes, "phase" with duty cycles
-    )
+    fidelity: Fidelity = "phase"  # ends with duty cycles; "force" with currents, "dq" with voltages of axes
     tunable: bool = False  # gains, limits, references and monitors from a record that the target may change
     gains: GainBox | None = None  # what is proven of other gains; None: nothing was asked for
     excited: bool = False  # forces beside the law's are read at every sample

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -24,18 +24,23 @@ from malta.loops.sampled_loops import LAST
 from malta.margins.travel import ENDS, extent_of, travel_loops
 from malta.model.data import plant_of, published_figures
 from malta.model.parameters import units_of
+from malta.model.plant import Plant
 from malta.proof.box import box_of, sides_of
 from malta.proof.certificate.certificate import Origin, loops_of
-from malta.proof.certificate.checked_file import LONG, Claim, Document, Loop, Parameter, Places, double
-from malta.proof.certificate.checked_file import Origin as Named
+from malta.proof.certificate.checked_file import (
+    LONG,
+    Claim,
+    Document,
+    Loop,
+    Origin as Named,
+    Parameter,
+    Places,
+    double,
+)
 from malta.proof.expressions import NotAnalytic, exact
-from malta.proof.windings import chosen_loops
-
-if TYPE_CHECKING:
-    from malta.model.plant import Plant
-    from malta.proof.margin import Ranges
-    from malta.proof.windings import CurrentLoops
-    from malta.synthesis.controller import Controller
+from malta.proof.margin import Ranges
+from malta.proof.windings import CurrentLoops, chosen_loops
+from malta.synthesis.controller import Controller
 
 
 def origin_of(

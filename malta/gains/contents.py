@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from malta.model.data import parameters_record, plant_of
 from malta.model.linear import LinearSystem, linear_machine
 from malta.model.machines import machine
 from malta.model.parameters import later_parameters, units_of
-from malta.model.plant import Plant, Signal, outputs_at
+from malta.model.plant import FloatArray, Parameters, Plant, Signal, outputs_at
 from malta.synthesis.controller import (
     Commutation,
     Controller,
@@ -30,11 +30,7 @@ from malta.synthesis.controller import (
     stored_forces,
 )
 from malta.synthesis.schedule import SCHEDULED, Schedule
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Parameters
-    from malta.synthesis.spec import Coordinates
-
+from malta.synthesis.spec import Coordinates
 
 # The table of a machine from plain matrices in a gain file, from and to its parameters.
 

@@ -35,30 +35,23 @@ from collections.abc import Mapping
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.files import locate, replace_files, require_plain_name, version
 from malta.gains.contents import LINEAR, build_controller, linear_table, signal_tables
-from malta.gains.encodings import SUFFIXES as SUFFIXES
-from malta.gains.encodings import content_sha256, decode, encode
+from malta.gains.encodings import SUFFIXES as SUFFIXES, content_sha256, decode, encode
 from malta.gains.schema import GainFile
-from malta.margins.loop_report import require_stable
+from malta.margins.loop_report import LoopReport, require_stable
 from malta.margins.verify import unstable_gain
 from malta.model.data import plant_of
 from malta.model.linear import is_linear
 from malta.model.parameters import units_of, values_of
-from malta.synthesis.controller import (
-    Controller,
-)
+from malta.synthesis.controller import Controller
 from malta.synthesis.schedule import SCHEDULED, Schedule
 from malta.tables import validate
-
-if TYPE_CHECKING:
-    from malta.margins.loop_report import LoopReport
-
 
 SCHEMA = "malta-gains"
 

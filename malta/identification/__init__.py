@@ -6,28 +6,24 @@ from malta.contents import contents
 
 if TYPE_CHECKING:
     from malta.identification.convergence import contraction as contraction
-    from malta.identification.dump import ExactReplay as ExactReplay
-    from malta.identification.dump import replay_dump as replay_dump
+    from malta.identification.dump import ExactReplay as ExactReplay, replay_dump as replay_dump
     from malta.identification.excite import ExcitationPlan as ExcitationPlan
-    from malta.identification.identify import Identified as Identified
-    from malta.identification.identify import weigh as weigh
-    from malta.identification.learn import Learned as Learned
-    from malta.identification.learn import LearnedV0 as LearnedV0
-    from malta.identification.learn import learn_v0 as learn_v0
-    from malta.identification.log import Log as Log
-    from malta.identification.log import log_of as log_of
-    from malta.identification.log_files import read_log as read_log
-    from malta.identification.log_files import write_log as write_log
-    from malta.identification.measure import Measurement as Measurement
-    from malta.identification.measure import MeasurementPlan as MeasurementPlan
-    from malta.identification.measure import plan_measurement as plan_measurement
-    from malta.identification.replay import LawReplay as LawReplay
-    from malta.identification.replay import replay_law as replay_law
-    from malta.identification.strokes import LearnedStrokes as LearnedStrokes
-    from malta.identification.strokes import learn_strokes as learn_strokes
-    from malta.identification.strokes import next_stroke as next_stroke
-    from malta.identification.windings import Windings as Windings
-    from malta.identification.windings import identify_windings as identify_windings
+    from malta.identification.identify import Identified as Identified, weigh as weigh
+    from malta.identification.learn import Learned as Learned, LearnedV0 as LearnedV0, learn_v0 as learn_v0
+    from malta.identification.log import Log as Log, log_of as log_of
+    from malta.identification.log_files import read_log as read_log, write_log as write_log
+    from malta.identification.measure import (
+        Measurement as Measurement,
+        MeasurementPlan as MeasurementPlan,
+        plan_measurement as plan_measurement,
+    )
+    from malta.identification.replay import LawReplay as LawReplay, replay_law as replay_law
+    from malta.identification.strokes import (
+        LearnedStrokes as LearnedStrokes,
+        learn_strokes as learn_strokes,
+        next_stroke as next_stroke,
+    )
+    from malta.identification.windings import Windings as Windings, identify_windings as identify_windings
 
 _NAMES = {
     "malta.identification.convergence": "contraction",

@@ -18,11 +18,10 @@ from scipy.stats import t as student
 
 from malta.errors import CheckError, InputError
 from malta.model.equilibrium import trim
-from malta.model.plant import outputs_at
+from malta.model.plant import FloatArray, Plant, outputs_at
 
 if TYPE_CHECKING:
     from malta.identification.log import Log
-    from malta.model.plant import FloatArray, Plant
 
 BATCHES = 20
 FEWEST = 10  # samples of a batch

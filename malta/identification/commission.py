@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,21 +24,18 @@ from malta.files import file_exists, json_text, read_file, replace_files
 from malta.gains.file import content_of
 from malta.identification.calibration import Estimate, at_rest
 from malta.identification.learn import FACTORS, learn
-from malta.identification.log import log_of
+from malta.identification.log import Log, log_of
 from malta.identification.log_files import read_log, write_log
 from malta.identification.measure import SAME_LAW, measure, plan_measurement
 from malta.identification.windings import identify_windings
 from malta.loops.loop import loop
 from malta.model.data import plant_of
 from malta.model.machines import attribute_of
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-
-if TYPE_CHECKING:
-    from malta.identification.log import Log
-    from malta.model.plant import Plant
-    from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller
 
 JOURNAL = "journal.json"
 LARGEST = 10_000_000  # bytes of a journal

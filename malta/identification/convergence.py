@@ -27,26 +27,23 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg, signal
 
 from malta.errors import InputError
 from malta.identification.strokes import FORCE
 from malta.loops.loop import loop
 from malta.model.data import plant_of
+from malta.model.plant import ComplexArray, FloatArray
 from malta.proof.blocks.gain import Gain, worst_case_gain
 from malta.proof.box import INTERVALS, Interval, box_of
 from malta.proof.groups import loop_of
 from malta.proof.uncertain import Compensator, UncertainSystem, closed_loop
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import ComplexArray, FloatArray
-    from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller
 
 TOLERANCE = 1e-2  # relative distance between the proven bound and the largest value found
 ALIKE = 1e-6  # by which V T_0 may miss z^-r B

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -23,10 +23,8 @@ from malta.files import read_file
 from malta.firmware.flight import compile_controller, new_state
 from malta.firmware.signals import Target
 from malta.firmware.sources import CAUSES, HEAD, LARGEST, LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-    from malta.synthesis.controller import Controller
+from malta.model.plant import FloatArray
+from malta.synthesis.controller import Controller
 
 WORDS = ("machine", "controller", "gains", "sample_time", "precision", "fidelity")
 COUNTS = ("excited", "tunable", "block", "blocks")

@@ -21,12 +21,11 @@ from malta.identification.response import (
     well_found,
 )
 from malta.model.equilibrium import trim
-from malta.model.plant import outputs_at
+from malta.model.plant import ComplexArray, FloatArray, outputs_at
 from malta.simulation.inputs import Multisine, interleaved_multisine
 
 if TYPE_CHECKING:
     from malta.loops.loop import Loop
-    from malta.model.plant import ComplexArray, FloatArray
 
 BAND = (2.0, 400.0)  # Hz
 LINES = 12  # of each input
@@ -34,10 +33,7 @@ PERIODS = 10
 SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
 QUIET = 1e-9  # m or rad: noise of a sensor that has none
 LONGEST = 5e7  # samples of a flight
-WIDE, FAR = (
-    2.0,
-    5.0,
-)  # times the largest motion, and deviations of the noise: beyond both another machine flies
+WIDE, FAR = 2.0, 5.0  # times the largest motion, deviations of the noise: beyond both another machine flies
 CURRENT = 0.1  # of the current limit: the amplitude where none is given
 
 

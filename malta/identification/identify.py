@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import gammainccinv, gammaincinv
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.identification.log import Log, require_currents
-from malta.identification.prediction import (
-    Predicted,
-    predict,
-)
+from malta.identification.prediction import Predicted, predict
 from malta.identification.response import (
     STEP,
     ResponseModel,
@@ -54,14 +52,10 @@ from malta.identification.spectra import (
     windowed_covariances,
 )
 from malta.model.data import plant_of
+from malta.model.plant import ComplexArray, FloatArray, Plant
+from malta.synthesis.controller import Controller
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import ComplexArray, FloatArray, Plant
-    from malta.synthesis.controller import Controller
-
-    IntArray = NDArray[np.integer[Any]]
+IntArray = NDArray[np.integer[Any]]
 
 GROUPS = ("y", "v", "i", "excitation")  # of a log, which are used
 SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
@@ -72,9 +66,7 @@ WHITE = 5.0  # standard deviations of the correlation between neighbouring lines
 STRAIGHTENED = 12  # estimates at most, each with the curvature and the weights of the one before
 SETTLED = 0.01  # standard deviations: what moves by less is settled
 DIFFERENT = 3.0  # standard deviations between the estimates at the lines and in time
-QUIET = (
-    4.0  # power at the lines over the noise, of the output that moves most, without which nothing was excited
-)
+QUIET = 4.0  # power at the lines over the noise, of the output that moves most: below, nothing was excited
 
 
 @display

@@ -6,7 +6,7 @@ v0(z), the thrust that holds it along a part of its stroke, is learned from the 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,13 +17,10 @@ from malta.errors import CheckError, InputError
 from malta.identification.log import Log, reference_spline, require_currents, require_same_law
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.engine.engines import evaluate
+from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import V0_STEPS
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
-    from malta.synthesis.controller import Controller
-
 
 SLOW = 0.02  # of the thrust's limit, that the inertia may take
 SHORTEST = 2.0  # spacings of the spline's knots, that a stroke has to cover

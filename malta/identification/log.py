@@ -5,22 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
-from malta.model.plant import Signal, readonly
+from malta.model.plant import FloatArray, Plant, Signal, readonly
 from malta.simulation.current_control import reading_errors
 from malta.simulation.inputs import Multisine
 from malta.simulation.layout import Loop
 from malta.simulation.simulate import prepare
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
-    from malta.simulation.trajectory import Trajectory
+from malta.simulation.trajectory import Trajectory
 
 GROUPS = {"y": "", "v": "", "i": "", "u": "", "reference": "ref.", "excitation": "exc.", "flags": "flag."}
 """The groups of columns, and what stands before the signal's name in a heading."""

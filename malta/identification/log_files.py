@@ -13,7 +13,7 @@ from functools import partial
 from hashlib import sha256
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,14 +22,11 @@ from malta.files import packaged, read_file, replace_files, require_suffix
 from malta.gains.encodings import read_mat
 from malta.identification.dump import decode_dump
 from malta.identification.log import GROUPS, Log
-from malta.model.plant import Signal
+from malta.model.plant import FloatArray, Signal
 from malta.simulation.engine.compiled import address_of, library
 from malta.simulation.engine.engines import SAMPLE_LOOP_FLAGS
 from malta.tables import read_npz
 from malta.units import is_unit_of, to_si
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 VERSION = 1
 LARGEST = 2_000_000_000  # bytes of a log

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import norm
@@ -22,17 +22,15 @@ from scipy.stats import norm
 from malta.display import Curves, Description, display
 from malta.errors import InputError
 from malta.identification.excite import LONGEST, ExcitationPlan, excite
+from malta.identification.log import Log
 from malta.identification.spectra import FEWEST, SIGMA, Columns, Line, columns_of, lines_of
 from malta.loops.classical import Disk, disk_sizes
 from malta.loops.loop import Loop, loop
 from malta.margins.loop_report import zone
 from malta.model.data import plant_of
 from malta.model.parameters import box_words, units_of
-
-if TYPE_CHECKING:
-    from malta.identification.log import Log
-    from malta.model.plant import ComplexArray, FloatArray
-    from malta.synthesis.controller import Controller
+from malta.model.plant import ComplexArray, FloatArray
+from malta.synthesis.controller import Controller
 
 SAME_LAW = 0.02  # of a command at the lines, by which the law of the gain file may miss it
 SAMPLES = 32  # machines at random in the box, beside its corners

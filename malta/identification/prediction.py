@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -27,13 +27,10 @@ from scipy.optimize import minimize
 from malta.errors import CheckError
 from malta.identification.response import ResponseModel, axes_of, current_rate
 from malta.model.parameters import symbolic_names, twins_of
-from malta.model.plant import Plant, symbolic
+from malta.model.plant import ComplexArray, FloatArray, Plant, symbolic
 from malta.simulation.engine.engines import Loop, loop_of
 from malta.simulation.period import runge_kutta
 from malta.synthesis.riccati import dare
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
 
 BLOCK = 1000  # samples that are summed up together
 PASSES = 8  # of the filter over the log, at most
@@ -444,9 +441,7 @@ def _result(
     predicted = s.y - flight.e
     gone = (s.there == 0) | off
     spread = max(1.0, float(np.nanmean(kept**2)))
-    if (
-        s.nu < NORMAL
-    ):  # of weights that depend on e: the mean of score^2 over that of the score's slope, squared
+    if s.nu < NORMAL:  # of weights that depend on e: mean score^2 over the squared mean of the score's slope
         w = flight.w
         slope = (w * (1 - 2 * w * size**2 / (s.nu + 1))).sum() / w.sum()
         spread = float((w**2 * size**2).sum() / w.sum() / slope**2)

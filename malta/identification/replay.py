@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,6 +17,7 @@ from malta.identification.response import acting
 from malta.identification.spectra import FARTHEST, sentence_of
 from malta.model.data import plant_of
 from malta.model.parameters import twins_of
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.engine.engines import Loop, loop_of
 from malta.simulation.inputs import Inputs, initial_values, sample_inputs
 from malta.simulation.layout import layout_of
@@ -36,9 +37,6 @@ from malta.synthesis.controller import (
     sum_errors,
 )
 from malta.synthesis.schedule import interpolate
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
 
 SAME = 1e-6  # of a force's limit: commands that differ by less are the same, in files of nine digits too
 SETTLED = 0.5  # of a log, after which the start of the filter is forgotten

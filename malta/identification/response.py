@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -21,12 +21,9 @@ from scipy.linalg import expm
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names, twins_of
-from malta.model.plant import Plant, symbolic
+from malta.model.plant import ComplexArray, FloatArray, Plant, symbolic
 from malta.model.signals import with_lags
 from malta.simulation.engine.engines import evaluate
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
 
 STEP = 1e-5  # of a scale: for derivatives by differences
 ALIKE = 1e3  # condition number of eigenvectors, which are too much alike above it

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from malta.errors import CheckError
 from malta.firmware.signals import place_of_readings
@@ -26,8 +27,6 @@ from malta.identification.response import STEP, ResponseModel, acting
 from malta.model.parameters import twins_of
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from malta.loops.loop import Loop
     from malta.model.plant import ComplexArray, FloatArray, Plant
 
@@ -59,9 +58,7 @@ class Spectrum(NamedTuple):
     rate: float  # rad/s of a bin
     periods: int  # of the excitation in the record: every so many bins is a harmonic
     source: str  # the log's
-    weight: (
-        FloatArray  # of each output: 1 over the size of its coefficients above the lines, where nothing moves
-    )
+    weight: FloatArray  # of each output: 1 over the size of its coefficients above the lines
 
 
 def require_log(log: Log, machine: str, sample_time: float) -> None:

@@ -21,7 +21,6 @@ over the gain file's,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
@@ -36,14 +35,11 @@ from malta.identification.measure import cut_loop
 from malta.identification.replay import reference_motion
 from malta.loops.loop import Loop, loop
 from malta.model.data import plant_of
+from malta.model.plant import FloatArray, Plant
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-from malta.simulation.trajectory import stroke_figures
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
-    from malta.simulation.trajectory import Trajectory
-    from malta.synthesis.controller import Controller
+from malta.simulation.trajectory import Trajectory, stroke_figures
+from malta.synthesis.controller import Controller
 
 FORCE = 0.8  # of what the model says is missing, that the next stroke is sent at most
 FINE = 4.0  # knots of the force in a period of the highest frequency of the reference
@@ -123,10 +119,7 @@ class NextStroke:
 
 
 def next_stroke(
-    controller: Controller,
-    log: Log,
-    patterns: ThrustPatterns | None = None,
-    before: NextStroke | None = None,
+    controller: Controller, log: Log, patterns: ThrustPatterns | None = None, before: NextStroke | None = None
 ) -> NextStroke:
     """What the next stroke is sent beside the law's thrust, from the log of the one before.
 

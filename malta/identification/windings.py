@@ -13,7 +13,7 @@ file's controllers the crossover and the phase margin that the current loops hav
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -24,7 +24,7 @@ from malta.display import Description, display
 from malta.errors import InputError
 from malta.identification.calibration import Estimate
 from malta.identification.identify import LIKELY, SLACK
-from malta.identification.log import require_currents
+from malta.identification.log import Log, require_currents
 from malta.identification.spectra import (
     SIGMA,
     WIDER,
@@ -37,14 +37,10 @@ from malta.identification.spectra import (
     whole,
 )
 from malta.model.data import plant_of
-from malta.model.plant import placed
+from malta.model.plant import ComplexArray, FloatArray, Plant, placed
 from malta.simulation.current_control import open_loop_gain
 from malta.simulation.engine.engines import evaluate
-
-if TYPE_CHECKING:
-    from malta.identification.log import Log
-    from malta.model.plant import ComplexArray, FloatArray, Plant
-    from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller
 
 ROUNDS = 3  # searches, each with the noise that the one before has left between the lines
 LONGEST = 20.0  # samples of dead time

@@ -7,10 +7,7 @@ curves, locus         responses, poles, zeros; root loci
 time_domain           answers to references and loads, and what noise leaves at rest
 """
 
-from malta.loops.curves import LoopCurves as LoopCurves
-from malta.loops.curves import loop_curves as loop_curves
-from malta.loops.linear_loops import LoopSystems as LoopSystems
-from malta.loops.linear_loops import loop_systems as loop_systems
+from malta.loops.curves import LoopCurves as LoopCurves, loop_curves as loop_curves
+from malta.loops.linear_loops import LoopSystems as LoopSystems, loop_systems as loop_systems
 from malta.loops.loop import Loop as Loop
-from malta.loops.time_domain import Recovery as Recovery
-from malta.loops.time_domain import recovery as recovery
+from malta.loops.time_domain import Recovery as Recovery, recovery as recovery

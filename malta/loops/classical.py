@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from malta.display import display
+from malta.model.plant import ComplexArray, FloatArray
 from malta.proof.uncertain import Compensator, UncertainSystem, find_peaks, instability, responses
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
-
 
 ROUNDS = 60  # of the balance of a matrix at most
 BALANCED = 1e-9  # relative difference of norms of rows and columns

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import linalg
@@ -32,11 +32,9 @@ from malta.loops.classical import (
     margins_of_channel,
 )
 from malta.loops.linear_loops import LinearLoop, Place, linear_loop
+from malta.model.plant import ComplexArray, FloatArray, Signal
 from malta.processes import on_one_thread
 from malta.synthesis.state_space import System, balanced_units
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray, Signal
 
 BASE = 160  # frequencies of the logarithmic grid
 DECADES = 8.0  # at most

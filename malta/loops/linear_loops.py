@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy import linalg
@@ -23,15 +23,11 @@ from scipy import linalg
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.loops.loop import Loop, loop_along, loop_from
-from malta.model.plant import Plant, Signal
+from malta.model.plant import ComplexArray, FloatArray, Plant, Signal
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, LinearLaw, linear_law
 from malta.synthesis.riccati import eigenvalues
 from malta.synthesis.state_space import System, balanced_units, named_system, reference_names, set_point
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
-
 
 # The loop of a machine and a controller as systems of python-control: to plot, to simulate, to compute with.
 #

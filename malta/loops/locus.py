@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import optimize
@@ -21,15 +21,12 @@ from malta.errors import CheckError, InputError, require_known
 from malta.loops.linear_loops import LinearLoop, Place, linear_loop
 from malta.model.data import plant_of
 from malta.model.parameters import units_of
-from malta.model.plant import Plant
+from malta.model.plant import ComplexArray, FloatArray, Plant
 from malta.processes import on_one_thread
+from malta.synthesis.controller import Controller
 from malta.synthesis.riccati import eigenvalues
 
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
-
-    Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
-    from malta.synthesis.controller import Controller
+Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 
 GAIN = "gain"  # the name of the factor of the loop gain
 SAMPLES = 41

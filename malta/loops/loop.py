@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,20 +24,16 @@ from malta.loops.sampled_loops import (
     push_through,
 )
 from malta.model.equilibrium import with_parameters
+from malta.model.linearize import LinearModel
 from malta.model.parameters import units_of
-from malta.model.plant import position_at
+from malta.model.plant import ComplexArray, FloatArray, Plant, position_at
 from malta.processes import on_one_thread
 from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.robust import robust_margin
+from malta.proof.uncertain import Compensator, UncertainSystem
 from malta.proof.windings import CurrentLoops, chosen_loops, left_out
-from malta.synthesis.controller import law_at
+from malta.synthesis.controller import Controller, law_at
 from malta.synthesis.riccati import eigenvalues
-
-if TYPE_CHECKING:
-    from malta.model.linearize import LinearModel
-    from malta.model.plant import ComplexArray, FloatArray, Plant
-    from malta.proof.uncertain import Compensator, UncertainSystem
-    from malta.synthesis.controller import Controller
 
 
 @display

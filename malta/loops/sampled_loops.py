@@ -12,9 +12,10 @@ reading is a further input of P, and F passes it on.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -25,7 +26,16 @@ from malta.loops.classical import Nominal, remembered
 from malta.model.data import plant_of
 from malta.model.equilibrium import trace, trim
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import off_stroke, position_in, readonly, whole_samples
+from malta.model.plant import (
+    ComplexArray,
+    FloatArray,
+    OperatingPoint,
+    Plant,
+    off_stroke,
+    position_in,
+    readonly,
+    whole_samples,
+)
 from malta.model.signals import with_lags
 from malta.proof.parametric_plants import of_plant
 from malta.proof.uncertain import Compensator, UncertainSystem, held_gain, is_commutated
@@ -48,12 +58,6 @@ from malta.synthesis.controller import Controller, LinearLaw, law_at, linear_law
 from malta.synthesis.recovery import StepResponse, step_response
 from malta.synthesis.riccati import add_lags, delay_inputs, eigenvalues, sample
 from malta.synthesis.state_space import System
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from malta.model.plant import ComplexArray, FloatArray, OperatingPoint, Plant
-
 
 # The control law of a gain file as the machine runs it, as the compensator of a proof: hold, delay, current loops.
 
@@ -166,12 +170,7 @@ class SampledLoop:
     def closed(self) -> FloatArray:
         """State matrix of the closed loop, states of the machine first."""
         c = self.control
-        return np.block(
-            [
-                [self.Ad + self.Bd @ c.D_y @ self.Cd, self.Bd @ c.C],
-                [c.B_y @ self.Cd, c.A],
-            ]
-        )
+        return np.block([[self.Ad + self.Bd @ c.D_y @ self.Cd, self.Bd @ c.C], [c.B_y @ self.Cd, c.A]])
 
     def loop_gain(self, w: FloatArray) -> ComplexArray:
         """The loop gain at the sensors, L = -P F, at the frequencies w (rad/s): k x p x p."""

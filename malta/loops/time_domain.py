@@ -17,7 +17,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,19 +26,14 @@ from malta.errors import CheckError, InputError, require_known
 from malta.loops.linear_loops import LinearLoop
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.loops.sampled_loops import SampledLoop
-from malta.model.plant import position_in
+from malta.model.plant import FloatArray, Plant, position_in
 from malta.processes import on_one_thread
 from malta.proof.uncertain import find_peaks
-from malta.synthesis.recovery import StepResponse, step_response
+from malta.synthesis.controller import Controller
+from malta.synthesis.recovery import RecoveryBound, StepResponse, step_response
 from malta.synthesis.requirements import Noise
 from malta.synthesis.riccati import sample
 from malta.synthesis.state_space import System
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
-    from malta.synthesis.controller import Controller
-    from malta.synthesis.recovery import RecoveryBound
-
 
 AFTER = (0.1, 0.3)  # s
 SHARE = 0.01  # of the largest deviation

@@ -20,19 +20,16 @@ from malta.margins.travel import NOT_BETWEEN, NOWHERE, Extent
 from malta.merits import ROOTS, Merit, figure, in_groups
 from malta.model.machines import FINE
 from malta.model.parameters import box_words
-from malta.proof.margin import NOT_PROVEN
-from malta.proof.windings import left_out
-from malta.synthesis.requirements import Figure, judge_figure, ratio_of
+from malta.proof.margin import NOT_PROVEN, Margin
+from malta.proof.windings import CurrentLoops, left_out
+from malta.synthesis.requirements import Figure, Noise, Verdict, judge_figure, ratio_of
 
 if TYPE_CHECKING:
     from malta.loops.classical import Classical, Disk
     from malta.model.linearize import LinearModel
     from malta.model.plant import ComplexArray, Plant
     from malta.proof.blocks.gain import Gain
-    from malta.proof.margin import Margin
-    from malta.proof.windings import CurrentLoops
     from malta.synthesis.controller import Controller
-    from malta.synthesis.requirements import Noise, Verdict
 
 
 # ISO 14839-3: upper limits of the peak sensitivity
@@ -53,14 +50,8 @@ def zone(peak: float) -> str:
 
 
 CURVE = 120  # points of a curve in a notebook
-FIRST = (
-    "disk",
-    "delay_margin",
-    "peak_s",
-    "peak_t",
-    "damping",
-    "requirements",
-)  # kinds that a reader looks for
+# Kinds that a reader looks for.
+FIRST = ("disk", "delay_margin", "peak_s", "peak_t", "damping", "requirements")
 
 
 @display

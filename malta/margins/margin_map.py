@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -22,14 +22,11 @@ from malta.errors import InputError, require_known
 from malta.loops.sampled_loops import continuous_poles
 from malta.margins.travel import extent_of, travel_loops, travel_margin
 from malta.model.parameters import units_of
+from malta.model.plant import ComplexArray, FloatArray, Plant
 from malta.processes import on_one_thread
-from malta.proof.uncertain import closed_loop, instability
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray, Plant
-    from malta.proof.margin import Margin
-    from malta.proof.uncertain import Compensator, UncertainSystem
-    from malta.synthesis.controller import Controller
+from malta.proof.margin import Margin
+from malta.proof.uncertain import Compensator, UncertainSystem, closed_loop, instability
+from malta.synthesis.controller import Controller
 
 GRID, COARSE = 25, 4  # values of each parameter; every so many of them are looked at first
 ABOUT = (0.97, 1.0, 1.01, 1.03)  # of the proven box: values beside those of the grid

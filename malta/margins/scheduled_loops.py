@@ -21,11 +21,11 @@ from __future__ import annotations
 
 import keyword
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, make_dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -35,7 +35,7 @@ from scipy import linalg
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import si, units_of
-from malta.model.plant import Plant, readonly, whole_samples
+from malta.model.plant import FloatArray, Plant, readonly, whole_samples
 from malta.processes import on_one_thread
 from malta.proof.expressions import BALLS, NotAnalytic, Program, program
 from malta.proof.parametric_plants import of_plant
@@ -54,13 +54,7 @@ from malta.proof.rates import (
 )
 from malta.proof.uncertain import Compensator, UncertainSystem
 from malta.proof.windings import CurrentLoops, chosen_loops
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from malta.model.plant import FloatArray
-    from malta.synthesis.controller import Controller
-
+from malta.synthesis.controller import Controller
 
 CALLER = "rate_of_cells"
 SAMPLE = 4  # parts of a sample in which e^(M s) is enclosed

@@ -13,7 +13,7 @@ law does what was left to be done with v(i). At k = 1 the loop is the machine's 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -21,6 +21,7 @@ import numpy as np
 from malta.loops.sampled_loops import LAST
 from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
+from malta.model.plant import FloatArray, Plant
 from malta.processes import on_one_thread
 from malta.proof.box import box_of
 from malta.proof.groups import groups, loop_of
@@ -29,10 +30,7 @@ from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator, UncertainSystem, is_commutated
 from malta.proof.windings import chosen_loops, current_control, force_modes, windings_of
 from malta.proof.work import Budget
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
-    from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller
 
 FACTOR = "gain factor"  # the name of the further parameter
 MOST = 0.2  # share by which gains may scatter at most: nothing beyond is looked at

@@ -10,18 +10,13 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from malta.errors import CheckError, InputError
-from malta.loops.classical import (
-    Classical,
-    classical_margins,
-    nominal_loop,
-    peak_sensitivity,
-    worst_of,
-)
+from malta.loops.classical import Classical, classical_margins, nominal_loop, peak_sensitivity, worst_of
 from malta.loops.loop import loop_of_model
 from malta.loops.sampled_loops import (
     LAST,
@@ -46,7 +41,7 @@ from malta.margins.travel import (
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.model.parameters import units_of
-from malta.model.plant import Plant, position_at
+from malta.model.plant import ComplexArray, FloatArray, Plant, position_at
 from malta.processes import on_one_thread
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.parametric_plants import of_plant
@@ -58,11 +53,6 @@ from malta.synthesis.controller import Controller
 from malta.synthesis.filters import gain_at_rest
 from malta.synthesis.lqg import integrals_of, kalman, lqi, lqr, weights_of
 from malta.synthesis.riccati import add_integrals, eigenvalues
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import ComplexArray, FloatArray
 
 
 def controller_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:

@@ -5,18 +5,17 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
-    from malta.model.coils import Allocation as Allocation
-    from malta.model.coils import allocation as allocation
+    from malta.model.coils import Allocation as Allocation, allocation as allocation
     from malta.model.data import published as published
     from malta.model.linearize import LinearModel as LinearModel
-    from malta.model.parameters import check_parameters as check_parameters
-    from malta.model.parameters import si as si
-    from malta.model.plant import Actuator as Actuator
-    from malta.model.plant import OperatingPoint as OperatingPoint
-    from malta.model.plant import Plant as Plant
-    from malta.model.plant import Signal as Signal
-    from malta.model.signals import InverseCheck as InverseCheck
-    from malta.model.signals import LateSensors as LateSensors
+    from malta.model.parameters import check_parameters as check_parameters, si as si
+    from malta.model.plant import (
+        Actuator as Actuator,
+        OperatingPoint as OperatingPoint,
+        Plant as Plant,
+        Signal as Signal,
+    )
+    from malta.model.signals import InverseCheck as InverseCheck, LateSensors as LateSensors
     from malta.units import in_unit as in_unit
 
 _NAMES = {

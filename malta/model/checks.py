@@ -70,14 +70,8 @@ def _check_intervals(plant: Plant) -> None:
             raise InputError(plant.name, f"over.{name}", f"{ends}", f"(low, high) about its value, {value:g}")
 
 
-def check_plant(plant: Plant) -> None:
-    """Check a plant. Raises InputError when its fields do not fit, or a function of it fails or has a wrong size."""
-    check_numbers(plant)
-    check_symbols(plant)
-
-
 def check_numbers(plant: Plant) -> None:
-    """The part of `check_plant` that depends on the numbers of a plant's parameters."""
+    """Raise InputError when a plant's fields do not fit, or a function of it fails or has a wrong size."""
     check_signals(plant)
     check_equations(plant)
 

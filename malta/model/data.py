@@ -17,8 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, Literal, cast
 
-from pydantic import Field as Checked
-from pydantic import StrictStr
+from pydantic import Field as Checked, StrictStr
 
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, locate, shipped_path

@@ -35,9 +35,7 @@ Equations = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 
 Expressions = list[Any]
-Recipe = Callable[
-    ..., tuple[Expressions, Expressions]
-]  # plant, believed plant or None, options -> inputs, outputs
+Recipe = Callable[..., tuple[Expressions, Expressions]]  # plant, believed one, options -> ins, outs
 
 
 class Traced(NamedTuple):
@@ -410,9 +408,8 @@ def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> Flo
     """The inputs that hold the machine at rest, or that cancel its loads alone; one row for each row of states."""
     left = trace(_rates_left, plant, None, loads_alone)
     depends = np.unique(np.concatenate([left.function.jac_sparsity(k, 0).get_triplet()[1] for k in (0, 1)]))
-    _, first, same = np.unique(
-        states[:, depends.astype(int)], axis=0, return_index=True, return_inverse=True
-    )  # a load that is the same along the stroke is balanced once
+    # A load that is the same along the stroke is balanced once.
+    _, first, same = np.unique(states[:, depends.astype(int)], axis=0, return_index=True, return_inverse=True)
     start = np.zeros((len(first), len(plant.inputs)))
     found = solve(_equations(left, states[first]), [start], _scales(plant), STILL, SHARE)
     _require_solved(plant, found.left, "input", states[first])

@@ -189,12 +189,8 @@ class LinearSystem:
     limit: tuple[float, ...]  # m, of each input, its unit; inf: none
     noise: tuple[float, ...]  # p, rms of a sample, the unit of each output
     dead_time: float  # s, from measurement to force
-    formulas: tuple[
-        tuple[str, str], ...
-    ] = ()  # what is added to an entry: ("A_2_1", "-b / J"), row and column from 1
-    limits: tuple[
-        tuple[str, float, float], ...
-    ] = ()  # of parameters: name, above, below, exclusive; inf: none
+    formulas: tuple[tuple[str, str], ...] = ()  # added to an entry: ("A_2_1", "-b / J")
+    limits: tuple[tuple[str, float, float], ...] = ()  # of parameters: name, above, below; inf: none
 
 
 class Details(TypedDict, total=False):
@@ -404,9 +400,7 @@ def _of_state_space(source: Any) -> tuple[Any, Any, Any, Details]:
     if np.any(source.D):
         raise InputError(CALLER, "D", "inputs that the outputs follow at once", "zeros")
     labels: Details = {} if re.fullmatch(r"sys\[\d+\].*", source.name) else {"name": source.name}
-    if source.state_labels != [
-        f"x[{k}]" for k in range(source.nstates)
-    ]:  # not those that the library numbers
+    if source.state_labels != [f"x[{k}]" for k in range(source.nstates)]:  # not the library's numbers
         labels["states"] = source.state_labels
     if source.input_labels != [f"u[{k}]" for k in range(source.ninputs)]:
         labels["inputs"] = source.input_labels

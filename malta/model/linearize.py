@@ -182,9 +182,7 @@ def jacobians(
     kind = type(x)
     y, i = kind.sym("y", C.shape[0]), kind.sym("i", len(plant.actuator.coils))
     made, wanted = plant.forces(x, i), (believed or plant).currents(y, v)
-    here = ca.densify(
-        plant.h(x, u)
-    )  # a sensor or coil may be zero always: substitute asks for equal patterns
+    here = ca.densify(plant.h(x, u))  # a coil may be zero always: substitute asks for equal patterns
     carried = ca.densify(ca.substitute([wanted], [y], [here])[0])
 
     def at(expression: Any) -> Any:

@@ -204,9 +204,7 @@ def _from_file(path: Path) -> ModuleType:
     text = read_file(where, "Python module", Path.read_bytes)
     module = f"{FILES}.{name}_{hashlib.sha256(text).hexdigest()[:12]}"
     known = sys.modules.get(module)
-    if (
-        known is not None and Path(str(known.__file__)) != path
-    ):  # a copy of the text, perhaps beside other modules
+    if known is not None and Path(str(known.__file__)) != path:  # a copy, perhaps beside other modules
         module += hashlib.sha256(str(path).encode()).hexdigest()[:12]
     return _load(where, _File(path, module))
 

@@ -23,17 +23,17 @@ from malta.model.equations import Body
 from malta.model.parameters import Parameters as Parameters
 from malta.model.signals import (
     CasadiFn,
+    ComplexArray as ComplexArray,
     Drive,
     Electronics,
+    FloatArray as FloatArray,
     InverseCheck,
     LateSensors,
+    Signal as Signal,
+    readonly as readonly,
     require_short,
     split_dead_time,
 )
-from malta.model.signals import ComplexArray as ComplexArray
-from malta.model.signals import FloatArray as FloatArray
-from malta.model.signals import Signal as Signal
-from malta.model.signals import readonly as readonly
 
 DEFAULT: Any = None  # stands for a function that follows from the other fields
 

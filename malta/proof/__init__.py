@@ -22,19 +22,18 @@ from malta.contents import contents
 if TYPE_CHECKING:
     from malta.proof.blocks import Dynamic as Dynamic
     from malta.proof.blocks.gain import Gain as Gain
-    from malta.proof.connections import append as append
-    from malta.proof.connections import feedback as feedback
-    from malta.proof.connections import interconnect as interconnect
-    from malta.proof.connections import parallel as parallel
-    from malta.proof.connections import random_systems as random_systems
-    from malta.proof.connections import series as series
+    from malta.proof.connections import (
+        append as append,
+        feedback as feedback,
+        interconnect as interconnect,
+        parallel as parallel,
+        random_systems as random_systems,
+        series as series,
+    )
     from malta.proof.margin import Margin as Margin
-    from malta.proof.rates import RateBound as RateBound
-    from malta.proof.rates import varying as varying
-    from malta.proof.robust import Interrupted as Interrupted
-    from malta.proof.robust import margin_of_polynomial as margin_of_polynomial
-    from malta.proof.uncertain import Compensator as Compensator
-    from malta.proof.uncertain import UncertainSystem as UncertainSystem
+    from malta.proof.rates import RateBound as RateBound, varying as varying
+    from malta.proof.robust import Interrupted as Interrupted, margin_of_polynomial as margin_of_polynomial
+    from malta.proof.uncertain import Compensator as Compensator, UncertainSystem as UncertainSystem
     from malta.proof.work import Budget as Budget
 
 _NAMES = {

@@ -10,25 +10,16 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from flint import arb
 
 from malta.errors import InputError, require_known
+from malta.model.plant import FloatArray
 from malta.proof.expressions import KNOWN, POINTS, Arithmetic, NotAnalytic, Program, exact, program
-from malta.proof.uncertain import (
-    LARGEST,
-    by_name,
-    describe,
-    is_number,
-    is_pair,
-)
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
+from malta.proof.uncertain import LARGEST, by_name, describe, is_number, is_pair
 
 FAR = 1e2  # search limit, in multiples of the modelled box
 EDGE = 1e-4  # relative distance of the search from the limits of parameters

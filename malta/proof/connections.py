@@ -161,8 +161,7 @@ def feedback(system: Any, law: Any, sign: int = -1) -> UncertainSystem:
     return whole.system(
         _Parts(
             ca.vertcat(
-                ca.horzcat(G.A, ca.SX(n, k)) + G.B @ e_from_x,
-                ca.horzcat(ca.SX(k, n), K.A) + K.B @ y_from_x,
+                ca.horzcat(G.A, ca.SX(n, k)) + G.B @ e_from_x, ca.horzcat(ca.SX(k, n), K.A) + K.B @ y_from_x
             ),
             ca.vertcat(G.B @ e_from_u, K.B @ y_from_u),
             y_from_x,

@@ -195,11 +195,8 @@ _BALLS: dict[str, Callable[..., Any]] = {
     "atan": lambda z: _require_within_unit(z).atan(),
     "hypot": lambda a, b: _require_off_cut(a * a + b * b).sqrt(),
 }
-_POINTS = _BALLS | {  # on the real axis no branch is near
-    "atan": lambda x: x.atan(),
-    "asin": lambda x: x.asin(),
-    "acos": lambda x: x.acos(),
-}
+# On the real axis no branch is near.
+_POINTS = _BALLS | {"atan": lambda x: x.atan(), "asin": lambda x: x.asin(), "acos": lambda x: x.acos()}
 KNOWN = frozenset({*FIELD, *_BALLS, "const", "input", "constpow"})
 EXACT = Arithmetic(exact, {})
 

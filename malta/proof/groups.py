@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,22 +17,10 @@ from flint import arb, arb_mat
 from scipy import linalg, sparse
 
 from malta.errors import InputError
-from malta.proof.expressions import (
-    NotAnalytic,
-    Program,
-    exact,
-    program,
-)
-from malta.proof.polynomial.rational import (
-    Ratio,
-    Symbolic,
-    TooLarge,
-    symbolic,
-)
+from malta.model.plant import FloatArray
+from malta.proof.expressions import NotAnalytic, Program, exact, program
+from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge, symbolic
 from malta.proof.uncertain import Compensator, Group, UncertainSystem, plural
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 A, B, C, D, E = range(5)
 

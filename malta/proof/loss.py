@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.errors import CheckError
-from malta.proof.exclusion.witness import gradients
+from malta.proof.exclusion.witness import Zero, gradients
 from malta.proof.expressions import NotAnalytic
 from malta.proof.uncertain import Compensator, UncertainSystem, critical_frequency, instability
 from malta.proof.work import is_past
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
     from malta.proof.box import Box
     from malta.proof.exclusion import Part
-    from malta.proof.exclusion.witness import Zero
     from malta.proof.problem import Problem
 
     Loss = tuple[float, float | None, FloatArray | None]  # t, w, p

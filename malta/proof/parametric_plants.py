@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -13,20 +13,15 @@ import numpy as np
 from malta.errors import InputError, require_known
 from malta.model.equilibrium import commanded
 from malta.model.parameters import shape_parameters, units_of
-from malta.model.plant import Plant, position_in, readonly
+from malta.model.plant import FloatArray, Plant, position_in, readonly
 from malta.model.signals import LateSensors, with_lags
 from malta.proof.box import without_branches
 from malta.proof.expressions import NotAnalytic, program
 from malta.proof.polynomial import rational
-from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge
-from malta.proof.polynomial.rational import symbolic as rational_functions
+from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge, symbolic as rational_functions
 from malta.proof.uncertain import UncertainSystem, describe, in_symbols, is_commutated, limits_of, model_of
 from malta.proof.windings import Windings, with_windings
 from malta.proof.work import check_clock
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # The command at which a machine's preload acts, as a function of its parameters.
 #
@@ -316,9 +311,7 @@ def _expanded_matrices(
     if not all((slope[at] - r).is_zero() for at, r in ratio.items()):
         return None  # one step finds the command of a chain that is affine in it, and of no other
     ratio = slope
-    moved = rational.solution(
-        s, ratio, left, m
-    )  # what has to be wanted beyond the preload so that the preload acts
+    moved = rational.solution(s, ratio, left, m)  # what is wanted beyond the preload for it to act
     wanted = {k + i: acting[k + i] + moved[i] for i in range(m)}
     A, B, C, E = ({at: rational.substitute(s, r, wanted) for at, r in t.items()} for t in (A, B, C, E))
     n, outputs = of.size1_out(0), of.size1_out(2)

@@ -12,41 +12,28 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from flint import acb, arb, arb_mat, fmpq
 
-from malta.proof.expressions import (
-    BALLS,
-    EXACT,
-    POINTS,
-    NotAnalytic,
-    Program,
-    exact,
-)
+from malta.proof.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program, exact
 from malta.proof.groups import UncertainLoop, groups
-from malta.proof.polynomial.characteristic import (
-    Characteristic,
-    map_bilinear,
-    map_bounds,
-    pair,
-)
+from malta.proof.polynomial.characteristic import Characteristic, map_bilinear, map_bounds, pair
 from malta.proof.polynomial.closed_loop import Couplings, closed_loop, driven_group, loop_parts
-from malta.proof.polynomial.enclosure import precision
+from malta.proof.polynomial.enclosure import Polynomial, precision
 from malta.proof.polynomial.family import binary
 from malta.proof.polynomial.rational import Symbolic, TooLarge, over_common_denominator, symbolic
 from malta.proof.uncertain import (
     Compensator,
     Group,
     UncertainSystem,
+    closed_loop as closed_matrices,
     critical_frequency,
     instability,
     worst_frequency,
 )
-from malta.proof.uncertain import closed_loop as closed_matrices
 from malta.proof.work import WorkUp
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
     from malta.proof.box import Box
     from malta.proof.exclusion import Part
-    from malta.proof.polynomial.enclosure import Polynomial
 
 
 # A polynomial with coefficients in p as a loop in which every parameter enters linearly, for multipliers.

@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import math
 import time as clock
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import casadi as ca
 import numpy as np
@@ -28,17 +29,13 @@ from scipy import linalg
 from malta.bound import at_least
 from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
+from malta.model.plant import FloatArray
 from malta.processes import on_one_thread
 from malta.proof.expressions import NotAnalytic
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.robust import law_of
 from malta.proof.uncertain import Compensator, UncertainSystem, interval, positive
 from malta.proof.work import is_past, metered, work_limit
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from malta.model.plant import FloatArray
 
 CALLER = "varying"
 BITS = 128
@@ -250,9 +247,8 @@ def _loop_of(system: UncertainSystem, law: Compensator, name: str) -> _Loop:
         )
     n, own = len(A), len(A) + law.delay * B.shape[1]
     x, u, s = t[:n], 2.0 ** np.round(np.log2(t[n:own]).mean()) if own > n else 1.0, t[own:]
-    law = replace(
-        law, A=law.A * s / s[:, None], B=law.B / s[:, None], C=law.C * s / u, D=law.D / u
-    )  # powers of two: exact
+    # Powers of two: exact.
+    law = replace(law, A=law.A * s / s[:, None], B=law.B / s[:, None], C=law.C * s / u, D=law.D / u)
     return _closed(A * x / x[:, None], A1 * x / x[:, None], B * u / x[:, None], C * x, law)
 
 
@@ -336,9 +332,7 @@ class _Choice:
             return None
         _, V = np.linalg.eig(frozen[len(frozen) // 2])
         back = np.linalg.pinv(V)
-        acts = np.abs(
-            back @ (frozen[-1] - frozen[0]) @ V
-        )  # of p on the modes, which are scaled so that it is small
+        acts = np.abs(back @ (frozen[-1] - frozen[0]) @ V)  # of p on modes, scaled so that it is small
         _, (size, _) = linalg.matrix_balance(acts + 1e-9 * acts.max() + 1e-300, permute=False, separate=True)
         back = back / size[:, None]
         return cls(loop, (back.conj().T @ back).real, radius**-share)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,6 +19,8 @@ import numpy as np
 from malta.errors import InputError, require_known
 from malta.model.plant import Plant, readonly
 from malta.proof.uncertain import (
+    Compensator,
+    UncertainSystem,
     by_name,
     describe,
     interval,
@@ -28,10 +30,6 @@ from malta.proof.uncertain import (
     plural,
     positive,
 )
-
-if TYPE_CHECKING:
-    from malta.proof.uncertain import Compensator, UncertainSystem
-
 
 # Algebraic equations of a descriptor system: zero rows of E, solved for the states of its zero columns.
 #
@@ -124,7 +122,6 @@ def from_source(
     terms : None in the place of a matrix: zeros
     limits : infinite for parameters without
     """
-    from malta.proof.uncertain import UncertainSystem
 
     names = tuple(by_name("uncertain", "nominal", nominal, '{"k": 1.5}'))
     if not names:
@@ -279,7 +276,6 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
 
     Raises InputError when its inputs and outputs do not fit the system, or its sample time is unspecified.
     """
-    from malta.proof.uncertain import Compensator
 
     wanted = "a Compensator, a proper control.StateSpace or TransferFunction, or a gain matrix"
     if hasattr(law, "num_list") or hasattr(law, "num_array"):

@@ -10,23 +10,19 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from malta.errors import InputError, require_known
 from malta.model.linearize import jacobians, linearize
 from malta.model.parameters import twins_of
-from malta.model.plant import Plant, symbolic
+from malta.model.plant import ComplexArray, FloatArray, Plant, symbolic
 from malta.proof.work import check_clock
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import ComplexArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)

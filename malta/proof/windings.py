@@ -26,12 +26,11 @@ from malta.errors import CheckError, InputError
 from malta.model.data import plant_of
 from malta.model.equilibrium import trace
 from malta.model.linearize import linearize
-from malta.model.plant import outputs_at, readonly
+from malta.model.plant import FloatArray, OperatingPoint, Plant, outputs_at, readonly
 from malta.proof.uncertain import Compensator, is_commutated
 from malta.synthesis.riccati import delay_inputs, sample
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, OperatingPoint, Plant
     from malta.synthesis.controller import Controller, CurrentLoop, LinearLaw
 
 

@@ -11,65 +11,84 @@ from typing import TYPE_CHECKING, Any
 from malta.contents import contents
 
 if TYPE_CHECKING:  # each is loaded when it is first asked for: commands that draw nothing start sooner
-    from malta.report.figures import experiment_figure as experiment_figure
-    from malta.report.figures import stroke_figure as stroke_figure
-    from malta.report.figures.campaign import CAMPAIGN_FILES as CAMPAIGN_FILES
-    from malta.report.figures.campaign import CampaignFigures as CampaignFigures
-    from malta.report.figures.campaign import campaign as campaign
-    from malta.report.figures.campaign import distributions_figure as distributions_figure
-    from malta.report.figures.campaign import sensitivity_figure as sensitivity_figure
-    from malta.report.figures.campaign import worst_figure as worst_figure
-    from malta.report.figures.campaign import yield_figure as yield_figure
-    from malta.report.figures.drawing import STYLES as STYLES
-    from malta.report.figures.drawing import encode_figure as encode_figure
-    from malta.report.figures.drawing import new_figure as new_figure
-    from malta.report.figures.drawing import save as save
-    from malta.report.figures.margins import chain_figure as chain_figure
-    from malta.report.figures.margins import front_figure as front_figure
-    from malta.report.figures.margins import recovery_figure as recovery_figure
-    from malta.report.page.report import compare_gains as compare_gains
-    from malta.report.page.report import comparison_page as comparison_page
-    from malta.report.page.report import gain_page as gain_page
-    from malta.report.plots import bode as bode
-    from malta.report.plots import gang_of_four as gang_of_four
-    from malta.report.plots import load_response as load_response
-    from malta.report.plots import nichols as nichols
-    from malta.report.plots import nyquist as nyquist
-    from malta.report.plots import pzmap as pzmap
-    from malta.report.plots import root_locus as root_locus
-    from malta.report.plots import sensitivity_curves as sensitivity_curves
-    from malta.report.plots import sigma as sigma
-    from malta.report.plots import step as step
+    from malta.report.figures import experiment_figure as experiment_figure, stroke_figure as stroke_figure
+    from malta.report.figures.campaign import (
+        CAMPAIGN_FILES as CAMPAIGN_FILES,
+        CampaignFigures as CampaignFigures,
+        campaign as campaign,
+        distributions_figure as distributions_figure,
+        sensitivity_figure as sensitivity_figure,
+        worst_figure as worst_figure,
+        yield_figure as yield_figure,
+    )
+    from malta.report.figures.drawing import (
+        STYLES as STYLES,
+        encode_figure as encode_figure,
+        new_figure as new_figure,
+        save as save,
+    )
+    from malta.report.figures.margins import (
+        chain_figure as chain_figure,
+        front_figure as front_figure,
+        recovery_figure as recovery_figure,
+    )
+    from malta.report.page.report import (
+        compare_gains as compare_gains,
+        comparison_page as comparison_page,
+        gain_page as gain_page,
+    )
+    from malta.report.plots import (
+        bode as bode,
+        gang_of_four as gang_of_four,
+        load_response as load_response,
+        nichols as nichols,
+        nyquist as nyquist,
+        pzmap as pzmap,
+        root_locus as root_locus,
+        sensitivity_curves as sensitivity_curves,
+        sigma as sigma,
+        step as step,
+    )
     from malta.report.plots.polar import margin_map as margin_map
     from malta.report.tables import Paragraph as Paragraph
-    from malta.report.tables.campaign import campaign_tables as campaign_tables
-    from malta.report.tables.campaign import rare_event_tables as rare_event_tables
-    from malta.report.tables.campaign import sensitivity_tables as sensitivity_tables
-    from malta.report.tables.campaign import spreads_table as spreads_table
-    from malta.report.tables.design import bandwidth_table as bandwidth_table
-    from malta.report.tables.design import design_page as design_page
-    from malta.report.tables.design import front_markdown as front_markdown
-    from malta.report.tables.design import front_table as front_table
-    from malta.report.tables.design import loop_poles_table as loop_poles_table
-    from malta.report.tables.design import poles_table as poles_table
-    from malta.report.tables.design import recovery_table as recovery_table
-    from malta.report.tables.design import requirements_table as requirements_table
-    from malta.report.tables.design import sensitivity_table as sensitivity_table
-    from malta.report.tables.experiments import claims_table as claims_table
-    from malta.report.tables.experiments import experiment_table as experiment_table
-    from malta.report.tables.experiments import limits_text as limits_text
-    from malta.report.tables.experiments import scenarios_table as scenarios_table
-    from malta.report.tables.margins import chain_table as chain_table
-    from malta.report.tables.margins import disk_table as disk_table
-    from malta.report.tables.margins import gang_table as gang_table
-    from malta.report.tables.margins import loop_tables as loop_tables
-    from malta.report.tables.margins import open_bounds as open_bounds
-    from malta.report.tables.margins import places_table as places_table
-    from malta.report.tables.margins import tolerance_table as tolerance_table
-    from malta.report.tables.margins import worst_case_table as worst_case_table
-    from malta.report.verdict import verdict_html as verdict_html
-    from malta.report.verdict import verdict_lines as verdict_lines
-    from malta.report.verdict import verdict_text as verdict_text
+    from malta.report.tables.campaign import (
+        campaign_tables as campaign_tables,
+        rare_event_tables as rare_event_tables,
+        sensitivity_tables as sensitivity_tables,
+        spreads_table as spreads_table,
+    )
+    from malta.report.tables.design import (
+        bandwidth_table as bandwidth_table,
+        design_page as design_page,
+        front_markdown as front_markdown,
+        front_table as front_table,
+        loop_poles_table as loop_poles_table,
+        poles_table as poles_table,
+        recovery_table as recovery_table,
+        requirements_table as requirements_table,
+        sensitivity_table as sensitivity_table,
+    )
+    from malta.report.tables.experiments import (
+        claims_table as claims_table,
+        experiment_table as experiment_table,
+        limits_text as limits_text,
+        scenarios_table as scenarios_table,
+    )
+    from malta.report.tables.margins import (
+        chain_table as chain_table,
+        disk_table as disk_table,
+        gang_table as gang_table,
+        loop_tables as loop_tables,
+        open_bounds as open_bounds,
+        places_table as places_table,
+        tolerance_table as tolerance_table,
+        worst_case_table as worst_case_table,
+    )
+    from malta.report.verdict import (
+        verdict_html as verdict_html,
+        verdict_lines as verdict_lines,
+        verdict_text as verdict_text,
+    )
 
 # Names that go with the next minor version: functions whose second argument was the path.
 _OLD = {

@@ -27,7 +27,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 from malta.bound import at_least
 from malta.errors import InputError
@@ -36,16 +36,13 @@ from malta.margins.verify import linear_report
 from malta.model.data import published_value
 from malta.model.linearize import LinearModel, linearize
 from malta.model.machines import require_part
+from malta.proof.margin import Margin
 from malta.simulation.experiments import Experiment, Progress, progress_of_part
 from malta.simulation.experiments.catalogue import experiment
+from malta.synthesis.controller import Controller
+from malta.synthesis.spec import Spec
 from malta.synthesis.synthesize import synthesize
 from malta.units import in_unit
-
-if TYPE_CHECKING:
-    from malta.proof.margin import Margin
-    from malta.synthesis.controller import Controller
-    from malta.synthesis.spec import Spec
-
 
 CLOSE, NEAR = 0.05, 0.2  # largest relative differences that are "reproduced" and "within x %"
 FACTOR, FAR = ", x ", 1000.0  # in front of a factor from a bound, and the largest one that is shown

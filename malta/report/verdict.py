@@ -73,13 +73,7 @@ def verdict_lines(found: LoopReport, campaigns: Sequence[Summary] = ()) -> tuple
     requirements: not judged
     yield: not sampled
     """
-    return (
-        _loop(found),
-        _margin(found),
-        _peak(found),
-        _requirements(found.requirements),
-        _yield(campaigns),
-    )
+    return (_loop(found), _margin(found), _peak(found), _requirements(found.requirements), _yield(campaigns))
 
 
 def _loop(found: LoopReport) -> VerdictLine:

@@ -10,5 +10,4 @@ file: what depends on other files or on arithmetic (dimensions of units, shapes 
 checks alone.
 """
 
-from malta.schemas.files import SCHEMAS as SCHEMAS
-from malta.schemas.files import schema as schema
+from malta.schemas.files import SCHEMAS as SCHEMAS, schema as schema

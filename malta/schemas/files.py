@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import BaseModel, StrictStr, create_model
 
@@ -11,13 +11,10 @@ from malta.errors import InputError
 from malta.gains.schema import GainFile
 from malta.model.data import MachineFile
 from malta.model.parameters import units_of
+from malta.model.plant import Plant
 from malta.synthesis.design_file import LQG, NOT_BESIDE, ONLY_LQG
 from malta.synthesis.design_tables import AnyBound, DesignFile, specification_record
 from malta.synthesis.requirements import requirements_for
-
-if TYPE_CHECKING:
-    from malta.model.plant import Plant
-
 
 # JSON schemas as nested tables, and what is changed in those that pydantic makes.
 
@@ -187,12 +184,8 @@ def _or_published(node: Schema) -> Schema:
     return node
 
 
-NUMERIC = (
-    "Quantity",
-    "BoundsTable",
-    "RecoveryTable",
-    "Specification",
-)  # tables of quantities, and quantities
+# Tables of quantities, and quantities.
+NUMERIC = ("Quantity", "BoundsTable", "RecoveryTable", "Specification")
 
 
 def _is_numeric(node: Schema) -> bool:

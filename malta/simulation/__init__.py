@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
-    from malta.simulation.engine.batch import replayed as replayed
-    from malta.simulation.engine.batch import simulate_many as simulate_many
+    from malta.simulation.engine.batch import replayed as replayed, simulate_many as simulate_many
     from malta.simulation.engine.digest import Batch as Batch
     from malta.simulation.experiments import Experiment as Experiment
     from malta.simulation.experiments.time_optimal import fastest_stroke as fastest_stroke
     from malta.simulation.inputs import Multisine as Multisine
     from malta.simulation.scenario import Fault as Fault
-    from malta.simulation.trajectory import Trajectory as Trajectory
-    from malta.simulation.trajectory import stroke_figures as stroke_figures
+    from malta.simulation.trajectory import Trajectory as Trajectory, stroke_figures as stroke_figures
 
 _NAMES = {
     "malta.simulation.engine.batch": "replayed simulate_many",

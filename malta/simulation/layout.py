@@ -216,9 +216,7 @@ def _winding_counts(plant: Plant) -> tuple[int, int]:
 
 def signals_of(sizes: Layout, kind: Any) -> Signals:
     """Symbols of CasADi's `kind`, SX or MX, for every signal of a layout."""
-    return Signals(
-        *({name: kind.sym(name, size) for name, size in part.items()} for part in sizes[:3]),
-    )
+    return Signals(*({name: kind.sym(name, size) for name, size in part.items()} for part in sizes[:3]))
 
 
 def _symbolic_parameters(plant: Plant, g: Mapping[str, Any]) -> Any:

@@ -277,9 +277,7 @@ class StrokeFigures:
     """Figures of a stroke, as papers publish them. SI."""
 
     rise: float = reported("rise, 10-90 %", "ms")  # s, of the true position; NaN when it was not reached
-    overshoot: float = reported(
-        "overshoot", "percent", "at most"
-    )  # of the stroke; NaN when the run ended early
+    overshoot: float = reported("overshoot", "percent", "at most")  # NaN when the run ended early
     axial_error: float = reported("axial error", "mm", "at most")  # m, largest |z* - z|
     radial: Mapping[str, float] = reported("deviation {}", "um", "at most")  # m, largest, by radial output
     force: float = reported("largest thrust", "N")  # N, commanded

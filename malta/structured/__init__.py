@@ -8,28 +8,33 @@ h_infinity from a generalized plant to the best law of its order, by two Riccati
 """
 
 from malta.structured.design import tune_design as tune_design
-from malta.structured.goals import Goal as Goal
-from malta.structured.goals import disk_margin as disk_margin
-from malta.structured.goals import gain_limit as gain_limit
-from malta.structured.goals import noise_limit as noise_limit
-from malta.structured.goals import poles as poles
-from malta.structured.goals import sensitivity as sensitivity
-from malta.structured.goals import soft as soft
-from malta.structured.goals import stable_law as stable_law
-from malta.structured.goals import tracking as tracking
-from malta.structured.riccati import Synthesized as Synthesized
-from malta.structured.riccati import h_infinity as h_infinity
-from malta.structured.riccati import mixed_sensitivity as mixed_sensitivity
-from malta.structured.riccati import shape_loop as shape_loop
-from malta.structured.rounds import Tuned as Tuned
-from malta.structured.rounds import tune as tune
-from malta.synthesis.elements import Element as Element
-from malta.synthesis.elements import gain as gain
-from malta.synthesis.elements import lead as lead
-from malta.synthesis.elements import notch as notch
-from malta.synthesis.elements import observer as observer
-from malta.synthesis.elements import pid as pid
-from malta.synthesis.elements import states as states
-from malta.synthesis.elements import transfer as transfer
+from malta.structured.goals import (
+    Goal as Goal,
+    disk_margin as disk_margin,
+    gain_limit as gain_limit,
+    noise_limit as noise_limit,
+    poles as poles,
+    sensitivity as sensitivity,
+    soft as soft,
+    stable_law as stable_law,
+    tracking as tracking,
+)
+from malta.structured.riccati import (
+    Synthesized as Synthesized,
+    h_infinity as h_infinity,
+    mixed_sensitivity as mixed_sensitivity,
+    shape_loop as shape_loop,
+)
+from malta.structured.rounds import Tuned as Tuned, tune as tune
+from malta.synthesis.elements import (
+    Element as Element,
+    gain as gain,
+    lead as lead,
+    notch as notch,
+    observer as observer,
+    pid as pid,
+    states as states,
+    transfer as transfer,
+)
 from malta.synthesis.structure import Place as Place
 from malta.synthesis.tunable_lqg import lqg as lqg

@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import tomlkit
@@ -20,11 +20,9 @@ from malta.structured import goals as kinds
 from malta.structured.goals import Goal, noise_limit, sensitivity, soft
 from malta.structured.rounds import Tuned, tune
 from malta.synthesis.requirements import requirements_for
+from malta.synthesis.spec import Spec, StructuredGoal
 from malta.synthesis.structure import places_in, with_values
 from malta.units import to_si
-
-if TYPE_CHECKING:
-    from malta.synthesis.spec import Spec, StructuredGoal
 
 DIGITS = 6  # of numbers in a design file
 

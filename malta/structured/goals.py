@@ -13,18 +13,16 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from malta.display import display
 from malta.errors import InputError
+from malta.model.plant import FloatArray
 from malta.structured.loops import Channels, ClosedLoop, Pole, gain_slope, noise, peaks_of, response_at
 from malta.synthesis.elements import CALLER
 from malta.synthesis.state_space import System
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 At = Literal["sensors", "forces"]
 SLOWEST = 6  # poles of a group that a search looks at

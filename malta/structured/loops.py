@@ -12,20 +12,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from malta.errors import CheckError, InputError
+from malta.model.plant import ComplexArray, FloatArray
 from malta.synthesis.elements import CALLER
 from malta.synthesis.state_space import System
 from malta.synthesis.structure import OF_INPUTS, OF_OUTPUTS
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import ComplexArray, FloatArray
 
 # Figures of a stable linear system with their exact derivatives: peaks of its gain, its noise, its poles.
 #

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import linalg
@@ -29,14 +29,11 @@ from scipy.linalg import matrix_balance
 
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
+from malta.model.plant import FloatArray
 from malta.processes import on_one_thread
 from malta.structured.loops import peak_gain
 from malta.synthesis.elements import CALLER
 from malta.synthesis.state_space import System
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 H_INFINITY = "h_infinity"
 TOLERANCE = 1e-6  # relative, of the smallest gamma

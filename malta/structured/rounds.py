@@ -17,7 +17,7 @@ import itertools
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -38,14 +38,11 @@ from malta.proof.windings import chosen_loops
 from malta.structured.goals import Goal
 from malta.structured.loops import Model, model_of, models_of_systems
 from malta.structured.search import ROOM, Look, Task, contradiction, random_starts, rate_of, search
+from malta.synthesis.controller import Controller
 from malta.synthesis.elements import CALLER
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 from malta.synthesis.state_space import System, controller_of
 from malta.synthesis.structure import Structure, places_of, sample_law
-
-if TYPE_CHECKING:
-    from malta.synthesis.controller import Controller
-
 
 Values = Mapping[str, float]
 
@@ -114,9 +111,7 @@ class Machine:
     plant: Plant
     sample_time: float
     places: tuple[Values, ...]
-    zero: Controller = field(
-        repr=False
-    )  # a law of errors that does nothing, with the machine's current loops
+    zero: Controller = field(repr=False)  # a law that does nothing, with the machine's current loops
 
     @property
     def nominal(self) -> list[Model]:

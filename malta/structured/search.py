@@ -18,20 +18,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError
+from malta.model.plant import FloatArray
 from malta.structured.goals import Figure, Goal, stability
 from malta.structured.loops import ClosedLoop, Model
 from malta.synthesis.elements import CALLER
 from malta.synthesis.structure import Structure
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 PENALTY = 30.0  # cost of a hard figure's excess over 1, in that of a soft one
 RADIUS = 0.3  # of the first step, in x

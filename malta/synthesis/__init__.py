@@ -6,10 +6,7 @@ from malta.contents import contents
 
 if TYPE_CHECKING:
     from malta.synthesis.controller import Controller as Controller
-    from malta.synthesis.lqg import kalman as kalman
-    from malta.synthesis.lqg import lqi as lqi
-    from malta.synthesis.lqg import lqr as lqr
-    from malta.synthesis.lqg import weights as weights
+    from malta.synthesis.lqg import kalman as kalman, lqi as lqi, lqr as lqr, weights as weights
     from malta.synthesis.spec import Weights as Weights
     from malta.synthesis.state_space import controller_of as controller_of
     from malta.synthesis.synthesize import schedule_laws as schedule_laws

@@ -56,11 +56,10 @@ import numpy as np
 from malta.display import display
 from malta.errors import InputError
 from malta.model.equations import note
-from malta.model.plant import Parameters, Plant, Signal, outputs_at, readonly
+from malta.model.plant import FloatArray, Parameters, Plant, Signal, outputs_at, readonly
 from malta.synthesis.schedule import SCHEDULED, Schedule, interpolate
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
     from malta.synthesis.filters import Gains
     from malta.synthesis.spec import Coordinates
 
@@ -409,12 +408,7 @@ def estimated(g: Mapping[str, Any], xi_pred: Any, y: Any, C: Any = None, add: Ad
 
 
 def commanded(
-    g: Mapping[str, Any],
-    xi_hat: Any,
-    e: Any,
-    xi_ref: Any,
-    v_ff: Any,
-    v0: Any,
+    g: Mapping[str, Any], xi_hat: Any, e: Any, xi_ref: Any, v_ff: Any, v0: Any
 ) -> tuple[Any, Any, Any]:
     """Steps 3, 4 and 6: (xi_pred, forces that saturate, v) from the estimate and the sums of errors."""
     wanted = _wanted(g, xi_hat, e, xi_ref, v_ff, v0)

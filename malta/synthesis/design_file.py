@@ -17,7 +17,7 @@ from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from malta.errors import CheckError, InputError, relocate_errors, require_known
 from malta.files import locate
 from malta.model.data import plant_of, published, read
 from malta.model.parameters import units_of
-from malta.model.plant import Plant, Signal
+from malta.model.plant import FloatArray, Parameters, Plant, Signal
 from malta.synthesis.design_tables import (
     BasesTable,
     DesignFile,
@@ -64,14 +64,9 @@ from malta.synthesis.structure import read_structure
 from malta.tables import Quantity, load_toml, validate
 from malta.units import to_si
 
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Parameters
-
 
 def read_design(
-    path: str | Path,
-    parameters: Mapping[str, float] | None = None,
-    entries: Mapping[str, Any] | None = None,
+    path: str | Path, parameters: Mapping[str, float] | None = None, entries: Mapping[str, Any] | None = None
 ) -> Spec:
     """Read a design file, and the data of the machine that it names.
 

@@ -6,17 +6,15 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from scipy import linalg
 
 from malta.errors import InputError
+from malta.model.plant import FloatArray
 from malta.synthesis.state_space import System
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 CALLER = "structured"
 Matrices = tuple[Any, Any, Any, Any]  # A, B, C and D in CasADi

@@ -5,27 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.model.equilibrium import holding_commands, load_balance
 from malta.model.linearize import LinearModel
-from malta.model.plant import Actuator, Plant, off_stroke
-from malta.synthesis.controller import (
-    Commutation,
-    Controller,
-    CurrentLoop,
-    Feedforward,
-    Limits,
-)
+from malta.model.plant import Actuator, FloatArray, Plant, off_stroke
+from malta.synthesis.controller import Commutation, Controller, CurrentLoop, Feedforward, Limits
 from malta.synthesis.filters import between_samples
 from malta.synthesis.riccati import sample
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 V0_STEP = 0.25e-3  # m, longest step of the grid of v0(z)
 

@@ -13,26 +13,16 @@ its poles are less damped, and delay the loop less.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy import linalg
 
 from malta.errors import InputError
+from malta.model.plant import FloatArray
 from malta.processes import on_one_thread
-from malta.synthesis.riccati import (
-    add_lags,
-    care,
-    dare,
-    delay_inputs,
-    sample,
-    sample_noise,
-)
+from malta.synthesis.riccati import add_lags, care, dare, delay_inputs, sample, sample_noise
 from malta.synthesis.spec import Coordinates, Weights
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # The design model between samples: currents that are held, forces behind the lag of the current loops.
 

@@ -25,51 +25,30 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import linalg
 
 from malta.errors import CheckError, InputError
 from malta.model.linearize import LinearModel
+from malta.model.plant import ComplexArray, FloatArray
 from malta.processes import on_one_thread
-from malta.synthesis.controller import (
-    Controller,
-    Cost,
-    Noise,
-    disturbances,
-    lagging_forces,
-    stored_forces,
-)
+from malta.synthesis.controller import Controller, Cost, Noise, disturbances, lagging_forces, stored_forces
 from malta.synthesis.feedforward import machine_part
 from malta.synthesis.filters import (
     Gains,
     Linear,
     between_samples,
+    kalman as kalman,
     positions_from,
     sampled_filter,
     sampled_model,
     with_lags,
 )
-from malta.synthesis.filters import kalman as kalman
-from malta.synthesis.riccati import (
-    add_integrals,
-    care,
-    dare,
-    eigenvalues,
-    sample,
-    sample_cost,
-)
-from malta.synthesis.spec import (
-    Discretization,
-    Weights,
-)
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from malta.model.plant import ComplexArray, FloatArray
-
+from malta.synthesis.riccati import add_integrals, care, dare, eigenvalues, sample, sample_cost
+from malta.synthesis.spec import Discretization, Weights
 
 # Why a linear model has no stabilizing controller, in words: modes that nothing moves or sees, zeros, slow samples.
 
@@ -386,11 +365,7 @@ def lqg(
     lagging = lagging_forces(plant.inputs) if current_lag else ()
     return Controller(
         **machine_part(
-            model,
-            Ts,
-            delay,
-            current_loop_delay=current_loop_delay,
-            position_feedforward=position_feedforward,
+            model, Ts, delay, current_loop_delay=current_loop_delay, position_feedforward=position_feedforward
         ),
         **found._asdict(),
         name=name,

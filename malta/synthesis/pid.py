@@ -10,25 +10,21 @@ diagonal, and so are both halves of K times P^-1.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg
 
 from malta.errors import CheckError, InputError
 from malta.model.linearize import LinearModel
+from malta.model.plant import FloatArray
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import machine_part
 from malta.synthesis.filters import Gains
-from malta.synthesis.spec import Pid, require_pairs
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from malta.model.plant import FloatArray
-    from malta.synthesis.spec import PidAxes
+from malta.synthesis.spec import Pid, PidAxes, require_pairs
 
 
 class Axes(NamedTuple):

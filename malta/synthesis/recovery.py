@@ -21,19 +21,15 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field, StrictStr
 
 from malta.errors import CheckError, InputError, require_known
-from malta.model.plant import Signal, readonly
+from malta.model.plant import FloatArray, Plant, Signal, readonly
 from malta.tables import Quantity, Record, entry
 from malta.units import is_unit_of, to_si, units_like
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
-
 
 # The answer of a sampled loop to a constant load: s+ = M s + g w, y = C s, w a unit step on one load at a time.
 #

@@ -22,15 +22,13 @@ import numpy as np
 from scipy import special
 
 from malta.model.machines import attribute_of
-from malta.model.plant import Plant, Signal
-from malta.synthesis.spec import Law as Law
+from malta.model.plant import ComplexArray, FloatArray, Parameters, Plant, Signal
+from malta.synthesis.spec import Law as Law, Spec
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray, Parameters
     from malta.synthesis.controller import Controller
     from malta.synthesis.filters import Linear
     from malta.synthesis.recovery import RecoveryBound, StepResponse
-    from malta.synthesis.spec import Spec
 
 Trade = Literal["force", "motion"]
 Form = Literal["number", "switch", "outputs", "inputs", "loads"]

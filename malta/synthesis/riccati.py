@@ -20,13 +20,12 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from malta.model.plant import ComplexArray, FloatArray
 
 RESIDUAL = 1e-9  # largest accepted relative residual of a Riccati equation
@@ -161,14 +160,7 @@ def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: 
 
 # A slider moves one weight: the equations of other axes, and the filter's, are the same.
 @lru_cache(maxsize=64)
-def _solution_of(
-    shape: tuple[int, int],
-    a: bytes,
-    b: bytes,
-    q: bytes,
-    what: str,
-    discrete: bool,
-) -> _Found:
+def _solution_of(shape: tuple[int, int], a: bytes, b: bytes, q: bytes, what: str, discrete: bool) -> _Found:
     A, B, Q = (np.frombuffer(entries).reshape(shape[0], -1) for entries in (a, b, q))
     candidates: list[_Found] = []
     failures: list[Exception] = []
@@ -492,9 +484,7 @@ def _exponential(M: FloatArray) -> FloatArray:
     """e^M, of a stack of matrices each."""
     with np.errstate(all="ignore"):
         turn = np.ones(M.shape)
-        if (
-            not np.abs(M).max(initial=0.0) < LARGEST and np.isfinite(M).all()
-        ):  # by the units of states, perhaps
+        if not np.abs(M).max(initial=0.0) < LARGEST and np.isfinite(M).all():  # units of states?
             if M.ndim > 2:
                 return np.array([_exponential(one) for one in M])
             _, (units, _) = linalg.matrix_balance(M, permute=False, separate=True)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -20,10 +20,7 @@ import numpy as np
 from malta.display import display
 from malta.errors import InputError
 from malta.model.equations import note
-from malta.model.plant import outputs_at, readonly
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, OperatingPoint, Plant
+from malta.model.plant import FloatArray, OperatingPoint, Plant, outputs_at, readonly
 
 SCHEDULED = ("Ad", "Bd", "Cd", "K", "Ki", "L")
 

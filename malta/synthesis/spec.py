@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from dataclasses import field as dataclass_field
+from dataclasses import dataclass, field as dataclass_field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
@@ -22,11 +21,10 @@ from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
 from malta.model.data import plant_of
 from malta.model.parameters import box_words, fingerprint, replace_fields
-from malta.model.plant import Plant, Signal, readonly
+from malta.model.plant import FloatArray, Parameters, Plant, Signal, readonly
 from malta.units import to_si
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Parameters
     from malta.synthesis.recovery import RecoveryBound
 
 Discretization = Literal["backward-euler", "zoh", "sampled-data"]

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -22,13 +22,10 @@ from scipy.linalg import matrix_balance
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import OperatingPoint, Plant, Signal, outputs_at
+from malta.model.plant import ComplexArray, FloatArray, OperatingPoint, Plant, Signal, outputs_at
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, linear_law
 from malta.synthesis.feedforward import machine_part
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
 
 CALLER = "controller_of"
 ERROR = "[e]"  # what follows a measurement's name in the name of its last error
@@ -198,9 +195,7 @@ class System(NamedTuple):
         """The function `response`, for several calls: what does not depend on the frequencies is computed once."""
         A, B, C, D = self.balanced
         label = sparse.csgraph.connected_components(A != 0, directed=False)[1] if len(A) else np.zeros(0)
-        states = [
-            np.flatnonzero(label == k) for k in np.unique(label)
-        ]  # sets of states that nothing joins to each other
+        states = [np.flatnonzero(label == k) for k in np.unique(label)]  # sets that nothing joins
         parts = [_JoinedStates(A[np.ix_(i, i)], B[i], C[:, i]) for i in states]
 
         def response(s: ComplexArray) -> ComplexArray:

@@ -35,7 +35,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -43,7 +43,7 @@ from scipy import linalg
 
 from malta.errors import InputError
 from malta.model.linearize import LinearModel
-from malta.model.plant import Plant, Signal
+from malta.model.plant import FloatArray, Plant, Signal
 from malta.synthesis import elements
 from malta.synthesis.controller import Controller
 from malta.synthesis.design_tables import ElementTable, GoalTable, StructureTable
@@ -62,9 +62,6 @@ from malta.synthesis.state_space import System, law_of_errors
 from malta.synthesis.tunable_lqg import lqg
 from malta.tables import Quantity
 from malta.units import to_si
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 
 class Place(NamedTuple):

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from malta.errors import CheckError, InputError, relocate_errors
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import outputs_at
+from malta.model.plant import FloatArray, outputs_at
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import commutate_ahead
@@ -21,10 +21,6 @@ from malta.synthesis.pid import pid
 from malta.synthesis.schedule import SCHEDULED, Schedule, point_at
 from malta.synthesis.spec import Spec
 from malta.synthesis.structure import structured_controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 CALLER = "schedule_laws"
 ALIKE = ("parameters", "sample_time", "states", "forces", "measurements")  # of all laws of a schedule

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -25,15 +25,13 @@ from scipy import linalg
 
 from malta.errors import CheckError, InputError, relocate_errors
 from malta.model.linearize import LinearModel
+from malta.model.plant import FloatArray
 from malta.processes import on_one_thread
 from malta.synthesis.elements import CALLER, Bounds, Element, Matrices, keep_sign
 from malta.synthesis.filters import Lagged
 from malta.synthesis.lqg import check_sizes, out_of_reach
 from malta.synthesis.riccati import Solution, care
 from malta.synthesis.spec import Weights
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 
 @on_one_thread

@@ -157,20 +157,14 @@ class Group:
     model: Part
     nominal: SampledMachine  # with its loads, at their trim
     slope: FloatArray  # of v0(z), which acts against them: inputs x outputs
-    forecast: (
-        FloatArray  # of induced voltages, which current controllers take off: inputs x states; or nothing
-    )
+    forecast: FloatArray  # of induced voltages, that current controllers take off: inputs x states, or none
     corners: SampledMachine | None  # levels x corners
     w: FloatArray  # rad/s
     response: ComplexArray  # of the nominal machine at w
     variance: FloatArray  # of a measurement, m2
-    places: tuple[
-        Place, ...
-    ]  # where loads act from outside: operating point and ends; none where not asked for
+    places: tuple[Place, ...]  # where loads act from outside: operating point and ends; or none
     role: tuple[Any, ...]  # what the requirements see in it: stroke, thrust, bounds of its signals
-    requirements: tuple[
-        tuple[str, str, Requirement], ...
-    ]  # figure, signal, requirement: those with an estimate
+    requirements: tuple[tuple[str, str, Requirement], ...]  # figure, signal, requirement, with an estimate
 
     @property
     def picture(self) -> tuple[Any, ...]:

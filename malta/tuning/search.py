@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import StrictFloat, StrictStr, TypeAdapter
@@ -22,13 +22,11 @@ from scipy import optimize, sparse
 from malta.errors import InputError
 from malta.files import file_exists, read_file, replace_files
 from malta.model.linearize import LinearModel, linearize
+from malta.model.plant import FloatArray, Plant
+from malta.synthesis.controller import Controller
 from malta.synthesis.requirements import requirements_for
+from malta.synthesis.spec import Spec
 from malta.synthesis.synthesize import synthesize
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
-    from malta.synthesis.controller import Controller
-    from malta.synthesis.spec import Spec
 
 Progress = Callable[[float], None]
 DIGITS = 5  # significant, of what is tried and written

@@ -19,7 +19,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import tomlkit
@@ -28,6 +28,7 @@ from tomlkit.items import Item
 
 from malta.display import Description, display
 from malta.errors import InputError
+from malta.margins.loop_report import Outcome
 from malta.margins.travel import travel_margin
 from malta.model.parameters import describe
 from malta.model.plant import FloatArray, Plant
@@ -53,10 +54,6 @@ from malta.tuning.search import (
     separate,
 )
 from malta.tuning.verify import judge
-
-if TYPE_CHECKING:
-    from malta.margins.loop_report import Outcome
-
 
 # Descent by linear programs: the smallest worst ratio, or the least noise that bounds allow.
 #
@@ -96,9 +93,7 @@ class Merit(NamedTuple):
         return point.f + self.steep * max(self.floor, float(point.r.max()))
 
 
-Look = Callable[
-    ["FloatArray"], tuple[float, "FloatArray"] | None
-]  # (f, r) of a place; None: an unstable loop
+Look = Callable[["FloatArray"], tuple[float, "FloatArray"] | None]  # (f, r) of a place; None: unstable
 
 
 def descend(look: Look, u: FloatArray, merit: Merit, trials: int) -> FloatArray:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from malta.errors import CheckError, InputError
 from malta.files import locate
@@ -21,23 +21,20 @@ from malta.margins.travel import LoopAlong, worst_sensitivities
 from malta.margins.verify import linear_report, staged_report
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
+from malta.model.plant import Parameters, Plant
+from malta.proof.margin import Progress
+from malta.proof.windings import CurrentLoops
+from malta.simulation.experiments import Experiment
 from malta.simulation.experiments.catalogue import experiment, payload
+from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
+from malta.synthesis.recovery import RecoveryBound
 from malta.synthesis.requirements import Figure, Noise, Requirement, requirements_for
+from malta.synthesis.spec import Spec
 from malta.tuning.pid import loads_of, loop_figures, whole_machine
 from malta.tuning.search import base_of, model_and_controller
-
-if TYPE_CHECKING:
-    from malta.model.plant import Parameters, Plant
-    from malta.proof.margin import Progress
-    from malta.proof.windings import CurrentLoops
-    from malta.simulation.experiments import Experiment
-    from malta.simulation.scenario import Scenario
-    from malta.simulation.trajectory import Trajectory
-    from malta.synthesis.recovery import RecoveryBound
-    from malta.synthesis.spec import Spec
-
 
 # What a design has of what it is asked for: requirements measured on its verified loop and simulated machine.
 

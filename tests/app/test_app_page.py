@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browsing import browser as browser
-from browsing import printed
+from browsing import browser as browser, printed
 from test_app import copied
 
 import malta

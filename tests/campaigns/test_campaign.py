@@ -19,19 +19,11 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pytest
 from conftest import assert_folds, printed, refusal
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import malta
-from malta import campaign as function
-from malta import report
-from malta.campaigns.plan import (
-    SAMPLERS,
-    Plan,
-    box_of,
-    draw_machines,
-    planned_run,
-)
+from malta import campaign as function, report
+from malta.campaigns.plan import SAMPLERS, Plan, box_of, draw_machines, planned_run
 from malta.campaigns.result import Campaign, figures_of, rate, runs_within_bounds
 from malta.campaigns.run import SLOW_BLOCK, campaign, replay
 from malta.campaigns.store import MANIFEST, block_name, read_plan

@@ -22,14 +22,7 @@ from page_examples import without_progress
 
 import malta
 from malta.campaigns import dask as cluster
-from malta.campaigns.dask import (
-    block_of,
-    blocks,
-    collect_blocks,
-    require_malta,
-    simulate_at_worker,
-    task_of,
-)
+from malta.campaigns.dask import block_of, blocks, collect_blocks, require_malta, simulate_at_worker, task_of
 from malta.campaigns.plan import Plan
 from malta.campaigns.run import campaign
 from malta.campaigns.store import fly

@@ -391,14 +391,7 @@ def test_a_touchdown_of_one_in_a_million() -> None:
 
 @pytest.mark.slow
 def test_the_command(run: Run, tmp_path: Path) -> None:
-    quick = (
-        "--spread",
-        "20%",
-        "--option",
-        "fidelity=force",
-        "--samples",
-        "2000",
-    )
+    quick = ("--spread", "20%", "--option", "fidelity=force", "--samples", "2000")
     common = ("campaign", SHAKY, *quick, "--out", tmp_path)
     code, out, err = run(*common, "--study", "rare", "--limit", "touchdown")
     assert (code, err) == (0, "")
@@ -428,10 +421,7 @@ def test_the_command(run: Run, tmp_path: Path) -> None:
             ("--study", "rare", "--limit", "collision"),
             "--limit: found 'collision', expected one of touchdown",
         ),
-        (
-            ("--rare", "touchdown", "--sobol"),
-            "found --rare and --sobol, expected one study",
-        ),
+        (("--rare", "touchdown", "--sobol"), "found --rare and --sobol, expected one study"),
         (("--limit", "published"), "--limit: found 'published', expected it with --study"),
         (("--study", "many"), "--study: found 'many', expected one of rare, sensitivity, tolerances"),
         (("--study", "tolerances"), "found no --keep"),

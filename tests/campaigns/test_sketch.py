@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from malta.campaigns import summary as module
 from malta.campaigns.summary import ACCURACY, EXACT, Sketch, histogram, merge, quantiles, sketch_of

@@ -17,8 +17,7 @@ from rich.console import Console
 
 import malta
 from malta import report
-from malta.campaigns import summary
-from malta.campaigns import summary as sketch
+from malta.campaigns import summary, summary as sketch
 from malta.campaigns.plan import SAMPLERS, Plan, draw_machines
 from malta.campaigns.result import Campaign, figures_of, gather, runs_within_bounds, yields_of
 from malta.campaigns.run import (

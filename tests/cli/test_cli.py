@@ -289,16 +289,7 @@ def test_design_without_names_takes_the_folder(
         ((INPUT_BASES, 'input = "metric"'), 2, "bases.input: found 'metric'"),
         (("delay = 0 ", 'delay = 0\n"a\\nb" = 3 '), 2, "a b: found an unknown key"),
     ],
-    ids=[
-        "10 s",
-        "loud",
-        "silent",
-        "a huge integral",
-        "large bases",
-        "small bases",
-        "metric",
-        "two lines",
-    ],
+    ids=["10 s", "loud", "silent", "a huge integral", "large bases", "small bases", "metric", "two lines"],
 )
 def test_design_that_cannot_be_computed_names_its_file(
     run: Run, tmp_path: Path, base: str, design: tuple[str, str], code: int, found: str

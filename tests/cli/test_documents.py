@@ -12,8 +12,7 @@ from conftest import Run
 from jsonschema import Draft202012Validator
 
 import malta
-from malta.cli.documents.published import ALL_SCHEMAS, MODELS
-from malta.cli.documents.published import schema_of as schema
+from malta.cli.documents.published import ALL_SCHEMAS, MODELS, schema_of as schema
 from malta.report.ledger import Claim, Ledger
 from malta.units import distinct, identifier, unit_factor, unit_suffix
 

@@ -13,15 +13,7 @@ from exported import PRECISIONS, call_piece, controller, of_each_kind, target
 
 import malta
 from malta.firmware.export import folder_files
-from malta.firmware.flight import (
-    call,
-    compile_controller,
-    differences,
-    engine_of_c,
-    new_state,
-    view,
-    write,
-)
+from malta.firmware.flight import call, compile_controller, differences, engine_of_c, new_state, view, write
 from malta.firmware.fmu import build_fmu
 from malta.firmware.program import Precision, evaluate
 from malta.firmware.signals import Target, reading_ranges

@@ -17,12 +17,7 @@ SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "precision"),
-    [
-        ("halbach", "double"),
-        ("robust", "float"),
-        ("planar_pid", "float"),
-    ],
+    ("name", "precision"), [("halbach", "double"), ("robust", "float"), ("planar_pid", "float")]
 )
 def test_it_moves_and_lands(name: str, precision: Precision, tmp_path: Path) -> None:
     """Its exit code says so: a whole stroke, off again, and no monitor that acted."""

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from exported import PRECISIONS, controller, target
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import malta
 from malta.firmware.flight import Native, call, compile_controller, engine_of_c, new_state, view, write

@@ -59,10 +59,7 @@ def test_default_parameters_compute_the_bits_of_constants(name: str, precision: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "precision"),
-    [("halbach", "double"), ("robust", "float")],
-)
+@pytest.mark.parametrize(("name", "precision"), [("halbach", "double"), ("robust", "float")])
 def test_the_folder_compiles_without_a_warning_and_passes(
     name: str, precision: Precision, tmp_path: Path
 ) -> None:

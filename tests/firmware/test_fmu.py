@@ -157,12 +157,7 @@ FLIGHTS = [
     ("halbach_late", None, 3),
     *(
         pytest.param(*case, marks=pytest.mark.slow)
-        for case in (
-            ("halbach", None, 2),
-            ("robust", None, 3),
-            ("robust", "dq", 2),
-            ("tubular_pid", None, 2),
-        )
+        for case in (("halbach", None, 2), ("robust", None, 3), ("robust", "dq", 2), ("tubular_pid", None, 2))
     ),
 ]
 

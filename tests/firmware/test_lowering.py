@@ -7,8 +7,7 @@ import math
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import malta
 from malta.firmware.program import Precision, Program, build_program, evaluate, lower

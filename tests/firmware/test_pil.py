@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from conftest import ROOT, one_sentence
 from exported import HERE, PROCESSORS, Processor, build, texts
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from test_documents import document
 
 import malta

@@ -81,11 +81,7 @@ def _gain_mat(document: Any, case: Case) -> bytes:
     return encodings.mat_header(body) + body
 
 
-_FORMS: dict[str, Callable[[Any, Case], bytes]] = {
-    ".json": _gain_json,
-    ".npz": _gain_npz,
-    ".mat": _gain_mat,
-}
+_FORMS: dict[str, Callable[[Any, Case], bytes]] = {".json": _gain_json, ".npz": _gain_npz, ".mat": _gain_mat}
 
 
 def read_gain_file(case: Case, folder: Path, suffix: str) -> Ended | None:

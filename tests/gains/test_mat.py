@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import refusal
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.io import loadmat, savemat
 from scipy.sparse import csc_array
 
 from malta.errors import InputError
-from malta.gains import encodings
-from malta.gains import encodings as mat
+from malta.gains import encodings, encodings as mat
 from malta.gains.encodings import COMPRESSED, DEEPEST, LARGEST, MATRIX, read_mat
 
 COMMITTED = sorted(Path("design/gains").glob("*.mat"))

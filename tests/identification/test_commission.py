@@ -15,8 +15,7 @@ from conftest import Run
 
 import malta
 from malta.errors import CheckError, InputError
-from malta.identification import calibration
-from malta.identification import measure as measuring
+from malta.identification import calibration, measure as measuring
 from malta.identification.calibration import Estimate
 from malta.identification.commission import JOURNAL, Bench, Finding, Step, commission, read_journal, steps_of
 from malta.machines.tubular import bench as tubular

@@ -14,8 +14,7 @@ from conftest import Run
 from figure_checks import defects
 
 import malta
-from malta.identification import ExcitationPlan, Log, Measurement
-from malta.identification import measure as measuring
+from malta.identification import ExcitationPlan, Log, Measurement, measure as measuring
 from malta.identification.measure import cut_loop
 from malta.identification.spectra import interpolate_columns
 from malta.report.figures import measured_figure
@@ -74,9 +73,7 @@ def share_within(curve: Curve, truth: Any, factor: float = 1.96) -> float:
     return float((np.abs(curve.size - np.abs(truth)) < factor * curve.deviation).mean())
 
 
-def test_bands_hold_the_truth_of_a_machine_that_the_gain_file_does_not_know(
-    found: Measurement,
-) -> None:
+def test_bands_hold_the_truth_of_a_machine_that_the_gain_file_does_not_know(found: Measurement) -> None:
     S = true_sensitivity(found.w)
     s = np.einsum("kpp->kp", S)
     for curve, truth in ((found.S, s), (found.T, 1 - s), (found.L, 1 / s - 1)):

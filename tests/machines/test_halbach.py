@@ -11,15 +11,12 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.integrate import solve_ivp
 
 import malta
 from malta.gains.encodings import content_sha256
-from malta.machines.halbach import electronics
-from malta.machines.halbach import electronics as motor
-from malta.machines.halbach import plant as halbach
+from malta.machines.halbach import electronics, electronics as motor, plant as halbach
 from malta.machines.halbach.parameters import GAP, Parameters
 from malta.model.data import published_value
 from malta.model.parameters import values_of

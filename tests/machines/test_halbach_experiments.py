@@ -21,10 +21,7 @@ from conftest import ROOT, Run
 from scipy.linalg import expm, solve_discrete_lyapunov
 
 import malta
-from malta.machines.halbach import electronics
-from malta.machines.halbach import electronics as motor
-from malta.machines.halbach import paper as claims
-from malta.machines.halbach import plant as halbach
+from malta.machines.halbach import electronics, electronics as motor, paper as claims, plant as halbach
 from malta.machines.halbach.electronics import IDEAL, Options
 from malta.machines.halbach.experiments import steps_reference
 from malta.machines.halbach.open_loop import (

@@ -9,13 +9,10 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import malta
-from malta.machines.halbach import electronics
-from malta.machines.halbach import electronics as motor
-from malta.machines.halbach import plant as halbach
+from malta.machines.halbach import electronics, electronics as motor, plant as halbach
 from malta.machines.halbach.electronics import IDEAL, REAL, Options
 from malta.machines.halbach.plant import Parameters
 from malta.model.parameters import shape_parameters

@@ -13,9 +13,7 @@ import numpy as np
 import pytest
 
 import malta
-from malta.machines.halbach import electronics
-from malta.machines.halbach import electronics as motor
-from malta.machines.halbach import paper as claims
+from malta.machines.halbach import electronics, electronics as motor, paper as claims
 from malta.machines.halbach.electronics import DEAD_ENDS, IDEAL, IQ_BITS, Options
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import plant_of, published_value

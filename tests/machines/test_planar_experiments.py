@@ -15,15 +15,18 @@ from conftest import Run
 from scipy.integrate import solve_ivp
 
 import malta
-from malta.machines.planar import commutation, field, motions
-from malta.machines.planar import experiments as experiments
-from malta.machines.planar import experiments as timings
-from malta.machines.planar import motions as jumps
-from malta.machines.planar import paper as claims
-from malta.machines.planar import plant as planar
+from malta.machines.planar import (
+    commutation,
+    experiments as experiments,
+    experiments as timings,
+    field,
+    motions,
+    motions as jumps,
+    paper as claims,
+    plant as planar,
+)
 from malta.margins.loop_report import LoopReport
-from malta.model.data import published as read_published
-from malta.model.data import published_value
+from malta.model.data import published as read_published, published_value
 from malta.report.figures import experiment_figure
 from malta.report.ledger import ledger
 from malta.simulation.experiments import Experiment

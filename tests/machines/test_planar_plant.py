@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import malta
-from malta.machines.planar import commutation
-from malta.machines.planar import field as coils
-from malta.machines.planar import plant as planar
+from malta.machines.planar import commutation, field as coils, plant as planar
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim
 from malta.model.parameters import shape_parameters, units_of

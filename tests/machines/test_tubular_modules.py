@@ -12,8 +12,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import Run, one_sentence
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import malta
 from malta.gains.encodings import content_sha256

@@ -10,24 +10,13 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import malta
 from malta.machines.tubular import drive as windings
-from malta.machines.tubular.drive import (
-    AXES,
-    K_L,
-    K_R,
-    TURN,
-    WEIGHT,
-    K_L_inverse,
-    K_R_inverse,
-    to_axes,
-    to_phases,
-)
+from malta.machines.tubular.drive import AXES, K_L, K_R, TURN, WEIGHT, K_L_inverse, to_axes, to_phases
 from malta.simulation import current_control
 from malta.synthesis.feedforward import pi_current_loop
 
@@ -47,6 +36,11 @@ k_P = math.pi / 15e-3  # rad/m, electrical angle along the machine
 
 def _array(value: Any) -> FloatArray:
     return np.array(ca.DM(value))
+
+
+def K_R_inverse(phi: Any) -> Any:
+    """3 x 2, Moore-Penrose: K_R' with its orthogonal rows scaled by 1 / |row|^2 = 3 and 3/2."""
+    return K_R(phi).T @ ca.diag(ca.DM([3, 1.5]))
 
 
 def _flat(value: Any) -> FloatArray:

@@ -11,8 +11,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import Run, one_sentence
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
@@ -214,10 +213,7 @@ def test_recovery_is_of_the_true_outputs(controller: Any) -> None:
     flat = replace(controller, feedforward=replace(controller.feedforward, v0=0 * controller.feedforward.v0))
     (answer,) = recovery(plant, flat, {"push": {"F_x": 0.1}})
     hold = Scenario(
-        "hold",
-        0.05,
-        malta.references.hold,
-        disturbance=lambda t: np.tile([0.1, 0, 0, 0, 0, 0], (len(t), 1)),
+        "hold", 0.05, malta.references.hold, disturbance=lambda t: np.tile([0.1, 0, 0, 0, 0, 0], (len(t), 1))
     )
     run = simulate(plant, flat, hold)
     largest = abs(run.p[:, [0, 2]]).max(axis=0)

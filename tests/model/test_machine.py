@@ -11,13 +11,11 @@ import casadi as ca
 import numpy as np
 import pytest
 from conditions import EPS
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import malta
 from malta import references
-from malta.machines.tubular import drive as windings
-from malta.machines.tubular import plant as tubular
+from malta.machines.tubular import drive as windings, plant as tubular
 from malta.simulation.engine.engines import engine_of
 from malta.simulation.inputs import initial_values, inputs_of
 from malta.simulation.layout import FIDELITIES, Fidelity, layout_of

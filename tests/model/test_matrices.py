@@ -277,10 +277,7 @@ ONE: dict[str, Any] = {"A": [[1.0]], "B": [[1.0]], "C": [[1.0]]}
             {"nominal": {"a b": 1}, "terms": {"a b": []}},
             "nominal.a b: found this name, expected a name as Python has them",
         ),
-        (
-            {"nominal": {"k": "1"}, "terms": {"k": [[[1]]]}},
-            "k: found '1', expected a finite number in 1",
-        ),
+        ({"nominal": {"k": "1"}, "terms": {"k": [[[1]]]}}, "k: found '1', expected a finite number in 1"),
         ({"states": ["a", "b"]}, "states: found 2 names, expected 1 names in a list"),
         ({"outputs": ["a.b"]}, "outputs: found 'a.b', expected a name without dots, or \"z [m]\""),
         ({"limit": 0}, "limit: found 0, expected a number above 0, or 1 of them"),

@@ -17,14 +17,7 @@ from malta import report
 from malta.campaigns.result import bounds_of
 from malta.margins.travel import NOWHERE
 from malta.model import machines
-from malta.model.machines import (
-    inputs_of,
-    lateral_outputs,
-    outputs_of,
-    part_of,
-    require_part,
-    stroke_unit,
-)
+from malta.model.machines import inputs_of, lateral_outputs, outputs_of, part_of, require_part, stroke_unit
 from malta.model.plant import Signal
 from malta.report import figures
 from malta.simulation.experiments import Case, Experiment, Merit, PlannedRun, fly, scenario_of

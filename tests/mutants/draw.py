@@ -64,10 +64,7 @@ def _faults(tree: ast.Module, seen: bool) -> Iterator[tuple[ast.expr, str]]:
             other = COMPARED[type(node.ops[0])]
             yield node, f"{ast.unparse(node.left)} {other} {ast.unparse(node.comparators[0])}"
         elif isinstance(node, ast.BinOp) and type(node.op) in COMBINED and not _is_text(node):
-            yield (
-                node,
-                f"({ast.unparse(node.left)}) {COMBINED[type(node.op)]} ({ast.unparse(node.right)})",
-            )
+            yield (node, f"({ast.unparse(node.left)}) {COMBINED[type(node.op)]} ({ast.unparse(node.right)})")
         elif isinstance(node, ast.Constant) and not seen and not isinstance(node.value, bool):
             if isinstance(node.value, int):
                 yield node, repr(node.value + 1)

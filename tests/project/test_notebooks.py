@@ -124,8 +124,7 @@ def test_a_notebook_shows_a_figure_once(first: str) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("kernel")
 @pytest.mark.parametrize(
-    "notebook",
-    [pytest.param(n, id=f"{n.parent.name}/{n.stem}") for n in PAGES if n.stem == "notebook"],
+    "notebook", [pytest.param(n, id=f"{n.parent.name}/{n.stem}") for n in PAGES if n.stem == "notebook"]
 )
 def test_pictures_are_on_the_pages(notebook: Path) -> None:
     """Executed in a kernel, below each cell at least as many pictures as the cell has calls that draw."""

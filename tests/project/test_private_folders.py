@@ -11,8 +11,7 @@ from typing import Any
 
 import pytest
 
-from malta.simulation.engine import compiled
-from malta.simulation.engine import compiled as private_folders
+from malta.simulation.engine import compiled, compiled as private_folders
 from malta.simulation.engine.compiled import is_private, open_private, process_folder
 
 TEXT = "int answer(void) { return 42; }"

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 import tomlkit
 from conftest import ROOT
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from jsonschema import Draft202012Validator
 
 import malta
@@ -185,12 +184,7 @@ def test_what_the_schema_refuses_the_reader_refuses(name: str, stem: str, tmp_pa
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "stem"),
-    [
-        ("design", "robust"),
-        ("design", "halbach_pid"),
-        ("data", "tubular"),
-        ("gain", "linear"),
-    ],
+    [("design", "robust"), ("design", "halbach_pid"), ("data", "tubular"), ("gain", "linear")],
 )
 def test_whatever_the_schema_refuses_the_reader_refuses(name: str, stem: str, tmp_path: Path) -> None:
     assert check_edits(name, stem, 100, tmp_path) > 20

@@ -422,10 +422,7 @@ def test_a_gain_file_that_is_none(document: Content, tmp_path: Path) -> None:
 # machines of one's own
 
 
-WARM = {
-    'name = "ball"': 'name = "warm"',
-    'name="ball",': 'name="warm", over={"C": (1.9e-5, 2.1e-5)},',
-}
+WARM = {'name = "ball"': 'name = "warm"', 'name="ball",': 'name="warm", over={"C": (1.9e-5, 2.1e-5)},'}
 
 
 @pytest.mark.slow

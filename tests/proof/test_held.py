@@ -55,10 +55,7 @@ def _weights(machine: str, *, drift: bool = True) -> Weights:
         return _made(own | noise, 1, [1e-6] if drift else [])
     own = {"q": [1.0] * 6 + [0.0] * 6, "q_base": [1e-6] * 3 + [1e-5] * 3 + [1.0] * 6}
     own |= {"r": [1.0] * 6, "r_base": [10.0] * 3 + [1.0] * 3}
-    noise = {
-        "process_variance": [1.0] * 3 + [0.01] * 3,
-        "sensor_variance": [4e-16] * 3 + [1e-14] * 3,
-    }
+    noise = {"process_variance": [1.0] * 3 + [0.01] * 3, "sensor_variance": [4e-16] * 3 + [1e-14] * 3}
     return _made(own | noise, 6, [1e-2] * 3 + [1e-4] * 3 if drift else [])
 
 
@@ -177,10 +174,7 @@ def test_regulator_and_filter_are_stable_by_the_separation_principle(machine: st
     k = len(c.Ad) - len(c.forces)
     law = linear_law(c)
     plant = np.block(
-        [
-            [c.Ad[:k, :k] + c.Bd[:k] @ law.D_y @ c.Cd[:, :k], c.Bd[:k] @ law.C],
-            [law.B_y @ c.Cd[:, :k], law.A],
-        ]
+        [[c.Ad[:k, :k] + c.Bd[:k] @ law.D_y @ c.Cd[:, :k], c.Bd[:k] @ law.C], [law.B_y @ c.Cd[:, :k], law.A]]
     )
     expected = np.concatenate([regulator, observer])
     found = np.linalg.eigvals(plant)

@@ -15,14 +15,7 @@ from scipy import linalg
 
 import malta
 from malta.proof.box import Box, box_of
-from malta.proof.multipliers import (
-    Blocks,
-    Branch,
-    Multiplier,
-    excludes_zero,
-    multiplier,
-    response,
-)
+from malta.proof.multipliers import Blocks, Branch, Multiplier, excludes_zero, multiplier, response
 from malta.proof.multipliers.pencil import LEVELS, gains_of_level
 from malta.proof.multipliers.structured import Structured, rows_of
 from malta.proof.problem import OfLoop

@@ -9,8 +9,7 @@ import casadi as ca
 import control
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 import malta
 from malta.errors import InputError

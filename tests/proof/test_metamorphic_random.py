@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 import malta
 from malta.proof.robust import problem_of
@@ -56,11 +55,7 @@ class Case:
             A, B, C, E = (ca.diagcat(*[M] * self.copies) for M in (A, B, C, E))
             return A, B, C, ca.DM(C.shape[0], B.shape[1]), E
 
-        system = malta.uncertain(
-            matrices,
-            {"k": 1.0, "p": 1.0},
-            **({"sample_time": T} if discrete else {}),
-        )
+        system = malta.uncertain(matrices, {"k": 1.0, "p": 1.0}, **({"sample_time": T} if discrete else {}))
         a, b, c, d = (np.kron(np.eye(self.copies), M) for M in self.law)
         rate = self.seconds if T is None else 1.0
         return system, malta.proof.Compensator(a * rate, b * rate, c, d, sample_time=T)

@@ -8,8 +8,7 @@ import pytest
 import malta
 from malta.proof import robust
 from malta.proof.groups import groups, loop_of
-from malta.proof.polynomial import minors
-from malta.proof.polynomial import minors as mirrors
+from malta.proof.polynomial import minors, minors as mirrors
 from malta.proof.polynomial.minors import Image, Places, first_alike, image_of
 from malta.proof.uncertain import Compensator
 

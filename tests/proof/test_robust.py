@@ -12,8 +12,7 @@ import control
 import numpy as np
 import pytest
 from conditions import EPS
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 from malta import gains
 from malta.errors import InputError

@@ -270,11 +270,7 @@ def test_a_discrete_interval_polynomial_of_the_polynomial_toolbox() -> None:
 
 def test_rohrs_1985() -> None:
     """Robustness of continuous-time adaptive control, IEEE TAC 30: lost at a gain of 17.03, at 16.1 rad/s."""
-    m = margin(
-        lambda k: [1, 31, 259, 229 + 458 * k],
-        {"k": (1.0, 2.0)},
-        {"k": 1.0},
-    )
+    m = margin(lambda k: [1, 31, 259, 229 + 458 * k], {"k": (1.0, 2.0)}, {"k": 1.0})
     bracketed(m, 7800 / 458 - 1)
     assert 1 + m.upper == pytest.approx(17.03, abs=0.02)
     assert m.frequency == pytest.approx(16.1, abs=0.05)

@@ -22,7 +22,7 @@ from malta.campaigns.result import figures_of
 from malta.margins.loop_report import LoopReport, zone
 from malta.margins.travel import NOWHERE, Extent, extent_of, positions_of, travel_loops, travel_margin
 from malta.model import machines
-from malta.model.checks import check_plant
+from malta.model.checks import check_numbers, check_symbols
 from malta.model.machines import machine
 from malta.model.plant import Plant
 from malta.proof.blocks.gain import Gain
@@ -288,7 +288,7 @@ def test_intervals_have_to_be_some(plant: Plant, par: Any) -> None:
         ({"Omega": (0.0, math.inf)}, r"\(0.0, inf\)"),
     ):
         with pytest.raises(malta.InputError, match=f"rotor: over.*: found {found}"):
-            check_plant(replace(plant, over=over))
+            check_numbers(replace(plant, over=over))
     with pytest.raises(
         malta.InputError, match=r"Omega: found 3000 rad/s, expected at most Omega_max, 2094\.4 rad/s"
     ):
@@ -303,13 +303,13 @@ def test_a_parameter_taken_for_a_number_is_named(plant: Plant, par: Any) -> None
         return replace(plant, parameters=p, variant=build, load=lambda _: ca.vertcat(pull, 0, 0, 0))
 
     with pytest.raises(malta.InputError, match=r"rotor: load: found slope, taken for a number.*ca.sin"):
-        check_plant(build(par))
+        check_symbols(build(par))
 
     def refusing(p: Any) -> Plant:
         return replace(plant, parameters=p, variant=refusing, mass=1.0 if p.e_u > 1 else 2.0)
 
     with pytest.raises(malta.InputError, match=r"rotor: plant: found e_u, taken for a number"):
-        check_plant(refusing(par))
+        check_symbols(refusing(par))
 
 
 def test_rotors_that_differ_are_flown_and_listed(

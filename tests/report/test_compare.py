@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from browsing import browser as browser
-from browsing import open_page
+from browsing import browser as browser, open_page
 from conftest import ROOT, Run
 from page_checks import read_page
 from rich.console import Console

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from browsing import browser as browser
-from browsing import open_page
+from browsing import browser as browser, open_page
 from conftest import ROOT, Run
 from PIL import Image
 

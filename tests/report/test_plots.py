@@ -81,9 +81,7 @@ def test_plots_of_stable_and_unstable_loops_have_no_defects(draw: Any, unstable:
 @pytest.mark.slow
 @pytest.mark.parametrize("draw", [*PLOTS, report.load_response], ids=lambda draw: draw.__name__)
 @pytest.mark.parametrize(
-    "names",
-    [("robust", "tubular_pid"), ("halbach",), ("planar", "planar_pid")],
-    ids=lambda names: names[0],
+    "names", [("robust", "tubular_pid"), ("halbach",), ("planar", "planar_pid")], ids=lambda names: names[0]
 )
 def test_plots_of_every_machine_have_no_defects(draw: Any, names: tuple[str, ...]) -> None:
     assert defects(draw({name: shipped(name) for name in names})) == []

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from browsing import browser as browser
-from browsing import open_page, printed
+from browsing import browser as browser, open_page, printed
 from conftest import ROOT, Run
 from page_checks import cells_of, read_page
 

@@ -10,11 +10,7 @@ import pytest
 
 import malta
 from malta import references
-from malta.machines.tubular.experiments.disturbances import (
-    BEGIN,
-    carrier_acceleration,
-    inertial_wrench,
-)
+from malta.machines.tubular.experiments.disturbances import BEGIN, carrier_acceleration, inertial_wrench
 from malta.simulation.experiments import Experiment
 from malta.simulation.inputs import countering_forces
 from malta.simulation.scenario import Scenario

@@ -17,13 +17,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import malta
 from malta import references
-from malta.simulation.engine import compiled, engines
-from malta.simulation.engine import engines as translate
+from malta.simulation.engine import compiled, engines, engines as translate
 from malta.simulation.engine.compiled import LANES, process_folder
 from malta.simulation.engine.engines import engine_of, library_of, shape_of
 from malta.simulation.engine.instructions import Counts

@@ -19,9 +19,13 @@ from scipy.linalg import expm
 import malta
 from malta import references
 from malta.loops.sampled_loops import machine_loop, sampled_loop
-from malta.machines.tubular.experiments import EXPERIMENTS, lifting, strokes
-from malta.machines.tubular.experiments import disturbances as forces
-from malta.machines.tubular.experiments import disturbances as rest
+from malta.machines.tubular.experiments import (
+    EXPERIMENTS,
+    disturbances as forces,
+    disturbances as rest,
+    lifting,
+    strokes,
+)
 from malta.model.data import plant_of, published_value
 from malta.simulation.experiments import Case, Experiment, Merit, compliance
 from malta.simulation.experiments.catalogue import experiment
@@ -777,9 +781,7 @@ def test_before_it_strikes_a_fault_is_not_there(design: Design, flown: Flown) ->
     real: dict[str, Any] = {"noise": 1.0, "quantize": True, "sensor_errors": {}, "bearing": True}
     whole = {
         kind: simulate(
-            design.plant,
-            design.controller,
-            Scenario("faults", 0.3, references.hold, **(real | options)),
+            design.plant, design.controller, Scenario("faults", 0.3, references.hold, **(real | options))
         )
         for kind, options in kinds.items()
     }

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.integrate import simpson, solve_ivp
 from scipy.optimize import fsolve
 
@@ -170,11 +169,7 @@ def test_a_finer_mesh_takes_as_long(plant: Plant, par: tubular.Parameters, strok
 
 @pytest.mark.slow
 @settings(max_examples=3, deadline=None)
-@given(
-    distance=st.floats(1e-4, 0.03),
-    voltage_share=st.floats(0.2, 0.9),
-    current_share=st.floats(0.2, 0.9),
-)
+@given(distance=st.floats(1e-4, 0.03), voltage_share=st.floats(0.2, 0.9), current_share=st.floats(0.2, 0.9))
 def test_more_of_a_limit_never_takes_longer(
     plant: Plant, par: tubular.Parameters, distance: float, voltage_share: float, current_share: float
 ) -> None:

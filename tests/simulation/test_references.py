@@ -7,17 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import malta
-from malta.simulation.references import (
-    PROFILES,
-    QUINTIC_DURATION,
-    circle,
-    hold,
-    stroke,
-)
+from malta.simulation.references import PROFILES, QUINTIC_DURATION, circle, hold, stroke
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant

@@ -26,8 +26,7 @@ from malta.proof.box import below
 from malta.proof.certificate import certificate, check, checked_file, checked_loop
 from malta.proof.groups import loop_of
 from malta.proof.margin import Margin
-from malta.proof.polynomial import characteristic as degrees
-from malta.proof.polynomial import enclosure
+from malta.proof.polynomial import characteristic as degrees, enclosure
 from malta.proof.polynomial.closed_loop import loop_parts
 from malta.proof.polynomial.family import nodes, restrict, restriction_rounding
 from malta.proof.problem import OfLoop

@@ -10,8 +10,7 @@ import control
 import numpy as np
 import pytest
 from conditions import EPS, of_gain
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy import linalg
 from scipy.integrate import quad_vec
 

@@ -16,10 +16,10 @@ from malta.machines.tubular import paper as tubular
 from malta.machines.tubular.paper.quantities import (
     axial_deviation,
     axis_coupling,
+    evidence as evidence_of,
     load_deviation,
     noise_forces,
 )
-from malta.machines.tubular.paper.quantities import evidence as evidence_of
 from malta.margins.loop_report import Outcome
 from malta.report import ledger as claims
 from malta.report.ledger import Row

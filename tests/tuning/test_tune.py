@@ -27,16 +27,16 @@ from malta.synthesis.requirements import requirements_for
 from malta.synthesis.riccati import eigenvalues
 from malta.tuning import tune as lqg
 from malta.tuning.groups import figures_of
-from malta.tuning.search import (
-    Effort,
-    Journal,
-    Trial,
-    apply_trial,
-    at_least_of,
-    merge,
+from malta.tuning.search import Effort, Journal, Trial, apply_trial, at_least_of, merge
+from malta.tuning.tune import (
+    Tuned,
+    cluster_search,
+    clusters_of,
+    design_text,
+    problem_sha256,
+    tune as tuned,
+    worst_ratio,
 )
-from malta.tuning.tune import Tuned, cluster_search, clusters_of, design_text, problem_sha256, worst_ratio
-from malta.tuning.tune import tune as tuned
 from malta.tuning.verify import judge
 
 if TYPE_CHECKING:
@@ -465,8 +465,7 @@ def test_wishes_do_not_shape_the_gains(tmp_path: Path, spec: Spec) -> None:
 def test_what_varies_must_stand_in_the_file(tmp_path: Path) -> None:
     name = 'thrust = { vary = ["noise.process.z"], low = 0.3, high = 300, unit = "m/s^2" }'
     path = edited(
-        tmp_path,
-        (name, 'thrust = { vary = ["noise.sensor.z"], low = 0.3, high = 300, unit = "m/s^2" }'),
+        tmp_path, (name, 'thrust = { vary = ["noise.sensor.z"], low = 0.3, high = 300, unit = "m/s^2" }')
     )
     assert refusal(lambda: malta.read_design(path), path).field == "search.numbers.thrust.unit"
     text = path.read_text(encoding="utf-8")

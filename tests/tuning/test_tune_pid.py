@@ -18,28 +18,13 @@ from scipy import linalg
 
 import malta
 from malta.loops.sampled_loops import machine_loop
-from malta.machines.halbach import electronics
-from malta.machines.halbach import plant as halbach
+from malta.machines.halbach import electronics, plant as halbach
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Pid
 from malta.tuning import pid, verify
-from malta.tuning.pid import (
-    close_loop,
-    goal_value,
-    loads_of,
-    loop_figures,
-    parts_of,
-    whole_machine,
-)
-from malta.tuning.search import (
-    Effort,
-    Journal,
-    Search,
-    model_and_controller,
-    separate,
-)
-from malta.tuning.tune import design_text, problem_sha256
-from malta.tuning.tune import tune as tuned
+from malta.tuning.pid import close_loop, goal_value, loads_of, loop_figures, parts_of, whole_machine
+from malta.tuning.search import Effort, Journal, Search, model_and_controller, separate
+from malta.tuning.tune import design_text, problem_sha256, tune as tuned
 from malta.tuning.verify import judge
 
 if TYPE_CHECKING:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
@@ -21,9 +23,6 @@ from malta.cli.documents.loops import (
 from malta.units import distinct, identifier
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
     from malta.campaigns.rare import RareEvent
     from malta.campaigns.run import Status
     from malta.campaigns.studies import Index, Sensitivity, Tolerances
@@ -447,11 +446,7 @@ def _stroke(experiment: Experiment) -> StrokePart:
 def flights(found: Mapping[str, Mapping[Precision, Sequence[Difference]]]) -> list[FlightPart]:
     """The differences of the exported C's flights, by case and precision."""
     return [
-        FlightPart(
-            case=label,
-            precision=precision,
-            signals={d.name: SignalPart.of(d) for d in rows},
-        )
+        FlightPart(case=label, precision=precision, signals={d.name: SignalPart.of(d) for d in rows})
         for label, by_precision in found.items()
         for precision, rows in by_precision.items()
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -13,8 +14,6 @@ from malta.merits import Merit, by_identifier
 from malta.units import distinct
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from malta.loops.time_domain import Deviation, Recovery
     from malta.margins.loop_report import LoopReport
     from malta.report.page.comparison import Comparison

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
@@ -13,9 +15,6 @@ from malta.report.ledger import Word
 from malta.units import identifier
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
     from malta.identification.dump import ExactReplay
     from malta.identification.identify import Identified
     from malta.identification.log import Log

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -12,8 +13,6 @@ from pydantic import Field
 from malta.cli.documents.loops import Files, Number, Part
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from malta.loops.classical import ChannelMargins
     from malta.loops.curves import LoopCurves
     from malta.loops.linear_loops import Place

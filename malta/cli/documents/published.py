@@ -36,9 +36,9 @@ def output_schema(name: str) -> dict[str, Any]:
     return {"$schema": DRAFT} | MODELS[name].model_json_schema(mode="serialization")
 
 
-ALL_SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = SCHEMAS | {
-    name: partial(output_schema, name) for name in MODELS
-}  # of files and of documents, by name
+# Of files and of documents, by name.
+ALL_SCHEMAS: dict[str, Callable[[], dict[str, Any]]]
+ALL_SCHEMAS = SCHEMAS | {name: partial(output_schema, name) for name in MODELS}
 
 
 def schema_of(name: str) -> dict[str, Any]:

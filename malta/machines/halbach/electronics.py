@@ -141,25 +141,19 @@ MEAN_OF = 32  # samples in the rolling mean of a current, Sec. 4.2
 # Counts at either end of a period within which the edges of the high-resolution PWM have the counter's steps. Sec. 4.1
 # says "near 0 % and 100 %"; the manual of the PWM module, Texas Instruments SPRUGE8, has three clocks.
 DEAD_ENDS = 3
-IQ_BITS = (
-    24  # bits behind the point of the DSP's fixed-point numbers: the IQmath library's default; not printed
-)
+IQ_BITS = 24  # bits behind the point of the DSP's fixed-point numbers: IQmath's default; not printed
 
 
 @dataclass(frozen=True)
 class Options:
     """What the electronics consist of; each source of error can be switched off."""
 
-    pwm: Pwm = (
-        "plain"  # duty cycles: exact, or in steps of the counter, or in those of the high-resolution PWM
-    )
+    pwm: Pwm = "plain"  # duty cycles: exact, in steps of the counter, or in those of the high-resolution PWM
     adc_steps: bool = True
     adc_noise: bool = True
     mean_of: int = MEAN_OF  # samples in the rolling mean of a current
     current_loops: bool = True  # vector control; without loops, voltages are R times the wanted currents
-    dead_ends: int = (
-        0  # counts at either end of a duty cycle without fine steps; DEAD_ENDS on the paper's DSP
-    )
+    dead_ends: int = 0  # counts at either end of a duty cycle without fine steps; the paper's: DEAD_ENDS
     angle_bits: int | None = None  # of a turn of the Park angle, and of its cosine and sine; None: exact
 
     def __post_init__(self) -> None:
@@ -407,9 +401,7 @@ def _start(parts: _Parts, x: Any, i: Any) -> dict[str, Any]:
     """The electronics' state in a steady state at the position x[0] with phase currents i."""
     par, o = parts
     P, n = park(x[0], par.k), o.mean_of
-    drop = (
-        resistive_drop(par, i) if o.current_loops else par.R * i
-    )  # integrals have found each phase's resistance
+    drop = resistive_drop(par, i) if o.current_loops else par.R * i  # integrals found each resistance
     u = P @ drop
     codes = sample_current(par, i[0:2], steps=o.adc_steps)[0]
     state = {

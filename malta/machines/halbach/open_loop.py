@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.machines.halbach import electronics
-from malta.machines.halbach import electronics as motor
+from malta.machines.halbach import electronics, electronics as motor
 from malta.machines.halbach.electronics import IDEAL, Options, Pwm
 from malta.model.plant import FloatArray, Plant
 from malta.simulation import references
@@ -56,9 +55,7 @@ def lift_force(run: Trajectory) -> FloatArray:
 MOVE = 5e-3  # m
 CALM, AFTER = 100, 120  # readings before a move, and from its beginning to the end
 FASTER = 50  # control periods of the open loop in a period of the laser
-FAULTS: Mapping[
-    str, Mapping[str, float]
-] = {  # possible explanations of the paper's figures: parameters, angle (rad), outer force (N)
+FAULTS: Mapping[str, Mapping[str, float]] = {  # that may explain the paper: angle in rad, outer force in N
     "sound": {},
     "windings x 0.9, 0.9, 1.25": {"r_a": 0.9, "r_b": 0.9, "r_c": 1.25},
     "magnets of a phase x 0.8": {"a_a": 0.8},

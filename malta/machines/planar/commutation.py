@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from itertools import product
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -27,26 +27,16 @@ from malta.machines.planar.field import (
     shape_of,
     simulation_model,
 )
+from malta.machines.planar.parameters import Parameters
 from malta.model.equations import Equation, note, recorded_equations, recording, rotation
 from malta.model.plant import FloatArray, readonly
-
-if TYPE_CHECKING:
-    from malta.machines.planar.parameters import Parameters
-
 
 STEPS = (-1.5, -0.5, 0.5, 1.5)  # coil pitches from the mover's centre, along x and y
 WORST = 10.0  # largest accepted condition of K(p): 2.4 with a pitch of 16/3 tau_n, 20 and more with a bad one
 
 
-_FACTORS = (
-    "coil_pitch",
-    "r_z",
-    "h",
-    "N_c",
-    "B_r",
-    "B_z",
-    "C",
-)  # parameters of K(p) that harmonics do not depend on
+# Parameters of K(p) that harmonics do not depend on.
+_FACTORS = ("coil_pitch", "r_z", "h", "N_c", "B_r", "B_z", "C")
 
 
 def factors_of(par: Parameters) -> Any:
@@ -264,12 +254,6 @@ def check_pitch(par: Parameters, model: CoilModel) -> float:
             f" {WORST:g}: the coils' phases do not give forces and torques in every direction at every position"
         )
     return worst
-
-
-def hover(par: Parameters, model: CoilModel, p: FloatArray) -> FloatArray:
-    """The coil currents, A, whose wrench balances the weight of the level mover at p."""
-    weight = np.array([0, 0, par.m * par.g, 0, 0, 0])
-    return np.asarray(currents(wrench_matrix(par, model, check_position(par, p)), weight))
 
 
 def decoupling(par: Parameters, model: CoilModel) -> ca.Function:

@@ -24,8 +24,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.machines.planar import commutation, field
-from malta.machines.planar import plant as planar
+from malta.machines.planar import commutation, field, plant as planar
 from malta.machines.planar.motions import (
     CELLS,
     FORCES,
@@ -274,9 +273,7 @@ EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "delay": delay,
     "timing": timing,
 }
-CASES: dict[str, Callable[..., list[PlannedRun]]] = {
-    "step": step_cases
-}  # with the controller's own coil model
+CASES: dict[str, Callable[..., list[PlannedRun]]] = {"step": step_cases}  # with the controller's coil model
 FINDINGS = ("delay",)
 WORDS = {
     "stroke": "y",

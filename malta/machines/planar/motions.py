@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from malta.errors import InputError
-from malta.machines.planar import commutation
-from malta.machines.planar import plant as planar
+from malta.machines.planar import commutation, plant as planar
 from malta.machines.planar.parameters import COIL_ORDER
 from malta.model.linearize import linearize
 from malta.model.plant import FloatArray, Plant

@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.machines.planar import commutation
-from malta.machines.planar import field as planar_field
-from malta.machines.planar import plant as planar
+from malta.machines.planar import commutation, field as planar_field, plant as planar
 from malta.machines.planar.experiments import CURRENT, coil_wrench
 from malta.machines.planar.motions import AHEAD, DESIGNED, LINEAR, SOFT, jump, steps_ahead
 from malta.margins.loop_report import LoopReport
@@ -27,9 +25,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 EXPERIMENT_NAMES = ("step", "jump", "errors", "timing", "delay")
-SLOWER = (
-    49.6  # 1/s, rate of approach of Kp = 1.2 N/um with the Kd of planar_pid: how far torques depend on gains
-)
+SLOWER = 49.6  # 1/s, approach of Kp = 1.2 N/um with the Kd of planar_pid: how far torques depend on gains
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,9 +197,7 @@ ARM = (
     "the paper names neither the coil nor the pitch; its F_z and T_x imply an arm of 65 mm, ours is 47 mm: see the "
     "rows with 22/3 τ_n"
 )
-WIDE = (
-    22 / 3
-)  # coil pitch in tau_n whose half is that arm; 4 + 10/3, where K(p) is as well conditioned as with 16/3
+WIDE = 22 / 3  # coil pitch in tau_n whose half is that arm; 4 + 10/3, where K(p) is conditioned as with 16/3
 BOTH = "B_r and the corner radius, not printed, were chosen for it and 0.81 T"
 NOTES = {"F_x": BOTH, "F_y": BOTH, "T_x": "", "T_y": "", "T_z": ""}
 ERRORS = {

@@ -22,9 +22,7 @@ class Parameters:
     N_c: float = si("1", above=0)  # turns
     h_m: float = si("m", above=0, shapes=True)  # thickness of the magnets
     B_r: float = si("T", above=0)  # their remanence, relative permeability 1
-    upright: float = si(
-        "1", above=0, shapes=True
-    )  # width of the upright blocks in their own pole pitch, sqrt(2) tau_n
+    upright: float = si("1", above=0, shapes=True)  # upright blocks' width over sqrt(2) tau_n
     h: float = si("m", above=0)  # air gap: the working height
     B_z: float = si("T", above=0)  # flux density that (17)-(24) count with, at the working height
     C: float = si("1", above=0)  # harmonic compensation factor of (23), (24)
@@ -46,9 +44,7 @@ class Parameters:
     s_p: float = si("m", at_least=0)  # position sensor noise, rms of a sample
     s_a: float = si("rad", at_least=0)  # angle sensor noise, rms of a sample
     order: float = si("1", at_least=1, shapes=True)  # harmonics of the controller's coil model; 1: (17)-(24)
-    cells: float = si(
-        "1", at_least=0, shapes=True
-    )  # of its table over tau_n, along x and along y; 0: no table
+    cells: float = si("1", at_least=0, shapes=True)  # of its table over tau_n, along x and y; 0: no table
     preset: str = "custom"
 
     def __post_init__(self) -> None:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -34,9 +34,7 @@ from malta.model.data import plant_of
 from malta.model.plant import FloatArray, Signal
 from malta.simulation import references
 from malta.simulation.scenario import Scenario
-
-if TYPE_CHECKING:
-    from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller
 
 PLANES = (("x1", "y1"), ("x2", "y2"))
 PUSH = 6.0  # N, of each module along the ring: more than the weight

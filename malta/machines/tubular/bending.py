@@ -15,16 +15,14 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from malta.machines.tubular.parameters import Parameters
 from malta.model.data import published_figures, published_value
 from malta.proof.blocks import Dynamic
-
-if TYPE_CHECKING:
-    from malta.machines.tubular.plant import Parameters
-    from malta.proof.uncertain import UncertainSystem
+from malta.proof.uncertain import UncertainSystem
 
 FREE = 4.730040744862704  # k of the first mode of a free beam
 SIZE = 2.0  # the square of sqrt 2: two forces, and two sensors, of one plane

@@ -8,20 +8,16 @@ Both are the paper's measured constants and kept as such: electrical and mechani
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 
+from malta.machines.tubular.parameters import Parameters
 from malta.model.equations import note
 from malta.model.plant import Signal
 from malta.model.signals import CurrentSensors, Drive
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from malta.machines.tubular.parameters import Parameters
-
 
 # Windings: the two-directional dq transformation, and position sensing by Hall sensors.
 #
@@ -63,11 +59,6 @@ def K_L(theta: Any) -> Any:
         sines=sines,
     )
     return 2 / 3 * ca.horzcat(cosines, -sines)
-
-
-def K_R_inverse(phi: Any) -> Any:
-    """3 x 2, Moore-Penrose: K_R' with its orthogonal rows scaled by 1 / |row|^2 = 3 and 3/2."""
-    return K_R(phi).T @ ca.diag(ca.DM([3, 1.5]))
 
 
 def K_L_inverse(theta: Any) -> Any:

@@ -66,9 +66,7 @@ def second_derivative(r: Any, q: Any, dq: Any, ddq: Any) -> Any:
 POSITIONS = tuple(Signal(n, "m") for n in "xyz") + tuple(Signal(n, "rad") for n in ("alpha", "beta", "gamma"))
 RATES = tuple(Signal(f"{s.name}_dot", f"{s.unit}/s") for s in POSITIONS)
 INPUTS = tuple(Signal(n, "N") for n in ("fx_B1", "fy_B1", "fx_B2", "fy_B2", "f_D"))
-COILS = tuple(
-    Signal(s.name.replace("f", "i", 1), "A") for s in INPUTS
-)  # axes of the transformation, one for each input
+COILS = tuple(Signal(s.name.replace("f", "i", 1), "A") for s in INPUTS)  # axes of inputs' transformation
 OUTPUTS = tuple(Signal(n, "m") for n in ("x1", "y1", "x2", "y2", "z"))
 SENSOR_ERRORS = (
     *(Signal(f"gain_{s.name}", "1") for s in OUTPUTS[:4]),

@@ -6,10 +6,11 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 import numpy as np
 
+from malta.model.plant import Plant
 from malta.simulation.scenario import ESTIMATORS, Scenario
 from malta.simulation.simulate import fits_kalman_filter
 from malta.simulation.trajectory import stroke_figures
@@ -26,9 +27,6 @@ from malta.synthesis.requirements import (
     reached_with_every_seed,
     worst_merit,
 )
-
-if TYPE_CHECKING:
-    from malta.model.plant import Plant
 
 DRIVE = "K_D"  # the force constant of the drive, which scales the thrust and no other force
 DRIVE_ERROR = 0.05  # of the drive's force constant, in the strokes of tracking_error

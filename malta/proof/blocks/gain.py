@@ -12,13 +12,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from malta.bound import Bound, at_least, at_most
 from malta.display import Description, display, quantity
 from malta.errors import InputError
+from malta.model.plant import ComplexArray, FloatArray
 from malta.processes import on_one_thread
 from malta.proof.blocks import (
     At,
@@ -48,17 +49,12 @@ from malta.proof.blocks.transfer import (
 from malta.proof.box import Box, box_of, within_branches
 from malta.proof.groups import loop_of
 from malta.proof.loss import first_loss
-from malta.proof.margin import Margin, unproven
+from malta.proof.margin import Margin, Ranges, unproven
 from malta.proof.polynomial.enclosure import NO_COEFFICIENTS, Unproven
 from malta.proof.problem import OfLoop, is_nominal_stable
 from malta.proof.robust import law_of, problem_of
 from malta.proof.uncertain import Compensator, UncertainSystem, positive, responses
 from malta.proof.work import Budget, WorkUp, in_rounds, is_past, work_limit
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
-    from malta.proof.margin import Ranges
-
 
 # Unmodelled dynamics beside real parameters: stable blocks Delta_k with |Delta_k(jw)| <= t |W_k(jw)|.
 #
@@ -68,17 +64,8 @@ if TYPE_CHECKING:
 
 
 DYNAMIC_TOLERANCE = 1e-3
-DYNAMIC_STEPS = (
-    1,
-    3,
-    10,
-    30,
-    100,
-    300,
-    1000,
-    3000,
-    10_000,
-)  # bounds that are tried, in multiples of the tolerance
+# Bounds that are tried, in multiples of the tolerance.
+DYNAMIC_STEPS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10_000)
 ROUNDS = 3
 ROUNDS_OF_SECANT = 40
 SEARCH = 0.4  # share of the work for the search of a loss; the rest is for the proof

@@ -27,23 +27,13 @@ from flint import acb, arb
 
 from malta.proof.blocks import Block, Expanded
 from malta.proof.box import Box
-from malta.proof.exclusion import (
-    PATCHES,
-    CellBounds,
-    Growth,
-    advance,
-    cut,
-    growth_over,
-    on_boxes,
-    start,
-)
-from malta.proof.polynomial.enclosure import family_over
+from malta.proof.exclusion import PATCHES, CellBounds, Growth, advance, cut, growth_over, on_boxes, start
+from malta.proof.polynomial.enclosure import Polynomial, family_over
 from malta.proof.polynomial.family import Family, align, combine
 from malta.proof.work import is_past
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
-    from malta.proof.polynomial.enclosure import Polynomial
     from malta.proof.problem import OfLoop
 
 
@@ -73,11 +63,7 @@ class Part:
 
 
 def parts_of(
-    problem: OfLoop,
-    blocks: Sequence[tuple[Block, list[int]]],
-    box: Box,
-    reach: float,
-    most: Sequence[float],
+    problem: OfLoop, blocks: Sequence[tuple[Block, list[int]]], box: Box, reach: float, most: Sequence[float]
 ) -> list[Part]:
     """The groups' polynomials over parts of box(reach).
 

@@ -21,13 +21,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from malta.model.plant import readonly
+from malta.model.plant import ComplexArray, FloatArray, readonly
 from malta.proof.blocks import Block
 from malta.proof.uncertain import Responses
 from malta.proof.work import is_past
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
     from malta.proof.problem import OfLoop
 
 

@@ -162,14 +162,8 @@ def divides(f: Polynomial, i: int) -> bool:
     )
 
 
-SHARES = (
-    0.999,
-    0.97,
-    0.9,
-    0.75,
-    0.5,
-    0.25,
-)  # of the margin's lower bound: the first that is proven is claimed
+# Of the margin's lower bound: the first that is proven is claimed.
+SHARES = (0.999, 0.97, 0.9, 0.75, 0.5, 0.25)
 MOST_CELLS = 20_000  # cells of one group at most
 MOST_PARTS = 64
 HIGHEST = 24  # degree of an interpolant along one parameter

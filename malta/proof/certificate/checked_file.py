@@ -129,9 +129,7 @@ class Loop:
 
     states: int
     steps: tuple[tuple[str, int, tuple[int, ...], Any], ...]
-    entries: tuple[
-        tuple[tuple[int, int, int], ...], ...
-    ]  # of A, B, C, E: row, column, step; E diagonal, or I
+    entries: tuple[tuple[tuple[int, int, int], ...], ...]  # of A, B, C, E: row, column, step; E diagonal or I
     law: tuple[list[list[Any]], ...]  # A, B, C, D
     sample_time: Any
     discrete: bool

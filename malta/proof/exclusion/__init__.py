@@ -12,18 +12,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from malta.model.plant import ComplexArray, FloatArray
 from malta.proof.box import Box, smallest_t
 from malta.proof.polynomial.enclosure import Polynomial, TooWide, Unproven
 from malta.proof.polynomial.family import EPS, Family, restrict, restriction_rounding
 from malta.proof.work import is_past
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
-
 
 # A family along s = jw: Taylor expansions on intervals of frequency, from zero to infinity.
 #
@@ -223,9 +220,7 @@ class CellBounds(NamedTuple):
     lasting: FloatArray  # what of the radius narrower intervals of frequency leave
     discs: ComplexArray  # cells x nodes
     moves: list[FloatArray]
-    sure: ComplexArray | None = (
-        None  # directions of cells that are excluded for reasons of their own, zero elsewhere
-    )
+    sure: ComplexArray | None = None  # directions of cells that are excluded for other reasons, else zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,9 +235,7 @@ class Search:
     depth: FloatArray
     target: float
     count: int = 0
-    around: Callable[[FloatArray, FloatArray], CellBounds] | None = (
-        None  # f by more than its family, on cells and boxes
-    )
+    around: Callable[[FloatArray, FloatArray], CellBounds] | None = None  # f by more than its family
     hasty: bool = False  # whether few cells are cut several times at once
     # the smallest t of a cell that no splitting frees of zero, as the radius is larger than f
     blocked: float = np.inf
@@ -384,13 +377,7 @@ def half_plane(terms: list[ComplexArray], radius: FloatArray) -> ComplexArray:
     return c
 
 
-def _split(
-    s: Search,
-    cells: FloatArray,
-    boxes: FloatArray,
-    depth: FloatArray,
-    found: CellBounds,
-) -> Search:
+def _split(s: Search, cells: FloatArray, boxes: FloatArray, depth: FloatArray, found: CellBounds) -> Search:
     """Split each cell in two across the axis that moves f most: frequency, a parameter or a further axis."""
     shape, terms, radius = s.family.shape, found.terms, found.radius
     count = terms[0].shape[1]
@@ -465,10 +452,7 @@ class Part:
 
 
 def cut(
-    sides: FloatArray,
-    nominal: FloatArray,
-    made: Callable[[FloatArray], list[Any]],
-    most: int = PATCHES,
+    sides: FloatArray, nominal: FloatArray, made: Callable[[FloatArray], list[Any]], most: int = PATCHES
 ) -> list[Any]:
     """Apply `made` to a box, or to parts of it where the box is too wide; `most` parts at most.
 

@@ -16,25 +16,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
+from malta.model.plant import FloatArray
+from malta.proof.box import Box
 from malta.proof.exclusion import cut
 from malta.proof.expressions import NotAnalytic, exact
 from malta.proof.polynomial.characteristic import pair
-from malta.proof.polynomial.enclosure import Disc, TooWide, Unproven, discs_of, ends_of, precision
+from malta.proof.polynomial.enclosure import Disc, Polynomial, TooWide, Unproven, discs_of, ends_of, precision
 from malta.proof.polynomial.family import nodes, scale_of
-from malta.proof.problem import hurwitz
+from malta.proof.problem import Problem, hurwitz
 from malta.proof.work import check_clock, spend
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-    from malta.proof.box import Box
-    from malta.proof.polynomial.enclosure import Polynomial
-    from malta.proof.problem import Problem
-
 
 BITS = 640  # of balls: Bernstein coefficients of degree d lose about 2 d of them
 LARGEST = 14  # degree in s

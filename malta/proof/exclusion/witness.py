@@ -5,17 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from malta.model.plant import ComplexArray, FloatArray
 from malta.proof.exclusion import Cell, Growth, cover
 from malta.proof.polynomial.family import Family, basis
 from malta.proof.work import is_past
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
-
 
 STEPS = 8  # of the frequency grid in an octave
 SPACING = 0.6 / STEPS  # half a step and more, in ln w
@@ -368,9 +365,7 @@ def _grow_box(
     """The smallest t whose box contains a du with s du = h; infinite when the trust region ends before."""
     (low, high), (grows, middle, below, above) = room, sides
     with np.errstate(all="ignore"):
-        full = np.where(
-            s > 0, (high - middle) / above, (middle - low) / below
-        )  # t at which an axis reaches the trust region
+        full = np.where(s > 0, (high - middle) / above, (middle - low) / below)  # t of the trust region
         rate = np.where(grows & (s != 0), np.abs(s) * np.where(s > 0, above, below), 0)
     for stop in [*np.sort(full[(rate > 0) & (full > t)]).tolist(), np.inf]:
         pull = float(rate[full > t].sum())

@@ -21,18 +21,14 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import linalg
 
-from malta.proof.multipliers.pencil import EPS, Expansion
+from malta.model.plant import ComplexArray, FloatArray
+from malta.proof.multipliers.pencil import EPS, Expansion, Pencil
 from malta.proof.work import spend
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
-    from malta.proof.multipliers.pencil import Pencil
-
 
 STEPS = 60  # of the level, at most
 INNER = 5  # Newton steps for each

@@ -14,19 +14,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import linalg
 
+from malta.model.plant import FloatArray
 from malta.proof.groups import C, UncertainLoop
 from malta.proof.polynomial.characteristic import clear_denominators
 from malta.proof.polynomial.rational import TooLarge
 from malta.proof.uncertain import Group
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # Matrices over a box of parameters to first order: M(p) = M_0 + sum_i delta_i M_i + rest, with |delta_i| <= 1.
 
@@ -278,10 +275,8 @@ def _sum(Y: FloatArray, slopes: FloatArray, b: Sequence[float], even: bool) -> t
 TERMS = 20_000  # of all entries, beyond which they are not expanded
 LIFTED = 8  # states up to which the fraction of a hold has rows of its own
 WIDEST = 40  # rows of a pencil with these, beyond the first level
-LESS = (
-    0.2,
-    0.05,
-)  # largest ratio of bounds with and without these rows: where they cost little, and one level else
+# Largest ratio of bounds with and without these rows: where they cost little, and one level else.
+LESS = (0.2, 0.05)
 MORE = 2  # times the coordinates of multipliers without these rows, that cost little
 
 

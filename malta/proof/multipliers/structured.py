@@ -10,6 +10,7 @@ multipliers of one interval are continued to the next, by their slopes.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,26 +18,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
-from malta.proof.groups import groups
-from malta.proof.multipliers import (
-    Blocks,
-    Branch,
-    Multiplier,
-    excludes_zero,
-    multiplier,
-    response,
-)
-from malta.proof.multipliers.pencil import TERMS, Rows
+from malta.proof.groups import UncertainLoop, groups
+from malta.proof.multipliers import Blocks, Branch, Multiplier, excludes_zero, multiplier, response
+from malta.proof.multipliers.pencil import TERMS, Pencil, Rows
 from malta.proof.polynomial.rational import TooLarge
 from malta.proof.work import is_past, spend, spent
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from malta.model.plant import FloatArray
     from malta.proof.box import Box
-    from malta.proof.groups import UncertainLoop
-    from malta.proof.multipliers.pencil import Pencil
     from malta.proof.problem import Problem
 
 NEAR = 0.98  # beta up to which splitting frequency is expected to do
@@ -138,9 +128,7 @@ class Structured:
     lower: float = 0.0
     count: int = 0
     layers: list[Layer] = field(default_factory=list, repr=False)
-    _shown: dict[float, list[Shown]] = field(
-        default_factory=dict, repr=False
-    )  # by the t of boxes that were begun
+    _shown: dict[float, list[Shown]] = field(default_factory=dict, repr=False)  # by t of begun boxes
     _order: list[Cell] = field(default_factory=list, repr=False)  # those that resist first
     # t of the largest box that was begun, and its cells that are left
     _open: tuple[float, list[Cell]] | None = None

@@ -19,14 +19,7 @@ from typing import Any
 import numpy as np
 from flint import acb, acb_mat, arb, arb_mat, ctx, fmpq, fmpq_mat
 
-from malta.proof.expressions import (
-    BALLS,
-    EXACT,
-    POINTS,
-    NotAnalytic,
-    Program,
-    finite,
-)
+from malta.proof.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program, finite
 from malta.proof.groups import A, B, C, D, E, UncertainLoop, divide_by_descriptor, rational
 from malta.proof.polynomial.closed_loop import (
     closed_loop,

@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from flint import acb, acb_mat, arb
 from scipy import linalg, sparse
 
+from malta.model.plant import FloatArray
 from malta.proof.expressions import BALLS, NotAnalytic, exact, finite
 from malta.proof.groups import (
     A,
@@ -29,9 +30,6 @@ from malta.proof.groups import (
 from malta.proof.polynomial.rational import Ratio, Symbolic, value
 from malta.proof.uncertain import Group
 from malta.proof.work import spend
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 
 class DrivenGroup(NamedTuple):
@@ -186,10 +184,7 @@ def add_delay(matrix: Any, phi: Any, gamma: Any, c: Any, d: Any, delay: int) -> 
         matrix, stored, stored,
         [(i, i, -1) for i in range(stored)] + [(i, i + m, 1) for i in range(stored - m)],
     )  # fmt: skip
-    a = _stack(
-        matrix,
-        [[phi, gamma, zeros(matrix, n, stored - m)], [zeros(matrix, stored, n), shift]],
-    )
+    a = _stack(matrix, [[phi, gamma, zeros(matrix, n, stored - m)], [zeros(matrix, stored, n), shift]])
     b = dense(matrix, n + stored, m, ((n + stored - m + j, j, 1) for j in range(m)))
     late = join_columns(
         matrix, c, *([d] if d is not None else [zeros(matrix, p, m)]), zeros(matrix, p, stored - m)

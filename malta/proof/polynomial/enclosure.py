@@ -12,18 +12,16 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 from weakref import WeakKeyDictionary
 
 from flint import acb, arb, ctx, fmpq
 
+from malta.model.plant import FloatArray
 from malta.proof.expressions import NotAnalytic, exact
 from malta.proof.polynomial.characteristic import pair
 from malta.proof.polynomial.family import Family, family, nodes
 from malta.proof.work import check_clock, remembered, spend
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
 
 MOST_NODES = 20_000  # places of exact coefficients, at most
 MOST_BALLS = 6000  # places where they take an exponential

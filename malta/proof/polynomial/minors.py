@@ -12,12 +12,13 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from flint import arb, arb_mat, arb_poly, ctx, fmpq_mat, fmpq_poly
 from scipy import sparse
 
+from malta.model.plant import FloatArray
 from malta.proof.expressions import NotAnalytic, Program, exact
 from malta.proof.groups import A, B, C, E, UncertainLoop, rational
 from malta.proof.polynomial.closed_loop import (
@@ -34,10 +35,6 @@ from malta.proof.polynomial.closed_loop import (
 )
 from malta.proof.polynomial.rational import Ratio, Symbolic
 from malta.proof.uncertain import Group
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 # Groups of states whose own dynamics are equal but for signs, as those of the two planes of a round body.
 #
@@ -280,12 +277,7 @@ class Minors:
 
         Raises NotAnalytic when numbers overflow.
         """
-        a, b, c, diagonal = entry_bounds(
-            entries,
-            self.group.states,
-            self.inputs,
-            self.outputs,
-        )
+        a, b, c, diagonal = entry_bounds(entries, self.group.states, self.inputs, self.outputs)
         b = b[list(self.rows)]
         parts = a, b, c, diagonal
         known, key = self.resolvents, tuple((part.shape, part.tobytes()) for part in parts)

@@ -8,25 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from flint import Ordering, acb, fmpq_mpoly_ctx
 
+from malta.model.plant import FloatArray
 from malta.proof.box import resolve_branches
-from malta.proof.expressions import (
-    FIELD,
-    NotAnalytic,
-    Program,
-    exact,
-    program,
-)
+from malta.proof.expressions import FIELD, NotAnalytic, Program, exact, program
 from malta.proof.work import check_clock
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 LARGEST = 4000  # terms of an expression at most
 LONGEST = 2_000_000  # products of terms that are added at once: more take seconds

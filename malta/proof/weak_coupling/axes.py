@@ -13,21 +13,19 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
+from malta.model.plant import FloatArray
 from malta.proof.expressions import exact
 from malta.proof.groups import rational
 from malta.proof.polynomial.characteristic import bilinear_table, map_bilinear
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.polynomial.family import EPS, binary
+from malta.proof.uncertain import Compensator
 from malta.proof.weak_coupling.held_currents import HeldMachine, Lead
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-    from malta.proof.uncertain import Compensator
 
 BITS = 320
 STIFF = 2  # axes of a group whose own stiffness is kept

@@ -13,19 +13,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from flint import arb
 
+from malta.model.plant import FloatArray, Plant
 from malta.proof.expressions import NotAnalytic, program
 from malta.proof.uncertain import model_of
 from malta.proof.weak_coupling import taylor
 from malta.proof.weak_coupling.taylor import Evaluation, Laurent, Monomial, Value
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
 
 INTERVALS = 160  # pieces of the travel
 SURE = 1e-5  # half width of the forces at rest, relative to the largest one; checked over each box

@@ -12,16 +12,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from malta.model.plant import FloatArray
 from malta.proof.expressions import NotAnalytic, Program
 from malta.proof.work import check_clock
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-
 
 ORDER = 6
 EPS = 2.0**-52
@@ -179,11 +176,7 @@ class Laurent:
 
 
 Value = float | Taylor | Laurent  # a constant, of y alone, of p and y
-FUNCTIONS: dict[str, Callable[[Taylor], Taylor]] = {
-    "sin": sine,
-    "cos": cosine,
-    "sqrt": root,
-}
+FUNCTIONS: dict[str, Callable[[Taylor], Taylor]] = {"sin": sine, "cos": cosine, "sqrt": root}
 
 
 class Evaluation:

@@ -21,28 +21,30 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.model.machines import KINDS, Group, attribute_of, outputs_of
-from malta.report.figures.campaign import distributions_figure as distributions_figure
-from malta.report.figures.campaign import worst_figure as worst_figure
-from malta.report.figures.campaign import yield_figure as yield_figure
-from malta.report.figures.drawing import MORE as MORE
-from malta.report.figures.drawing import POINTS as POINTS
-from malta.report.figures.drawing import STYLES as STYLES
+from malta.report.figures.campaign import (
+    distributions_figure as distributions_figure,
+    worst_figure as worst_figure,
+    yield_figure as yield_figure,
+)
 from malta.report.figures.drawing import (
+    MORE as MORE,
+    POINTS as POINTS,
+    STYLES as STYLES,
     Published,
     draw_bound,
     draw_grid,
     draw_group,
     draw_line,
+    encode_figure as encode_figure,
     ending_text,
     finish_axes,
     micro,
     new_figure,
     new_page,
+    number as number,
+    save as save,
     saved,
 )
-from malta.report.figures.drawing import encode_figure as encode_figure
-from malta.report.figures.drawing import number as number
-from malta.report.figures.drawing import save as save
 from malta.simulation.experiments import Case, Experiment
 from malta.simulation.experiments.catalogue import experiments_of
 from malta.simulation.trajectory import Trajectory

@@ -33,7 +33,7 @@ from malta.report.figures.drawing import (
     rows_and_columns,
     saved,
 )
-from malta.simulation.engine.digest import LARGEST_FIGURE
+from malta.simulation.engine.digest import LARGEST_FIGURE, verdicts
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -268,16 +268,13 @@ def _set_reach(axes: Axes, values: FloatArray, bounds: Sequence[float]) -> None:
 
 def _run_label(plan: Plan, index: int, verdict: float) -> str:
     """The number of a run, and how it ended."""
-    from malta.simulation.engine.digest import verdicts
 
     name = verdicts(plan.plant)[int(verdict)]
     text = f"run {index}"
     return text if name == "completed" else f"{text}\n{name.replace(' at ', chr(10) + 'at ')}"
 
 
-FINE: Mapping[
-    str, dict[str, Any]
-] = {  # ways in which runs end, the best first, light to dark; contacts follow
+FINE: Mapping[str, dict[str, Any]] = {  # ways in which runs end, the best first; contacts follow
     "within the published bounds": {"facecolor": "#ececec"},
     "completed": {"facecolor": "#b4b4b4"},
     "completed, commands limited": {"facecolor": "#b4b4b4", "hatch": "////"},

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from malta.display import micro as micro
-from malta.display import number as number
+from malta.display import micro as micro, number as number
 from malta.errors import InputError
 from malta.files import PICTURES, replace_files, require_suffix
 from malta.merits import ROOTS
@@ -55,16 +54,11 @@ MORE: Sequence[dict[str, Any]] = (  # used after STYLES
 BOUND: dict[str, Any] = {"color": "#9a9a9a", "linestyle": (0, (8, 3)), "linewidth": 0.9}
 BOUND_LINE = "bound"  # marks what is no data
 BEYOND = 2.5  # times the data: bounds further away are arrows
-REFERENCE: dict[str, Any] = {
-    "color": "#a9c6e0",
-    "linestyle": "-",
-    "linewidth": 5.0,
-    "zorder": 1.5,
-}  # under a curve
+# A reference that lies under a curve.
+REFERENCE: dict[str, Any] = {"color": "#a9c6e0", "linestyle": "-", "linewidth": 5.0, "zorder": 1.5}
 NOTE: dict[str, Any] = {"fontsize": 8, "color": "#5a5a5a"}
-PAPER: dict[str, Any] = {
-    "bbox": {"facecolor": "#ffffff", "edgecolor": "none", "alpha": 0.75, "pad": 0.4}
-}  # of a text
+# The ground of a text.
+PAPER: dict[str, Any] = {"bbox": {"facecolor": "#ffffff", "edgecolor": "none", "alpha": 0.75, "pad": 0.4}}
 DOT: dict[str, Any] = {"marker": "o", "markersize": 6, "linestyle": "none", "color": "#000000"}
 CROSS: dict[str, Any] = DOT | {"marker": "X", "markersize": 9, "markeredgecolor": "#ffffff", "clip_on": False}
 LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8, "handlelength": 2.4, "columnspacing": 1.5}
@@ -255,12 +249,7 @@ def end_of(run: Trajectory) -> int:
 
 
 def draw_published(
-    axes: Axes,
-    published: Published | None,
-    key: str,
-    unit: str,
-    text: str = "published bound",
-    **drawn: Any,
+    axes: Axes, published: Published | None, key: str, unit: str, text: str = "published bound", **drawn: Any
 ) -> None:
     """`draw_bound` at a published value; nothing without published figures."""
     if published is not None:

@@ -231,14 +231,8 @@ def _legend(axes: Axes, bottom: float = 1.0, handles: Sequence[Artist] | None = 
 FINE = {"m": "um", "rad": "urad"}  # units that outputs are drawn in
 SHOWN = 1.5  # times the longest time to 1 %
 POINTS = 400  # of frequency
-RECOVERY_LOOKS = (
-    STYLES[0],
-    MORE[1],
-    STYLES[2],
-    MORE[0],
-    *STYLES[1::2],
-    *MORE[2:],
-)  # a line that covers another has gaps
+# A line that covers another has gaps.
+RECOVERY_LOOKS = (STYLES[0], MORE[1], STYLES[2], MORE[0], *STYLES[1::2], *MORE[2:])
 
 
 def recovery_figure(

@@ -50,15 +50,11 @@ class Subject(NamedTuple):
 
     controller: Controller
     parameters: Parameters  # of the machine, which need not be those of the controller
-    box: Mapping[
-        str, float
-    ] = {}  # parameter -> share, either way, at margin 1; empty: no margin of parameters
+    box: Mapping[str, float] = {}  # parameter -> share, either way, at margin 1; empty: no such margin
     spec: Spec | None = None  # the design file, whose [specification] is judged
     source: str = ""  # the gain file, as the user named it
     changes: Sequence[str] = ()  # of the machine, as "m=0.56"
-    provenance: Sequence[
-        tuple[str, str]
-    ] = ()  # of the gain file: its seal, and versions that it was written with
+    provenance: Sequence[tuple[str, str]] = ()  # of the gain file: seal, and versions that wrote it
     current_loops: CurrentLoops = LAST
 
     @property

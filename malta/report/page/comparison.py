@@ -14,7 +14,7 @@ from rich.text import Text
 
 from malta.errors import InputError
 from malta.merits import Merit, by_identifier, find_best
-from malta.report.page.analysis import GROUPS, Analysis, Entry, Subject, design_entries, display_unit
+from malta.report.page.analysis import GROUPS, Analysis, Entry, Subject, analyse, design_entries, display_unit
 from malta.report.tables import Paragraph, new_table
 from malta.report.verdict import Stair, VerdictLine, staircase, verdict_lines
 from malta.simulation.experiments import progress_of_part
@@ -246,7 +246,6 @@ def compare(
 
     Raises InputError for fewer than LEAST or more than MOST designs, CheckError as `analyse`.
     """
-    from malta.report.page.analysis import analyse
 
     require_count(len(subjects))
     designs = [

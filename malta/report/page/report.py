@@ -149,11 +149,7 @@ def _foot(found: Analysis) -> str:
 
 
 def report_work(
-    subject: Subject,
-    *,
-    proof: bool,
-    campaigns: Sequence[Summary],
-    progress: Callable[[float], None] | None,
+    subject: Subject, *, proof: bool, campaigns: Sequence[Summary], progress: Callable[[float], None] | None
 ) -> tuple[Analysis, Page]:
     """Analyse a subject and write its page, behind one measure of progress."""
     from malta.report.page.analysis import analyse

@@ -429,12 +429,7 @@ def _noise(a: Analysis) -> Iterator[Item]:
             budget.motion,
             "True motion at rest, rms, and the sensors that cause it",
         ),
-        (
-            a.plant.inputs,
-            noise.force,
-            budget.force,
-            "Commands at rest, rms, and the sensors that cause them",
-        ),
+        (a.plant.inputs, noise.force, budget.force, "Commands at rest, rms, and the sensors that cause them"),
     ):
         if not np.any(totals):
             continue

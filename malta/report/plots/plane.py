@@ -8,11 +8,11 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from malta.errors import InputError
 from malta.loops.curves import LoopCurves, loop_curves
-from malta.loops.locus import DELAY, GAIN, RootLocus
-from malta.loops.locus import root_locus as locus_of
+from malta.loops.locus import DELAY, GAIN, RootLocus, root_locus as locus_of
 from malta.report.figures.drawing import new_figure, number
 from malta.report.plots.frequency import title_of
 from malta.report.plots.panels import Sheet, add_hertz, add_legend, head_of, loops_of, plain, styles_of
@@ -20,7 +20,6 @@ from malta.report.plots.panels import Sheet, add_hertz, add_legend, head_of, loo
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
     from malta.loops.linear_loops import Place
     from malta.model.plant import ComplexArray

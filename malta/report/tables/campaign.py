@@ -12,6 +12,7 @@ from malta.model.machines import lateral_outputs
 from malta.model.parameters import differences
 from malta.report.figures.drawing import Published, number
 from malta.report.tables import Paragraph, add_row, end_cell, new_table
+from malta.simulation.engine.digest import verdicts
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -43,10 +44,7 @@ def box_text(plan: Plan) -> str:
 
 
 def campaign_tables(
-    found: Campaign | Summary,
-    published: Published | None = None,
-    worst: int = 5,
-    spec: Spec | None = None,
+    found: Campaign | Summary, published: Published | None = None, worst: int = 5, spec: Spec | None = None
 ) -> Group:
     """Tabulate how the runs of a campaign end, their figures of merit beside the published bounds, and the worst runs.
 
@@ -117,11 +115,7 @@ def _findings_table(found: Summary) -> Table:
     bounds = any(m.merit.bound is not None for m in found.merits)
     heads = [*(f"{p} %" for p in PERCENTILES), "largest", *(["published", "kept [%]"] if bounds else [])]
     accuracy = "" if found.exact else f", within {100 * ACCURACY:.1g} % of their values"
-    table = new_table(
-        f"Figures of merit: percentiles of the completed runs{accuracy}",
-        "figure",
-        *heads,
-    )
+    table = new_table(f"Figures of merit: percentiles of the completed runs{accuracy}", "figure", *heads)
     for m in found.merits:
         if not m.sketch.count:
             continue
@@ -145,7 +139,6 @@ def _worst_table(found: Summary, count: int) -> Table:
     """The worst runs, each with its parameters relative to the middle of the box and its sensor errors."""
     from malta.campaigns.plan import varied_names
     from malta.campaigns.summary import worst_runs
-    from malta.simulation.engine.digest import verdicts
 
     plan, runs = found.plan, worst_runs(found, count)
     ends, groups = verdicts(plan.plant), lateral_outputs(plan.plant)

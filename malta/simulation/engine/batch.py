@@ -240,10 +240,7 @@ def _split(
         first, last = part.samples.start, part.samples.stop
         if first < sample < last:
             keys = np.ascontiguousarray(advance_keys(part.keys, sample - first, sensors))
-            split += [
-                part._replace(samples=slice(first, sample), then=then),
-                Part(slice(sample, last), keys),
-            ]
+            split += [part._replace(samples=slice(first, sample), then=then), Part(slice(sample, last), keys)]
         else:
             split.append(part._replace(then=then) if last == sample else part)
     return split

@@ -121,9 +121,7 @@ FLAGS = (
     "-fno-tree-slp-vectorize",  # which may compute a number twice, rounded in two ways: v != w then means nothing
 )
 GCC_ALONE = ("-fschedule-insns", "-fsched-pressure")  # clang does not know them
-OTHERWISE = {
-    "-ffp-contract=fast": "-ffp-contract=off"
-}  # clang contracts a lane by itself otherwise than many
+OTHERWISE = {"-ffp-contract=fast": "-ffp-contract=off"}  # clang contracts one lane otherwise than many
 NATIVE = ("-march=native", "-mtune=generic")  # tuned for a compiler's guess of a processor, text is slower
 
 

@@ -19,21 +19,7 @@ from malta.errors import CheckError
 
 _BINARY = {"ADD": "+", "SUB": "-", "MUL": "*"}
 _TRUTH = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
-_EACH = [
-    "sqrt",
-    "floor",
-    "ceil",
-    "exp",
-    "log",
-    "tan",
-    "tanh",
-    "asin",
-    "acos",
-    "atan",
-    "sinh",
-    "cosh",
-    "sign",
-]
+_EACH = ["sqrt", "floor", "ceil", "exp", "log", "tan", "tanh", "asin", "acos", "atan", "sinh", "cosh", "sign"]
 _FORMS = (
     {f"OP_{name}": f"{{0}} {sign} {{1}}" for name, sign in _BINARY.items()}
     | {f"OP_{name.upper()}": f"each_{name}({{0}})" for name in _EACH}
@@ -285,14 +271,7 @@ def needed_nodes(nodes: list[Node], roots: list[int]) -> list[int]:
 # g   once a sample for all lanes: depends on these and on the inputs of the sample, as K xi* + v_ff does
 
 
-PLAIN = (
-    "OP_ADD",
-    "OP_SUB",
-    "OP_MUL",
-    "OP_SQ",
-    "OP_NEG",
-    "OP_TWICE",
-)  # the same text for one number and for lanes
+PLAIN = ("OP_ADD", "OP_SUB", "OP_MUL", "OP_SQ", "OP_NEG", "OP_TWICE")  # same text for lanes
 
 
 class Counts(NamedTuple):

@@ -59,9 +59,7 @@ class Identities:
 
     def __init__(self) -> None:
         self._numbers: dict[Any, int] = {}
-        self._known: dict[
-            int, tuple[int, Any]
-        ] = {}  # by CasADi's hash; the expression is kept, so that it stays unique
+        self._known: dict[int, tuple[int, Any]] = {}  # by CasADi's hash; kept, so that it is unique
 
     def number(self, e: Any) -> int:
         mark = e.element_hash()

@@ -20,8 +20,7 @@ import numpy as np
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.loops.loop import loop_along
-from malta.merits import Merit as Merit
-from malta.merits import figure
+from malta.merits import Merit as Merit, figure
 from malta.model.linearize import linearize
 from malta.model.machines import attribute_of
 from malta.model.plant import FloatArray, Plant
@@ -172,10 +171,7 @@ def fly_all(
     cases: list[Case] = []
     samples = sum(one.scenario.samples(controller.sample_time) for _, controller, one in flights)
     if samples > LONGEST:
-        where, found = (
-            flights[0][2].scenario.where,
-            f"{len(flights)} of {samples:.4g} samples in all",
-        )
+        where, found = (flights[0][2].scenario.where, f"{len(flights)} of {samples:.4g} samples in all")
         raise InputError(where, "runs", found, f"at most {LONGEST} samples")
     for n, (plant, controller, (label, scenario, merits)) in enumerate(flights):
         share = progress_of_part(progress, n, len(flights))

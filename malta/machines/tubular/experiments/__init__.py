@@ -39,12 +39,12 @@ from malta.machines.tubular.experiments.lifting import capture, lift_cases, lift
 from malta.machines.tubular.experiments.strokes import (
     DISTANCE,
     RISE,
+    SETTLE as SETTLE,
     drive_limit_cases,
     drive_limits,
     record_v0,
     stroke_cases,
 )
-from malta.machines.tubular.experiments.strokes import SETTLE as SETTLE
 from malta.simulation.experiments import Experiment, PlannedRun, experiment_of, merits_of_first
 
 if TYPE_CHECKING:

@@ -440,9 +440,7 @@ def _strike(
     off = t[np.isin(states, ended) & (t >= b.at)]
     speed_alone, speed = (float(np.nan_to_num(contact_of(run, b.at)[1])) for run in runs)
     current_alone, current = (float(np.abs(run.i[run.t >= b.at]).max(initial=0.0)) for run in runs)
-    end = replace(
-        runs[1], verdict=Verdict("completed", float(runs[1].t[-1]))
-    )  # a contact is a figure of merit
+    end = replace(runs[1], verdict=Verdict("completed", float(runs[1].t[-1])))  # a contact is a figure
     outcome = Outcome(
         phase=list(PHASES).index(b.phase),
         at=b.at,

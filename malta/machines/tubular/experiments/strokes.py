@@ -155,10 +155,8 @@ def _limit_strokes(
     plant: Plant, distance: float, current_share: float, voltage_share: float
 ) -> tuple[FastestStroke, SigmoidStroke]:
     """The fastest stroke within shares of current and voltage, and the sigmoid of the same peak current."""
-    from malta.simulation.experiments.time_optimal import (
-        fastest_stroke,  # with scipy's integrators, for these experiments alone
-        sigmoid_at_peak_current,
-    )
+    # With scipy's integrators, for these experiments alone.
+    from malta.simulation.experiments.time_optimal import fastest_stroke, sigmoid_at_peak_current
 
     shares: dict[str, Any] = {"voltage_share": voltage_share, "current_share": current_share}
     emf = induced_per_speed(plant)
@@ -380,9 +378,7 @@ def _fit(log: ForceLog, z_grid: FloatArray, stroke: str, way: str) -> FloatArray
         raise InputError(log.source, stroke, found, "a slow stroke there and back over the whole travel")
     b = (z - z_grid[k]) / (z_grid[k + 1] - z_grid[k])
     a, g = 1 - b, len(z_grid)
-    normal = np.zeros(
-        (2, g)
-    )  # the symmetric tridiagonal matrix of the normal equations: diagonal, then below it
+    normal = np.zeros((2, g))  # tridiagonal matrix of the normal equations: its diagonal, then below it
     normal[0] = np.bincount(k, a * a, g) + np.bincount(k + 1, b * b, g)
     normal[1] = np.bincount(k, a * b, g)
     right = [np.bincount(k, a * f, g) + np.bincount(k + 1, b * f, g) for f in v.T]

@@ -23,6 +23,7 @@ from malta.machines.tubular.paper.quantities import (
     carried_payload,
     carried_weight,
     current_loop_margin,
+    evidence as evidence,
     full_state_share,
     is_solved_for_ratio,
     link_rise,
@@ -44,7 +45,6 @@ from malta.machines.tubular.paper.quantities import (
     true_radial,
     yield_share,
 )
-from malta.machines.tubular.paper.quantities import evidence as evidence
 from malta.report.ledger import ZONE_NOTE, Row, bandwidth, machine_share, merit, peak_sensitivity
 
 SOURCE = "S. Miric et al., IEEE Trans. Ind. Electron. 68(1), 2021"
