@@ -22,7 +22,7 @@ from malta.cli.options import (
 )
 from malta.cli.output import make_console, print_document, print_note, print_written, progress_bar
 from malta.errors import InputError
-from malta.files import locate, read_file, replace_files
+from malta.files import locate, read_file, replace_files, watch_interrupts
 
 if TYPE_CHECKING:
     from malta.app.session import Session
@@ -251,15 +251,26 @@ def compute_ledgers(specs: Sequence[Spec], progress: Callable[[float], None] | N
 
 
 def _compute_each(groups: Sequence[Sequence[Spec]], progress: Callable[[float], None] | None) -> list[Ledger]:
-    """Compute the ledger of each group of designs of one machine."""
+    """Compute the ledger of each group of designs of one machine. Raises KeyboardInterrupt where Ctrl-C cut it short.
+
+    A campaign or an experiment that is cut short hands over what it has, of which a paper's figures cannot be made.
+    """
     from malta.model.data import published
     from malta.report.ledger import ledger
     from malta.simulation.experiments import progress_of_part
 
-    return [
-        ledger(group, published(group[0].machine_file), progress_of_part(progress, n, len(groups)))
-        for n, group in enumerate(groups)
-    ]
+    with watch_interrupts() as pressed:
+        try:
+            found = [
+                ledger(group, published(group[0].machine_file), progress_of_part(progress, n, len(groups)))
+                for n, group in enumerate(groups)
+            ]
+        except Exception:
+            if not pressed:
+                raise
+        if pressed:
+            raise KeyboardInterrupt
+    return found
 
 
 def _update(file: Path, designs: Sequence[Path]) -> None:

@@ -459,8 +459,11 @@ class Interrupted(KeyboardInterrupt):
     """
 
     def __init__(self, margin: Margin) -> None:
-        super().__init__(f"interrupted: {margin}")
+        super().__init__(margin)
         self.margin = margin
+
+    def __str__(self) -> str:
+        return f"interrupted: {self.margin}"
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 import time
 from collections.abc import Callable
 from itertools import count
@@ -228,6 +229,7 @@ def test_an_interrupted_search_says_what_it_knows() -> None:
     assert 0 < known.lower <= whole.lower <= known.upper * (1 + 1e-9)
     assert known.reason.startswith("interrupted after ")
     assert str(stopped.value).startswith("interrupted: proven ")
+    assert pickle.loads(pickle.dumps(stopped.value)).margin.lower == known.lower
 
 
 @pytest.mark.slow

@@ -124,8 +124,13 @@ def with_inertia(controller: Controller, factor: float) -> Controller:
 def fly_strokes(
     controller: Controller, spec: Spec, published: Mapping[str, Any], *, machines: int, settle: bool
 ) -> Strokes:
-    """The strokes of machines drawn from the design's uncertainty, after a rest or from the first sample on."""
+    """The strokes of machines drawn from the design's uncertainty, after a rest or from the first sample on.
+
+    Raises KeyboardInterrupt where Ctrl-C cut the campaign short.
+    """
     flown = main_campaign(controller, spec, machines, settle=settle)
+    if flown.interrupted:
+        raise KeyboardInterrupt
     axis = spec.plant.stroke_output
     radial = np.delete(flown.batch.deviation[flown.completed], axis, axis=1).max(axis=1)
     return Strokes(yields_of(flown, published, spec), float(np.median(radial)), float(radial.max()))
