@@ -249,8 +249,8 @@ def test_a_worker_of_a_python_without_malta_is_one_sentence(loopback: Loopback, 
     assert (found.returncode, out) == (2, "")
     assert re.fullmatch(
         r"malta: --cluster: the worker tcp://127.0.0.1:\d+: found a Python without malta, "
-        rf"expected malta {re.escape(malta_version())} there\n",
-        err,
+        rf"expected malta {re.escape(malta_version())} there",
+        err.splitlines()[-1],  # after how far it is, on a busy computer
     )
 
 
