@@ -49,6 +49,9 @@ hypothesis.settings.register_profile("untimed", deadline=None, max_examples=200)
 hypothesis.settings.register_profile("fast", deadline=None, max_examples=30, derandomize=True)
 
 os.environ.pop("COLUMNS", None)  # which workers of pytest may have: tables have the width of a file
+# Of the make that runs the tests: a make inside one of them would say which folder it enters.
+for _name in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS"):
+    os.environ.pop(_name, None)
 ROOT = Path(__file__).parents[1]
 DESIGNS = ("table2", "calibrated")
 
