@@ -108,7 +108,7 @@ def solve(edited: Edited) -> Problem:
     """Synthesize the controller of an edited design. Raises InputError and CheckError as `synthesize`."""
     spec = edited.spec
     at = tuple(spec.operating_point.items())
-    controller = synthesize(spec, _design_model(spec.plant, at))
+    controller = synthesize(spec, _design_model(spec.plant, at), solver="scipy")
     plant = _machine(edited)
     return Problem(spec, plant, _design_model(plant, at), controller)
 

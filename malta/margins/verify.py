@@ -251,7 +251,13 @@ def compensators(
         return own
     believed, weights = plant_of(controller.parameters), weights_of(controller)
     model = linearize(believed, believed.point(controller.operating_point[0]))
-    A, B, C, K, L = model.A, model.B, model.C, lqr(model, weights), kalman(model, weights)
+    A, B, C, K, L = (
+        model.A,
+        model.B,
+        model.C,
+        lqr(model, weights, solver="scipy"),
+        kalman(model, weights, solver="scipy"),
+    )
     n, p, m = len(A), len(C), B.shape[1]
     half = believed.coordinates
     summed = integrals_of(model, weights).outputs
@@ -265,7 +271,7 @@ def compensators(
             True,
         )
     }
-    K_i, Ki = lqi(model, weights)
+    K_i, Ki = lqi(model, weights, solver="scipy")
     Ki, k = (Ki @ back)[:, summed], len(summed)
     e = -to_modes[summed]  # e' = -y, in the coordinates of the modes
     if summed:

@@ -124,7 +124,7 @@ def run_design(spec: Spec, names: Sequence[str], progress: Progress | None = Non
     """
     plant = spec.plant
     model = linearize(plant, plant.at(**spec.operating_point))
-    controller = synthesize(spec, model)
+    controller = synthesize(spec, model, solver="scipy")
     experiments = {
         name: experiment(name, plant, controller, progress=progress_of_part(progress, n, len(names)))
         for n, name in enumerate(names)

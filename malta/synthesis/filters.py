@@ -21,7 +21,7 @@ from scipy import linalg
 from malta.errors import InputError
 from malta.model.plant import FloatArray
 from malta.processes import on_one_thread
-from malta.synthesis.riccati import add_lags, care, dare, delay_inputs, sample, sample_noise
+from malta.synthesis.riccati import Solver, add_lags, care, dare, delay_inputs, sample, sample_noise
 from malta.synthesis.spec import Coordinates, Weights
 
 # The design model between samples: currents that are held, forces behind the lag of the current loops.
@@ -104,7 +104,7 @@ class Gains(NamedTuple):
 
 
 @on_one_thread
-def kalman(model: Linear, weights: Weights) -> FloatArray:
+def kalman(model: Linear, weights: Weights, *, solver: Solver = "python-control") -> FloatArray:
     """Design the continuous steady-state Kalman filter: xi_hat' = A xi_hat + B v + L (y - C xi_hat).
 
     L = P C' V^-1 with 0 = A P + P A' + W - P C' V^-1 C P. Only the ratio of process to sensor noise matters, so
@@ -112,6 +112,7 @@ def kalman(model: Linear, weights: Weights) -> FloatArray:
 
     model : the linear model
     weights : whose variances are used
+    solver : of the scaled equation: "python-control", or "scipy" without it, to the bit the same
 
     Returns L, n x p.
 
@@ -124,21 +125,69 @@ def kalman(model: Linear, weights: Weights) -> FloatArray:
     >>> malta.synthesis.kalman(model, weights).round(6).tolist()
     [[14.142136], [100.0]]
     """
-    G = noise_input(model.B, weights.coordinates)
-    W, V = G * weights.process_variance @ G.T, np.diag(weights.sensor_variance)
-    if not weights.correlation.any():
-        return care(model.A.T, model.C.T, W, V, "Kalman filter").K.T
-    along = G @ _cross_covariance(model, weights) / weights.sensor_variance  # S V^-1
-    rest = W - along @ V @ along.T
-    return care((model.A - along @ model.C).T, model.C.T, rest, V, "Kalman filter").K.T + along
+    A, W, along = intensities(model, weights)
+    V = np.diag(weights.sensor_variance)
+    return care(A.T, model.C.T, W, V, "Kalman filter", solver=solver).K.T + along
 
 
-def sampled_filter(model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool) -> FloatArray:
+def intensities(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A and W of a continuous filter without the part of w that comes with n, and S V^-1, which takes that off."""
+    G, A = noise_input(model.B, weights.coordinates), model.A
+    W, along = G * weights.process_variance @ G.T, np.zeros_like(model.C.T)
+    if weights.correlation.any():
+        along = G @ _cross_covariance(model, weights) / weights.sensor_variance
+        A, W = A - along @ model.C, W - along * weights.sensor_variance @ along.T
+    return A, W, along
+
+
+def sampled_filter(
+    model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool, solver: Solver = "scipy"
+) -> FloatArray:
     """Filter-form Kalman gain. The stored forces are known, so their rows are zero; disturbances stand last.
 
-    L = (P C' + S) (C P C' + C S + S' C' + V)^-1 with the covariance P of the prediction, and S of what acted over the
-    last sample with the reading. The noise of a reading is in the currents that are commutated for it, too; beside what
-    it does through the law that is next to nothing, and left out.
+    L = (P C' + S) (C P C' + C S + S' C' + V)^-1 with the covariance P of the prediction.
+
+    integrated : process noise is white within a sample; otherwise held over it
+    """
+    n, m, p = len(model.A), model.B.shape[1], len(model.C)
+    noisy = sampled_noise(model, weights, Ts, delay, integrated=integrated)
+    L = filter_gain(noisy, covariance(noisy, solver))
+    return np.vstack([L[:n], np.zeros((delay * m, p)), L[n:]])
+
+
+class Noisy(NamedTuple):
+    """A sampled model and its noise: x+ = F x + w, y = H x + n. Q, R are the variances of w and n, M = E[w n'] of what
+    acted over the last sample with the reading."""
+
+    F: FloatArray
+    H: FloatArray
+    Q: FloatArray
+    R: FloatArray
+    M: FloatArray
+
+
+def covariance(noisy: Noisy, solver: Solver = "scipy") -> FloatArray:
+    """P of the states after a prediction, in the steady state."""
+    F, H, Q, _, M = noisy
+    return dare(F.T, H.T, Q, _with_reading(noisy), F @ M, "sampled Kalman filter", solver=solver).X
+
+
+def filter_gain(noisy: Noisy, P: FloatArray) -> FloatArray:
+    """(P H' + M) (H P H' + H M + M' H' + R)^-1."""
+    H, M = noisy.H, noisy.M
+    return np.asarray(np.linalg.solve(H @ P @ H.T + _with_reading(noisy), H @ P + M.T).T)
+
+
+def _with_reading(noisy: Noisy) -> FloatArray:
+    """R + H M + M' H'."""
+    return noisy.R + noisy.H @ noisy.M + noisy.M.T @ noisy.H.T
+
+
+def sampled_noise(model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool) -> Noisy:
+    """What a sampled filter knows of the machine; disturbances stand last, stored forces are known and left out.
+
+    The noise of a reading is in the currents that are commutated for it, too; beside what it does through the law that
+    is next to nothing, and left out.
 
     integrated : process noise is white within a sample; otherwise held over it
     """
@@ -164,14 +213,7 @@ def sampled_filter(model: Linear, weights: Weights, Ts: float, delay: int, *, in
         Ad = np.block([[Ad, Bd], [np.zeros((m, n)), np.eye(m)]])
         W = np.asarray(linalg.block_diag(W, drift))
         C, S = np.hstack([C, np.zeros((p, m))]), np.vstack([S, np.zeros((m, p))])
-    if S.any():
-        V = V + C @ S + S.T @ C.T
-        P = dare(Ad.T, C.T, W, V, Ad @ S, "sampled Kalman filter").X
-        L = np.linalg.solve(C @ P @ C.T + V, C @ P + S.T).T
-    else:
-        P = dare(Ad.T, C.T, W, V, what="sampled Kalman filter").X
-        L = np.linalg.solve(C @ P @ C.T + V, C @ P).T
-    return np.vstack([L[:n], np.zeros((delay * m, p)), L[n:]])
+    return Noisy(Ad, C, W, V, S)
 
 
 def noise_input(B: FloatArray, coordinates: Coordinates) -> FloatArray:

@@ -47,7 +47,7 @@ from malta.synthesis.filters import (
     sampled_model,
     with_lags,
 )
-from malta.synthesis.riccati import add_integrals, care, dare, eigenvalues, sample, sample_cost
+from malta.synthesis.riccati import Solver, add_integrals, care, dare, eigenvalues, sample, sample_cost
 from malta.synthesis.spec import Discretization, Weights
 
 # Why a linear model has no stabilizing controller, in words: modes that nothing moves or sees, zeros, slow samples.
@@ -156,13 +156,14 @@ def _rank_at_rest(A: FloatArray, B: FloatArray, C: FloatArray) -> int:
 
 
 @on_one_thread
-def lqr(model: Linear, weights: Weights) -> FloatArray:
+def lqr(model: Linear, weights: Weights, *, solver: Solver = "python-control") -> FloatArray:
     """Design a continuous LQR: v = -K xi minimizes the integral of xi' Q xi + v' R v.
 
     K = R^-1 B' P with 0 = A' P + P A + Q - P B R^-1 B' P. The same as control.lqr(A, B, Q, R)[0].
 
     model : the linear model
     weights : Q and R
+    solver : of the scaled equation: "python-control", or "scipy" without it, to the bit the same
 
     Returns K, m x n.
 
@@ -176,11 +177,13 @@ def lqr(model: Linear, weights: Weights) -> FloatArray:
     [[4.0, 2.828427]]
     """
     check_sizes(model, weights)
-    return care(model.A, model.B, weights.Q, weights.R, "LQR").K
+    return care(model.A, model.B, weights.Q, weights.R, "LQR", solver=solver).K
 
 
 @on_one_thread
-def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
+def lqi(
+    model: Linear, weights: Weights, *, solver: Solver = "python-control"
+) -> tuple[FloatArray, FloatArray]:
     """Design a continuous LQR with the integrals of the measured errors.
 
         minimize integral of xi' Q xi + e' Q_i e + v' R v,    v = K (xi* - xi) + Ki e,   e' = p* - p
@@ -190,6 +193,7 @@ def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
 
     model : the linear model
     weights : Q, R and Q_i
+    solver : of the scaled equation: "python-control", or "scipy" without it, to the bit the same
 
     Returns K (m x n) and Ki (m x p).
 
@@ -206,10 +210,10 @@ def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
     summed, Q_i = integrals_of(model, weights)
     n, k, Ki = len(model.A), len(summed), np.zeros((model.B.shape[1], len(model.C)))
     if not summed:
-        return lqr(model, weights), Ki
+        return lqr(model, weights, solver=solver), Ki
     A = np.block([[model.A, np.zeros((n, k))], [-model.C[summed], np.zeros((k, k))]])
     B = np.vstack([model.B, np.zeros((k, model.B.shape[1]))])
-    gain = care(A, B, linalg.block_diag(weights.Q, Q_i), weights.R, "LQI").K
+    gain = care(A, B, linalg.block_diag(weights.Q, Q_i), weights.R, "LQI", solver=solver).K
     Ki[:, summed] = -gain[:, n:]
     return gain[:, :n], Ki
 
@@ -238,13 +242,13 @@ def continuous_poles(model: LinearModel, weights: Weights) -> dict[str, ComplexA
     """Poles of the continuous LQR, LQI and Kalman filter, rad/s: what the weights ask for, before sampling."""
     poles = {}
     with suppress(CheckError):  # weights on the integrals alone stabilize the LQI only
-        poles["LQR"] = eigenvalues(model.A - model.B @ lqr(model, weights))
+        poles["LQR"] = eigenvalues(model.A - model.B @ lqr(model, weights, solver="scipy"))
     if summed := integrals_of(model, weights).outputs:
-        K, Ki = lqi(model, weights)
+        K, Ki = lqi(model, weights, solver="scipy")
         rest = np.zeros((len(summed), len(summed)))
         integrating = np.block([[model.A - model.B @ K, model.B @ Ki[:, summed]], [-model.C[summed], rest]])
         poles["LQR with integrals"] = eigenvalues(integrating)
-    poles["Kalman filter"] = eigenvalues(model.A - kalman(model, weights) @ model.C)
+    poles["Kalman filter"] = eigenvalues(model.A - kalman(model, weights, solver="scipy") @ model.C)
     return {name: np.sort_complex(values) for name, values in poles.items()}
 
 
@@ -255,6 +259,7 @@ def gains(
     discretization: Discretization,
     delay: int = 0,
     lag: float | None = None,
+    solver: Solver = "scipy",
 ) -> Gains:
     """LQR with integrals and Kalman filter of a model, sampled. Raises CheckError as riccati.dare.
 
@@ -265,7 +270,7 @@ def gains(
     integral_action sums errors without Ts, and one sample late.
     """
     if discretization == "backward-euler":
-        return Gains(*_backward_euler(model, weights, Ts))
+        return Gains(*_backward_euler(model, weights, Ts, solver))
     integrated, n, m = discretization == "sampled-data", len(model.A), model.B.shape[1]
     driven, cost, known = model, weights, delay  # blocks of forces that are known, as what was commanded is
     if lag is not None:
@@ -274,8 +279,8 @@ def gains(
         cost = replace(weights, q=np.append(weights.q, free), q_base=np.append(weights.q_base, free + 1))
     Ad, Bd, Cd = sampled_model(driven, Ts, delay)
     integrals = integrals_of(model, weights)
-    K, Ki = _sampled_regulator(driven, cost, integrals, Ts, delay, integrated=integrated)
-    L = sampled_filter(model, weights, Ts, known, integrated=integrated)
+    K, Ki = _sampled_regulator(driven, cost, integrals, Ts, delay, integrated=integrated, solver=solver)
+    L = sampled_filter(model, weights, Ts, known, integrated=integrated, solver=solver)
     if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d; v takes d off, as forces under way have
         p, pushed = len(Cd), np.zeros((len(Ad), m))
         pushed[:n] = sample(between_samples(model).A, model.B, Ts)[1]
@@ -298,6 +303,7 @@ def lqg(
     current_loop_delay: bool = True,
     current_lag: bool = False,
     position_feedforward: bool = False,
+    solver: Solver = "python-control",
 ) -> Controller:
     """Design an LQG controller: LQR with integrals, steady-state Kalman filter, feedforward, current loop, all sampled.
 
@@ -311,6 +317,8 @@ def lqg(
     current_loop_delay : design the current loop with the machine's dead time
     current_lag : forces are states of the design model, first-order lags at the current loops' crossover behind v
     position_feedforward : feed forward the forces that hold the machine at its reference, so that a tilt meets no error
+    solver : of the scaled Riccati equations: "python-control" (control.care, control.dare), or "scipy" without it, to
+        the bit the same and without two seconds of import
 
     Returns a Controller.
 
@@ -353,7 +361,7 @@ def lqg(
     lag = model.plant.actuator.crossover if current_lag else None
     _require_lag(model, lag, discretization)
     try:
-        found = gains(model, weights, Ts, discretization, delay, lag)
+        found = gains(model, weights, Ts, discretization, delay, lag, solver)
     except CheckError as error:
         reason = obstacle(model, weights, Ts)
         said = f"{str(error).partition(': ')[0]}: no sound solution: {reason}" if reason else str(error)
@@ -456,14 +464,14 @@ def _without_bases(
 
 
 def _backward_euler(
-    model: Linear, weights: Weights, Ts: float
+    model: Linear, weights: Weights, Ts: float, solver: Solver
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Continuous gains; xi_hat' = A xi_hat + B v + L (y - C xi_hat) by backward Euler, in filter form.
 
     (I - Ts A) xi_pred = xi_hat + Ts B v, and the correction is (I - Ts (A - L C))^-1 Ts L (y - C xi_pred).
     """
-    K, Ki = lqi(model, weights)
-    Lc = kalman(model, weights)
+    K, Ki = lqi(model, weights, solver=solver)
+    Lc = kalman(model, weights, solver=solver)
     eye = np.eye(len(model.A))
     Ad = np.linalg.inv(eye - Ts * model.A)
     L = np.linalg.solve(eye - Ts * (model.A - Lc @ model.C), Ts * Lc)
@@ -471,7 +479,14 @@ def _backward_euler(
 
 
 def _sampled_regulator(
-    model: Linear, weights: Weights, integrals: Integrals, Ts: float, delay: int, *, integrated: bool
+    model: Linear,
+    weights: Weights,
+    integrals: Integrals,
+    Ts: float,
+    delay: int,
+    *,
+    integrated: bool,
+    solver: Solver,
 ) -> tuple[FloatArray, FloatArray]:
     """K, Ki of the sampled model. With delay, a force acts on the states d samples after it is commanded.
 
@@ -495,10 +510,10 @@ def _sampled_regulator(
         N = N + pull.T @ acting
     Ki, (summed, Q_i) = np.zeros((m, p)), integrals
     if not summed:
-        return dare(Ad, Bd, Q, R, N, "sampled LQR").K, Ki
+        return dare(Ad, Bd, Q, R, N, "sampled LQR", solver=solver).K, Ki
     A, B = add_integrals(Ad, Bd, Cd[summed], Ts)
     N = np.vstack([N, np.zeros((len(summed), m))])
-    gain = dare(A, B, linalg.block_diag(Q, Q_i * Ts), R, N, "sampled LQI").K
+    gain = dare(A, B, linalg.block_diag(Q, Q_i * Ts), R, N, "sampled LQI", solver=solver).K
     Ki[:, summed] = -gain[:, n + m * d :]
     return gain[:, : n + m * d], Ki
 

@@ -1,12 +1,16 @@
-"""Riccati equations, scaled before they are solved and checked after; and systems sampled exactly.
+"""Riccati equations, scaled, solved by python-control and checked; and systems sampled exactly.
+
+control.care and control.dare find X of a scaled equation, by scipy (their method "scipy", whether or not slycot is
+there). Where nothing goes into a gain file scipy is asked itself, which saves the import: to the bit the same X.
 
 python-control, by scipy or slycot, is not indifferent to units. Positions in micrometres and sensor variances of
 1e-13 m2 beside forces of newtons spread the Hamiltonian over twenty decades. Of 300 random systems in units over
 twelve decades, control.care and control.dare refuse 4 and 1 %, and return 2 % of the gains wrong by more than 1 %,
 silently (slycot: 20, 32 and 15 %): scipy balances the pencil, and never looks at X. So R is made the identity, the
 states are scaled until the Hamiltonian is balanced and then until X has a diagonal of ones, and time is counted in
-its largest entry. What error is left, `_refine` takes off. Systems that do not touch each other are solved one by
-one, so that gains between them are exactly zero.
+its largest entry. What error is left, `_refine` takes off; where that moves X by more than the condition of the
+equation allows, X is asked for another way, or refused. Systems that do not touch each other are solved one by one,
+so that gains between them are exactly zero.
 
 The gains are those of control.lqr, dlqr, lqe and dlqe where these keep their digits. For the shipped designs in SI
 units the regulators agree to 1e-7 and better, the filters of dlqe to 1e-3; lqe refuses the planar motor. The filters
@@ -16,8 +20,8 @@ noise: X then has a diagonal of ones.
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +32,12 @@ from malta.errors import CheckError, InputError
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
 
+Solver = Literal[
+    "python-control", "scipy"
+]  # who finds X; the first is imported where it is asked, in two seconds
+
 RESIDUAL = 1e-9  # largest accepted relative residual of a Riccati equation
+GIVEN = 1e-8  # of the terms of an equation: what a library's rounding may be worth, more than the condition explains
 REFINED = 1e-13  # the residual above which a solution is refined: rounding leaves less than a tenth of it
 EPS = float(np.finfo(float).eps)
 STEPS = 8  # of Newton's at most; each squares the error
@@ -76,6 +85,7 @@ def care(
     what: str = "CARE",
     *,
     N: FloatArray | None = None,
+    solver: Solver = "scipy",
 ) -> Solution:
     """Solve A'X + XA - (XB + N) R^-1 (B'X + N') + Q = 0 for the stabilizing X; K = R^-1 (B'X + N').
 
@@ -83,10 +93,10 @@ def care(
     weights, as of games and of passive systems, may have a stabilizing X, which may then be indefinite.
 
     A, Q : n x n, B, N : n x m, R : m x m
-    Raises InputError (shapes, NaN, R not > 0) and CheckError (no stabilizing solution, residual above 1e-9, X not >= 0
-    where the weights are); `what` opens the message.
+    Raises InputError (shapes, NaN, R not > 0) and CheckError (no stabilizing solution, residual above 1e-9, a solver
+    whose X is further off than the condition allows, X not >= 0 where the weights are); `what` opens the message.
     """
-    return _by_parts(A, B, Q, R, np.zeros_like(B) if N is None else N, what, discrete=False)
+    return _by_parts(A, B, Q, R, np.zeros_like(B) if N is None else N, _Task(what, solver, discrete=False))
 
 
 def dare(
@@ -96,6 +106,8 @@ def dare(
     R: FloatArray,
     N: FloatArray | None = None,
     what: str = "DARE",
+    *,
+    solver: Solver = "scipy",
 ) -> Solution:
     """Solve the discrete Riccati equation for the cost sum x'Qx + 2 x'Nu + u'Ru; u = -Kx, the stabilizing one.
 
@@ -106,12 +118,20 @@ def dare(
     S = np.zeros_like(B) if N is None else N
     _check_shapes(A, B, Q, R, S, what)
     if not _is_definite(R):
-        return _with_known_cost(A, B, Q, R, S, what)
-    return _by_parts(A, B, Q, R, S, what, discrete=True)
+        return _with_known_cost(A, B, Q, R, S, _Task(what, solver, discrete=True))
+    return _by_parts(A, B, Q, R, S, _Task(what, solver, discrete=True))
+
+
+class _Task(NamedTuple):
+    """What an equation is for, as messages say it, who solves it, and of which kind it is."""
+
+    what: str
+    solver: Solver
+    discrete: bool
 
 
 def _with_known_cost(
-    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, what: str
+    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, task: _Task
 ) -> Solution:
     """The solution as X0 + Y, with X0 such that R + B'X0B > 0: the equation of Y has this as its weight of inputs.
 
@@ -124,28 +144,29 @@ def _with_known_cost(
     X0 = one * ((np.abs(R).max() or np.abs(Q * np.outer(t, t)).max()) / size if size else 1.0)
     R1 = _symmetric(R + B.T @ X0 @ B)
     if not _is_definite(R1):
-        raise InputError(what, "R", "a matrix that is not positive definite", "R > 0, or R + B'XB > 0")
-    Y = _by_parts(A, B, _symmetric(Q + A.T @ X0 @ A - X0), R1, N + A.T @ X0 @ B, what, discrete=True)
+        expected = "R > 0, or R + B'XB > 0"
+        raise InputError(task.what, "R", "a matrix that is not positive definite", expected)
+    Y = _by_parts(A, B, _symmetric(Q + A.T @ X0 @ A - X0), R1, N + A.T @ X0 @ B, task)
     X = X0 + Y.X
     terms = [A.T @ X @ A, -X, -(A.T @ X @ B + N) @ Y.K, Q]
     residual = float(np.linalg.norm(sum(terms)) / sum(np.linalg.norm(term) for term in terms))
     if not residual <= RESIDUAL:
-        raise CheckError(f"{what}: the relative residual is {residual:.1e}, allowed {RESIDUAL:.0e}")
+        raise CheckError(f"{task.what}: the relative residual is {residual:.1e}, allowed {RESIDUAL:.0e}")
     return Solution(X, Y.K, residual)
 
 
 @np.errstate(all="ignore")  # what overflows fails its check below
 def _by_parts(
-    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, what: str, *, discrete: bool
+    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, task: _Task
 ) -> Solution:
     X, K, residual = np.zeros_like(A), np.zeros_like(B.T), 0.0
-    for i, j in _parts(A, B, Q, R, N, what):
+    for i, j in _parts(A, B, Q, R, N, task.what):
         ii, ij = np.ix_(i, i), np.ix_(i, j)
         U = np.linalg.cholesky(_symmetric(R[np.ix_(j, j)]))
         B0 = linalg.solve_triangular(U, B[ij].T, lower=True).T  # the input weight is the identity
         S = linalg.solve_triangular(U, N[ij].T, lower=True).T
         A0, Q0 = A[ii] - B0 @ S.T, Q[ii] - S @ S.T  # the cross term, absorbed into u + S'x
-        found = _solve(A0, B0, Q0, what, discrete=discrete)
+        found = _solution_of(B0.shape, A0.tobytes(), B0.tobytes(), Q0.tobytes(), task)
         t, unit = found.equation.t, found.equation.unit
         X[ii] = found.X * unit / np.outer(t, t)
         K[np.ix_(j, i)] = linalg.solve_triangular(U.T, found.K / t + S.T, lower=False)
@@ -153,69 +174,116 @@ def _by_parts(
     return Solution(X, K, residual)
 
 
-def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: bool) -> _Found:
-    """The first solution that is as good as rounding allows, or else the best; R is the identity."""
-    return _solution_of(B.shape, A.tobytes(), B.tobytes(), Q.tobytes(), what, discrete)
-
-
 # A slider moves one weight: the equations of other axes, and the filter's, are the same.
 @lru_cache(maxsize=64)
-def _solution_of(shape: tuple[int, int], a: bytes, b: bytes, q: bytes, what: str, discrete: bool) -> _Found:
+def _solution_of(shape: tuple[int, int], a: bytes, b: bytes, q: bytes, task: _Task) -> _Found:
+    """The first solution that is as good as rounding allows, or else the best; R is the identity."""
     A, B, Q = (np.frombuffer(entries).reshape(shape[0], -1) for entries in (a, b, q))
     candidates: list[_Found] = []
     failures: list[Exception] = []
+    what, discrete = task.what, task.discrete
     balanced = _balance(A - discrete * np.eye(len(A)), B @ B.T, Q)
-    for way in (_symplectic, _doubled) if discrete else (_hamiltonian,):
+    for way in (_symplectic, _bilinear) if discrete else (_hamiltonian,):
         t = balanced
         try:
             for last in (False, True):
                 equation = _on_scales(t, A, B, Q, discrete=discrete)
-                X = way(equation)
+                X = way(equation, task.solver)
                 t = t if last else _unit_diagonal(t, X * equation.unit)
-            found = _refine(_evaluate(equation, X))
-        except ValueError as error:
+            given = _evaluate(equation, X)
+            found = _refine(given)
+            _compare(given, found, task.solver)
+        except (ValueError, CheckError) as error:
             failures.append(error)
             continue
-        if way is not _doubled or _stands(found):
-            candidates.append(found)
+        candidates.append(found)
         if found.residual <= REFINED:
             break
     if not candidates:
-        raise CheckError(f"{what}: no stabilizing solution ({_first_sentence(failures[0])})") from failures[0]
+        first = failures[0]
+        said = (
+            str(first)
+            if isinstance(first, CheckError)
+            else f"no stabilizing solution ({_first_sentence(first)})"
+        )
+        raise CheckError(f"{what}: {said}") from first
     found = min(candidates, key=lambda candidate: candidate.residual)
     _check(found, what, definite=np.linalg.eigvalsh(Q).min() >= -1e-12 * np.abs(Q).max())
     return found
 
 
-def _hamiltonian(equation: _Equation) -> FloatArray:
-    """X by scipy's Hamiltonian; time counts in the largest entry of A."""
+def _given(
+    solver: Solver, A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, *, discrete: bool
+) -> FloatArray:
+    """X as a library finds it. The equation is scaled: neither of them does that."""
+    if solver == "scipy":
+        return np.asarray(
+            (linalg.solve_discrete_are if discrete else linalg.solve_continuous_are)(A, B, Q, R)
+        )
+    import control
+
+    return np.asarray((control.dare if discrete else control.care)(A, B, Q, R, method="scipy")[0])
+
+
+def _hamiltonian(equation: _Equation, solver: Solver) -> FloatArray:
+    """X from the stable subspace of the Hamiltonian; time counts in the largest entry of A."""
     A, B, Q, R = equation[:4]
     rate = np.abs(A).max() or 1.0
-    return np.asarray(linalg.solve_continuous_are(A / rate, B / np.sqrt(rate), Q / rate, R))
+    return _given(solver, A / rate, B / np.sqrt(rate), Q / rate, R, discrete=False)
 
 
-def _symplectic(equation: _Equation) -> FloatArray:
-    """X by scipy's pencil, from a basis of its stable subspace, [I; X] times some matrix.
+def _symplectic(equation: _Equation, solver: Solver) -> FloatArray:
+    """X from a basis of the stable subspace of a pencil, [I; X] times some matrix.
 
     X counts in units of Q. Where weights are weak or samples short Q is small beside X, and the I beside this X: the
     ratio is lost in digits. scipy balances the pencil once more and so returns to these units from any other.
     """
-    return np.asarray(linalg.solve_discrete_are(*equation[:4]))
+    return _given(solver, *equation[:4], discrete=True)
 
 
-def _doubled(equation: _Equation) -> FloatArray:
-    """By doubling the horizon (Chu, Fan, Lin, Wang, Int. J. Control 77(8), 2004): X is the sum of the costs.
+def _bilinear(equation: _Equation, solver: Solver) -> FloatArray:
+    """X as that of a continuous equation, z = (1 + s) / (1 - s): where poles are close to 1 it keeps their digits.
 
-    No eigenvalues need to be told apart, but where a mode neither dies nor can be moved its gain does not stabilize.
+        A_c = (A - I) V,  B_c = sqrt(2) V B H^-1/2,  Q_c = 2 V' Q V,  V = (A + I)^-1,  H = I + B' V' Q V B
+
+    with the cross term N_c = -sqrt(2) V' Q V B H^-1/2: both have the same costs, so the same X, which
+    counts in the unit on which its diagonal is of ones.
     """
-    F, G, X = equation.A, equation.B @ equation.B.T * equation.unit, equation.Q
-    for _ in range(DOUBLINGS):
-        W = np.linalg.inv(np.eye(len(X)) + G @ X)
-        FW, step = F @ W, _symmetric(F.T @ X @ W @ F)
-        G, X, F = G + _symmetric(FW @ G @ F.T), X + step, FW @ F
-        if not np.linalg.norm(step) > EPS * np.linalg.norm(X):  # or NaN
-            break
-    return X
+    A, B, one = equation.A, equation.B, np.eye(len(equation.A))
+    Q, V = equation.Q * equation.unit, np.linalg.inv(A + one)
+    G = V @ B
+    U = np.linalg.cholesky(np.eye(B.shape[1]) + G.T @ Q @ G)
+    G = np.sqrt(2) * linalg.solve_triangular(U, G.T, lower=True).T
+    N = -V.T @ Q @ G
+    F, W = (A - one) @ V - G @ N.T, _symmetric(2 * V.T @ Q @ V - N @ N.T)
+    found = _Equation(F, G, W, np.eye(B.shape[1]), equation.t, 1.0, discrete=False)
+    return _hamiltonian(found, solver) / equation.unit
+
+
+def _compare(given: _Found, found: _Found, solver: Solver) -> None:
+    """CheckError where refining has moved X by more than the condition of the equation allows."""
+    if found is given:
+        return
+    apart = np.linalg.norm(given.X - found.X, 2) / np.linalg.norm(found.X, 2)
+    allowed = GIVEN * _condition(found)
+    if not apart <= allowed:
+        said = f"the solution of {solver} is {apart:.1e} from its refinement"
+        raise CheckError(f"{said}, and the condition of the equation allows {allowed:.1e}")
+
+
+def _condition(found: _Found) -> float:
+    """How many times a relative change of the terms of the equation changes X, relative to X.
+
+    The Lyapunov operator of A - B K takes what the terms change by to what X does (Kenney, Hewer, SIAM J. Control
+    Optim. 28(1), 1990); its inverse's norm is that of its answer to the identity.
+    """
+    A, B, Q, R, _, _, discrete = found.equation
+    X, closed = found.X, found.closed
+    size = partial(np.linalg.norm, ord=2)
+    back = size(_lyapunov(closed, np.eye(len(A)), discrete=discrete))
+    pushed = size(B @ np.linalg.solve(R + discrete * B.T @ X @ B, B.T)) * size(X)
+    terms = (1 + size(A)) ** 2 + pushed * size(closed) ** 2 if discrete else 2 * size(A) + pushed
+    return float(back * (terms + size(Q) / size(X)))
 
 
 def _refine(found: _Found) -> _Found:

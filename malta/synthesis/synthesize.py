@@ -18,6 +18,7 @@ from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import commutate_ahead
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
+from malta.synthesis.riccati import Solver
 from malta.synthesis.schedule import SCHEDULED, Schedule, point_at
 from malta.synthesis.spec import Spec
 from malta.synthesis.structure import structured_controller
@@ -101,11 +102,12 @@ def _require_alike(base: Controller, law: Controller) -> None:
 
 
 @on_one_thread
-def synthesize(spec: Spec, model: LinearModel) -> Controller:
+def synthesize(spec: Spec, model: LinearModel, *, solver: Solver = "python-control") -> Controller:
     """Design the controller that a design file asks for.
 
     spec : from `malta.read_design`
     model : the machine's linear model at the design's operating point
+    solver : of the Riccati equations of an LQG, as of `malta.lqg`
 
     Returns a Controller.
 
@@ -117,11 +119,11 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
     >>> controller.name, controller.K.shape  # position, rate, and a stored force
     ('ball', (1, 3))
     """
-    controller = _law_at(spec, model)
+    controller = _law_at(spec, model, solver)
     if spec.schedule is not None:
         plant, (variable, places) = spec.plant, spec.schedule
         points = [point_at(plant, model.operating_point.x, variable, place) for place in places]
-        laws = [_law_at(spec, linearize(plant, point)) for point in points]
+        laws = [_law_at(spec, linearize(plant, point), solver) for point in points]
         with relocate_errors(spec.path, "schedule"):
             controller = schedule_laws(laws, variable, about=controller)
     if spec.inertia_feedforward != 1:
@@ -145,7 +147,7 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
     )
 
 
-def _law_at(spec: Spec, model: LinearModel) -> Controller:
+def _law_at(spec: Spec, model: LinearModel, solver: Solver) -> Controller:
     """The law alone at the operating point of a model. Raises InputError and CheckError, which name the file."""
     named: dict[str, Any] = {
         "name": spec.name,
@@ -159,7 +161,7 @@ def _law_at(spec: Spec, model: LinearModel) -> Controller:
         elif spec.pid is not None:
             controller = pid(model, spec.pid, spec.sample_time, **named)
         else:
-            named["current_lag"] = spec.current_lag
+            named |= {"current_lag": spec.current_lag, "solver": solver}
             controller = lqg(model, spec.weights, spec.sample_time, spec.discretization, spec.delay, **named)
     except InputError as error:
         raise InputError(spec.path, f"{error.where}: {error.field}", error.found, error.expected) from error

@@ -57,7 +57,7 @@ def apply_trial(spec: Spec, trial: Trial) -> Spec:
 def model_and_controller(spec: Spec) -> tuple[LinearModel, Controller]:
     """Linearize the machine at the design's operating point, and synthesize the controller."""
     model = linearize(spec.plant, spec.plant.at(**spec.operating_point))
-    return model, synthesize(spec, model)
+    return model, synthesize(spec, model, solver="scipy")
 
 
 def at_least_of(plant: Plant) -> frozenset[str]:

@@ -65,11 +65,11 @@ def shipped(request: pytest.FixtureRequest) -> Design:
     model = malta.linearize(spec.plant, spec.plant.at(**spec.operating_point))
     asked: dict[str, list[Question]] = {"care": [], "dare": []}
 
-    def noted(name: str, *given: Any, what: str = "") -> riccati.Solution:
-        found: riccati.Solution = getattr(riccati, name)(*given, **({"what": what} if what else {}))
+    def noted(name: str, *given: Any, solver: riccati.Solver) -> riccati.Solution:
+        found: riccati.Solution = getattr(riccati, name)(*given, solver=solver)
         A, B, Q, R, *rest = given
-        N = rest[0] if name == "dare" and rest else np.zeros_like(B)
-        asked[name].append(Question(A, B, Q, R, N, what or str(rest[-1]), found))
+        N = rest[0] if name == "dare" else np.zeros_like(B)
+        asked[name].append(Question(A, B, Q, R, N, str(rest[-1]), found))
         return found
 
     with pytest.MonkeyPatch.context() as patch:

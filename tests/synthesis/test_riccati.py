@@ -18,6 +18,7 @@ import malta
 from malta.synthesis import riccati
 from malta.synthesis.riccati import (
     RESIDUAL,
+    Solver,
     care,
     dare,
     delay_inputs,
@@ -370,42 +371,70 @@ def solved_anew(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("solved_anew")
-@pytest.mark.parametrize(("way", "solve"), [("_hamiltonian", care), ("_symplectic", dare)])
+@pytest.mark.parametrize("solver", ["python-control", "scipy"])
+@pytest.mark.parametrize("solve", [care, dare])
 def test_what_the_solver_leaves_is_refined(
-    way: str, solve: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    solve: Callable[..., Any], solver: Solver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From a solution that is off by 0.1 %, and from one by 30 % (its gain still stabilizes)."""
+    """From a solution that is off by what its condition allows; one by 0.1 % is refused, or by 30 %."""
     A, B = (PENDULUM, PUSH) if solve is care else sample(PENDULUM, PUSH, 0.01)
     Q, R = np.diag([1, 0.01]), np.array([[1e-3]])
-    right, first = solve(A, B, Q, R), getattr(riccati, way)
-    for off in (0.999, 1.3):
-        monkeypatch.setattr(riccati, way, lambda equation, off=off: first(equation) * off)
-        X, K, residual = solve(A, B, Q, R)
+    right, first = solve(A, B, Q, R, solver=solver), riccati._given
+    for off in (1 - 1e-8, 1 + 1e-7):
+        monkeypatch.setattr(riccati, "_given", lambda *a, off=off, **k: first(*a, **k) * off)
+        X, K, residual = solve(A, B, Q, R, solver=solver)
         assert residual < 1e-15
         assert pytest.approx(right.X, rel=1e-11) == X
         assert pytest.approx(right.K, rel=1e-11) == K
+    for off in (0.999, 1.3):
+        monkeypatch.setattr(riccati, "_given", lambda *a, off=off, **k: first(*a, **k) * off)
+        with pytest.raises(
+            malta.CheckError, match=f": the solution of {solver} is .* from its refinement, and "
+        ):
+            solve(A, B, Q, R, solver=solver)
+
+
+@pytest.mark.usefixtures("solved_anew")
+@pytest.mark.parametrize("Ts", [1e-1, 1e-3, 1e-5])
+def test_a_sampled_equation_has_the_solution_of_a_continuous_one(
+    Ts: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both ways give the gain, and the second still does where the sample is short and the weight weak."""
+    A, B = sample(PENDULUM, PUSH, Ts)
+    Q, R = np.diag([1, 0.01]) * Ts, np.array([[1e-3]]) * Ts
+    exact = exact_gain(A, B, Q, R[0, 0])
+    assert pytest.approx(exact, rel=1e-9) == dare(A, B, Q, R).K
+
+    def refuses(*_: Any) -> FloatArray:
+        raise np.linalg.LinAlgError("Reordering of (A, B) failed")
+
+    monkeypatch.setattr(riccati, "_symplectic", refuses)
+    assert pytest.approx(exact, rel=1e-9) == dare(A, B, Q, R).K
+    monkeypatch.setattr(riccati, "_refine", lambda found: found)
+    assert pytest.approx(exact, rel=1e-8) == dare(A, B, Q, R).K
 
 
 @pytest.mark.usefixtures("solved_anew")
 def test_a_gain_that_does_not_stabilize_is_not_refined(monkeypatch: pytest.MonkeyPatch) -> None:
-    """X = 0 leaves the pendulum standing: care says so, dare finds X by doubling. So it does when scipy refuses."""
+    """X = 0 leaves the pendulum standing: care says so, dare finds X another way. So it does when scipy refuses."""
     Q, R = np.diag([1, 0.01]), np.array([[1e-3]])
     Ad, Bd = sample(PENDULUM, PUSH, 0.01)
     exact = exact_gain(Ad, Bd, Q, 1e-3)
 
-    def nothing(equation: Any) -> FloatArray:
+    def nothing(equation: Any, _solver: Solver) -> FloatArray:
         return np.asarray(0 * equation.A)
 
-    def refuses(_equation: Any) -> FloatArray:
+    def refuses(_equation: Any, _solver: Solver) -> FloatArray:
         raise np.linalg.LinAlgError("Reordering of (A, B) failed")
 
-    monkeypatch.setattr(riccati, "_hamiltonian", nothing)
-    with pytest.raises(malta.CheckError, match="residual is 1"):
-        care(PENDULUM, PUSH, Q, R)
+    with monkeypatch.context() as patch:
+        patch.setattr(riccati, "_hamiltonian", nothing)
+        with pytest.raises(malta.CheckError, match="residual is 1"):
+            care(PENDULUM, PUSH, Q, R)
     for way in (nothing, refuses):
         monkeypatch.setattr(riccati, "_symplectic", way)
         assert pytest.approx(exact, rel=1e-11) == dare(Ad, Bd, Q, R).K
-    monkeypatch.setattr(riccati, "_doubled", nothing)
+    monkeypatch.setattr(riccati, "_bilinear", refuses)
     with pytest.raises(malta.CheckError, match=r"no stabilizing solution \(Reordering of \(A, B\) failed\)"):
         dare(Ad, Bd, Q, R)
 

@@ -273,7 +273,9 @@ def scale_speed(controller: Controller, speed: float, delay: int) -> Controller:
         drift_variance=own.drift_variance * speed**6,
     )
     model = linearize(plant, plant.point(controller.operating_point[0]))
-    return lqg(model, weights, controller.sample_time, "sampled-data", delay, name=controller.name)
+    return lqg(
+        model, weights, controller.sample_time, "sampled-data", delay, name=controller.name, solver="scipy"
+    )
 
 
 def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
@@ -386,7 +388,8 @@ def soften(controller: Controller, plant: Plant, rates: tuple[float, float]) -> 
         q[k] = min(own.r[k] * (2 * plant.inertia[k] * rate**2) ** 2, q[k])
     model = linearize(plant, plant.point(controller.operating_point[0]))
     softer = replace(own, q=q)
-    return lqg(model, softer, controller.sample_time, "sampled-data", controller.delay, name=controller.name)
+    Ts, delay = controller.sample_time, controller.delay
+    return lqg(model, softer, Ts, "sampled-data", delay, name=controller.name, solver="scipy")
 
 
 def jumps_reference(

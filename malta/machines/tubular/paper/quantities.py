@@ -91,7 +91,7 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
         model,
         controller,
         margins,
-        lqr(model, spec.weights) if spec.kind == "LQG" else None,
+        lqr(model, spec.weights, solver="scipy") if spec.kind == "LQG" else None,
         experiments,
         stroke_figures(slow),
         published_value(published, "dc_link.speed"),
