@@ -50,7 +50,7 @@ from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
 
 ROOT = Path(__file__).parents[1]
-IMPORTS = "import numpy, scipy, control, casadi"
+IMPORTS = "import numpy, scipy, control, casadi, filterpy.kalman"
 MACHINES = 10_000
 MANY = 100_000  # machines of a campaign in flat memory, which is timed once
 SCENARIO = malta.Scenario.stroke(delay=0, fidelity="force")

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from malta.margins.loop_report import LoopReport, Outcome
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
+    from malta.synthesis.filter_check import FilterCheck
     from malta.synthesis.spec import Pid, Spec
     from malta.tuning.search import Effort
     from malta.tuning.tune import Tuned
@@ -101,6 +102,7 @@ class Made(NamedTuple):
     page: Any
     margins: LoopReport
     result: Experiment
+    observer: FilterCheck | None  # of an LQG
     paths: Sequence[Path]  # gain files
     picture: Path
     unchanged: bool  # the gain files held these numbers already
@@ -140,6 +142,11 @@ def _run_design(
             raise InputError(file, "name", repr(spec.name), f"another name than that of {sources[target]}")
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model)
+    observer = None
+    if spec.kind == "LQG":
+        from malta.synthesis.filter_check import check_filter
+
+        observer = check_filter(spec, model, controller)
     note("margins")
     margins = linear_report(model, controller, spec.uncertainty)
     try:
@@ -158,7 +165,7 @@ def _run_design(
     if not unchanged:
         contents |= gains.file_contents(controller, margins, *paths)
     replace_files(contents)  # last, all at once: whatever fails leaves the old gain files and their figure
-    return Made(spec.name, page, margins, result, paths, picture, unchanged)
+    return Made(spec.name, page, margins, result, observer, paths, picture, unchanged)
 
 
 def _with_other_sign(spec: Spec, pid: Pid) -> Spec:
@@ -168,15 +175,22 @@ def _with_other_sign(spec: Spec, pid: Pid) -> Spec:
 
 def _document(made: Made, changes: Sequence[str]) -> DesignPart:
     """The design in the JSON document."""
-    from malta.cli.documents.campaigns import design_part
+    from malta.cli.documents.campaigns import ObserverPart, design_part
 
-    return design_part(made.name, (*made.paths, made.picture), changes, made.margins, made.result)
+    files = (*made.paths, made.picture)
+    observer = None if made.observer is None else ObserverPart.of(made.observer)
+    return design_part(made.name, files, made.margins, made.result, changes=list(changes), observer=observer)
 
 
 def _print_design(made: Made) -> None:
     """Print the page of a design, and the files."""
     console = make_console()
     console.print(made.page)
+    if made.observer is not None:
+        samples, apart, _ = made.observer
+        console.print(
+            f"Gains by python-control; filterpy's filter agrees to {apart:.0e} ({samples} samples)."
+        )
     if made.unchanged:
         console.print(f"{made.paths[0]}: holds these numbers already; left as it is", soft_wrap=True)
     print_written(console, (made.picture,) if made.unchanged else (*made.paths, made.picture))

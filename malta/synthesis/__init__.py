@@ -6,6 +6,7 @@ from malta.contents import contents
 
 if TYPE_CHECKING:
     from malta.synthesis.controller import Controller as Controller
+    from malta.synthesis.filter_check import check_filter as check_filter
     from malta.synthesis.lqg import kalman as kalman, lqi as lqi, lqr as lqr, weights as weights
     from malta.synthesis.spec import Weights as Weights
     from malta.synthesis.state_space import controller_of as controller_of
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "malta.synthesis.controller": "Controller",
+    "malta.synthesis.filter_check": "check_filter",
     "malta.synthesis.lqg": "kalman lqi lqr weights",
     "malta.synthesis.spec": "Weights",
     "malta.synthesis.state_space": "controller_of",

@@ -158,6 +158,33 @@ except SystemExit as ended:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["verify", TABLE2],
+        ["campaign", TABLE2, "--samples", "8", "--seed", "1"],
+        ["simulate", TABLE2, "--scenario", "hold", "--out", "."],
+        ["export", TABLE2, "--out", "c"],
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_commands_on_gain_files_import_no_library_of_synthesis(arguments: list[str], tmp_path: Path) -> None:
+    """What a design of an LQG needs two seconds of processor time to import stays there."""
+    program = """
+import sys
+from malta.cli.main import main
+try:
+    main()
+except SystemExit as ended:
+    print("exit", ended.code, *sorted(set(sys.modules) & {"control", "filterpy", "slycot"}))
+"""
+    named = [str(ROOT / one) if one.startswith("design/") else one for one in arguments]
+    command = [sys.executable, "-c", program, *named]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=True, cwd=tmp_path)
+    assert done.stdout.splitlines()[-1] == "exit 0", done.stderr
+
+
+@pytest.mark.slow
 def test_a_simulation_imports_what_it_needs_alone() -> None:
     """Modules that take long to import stay out of the commands that do without them."""
     program = """

@@ -409,12 +409,21 @@ class SimulateOutput(ExperimentPart):
     exported: list[FlightPart] = Field(default=[], description="of --controller c")
 
 
+class ObserverPart(Part):
+    """How far the observer's gain is from that of filterpy's filter, which ran until it stood."""
+
+    samples: int
+    apart: Number = Field(description="of the largest gain, in units of standard deviations")
+    allowed: Number
+
+
 class DesignPart(LoopPart, ExperimentPart):
     """A design that was made, verified and simulated."""
 
     design: str
     files: Files = Field(description="gain files, and the figure")
     changes: list[str] = Field(default=[], description="of --set")
+    observer: ObserverPart | None = Field(default=None, description="of an LQG")
 
 
 class DesignOutput(Part):
@@ -453,13 +462,13 @@ def flights(found: Mapping[str, Mapping[Precision, Sequence[Difference]]]) -> li
 
 
 def design_part(
-    name: str, files: Sequence[Path], changes: Sequence[str], margins: LoopReport, flown: Experiment
+    name: str, files: Sequence[Path], margins: LoopReport, flown: Experiment, **more: Any
 ) -> DesignPart:
-    """A design with its loop and its main job."""
+    """A design with its loop and its main job; `more` are other fields of a DesignPart."""
     return DesignPart(
         design=name,
         files=[str(file) for file in files],
-        changes=list(changes),
         **loop_fields(margins),
         **experiment_fields(flown),
+        **more,
     )
