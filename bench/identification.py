@@ -25,8 +25,8 @@ from malta.identification.response import ResponseModel
 from malta.identification.spectra import noise_of, readings, residuals_of, spectrum_of, straightened, whole
 
 if TYPE_CHECKING:
+    from malta.arrays import FloatArray
     from malta.identification.log import Log
-    from malta.model.plant import FloatArray
     from malta.synthesis.controller import Controller
 
 ROOT = Path(__file__).parents[1]

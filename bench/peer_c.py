@@ -16,7 +16,7 @@ from peer_problem import MECHANICAL, NO_SPIN, Stated, Workload, packed, problem,
 from malta.simulation.readings import keys
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 SOURCES = Path(__file__).parent / "peers"
 GCC = shutil.which("gcc")

@@ -18,7 +18,7 @@ from malta.machines.tubular.plant import Parameters
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 SUBSTEPS = 4
 

@@ -14,7 +14,7 @@ from jax import lax
 from peer_problem import Machine, Workload, packed, problem
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 jax.config.update("jax_enable_x64", True)
 # Read at the first computation: without it XLA computes anew for every result what several of them share.

@@ -12,7 +12,7 @@ from jax import lax
 from peer_problem import Workload, stated
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 jax.config.update("jax_enable_x64", True)
 

@@ -20,7 +20,7 @@ import numpy as np
 from malta.proof.uncertain import Compensator, UncertainSystem, instability, responses
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
+    from malta.arrays import ComplexArray, FloatArray
 
 Lost = Callable[["FloatArray"], np.ndarray]  # which rows are unstable; deviations in multiples of the box
 SHARE = 0.2

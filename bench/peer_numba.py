@@ -14,7 +14,7 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from peer_problem import NO_SPIN, Machine, Workload, packed, problem
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 LANES = 32  # machines to a block; 8 would be unrolled and not vectorized
 Function = TypeVar("Function", bound=Callable[..., Any])

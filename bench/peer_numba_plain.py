@@ -11,7 +11,7 @@ import numpy as np
 from peer_problem import Workload, stated
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 njit: Callable[[Function], Function] = numba.njit(fastmath=True, error_model="numpy")

@@ -12,7 +12,7 @@ from peer_problem import Machine, Problem, Workload, problem
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 PART = 5000  # machines, at most
 

@@ -11,7 +11,7 @@ from malta.machines.planar.field import Table
 from malta.machines.planar.plant import Parameters
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 ODD = np.array([[1, 0, 0, 0, 1, 1], [0, 1, 0, 1, 0, 1]])  # F_x F_y F_z T_x T_y T_z, about x and about y
 

@@ -17,7 +17,7 @@ from malta.simulation.engine.compiled import feedforward_table
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 NO_SPIN = 0.0  # rad/s
 MECHANICAL = [0, 1, 2, 3, 4, 6, 7, 8, 9, 10]  # of the twelve states: all but gamma's

@@ -20,7 +20,7 @@ from malta.proof.robust import law_of
 from malta.proof.uncertain import instability
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
+    from malta.arrays import ComplexArray, FloatArray
 
 MOST = 16.0  # boxes that are looked at
 FREQUENCIES = np.geomspace(1e-2, 1e4, 300)  # rad/s

@@ -21,7 +21,7 @@ from malta.structured.search import Task, random_starts, rate_of, search
 from malta.synthesis.structure import Structure, places_of
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 LOST = 1e3  # the merit of an unstable loop
 WIDE = 3.0  # of x, either way: factors of 20

@@ -29,7 +29,7 @@ from malta.proof.weak_coupling import taylor
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from malta.model.plant import ComplexArray, FloatArray
+    from malta.arrays import ComplexArray, FloatArray
 
 FOLDER = Path(__file__).parent / "theory" / "figures"
 STYLES = malta.report.STYLES

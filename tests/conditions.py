@@ -12,7 +12,7 @@ import numpy as np
 from scipy import linalg
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 EPS = float(np.finfo(float).eps)
 OPERATIONS = 10  # roundings that add up in an entry of a small problem

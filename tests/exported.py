@@ -15,6 +15,7 @@ import pytest
 from conftest import ROOT
 
 import malta
+from malta.arrays import FloatArray
 from malta.firmware import export
 from malta.firmware.export import folder_files
 from malta.firmware.flight import Native
@@ -22,7 +23,6 @@ from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.sources import piece_records, render, root_context
 from malta.firmware.step import programs_of
-from malta.model.plant import FloatArray
 from malta.synthesis.controller import Controller
 
 PRECISIONS: tuple[Precision, ...] = ("double", "float")

@@ -15,7 +15,8 @@ from malta.simulation.period import chain, initial_state, period_of
 from malta.simulation.scenario import setup_of, steps_of
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.arrays import ComplexArray, FloatArray
+    from malta.model.plant import Plant
     from malta.simulation.layout import Fidelity
     from malta.synthesis.controller import Controller
 

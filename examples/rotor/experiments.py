@@ -38,7 +38,7 @@ from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
+    from malta.arrays import ComplexArray, FloatArray
 
 SPEEDS = (200.0, 500.0, 800.0, 1200.0, 1600.0, 2094.0)  # rad/s
 SETTLING = 0.1  # s, before amplitudes are read

@@ -19,8 +19,9 @@ from malta.identification.measure import cut_loop
 from malta.model.equilibrium import trim
 
 if TYPE_CHECKING:
+    from malta.arrays import ComplexArray, FloatArray
     from malta.identification import Log
-    from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.model.plant import Plant
     from malta.synthesis.controller import Controller
 
 TURNS = 20  # of the rotor at least

@@ -17,6 +17,7 @@ import numpy as np
 
 from malta.app.files import Edited
 from malta.app.linear_run import linear_run
+from malta.arrays import FloatArray
 from malta.bound import at_most
 from malta.errors import CheckError, InputError
 from malta.loops.classical import phase_and_delay
@@ -29,7 +30,7 @@ from malta.margins.verify import machine_report
 from malta.merits import Merit, figure
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import FloatArray, Plant, Signal
+from malta.model.plant import Plant, Signal
 from malta.proof.loss import RayBound, ray_bound
 from malta.simulation.experiments import PlannedRun
 from malta.simulation.experiments.catalogue import cases_of, main_job, series_of, step_cases

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.campaigns.plan import Plan, machines_at, planned_run, varied_names
 from malta.campaigns.result import Campaign, Finding, figures_of, specified_bounds
 from malta.campaigns.store import simulate_machines
@@ -24,7 +25,6 @@ from malta.campaigns.summary import UNBOUNDED, Bounds
 from malta.display import display
 from malta.errors import InputError
 from malta.model.machines import outputs_of
-from malta.model.plant import FloatArray
 from malta.simulation.engine.digest import Batch
 from malta.units import in_unit
 

@@ -21,6 +21,7 @@ from zipimport import zipimporter
 import numpy as np
 from numpy.typing import NDArray
 
+from malta.arrays import FloatArray, readonly
 from malta.display import display
 from malta.errors import InputError
 from malta.files import read_file, version
@@ -30,7 +31,7 @@ from malta.gains.encodings import decode
 from malta.model.data import plant_of
 from malta.model.machines import module_of, part_of
 from malta.model.parameters import differences, fingerprint, shape_parameters, twins_of, units_of, values_of
-from malta.model.plant import FloatArray, Plant, readonly
+from malta.model.plant import Plant
 from malta.simulation.engine.batch import functions_text
 from malta.simulation.experiments import PlannedRun
 from malta.simulation.experiments.catalogue import cases_of

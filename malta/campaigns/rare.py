@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import t as student
 
+from malta.arrays import FloatArray
 from malta.campaigns.limits import Limit
 from malta.campaigns.plan import (
     Plan,
@@ -41,7 +42,6 @@ from malta.campaigns.store import seal, simulate_machines
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.files import file_exists, json_text, read_file, replace_files
-from malta.model.plant import FloatArray
 from malta.simulation.engine.digest import Batch, verdicts
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import Experiment, Progress

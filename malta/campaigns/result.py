@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
+from malta.arrays import FloatArray, readonly
 from malta.campaigns.plan import Plan, half_width, varied_names
 from malta.campaigns.store import Block, figure_shapes
 from malta.display import Description, display
@@ -19,7 +20,6 @@ from malta.merits import Merit
 from malta.model.data import published_value
 from malta.model.machines import inputs_of, outputs_of, stroke_unit
 from malta.model.parameters import differences, units_of
-from malta.model.plant import FloatArray, readonly
 from malta.simulation.engine.digest import Batch, verdicts
 from malta.simulation.experiments import setting
 from malta.synthesis.spec import Spec

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from malta.arrays import FloatArray
 from malta.campaigns.plan import (
     PRECISIONS,
     SCHEMA,
@@ -38,7 +39,6 @@ from malta.errors import InputError
 from malta.files import file_exists, read_file, remove_leftovers, replace_files, writer
 from malta.firmware.flight import engine_of_c
 from malta.model.parameters import fingerprint
-from malta.model.plant import FloatArray
 from malta.simulation.engine.batch import is_compiled, simulate_many
 from malta.simulation.engine.compiled import MOST_LANES
 from malta.simulation.engine.digest import LARGEST_FIGURE, Batch, verdicts

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import qmc, sobol_indices
 
+from malta.arrays import FloatArray
 from malta.campaigns.limits import Limit, findings_of
 from malta.campaigns.plan import (
     Plan,
@@ -33,7 +34,6 @@ from malta.campaigns.store import simulate_machines
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.model.parameters import differences
-from malta.model.plant import FloatArray
 from malta.simulation.experiments import Progress, progress_of_part
 
 NOISE = "noise"  # the name of its factor

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from malta.arrays import FloatArray
 from malta.campaigns.plan import Plan, half_width, middle_of
 from malta.campaigns.result import (
     CLEARANCE,
@@ -33,7 +34,6 @@ from malta.campaigns.result import (
 )
 from malta.display import Description, display
 from malta.merits import Merit, figure
-from malta.model.plant import FloatArray
 from malta.simulation.engine.digest import LARGEST_FIGURE, Batch, verdicts
 from malta.synthesis.spec import Spec
 from malta.units import in_unit

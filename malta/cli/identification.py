@@ -28,8 +28,9 @@ from malta.errors import CheckError, InputError
 from malta.files import PICTURES, replace_files
 
 if TYPE_CHECKING:
+    from malta.arrays import FloatArray
     from malta.identification.excite import ExcitationPlan
-    from malta.model.plant import FloatArray, Plant, Signal
+    from malta.model.plant import Plant, Signal
     from malta.proof.blocks.gain import Gain
     from malta.synthesis.controller import Controller
 

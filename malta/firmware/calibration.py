@@ -16,11 +16,12 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.firmware.ctext import c_number, c_numbers
 from malta.firmware.signals import Field, Target
 from malta.firmware.supervisor import Monitor, monitors_of, reference_limits
-from malta.model.plant import FloatArray, Signal
+from malta.model.plant import Signal
 from malta.synthesis.controller import gains_of
 from malta.units import unit_factor
 

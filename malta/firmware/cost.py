@@ -18,6 +18,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
+from malta.arrays import FloatArray
 from malta.files import scratch_folder
 from malta.firmware.ctext import c_name
 from malta.firmware.program import TRUTHS
@@ -26,7 +27,7 @@ from malta.firmware.sources import ring_sources, sources
 from malta.firmware.step import programs_of, started_state, step_function, zero_reference
 from malta.firmware.supervisor_text import supervisor_sources
 from malta.firmware.vectors import readings_of
-from malta.model.plant import FloatArray, position_in
+from malta.model.plant import position_in
 from malta.simulation import references
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate

@@ -16,12 +16,13 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.firmware.ctext import c_name
 from malta.firmware.program import Precision
 from malta.firmware.signals import Field, Target
 from malta.firmware.sources import sources
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation.engine.compiled import library
 from malta.simulation.engine.engines import Engine, evaluate, substeps_until
 from malta.simulation.layout import (

@@ -16,12 +16,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.firmware.blocks import Staged, staged_function
 from malta.firmware.calibration import law_arguments, law_symbols
 from malta.firmware.program import as_written
 from malta.firmware.signals import Field, Target, reading_ranges
 from malta.model.equations import note, recorded_equations, recorded_look_ups
-from malta.model.plant import FloatArray, placed
+from malta.model.plant import placed
 from malta.simulation.current_control import control_currents
 from malta.simulation.layout import Loop, Signals, electronics_of, numbers_of
 from malta.simulation.period import law_reference, limited_currents, state_reference

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
 from malta.firmware.program import TYPES, Precision
 from malta.model.data import plant_of
 from malta.model.equations import LookUp, recorded_look_ups
-from malta.model.plant import FloatArray, Plant, Signal, placed, readonly
+from malta.model.plant import Plant, Signal, placed
 from malta.simulation.layout import Fidelity, Setup, electronics_of, fidelities
 from malta.synthesis.controller import Controller
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.files import version
 from malta.firmware.blocks import unrolled
@@ -32,7 +33,7 @@ from malta.firmware.program import TYPES, Precision, Program, build_program, low
 from malta.firmware.signals import Field, Target, place_of_readings
 from malta.firmware.step import programs_of
 from malta.firmware.supervisor import JUMP, MOST_RATE, bounds_of, reading_deviations, reference_limits
-from malta.model.plant import FloatArray, Signal, placed
+from malta.model.plant import Signal, placed
 from malta.simulation.period import state_reference
 
 if TYPE_CHECKING:

@@ -23,9 +23,10 @@ from typing import Literal, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.firmware.signals import Target, place_of_readings, reading_ranges, used_clearances
-from malta.model.plant import FloatArray, Plant, placed
+from malta.model.plant import Plant, placed
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import noise_input
 from malta.synthesis.riccati import dare, eigenvalues, sample

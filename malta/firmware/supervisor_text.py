@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.firmware.ctext import c_number, function_text
 from malta.firmware.flight import (
@@ -57,7 +58,7 @@ from malta.firmware.supervisor import (
     reference_limits,
     stars_of,
 )
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.engine.engines import Engine
 from malta.simulation.layout import electronics_of

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.firmware.calibration import FNV_FACTOR, FNV_START
 from malta.firmware.ctext import c_number, c_numbers
 from malta.firmware.program import Program, evaluate
@@ -37,7 +38,6 @@ from malta.firmware.supervisor import (
     monitors_of,
     reference_limits,
 )
-from malta.model.plant import FloatArray
 from malta.simulation import references
 from malta.simulation.inputs import motion_of
 from malta.simulation.scenario import Scenario

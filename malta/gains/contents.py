@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors, require_known
 from malta.files import require_plain_name
 from malta.gains.schema import GainFile, LinearTable, PlantTable
@@ -16,7 +17,7 @@ from malta.model.data import parameters_record, plant_of
 from malta.model.linear import LinearSystem, linear_machine
 from malta.model.machines import machine
 from malta.model.parameters import later_parameters, units_of
-from malta.model.plant import FloatArray, Parameters, Plant, Signal, outputs_at
+from malta.model.plant import Parameters, Plant, Signal, outputs_at
 from malta.synthesis.controller import (
     Commutation,
     Controller,

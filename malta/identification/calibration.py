@@ -16,9 +16,10 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.model.equilibrium import trim
-from malta.model.plant import FloatArray, Plant, outputs_at
+from malta.model.plant import Plant, outputs_at
 
 if TYPE_CHECKING:
     from malta.identification.log import Log

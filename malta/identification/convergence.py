@@ -34,11 +34,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, signal
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError
 from malta.identification.strokes import FORCE
 from malta.loops.loop import loop
 from malta.model.data import plant_of
-from malta.model.plant import ComplexArray, FloatArray
 from malta.proof.blocks.gain import Gain, worst_case_gain
 from malta.proof.box import INTERVALS, Interval, box_of
 from malta.proof.groups import loop_of

@@ -17,13 +17,13 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.files import read_file
 from malta.firmware.flight import compile_controller, new_state
 from malta.firmware.signals import Target
 from malta.firmware.sources import CAUSES, HEAD, LARGEST, LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
-from malta.model.plant import FloatArray
 from malta.synthesis.controller import Controller
 
 WORDS = ("machine", "controller", "gains", "sample_time", "precision", "fidelity")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.identification.response import (
@@ -21,7 +22,7 @@ from malta.identification.response import (
     well_found,
 )
 from malta.model.equilibrium import trim
-from malta.model.plant import ComplexArray, FloatArray, outputs_at
+from malta.model.plant import outputs_at
 from malta.simulation.inputs import Multisine, interleaved_multisine
 
 if TYPE_CHECKING:

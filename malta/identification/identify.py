@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import gammainccinv, gammaincinv
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.identification.log import Log, require_currents
@@ -52,7 +53,7 @@ from malta.identification.spectra import (
     windowed_covariances,
 )
 from malta.model.data import plant_of
-from malta.model.plant import ComplexArray, FloatArray, Plant
+from malta.model.plant import Plant
 from malta.synthesis.controller import Controller
 
 IntArray = NDArray[np.integer[Any]]

@@ -12,12 +12,13 @@ import casadi as ca
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
+from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.identification.log import Log, reference_spline, require_currents, require_same_law
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation.engine.engines import evaluate
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import V0_STEPS

@@ -10,9 +10,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray, readonly
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
-from malta.model.plant import FloatArray, Plant, Signal, readonly
+from malta.model.plant import Plant, Signal
 from malta.simulation.current_control import reading_errors
 from malta.simulation.inputs import Multisine
 from malta.simulation.layout import Loop

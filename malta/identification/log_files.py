@@ -17,12 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.files import packaged, read_file, replace_files, require_suffix
 from malta.gains.encodings import read_mat
 from malta.identification.dump import decode_dump
 from malta.identification.log import GROUPS, Log
-from malta.model.plant import FloatArray, Signal
+from malta.model.plant import Signal
 from malta.simulation.engine.compiled import address_of, library
 from malta.simulation.engine.engines import SAMPLE_LOOP_FLAGS
 from malta.tables import read_npz

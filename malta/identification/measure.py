@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import norm
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.display import Curves, Description, display
 from malta.errors import InputError
 from malta.identification.excite import LONGEST, ExcitationPlan, excite
@@ -29,7 +30,6 @@ from malta.loops.loop import Loop, loop
 from malta.margins.loop_report import zone
 from malta.model.data import plant_of
 from malta.model.parameters import box_words, units_of
-from malta.model.plant import ComplexArray, FloatArray
 from malta.synthesis.controller import Controller
 
 SAME_LAW = 0.02  # of a command at the lines, by which the law of the gain file may miss it

@@ -24,10 +24,11 @@ from scipy.linalg import expm
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError
 from malta.identification.response import ResponseModel, axes_of, current_rate
 from malta.model.parameters import symbolic_names, twins_of
-from malta.model.plant import ComplexArray, FloatArray, Plant, symbolic
+from malta.model.plant import Plant, symbolic
 from malta.simulation.engine.engines import Loop, loop_of
 from malta.simulation.period import runge_kutta
 from malta.synthesis.riccati import dare

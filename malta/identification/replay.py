@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.identification.log import Log, in_order, reference_spline, require_same_law, sample_excitation
@@ -17,7 +18,7 @@ from malta.identification.response import acting
 from malta.identification.spectra import FARTHEST, sentence_of
 from malta.model.data import plant_of
 from malta.model.parameters import twins_of
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation.engine.engines import Loop, loop_of
 from malta.simulation.inputs import Inputs, initial_values, sample_inputs
 from malta.simulation.layout import layout_of

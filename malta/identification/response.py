@@ -18,10 +18,11 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names, twins_of
-from malta.model.plant import ComplexArray, FloatArray, Plant, symbolic
+from malta.model.plant import Plant, symbolic
 from malta.model.signals import with_lags
 from malta.simulation.engine.engines import evaluate
 

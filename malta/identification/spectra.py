@@ -27,8 +27,9 @@ from malta.identification.response import STEP, ResponseModel, acting
 from malta.model.parameters import twins_of
 
 if TYPE_CHECKING:
+    from malta.arrays import ComplexArray, FloatArray
     from malta.loops.loop import Loop
-    from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.model.plant import Plant
 
     IntArray = NDArray[np.integer[Any]]
 

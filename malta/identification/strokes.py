@@ -27,6 +27,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from scipy.optimize import isotonic_regression
 from scipy.signal import fftconvolve
 
+from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.identification.learn import learn
@@ -35,7 +36,7 @@ from malta.identification.measure import cut_loop
 from malta.identification.replay import reference_motion
 from malta.loops.loop import Loop, loop
 from malta.model.data import plant_of
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory, stroke_figures

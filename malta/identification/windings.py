@@ -20,6 +20,7 @@ import numpy as np
 from scipy.optimize import brentq, least_squares
 from scipy.special import gammainccinv
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.identification.calibration import Estimate
@@ -37,7 +38,7 @@ from malta.identification.spectra import (
     whole,
 )
 from malta.model.data import plant_of
-from malta.model.plant import ComplexArray, FloatArray, Plant, placed
+from malta.model.plant import Plant, placed
 from malta.simulation.current_control import open_loop_gain
 from malta.simulation.engine.engines import evaluate
 from malta.synthesis.controller import Controller

@@ -9,8 +9,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.display import display
-from malta.model.plant import ComplexArray, FloatArray
 from malta.proof.uncertain import Compensator, UncertainSystem, find_peaks, instability, responses
 
 ROUNDS = 60  # of the balance of a matrix at most

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.display import Curves, Description, display
 from malta.errors import CheckError, require_known
 from malta.loops.classical import (
@@ -32,7 +33,7 @@ from malta.loops.classical import (
     margins_of_channel,
 )
 from malta.loops.linear_loops import LinearLoop, Place, linear_loop
-from malta.model.plant import ComplexArray, FloatArray, Signal
+from malta.model.plant import Signal
 from malta.processes import on_one_thread
 from malta.synthesis.state_space import System, balanced_units
 

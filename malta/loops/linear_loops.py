@@ -20,10 +20,11 @@ from typing import Any, Literal
 import numpy as np
 from scipy import linalg
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.loops.loop import Loop, loop_along, loop_from
-from malta.model.plant import ComplexArray, FloatArray, Plant, Signal
+from malta.model.plant import Plant, Signal
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, LinearLaw, linear_law
 from malta.synthesis.riccati import eigenvalues

@@ -9,6 +9,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
 from malta.loops.classical import Classical, Nominal, classical_margins
@@ -26,7 +27,7 @@ from malta.loops.sampled_loops import (
 from malta.model.equilibrium import with_parameters
 from malta.model.linearize import LinearModel
 from malta.model.parameters import units_of
-from malta.model.plant import ComplexArray, FloatArray, Plant, position_at
+from malta.model.plant import Plant, position_at
 from malta.processes import on_one_thread
 from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.robust import robust_margin

@@ -21,12 +21,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError, require_known
 from malta.loops.linear_loops import LinearLoop
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.loops.sampled_loops import SampledLoop
-from malta.model.plant import FloatArray, Plant, position_in
+from malta.model.plant import Plant, position_in
 from malta.processes import on_one_thread
 from malta.proof.uncertain import find_peaks
 from malta.synthesis.controller import Controller

@@ -25,9 +25,10 @@ from malta.proof.windings import CurrentLoops, left_out
 from malta.synthesis.requirements import Figure, Noise, Verdict, judge_figure, ratio_of
 
 if TYPE_CHECKING:
+    from malta.arrays import ComplexArray
     from malta.loops.classical import Classical, Disk
     from malta.model.linearize import LinearModel
-    from malta.model.plant import ComplexArray, Plant
+    from malta.model.plant import Plant
     from malta.proof.blocks.gain import Gain
     from malta.synthesis.controller import Controller
 

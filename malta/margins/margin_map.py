@@ -18,11 +18,12 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError, require_known
 from malta.loops.sampled_loops import continuous_poles
 from malta.margins.travel import extent_of, travel_loops, travel_margin
 from malta.model.parameters import units_of
-from malta.model.plant import ComplexArray, FloatArray, Plant
+from malta.model.plant import Plant
 from malta.processes import on_one_thread
 from malta.proof.margin import Margin
 from malta.proof.uncertain import Compensator, UncertainSystem, closed_loop, instability

@@ -32,10 +32,11 @@ import numpy as np
 from flint import acb, arb, arb_mat
 from scipy import linalg
 
+from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import si, units_of
-from malta.model.plant import FloatArray, Plant, readonly, whole_samples
+from malta.model.plant import Plant, whole_samples
 from malta.processes import on_one_thread
 from malta.proof.expressions import BALLS, NotAnalytic, Program, program
 from malta.proof.parametric_plants import of_plant

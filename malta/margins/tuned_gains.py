@@ -18,10 +18,11 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.loops.sampled_loops import LAST
 from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.processes import on_one_thread
 from malta.proof.box import box_of
 from malta.proof.groups import groups, loop_of

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.loops.classical import Classical, classical_margins, nominal_loop, peak_sensitivity, worst_of
 from malta.loops.loop import loop_of_model
@@ -41,7 +42,7 @@ from malta.margins.travel import (
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.model.parameters import units_of
-from malta.model.plant import ComplexArray, FloatArray, Plant, position_at
+from malta.model.plant import Plant, position_at
 from malta.processes import on_one_thread
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.parametric_plants import of_plant

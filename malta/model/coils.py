@@ -21,9 +21,9 @@ from numpy.typing import ArrayLike
 from scipy.linalg import null_space
 from scipy.optimize import linprog, nnls
 
+from malta.arrays import FloatArray, readonly
 from malta.display import display
 from malta.errors import CheckError, InputError
-from malta.model.plant import FloatArray, readonly
 
 CALLER = "allocation"
 WORST = 1e8  # condition of T that is taken for full rank, its rows scaled

@@ -27,8 +27,8 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError
-from malta.model.signals import FloatArray
 
 T = TypeVar("T")
 

@@ -25,11 +25,11 @@ from weakref import WeakKeyDictionary
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError
 from malta.model.checks import check_equations, check_signals, check_symbols
 from malta.model.parameters import acting_names
 from malta.model.plant import OperatingPoint, Plant
-from malta.model.signals import FloatArray
 
 Equations = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 

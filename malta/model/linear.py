@@ -30,11 +30,12 @@ import casadi as ca
 import numpy as np
 from scipy import linalg
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.machines import machine_names
 from malta.model.parameters import check_parameters, si, symbolic_names
-from malta.model.plant import Actuator, FloatArray, Parameters, Plant, Signal
+from malta.model.plant import Actuator, Parameters, Plant, Signal
 
 LONGEST = 4000  # characters of a formula
 FUNCTIONS = {

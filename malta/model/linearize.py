@@ -17,10 +17,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError
 from malta.model.equilibrium import chain, commanded, trace
 from malta.model.plant import OperatingPoint, Plant
-from malta.model.signals import FloatArray, InverseCheck, Mismatch, readonly
+from malta.model.signals import InverseCheck, Mismatch
 
 ROUNDING = 1e-14  # of a slope, beside the others of its row and column
 

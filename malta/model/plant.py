@@ -17,20 +17,18 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from malta.arrays import FloatArray, readonly
 from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.model.equations import Body
 from malta.model.parameters import Parameters as Parameters
 from malta.model.signals import (
     CasadiFn,
-    ComplexArray as ComplexArray,
     Drive,
     Electronics,
-    FloatArray as FloatArray,
     InverseCheck,
     LateSensors,
     Signal as Signal,
-    readonly as readonly,
     require_short,
     split_dead_time,
 )

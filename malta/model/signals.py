@@ -1,6 +1,6 @@
 """Signals of a machine and the sensors that read them: records that stand below a plant.
 
-Arrays of values, and whether commanded ones are those that currents make. This module imports none of a model's.
+Among them whether commanded values are those that currents make. This module imports none of a model's.
 
 Sensors that read late have a first-order lag of each output, and a dead time of all of them:
 
@@ -17,13 +17,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import casadi as ca
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from malta.errors import InputError
 
-FloatArray = NDArray[np.floating[Any]]
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
 CasadiFn = Callable[..., Any]  # takes and returns casadi SX, MX or DM
 EXACT = 1e-9  # of the limit of a command
 SHOWN = 7  # states
@@ -42,15 +38,6 @@ class Signal(NamedTuple):
 
     name: str
     unit: str
-
-
-def readonly(array: ArrayLike) -> FloatArray:
-    """A read-only copy as floats; a read-only array of floats is returned unchanged."""
-    if isinstance(array, np.ndarray) and array.dtype == float and not array.flags.writeable:
-        return array
-    copy = np.array(array, dtype=float)
-    copy.flags.writeable = False
-    return copy
 
 
 class Mismatch(NamedTuple):

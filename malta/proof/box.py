@@ -16,8 +16,8 @@ import casadi as ca
 import numpy as np
 from flint import arb
 
+from malta.arrays import FloatArray
 from malta.errors import InputError, require_known
-from malta.model.plant import FloatArray
 from malta.proof.expressions import KNOWN, POINTS, Arithmetic, NotAnalytic, Program, exact, program
 from malta.proof.uncertain import LARGEST, by_name, describe, is_number, is_pair
 

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import readonly
 from malta.errors import InputError, require_known
-from malta.model.plant import readonly
 from malta.proof.box import box_of
 from malta.proof.systems import compensator_of
 from malta.proof.uncertain import Compensator, UncertainSystem, describe, plural

@@ -16,8 +16,8 @@ import numpy as np
 from flint import arb, arb_mat
 from scipy import linalg, sparse
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.model.plant import FloatArray
 from malta.proof.expressions import NotAnalytic, Program, exact, program
 from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge, symbolic
 from malta.proof.uncertain import Compensator, Group, UncertainSystem, plural

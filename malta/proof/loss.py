@@ -18,7 +18,7 @@ from malta.proof.uncertain import Compensator, UncertainSystem, critical_frequen
 from malta.proof.work import is_past
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
     from malta.proof.box import Box
     from malta.proof.exclusion import Part
     from malta.proof.problem import Problem

@@ -12,7 +12,7 @@ from malta.display import Description, display, quantity
 from malta.proof.work import MORE
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
     from malta.proof.multipliers.structured import Proof
 
 Ranges = Mapping[str, "float | tuple[float, float] | list[float]"]

@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray, readonly
 from malta.errors import InputError, require_known
 from malta.model.equilibrium import commanded
 from malta.model.parameters import shape_parameters, units_of
-from malta.model.plant import FloatArray, Plant, position_in, readonly
+from malta.model.plant import Plant, position_in
 from malta.model.signals import LateSensors, with_lags
 from malta.proof.box import without_branches
 from malta.proof.expressions import NotAnalytic, program

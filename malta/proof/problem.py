@@ -31,7 +31,7 @@ from malta.proof.uncertain import (
 from malta.proof.work import WorkUp
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
     from malta.proof.box import Box
     from malta.proof.exclusion import Part
 

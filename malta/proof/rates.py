@@ -26,10 +26,10 @@ import numpy as np
 from flint import arb, arb_mat
 from scipy import linalg
 
+from malta.arrays import FloatArray
 from malta.bound import at_least
 from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
-from malta.model.plant import FloatArray
 from malta.processes import on_one_thread
 from malta.proof.expressions import NotAnalytic
 from malta.proof.polynomial.enclosure import precision

@@ -26,7 +26,7 @@ from malta.proof.problem import Problem, is_nominal_stable
 from malta.proof.work import WorkUp, is_past, is_stopped, refuse, spent, work_limit
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
     from malta.proof.loss import Loss
     from malta.proof.polynomial.enclosure import Polynomial
 

@@ -16,8 +16,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import readonly
 from malta.errors import InputError, require_known
-from malta.model.plant import Plant, readonly
+from malta.model.plant import Plant
 from malta.proof.uncertain import (
     Compensator,
     UncertainSystem,

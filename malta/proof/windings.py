@@ -22,11 +22,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError
 from malta.model.data import plant_of
 from malta.model.equilibrium import trace
 from malta.model.linearize import linearize
-from malta.model.plant import FloatArray, OperatingPoint, Plant, outputs_at, readonly
+from malta.model.plant import OperatingPoint, Plant, outputs_at
 from malta.proof.uncertain import Compensator, is_commutated
 from malta.synthesis.riccati import delay_inputs, sample
 

@@ -10,9 +10,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.model.data import plant_of
 from malta.model.equations import note
-from malta.model.plant import Actuator, FloatArray, placed
+from malta.model.plant import Actuator, placed
 from malta.model.signals import Drive
 from malta.simulation.layout import Loop, Setup, Signals
 from malta.synthesis.controller import Add

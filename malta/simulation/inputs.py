@@ -16,9 +16,10 @@ import casadi as ca
 import numpy as np
 from scipy.special import erf
 
+from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
 from malta.model.data import plant_of
-from malta.model.plant import FloatArray, Plant, off_stroke, outputs_at, placed, position_in, readonly
+from malta.model.plant import Plant, off_stroke, outputs_at, placed, position_in
 from malta.simulation import references
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.layout import electronics_of, layout_of, noise_scales

@@ -17,8 +17,9 @@ from typing import Any, Literal, NamedTuple, get_args
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.model.parameters import acting_names, twins_of
-from malta.model.plant import FloatArray, Plant, symbolic
+from malta.model.plant import Plant, symbolic
 from malta.model.signals import Electronics
 from malta.synthesis.controller import Controller, CurrentLoop, gains_of
 from malta.synthesis.schedule import SCHEDULED

@@ -20,7 +20,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from malta.model.plant import FloatArray, Plant
+from malta.arrays import FloatArray
+from malta.model.plant import Plant
 from malta.simulation.layout import Loop, Setup
 
 TINY = 1e-6  # share of a step that rounding may take from the clock

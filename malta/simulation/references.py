@@ -12,9 +12,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.model.machines import attribute_of
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 
 Profile = Literal["logistic", "quintic"]
 """The courses of a stroke: "logistic" or "quintic".

@@ -10,10 +10,11 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.display import display
 from malta.errors import InputError
 from malta.model.parameters import replace_fields, units_of
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.model.signals import require_short, split_dead_time
 from malta.simulation import references
 from malta.simulation.layout import FIDELITIES, Fidelity, Setup, electronics_of, fidelities

@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray, readonly
 from malta.display import Curves, Description, display, quantity
 from malta.files import replace_files
 from malta.merits import Merit, reported, reported_merits
 from malta.model.machines import FINE
-from malta.model.plant import FloatArray, Plant, Signal, readonly
+from malta.model.plant import Plant, Signal
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.inputs import Inputs
 from malta.simulation.layout import columns_of_row, electronics_of

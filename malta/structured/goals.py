@@ -17,9 +17,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.display import display
 from malta.errors import InputError
-from malta.model.plant import FloatArray
 from malta.structured.loops import Channels, ClosedLoop, Pole, gain_slope, noise, peaks_of, response_at
 from malta.synthesis.elements import CALLER
 from malta.synthesis.state_space import System

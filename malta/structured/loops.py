@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
-from malta.model.plant import ComplexArray, FloatArray
 from malta.synthesis.elements import CALLER
 from malta.synthesis.state_space import System
 from malta.synthesis.structure import OF_INPUTS, OF_OUTPUTS

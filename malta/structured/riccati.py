@@ -27,9 +27,9 @@ import numpy as np
 from scipy import linalg
 from scipy.linalg import matrix_balance
 
+from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.model.plant import FloatArray
 from malta.processes import on_one_thread
 from malta.structured.loops import peak_gain
 from malta.synthesis.elements import CALLER

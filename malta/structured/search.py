@@ -23,8 +23,8 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
-from malta.model.plant import FloatArray
 from malta.structured.goals import Figure, Goal, stability
 from malta.structured.loops import ClosedLoop, Model
 from malta.synthesis.elements import CALLER

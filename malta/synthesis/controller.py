@@ -53,10 +53,11 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray, readonly
 from malta.display import display
 from malta.errors import InputError
 from malta.model.equations import note
-from malta.model.plant import FloatArray, Parameters, Plant, Signal, outputs_at, readonly
+from malta.model.plant import Parameters, Plant, Signal, outputs_at
 from malta.synthesis.schedule import SCHEDULED, Schedule, interpolate
 
 if TYPE_CHECKING:

@@ -21,11 +21,12 @@ from typing import Any
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors, require_known
 from malta.files import locate
 from malta.model.data import plant_of, published, read
 from malta.model.parameters import units_of
-from malta.model.plant import FloatArray, Parameters, Plant, Signal
+from malta.model.plant import Parameters, Plant, Signal
 from malta.synthesis.design_tables import (
     BasesTable,
     DesignFile,

@@ -12,8 +12,8 @@ import casadi as ca
 import numpy as np
 from scipy import linalg
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.model.plant import FloatArray
 from malta.synthesis.state_space import System
 
 CALLER = "structured"

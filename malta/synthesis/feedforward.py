@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.model.equilibrium import holding_commands, load_balance
 from malta.model.linearize import LinearModel
-from malta.model.plant import Actuator, FloatArray, Plant, off_stroke
+from malta.model.plant import Actuator, Plant, off_stroke
 from malta.synthesis.controller import Commutation, Controller, CurrentLoop, Feedforward, Limits
 from malta.synthesis.filters import between_samples
 from malta.synthesis.riccati import sample

@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import ComplexArray, FloatArray
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import Noisy, covariance, filter_gain, intensities, kalman, sampled_noise

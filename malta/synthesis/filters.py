@@ -18,8 +18,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy import linalg
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.model.plant import FloatArray
 from malta.processes import on_one_thread
 from malta.synthesis.riccati import Solver, add_lags, care, dare, delay_inputs, sample, sample_noise
 from malta.synthesis.spec import Coordinates, Weights

@@ -31,9 +31,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.model.linearize import LinearModel
-from malta.model.plant import ComplexArray, FloatArray
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, Cost, Noise, disturbances, lagging_forces, stored_forces
 from malta.synthesis.feedforward import machine_part

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.model.linearize import LinearModel
-from malta.model.plant import FloatArray
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import machine_part

@@ -26,8 +26,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, StrictStr
 
+from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError, require_known
-from malta.model.plant import FloatArray, Plant, Signal, readonly
+from malta.model.plant import Plant, Signal
 from malta.tables import Quantity, Record, entry
 from malta.units import is_unit_of, to_si, units_like
 

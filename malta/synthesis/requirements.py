@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 import numpy as np
 from scipy import special
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.model.machines import attribute_of
-from malta.model.plant import ComplexArray, FloatArray, Parameters, Plant, Signal
+from malta.model.plant import Parameters, Plant, Signal
 from malta.synthesis.spec import Law as Law, Spec
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from scipy import linalg, sparse
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
+    from malta.arrays import ComplexArray, FloatArray
 
 Solver = Literal[
     "python-control", "scipy"

@@ -17,10 +17,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray, readonly
 from malta.display import display
 from malta.errors import InputError
 from malta.model.equations import note
-from malta.model.plant import FloatArray, OperatingPoint, Plant, outputs_at, readonly
+from malta.model.plant import OperatingPoint, Plant, outputs_at
 
 SCHEDULED = ("Ad", "Bd", "Cd", "K", "Ki", "L")
 

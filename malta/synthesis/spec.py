@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from malta.arrays import FloatArray, readonly
 from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
 from malta.model.data import plant_of
 from malta.model.parameters import box_words, fingerprint, replace_fields
-from malta.model.plant import FloatArray, Parameters, Plant, Signal, readonly
+from malta.model.plant import Parameters, Plant, Signal
 from malta.units import to_si
 
 if TYPE_CHECKING:

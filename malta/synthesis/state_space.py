@@ -19,10 +19,11 @@ import numpy as np
 from scipy import linalg, sparse
 from scipy.linalg import matrix_balance
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import ComplexArray, FloatArray, OperatingPoint, Plant, Signal, outputs_at
+from malta.model.plant import OperatingPoint, Plant, Signal, outputs_at
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, linear_law
 from malta.synthesis.feedforward import machine_part

@@ -41,9 +41,10 @@ import casadi as ca
 import numpy as np
 from scipy import linalg
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.model.linearize import LinearModel
-from malta.model.plant import FloatArray, Plant, Signal
+from malta.model.plant import Plant, Signal
 from malta.synthesis import elements
 from malta.synthesis.controller import Controller
 from malta.synthesis.design_tables import ElementTable, GoalTable, StructureTable

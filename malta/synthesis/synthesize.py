@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import FloatArray, outputs_at
+from malta.model.plant import outputs_at
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import commutate_ahead

@@ -23,9 +23,9 @@ import casadi as ca
 import numpy as np
 from scipy import linalg
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors
 from malta.model.linearize import LinearModel
-from malta.model.plant import FloatArray
 from malta.processes import on_one_thread
 from malta.synthesis.elements import CALLER, Bounds, Element, Matrices, keep_sign
 from malta.synthesis.filters import Lagged

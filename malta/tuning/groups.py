@@ -22,12 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.loops.sampled_loops import disturbance_map, push_through
 from malta.loops.time_domain import covariance, noise_variance
 from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import ComplexArray, FloatArray, Plant, position_in
+from malta.model.plant import Plant, position_in
 from malta.proof.parametric_plants import of_plant
 from malta.proof.uncertain import crossing_frequency
 from malta.proof.windings import (

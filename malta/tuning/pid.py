@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize, sparse
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.loops.loop import loop_of_model
 from malta.loops.sampled_loops import SampledLoop
@@ -32,7 +33,7 @@ from malta.loops.time_domain import covariance
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import FloatArray, position_at, position_in
+from malta.model.plant import position_at, position_in
 from malta.proof.uncertain import crossing_frequency
 from malta.proof.windings import emf_slope, estimated_rows, windings_of, with_estimated_emf
 from malta.synthesis.controller import Controller, linear_law_of, with_readings

@@ -19,10 +19,11 @@ import numpy as np
 from pydantic import StrictFloat, StrictStr, TypeAdapter
 from scipy import optimize, sparse
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.files import file_exists, read_file, replace_files
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.synthesis.controller import Controller
 from malta.synthesis.requirements import requirements_for
 from malta.synthesis.spec import Spec

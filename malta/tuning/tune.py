@@ -26,12 +26,13 @@ import tomlkit
 from scipy import optimize
 from tomlkit.items import Item
 
+from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.margins.loop_report import Outcome
 from malta.margins.travel import travel_margin
 from malta.model.parameters import describe
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.synthesis.requirements import Trade, ratio_of, requirements_for
 from malta.synthesis.spec import Spec, Weights
 from malta.tuning import groups, pid

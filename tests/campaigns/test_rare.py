@@ -39,8 +39,8 @@ from malta.simulation.readings import keys
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from malta.arrays import FloatArray
     from malta.campaigns.rare import Severity
-    from malta.model.plant import FloatArray
     from malta.simulation.engine.digest import Batch
 
 BOX = ("m", "K_A", "K_B", "K_D")

@@ -19,7 +19,8 @@ from malta.loops.loop import Loop
 from malta.synthesis.feedforward import static_feedforward
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
 
 CONTROLLER = malta.gains.read("design/gains/robust.json")
 

@@ -24,7 +24,8 @@ from malta.model.parameters import twins_of
 from malta.proof.uncertain import closed_loop, instability
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, Plant
+    from malta.arrays import ComplexArray
+    from malta.model.plant import Plant
     from malta.synthesis.controller import Controller
 
 TUBULAR = ("table2", "calibrated", "robust", "robust_observer", "tubular_pid")

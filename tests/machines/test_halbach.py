@@ -23,7 +23,7 @@ from malta.model.parameters import values_of
 from malta.synthesis.filters import sampled_model
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 GAINS = Path("design/gains/halbach.json")
 F_Z = 5.0  # N, of all figures of the paper's Section 5

@@ -47,7 +47,7 @@ from malta.synthesis.filters import sampled_model
 from malta.synthesis.riccati import sample_noise
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
     from malta.simulation.experiments import Experiment
 
 pytestmark = pytest.mark.usefixtures("proven_once")

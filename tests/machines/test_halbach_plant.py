@@ -20,7 +20,7 @@ from malta.model.plant import Plant, symbolic
 from malta.model.signals import Electronics
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 State = dict[str, Any]
 PLACE = st.floats(-50e-3, 50e-3)

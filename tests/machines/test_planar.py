@@ -28,7 +28,7 @@ from malta.simulation.engine.engines import translate
 from malta.simulation.references import QUINTIC_DURATION, quintic
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 FILE = Path("data/planar.toml")
 START = (6e-3, 4e-3)  # m, where nothing is symmetric

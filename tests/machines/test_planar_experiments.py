@@ -35,7 +35,8 @@ from malta.synthesis.controller import law, linear_law
 from malta.synthesis.synthesize import braking_errors
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 

@@ -20,7 +20,7 @@ from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant, symbolic
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 FILE = Path("data/planar.toml")
 AT = np.array([6e-3, 4e-3, 0.3e-3, *np.zeros(9)])  # level, where nothing is symmetric

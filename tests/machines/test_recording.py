@@ -32,7 +32,8 @@ from malta.synthesis.feedforward import static_feedforward
 if TYPE_CHECKING:
     from conftest import Run
 
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
     from malta.synthesis.controller import Controller
 
 ROBUST = "design/gains/robust.json"

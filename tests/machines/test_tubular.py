@@ -21,7 +21,8 @@ from malta.model.equations import cardan_rates, rotation
 from malta.model.parameters import differences
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
 
 Rate = Callable[[Any, Any, Any], "FloatArray"]
 

@@ -34,7 +34,7 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 GAINS = Path("design/gains/calibrated.json")
 NAMES = ("dK_A", "dK_B", "kappa", "e_x", "e_y", "c_x", "c_y")  # of modules and mover

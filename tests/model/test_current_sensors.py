@@ -18,7 +18,7 @@ from malta.simulation.scenario import Scenario, setup_of
 from malta.simulation.simulate import simulate
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
     from malta.simulation.trajectory import Trajectory
 
 ELECTRIC = ("dq", "phase")

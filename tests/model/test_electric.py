@@ -21,8 +21,9 @@ from malta.simulation import current_control
 from malta.synthesis.feedforward import pi_current_loop
 
 if TYPE_CHECKING:
+    from malta.arrays import FloatArray
     from malta.machines.tubular import plant as tubular
-    from malta.model.plant import FloatArray, Plant
+    from malta.model.plant import Plant
 
 ANGLE = st.floats(-20, 20)
 NINE = st.lists(st.floats(-10, 10), min_size=9, max_size=9)

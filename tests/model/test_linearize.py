@@ -15,8 +15,9 @@ from malta.machines.tubular import plant as tubular
 from malta.model.plant import OperatingPoint
 
 if TYPE_CHECKING:
+    from malta.arrays import FloatArray
     from malta.model.linearize import LinearModel
-    from malta.model.plant import FloatArray, Plant
+    from malta.model.plant import Plant
 
 STROKE = [-15e-3, -7.3e-3, 0.0, 5e-3, 15e-3]  # m
 Q = ("x", "y", "z", "alpha", "beta")

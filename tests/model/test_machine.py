@@ -26,7 +26,8 @@ from malta.simulation.scenario import Correction, Fault, Scenario, Simulation, s
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
     from malta.synthesis.controller import Controller
 
 Ts = 50e-6  # s, of every design here

@@ -22,7 +22,8 @@ from malta.simulation.experiments.catalogue import held_payload
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

@@ -24,7 +24,7 @@ from malta.model.equations import (
 )
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 ANGLES = st.lists(st.floats(-10, 10), min_size=3, max_size=3)
 TILTS = st.tuples(st.floats(-10, 10), st.floats(-1.4, 1.4), st.floats(-10, 10))  # beta short of +-90 degrees

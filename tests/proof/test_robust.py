@@ -28,7 +28,8 @@ from malta.proof.uncertain import Compensator, UncertainSystem, critical_frequen
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
     from malta.proof.margin import Certificate, Margin
     from malta.synthesis.controller import Controller
 

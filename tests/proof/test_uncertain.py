@@ -18,7 +18,8 @@ from malta.proof.uncertain import closed_loop, critical_frequency, instability, 
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
 
 NAMES = ("m", "K_A", "K_D", "K_B", "l_B", "l_S", "I_xx")
 

@@ -33,7 +33,7 @@ from malta.simulation.trajectory import SERIES
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 STATES, GIVEN, THETA = 3, 3, 2  # of the engine that expressions are tried in
 SIXTYFOURTHS = st.integers(-512, 512).map(

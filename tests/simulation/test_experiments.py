@@ -37,8 +37,9 @@ from malta.synthesis.lqg import lqr
 if TYPE_CHECKING:
     from conftest import Design
 
+    from malta.arrays import FloatArray
     from malta.model.linearize import LinearModel
-    from malta.model.plant import FloatArray, Plant
+    from malta.model.plant import Plant
 
 Flown = Callable[..., Experiment]
 QUIET: dict[str, Any] = {"noise": 0.0, "quantize": False, "sensor_errors": None}

@@ -31,7 +31,8 @@ from malta.synthesis.feedforward import static_feedforward
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
 
 DISTANCE = 10e-3  # m
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import malta
+from malta.arrays import FloatArray
 from malta.machines.halbach import electronics
-from malta.model.plant import FloatArray
 from malta.simulation.current_control import duty_cycles
 from malta.simulation.period import limited_currents
 from malta.synthesis.controller import commanded, gains_of

@@ -26,7 +26,7 @@ from malta.simulation.trajectory import Trajectory, stroke_figures
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 FIGURES = tuple(Batch.__dataclass_fields__)
 

@@ -13,7 +13,7 @@ from scipy import stats
 from malta.simulation.readings import GAMMA, keys, normals
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 SEED = st.integers(0, 2**64)
 RUNS = 64

@@ -18,7 +18,8 @@ from malta.simulation.experiments.catalogue import settling
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
     from malta.simulation.engine.digest import Batch
     from malta.synthesis.controller import Controller
 

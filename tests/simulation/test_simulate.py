@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
     from conftest import Design
 
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
 
 SP1 = {"x1": 1e-6, "y1": -0.7e-6, "x2": 0.4e-6, "y2": 0.9e-6}
 

@@ -34,7 +34,8 @@ from malta.simulation.scenario import Scenario, setup_of
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
 
 needs_compiler = pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler")
 SPIN = 11  # the state gamma'

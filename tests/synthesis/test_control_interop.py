@@ -25,9 +25,10 @@ from malta.simulation.experiments.catalogue import jump
 from malta.synthesis import filters, lqg, riccati
 
 if TYPE_CHECKING:
+    from malta.arrays import FloatArray
     from malta.loops.linear_loops import LoopSystems
     from malta.model.linearize import LinearModel
-    from malta.model.plant import FloatArray, Plant
+    from malta.model.plant import Plant
     from malta.synthesis.controller import Controller
 
 LQGS = ("calibrated", "halbach", "halbach_late", "planar", "robust", "table2")

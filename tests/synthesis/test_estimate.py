@@ -18,8 +18,8 @@ from malta.synthesis.riccati import dare
 if TYPE_CHECKING:
     from conftest import Design
 
+    from malta.arrays import FloatArray
     from malta.machines.tubular import plant as tubular
-    from malta.model.plant import FloatArray
     from malta.synthesis.controller import Controller
 
 Ts = 50e-6

@@ -22,7 +22,7 @@ from malta.simulation.references import Motion
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
     from malta.synthesis.controller import Controller
 
 # A law of errors stands in gain.md alone.

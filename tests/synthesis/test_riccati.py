@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
     from conftest import Design
 
+    from malta.arrays import FloatArray
     from malta.model.linearize import LinearModel
-    from malta.model.plant import FloatArray
 
 
 @given(

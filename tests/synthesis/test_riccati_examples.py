@@ -19,7 +19,7 @@ from scipy import linalg
 from malta.synthesis.riccati import Solution, care, dare
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 flint = pytest.importorskip("flint")
 

@@ -12,10 +12,11 @@ import casadi as ca
 import numpy as np
 from scipy.special import ndtr
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.machines.halbach.parameters import GAP, Parameters
 from malta.model.equations import note
-from malta.model.plant import FloatArray, Signal
+from malta.model.plant import Signal
 from malta.model.signals import Electronics
 from malta.simulation.period import runge_kutta
 

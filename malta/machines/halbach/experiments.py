@@ -22,11 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.machines.halbach import electronics
 from malta.machines.halbach.electronics import IDEAL, IQ_BITS, MEAN_OF, Options, Pwm
 from malta.machines.halbach.open_loop import F_MOST, force, identify, lift_deviation, stairs
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,

@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.machines.halbach import electronics, electronics as motor
 from malta.machines.halbach.electronics import IDEAL, Options, Pwm
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,

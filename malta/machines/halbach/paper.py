@@ -33,7 +33,8 @@ from malta.synthesis.filters import sampled_model
 from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
 
 DEAD_FORCE = 14.45  # N, between the largest with fine steps everywhere, 14.42 N, and the supply's 14.46 N
 EXPERIMENT_NAMES = ("step", "stairs", "ramp", "force", "budget", "identify")

@@ -16,6 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError
 from malta.machines.planar.field import (
     CoilModel,
@@ -29,7 +30,6 @@ from malta.machines.planar.field import (
 )
 from malta.machines.planar.parameters import Parameters
 from malta.model.equations import Equation, note, recorded_equations, recording, rotation
-from malta.model.plant import FloatArray, readonly
 
 STEPS = (-1.5, -0.5, 0.5, 1.5)  # coil pitches from the mover's centre, along x and y
 WORST = 10.0  # largest accepted condition of K(p): 2.4 with a pitch of 16/3 tau_n, 20 and more with a bad one

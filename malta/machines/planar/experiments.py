@@ -23,6 +23,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.machines.planar import commutation, field, plant as planar
 from malta.machines.planar.motions import (
@@ -36,7 +37,7 @@ from malta.machines.planar.motions import (
     step_cases,
     with_coil_model,
 )
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.engine import compiled as engine
 from malta.simulation.experiments import Experiment, Merit, PlannedRun, Progress, fly, fly_all, scenario_of

@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
 from malta.machines.planar.parameters import COIL_ORDER, Parameters
 from malta.model.equations import look_up, note
-from malta.model.plant import FloatArray, readonly
 
 ORDER = 60  # of the field: the last harmonic has decayed to 2e-5 at z = 1 mm
 # Harmonic orders in x and y are `sin` (1) or `cos` (0) in the coil's position: mirroring the coil at x = 0 turns the

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
     from malta.simulation.experiments import Experiment
 
 

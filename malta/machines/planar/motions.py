@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.machines.planar import commutation, plant as planar
 from malta.machines.planar.parameters import COIL_ORDER
 from malta.model.linearize import linearize
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,

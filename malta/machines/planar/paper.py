@@ -22,7 +22,7 @@ from malta.synthesis.controller import Controller
 from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 EXPERIMENT_NAMES = ("step", "jump", "errors", "timing", "delay")
 SLOWER = 49.6  # 1/s, approach of Kp = 1.2 N/um with the Kd of planar_pid: how far torques depend on gains

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError
 from malta.identification.calibration import (
     Estimate,
@@ -31,7 +32,7 @@ from malta.identification.log import Log
 from malta.machines.tubular.drive import hall_signals
 from malta.machines.tubular.experiments.lifting import lift_cases, rest_on_bearing
 from malta.model.data import plant_of
-from malta.model.plant import FloatArray, Signal
+from malta.model.plant import Signal
 from malta.simulation import references
 from malta.simulation.scenario import Scenario
 from malta.synthesis.controller import Controller

@@ -28,7 +28,7 @@ from malta.errors import InputError
 from malta.proof.uncertain import Compensator, UncertainSystem, describe, is_number
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
+    from malta.arrays import ComplexArray, FloatArray
 
 
 # The size of unmodelled dynamics: a weight W(s), expanded on intervals of frequency.

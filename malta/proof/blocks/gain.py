@@ -16,10 +16,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from malta.arrays import ComplexArray, FloatArray
 from malta.bound import Bound, at_least, at_most
 from malta.display import Description, display, quantity
 from malta.errors import InputError
-from malta.model.plant import ComplexArray, FloatArray
 from malta.processes import on_one_thread
 from malta.proof.blocks import (
     At,

@@ -33,7 +33,7 @@ from malta.proof.polynomial.family import Family, align, combine
 from malta.proof.work import is_past
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
+    from malta.arrays import ComplexArray, FloatArray
     from malta.proof.problem import OfLoop
 
 

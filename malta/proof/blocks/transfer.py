@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from malta.model.plant import ComplexArray, FloatArray, readonly
+from malta.arrays import ComplexArray, FloatArray, readonly
 from malta.proof.blocks import Block
 from malta.proof.uncertain import Responses
 from malta.proof.work import is_past

@@ -40,7 +40,7 @@ from malta.proof.polynomial.family import Family, binary
 from malta.proof.systems import compensator_of
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
     from malta.proof.margin import Margin, Ranges
     from malta.proof.uncertain import Compensator, UncertainSystem
 

@@ -23,7 +23,7 @@ from malta.proof.multipliers import SMALL, SMALLEST, Branch
 from malta.proof.polynomial.enclosure import precision
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
+    from malta.arrays import ComplexArray, FloatArray
     from malta.proof.multipliers.pencil import Pencil
     from malta.proof.multipliers.structured import Cell, Proof, Shown
 

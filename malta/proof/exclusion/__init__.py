@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from malta.model.plant import ComplexArray, FloatArray
+from malta.arrays import ComplexArray, FloatArray
 from malta.proof.box import Box, smallest_t
 from malta.proof.polynomial.enclosure import Polynomial, TooWide, Unproven
 from malta.proof.polynomial.family import EPS, Family, restrict, restriction_rounding

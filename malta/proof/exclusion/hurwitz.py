@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from malta.model.plant import FloatArray
+from malta.arrays import FloatArray
 from malta.proof.box import Box
 from malta.proof.exclusion import cut
 from malta.proof.expressions import NotAnalytic, exact

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from malta.model.plant import ComplexArray, FloatArray
+from malta.arrays import ComplexArray, FloatArray
 from malta.proof.exclusion import Cell, Growth, cover
 from malta.proof.polynomial.family import Family, basis
 from malta.proof.work import is_past

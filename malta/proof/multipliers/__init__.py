@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
-from malta.model.plant import ComplexArray, FloatArray
+from malta.arrays import ComplexArray, FloatArray
 from malta.proof.multipliers.pencil import EPS, Expansion, Pencil
 from malta.proof.work import spend
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
-from malta.model.plant import FloatArray
+from malta.arrays import FloatArray
 from malta.proof.groups import C, UncertainLoop
 from malta.proof.polynomial.characteristic import clear_denominators
 from malta.proof.polynomial.rational import TooLarge

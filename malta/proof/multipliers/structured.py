@@ -25,7 +25,7 @@ from malta.proof.polynomial.rational import TooLarge
 from malta.proof.work import is_past, spend, spent
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
     from malta.proof.box import Box
     from malta.proof.problem import Problem
 

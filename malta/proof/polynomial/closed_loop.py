@@ -12,7 +12,7 @@ import numpy as np
 from flint import acb, acb_mat, arb
 from scipy import linalg, sparse
 
-from malta.model.plant import FloatArray
+from malta.arrays import FloatArray
 from malta.proof.expressions import BALLS, NotAnalytic, exact, finite
 from malta.proof.groups import (
     A,

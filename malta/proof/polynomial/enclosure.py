@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 
 from flint import acb, arb, ctx, fmpq
 
-from malta.model.plant import FloatArray
+from malta.arrays import FloatArray
 from malta.proof.expressions import NotAnalytic, exact
 from malta.proof.polynomial.characteristic import pair
 from malta.proof.polynomial.family import Family, family, nodes

@@ -18,7 +18,7 @@ import numpy as np
 from malta.proof.work import spend
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.arrays import FloatArray
 
 EPS = 2.0**-52
 WIDE = 8  # nodes of the following axes from which on values are multiplied in place

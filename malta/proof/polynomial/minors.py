@@ -18,7 +18,7 @@ import numpy as np
 from flint import arb, arb_mat, arb_poly, ctx, fmpq_mat, fmpq_poly
 from scipy import sparse
 
-from malta.model.plant import FloatArray
+from malta.arrays import FloatArray
 from malta.proof.expressions import NotAnalytic, Program, exact
 from malta.proof.groups import A, B, C, E, UncertainLoop, rational
 from malta.proof.polynomial.closed_loop import (

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 from flint import Ordering, acb, fmpq_mpoly_ctx
 
-from malta.model.plant import FloatArray
+from malta.arrays import FloatArray
 from malta.proof.box import resolve_branches
 from malta.proof.expressions import FIELD, NotAnalytic, Program, exact, program
 from malta.proof.work import check_clock

@@ -30,7 +30,7 @@ import numpy as np
 from flint import arb
 from scipy import linalg, sparse
 
-from malta.model.plant import FloatArray
+from malta.arrays import FloatArray
 from malta.proof.box import Box
 from malta.proof.exclusion import CellBounds, Part, growth_over, on_boxes
 from malta.proof.expressions import NotAnalytic

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from malta.model.plant import FloatArray
+from malta.arrays import FloatArray
 from malta.proof.expressions import exact
 from malta.proof.groups import rational
 from malta.proof.polynomial.characteristic import bilinear_table, map_bilinear

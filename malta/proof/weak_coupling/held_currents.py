@@ -19,7 +19,8 @@ import casadi as ca
 import numpy as np
 from flint import arb
 
-from malta.model.plant import FloatArray, Plant
+from malta.arrays import FloatArray
+from malta.model.plant import Plant
 from malta.proof.expressions import NotAnalytic, program
 from malta.proof.uncertain import model_of
 from malta.proof.weak_coupling import taylor

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from malta.model.plant import FloatArray
+from malta.arrays import FloatArray
 from malta.proof.expressions import NotAnalytic, Program
 from malta.proof.work import check_clock
 

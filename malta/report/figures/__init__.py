@@ -54,9 +54,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from malta.arrays import FloatArray
     from malta.identification.log import Log
     from malta.identification.measure import Curve, Measurement
-    from malta.model.plant import FloatArray
 
 
 def experiment_figure(

@@ -40,11 +40,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from malta.arrays import FloatArray
     from malta.campaigns.plan import Plan
     from malta.campaigns.result import Campaign
     from malta.campaigns.studies import Index, Sensitivity
     from malta.campaigns.summary import Distribution, Runs, Summary
-    from malta.model.plant import FloatArray
 
 SHOWN = 9  # parameters with a panel each, at most
 LEAST = 1e-3  # of a deviation on a logarithmic axis, in its fine unit

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.display import micro as micro, number as number
 from malta.errors import InputError
 from malta.files import PICTURES, replace_files, require_suffix
 from malta.merits import ROOTS
 from malta.model.data import published_value
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.requirements import Trade, requirements_for
 from malta.units import in_unit

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.sampled_loops import LAST
@@ -20,7 +21,7 @@ from malta.model.data import plant_of
 from malta.model.linear import is_linear
 from malta.model.machines import FINE
 from malta.model.parameters import units_of
-from malta.model.plant import FloatArray, Parameters, Plant, Signal
+from malta.model.plant import Parameters, Plant, Signal
 from malta.report.figures.drawing import micro, number
 from malta.simulation.experiments import Experiment, progress_of_part
 from malta.simulation.experiments.catalogue import experiment, main_job

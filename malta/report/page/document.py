@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.figure import Figure
 
+    from malta.arrays import FloatArray
     from malta.identification.commission import Commissioning, Entry
-    from malta.model.plant import FloatArray
 
 
 # A figure as SVG that stands inside a page: colours by CSS variables, so that a dark page has light lines.

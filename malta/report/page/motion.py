@@ -25,7 +25,8 @@ from malta.tables import read_npz
 if TYPE_CHECKING:
     from PIL import Image, ImageDraw, ImageFont
 
-    from malta.model.plant import FloatArray, Plant
+    from malta.arrays import FloatArray
+    from malta.model.plant import Plant
     from malta.report.page.document import Page
     from malta.simulation.trajectory import Trajectory
 

@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from malta.arrays import FloatArray
     from malta.loops.classical import ChannelMargins
     from malta.loops.linear_loops import Place
-    from malta.model.plant import FloatArray
 
 ALONE = "one loop at a time, the others closed"
 RANGE = (-100.0, 120.0)  # dB, of a loop gain that is drawn

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.transforms import Transform
 
+    from malta.arrays import ComplexArray, FloatArray
     from malta.loops.classical import ChannelMargins
     from malta.loops.linear_loops import Place
-    from malta.model.plant import ComplexArray, FloatArray
 
 LINE = 0.155  # inch, of text above a panel
 FOOT = 0.64  # inch, below a panel of frequency

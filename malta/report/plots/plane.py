@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from malta.arrays import ComplexArray
     from malta.loops.linear_loops import Place
-    from malta.model.plant import ComplexArray
 
 DAMPING = (0.2, 0.5, 0.8)  # rays of the grid
 MARKERS = ("x", "s", "D", "^", "v", "p", "h", "*")  # of the closed loops

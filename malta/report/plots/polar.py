@@ -36,11 +36,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from malta.arrays import ComplexArray, FloatArray
     from malta.campaigns.result import Campaign
     from malta.campaigns.summary import Summary
     from malta.loops.classical import ChannelMargins
     from malta.loops.linear_loops import Place
-    from malta.model.plant import ComplexArray, FloatArray
 
 
 WIDEST = 4.0  # how far left of the origin a Nyquist plot reaches at most

@@ -29,7 +29,8 @@ from malta.synthesis.requirements import Trade, requirements_for
 from malta.units import in_unit
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.arrays import ComplexArray, FloatArray
+    from malta.model.plant import Plant
     from malta.simulation.experiments import Experiment
     from malta.synthesis.spec import Spec
     from malta.tuning.tune import Tuned

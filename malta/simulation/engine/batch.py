@@ -18,10 +18,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import is_default, shape_parameters, twins_of, units_of
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation.engine.compiled import (
     LANES,
     Lanes,

@@ -29,9 +29,9 @@ import numpy as np
 import platformdirs
 from numpy.typing import NDArray
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.files import scratch_folder
-from malta.model.plant import FloatArray
 
 # Folders that nobody else can write to: whoever writes a library's file decides what this process runs.
 #

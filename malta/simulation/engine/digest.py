@@ -10,8 +10,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray, readonly
 from malta.display import Description, display
-from malta.model.plant import FloatArray, Plant, readonly
+from malta.model.plant import Plant
 from malta.simulation.layout import flatten, layout_of, numbers_of
 from malta.simulation.readings import TOGETHER
 

@@ -13,11 +13,12 @@ from typing import Any, Literal, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.files import packaged
 from malta.model.data import plant_of
 from malta.model.parameters import acting_names, shape_parameters, twins_of
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation.engine.compiled import address_of, feedforward_table, library
 from malta.simulation.engine.instructions import (
     MASKS,

@@ -17,13 +17,14 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import InputError
 from malta.loops.loop import loop_along
 from malta.merits import Merit as Merit, figure
 from malta.model.linearize import linearize
 from malta.model.machines import attribute_of
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation.inputs import LONGEST
 from malta.simulation.references import Reference
 from malta.simulation.scenario import Scenario

@@ -36,13 +36,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.margins.loop_report import Payload
 from malta.model.data import plant_of
 from malta.model.equilibrium import balance
 from malta.model.machines import FINE
 from malta.model.parameters import units_of
-from malta.model.plant import FloatArray, Plant, Signal, placed
+from malta.model.plant import Plant, Signal, placed
 from malta.simulation import references
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import (

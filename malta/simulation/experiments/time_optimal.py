@@ -30,9 +30,10 @@ import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from malta.arrays import FloatArray, readonly
 from malta.display import Curves, Description, display, quantity
 from malta.errors import CheckError, InputError
-from malta.model.plant import FloatArray, Plant, readonly
+from malta.model.plant import Plant
 from malta.simulation import references
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.firmware.supervisor import FLYING, State
 from malta.firmware.supervisor_text import NUMBERS, Flown, Requests, require_compiler, supervised_engine
@@ -23,7 +24,7 @@ from malta.machines.tubular.experiments.faults import (
 )
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE
-from malta.model.plant import FloatArray, Plant, outputs_at
+from malta.model.plant import Plant, outputs_at
 from malta.simulation import references
 from malta.simulation.experiments import (
     Case,

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.machines.tubular.experiments.strokes import delayed_stroke
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,

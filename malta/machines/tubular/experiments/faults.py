@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.firmware.flight import view
 from malta.firmware.supervisor_text import (
@@ -30,7 +31,7 @@ from malta.firmware.supervisor_text import (
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE, delayed_stroke
 from malta.model.equilibrium import trim
-from malta.model.plant import FloatArray, Plant, outputs_at
+from malta.model.plant import Plant, outputs_at
 from malta.simulation import references
 from malta.simulation.experiments import (
     Case,

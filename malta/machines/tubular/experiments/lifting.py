@@ -11,10 +11,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.machines.tubular.experiments.strokes import delayed_stroke
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import FloatArray, Plant, outputs_at
+from malta.model.plant import Plant, outputs_at
 from malta.simulation import references
 from malta.simulation.engine.batch import is_compiled, simulate_many
 from malta.simulation.experiments import (

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
+from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.merits import reported_merits
-from malta.model.plant import FloatArray, Plant
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,

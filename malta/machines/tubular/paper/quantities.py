@@ -43,8 +43,9 @@ from malta.synthesis.spec import Spec
 from malta.synthesis.tunable_lqg import calibrate
 
 if TYPE_CHECKING:
+    from malta.arrays import FloatArray
     from malta.machines.tubular.parameters import Parameters
-    from malta.model.plant import FloatArray, Plant
+    from malta.model.plant import Plant
 
 
 EXPERIMENT_NAMES = ("stroke", "hold", "tilt", "thermal")
