@@ -122,7 +122,7 @@ def _run_design(
     over a gain file then.
     """
     from malta import gains, report
-    from malta.margins.loop_report import require_stable
+    from malta.gains.file import require_stable
     from malta.margins.verify import linear_report
     from malta.model.data import published_beside
     from malta.model.linearize import linearize

@@ -99,7 +99,7 @@ def verify(
     Example:  malta verify design/gains/calibrated.json --set m=0.56
     """
     from malta.cli.report import campaigns_of
-    from malta.margins.loop_report import require_stable
+    from malta.gains.file import require_stable
     from malta.model.data import plant_of, published_figures
     from malta.tuning.verify import verify as verify_loop
 

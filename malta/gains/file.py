@@ -35,7 +35,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -44,14 +44,16 @@ from malta.files import locate, replace_files, require_plain_name, version
 from malta.gains.contents import LINEAR, build_controller, linear_table, signal_tables
 from malta.gains.encodings import SUFFIXES as SUFFIXES, content_sha256, decode, encode
 from malta.gains.schema import GainFile
-from malta.margins.loop_report import LoopReport, require_stable
-from malta.margins.verify import unstable_gain
+from malta.loops.own_model import unstable_gain
 from malta.model.data import plant_of
 from malta.model.linear import is_linear
 from malta.model.parameters import units_of, values_of
 from malta.synthesis.controller import Controller
 from malta.synthesis.schedule import SCHEDULED, Schedule
 from malta.tables import validate
+
+if TYPE_CHECKING:
+    from malta.margins.loop_report import LoopReport
 
 SCHEMA = "malta-gains"
 
@@ -151,6 +153,15 @@ def _robust(margins: LoopReport) -> dict[str, Any] | None:
         "upper": None if margin.exhausted else margin.upper,
         "witness": None if margin.witness is None else dict(margin.witness),
     }
+
+
+def require_stable(found: LoopReport, name: str) -> None:
+    """Raise CheckError when a stage is unstable: such gains are not written to files."""
+    for stage in found.stages:
+        if not stage.stable:
+            raise CheckError(
+                f"{name}: the loop ({stage.name}) is unstable, |lambda| = {stage.spectral_radius:.6f}"
+            )
 
 
 def write(controller: Controller, margins: LoopReport, *paths: str | Path) -> None:

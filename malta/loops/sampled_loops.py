@@ -26,11 +26,11 @@ from malta.errors import CheckError
 from malta.loops.classical import Nominal, remembered
 from malta.model.data import plant_of
 from malta.model.equilibrium import trace, trim
-from malta.model.linearize import LinearModel, linearize
+from malta.model.linearize import LinearModel, is_commutated, linearize
 from malta.model.plant import OperatingPoint, Plant, off_stroke, position_in, whole_samples
 from malta.model.signals import with_lags
 from malta.proof.parametric_plants import of_plant
-from malta.proof.uncertain import Compensator, UncertainSystem, held_gain, is_commutated
+from malta.proof.uncertain import Compensator, UncertainSystem, held_gain
 from malta.proof.windings import (
     CurrentControl,
     CurrentLoops,

@@ -12,7 +12,6 @@ import numpy as np
 
 from malta.bound import at_least, at_most
 from malta.display import Curves, Description, display
-from malta.errors import CheckError
 from malta.loops.loop import Loop, loop_of_model
 from malta.loops.sampled_loops import LAST
 from malta.loops.time_domain import Recovery, furthest, noise_of, recovery
@@ -22,7 +21,7 @@ from malta.model.machines import FINE
 from malta.model.parameters import box_words
 from malta.proof.margin import NOT_PROVEN, Margin
 from malta.proof.windings import CurrentLoops, left_out
-from malta.synthesis.requirements import Figure, Noise, Verdict, judge_figure, ratio_of
+from malta.synthesis.requirements import Figure, Noise, Payload, Verdict, judge_figure, ratio_of
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray
@@ -108,14 +107,6 @@ class Place:
     peak: float
     disk: float  # size of the disk margin of all forces and sensors at once
     delay: float  # s, smallest delay margin; NaN where unstable, as peak and disk
-
-
-class Payload(NamedTuple):
-    """How much a machine carries beside its mover, kg."""
-
-    held: float  # by the forces at rest; inf: its weight loads no input
-    carried: float  # the largest that was flown; NaN: the machine has no experiment of it
-    dropped: float  # the smallest that was dropped; inf: none
 
 
 class Outcome(NamedTuple):
@@ -381,15 +372,6 @@ class LoopReport:
             name: np.linalg.norm(G, 2, axis=(1, 2)) for name, G in (("S", S), ("T", np.eye(S.shape[-1]) - S))
         }
         return Curves(w, "frequency [rad/s]", sizes, "largest singular value [1]", logarithmic=True)
-
-
-def require_stable(found: LoopReport, name: str) -> None:
-    """Raise CheckError when a stage is unstable: such gains are not written to files."""
-    for stage in found.stages:
-        if not stage.stable:
-            raise CheckError(
-                f"{name}: the loop ({stage.name}) is unstable, |lambda| = {stage.spectral_radius:.6f}"
-            )
 
 
 def _margins(a: LoopReport) -> Iterator[Merit]:

@@ -18,6 +18,7 @@ from malta.loops.classical import Nominal
 from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
 from malta.margins.scheduled_loops import loops_between_places
 from malta.model.data import plant_of
+from malta.model.linearize import is_commutated
 from malta.model.parameters import units_of
 from malta.model.plant import off_stroke, outputs_at, position_at
 from malta.processes import on_one_thread
@@ -36,7 +37,7 @@ from malta.proof.robust import (
     rank_of,
     robust_margin,
 )
-from malta.proof.uncertain import Compensator, UncertainSystem, is_commutated, model_of
+from malta.proof.uncertain import Compensator, UncertainSystem, model_of
 from malta.proof.weak_coupling import HeldLoop
 from malta.proof.weak_coupling.held_currents import held_machine
 from malta.proof.windings import CurrentLoops

@@ -22,13 +22,14 @@ from malta.arrays import FloatArray
 from malta.loops.sampled_loops import LAST
 from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
+from malta.model.linearize import is_commutated
 from malta.model.plant import Plant
 from malta.processes import on_one_thread
 from malta.proof.box import box_of
 from malta.proof.groups import groups, loop_of
 from malta.proof.margin import Ranges
 from malta.proof.robust import robust_margin
-from malta.proof.uncertain import Compensator, UncertainSystem, is_commutated
+from malta.proof.uncertain import Compensator, UncertainSystem
 from malta.proof.windings import chosen_loops, current_control, force_modes, windings_of
 from malta.proof.work import Budget
 from malta.synthesis.controller import Controller

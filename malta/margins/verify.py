@@ -19,6 +19,7 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.loops.classical import Classical, classical_margins, nominal_loop, peak_sensitivity, worst_of
 from malta.loops.loop import loop_of_model
+from malta.loops.own_model import controller_poles
 from malta.loops.sampled_loops import (
     LAST,
     SampledLoop,
@@ -53,44 +54,7 @@ from malta.proof.work import Budget, metered
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import gain_at_rest
 from malta.synthesis.lqg import integrals_of, kalman, lqi, lqr, weights_of
-from malta.synthesis.riccati import add_integrals, eigenvalues
-
-
-def controller_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
-    """Eigenvalues in z of regulator and filter on the controller's own model (separation principle).
-
-    The regulator has no poles for observed disturbance forces, which only the filter estimates.
-    """
-    k = len(c.Ad) - c.observed * len(c.forces)
-    A, B, K = c.Ad[:k, :k], c.Bd[:k], c.K[:, :k]
-    if c.integrating:
-        summed = list(c.summed)
-        A, B = add_integrals(A, B, c.Cd[summed, :k], c.sample_time)
-        K = np.hstack([K, -c.Ki[:, summed]])
-    return eigenvalues(A - B @ K), eigenvalues((np.eye(len(c.Ad)) - c.L @ c.Cd) @ c.Ad)
-
-
-@on_one_thread
-def unstable_gain(c: Controller) -> tuple[str, float] | None:
-    """The name of a gain that leaves the controller's own model unstable, and the worst |lambda|; None: all are stable.
-
-    An LQG is judged by its regulator and its filter. A PID or a law of errors has no model and is judged on the machine
-    that it names.
-    """
-    if c.schedule is not None:
-        fixed = (replace(c, **matrices, schedule=None) for matrices in map(c.schedule.at, c.schedule.places))
-        return next((found for found in map(unstable_gain, fixed) if found is not None), None)
-    if c.cost is None:
-        plant = plant_of(c.parameters)
-        model = linearize(plant, plant.point(c.operating_point[0]))
-        found = {"K": eigenvalues(loop_of_model(model, c).matrix)}
-    else:
-        found = dict(zip("KL", controller_poles(c), strict=True))
-    for name, poles in found.items():
-        radius = float(np.abs(poles).max())
-        if not radius < 1:
-            return name, radius
-    return None
+from malta.synthesis.riccati import eigenvalues
 
 
 @on_one_thread

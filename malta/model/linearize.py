@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -290,3 +290,11 @@ def _mismatch(plant: Plant, functions: Any, index: int, ends: tuple[float, float
                         share=share,
                     )
     return worst
+
+
+@lru_cache(maxsize=64)  # tracing the currents is slow
+def is_commutated(plant: Plant) -> bool:
+    """Whether a machine's currents depend on the measured position, so that holding them changes the loop."""
+    kind = ca.MX if plant.tabulated else ca.SX
+    y, v = kind.sym("y", len(plant.outputs)), kind.sym("v", len(plant.inputs))
+    return bool(ca.which_depends(plant.currents(y, v), y, 1, True) != [False] * len(plant.actuator.coils))

@@ -13,6 +13,7 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.errors import InputError, require_known
 from malta.model.equilibrium import commanded
+from malta.model.linearize import is_commutated
 from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant, position_in
 from malta.model.signals import LateSensors, with_lags
@@ -20,7 +21,7 @@ from malta.proof.box import without_branches
 from malta.proof.expressions import NotAnalytic, program
 from malta.proof.polynomial import rational
 from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge, symbolic as rational_functions
-from malta.proof.uncertain import UncertainSystem, describe, in_symbols, is_commutated, limits_of, model_of
+from malta.proof.uncertain import UncertainSystem, describe, in_symbols, limits_of, model_of
 from malta.proof.windings import Windings, with_windings
 from malta.proof.work import check_clock
 

@@ -205,14 +205,6 @@ def model_of(
     return ca.Function("model", [p, z, v], ca.cse([ca.densify(part) for part in parts]))
 
 
-@lru_cache(maxsize=64)  # tracing the currents is slow
-def is_commutated(plant: Plant) -> bool:
-    """Whether a machine's currents depend on the measured position, so that holding them changes the loop."""
-    kind = ca.MX if plant.tabulated else ca.SX
-    y, v = kind.sym("y", len(plant.outputs)), kind.sym("v", len(plant.inputs))
-    return bool(ca.which_depends(plant.currents(y, v), y, 1, True) != [False] * len(plant.actuator.coils))
-
-
 def limits_of(declared: Mapping[str, Any]) -> tuple[float, float]:
     """The exclusive limits of a declared parameter; for `at_least` the float just below."""
     above, least, below = (declared.get(key) for key in ("above", "at_least", "below"))

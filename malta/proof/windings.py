@@ -26,9 +26,9 @@ from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError
 from malta.model.data import plant_of
 from malta.model.equilibrium import trace
-from malta.model.linearize import linearize
+from malta.model.linearize import is_commutated, linearize
 from malta.model.plant import OperatingPoint, Plant, outputs_at
-from malta.proof.uncertain import Compensator, is_commutated
+from malta.proof.uncertain import Compensator
 from malta.synthesis.riccati import delay_inputs, sample
 
 if TYPE_CHECKING:

@@ -30,9 +30,9 @@ from scipy.linalg import LinAlgWarning
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.model.data import plant_of
+from malta.model.linearize import is_commutated
 from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant, placed
-from malta.proof.uncertain import is_commutated
 from malta.simulation import references
 from malta.simulation.engine.engines import Engine, EngineChoice, engine_of, evaluate, substeps_until
 from malta.simulation.inputs import (

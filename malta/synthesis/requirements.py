@@ -401,3 +401,11 @@ GENERIC = (
         meaning="noise of commanded inputs at rest, rms",
     ),
 )
+
+
+class Payload(NamedTuple):
+    """How much a machine carries beside its mover, kg."""
+
+    held: float  # by the forces at rest; inf: its weight loads no input
+    carried: float  # the largest that was flown; NaN: the machine has no experiment of it
+    dropped: float  # the smallest that was dropped; inf: none

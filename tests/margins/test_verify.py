@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import malta
+from malta.gains.file import require_stable
 from malta.loops.sampled_loops import machine_loop, sampled_loop
-from malta.margins.loop_report import BANDWIDTHS, require_stable, zone
+from malta.margins.loop_report import BANDWIDTHS, zone
 from malta.synthesis.riccati import eigenvalues
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from scipy import linalg
 
 import malta
 from malta.errors import InputError
+from malta.loops.own_model import controller_poles
 from malta.loops.sampled_loops import machine_loop, sampled_loop
-from malta.margins.verify import controller_poles
 from malta.simulation.inputs import lagging_references
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import with_lags

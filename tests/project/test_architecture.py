@@ -17,7 +17,18 @@ from house import ORDER as PACKAGES
 import malta
 
 # Each may import those before it; machines stand where nobody generic imports them.
-GROUND = ("arrays", "contents", "errors", "units", "files", "tables", "processes", "bound", "display", "merits")
+GROUND = (
+    "arrays",
+    "contents",
+    "errors",
+    "units",
+    "files",
+    "tables",
+    "processes",
+    "bound",
+    "display",
+    "merits",
+)
 ORDER = (*GROUND, *PACKAGES[1:])
 MACHINES = {"tubular", "halbach", "planar"}
 SOURCES = sorted((ROOT / "malta").rglob("*.py"))

@@ -11,8 +11,8 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 import malta
+from malta.loops.own_model import controller_poles
 from malta.loops.sampled_loops import sampled_loop
-from malta.margins.verify import controller_poles
 from malta.synthesis.controller import law, linear_law
 from malta.synthesis.riccati import eigenvalues, sample, sample_noise
 

@@ -14,9 +14,10 @@ from scipy import linalg
 
 import malta
 from malta import gains
+from malta.loops.own_model import controller_poles, unstable_gain
 from malta.loops.sampled_loops import machine_loop, machine_system, sampled_law, sampled_loop
 from malta.margins.travel import travel_margin
-from malta.margins.verify import controller_poles, linear_report, unstable_gain
+from malta.margins.verify import linear_report
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel
 from malta.model.plant import Plant

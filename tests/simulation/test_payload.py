@@ -12,9 +12,9 @@ from conftest import Run
 
 import malta
 from malta import gains
-from malta.margins.loop_report import Payload
 from malta.model.data import plant_of
 from malta.simulation.experiments.catalogue import FINENESS, flown_payload, held_payload, payload
+from malta.synthesis.requirements import Payload
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import malta
-from malta.margins.verify import controller_poles
+from malta.loops.own_model import controller_poles
 from malta.synthesis.feedforward import pi_current_loop, static_feedforward
 from malta.synthesis.filters import sampled_model
 

@@ -38,7 +38,6 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
-from malta.margins.loop_report import Payload
 from malta.model.data import plant_of
 from malta.model.equilibrium import balance
 from malta.model.machines import FINE
@@ -66,6 +65,7 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import EngineOf, simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
+from malta.synthesis.requirements import Payload
 
 # Experiments of any machine: hold still, step an output, push.
 #
