@@ -59,7 +59,7 @@ display(Markdown(f"**Judgement.** {plan.duration:g} s of motion below 40 µm tel
 # %%
 shares = found.half_widths / found.values
 box = {name: share for name, share in zip(names, shares.tolist(), strict=True) if name != "I_xx"}
-margin = malta.loop(found.plant, controller).margin(box)
+margin = malta.robust_margin(malta.loop(found.plant, controller), box)
 assert margin.lower is not None
 assert margin.lower > 10 * found.joint
 display(

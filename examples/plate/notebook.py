@@ -53,7 +53,7 @@ fig.savefig("build/forces.png", dpi=150)
 # %%
 for label, n_plant, n_law in (("all coils", 4, 4), ("one open, unknown", 3, 4), ("one open, known", 3, 3)):
     spec, law = specs[n_plant], laws[n_law]
-    found = malta.loop(spec.plant, law).margin({"k_f": 0.1, "k_z": 0.2})
+    found = malta.robust_margin(malta.loop(spec.plant, law), {"k_f": 0.1, "k_z": 0.2})
     step = malta.experiment("step", spec.plant, law, size=50e-6)
     assert step.cases[0].run.verdict.completed
     print(f"{label:18s} {found}")

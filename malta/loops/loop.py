@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from typing import NoReturn
 
 import numpy as np
 
@@ -28,9 +29,6 @@ from malta.model.equilibrium import with_parameters
 from malta.model.linearize import LinearModel
 from malta.model.parameters import units_of
 from malta.model.plant import Plant, position_at
-from malta.processes import on_one_thread
-from malta.proof.margin import Margin, Progress, Ranges
-from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator, UncertainSystem
 from malta.proof.windings import CurrentLoops, chosen_loops, left_out
 from malta.synthesis.controller import Controller, law_at
@@ -58,7 +56,7 @@ class Loop:
     >>> loop = malta.loop(malta.plant_of(controller.parameters), controller, z=5e-3)
     >>> loop.stable, loop.matrix.shape
     (True, (41, 41))
-    >>> found = loop.margin({"m": 0.2, "K_A": 0.2, "K_B": 0.2, "K_D": 0.2})
+    >>> found = malta.robust_margin(loop, {"m": 0.2, "K_A": 0.2, "K_B": 0.2, "K_D": 0.2})
     >>> f"{found.lower:.2f} times the box"
     '1.62 times the box'
     """
@@ -170,19 +168,10 @@ class Loop:
         """
         return machine_system(self.plant, self.controller, list(names), self.at, self.current_loops)
 
-    @on_one_thread
-    def margin(
-        self, ranges: Ranges, *, time: float | None = None, progress: Progress | None = None
-    ) -> Margin:
-        """The proven margin of the parameters at this operating point, in multiples of their ranges.
-
-        ranges : by parameter: 0.2 is +-20 %, (low, high) an interval in SI
-        time : s, longest search
-        progress : called with the lower and the upper bound so far
-
-        Raises InputError for unknown parameters.
-        """
-        return robust_margin(*self.uncertain(tuple(ranges)), ranges, time=time, progress=progress)
+    @property
+    def margin(self) -> NoReturn:
+        """Moved: `malta.robust_margin(loop, ranges)`. Raises InputError, which says so."""
+        raise InputError("Loop", "margin", "a name that has moved", "malta.robust_margin(loop, ranges)")
 
     @property
     def description(self) -> Description:

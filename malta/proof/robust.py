@@ -17,7 +17,7 @@ import time as clock
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -244,10 +244,16 @@ PLACES = 64  # nominal places of a box whose poles are computed at once
 
 
 @on_one_thread
+class Uncertain(Protocol):
+    """What gives itself as a system and a law in parameters by name, as the loop of a machine does."""
+
+    def uncertain(self, names: Sequence[str]) -> tuple[UncertainSystem, Compensator]: ...
+
+
 def robust_margin(
-    system: UncertainSystem,
-    compensator: Compensator | Any,
-    ranges: Ranges,
+    system: UncertainSystem | Uncertain,
+    compensator: Compensator | Any = None,
+    ranges: Ranges | None = None,
     over: Mapping[str, tuple[float, float]] | None = None,
     *,
     tolerance: float | None = None,
@@ -257,11 +263,14 @@ def robust_margin(
 ) -> Margin:
     """Prove how far the parameters may deviate together, in multiples of their ranges, before the loop is unstable.
 
+        robust_margin(loop, ranges)        a machine's loop, from `malta.loop`
+        robust_margin(system, F, ranges)   matrices
+
     With t the range (low, high) of a parameter grows to nominal - t (nominal - low) .. nominal + t (high - nominal).
     The proof encloses the characteristic polynomial on cells of frequency and parameters, and excludes zero on each.
 
-    system : the uncertain system, from `malta.uncertain`
-    compensator : u = F y (positive feedback): a Compensator, a control.StateSpace, or a gain matrix
+    system : the uncertain system, from `malta.uncertain`; or a Loop, which brings its law
+    compensator : u = F y (positive feedback): a Compensator, a control.StateSpace, or a gain matrix; none with a Loop
     ranges : by name; 0.2 is +-20 % of the nominal value, (low, high) an interval in SI
     over : intervals that do not grow with t, in SI: the bound holds anywhere in them (`z` over the travel)
     tolerance : relative distance between the proven bound and the witness; None: 9e-4, and less where that is cheap
@@ -286,9 +295,27 @@ def robust_margin(
     '5.00 5.00 2.00'
     """
     effort = Effort(tolerance, time, budget, progress)
-    law = law_of(system, compensator)
-    box = box_of(system.names, system.nominal, system.limits, ranges, {} if over is None else over)
-    return margin_of(problem_of(system, law), within_branches(box, system.positive), effort)
+    over = {} if over is None else over
+    named, law, ranges = _either_form(system, compensator, ranges, over)
+    box = box_of(named.names, named.nominal, named.limits, ranges, over)
+    return margin_of(problem_of(named, law), within_branches(box, named.positive), effort)
+
+
+def _either_form(
+    system: UncertainSystem | Uncertain, compensator: Any, ranges: Ranges | None, over: Mapping[str, Any]
+) -> tuple[UncertainSystem, Compensator, Ranges]:
+    """System, law and ranges of robust_margin(system, compensator, ranges) or of robust_margin(loop, ranges)."""
+    if isinstance(system, UncertainSystem):
+        if ranges is None:
+            raise InputError("robust_margin", "ranges", "none", "robust_margin(system, compensator, ranges)")
+        return system, law_of(system, compensator), ranges
+    if not hasattr(system, "uncertain"):
+        raise InputError("robust_margin", "system", describe(system), "a Loop, or what malta.uncertain makes")
+    if ranges is not None or not isinstance(compensator, Mapping):
+        found = "more than a Loop and ranges" if ranges is not None else describe(compensator)
+        raise InputError("robust_margin", "ranges", found, "robust_margin(loop, ranges), as {'m': 0.2}")
+    named, law = system.uncertain((*compensator, *over))
+    return named, law, compensator
 
 
 @on_one_thread

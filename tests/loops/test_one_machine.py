@@ -181,7 +181,7 @@ def test_one_loop_answers_all_questions() -> None:
     np.testing.assert_allclose(one.sensitivity(w), responses.S, rtol=0, atol=1e-7)
     np.testing.assert_allclose(one.sampled.sensitivity(w), responses.S, rtol=0, atol=1e-7)
     box = {"K_A": 0.2, "K_B": 0.2}
-    ours, there = one.margin(box), place_margin(heavy, c, box, 5e-3)
+    ours, there = malta.robust_margin(one, box), place_margin(heavy, c, box, 5e-3)
     assert ours.upper == pytest.approx(there.upper, rel=1e-9)
     assert ours.lower == pytest.approx(there.lower, rel=2e-3)
     moved = one.sampled.answer().largest[0, 0]

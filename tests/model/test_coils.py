@@ -118,7 +118,7 @@ def test_the_plate_flies_on_three_coils() -> None:
     np.testing.assert_allclose(models[0].B, models[1].B, atol=1e-9 * np.abs(models[0].B).max())
     assert four.plant.actuator.force_limit[0] == pytest.approx(2 * three.plant.actuator.force_limit[0])
     margins = [
-        malta.loop(spec.plant, law).margin({"k_f": 0.1, "k_z": 0.2})
+        malta.robust_margin(malta.loop(spec.plant, law), {"k_f": 0.1, "k_z": 0.2})
         for spec, law in ((four, laws[0]), (three, laws[0]), (three, laws[1]))
     ]
     assert margins[0].lower == pytest.approx(margins[2].lower, rel=1e-3)

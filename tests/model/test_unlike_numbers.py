@@ -105,7 +105,7 @@ def test_the_loop_has_the_poles_of_regulator_and_filter(name: str) -> None:
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_proven_is_lost_at_the_witness(name: str) -> None:
     plant, c = designed(name)
-    margin = malta.loop(plant, c).margin(CASES[name][3])
+    margin = malta.robust_margin(malta.loop(plant, c), CASES[name][3])
     assert margin.lower is not None
     assert 3 < margin.lower <= margin.upper < 5
     assert margin.witness is not None
@@ -219,7 +219,7 @@ def test_the_magnets_model_is_that_of_its_energy(name: str) -> None:
 def test_what_is_proven_of_the_magnet(name: str) -> None:
     spec = malta.read_design(f"examples/magnet/design/{name}.toml")
     c = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    margin = malta.loop(spec.plant, c).margin({"m": 0.1, "C": 0.1})
+    margin = malta.robust_margin(malta.loop(spec.plant, c), {"m": 0.1, "C": 0.1})
     assert margin.lower is not None
     assert 3.5 < margin.lower <= margin.upper
 

@@ -43,7 +43,7 @@ RESULTS: dict[str, tuple[Callable[[malta.Spec, malta.synthesis.Controller], Any]
     "systems": (lambda s, c: malta.loops.loop_systems(s.plant, c), "1 inputs, 1 outputs"),
     "curves": (lambda s, c: malta.loops.loop_curves(s.plant, c), "largest |S|  1.57"),
     "margins": (lambda s, c: malta.verify(malta.linearize(s.plant, s.plant.at()), c), "delay margin, smallest [µs]"),
-    "margin": (lambda s, c: malta.loop(s.plant, c).margin({"m": 0.2}), "proven 3"),
+    "margin": (lambda s, c: malta.robust_margin(malta.loop(s.plant, c), {"m": 0.2}), "proven 3"),
     "sampled": (lambda s, c: malta.loop(s.plant, c).sampled, "sample_time  0.0002"),
     "classical": (lambda s, c: malta.loop(s.plant, c).classical, "delay  y"),
     "poles": (lambda s, c: malta.verify(malta.linearize(s.plant, s.plant.at()), c).poles, "regulator"),
