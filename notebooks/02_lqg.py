@@ -19,8 +19,8 @@ from IPython.display import display
 from scipy.linalg import block_diag
 
 import malta
+from malta.linear.sampling import add_integrals, sample, sample_cost, sample_noise
 from malta.synthesis.lqg import integrals_of
-from malta.synthesis.riccati import add_integrals, sample, sample_cost, sample_noise
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

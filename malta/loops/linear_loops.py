@@ -23,11 +23,11 @@ from scipy import linalg
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
+from malta.linear.sampling import eigenvalues
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.model.plant import Plant, Signal
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, LinearLaw, linear_law
-from malta.synthesis.riccati import eigenvalues
 from malta.synthesis.state_space import System, balanced_units, named_system, reference_names, set_point
 
 # The loop of a machine and a controller as systems of python-control: to plot, to simulate, to compute with.

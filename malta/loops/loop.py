@@ -13,6 +13,7 @@ import numpy as np
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
+from malta.linear.sampling import eigenvalues
 from malta.loops.classical import Classical, Nominal, classical_margins
 from malta.loops.sampled_loops import (
     LAST,
@@ -32,7 +33,6 @@ from malta.model.plant import Plant, position_at
 from malta.proof.uncertain import Compensator, UncertainSystem
 from malta.proof.windings import CurrentLoops, chosen_loops, left_out
 from malta.synthesis.controller import Controller, law_at
-from malta.synthesis.riccati import eigenvalues
 
 
 @display

@@ -23,6 +23,7 @@ import numpy as np
 from malta.arrays import ComplexArray, FloatArray, readonly
 from malta.display import display
 from malta.errors import CheckError
+from malta.linear.sampling import add_lags, delay_inputs, eigenvalues, sample
 from malta.loops.classical import Nominal, remembered
 from malta.model.data import plant_of
 from malta.model.equilibrium import trace, trim
@@ -48,7 +49,6 @@ from malta.proof.windings import (
 )
 from malta.synthesis.controller import Controller, LinearLaw, law_at, linear_law, with_readings, with_slope
 from malta.synthesis.recovery import StepResponse, step_response
-from malta.synthesis.riccati import add_lags, delay_inputs, eigenvalues, sample
 from malta.synthesis.state_space import System
 
 # The control law of a gain file as the machine runs it, as the compensator of a proof: hold, delay, current loops.

@@ -24,6 +24,7 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError, require_known
+from malta.linear.sampling import sample
 from malta.loops.linear_loops import LinearLoop
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.loops.sampled_loops import SampledLoop
@@ -33,7 +34,6 @@ from malta.proof.uncertain import find_peaks
 from malta.synthesis.controller import Controller
 from malta.synthesis.recovery import RecoveryBound, StepResponse, step_response
 from malta.synthesis.requirements import Noise
-from malta.synthesis.riccati import sample
 from malta.synthesis.state_space import System
 
 AFTER = (0.1, 0.3)  # s

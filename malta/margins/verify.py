@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.sampling import eigenvalues
 from malta.loops.classical import Classical, classical_margins, nominal_loop, peak_sensitivity, worst_of
 from malta.loops.loop import loop_of_model
 from malta.loops.own_model import controller_poles
@@ -54,7 +55,6 @@ from malta.proof.work import Budget, metered
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import gain_at_rest
 from malta.synthesis.lqg import integrals_of, kalman, lqi, lqr, weights_of
-from malta.synthesis.riccati import eigenvalues
 
 
 @on_one_thread

@@ -19,11 +19,11 @@ from scipy import sparse
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError, require_known
+from malta.linear.sampling import add_lags, delay_inputs, sample
 from malta.model.linearize import jacobians, linearize
 from malta.model.parameters import twins_of
 from malta.model.plant import Plant, symbolic
 from malta.proof.work import check_clock
-from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,6 +29,7 @@ from scipy.linalg import LinAlgWarning
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.sampling import sample
 from malta.model.data import plant_of
 from malta.model.linearize import is_commutated
 from malta.model.parameters import shape_parameters, units_of
@@ -58,7 +59,6 @@ from malta.simulation.scenario import (
 from malta.simulation.trajectory import Trajectory, Verdict, columns_of, judge, label_rows
 from malta.synthesis.controller import Controller, Noise
 from malta.synthesis.filters import noise_input
-from malta.synthesis.riccati import sample
 
 Observer = Callable[[Engine, Plant, FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 

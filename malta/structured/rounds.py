@@ -23,6 +23,7 @@ import numpy as np
 
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
+from malta.linear.sampling import add_lags, delay_inputs, sample
 from malta.loops.loop import loop
 from malta.loops.sampled_loops import LAST, SampledLoop, sampled_loop
 from malta.margins.travel import travel_margin, worst_sensitivities
@@ -40,7 +41,6 @@ from malta.structured.loops import Model, model_of, models_of_systems
 from malta.structured.search import ROOM, Look, Task, contradiction, random_starts, rate_of, search
 from malta.synthesis.controller import Controller
 from malta.synthesis.elements import CALLER
-from malta.synthesis.riccati import add_lags, delay_inputs, sample
 from malta.synthesis.state_space import System, controller_of
 from malta.synthesis.structure import Structure, places_of, sample_law
 

@@ -11,12 +11,12 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.sampling import sample
 from malta.model.equilibrium import holding_commands, load_balance
 from malta.model.linearize import LinearModel
 from malta.model.plant import Actuator, Plant, off_stroke
 from malta.synthesis.controller import Commutation, Controller, CurrentLoop, Feedforward, Limits
 from malta.synthesis.filters import between_samples
-from malta.synthesis.riccati import sample
 
 V0_STEP = 0.25e-3  # m, longest step of the grid of v0(z)
 

@@ -18,11 +18,11 @@ import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError
+from malta.linear.sampling import eigenvalues
 from malta.model.linearize import LinearModel, linearize
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import Noisy, covariance, filter_gain, intensities, kalman, sampled_noise
-from malta.synthesis.riccati import eigenvalues
 from malta.synthesis.schedule import point_at
 from malta.synthesis.spec import Spec
 

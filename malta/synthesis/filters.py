@@ -20,8 +20,9 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.sampling import add_lags, delay_inputs, sample, sample_noise
 from malta.processes import on_one_thread
-from malta.synthesis.riccati import Solver, add_lags, care, dare, delay_inputs, sample, sample_noise
+from malta.synthesis.riccati import Solver, care, dare
 from malta.synthesis.spec import Coordinates, Weights
 
 # The design model between samples: currents that are held, forces behind the lag of the current loops.

@@ -33,6 +33,7 @@ from scipy import linalg
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.sampling import add_integrals, eigenvalues, sample, sample_cost
 from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, Cost, Noise, disturbances, lagging_forces, stored_forces
@@ -47,7 +48,7 @@ from malta.synthesis.filters import (
     sampled_model,
     with_lags,
 )
-from malta.synthesis.riccati import Solver, add_integrals, care, dare, eigenvalues, sample, sample_cost
+from malta.synthesis.riccati import Solver, care, dare
 from malta.synthesis.spec import Discretization, Weights
 
 # Why a linear model has no stabilizing controller, in words: modes that nothing moves or sees, zeros, slow samples.
@@ -266,7 +267,7 @@ def gains(
     lag : rad/s, of the forces behind their commands, which are then states of the design model; None: no lag
 
     Without delay, lag, integrals and disturbances K is control.dlqr(Ad, Bd, Qd, Rd, Nd)[0] with the sampled weights of
-    riccati.sample_cost, and Ad L is the gain of control.dlqe(Ad, 1, Cd, Wd, V)[0], a predictor's. control.dlqr with
+    linear.sampling.sample_cost, and Ad L is the gain of control.dlqe(Ad, 1, Cd, Wd, V)[0], a predictor's. control.dlqr with
     integral_action sums errors without Ts, and one sample late.
     """
     if discretization == "backward-euler":

@@ -1,4 +1,4 @@
-"""Riccati equations, scaled, solved by python-control and checked; and systems sampled exactly.
+"""Riccati equations, scaled, solved by python-control and checked.
 
 control.care and control.dare find X of a scaled equation, by scipy (their method "scipy", whether or not slycot is
 there). Where nothing goes into a gain file scipy is asked itself, which saves the import: to the bit the same X.
@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from malta.errors import CheckError, InputError
+from malta.linear.sampling import eigenvalues
 
 if TYPE_CHECKING:
-    from malta.arrays import ComplexArray, FloatArray
+    from malta.arrays import FloatArray
 
 Solver = Literal[
     "python-control", "scipy"
@@ -44,7 +45,6 @@ STEPS = 8  # of Newton's at most; each squares the error
 ROUNDING = 1e-16  # couplings below this, relative to what else acts on and from both ends, are none
 BALANCED = 1e-3  # the last change of scales that are rounded to powers of two
 DOUBLINGS = 64  # at most: sums of 2^64 samples
-LARGEST = 1e8  # entry of a matrix whose exponential is taken
 
 
 class Solution(NamedTuple):
@@ -479,92 +479,3 @@ def _rounding_of_poles(found: _Found) -> float:
 
 def _first_sentence(error: Exception) -> str:
     return str(error).split(";")[0].split(". ")[0].rstrip(".")
-
-
-def eigenvalues(M: FloatArray) -> ComplexArray:
-    """Eigenvalues, complex even where they all are real. CheckError where numbers have overflowed."""
-    if not np.isfinite(M).all():
-        raise CheckError("the model's numbers overflow")
-    return np.asarray(np.linalg.eigvals(M), dtype=complex)
-
-
-def sample(A: FloatArray, B: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:
-    """Zero-order hold: Ad = e^(A Ts), Bd = integral of e^(A s) B over one sample; of a stack of systems each."""
-    n, m = B.shape[-2:]
-    held = np.zeros((*A.shape[:-2], n + m, n + m))
-    held[..., :n, :n], held[..., :n, n:] = A, B
-    E = _exponential(held * Ts)
-    return E[..., :n, :n], E[..., :n, n:]
-
-
-def delay_inputs(Ad: FloatArray, Bd: FloatArray, delay: int) -> tuple[FloatArray, FloatArray]:
-    """The sampled system whose inputs act `delay` samples late; stored inputs follow x, the oldest first."""
-    n, m = Bd.shape[-2:]
-    if delay == 0:
-        return Ad, Bd
-    stored = m * delay
-    A = np.zeros((*Ad.shape[:-2], n + stored, n + stored))
-    A[..., :n, :n], A[..., :n, n : n + m] = Ad, Bd
-    A[..., n:, n:] = np.eye(stored, k=m)  # each stored input moves up one place
-    return A, np.vstack([np.zeros((n + stored - m, m)), np.eye(m)])
-
-
-def add_lags(A: FloatArray, B: FloatArray, rate: float) -> tuple[FloatArray, FloatArray]:
-    """The continuous system whose inputs follow as first-order lags, rate / (s + rate); they are states after x."""
-    n, m = B.shape[-2:]
-    lagged = np.zeros((*A.shape[:-2], n + m, n + m))
-    lagged[..., :n, :n], lagged[..., :n, n:], lagged[..., n:, n:] = A, B, -rate * np.eye(m)
-    return lagged, np.vstack([np.zeros((n, m)), rate * np.eye(m)])
-
-
-def add_integrals(Ad: FloatArray, Bd: FloatArray, Cd: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:
-    """The sampled system with e+ = e - Ts y+ appended, the controller's own sums of the measured errors."""
-    p = len(Cd)
-    A = np.block([[Ad, np.zeros((len(Ad), p))], [-Ts * Cd @ Ad, np.eye(p)]])
-    return A, np.vstack([Bd, -Ts * Cd @ Bd])
-
-
-def sample_cost(
-    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, Ts: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The integral of x'Qx + u'Ru over a sample, u held: Qd, Nd, Rd of x'Qd x + 2 x'Nd u + u'Rd u.
-
-    Van Loan, IEEE Trans. Autom. Control 23(3), 1978; the weights of MATLAB's lqrd.
-    """
-    n, m = B.shape
-    F = np.zeros((n + m, n + m))
-    F[:n, :n], F[:n, n:] = A, B
-    Wd = sample_noise(F.T, linalg.block_diag(Q, R), Ts)
-    return Wd[:n, :n], Wd[:n, n:], Wd[n:, n:]
-
-
-def sample_noise(A: FloatArray, W: FloatArray, Ts: float) -> FloatArray:
-    """Covariance that white noise of intensity W leaves in x after one sample (Van Loan).
-
-    The integral of e^(A s) W e^(A' s) over a sample, from one exponential; W counts in its largest entry.
-    """
-    n, size = len(A), np.abs(W).max() or 1.0
-    E = _exponential(np.block([[-A, W / size], [np.zeros((n, n)), A.T]]) * Ts)
-    return _symmetric(E[n:, n:].T @ E[:n, n:] * size)
-
-
-def _exponential(M: FloatArray) -> FloatArray:
-    """e^M, of a stack of matrices each."""
-    with np.errstate(all="ignore"):
-        turn = np.ones(M.shape)
-        if not np.abs(M).max(initial=0.0) < LARGEST and np.isfinite(M).all():  # units of states?
-            if M.ndim > 2:
-                return np.array([_exponential(one) for one in M])
-            _, (units, _) = linalg.matrix_balance(M, permute=False, separate=True)
-            turn = units / units[:, None]
-        # e^710 is past the largest float
-        E = (
-            linalg.expm(M * turn) / turn
-            if np.abs(M * turn).max(initial=0.0) < LARGEST
-            else np.array([np.inf])
-        )
-    if not np.isfinite(E).all():
-        raise CheckError(
-            "the sampled model's numbers overflow: no sample time of this length for so fast a machine"
-        )
-    return np.asarray(E)

@@ -24,6 +24,7 @@ from scipy import sparse
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.sampling import add_lags, delay_inputs, sample
 from malta.loops.sampled_loops import disturbance_map, push_through
 from malta.loops.time_domain import covariance, noise_variance
 from malta.model.equilibrium import trim
@@ -46,7 +47,6 @@ from malta.synthesis.filters import Gains, gain_at_rest
 from malta.synthesis.lqg import gains
 from malta.synthesis.recovery import StepResponse, step_response
 from malta.synthesis.requirements import Noise, Requirement, TrialFigures, requirements_for
-from malta.synthesis.riccati import add_lags, delay_inputs, sample
 from malta.synthesis.spec import Spec, Weights
 
 # The sampled machine at the corners of its box of parameters, and where each corner of the growing box is lost.

@@ -27,6 +27,7 @@ from scipy import optimize, sparse
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.sampling import sample, sample_noise
 from malta.loops.loop import loop_of_model
 from malta.loops.sampled_loops import SampledLoop
 from malta.loops.time_domain import covariance
@@ -39,7 +40,6 @@ from malta.proof.windings import emf_slope, estimated_rows, windings_of, with_es
 from malta.synthesis.controller import Controller, linear_law_of, with_readings
 from malta.synthesis.pid import Axes, axes_of, law_of_outputs, pid_gains
 from malta.synthesis.requirements import ratio_of
-from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Loads, Pid, Spec, pid_signals
 from malta.tuning.groups import Group, figures_of_gains, groups_of
 from malta.tuning.search import (

@@ -21,6 +21,7 @@ from conftest import ROOT, Run
 from scipy.linalg import expm, solve_discrete_lyapunov
 
 import malta
+from malta.linear.sampling import sample_noise
 from malta.machines.halbach import electronics, electronics as motor, paper as claims, plant as halbach
 from malta.machines.halbach.electronics import IDEAL, Options
 from malta.machines.halbach.experiments import steps_reference
@@ -44,7 +45,6 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller, linear_law
 from malta.synthesis.filters import sampled_model
-from malta.synthesis.riccati import sample_noise
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

@@ -11,9 +11,9 @@ import pytest
 
 import malta
 from malta.gains.file import require_stable
+from malta.linear.sampling import eigenvalues
 from malta.loops.sampled_loops import machine_loop, sampled_loop
 from malta.margins.loop_report import BANDWIDTHS, zone
-from malta.synthesis.riccati import eigenvalues
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,10 +14,10 @@ from scipy import linalg
 import malta
 from malta import gains
 from malta.errors import InputError
+from malta.linear.sampling import sample, sample_noise
 from malta.loops.sampled_loops import machine_loop
 from malta.synthesis.filters import kalman, positions_from, sampled_filter
 from malta.synthesis.lqg import integrals_of, lqg, lqi, weights_of
-from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Spec, Weights
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 import malta
+from malta.linear.sampling import eigenvalues, sample, sample_noise
 from malta.loops.own_model import controller_poles
 from malta.loops.sampled_loops import sampled_loop
 from malta.synthesis.controller import law, linear_law
-from malta.synthesis.riccati import eigenvalues, sample, sample_noise
 
 if TYPE_CHECKING:
     from conftest import Design

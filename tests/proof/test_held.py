@@ -14,6 +14,7 @@ from scipy import linalg
 
 import malta
 from malta import gains
+from malta.linear.sampling import sample
 from malta.loops.own_model import controller_poles, unstable_gain
 from malta.loops.sampled_loops import machine_loop, machine_system, sampled_law, sampled_loop
 from malta.margins.travel import travel_margin
@@ -31,7 +32,6 @@ from malta.synthesis.controller import Controller, linear_law
 from malta.synthesis.filters import between_samples, sampled_model
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
-from malta.synthesis.riccati import sample
 from malta.synthesis.spec import Pid, Weights
 
 ROOT = Path(__file__).parents[2]

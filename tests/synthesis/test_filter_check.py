@@ -13,9 +13,9 @@ import pytest
 from conftest import ROOT
 
 import malta
+from malta.linear.sampling import sample
 from malta.processes import environment
 from malta.synthesis.filter_check import ALLOWED, check_filter
-from malta.synthesis.riccati import sample
 
 DESIGNS = sorted(p for p in ROOT.glob("design/*.toml"))
 EXAMPLES = [ROOT / "examples" / name for name in ("magnet/design/scheduled.toml", "rotor/design/rotor.toml")]

@@ -15,18 +15,9 @@ from scipy import linalg
 from scipy.integrate import quad_vec
 
 import malta
+from malta.linear.sampling import delay_inputs, eigenvalues, sample, sample_cost, sample_noise
 from malta.synthesis import riccati
-from malta.synthesis.riccati import (
-    RESIDUAL,
-    Solver,
-    care,
-    dare,
-    delay_inputs,
-    eigenvalues,
-    sample,
-    sample_cost,
-    sample_noise,
-)
+from malta.synthesis.riccati import RESIDUAL, Solver, care, dare
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -17,6 +17,7 @@ from conftest import ROOT, Run, refusal
 
 import malta
 from malta import gains, report
+from malta.linear.sampling import eigenvalues
 from malta.loops.sampled_loops import machine_loop
 from malta.loops.time_domain import noise_of, noise_variance
 from malta.machines.tubular.requirements import DRIVE
@@ -24,7 +25,6 @@ from malta.margins.loop_report import BANDWIDTHS, Outcome
 from malta.simulation.experiments.catalogue import experiment
 from malta.synthesis.controller import linear_law, linear_law_of
 from malta.synthesis.requirements import requirements_for
-from malta.synthesis.riccati import eigenvalues
 from malta.tuning import tune as lqg
 from malta.tuning.groups import figures_of
 from malta.tuning.search import Effort, Journal, Trial, apply_trial, at_least_of, merge

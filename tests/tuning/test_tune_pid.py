@@ -17,9 +17,9 @@ from conftest import ROOT, Run, refusal
 from scipy import linalg
 
 import malta
+from malta.linear.sampling import sample, sample_noise
 from malta.loops.sampled_loops import machine_loop
 from malta.machines.halbach import electronics, plant as halbach
-from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Pid
 from malta.tuning import pid, verify
 from malta.tuning.pid import close_loop, goal_value, loads_of, loop_figures, parts_of, whole_machine

@@ -14,6 +14,7 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.sampling import sample
 from malta.machines.halbach import electronics, electronics as motor
 from malta.machines.halbach.electronics import IDEAL, Options, Pwm
 from malta.model.plant import Plant
@@ -32,7 +33,6 @@ from malta.simulation.experiments import (
 from malta.simulation.references import Motion, Reference
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
-from malta.synthesis.riccati import sample
 
 
 def lift_deviation(run: Trajectory) -> float:

@@ -17,6 +17,7 @@ from malta.campaigns.run import main_campaign, main_plan, replay
 from malta.errors import CheckError, InputError
 from malta.identification.learn import learn
 from malta.identification.log import log_of
+from malta.linear.sampling import add_integrals
 from malta.loops.loop import loop_of_model
 from malta.loops.time_domain import PLACES, Deviation, noise_of, recovery
 from malta.machines.tubular.experiments.disturbances import hold
@@ -38,7 +39,6 @@ from malta.simulation.trajectory import StrokeFigures, Trajectory, stroke_figure
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import static_feedforward
 from malta.synthesis.lqg import lqr
-from malta.synthesis.riccati import add_integrals
 from malta.synthesis.spec import Spec
 from malta.synthesis.tunable_lqg import calibrate
 

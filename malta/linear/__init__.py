@@ -1,0 +1,1 @@
+"""Linear systems, whatever they are of: sampling, responses, systems in parameters by name."""
