@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from malta.proof.uncertain import Compensator, UncertainSystem, instability, responses
+from malta.linear.uncertain import Compensator, UncertainSystem, instability, responses
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray, FloatArray

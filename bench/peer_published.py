@@ -16,8 +16,8 @@ import numpy as np
 from published_cases import Loop, Polynomial
 
 import malta
+from malta.linear.uncertain import instability
 from malta.proof.robust import law_of
-from malta.proof.uncertain import instability
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray, FloatArray

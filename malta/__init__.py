@@ -36,6 +36,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.identification.learn import learn as learn
     from malta.identification.measure import measure as measure
     from malta.loops.loop import loop as loop
+    from malta.loops.parametric_plants import uncertain as uncertain
     from malta.model.data import plant_of as plant_of, read as read
     from malta.model.equilibrium import trim as trim
     from malta.model.linear import linear_machine as linear_machine
@@ -43,7 +44,6 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.model.machines import machine as machine
     from malta.proof.blocks.gain import dynamic_margin as dynamic_margin, worst_case_gain as worst_case_gain
     from malta.proof.robust import robust_margin as robust_margin
-    from malta.proof.systems import uncertain as uncertain
     from malta.report.ledger import ledger as ledger
     from malta.simulation import references as references
     from malta.simulation.experiments.catalogue import experiment as experiment
@@ -96,7 +96,7 @@ _NAMES = {
     "malta.model.machines": "machine",
     "malta.proof.blocks.gain": "dynamic_margin worst_case_gain",
     "malta.proof.robust": "robust_margin",
-    "malta.proof.systems": "uncertain",
+    "malta.loops.parametric_plants": "uncertain",
     "malta.report.ledger": "ledger",
     "malta.simulation": "references",
     "malta.simulation.experiments.catalogue": "experiment",

@@ -26,12 +26,12 @@ import malta
 from malta.cli import main as cli
 from malta.files import replace_files
 from malta.firmware import cost
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.machines.tubular import plant as tubular
 from malta.model.data import published as read_published
 from malta.proof import robust
 from malta.proof.blocks import gain
 from malta.proof.problem import OfLoop, OfSeveral, Problem
-from malta.proof.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
     from malta.margins.loop_report import LoopReport

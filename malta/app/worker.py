@@ -39,7 +39,6 @@ from malta.errors import CheckError, InputError, shorten
 from malta.margins.loop_report import Outcome
 from malta.margins.travel import travel_loops, travel_margin
 from malta.proof.loss import ray_bound
-from malta.proof.work import metered
 from malta.simulation.simulate import simulate
 from malta.synthesis.requirements import judge_figure, proven_margin, ratio_of, requirements_for
 from malta.synthesis.spec import Spec, Variable
@@ -47,6 +46,7 @@ from malta.tuning.pid import LEAST, ROOM, STEEP, load_error, name_of, search_gai
 from malta.tuning.search import Effort, Journal, Progress, Trial, apply_trial, at_least_of, base_of
 from malta.tuning.tune import cluster_search, clusters_of, frugal_trials, search_weights
 from malta.tuning.verify import SynthesizedDesign, outcomes_of
+from malta.work import metered
 
 # Trials for each number, of one search after the other: the page's own, then better ones.
 POLISH = (0, 1, 2, 4, 8, 16, 40)

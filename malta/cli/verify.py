@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
     from malta.cli.documents.others import CheckOutput
     from malta.identification.data_file import IdentifiedData
+    from malta.loops.windings import CurrentLoops
     from malta.margins.loop_report import LoopReport
     from malta.proof.certificate.check import Verdict
-    from malta.proof.windings import CurrentLoops
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from malta.arguments import positive
 from malta.errors import InputError
 from malta.files import file_exists, locate, replace_files
 from malta.firmware.calibration import (
@@ -58,7 +59,6 @@ from malta.firmware.vectors import SAMPLES, Vector, record_vectors, trial_contex
 from malta.gains.file import content_of, read
 from malta.model.data import plant_of
 from malta.model.parameters import box_words
-from malta.proof.uncertain import positive
 from malta.simulation.layout import Fidelity
 from malta.synthesis.controller import Controller
 

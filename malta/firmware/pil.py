@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from malta.arguments import positive
 from malta.errors import InputError
 from malta.files import locate
 from malta.firmware.program import Precision
@@ -29,7 +30,6 @@ from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.vectors import SAMPLES, Vector, record_vectors
 from malta.gains.file import content_of, read
 from malta.model.data import plant_of
-from malta.proof.uncertain import positive
 from malta.simulation.layout import Fidelity
 
 # A serial line: its port, and frames on it with a checksum, which are asked for again when they are lost.

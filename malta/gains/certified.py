@@ -20,7 +20,9 @@ from malta.files import locate
 from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import content_sha256
 from malta.gains.file import APART, content_of, read
+from malta.linear.expressions import NotAnalytic, exact
 from malta.loops.sampled_loops import LAST
+from malta.loops.windings import CurrentLoops, chosen_loops
 from malta.margins.travel import ENDS, extent_of, travel_loops
 from malta.model.data import plant_of, published_figures
 from malta.model.parameters import units_of
@@ -37,9 +39,7 @@ from malta.proof.certificate.checked_file import (
     Places,
     double,
 )
-from malta.proof.expressions import NotAnalytic, exact
 from malta.proof.margin import Ranges
-from malta.proof.windings import CurrentLoops, chosen_loops
 from malta.synthesis.controller import Controller
 
 

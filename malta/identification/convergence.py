@@ -37,12 +37,13 @@ from scipy import linalg, signal
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError
 from malta.identification.strokes import FORCE
+from malta.linear.branches import INTERVALS, Interval
+from malta.linear.uncertain import Compensator, UncertainSystem, closed_loop
 from malta.loops.loop import loop
 from malta.model.data import plant_of
 from malta.proof.blocks.gain import Gain, worst_case_gain
-from malta.proof.box import INTERVALS, Interval, box_of
+from malta.proof.box import box_of
 from malta.proof.groups import loop_of
-from malta.proof.uncertain import Compensator, UncertainSystem, closed_loop
 from malta.synthesis.controller import Controller
 
 TOLERANCE = 1e-2  # relative distance between the proven bound and the largest value found

@@ -11,7 +11,7 @@ import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import display
-from malta.proof.uncertain import Compensator, UncertainSystem, find_peaks, instability, responses
+from malta.linear.uncertain import Compensator, UncertainSystem, find_peaks, instability, responses
 
 ROUNDS = 60  # of the balance of a matrix at most
 BALANCED = 1e-9  # relative difference of norms of rows and columns

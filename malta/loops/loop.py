@@ -14,6 +14,7 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
 from malta.linear.sampling import eigenvalues
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Classical, Nominal, classical_margins
 from malta.loops.sampled_loops import (
     LAST,
@@ -26,12 +27,11 @@ from malta.loops.sampled_loops import (
     machine_system,
     push_through,
 )
+from malta.loops.windings import CurrentLoops, chosen_loops, left_out
 from malta.model.equilibrium import with_parameters
 from malta.model.linearize import LinearModel
 from malta.model.parameters import units_of
 from malta.model.plant import Plant, position_at
-from malta.proof.uncertain import Compensator, UncertainSystem
-from malta.proof.windings import CurrentLoops, chosen_loops, left_out
 from malta.synthesis.controller import Controller, law_at
 
 

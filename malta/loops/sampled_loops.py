@@ -24,15 +24,10 @@ from malta.arrays import ComplexArray, FloatArray, readonly
 from malta.display import display
 from malta.errors import CheckError
 from malta.linear.sampling import add_lags, delay_inputs, eigenvalues, sample
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal, remembered
-from malta.model.data import plant_of
-from malta.model.equilibrium import trace, trim
-from malta.model.linearize import LinearModel, is_commutated, linearize
-from malta.model.plant import OperatingPoint, Plant, off_stroke, position_in, whole_samples
-from malta.model.signals import with_lags
-from malta.proof.parametric_plants import of_plant
-from malta.proof.uncertain import Compensator, UncertainSystem, held_gain
-from malta.proof.windings import (
+from malta.loops.parametric_plants import held_gain, of_plant
+from malta.loops.windings import (
     CurrentControl,
     CurrentLoops,
     axis_map,
@@ -47,6 +42,11 @@ from malta.proof.windings import (
     with_estimated_emf,
     with_windings,
 )
+from malta.model.data import plant_of
+from malta.model.equilibrium import trace, trim
+from malta.model.linearize import LinearModel, is_commutated, linearize
+from malta.model.plant import OperatingPoint, Plant, off_stroke, position_in, whole_samples
+from malta.model.signals import with_lags
 from malta.synthesis.controller import Controller, LinearLaw, law_at, linear_law, with_readings, with_slope
 from malta.synthesis.recovery import StepResponse, step_response
 from malta.synthesis.state_space import System

@@ -25,12 +25,12 @@ from malta.arrays import FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError, require_known
 from malta.linear.sampling import sample
+from malta.linear.uncertain import find_peaks
 from malta.loops.linear_loops import LinearLoop
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.loops.sampled_loops import SampledLoop
 from malta.model.plant import Plant, position_in
 from malta.processes import on_one_thread
-from malta.proof.uncertain import find_peaks
 from malta.synthesis.controller import Controller
 from malta.synthesis.recovery import RecoveryBound, StepResponse, step_response
 from malta.synthesis.requirements import Noise

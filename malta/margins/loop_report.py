@@ -15,12 +15,12 @@ from malta.display import Curves, Description, display
 from malta.loops.loop import Loop, loop_of_model
 from malta.loops.sampled_loops import LAST
 from malta.loops.time_domain import Recovery, furthest, noise_of, recovery
+from malta.loops.windings import CurrentLoops, left_out
 from malta.margins.travel import NOT_BETWEEN, NOWHERE, Extent
 from malta.merits import ROOTS, Merit, figure, in_groups
 from malta.model.machines import FINE
 from malta.model.parameters import box_words
 from malta.proof.margin import NOT_PROVEN, Margin
-from malta.proof.windings import CurrentLoops, left_out
 from malta.synthesis.requirements import Figure, Noise, Payload, Verdict, judge_figure, ratio_of
 
 if TYPE_CHECKING:

@@ -20,13 +20,13 @@ import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError, require_known
+from malta.linear.uncertain import Compensator, UncertainSystem, closed_loop, instability
 from malta.loops.sampled_loops import continuous_poles
 from malta.margins.travel import extent_of, travel_loops, travel_margin
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
 from malta.processes import on_one_thread
 from malta.proof.margin import Margin
-from malta.proof.uncertain import Compensator, UncertainSystem, closed_loop, instability
 from malta.synthesis.controller import Controller
 
 GRID, COARSE = 25, 4  # values of each parameter; every so many of them are looked at first

@@ -34,12 +34,14 @@ from scipy import linalg
 
 from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
+from malta.linear.expressions import BALLS, NotAnalytic, Program, program
+from malta.linear.uncertain import Compensator, UncertainSystem
+from malta.loops.parametric_plants import of_plant
+from malta.loops.windings import CurrentLoops, chosen_loops
 from malta.model.data import plant_of
 from malta.model.parameters import si, units_of
 from malta.model.plant import Plant, whole_samples
 from malta.processes import on_one_thread
-from malta.proof.expressions import BALLS, NotAnalytic, Program, program
-from malta.proof.parametric_plants import of_plant
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.rates import (
     BITS,
@@ -53,8 +55,6 @@ from malta.proof.rates import (
     rate_bound,
     spectral,
 )
-from malta.proof.uncertain import Compensator, UncertainSystem
-from malta.proof.windings import CurrentLoops, chosen_loops
 from malta.synthesis.controller import Controller
 
 CALLER = "rate_of_cells"

@@ -14,8 +14,12 @@ from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 from malta.errors import InputError
+from malta.linear.expressions import NotAnalytic
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal
+from malta.loops.parametric_plants import LONGEST, model_of
 from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
+from malta.loops.windings import CurrentLoops
 from malta.margins.scheduled_loops import loops_between_places
 from malta.model.data import plant_of
 from malta.model.linearize import is_commutated
@@ -23,9 +27,7 @@ from malta.model.parameters import units_of
 from malta.model.plant import off_stroke, outputs_at, position_at
 from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of
-from malta.proof.expressions import NotAnalytic
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
-from malta.proof.parametric_plants import LONGEST
 from malta.proof.problem import OfSeveral
 from malta.proof.robust import (
     TOLERANCE,
@@ -37,12 +39,10 @@ from malta.proof.robust import (
     rank_of,
     robust_margin,
 )
-from malta.proof.uncertain import Compensator, UncertainSystem, model_of
 from malta.proof.weak_coupling import HeldLoop
 from malta.proof.weak_coupling.held_currents import held_machine
-from malta.proof.windings import CurrentLoops
-from malta.proof.work import MORE, Budget, WorkUp, in_rounds, metered
 from malta.synthesis.schedule import point_at
+from malta.work import MORE, Budget, WorkUp, in_rounds, metered
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -366,7 +366,8 @@ def margin_anywhere(loop: LoopAlong, position: float | None = None) -> HeldLoop 
     try:
         if position is None:
             travel = (-plant.travel, plant.travel)
-            machine = held_machine(plant, plant_of(controller.parameters), loop.names, travel)
+            of = model_of(plant, plant_of(controller.parameters), tuple(loop.names))
+            machine = held_machine(of, loop.names, along[0][0].nominal, travel)
         else:
             whole = margin_anywhere(loop)
             if whole is None:

@@ -19,7 +19,9 @@ import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.sampled_loops import LAST
+from malta.loops.windings import chosen_loops, current_control, force_modes, windings_of
 from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
 from malta.model.linearize import is_commutated
@@ -29,10 +31,8 @@ from malta.proof.box import box_of
 from malta.proof.groups import groups, loop_of
 from malta.proof.margin import Ranges
 from malta.proof.robust import robust_margin
-from malta.proof.uncertain import Compensator, UncertainSystem
-from malta.proof.windings import chosen_loops, current_control, force_modes, windings_of
-from malta.proof.work import Budget
 from malta.synthesis.controller import Controller
+from malta.work import Budget
 
 FACTOR = "gain factor"  # the name of the further parameter
 MOST = 0.2  # share by which gains may scatter at most: nothing beyond is looked at

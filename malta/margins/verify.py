@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.linear.sampling import eigenvalues
+from malta.linear.uncertain import Compensator, crossing_frequency, find_peaks
 from malta.loops.classical import Classical, classical_margins, nominal_loop, peak_sensitivity, worst_of
 from malta.loops.loop import loop_of_model
 from malta.loops.own_model import controller_poles
+from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import (
     LAST,
     SampledLoop,
@@ -30,6 +32,7 @@ from malta.loops.sampled_loops import (
     sampled_loop,
     sorted_poles,
 )
+from malta.loops.windings import CurrentLoops, chosen_loops
 from malta.margins.loop_report import BANDWIDTHS, Link, LoopReport, Place, Poles, Stage
 from malta.margins.travel import (
     EACH,
@@ -47,14 +50,11 @@ from malta.model.parameters import units_of
 from malta.model.plant import Plant, position_at
 from malta.processes import on_one_thread
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
-from malta.proof.parametric_plants import of_plant
 from malta.proof.robust import robust_margin
-from malta.proof.uncertain import Compensator, crossing_frequency, find_peaks
-from malta.proof.windings import CurrentLoops, chosen_loops
-from malta.proof.work import Budget, metered
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import gain_at_rest
 from malta.synthesis.lqg import integrals_of, kalman, lqi, lqr, weights_of
+from malta.work import Budget, metered
 
 
 @on_one_thread

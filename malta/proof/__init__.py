@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
+    from malta.linear.uncertain import Compensator as Compensator, UncertainSystem as UncertainSystem
     from malta.proof.blocks import Dynamic as Dynamic
     from malta.proof.blocks.gain import Gain as Gain
     from malta.proof.connections import (
@@ -33,8 +34,7 @@ if TYPE_CHECKING:
     from malta.proof.margin import Margin as Margin
     from malta.proof.rates import RateBound as RateBound, varying as varying
     from malta.proof.robust import Interrupted as Interrupted, margin_of_polynomial as margin_of_polynomial
-    from malta.proof.uncertain import Compensator as Compensator, UncertainSystem as UncertainSystem
-    from malta.proof.work import Budget as Budget
+    from malta.work import Budget as Budget
 
 _NAMES = {
     "malta.proof.blocks": "Dynamic",
@@ -43,7 +43,7 @@ _NAMES = {
     "malta.proof.margin": "Margin",
     "malta.proof.rates": "RateBound varying",
     "malta.proof.robust": "Interrupted margin_of_polynomial",
-    "malta.proof.uncertain": "Compensator UncertainSystem",
-    "malta.proof.work": "Budget",
+    "malta.linear.uncertain": "Compensator UncertainSystem",
+    "malta.work": "Budget",
 }
 __all__, __getattr__, __dir__ = contents(__name__, _NAMES)

@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from malta.arguments import describe, plural
 from malta.arrays import readonly
 from malta.errors import InputError, require_known
+from malta.linear.systems import compensator_of
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.proof.box import box_of
-from malta.proof.systems import compensator_of
-from malta.proof.uncertain import Compensator, UncertainSystem, describe, plural
 
 if TYPE_CHECKING:
     from malta.proof.margin import Ranges

@@ -16,11 +16,12 @@ import numpy as np
 from flint import arb, arb_mat
 from scipy import linalg, sparse
 
+from malta.arguments import plural
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.proof.expressions import NotAnalytic, Program, exact, program
-from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge, symbolic
-from malta.proof.uncertain import Compensator, Group, UncertainSystem, plural
+from malta.linear.expressions import NotAnalytic, Program, exact, program
+from malta.linear.rational import Ratio, Symbolic, TooLarge, symbolic
+from malta.linear.uncertain import Compensator, Group, UncertainSystem
 
 A, B, C, D, E = range(5)
 

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.errors import CheckError
+from malta.linear.expressions import NotAnalytic
+from malta.linear.uncertain import Compensator, UncertainSystem, critical_frequency, instability
 from malta.proof.exclusion.witness import Zero, gradients
-from malta.proof.expressions import NotAnalytic
-from malta.proof.uncertain import Compensator, UncertainSystem, critical_frequency, instability
-from malta.proof.work import is_past
+from malta.work import is_past
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from malta.bound import Bound, at_least, at_most
 from malta.display import Description, display, quantity
-from malta.proof.work import MORE
+from malta.work import MORE
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

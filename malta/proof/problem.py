@@ -12,14 +12,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from flint import acb, arb, arb_mat, fmpq
 
-from malta.proof.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program, exact
-from malta.proof.groups import UncertainLoop, groups
-from malta.proof.polynomial.characteristic import Characteristic, map_bilinear, map_bounds, pair
-from malta.proof.polynomial.closed_loop import Couplings, closed_loop, driven_group, loop_parts
-from malta.proof.polynomial.enclosure import Polynomial, precision
-from malta.proof.polynomial.family import binary
-from malta.proof.polynomial.rational import Symbolic, TooLarge, over_common_denominator, symbolic
-from malta.proof.uncertain import (
+from malta.linear.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program, exact
+from malta.linear.rational import Symbolic, TooLarge, over_common_denominator, symbolic
+from malta.linear.uncertain import (
     Compensator,
     Group,
     UncertainSystem,
@@ -28,7 +23,12 @@ from malta.proof.uncertain import (
     instability,
     worst_frequency,
 )
-from malta.proof.work import WorkUp
+from malta.proof.groups import UncertainLoop, groups
+from malta.proof.polynomial.characteristic import Characteristic, map_bilinear, map_bounds, pair
+from malta.proof.polynomial.closed_loop import Couplings, closed_loop, driven_group, loop_parts
+from malta.proof.polynomial.enclosure import Polynomial, precision
+from malta.proof.polynomial.family import binary
+from malta.work import WorkUp
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

@@ -26,16 +26,17 @@ import numpy as np
 from flint import arb, arb_mat
 from scipy import linalg
 
+from malta.arguments import interval, positive
 from malta.arrays import FloatArray
 from malta.bound import at_least
 from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
+from malta.linear.expressions import NotAnalytic
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.processes import on_one_thread
-from malta.proof.expressions import NotAnalytic
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.robust import law_of
-from malta.proof.uncertain import Compensator, UncertainSystem, interval, positive
-from malta.proof.work import is_past, metered, work_limit
+from malta.work import is_past, metered, work_limit
 
 CALLER = "varying"
 BITS = 128

@@ -24,28 +24,20 @@ import numpy as np
 from flint import arb, fmpq, fmpq_mat
 from scipy import linalg
 
+from malta.arguments import by_name, describe, interval, is_pair, number, positive
 from malta.errors import InputError
+from malta.linear.expressions import NotAnalytic, Program, exact, program
+from malta.linear.rational import Ratio, Symbolic, product
+from malta.linear.systems import compensator_of, polynomial_of
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of, within_branches
-from malta.proof.expressions import NotAnalytic, Program, exact, program
 from malta.proof.groups import A, B, C, E, UncertainLoop, loop_of
 from malta.proof.loss import first_loss, loss_beside
 from malta.proof.margin import Margin, Progress, Ranges
-from malta.proof.polynomial.rational import Ratio, Symbolic, product
 from malta.proof.problem import CoefficientPolynomial, OfLoop, OfSeveral, Problem, is_nominal_stable
 from malta.proof.search import Question, Standing, search
-from malta.proof.systems import compensator_of, polynomial_of
-from malta.proof.uncertain import (
-    Compensator,
-    UncertainSystem,
-    by_name,
-    describe,
-    interval,
-    is_pair,
-    number,
-    positive,
-)
-from malta.proof.work import AGAIN, MORE, Budget, in_rounds, is_past
+from malta.work import AGAIN, MORE, Budget, in_rounds, is_past
 
 # A loop in the coordinates in which its parameters act apart: x = S x', exactly, found from how the parameters enter.
 #

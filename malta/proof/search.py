@@ -13,17 +13,17 @@ from flint import arb
 
 from malta.bound import at_least
 from malta.errors import CheckError
+from malta.linear.expressions import NotAnalytic
 from malta.proof.box import EDGE, Box
 from malta.proof.exclusion import Part, Search, advance, cut, growth_over, merge_twins, start
 from malta.proof.exclusion.hurwitz import Signs, raise_bound, signs_over
 from malta.proof.exclusion.witness import Zero, from_cell, nearest, starts
-from malta.proof.expressions import NotAnalytic
 from malta.proof.loss import confirm, contributions, corner_loss, first_loss
 from malta.proof.margin import Certificate, Margin, Progress
 from malta.proof.multipliers.structured import Proof, Structured, rows_of
 from malta.proof.polynomial.enclosure import NO_COEFFICIENTS, Unproven, family_over
 from malta.proof.problem import Problem, is_nominal_stable
-from malta.proof.work import WorkUp, is_past, is_stopped, refuse, spent, work_limit
+from malta.work import WorkUp, is_past, is_stopped, refuse, spent, work_limit
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

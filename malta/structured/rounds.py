@@ -24,8 +24,10 @@ import numpy as np
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.linear.sampling import add_lags, delay_inputs, sample
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.loop import loop
 from malta.loops.sampled_loops import LAST, SampledLoop, sampled_loop
+from malta.loops.windings import chosen_loops
 from malta.margins.travel import travel_margin, worst_sensitivities
 from malta.model.linearize import linearize
 from malta.model.parameters import units_of
@@ -34,8 +36,6 @@ from malta.processes import on_one_thread
 from malta.proof.blocks.gain import Gain, worst_case_gain
 from malta.proof.margin import Margin, Ranges
 from malta.proof.robust import robust_margin
-from malta.proof.uncertain import Compensator, UncertainSystem
-from malta.proof.windings import chosen_loops
 from malta.structured.goals import Goal
 from malta.structured.loops import Model, model_of, models_of_systems
 from malta.structured.search import ROOM, Look, Task, contradiction, random_starts, rate_of, search

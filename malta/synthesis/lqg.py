@@ -267,7 +267,7 @@ def gains(
     lag : rad/s, of the forces behind their commands, which are then states of the design model; None: no lag
 
     Without delay, lag, integrals and disturbances K is control.dlqr(Ad, Bd, Qd, Rd, Nd)[0] with the sampled weights of
-    linear.sampling.sample_cost, and Ad L is the gain of control.dlqe(Ad, 1, Cd, Wd, V)[0], a predictor's. control.dlqr with
+    `sample_cost`, and Ad L is the gain of control.dlqe(Ad, 1, Cd, Wd, V)[0], a predictor's. control.dlqr with
     integral_action sums errors without Ts, and one sample late.
     """
     if discretization == "backward-euler":

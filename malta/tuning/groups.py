@@ -25,14 +25,11 @@ from scipy import sparse
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.linear.sampling import add_lags, delay_inputs, sample
+from malta.linear.uncertain import crossing_frequency
+from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import disturbance_map, push_through
 from malta.loops.time_domain import covariance, noise_variance
-from malta.model.equilibrium import trim
-from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import Plant, position_in
-from malta.proof.parametric_plants import of_plant
-from malta.proof.uncertain import crossing_frequency
-from malta.proof.windings import (
+from malta.loops.windings import (
     Windings,
     emf_slope,
     estimated_rows,
@@ -41,6 +38,9 @@ from malta.proof.windings import (
     with_estimated_emf,
     with_windings,
 )
+from malta.model.equilibrium import trim
+from malta.model.linearize import LinearModel, linearize
+from malta.model.plant import Plant, position_in
 from malta.synthesis.controller import CurrentLoop, LinearLaw, linear_law_of
 from malta.synthesis.feedforward import current_loop_of, holding_gain, static_feedforward
 from malta.synthesis.filters import Gains, gain_at_rest

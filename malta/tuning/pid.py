@@ -28,15 +28,15 @@ from scipy import optimize, sparse
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.sampling import sample, sample_noise
+from malta.linear.uncertain import crossing_frequency
 from malta.loops.loop import loop_of_model
 from malta.loops.sampled_loops import SampledLoop
 from malta.loops.time_domain import covariance
+from malta.loops.windings import emf_slope, estimated_rows, windings_of, with_estimated_emf
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import position_at, position_in
-from malta.proof.uncertain import crossing_frequency
-from malta.proof.windings import emf_slope, estimated_rows, windings_of, with_estimated_emf
 from malta.synthesis.controller import Controller, linear_law_of, with_readings
 from malta.synthesis.pid import Axes, axes_of, law_of_outputs, pid_gains
 from malta.synthesis.requirements import ratio_of

@@ -15,6 +15,7 @@ from malta.gains.file import content_of, read
 from malta.loops.loop import Loop, loop_of_model
 from malta.loops.sampled_loops import LAST
 from malta.loops.time_domain import bounded_deviation, noise_of, worst_along
+from malta.loops.windings import CurrentLoops
 from malta.margins.loop_report import BANDWIDTHS, LoopReport, Outcome
 from malta.margins.scheduled_loops import schedule_rate
 from malta.margins.travel import LoopAlong, worst_sensitivities
@@ -23,7 +24,6 @@ from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import Parameters, Plant
 from malta.proof.margin import Progress
-from malta.proof.windings import CurrentLoops
 from malta.simulation.experiments import Experiment
 from malta.simulation.experiments.catalogue import experiment, payload
 from malta.simulation.scenario import Scenario

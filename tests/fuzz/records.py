@@ -25,10 +25,10 @@ from malta.firmware.signals import Target
 from malta.firmware.sources import LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
 from malta.identification.calibration import Estimate
 from malta.identification.commission import Commissioning, Entry, Finding, read_journal
+from malta.linear.uncertain import Compensator
 from malta.machines.tubular.experiments.strokes import forces_of, record
 from malta.proof.certificate import certificate, checked_file
 from malta.proof.certificate.check import check
-from malta.proof.uncertain import Compensator
 from malta.report import campaign_tables
 from malta.report.page.document import binder_page, binder_text
 from malta.report.page.motion import motion_page, read_motion

@@ -18,10 +18,10 @@ from magnets import MACHINES
 
 import malta
 from malta import gains
+from malta.linear.uncertain import closed_loop, instability
 from malta.loops.sampled_loops import loaded_model, machine_loop, machine_system
 from malta.margins.travel import place_margin
 from malta.model.parameters import twins_of
-from malta.proof.uncertain import closed_loop, instability
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray

@@ -20,6 +20,7 @@ import malta
 from malta import gains
 from malta.cli.main import app, main
 from malta.errors import InputError
+from malta.linear.uncertain import Compensator, UncertainSystem, closed_loop, instability, responses
 from malta.loops.classical import (
     balanced_norm,
     classical_margins,
@@ -27,6 +28,7 @@ from malta.loops.classical import (
     disk_margins_alone,
     nominal_loop,
 )
+from malta.loops.parametric_plants import uncertain
 from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
 from malta.margins.loop_report import LoopReport
 from malta.margins.travel import place_margin
@@ -35,8 +37,6 @@ from malta.model.data import plant_of
 from malta.model.linearize import linearize
 from malta.proof.blocks.gain import Gain
 from malta.proof.robust import robust_margin
-from malta.proof.systems import uncertain
-from malta.proof.uncertain import Compensator, UncertainSystem, closed_loop, instability, responses
 from malta.report.figures.margins import chain_figure
 
 if TYPE_CHECKING:

@@ -16,13 +16,13 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
 import malta
+from malta.linear.uncertain import instability
 from malta.loops.sampled_loops import machine_loop, machine_system
 from malta.loops.time_domain import recovery
 from malta.margins.travel import travel_margin
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
 from malta.model.signals import LateSensors, split_dead_time, with_lags
-from malta.proof.uncertain import instability
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 

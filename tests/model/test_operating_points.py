@@ -13,10 +13,10 @@ from magnets import BENCH, MACHINES, bench, two_coils
 
 import malta
 from malta.app.linear_run import linear_run
+from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import loaded_model, machine_loop, machine_system
 from malta.model.equilibrium import commanded
 from malta.model.plant import OperatingPoint
-from malta.proof.parametric_plants import of_plant
 from malta.simulation.experiments.catalogue import held_payload
 
 if TYPE_CHECKING:

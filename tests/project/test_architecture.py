@@ -28,6 +28,8 @@ GROUND = (
     "bound",
     "display",
     "merits",
+    "work",
+    "arguments",
 )
 ORDER = (*GROUND, *PACKAGES[1:])
 MACHINES = {"tubular", "halbach", "planar"}
@@ -210,3 +212,27 @@ def test_listed_tests_exist() -> None:
     for line in (ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").splitlines():
         file, name = line.partition("[")[0].split("::")
         assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), line
+
+
+# What a room never imports, in functions neither, whatever stands below it.
+NEVER = {
+    "linear": ("model", "synthesis", "loops", "proof", "margins"),
+    "synthesis": ("loops", "simulation", "proof", "margins"),
+    "loops": ("proof", "margins", "simulation"),
+    "proof": ("model", "synthesis", "loops", "margins", "simulation", "machines"),
+    "simulation": ("proof", "margins"),
+}
+ALLOWED = {
+    ("malta.proof.certificate.check", "malta.gains.certified"),  # as above
+}
+
+
+def test_rooms_keep_to_what_they_know() -> None:
+    """A prover knows matrices alone; the kernel (model to loops) and a flight know no prover."""
+    broken = {
+        (module_of(path), module)
+        for path in SOURCES
+        for module in imports(path)
+        if package_of(module) in NEVER.get(package_of(module_of(path)) or "", ())
+    }
+    assert broken - ALLOWED == set()

@@ -11,7 +11,7 @@ import pytest
 from flint import arb, fmpq
 
 import malta
-from malta.proof.expressions import EXACT
+from malta.linear.expressions import EXACT
 from malta.proof.groups import loop_of
 from malta.proof.robust import in_plain_basis, law_of, problem_of
 

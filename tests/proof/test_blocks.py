@@ -13,10 +13,10 @@ from hypothesis import given, settings, strategies as st
 
 import malta
 from malta.errors import InputError
+from malta.linear.uncertain import responses
 from malta.proof import Dynamic
 from malta.proof.blocks import Block, probe, weight_of
 from malta.proof.blocks.transfer import Signals, mu_bound, performance, transfer
-from malta.proof.uncertain import responses
 
 ONE = weight_of(1.0, "")
 

@@ -14,20 +14,12 @@ from flint import arb
 
 import malta
 from malta.errors import InputError
+from malta.linear.branches import INTERVALS, Interval, resolve_branches, without_branches
+from malta.linear.expressions import POINTS, NotAnalytic, program
+from malta.loops.parametric_plants import of_plant
 from malta.model import Actuator, Plant, Signal, si
-from malta.proof.box import (
-    ENDS,
-    FAR,
-    INTERVALS,
-    Interval,
-    box_of,
-    resolve_branches,
-    within_branches,
-    without_branches,
-)
+from malta.proof.box import ENDS, FAR, box_of, within_branches
 from malta.proof.certificate.certificate import certificate_of
-from malta.proof.expressions import POINTS, NotAnalytic, program
-from malta.proof.parametric_plants import of_plant
 
 
 @dataclass(frozen=True)

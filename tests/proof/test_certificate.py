@@ -23,12 +23,12 @@ from tampering import claiming, written
 import malta
 from malta.errors import CheckError, InputError
 from malta.gains.certified import origin_of
+from malta.linear.uncertain import Compensator
 from malta.loops.sampled_loops import LAST
 from malta.margins.travel import travel_loops, travel_margin
 from malta.proof.certificate import certificate
 from malta.proof.certificate.check import check, tiled
 from malta.proof.certificate.checked_loop import determinant_bounds
-from malta.proof.uncertain import Compensator
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

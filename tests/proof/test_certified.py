@@ -19,11 +19,11 @@ from tampering import claiming, written
 import malta
 from malta.errors import InputError
 from malta.gains.certified import origin_of
+from malta.loops.windings import CurrentLoops
 from malta.margins import travel
 from malta.margins.travel import travel_loops
 from malta.proof.certificate import certificate, checked_file
 from malta.proof.certificate.check import Verdict, check
-from malta.proof.windings import CurrentLoops
 from malta.report.tables.design import claim_share
 
 pytestmark = pytest.mark.usefixtures("proven_once")

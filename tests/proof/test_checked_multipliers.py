@@ -17,7 +17,7 @@ import malta
 from malta.proof.certificate.checked_multipliers import refusal
 from malta.proof.multipliers import Blocks, Multiplier
 from malta.proof.multipliers.structured import Proof, Shown, worst
-from malta.proof.work import WorkUp, work_limit
+from malta.work import WorkUp, work_limit
 
 
 @cache

@@ -12,10 +12,10 @@ from published_cases import ROBSTAB, Loop, pid
 import malta
 from malta import dynamic_margin, gains
 from malta.errors import InputError
+from malta.linear.uncertain import responses
 from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
 from malta.proof import Dynamic
-from malta.proof.uncertain import responses
 
 
 def robstab() -> malta.proof.UncertainSystem:

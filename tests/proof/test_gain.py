@@ -13,6 +13,7 @@ from hypothesis import given, settings, strategies as st
 import malta
 from malta import gains
 from malta.errors import InputError
+from malta.linear.uncertain import responses
 from malta.margins.travel import travel_loops, worst_sensitivities
 from malta.model.data import plant_of
 from malta.proof.blocks import Block, gain, weight_of
@@ -20,7 +21,6 @@ from malta.proof.blocks.gain import Blocks
 from malta.proof.blocks.transfer import Peak, Signals, frequencies, patterns, transfer
 from malta.proof.polynomial.family import align, combine, family
 from malta.proof.robust import problem_of
-from malta.proof.uncertain import responses
 
 
 def first_order(k: float = 1.0) -> malta.proof.UncertainSystem:

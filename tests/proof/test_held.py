@@ -15,16 +15,16 @@ from scipy import linalg
 import malta
 from malta import gains
 from malta.linear.sampling import sample
+from malta.linear.uncertain import UncertainSystem, closed_loop, responses
 from malta.loops.own_model import controller_poles, unstable_gain
+from malta.loops.parametric_plants import uncertain
 from malta.loops.sampled_loops import machine_loop, machine_system, sampled_law, sampled_loop
+from malta.loops.windings import left_out
 from malta.margins.travel import travel_margin
 from malta.margins.verify import linear_report
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel
 from malta.model.plant import Plant
-from malta.proof.systems import uncertain
-from malta.proof.uncertain import UncertainSystem, closed_loop, responses
-from malta.proof.windings import left_out
 from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate

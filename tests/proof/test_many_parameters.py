@@ -14,15 +14,15 @@ import pytest
 from scipy import linalg
 
 import malta
+from malta.linear.uncertain import Compensator, UncertainSystem, instability
 from malta.proof.box import Box, box_of
 from malta.proof.multipliers import Blocks, Branch, Multiplier, excludes_zero, multiplier, response
 from malta.proof.multipliers.pencil import LEVELS, gains_of_level
 from malta.proof.multipliers.structured import Structured, rows_of
 from malta.proof.problem import OfLoop
 from malta.proof.robust import law_of, problem_of
-from malta.proof.uncertain import Compensator, UncertainSystem, instability
-from malta.proof.work import WorkUp, work_limit
 from malta.synthesis.riccati import care, dare
+from malta.work import WorkUp, work_limit
 
 Loop = tuple[UncertainSystem, Compensator]
 

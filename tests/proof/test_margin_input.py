@@ -17,12 +17,12 @@ import pytest
 import malta
 from malta import gains
 from malta.errors import InputError
+from malta.linear.expressions import program
+from malta.linear.uncertain import UncertainSystem
 from malta.model.data import plant_of
 from malta.proof.box import box_of
-from malta.proof.expressions import program
 from malta.proof.problem import CoefficientPolynomial
 from malta.proof.robust import common_margin
-from malta.proof.uncertain import UncertainSystem
 
 PLANT = plant_of(gains.read("design/gains/table2.json").parameters)
 LAG = control.ss([[-1.0]], [[1.0]], [[-1.0]], [[0.0]])

@@ -9,9 +9,9 @@ import pytest
 from flint import arb, ctx
 
 import malta
+from malta.linear.uncertain import Compensator
 from malta.proof import groups, robust
 from malta.proof.polynomial import family, minors
-from malta.proof.uncertain import Compensator
 
 
 @pytest.mark.parametrize("decades", [0, 90, -90, 400])

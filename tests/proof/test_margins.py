@@ -13,8 +13,8 @@ from hypothesis import assume, given, settings, strategies as st
 
 import malta
 from malta.errors import InputError
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.proof.problem import hurwitz
-from malta.proof.uncertain import Compensator, UncertainSystem
 
 
 def chain(tau: float, unit: float = 1.0) -> UncertainSystem:

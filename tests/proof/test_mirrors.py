@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import malta
+from malta.linear.uncertain import Compensator
 from malta.proof import robust
 from malta.proof.groups import groups, loop_of
 from malta.proof.polynomial import minors, minors as mirrors
 from malta.proof.polynomial.minors import Image, Places, first_alike, image_of
-from malta.proof.uncertain import Compensator
 
 ONE, TWO = Places((0, 1), (1,)), Places((2, 3), (1,))
 

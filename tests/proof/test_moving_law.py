@@ -11,12 +11,12 @@ from flint import arb
 from scipy import linalg
 
 import malta
+from malta.linear.systems import compensator_of
+from malta.linear.uncertain import Compensator
 from malta.margins import schedule_rate, scheduled_loops
 from malta.margins.scheduled_loops import loops_between_places, rate_of_cells
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.rates import BITS, middle
-from malta.proof.systems import compensator_of
-from malta.proof.uncertain import Compensator
 
 TS = 0.01  # s
 

@@ -16,14 +16,14 @@ from hypothesis import assume, given, settings, strategies as st
 
 from malta import gains
 from malta.errors import InputError
+from malta.linear.uncertain import Compensator, UncertainSystem, critical_frequency, instability, responses
+from malta.loops.parametric_plants import uncertain
 from malta.loops.sampled_loops import machine_law, machine_system
 from malta.margins.travel import travel_margin
 from malta.margins.verify import compensators
 from malta.model.data import plant_of
 from malta.proof import Budget
 from malta.proof.robust import robust_margin
-from malta.proof.systems import uncertain
-from malta.proof.uncertain import Compensator, UncertainSystem, critical_frequency, instability, responses
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -19,6 +19,7 @@ from conftest import ROOT, printed
 import malta
 from malta import report
 from malta.campaigns.result import figures_of
+from malta.linear.uncertain import instability
 from malta.margins.loop_report import LoopReport, zone
 from malta.margins.travel import NOWHERE, Extent, extent_of, positions_of, travel_loops, travel_margin
 from malta.model import machines
@@ -27,7 +28,6 @@ from malta.model.machines import machine
 from malta.model.plant import Plant
 from malta.proof.blocks.gain import Gain
 from malta.proof.margin import Margin
-from malta.proof.uncertain import instability
 from malta.simulation.experiments.catalogue import cases_of
 
 if TYPE_CHECKING:

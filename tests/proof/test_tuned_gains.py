@@ -10,11 +10,11 @@ import pytest
 from exported import controller
 
 import malta
+from malta.linear.uncertain import closed_loop, instability
 from malta.loops.sampled_loops import machine_law
 from malta.margins.travel import travel_loops
 from malta.margins.tuned_gains import MOST, GainBox, gain_box, tuned_loop
 from malta.proof.groups import groups, loop_of
-from malta.proof.uncertain import closed_loop, instability
 from malta.synthesis.controller import Controller
 
 pytestmark = pytest.mark.usefixtures("proven_once")

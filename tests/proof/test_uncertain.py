@@ -10,10 +10,10 @@ import pytest
 
 import malta
 from malta.errors import InputError
+from malta.linear.uncertain import closed_loop, critical_frequency, instability, responses
+from malta.loops.parametric_plants import uncertain
 from malta.loops.sampled_loops import machine_law, sampled_loop
 from malta.proof.robust import robust_margin
-from malta.proof.systems import uncertain
-from malta.proof.uncertain import closed_loop, critical_frequency, instability, responses
 
 if TYPE_CHECKING:
     from conftest import Design

@@ -16,11 +16,12 @@ from flint import arb
 from scipy import linalg
 
 from malta import gains
+from malta.linear.expressions import NotAnalytic, program
+from malta.linear.uncertain import closed_loop, instability
+from malta.loops.parametric_plants import model_of
 from malta.margins.travel import NOT_BETWEEN, LoopAlong, margin_anywhere, travel_margin
 from malta.model.data import plant_of
 from malta.proof.box import box_of
-from malta.proof.expressions import NotAnalytic, program
-from malta.proof.uncertain import closed_loop, instability, model_of
 from malta.proof.weak_coupling import HeldLoop, coupling_bounds, taylor
 from malta.proof.weak_coupling.axes import members_of, state_matrix
 from malta.proof.weak_coupling.held_currents import HeldMachine, dominating_solution, held_machine
@@ -272,7 +273,7 @@ def test_couplings_are_bounded_where_a_cell_is() -> None:
 def test_a_stronger_coupling_proves_less() -> None:
     """The bound follows what couples the axes: ten times the stiffness of held currents costs some of it."""
     from malta.proof.robust import Effort, margin_of
-    from malta.proof.work import Budget
+    from malta.work import Budget
 
     _, _, problem = machine()
     h = problem.machine
@@ -293,8 +294,9 @@ def test_parameters_of_no_such_form_are_left_to_places() -> None:
     """The coil pitch enters through sines of the place of each coil: of that nothing is claimed."""
     controller = gains.read("design/gains/planar.json")
     plant = plant_of(controller.parameters)
+    of = model_of(plant, plant, ("coil_pitch",))
     with pytest.raises(NotAnalytic):
-        held_machine(plant, plant, ("coil_pitch",), (-plant.travel, plant.travel))
+        held_machine(of, ("coil_pitch",), np.array([0.04]), (-plant.travel, plant.travel))
 
 
 def test_at_a_position_the_bounds_are_narrower() -> None:

@@ -18,11 +18,11 @@ from test_metamorphic_random import random_case
 
 import malta
 from malta.errors import InputError
+from malta.linear.expressions import program
+from malta.linear.rational import symbolic
 from malta.margins.travel import travel_margin
 from malta.proof import Budget, Interrupted
-from malta.proof.expressions import program
-from malta.proof.polynomial.rational import symbolic
-from malta.proof.work import MORE, WorkUp, is_past, metered, remembered, spend, spent, work_limit
+from malta.work import MORE, WorkUp, is_past, metered, remembered, spend, spent, work_limit
 
 LIMIT = 0.3  # units of work
 SAMPLED = control.c2d(control.tf([-0.3, -0.3], [0.2, 1]), 0.1, "tustin")

@@ -19,7 +19,7 @@ from malta.structured.search import Task, random_starts, rate_of, search
 from malta.synthesis.structure import Structure, places_of
 
 if TYPE_CHECKING:
-    from malta.proof.uncertain import UncertainSystem
+    from malta.linear.uncertain import UncertainSystem
 
 J1, J2 = 1e-6, 1.15e-7  # kg m^2; MathWorks, Robust Tuning of Positioning System
 

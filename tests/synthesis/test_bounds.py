@@ -19,6 +19,7 @@ from flint import Ordering, arb, fmpq, fmpq_mpoly_ctx
 from tampering import claiming
 
 import malta
+from malta.linear.uncertain import Compensator, closed_loop
 from malta.margins.loop_report import Stage
 from malta.margins.travel import smallest_margin
 from malta.proof import exclusion
@@ -30,8 +31,7 @@ from malta.proof.polynomial import characteristic as degrees, enclosure
 from malta.proof.polynomial.closed_loop import loop_parts
 from malta.proof.polynomial.family import nodes, restrict, restriction_rounding
 from malta.proof.problem import OfLoop
-from malta.proof.uncertain import Compensator, closed_loop
-from malta.proof.work import WorkUp, metered, work_limit
+from malta.work import WorkUp, metered, work_limit
 
 RANGES = {"m": 0.3, "k": 0.3}
 

@@ -16,10 +16,10 @@ from malta.firmware.signals import Target
 from malta.gains.certified import origin_of
 from malta.gains.encodings import content_sha256, encode
 from malta.linear.sampling import sample
+from malta.linear.uncertain import instability
 from malta.loops.sampled_loops import machine_system
 from malta.margins.scheduled_loops import loops_between_places
 from malta.margins.travel import travel_margin, worst_sensitivities
-from malta.proof.uncertain import instability
 from malta.simulation.references import Motion
 from malta.synthesis.controller import Controller, law, law_at
 from malta.synthesis.schedule import SCHEDULED, Schedule, point_at

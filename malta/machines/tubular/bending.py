@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from malta.linear.uncertain import UncertainSystem
 from malta.machines.tubular.parameters import Parameters
 from malta.model.data import published_figures, published_value
 from malta.proof.blocks import Dynamic
-from malta.proof.uncertain import UncertainSystem
 
 FREE = 4.730040744862704  # k of the first mode of a free beam
 SIZE = 2.0  # the square of sqrt 2: two forces, and two sensors, of one plane

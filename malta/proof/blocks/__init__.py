@@ -23,9 +23,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.arguments import describe, is_number
 from malta.display import display
 from malta.errors import InputError
-from malta.proof.uncertain import Compensator, UncertainSystem, describe, is_number
+from malta.linear.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray, FloatArray

@@ -16,10 +16,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from malta.arguments import positive
 from malta.arrays import ComplexArray, FloatArray
 from malta.bound import Bound, at_least, at_most
 from malta.display import Description, display, quantity
 from malta.errors import InputError
+from malta.linear.uncertain import Compensator, UncertainSystem, responses
 from malta.processes import on_one_thread
 from malta.proof.blocks import (
     At,
@@ -53,8 +55,7 @@ from malta.proof.margin import Margin, Ranges, unproven
 from malta.proof.polynomial.enclosure import NO_COEFFICIENTS, Unproven
 from malta.proof.problem import OfLoop, is_nominal_stable
 from malta.proof.robust import law_of, problem_of
-from malta.proof.uncertain import Compensator, UncertainSystem, positive, responses
-from malta.proof.work import Budget, WorkUp, in_rounds, is_past, work_limit
+from malta.work import Budget, WorkUp, in_rounds, is_past, work_limit
 
 # Unmodelled dynamics beside real parameters: stable blocks Delta_k with |Delta_k(jw)| <= t |W_k(jw)|.
 #

@@ -30,7 +30,7 @@ from malta.proof.box import Box
 from malta.proof.exclusion import PATCHES, CellBounds, Growth, advance, cut, growth_over, on_boxes, start
 from malta.proof.polynomial.enclosure import Polynomial, family_over
 from malta.proof.polynomial.family import Family, align, combine
-from malta.proof.work import is_past
+from malta.work import is_past
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray, FloatArray

@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray, readonly
+from malta.linear.uncertain import Responses
 from malta.proof.blocks import Block
-from malta.proof.uncertain import Responses
-from malta.proof.work import is_past
+from malta.work import is_past
 
 if TYPE_CHECKING:
     from malta.proof.problem import OfLoop

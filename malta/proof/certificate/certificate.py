@@ -19,6 +19,8 @@ from scipy import linalg, sparse
 
 from malta.errors import CheckError, InputError
 from malta.files import replace_files, version
+from malta.linear.expressions import FIELD, exact
+from malta.linear.systems import compensator_of
 from malta.proof.box import Box, below, box_of
 from malta.proof.certificate import checked_file
 from malta.proof.certificate.check import BITS, MOST_NODES, balls, bernstein, interpolated, within
@@ -34,15 +36,13 @@ from malta.proof.certificate.checked_loop import (
     split,
 )
 from malta.proof.exclusion import Growth, advance, start
-from malta.proof.expressions import FIELD, exact
 from malta.proof.groups import E, UncertainLoop, loop_of
 from malta.proof.polynomial.family import Family, binary
-from malta.proof.systems import compensator_of
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
+    from malta.linear.uncertain import Compensator, UncertainSystem
     from malta.proof.margin import Margin, Ranges
-    from malta.proof.uncertain import Compensator, UncertainSystem
 
 
 # How a certificate splits a loop: groups of states, the sizes in which couplings between these count least, and v.

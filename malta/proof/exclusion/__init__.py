@@ -20,7 +20,7 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.proof.box import Box, smallest_t
 from malta.proof.polynomial.enclosure import Polynomial, TooWide, Unproven
 from malta.proof.polynomial.family import EPS, Family, restrict, restriction_rounding
-from malta.proof.work import is_past
+from malta.work import is_past
 
 # A family along s = jw: Taylor expansions on intervals of frequency, from zero to infinity.
 #

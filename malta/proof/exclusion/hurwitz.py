@@ -22,14 +22,14 @@ import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
 from malta.arrays import FloatArray
+from malta.linear.expressions import NotAnalytic, exact
 from malta.proof.box import Box
 from malta.proof.exclusion import cut
-from malta.proof.expressions import NotAnalytic, exact
 from malta.proof.polynomial.characteristic import pair
 from malta.proof.polynomial.enclosure import Disc, Polynomial, TooWide, Unproven, discs_of, ends_of, precision
 from malta.proof.polynomial.family import nodes, scale_of
 from malta.proof.problem import Problem, hurwitz
-from malta.proof.work import check_clock, spend
+from malta.work import check_clock, spend
 
 BITS = 640  # of balls: Bernstein coefficients of degree d lose about 2 d of them
 LARGEST = 14  # degree in s

@@ -12,7 +12,7 @@ import numpy as np
 from malta.arrays import ComplexArray, FloatArray
 from malta.proof.exclusion import Cell, Growth, cover
 from malta.proof.polynomial.family import Family, basis
-from malta.proof.work import is_past
+from malta.work import is_past
 
 STEPS = 8  # of the frequency grid in an octave
 SPACING = 0.6 / STEPS  # half a step and more, in ln w

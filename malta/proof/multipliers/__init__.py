@@ -28,7 +28,7 @@ from scipy import linalg
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.proof.multipliers.pencil import EPS, Expansion, Pencil
-from malta.proof.work import spend
+from malta.work import spend
 
 STEPS = 60  # of the level, at most
 INNER = 5  # Newton steps for each

@@ -20,10 +20,10 @@ import numpy as np
 from scipy import linalg
 
 from malta.arrays import FloatArray
+from malta.linear.rational import TooLarge
+from malta.linear.uncertain import Group
 from malta.proof.groups import C, UncertainLoop
 from malta.proof.polynomial.characteristic import clear_denominators
-from malta.proof.polynomial.rational import TooLarge
-from malta.proof.uncertain import Group
 
 # Matrices over a box of parameters to first order: M(p) = M_0 + sum_i delta_i M_i + rest, with |delta_i| <= 1.
 

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
+from malta.linear.rational import TooLarge
 from malta.proof.groups import UncertainLoop, groups
 from malta.proof.multipliers import Blocks, Branch, Multiplier, excludes_zero, multiplier, response
 from malta.proof.multipliers.pencil import TERMS, Pencil, Rows
-from malta.proof.polynomial.rational import TooLarge
-from malta.proof.work import is_past, spend, spent
+from malta.work import is_past, spend, spent
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

@@ -19,7 +19,9 @@ from typing import Any
 import numpy as np
 from flint import acb, acb_mat, arb, arb_mat, ctx, fmpq, fmpq_mat
 
-from malta.proof.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program, finite
+from malta.linear.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program, finite
+from malta.linear.rational import Ratio, Symbolic, over_common_denominator, value
+from malta.linear.uncertain import Group
 from malta.proof.groups import A, B, C, D, E, UncertainLoop, divide_by_descriptor, rational
 from malta.proof.polynomial.closed_loop import (
     closed_loop,
@@ -30,8 +32,6 @@ from malta.proof.polynomial.closed_loop import (
     majorant_matrix,
 )
 from malta.proof.polynomial.minors import Minors, Resolvent, minors
-from malta.proof.polynomial.rational import Ratio, Symbolic, over_common_denominator, value
-from malta.proof.uncertain import Group
 
 # Degrees of a characteristic polynomial in each parameter, upper bounds read from the entries of the matrices.
 

@@ -13,7 +13,9 @@ from flint import acb, acb_mat, arb
 from scipy import linalg, sparse
 
 from malta.arrays import FloatArray
-from malta.proof.expressions import BALLS, NotAnalytic, exact, finite
+from malta.linear.expressions import BALLS, NotAnalytic, exact, finite
+from malta.linear.rational import Ratio, Symbolic, value
+from malta.linear.uncertain import Group
 from malta.proof.groups import (
     A,
     B,
@@ -27,9 +29,7 @@ from malta.proof.groups import (
     rational,
     upper,
 )
-from malta.proof.polynomial.rational import Ratio, Symbolic, value
-from malta.proof.uncertain import Group
-from malta.proof.work import spend
+from malta.work import spend
 
 
 class DrivenGroup(NamedTuple):

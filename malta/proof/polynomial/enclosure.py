@@ -18,10 +18,10 @@ from weakref import WeakKeyDictionary
 from flint import acb, arb, ctx, fmpq
 
 from malta.arrays import FloatArray
-from malta.proof.expressions import NotAnalytic, exact
+from malta.linear.expressions import NotAnalytic, exact
 from malta.proof.polynomial.characteristic import pair
 from malta.proof.polynomial.family import Family, family, nodes
-from malta.proof.work import check_clock, remembered, spend
+from malta.work import check_clock, remembered, spend
 
 MOST_NODES = 20_000  # places of exact coefficients, at most
 MOST_BALLS = 6000  # places where they take an exponential

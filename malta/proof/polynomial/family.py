@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.proof.work import spend
+from malta.work import spend
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

@@ -19,7 +19,9 @@ from flint import arb, arb_mat, arb_poly, ctx, fmpq_mat, fmpq_poly
 from scipy import sparse
 
 from malta.arrays import FloatArray
-from malta.proof.expressions import NotAnalytic, Program, exact
+from malta.linear.expressions import NotAnalytic, Program, exact
+from malta.linear.rational import Ratio, Symbolic
+from malta.linear.uncertain import Group
 from malta.proof.groups import A, B, C, E, UncertainLoop, rational
 from malta.proof.polynomial.closed_loop import (
     all_bounds,
@@ -33,8 +35,6 @@ from malta.proof.polynomial.closed_loop import (
     solve,
     zeros,
 )
-from malta.proof.polynomial.rational import Ratio, Symbolic
-from malta.proof.uncertain import Group
 
 # Groups of states whose own dynamics are equal but for signs, as those of the two planes of a round body.
 #

@@ -31,16 +31,16 @@ from flint import arb
 from scipy import linalg, sparse
 
 from malta.arrays import FloatArray
+from malta.linear.expressions import NotAnalytic
+from malta.linear.uncertain import Compensator
 from malta.proof.box import Box
 from malta.proof.exclusion import CellBounds, Part, growth_over, on_boxes
-from malta.proof.expressions import NotAnalytic
 from malta.proof.polynomial.enclosure import Unproven
 from malta.proof.polynomial.family import Family, scale_of
 from malta.proof.problem import Problem, Traits, physical
-from malta.proof.uncertain import Compensator
 from malta.proof.weak_coupling.axes import Axes, axes_of, members_of, state_matrix, stiff_axes
 from malta.proof.weak_coupling.held_currents import Bounds, HeldMachine, dominating_solution
-from malta.proof.work import is_past
+from malta.work import is_past
 
 SMALL = 1e-11  # gains of a compensator below this, relative, may be rounding and do not join groups
 LARGEST = 4  # axes of a group

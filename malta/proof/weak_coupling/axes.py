@@ -19,12 +19,12 @@ import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
 from malta.arrays import FloatArray
-from malta.proof.expressions import exact
+from malta.linear.expressions import exact
+from malta.linear.uncertain import Compensator
 from malta.proof.groups import rational
 from malta.proof.polynomial.characteristic import bilinear_table, map_bilinear
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.polynomial.family import EPS, binary
-from malta.proof.uncertain import Compensator
 from malta.proof.weak_coupling.held_currents import HeldMachine, Lead
 
 BITS = 320

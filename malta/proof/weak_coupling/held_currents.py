@@ -20,9 +20,7 @@ import numpy as np
 from flint import arb
 
 from malta.arrays import FloatArray
-from malta.model.plant import Plant
-from malta.proof.expressions import NotAnalytic, program
-from malta.proof.uncertain import model_of
+from malta.linear.expressions import NotAnalytic, program
 from malta.proof.weak_coupling import taylor
 from malta.proof.weak_coupling.taylor import Evaluation, Laurent, Monomial, Value
 
@@ -194,18 +192,19 @@ def dominating_solution(M: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def held_machine(
-    plant: Plant, believed: Plant, names: Sequence[str], travel: tuple[float, float]
+    of: ca.Function, names: Sequence[str], nominal: FloatArray, travel: tuple[float, float]
 ) -> HeldMachine:
-    """Enclose a plant whose controller commutates with the parameters of `believed`, for all positions of an interval.
+    """Enclose a machine whose currents are held, for all positions of an interval.
+
+    of : its design model as a function of parameters, position and commands, from loops.parametric_plants.model_of
+    names, nominal : of the parameters
 
     Raises NotAnalytic when the model has not this form.
     """
-    names, n, k = tuple(names), len(plant.inputs), len(names)
-    of = model_of(plant, believed, names)
+    names, n, k = tuple(names), of.size1_in(2), len(names)
     q = ca.SX.sym("q", k + 1 + n)
     outputs = of(q[:k], q[k], q[k + 1 :])
     _require_linear(outputs, q[k + 1 :], of(q[:k], q[k], ca.SX.zeros(n))[4])
-    nominal = np.array([getattr(plant.parameters, name) for name in names], dtype=float)
     wanted, room = _forces_at_rest(of, nominal, sum(travel) / 2, n)
     run = Evaluation(k, *travel, INTERVALS)
     v = [_interval_about(run, x, room) for x in wanted]

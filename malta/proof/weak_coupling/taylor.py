@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from malta.arrays import FloatArray
-from malta.proof.expressions import NotAnalytic, Program
-from malta.proof.work import check_clock
+from malta.linear.expressions import NotAnalytic, Program
+from malta.work import check_clock
 
 ORDER = 6
 EPS = 2.0**-52

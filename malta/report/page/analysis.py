@@ -39,7 +39,7 @@ from malta.units import identifier, in_unit
 
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
-    from malta.proof.windings import CurrentLoops
+    from malta.loops.windings import CurrentLoops
     from malta.synthesis.controller import Controller
 
 

@@ -19,6 +19,7 @@ from malta.identification.learn import learn
 from malta.identification.log import log_of
 from malta.linear.sampling import add_integrals
 from malta.loops.loop import loop_of_model
+from malta.loops.parametric_plants import of_plant
 from malta.loops.time_domain import PLACES, Deviation, noise_of, recovery
 from malta.machines.tubular.experiments.disturbances import hold
 from malta.machines.tubular.experiments.strokes import delayed_stroke, stroke_merits
@@ -26,7 +27,6 @@ from malta.margins.loop_report import LoopReport
 from malta.margins.verify import compensators
 from malta.model.data import plant_of, published_value
 from malta.model.linearize import LinearModel, linearize
-from malta.proof.parametric_plants import of_plant
 from malta.proof.robust import robust_margin
 from malta.report.ledger import Chance, bandwidth, proven_share, run_design
 from malta.simulation.current_control import link_voltage, open_loop_gain

@@ -25,11 +25,11 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError
 from malta.linear.sampling import delay_inputs, sample
+from malta.linear.uncertain import Compensator
 from malta.model.data import plant_of
 from malta.model.equilibrium import trace
 from malta.model.linearize import is_commutated, linearize
 from malta.model.plant import OperatingPoint, Plant, outputs_at
-from malta.proof.uncertain import Compensator
 
 if TYPE_CHECKING:
     from malta.synthesis.controller import Controller, CurrentLoop, LinearLaw

@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
+from malta.arguments import describe
 from malta.arrays import FloatArray, readonly
 from malta.errors import InputError, require_known
+from malta.linear import rational
+from malta.linear.branches import without_branches
+from malta.linear.expressions import NotAnalytic, program
+from malta.linear.rational import Ratio, Symbolic, TooLarge, symbolic as rational_functions
+from malta.linear.systems import from_source
+from malta.linear.uncertain import UncertainSystem
+from malta.loops.windings import Windings, with_windings
 from malta.model.equilibrium import commanded
-from malta.model.linearize import is_commutated
-from malta.model.parameters import shape_parameters, units_of
-from malta.model.plant import Plant, position_in
+from malta.model.linearize import is_commutated, jacobians, linearize
+from malta.model.parameters import shape_parameters, twins_of, units_of
+from malta.model.plant import Plant, position_in, symbolic
 from malta.model.signals import LateSensors, with_lags
-from malta.proof.box import without_branches
-from malta.proof.expressions import NotAnalytic, program
-from malta.proof.polynomial import rational
-from malta.proof.polynomial.rational import Ratio, Symbolic, TooLarge, symbolic as rational_functions
-from malta.proof.uncertain import UncertainSystem, describe, in_symbols, limits_of, model_of
-from malta.proof.windings import Windings, with_windings
-from malta.proof.work import check_clock
+from malta.work import check_clock
 
 # The command at which a machine's preload acts, as a function of its parameters.
 #
@@ -331,3 +335,82 @@ def _expanded_matrices(
         b = ca.horzcat(b, rational.matrix_of(rest, (n, outputs), p))
     a, c = rational.matrix_of(A, (n, n), p), rational.matrix_of(C, (outputs, n), p)
     return a, b, c, ca.vertcat(*(rational.expression(r, p) for r in held_above.values()))
+
+
+def held_gain(plant: Plant, states: Mapping[str, float]) -> FloatArray:
+    """The gain H of held currents at these states, from E = B H: v + H y acts (forces x sensors)."""
+    check_clock()
+    model = linearize(plant, plant.at(**states))
+    return np.asarray(np.linalg.lstsq(model.B, model.E, rcond=None)[0])
+
+
+def in_symbols(plant: Plant, symbols: Mapping[str, Any]) -> Plant:
+    """The plant with symbols for some parameters; twins share a symbol."""
+    twins = {name: symbols[twin] for name, twin in twins_of(plant.parameters).items() if twin in symbols}
+    machine: Plant = plant.variant(symbolic(plant.parameters, {**twins, **symbols}))
+    return machine
+
+
+@lru_cache(maxsize=16)  # plants compare by identity, and are built once for their parameters
+def model_of(
+    plant: Plant, believed: Plant, names: tuple[str, ...], at: tuple[tuple[str, float], ...] = ()
+) -> ca.Function:
+    """The design model as a CasADi function of parameters, position along the stroke and commands v.
+
+    at : the other states that are not zero
+
+    Its outputs are those of `jacobians` on the controlled states (A, B, C, E, forces, their ratio) and the preload.
+    """
+    p, z, v = ca.SX.sym("p", len(names)), ca.SX.sym("z"), ca.SX.sym("v", len(plant.inputs))
+    own = dict(zip(names, ca.vertsplit(p), strict=True)) if names else {}
+    machine = in_symbols(plant, own)
+    x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
+    point = ca.SX(plant.state(dict(at)))
+    if plant.has_stroke:
+        point[plant.stroke_state] = z
+    preload = ca.SX(machine.preload(point))
+    check_clock()
+    found = jacobians(machine, believed, x, u, v, ca.SX.zeros(len(plant.disturbances)))
+    check_clock()
+    A, B, C, E, made, ratio = ca.substitute(list(found), [x, u], [point, preload])
+    keep = list(plant.controlled)
+    parts = [A[keep, keep], B[keep, :], C[:, keep], E[keep, :], made, ratio, preload]
+    return ca.Function("model", [p, z, v], ca.cse([ca.densify(part) for part in parts]))
+
+
+def limits_of(declared: Mapping[str, Any]) -> tuple[float, float]:
+    """The exclusive limits of a declared parameter; for `at_least` the float just below."""
+    above, least, below = (declared.get(key) for key in ("above", "at_least", "below"))
+    found = [] if above is None else [float(above)]
+    found += [] if least is None else [math.nextafter(float(least), -math.inf)]
+    return max(found, default=-math.inf), math.inf if below is None else float(below)
+
+
+def uncertain(source: Any, names: Any, **options: Any) -> UncertainSystem:
+    """Make a linear system that depends on parameters by name.
+
+        E(p) x' = A(p) x + B(p) u,  y = C(p) x + D(p) u
+
+    source : a Plant, which is linearized with these parameters; a function of the parameters by name (or of one array
+        p), of numpy and CasADi operations, that returns A, B, C, or with D, or with D and E; a casadi.Function of p; or
+        matrices A0, B0, C0[, D0[, E0]]
+    names : of a Plant the names of its parameters; else their nominal values by name, SI
+    options : of a Plant `x`, the states to linearize at; of the others `terms`, the factors of each parameter beside
+        matrices, as {"k": (A1, B1, C1)}; `limits` (above, below) of parameters; `sample_time` (s) of matrices that give
+        x+ in place of x'
+
+    Returns an UncertainSystem.
+
+    Raises InputError for unknown options, and for names, shapes and values that do not fit.
+
+    >>> import malta
+    >>> def motor(J, b):
+    ...     return [[0, 1], [0, -b / J]], [[0], [1 / J]], [[1, 0]]
+    >>> system = malta.uncertain(motor, {"J": 2e-3, "b": 0.1})
+    >>> system.names
+    ('J', 'b')
+    """
+    made = of_plant if isinstance(source, Plant) else from_source
+    known = [q.name for q in inspect.signature(made).parameters.values() if q.kind is q.KEYWORD_ONLY]
+    require_known(options, known, "uncertain", found="an unknown option")
+    return made(source, names, **options)

@@ -6,8 +6,7 @@ u = H F y                                 a control law F, and the lag, hold and
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -17,13 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from malta.arguments import number
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError, require_known
 from malta.linear.sampling import add_lags, delay_inputs, sample
-from malta.model.linearize import jacobians, linearize
-from malta.model.parameters import twins_of
-from malta.model.plant import Plant, symbolic
-from malta.proof.work import check_clock
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,55 +158,6 @@ class Compensator:
     sample_time: float | None = None
     delay: int = 0
     lag: float | None = None
-
-
-def held_gain(plant: Plant, states: Mapping[str, float]) -> FloatArray:
-    """The gain H of held currents at these states, from E = B H: v + H y acts (forces x sensors)."""
-    check_clock()
-    model = linearize(plant, plant.at(**states))
-    return np.asarray(np.linalg.lstsq(model.B, model.E, rcond=None)[0])
-
-
-def in_symbols(plant: Plant, symbols: Mapping[str, Any]) -> Plant:
-    """The plant with symbols for some parameters; twins share a symbol."""
-    twins = {name: symbols[twin] for name, twin in twins_of(plant.parameters).items() if twin in symbols}
-    machine: Plant = plant.variant(symbolic(plant.parameters, {**twins, **symbols}))
-    return machine
-
-
-@lru_cache(maxsize=16)  # plants compare by identity, and are built once for their parameters
-def model_of(
-    plant: Plant, believed: Plant, names: tuple[str, ...], at: tuple[tuple[str, float], ...] = ()
-) -> ca.Function:
-    """The design model as a CasADi function of parameters, position along the stroke and commands v.
-
-    at : the other states that are not zero
-
-    Its outputs are those of `jacobians` on the controlled states (A, B, C, E, forces, their ratio) and the preload.
-    """
-    p, z, v = ca.SX.sym("p", len(names)), ca.SX.sym("z"), ca.SX.sym("v", len(plant.inputs))
-    own = dict(zip(names, ca.vertsplit(p), strict=True)) if names else {}
-    machine = in_symbols(plant, own)
-    x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
-    point = ca.SX(plant.state(dict(at)))
-    if plant.has_stroke:
-        point[plant.stroke_state] = z
-    preload = ca.SX(machine.preload(point))
-    check_clock()
-    found = jacobians(machine, believed, x, u, v, ca.SX.zeros(len(plant.disturbances)))
-    check_clock()
-    A, B, C, E, made, ratio = ca.substitute(list(found), [x, u], [point, preload])
-    keep = list(plant.controlled)
-    parts = [A[keep, keep], B[keep, :], C[:, keep], E[keep, :], made, ratio, preload]
-    return ca.Function("model", [p, z, v], ca.cse([ca.densify(part) for part in parts]))
-
-
-def limits_of(declared: Mapping[str, Any]) -> tuple[float, float]:
-    """The exclusive limits of a declared parameter; for `at_least` the float just below."""
-    above, least, below = (declared.get(key) for key in ("above", "at_least", "below"))
-    found = [] if above is None else [float(above)]
-    found += [] if least is None else [math.nextafter(float(least), -math.inf)]
-    return max(found, default=-math.inf), math.inf if below is None else float(below)
 
 
 def difference_form(c: Compensator) -> tuple[FloatArray, FloatArray]:
@@ -436,92 +383,3 @@ def crossing_frequency(w: FloatArray, size: FloatArray, level: float, *, last: b
     k = falls[-1 if last else 0]
     (a, b), (wa, wb) = np.log(size[k : k + 2] / level), np.log(w[k : k + 2])
     return float(np.exp(wa + (wb - wa) * a / (a - b)))
-
-
-# Arguments of a caller, read as numbers, intervals, values by name or matrices. Raises InputError otherwise.
-
-
-LARGEST = 1e150  # size of a parameter at most, so that squares of its multiples do not overflow
-LONG = 60  # characters of a value that a message shows
-
-
-def describe(value: Any) -> str:
-    """A value as a message shows it: its text when that is short, else its type."""
-    text = repr(value) if isinstance(value, complex | float | int | str | tuple | list | dict) else ""
-    if text and len(text) <= LONG:
-        return text
-    return "None" if value is None else f"a value of type {type(value).__name__}"
-
-
-def is_number(value: Any) -> bool:
-    """Whether a value is one finite real number; strings and truth values are not."""
-    if isinstance(value, bool | np.bool_ | str | bytes | complex | np.complexfloating):
-        return False
-    if isinstance(value, np.ndarray) and (value.ndim or value.dtype.kind not in "iuf"):
-        return False
-    try:
-        return math.isfinite(float(value))
-    except (TypeError, ValueError, OverflowError, NotImplementedError, RuntimeError):
-        return False
-
-
-def number(caller: str, name: str, value: Any) -> float:
-    """A finite number. Raises InputError."""
-    if not is_number(value):
-        raise InputError(caller, name, describe(value), "a finite number")
-    return float(value)
-
-
-def positive(caller: str, name: str, value: Any, below: float = math.inf, *, endless: bool = False) -> float:
-    """A number above zero and below a bound, or infinity when `endless`. Raises InputError."""
-    if endless and isinstance(value, float) and value == math.inf:
-        return value
-    if not (is_number(value) and 0 < float(value) < below):
-        wanted = "a number above zero" + ("" if math.isinf(below) else f" and below {below:g}")
-        raise InputError(caller, name, describe(value), wanted)
-    return float(value)
-
-
-def is_pair(value: Any) -> bool:
-    """Whether a value is a tuple or a list of two."""
-    return isinstance(value, tuple | list) and len(value) == 2
-
-
-def interval(caller: str, name: str, value: Any) -> tuple[float, float]:
-    """An interval (low, high); either end may be infinite. Raises InputError."""
-    if is_pair(value):
-        low, high = (
-            float(v) if is_number(v) or (isinstance(v, float) and math.isinf(v)) else math.nan for v in value
-        )
-        if low < high:
-            return low, high
-    raise InputError(caller, name, describe(value), "(low, high), two numbers, the lower one first")
-
-
-def by_name(caller: str, name: str, value: Any, example: str) -> Mapping[str, Any]:
-    """Values by name. Raises InputError."""
-    if not isinstance(value, Mapping):
-        raise InputError(caller, name, describe(value), f"values by name, as {example}")
-    for key in value:
-        if not isinstance(key, str):
-            raise InputError(caller, name, f"{describe(key)} as a name", f"strings as names, as {example}")
-    return value
-
-
-def matrix(caller: str, name: str, value: Any, wanted: str = "a matrix of numbers") -> FloatArray:
-    """A matrix of finite numbers; a number is 1 x 1, a row of them 1 x n. Raises InputError."""
-    try:
-        found = np.asarray(value)
-        read = np.atleast_2d(found.astype(float)) if found.dtype.kind in "biufO" else None
-    except (TypeError, ValueError, RuntimeError, NotImplementedError):
-        read = None
-    if read is None or read.ndim != 2:
-        raise InputError(caller, name, describe(value), wanted)
-    if not np.isfinite(read).all():
-        raise InputError(caller, name, "NaN or infinity", "finite numbers")
-    return read
-
-
-def plural(count: int, one: str, many: str = "") -> str:
-    """A count with its noun: "1 input", "2 inputs"; "1 matrix", "2 matrices"."""
-    return f"{count} {one if count == 1 else many or one + 's'}"

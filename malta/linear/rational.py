@@ -15,9 +15,9 @@ import numpy as np
 from flint import Ordering, acb, fmpq_mpoly_ctx
 
 from malta.arrays import FloatArray
-from malta.proof.box import resolve_branches
-from malta.proof.expressions import FIELD, NotAnalytic, Program, exact, program
-from malta.proof.work import check_clock
+from malta.linear.branches import resolve_branches
+from malta.linear.expressions import FIELD, NotAnalytic, Program, exact, program
+from malta.work import check_clock
 
 LARGEST = 4000  # terms of an expression at most
 LONGEST = 2_000_000  # products of terms that are added at once: more take seconds

@@ -1,0 +1,183 @@
+"""Branches of a model: which of them is active at nominal parameters, and what is above zero while they stay so.
+
+fmax(v, 0) is v as long as v > 0, fabs(x) is x, and sqrt(x)^2 is x. A model is written with the branches that are
+active at its nominal parameters, as expressions without branches; what has to stay above zero for that becomes a
+condition. Derivatives are taken before, so that a branch of a derivative is resolved as well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import casadi as ca
+from flint import arb
+
+from malta.linear.expressions import KNOWN, POINTS, Arithmetic, NotAnalytic, Program, program
+
+_OTHERS: dict[str, Any] = {name: getattr(ca, name) for name in KNOWN if hasattr(ca, name)}
+
+
+SYMBOLS = Arithmetic(ca.SX, {**_OTHERS, "pow": ca.power})
+
+
+class Interval:
+    """Real numbers between two ends, rounded outwards: powers of positive ones stay positive, unlike those of balls."""
+
+    __slots__ = ("high", "low")
+
+    def __init__(self, low: float, high: float) -> None:
+        if not -math.inf < low <= high < math.inf:
+            raise NotAnalytic("numbers that overflow")
+        self.low, self.high = low, high
+
+    def __neg__(self) -> Interval:
+        return Interval(-self.high, -self.low)
+
+    def __add__(self, other: Interval) -> Interval:
+        return _outward(self.low + other.low, self.high + other.high)
+
+    def __sub__(self, other: Interval) -> Interval:
+        return self + -other
+
+    def __mul__(self, other: Interval) -> Interval:
+        ends = [x * y for x in (self.low, self.high) for y in (other.low, other.high)]
+        return _outward(min(ends), max(ends))
+
+    def __rtruediv__(self, one: float) -> Interval:
+        if self.low <= 0 <= self.high:
+            raise NotAnalytic("a division by what may be zero")
+        return _outward(one / self.high, one / self.low)
+
+    def __truediv__(self, other: Interval) -> Interval:
+        return self * (1.0 / other)
+
+    def __pow__(self, k: int) -> Interval:
+        found = Interval(1.0, 1.0)
+        for _ in range(k):
+            found = found * self
+        return found
+
+
+def _outward(low: float, high: float) -> Interval:
+    return Interval(math.nextafter(low, -math.inf), math.nextafter(high, math.inf))
+
+
+def _by_balls(function: Callable[..., Any]) -> Callable[..., Interval]:
+    """A function of intervals by that of balls."""
+
+    def found(*intervals: Interval) -> Interval:
+        ball = function(*(arb(x.low).union(arb(x.high)) for x in intervals))
+        return _outward(float(ball.lower()), float(ball.upper()))
+
+    return found
+
+
+INTERVALS = Arithmetic(lambda x: Interval(x, x), {name: _by_balls(f) for name, f in POINTS.others.items()})
+
+
+class _Resolved:
+    """The steps of a program so far, without branches, their values at nominal parameters, and what is above zero."""
+
+    def __init__(self, nominal: Sequence[float]) -> None:
+        self.nominal = nominal
+        self.steps: list[tuple[str, int, tuple[int, ...], float]] = []
+        self.values: list[Any] = []  # None: not known
+        self.positive: list[int] = []
+
+    def add(self, name: str, target: int, operands: tuple[int, ...], value: float) -> int:
+        self.steps.append((name, target, operands, value))
+        self.values.append(self._value(name, target, [self.values[k] for k in operands], value))
+        return len(self.steps) - 1
+
+    def _value(self, name: str, target: int, operands: list[Any], value: float) -> Any:
+        if name == "input":
+            return arb(self.nominal[target])
+        if name == "const":
+            return arb(value)
+        try:
+            return None if any(x is None for x in operands) else POINTS.apply(name, operands, value)
+        except NotAnalytic:
+            return None
+
+    def constant(self, x: float) -> int:
+        return self.add("const", 0, (), x)
+
+    def sign(self, k: int) -> int:
+        """1 or -1, the sign that a step has and is assumed to keep; 0 where it is not known."""
+        x = self.values[k]
+        if x is None or not (x > 0 or x < 0):
+            return 0
+        if self.steps[k][0] != "const":
+            self.positive.append(k if x > 0 else self.add("neg", 0, (k,), 0.0))
+        return 1 if x > 0 else -1
+
+    def resolved(self, name: str, operands: tuple[int, ...]) -> int | None:
+        """The step that stands for an operation with branches; None for any other, or where the branch is not known."""
+        if name in ("fmax", "fmin", "lt", "le"):
+            one, two = operands
+            sign = self.sign(self.add("sub", 0, operands, 0.0))
+            if not sign:
+                return None
+            if name in ("lt", "le"):
+                return self.constant(float(sign < 0))
+            return one if (sign > 0) == (name == "fmax") else two
+        if name in ("fabs", "sign"):
+            sign = self.sign(operands[0])
+            if not sign or (name == "fabs" and sign > 0):
+                return operands[0] if sign else None
+            return self.constant(float(sign)) if name == "sign" else self.add("neg", 0, operands, 0.0)
+        known = [self.steps[k][3] if self.steps[k][0] == "const" else None for k in operands]
+        if name == "if_else_zero" and known[0] is not None:
+            return operands[1] if known[0] else self.constant(0.0)
+        if name in ("not", "and", "or") and None not in known:
+            return self.constant(float({"not": lambda x: not x[0], "and": all, "or": any}[name](known)))
+        return None
+
+
+def resolve_branches(model: Program, nominal: Sequence[float]) -> tuple[Program, int]:
+    """The program with the branches that are active at nominal parameters, and how many conditions these have.
+
+    A last matrix of one column is added: first the conditions, which are above zero where the programs agree, then the
+    arguments of all roots, which are above zero where sqrt(x)^2 is x.
+    """
+    found, place = _Resolved(nominal), list[int]()
+    roots: dict[int, int] = {}
+    for name, target, operands, value in model.steps:
+        own = tuple(place[k] for k in operands)
+        step = found.resolved(name, own)
+        step = found.add(name, target, own, value) if step is None else step
+        if name == "sqrt":
+            roots[step] = own[0]
+        place.append(step)
+    positive = list(dict.fromkeys(found.positive))
+    last = [*positive, *roots.values()]
+    entries = tuple(tuple((i, j, place[k]) for i, j, k in matrix) for matrix in model.entries)
+    column = tuple((i, 0, k) for i, k in enumerate(last))
+    made = Program(tuple(found.steps), (*entries, column), (*model.shapes, (len(last), 1)), model.inputs)
+    return made, len(positive)
+
+
+def without_branches(
+    function: ca.Function, nominal: Sequence[float]
+) -> tuple[ca.Function, ca.Function | None]:
+    """The function with the branches that are active at nominal parameters, and their conditions (p -> above zero).
+
+    The function itself, without conditions, where it has no branches, or some that are not known.
+    """
+    model = program(function)
+    if not model.foreign:
+        return function, None
+    resolved, count = resolve_branches(model, nominal)
+    p = ca.SX.sym("p", model.inputs)
+    try:
+        *entries, above = resolved.run(ca.vertsplit(p), SYMBOLS)
+    except NotAnalytic:
+        return function, None
+    matrices = [ca.SX(*shape) for shape in model.shapes]
+    for matrix, own in zip(matrices, entries, strict=True):
+        for i, j, x in own:
+            matrix[i, j] = x
+    positive = ca.vertcat(*(x for i, _, x in above if i < count))
+    return ca.Function("matrices", [p], matrices), ca.Function("positive", [p], [positive]) if count else None
