@@ -126,16 +126,21 @@ class DesignRuns(NamedTuple):
     experiments: dict[str, Experiment]
 
 
-def run_design(spec: Spec, names: Sequence[str], progress: Progress | None = None) -> DesignRuns:
+def run_design(
+    spec: Spec, names: Sequence[str], progress: Progress | None = None, **options: Any
+) -> DesignRuns:
     """Design a controller, prove its margins, and run the experiments of these names.
 
     progress : called with the share that is done
+    options : of every experiment
     """
     plant = spec.plant
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model)
     experiments = {
-        name: experiment(name, plant, controller, progress=progress_of_part(progress, n, len(names)))
+        name: experiment(
+            name, plant, controller, progress=progress_of_part(progress, n, len(names)), **options
+        )
         for n, name in enumerate(names)
     }
     return DesignRuns(model, controller, linear_report(model, controller, spec.uncertainty), experiments)
