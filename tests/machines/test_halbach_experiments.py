@@ -23,7 +23,7 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 import malta
 from malta.machines.halbach import electronics, electronics as motor, paper as claims, plant as halbach
 from malta.machines.halbach.electronics import IDEAL, Options
-from malta.machines.halbach.experiments import steps_reference
+from malta.machines.halbach.experiments import responses, steps_reference
 from malta.machines.halbach.open_loop import (
     FAULTS,
     LAWS,
@@ -209,19 +209,20 @@ def test_the_calm_design_answers_what_the_paper_asked() -> None:
     c = controller_of("halbach_calm")
     plant = plant_for(c)
     step = experiment("step", plant, c)
-    assert found(step, "jumps", "mean overshoot") == pytest.approx(0.030, abs=0.005)
+    assert found(step, "jumps", "mean overshoot") == pytest.approx(0.029, abs=0.005)
     assert found(step, "jumps", "mean within 5 % after") < 0.25
-    assert found(step, "jumps", "at rest, rms") < 2.1e-6
+    assert found(step, "jumps", "at rest, rms") < 2.4e-6
+    mean = responses(step.run, 100e-6, 20).mean(axis=0)
+    assert mean[int((mean > 0.95).argmax()) :].min() > 0.985  # it does not swing back, but for noise
     assert 0.1e-6 < found(step, "jumps", "at rest, mean error") < 0.4e-6
     reference = partial(steps_reference, distance=100e-6, rise=0.0, count=1, Ts=c.sample_time)
     run = simulate(plant, c, Scenario("step", 60.0, reference, fidelity="force"))
     share = run.p[5:, 0] / 100e-6
     assert share.max() < 1.04
-    top = int(share.argmax())
-    assert share[top:].min() > 0.99  # it swings by none
+    assert share[int((share > 0.95).argmax()) :].min() > 0.99
     assert abs(share[-1] - 1) < 1e-4
     model = malta.linearize(plant, plant.at())
-    assert malta.verify(model, c, {}).peak_sensitivity["x"] == pytest.approx(1.753, abs=2e-3)
+    assert malta.verify(model, c, {}).peak_sensitivity["x"] == pytest.approx(2.11, abs=0.01)
     weak = replace(c, K=np.array([[150.0, 30.0]]), Ki=np.array([[30.0]]))
     assert malta.verify(model, weak, {}).peak_sensitivity["x"] == pytest.approx(7.06, abs=0.02)
 

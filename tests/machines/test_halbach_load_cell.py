@@ -1,4 +1,4 @@
-"""A, k and l from a load cell's record, Sec. 2.1: they come back, intervals hold what they say, bad records do not pass."""
+"""A, k and l from a load cell's record, Sec. 2.1: they come back, intervals hold, bad records do not pass."""
 
 from __future__ import annotations
 
