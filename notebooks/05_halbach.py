@@ -51,11 +51,11 @@ assert abs(F.max() - 1) < 1e-3
 
 # %%
 record = simulated_record(malta.plant_of(par))
-law = fit_motor_law(*record)
-print(f"A = {law.A:.4f} ± {law.A_half:.4f} N/A, k = {law.k:.2f} ± {law.k_half:.2f} rad/m")
-print(f"l = {1e3 * law.pitch:.3f} ± {1e3 * law.pitch_half:.3f} mm")
-assert abs(law.A - par.A) < 2 * law.A_half
-assert abs(law.k - par.k) < 2 * law.k_half
+fit = fit_motor_law(*record)
+print(f"A = {fit.A:.4f} ± {fit.A_half:.4f} N/A, k = {fit.k:.2f} ± {fit.k_half:.2f} rad/m")
+print(f"l = {1e3 * fit.pitch:.3f} ± {1e3 * fit.pitch_half:.3f} mm")
+assert abs(fit.A - par.A) < 2 * fit.A_half
+assert abs(fit.k - par.k) < 2 * fit.k_half
 
 # %% [markdown]
 # ## Dead zones

@@ -64,8 +64,10 @@ plain = coils.Analytical(replace(par, C=1.0))
 table = coils.table(par, truth, 35)
 
 heights = np.full_like(x, par.h)
-models = {"C = 1": plain, "fitted": fitted, "table": table}
-errors = {name: 3 * model(x, y, heights) - wrench for name, model in models.items()}
+errors = {
+    name: 3 * model(x, y, heights) - wrench
+    for name, model in (("C = 1", plain), ("fitted", fitted), ("table", table))
+}
 for name, error in errors.items():
     print(
         f"{name}: F_x off by {np.abs(error[..., 0]).max():.3f} N, F_z by {np.abs(error[..., 2]).max():.3f} N"

@@ -50,11 +50,8 @@ from malta.synthesis.synthesize import synthesize
 from malta.units import in_unit
 
 ABOUT, NEAR = 0.05, 0.2  # largest relative differences from an "about", and "within x %"
-FACTOR, BESIDE, FAR = (
-    ", x ",
-    1.1,
-    1000.0,
-)  # in front of a factor from a bound; below it two decimals; the largest
+# In front of a factor from a bound, below which one it has two decimals, and the largest one that is shown.
+FACTOR, BESIDE, FAR = ", x ", 1.1, 1000.0
 ROUNDING = 1e-9
 OTHER = "of another design"  # no design of the ledger is meant to reproduce the row
 LQG_ONLY = "of an LQG only"
@@ -126,9 +123,7 @@ class DesignRuns(NamedTuple):
     experiments: dict[str, Experiment]
 
 
-def run_design(
-    spec: Spec, names: Sequence[str], progress: Progress | None = None, **options: Any
-) -> DesignRuns:
+def run_design(spec: Spec, names: Sequence[str], progress: Progress | None, **options: Any) -> DesignRuns:
     """Design a controller, prove its margins, and run the experiments of these names.
 
     progress : called with the share that is done
@@ -137,11 +132,10 @@ def run_design(
     plant = spec.plant
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model)
+    parts = [progress_of_part(progress, n, len(names)) for n in range(len(names))]
     experiments = {
-        name: experiment(
-            name, plant, controller, progress=progress_of_part(progress, n, len(names)), **options
-        )
-        for n, name in enumerate(names)
+        name: experiment(name, plant, controller, progress=part, **options)
+        for name, part in zip(names, parts, strict=True)
     }
     return DesignRuns(model, controller, linear_report(model, controller, spec.uncertainty), experiments)
 
@@ -242,8 +236,7 @@ def claim_of(
     subject = row.subject + unit
     if row.published is None:
         return Claim(subject, "–", ours, "ours" + (f": {row.note}" if row.note else ""), "ours")
-    target = _printed(row, published)
-    printed = _as_printed(row, target)
+    target, printed = _printed(row, published)
     judged = [e for e in shown if _is_judged(row, e.spec.name, reproducing)]
     if not judged:
         note = f"; {row.note}" if row.note and shown else ""
@@ -257,21 +250,18 @@ def claim_of(
     return Claim(subject, printed, ours, verdict, word_of(words))
 
 
-def _printed(row: Row, published: Mapping[str, Any]) -> PublishedFigure:
-    """What the paper prints, in the row's unit: of data/published/, or what the row says that its text implies."""
+def _printed(row: Row, published: Mapping[str, Any]) -> tuple[PublishedFigure, str]:
+    """What the paper prints, or what the row says that its text implies, in the row's unit; and shown so."""
     if isinstance(row.published, str):
-        figure = published_figure(published, row.published)
-        return figure._replace(value=in_unit(figure.value, row.unit), half=in_unit(figure.half, row.unit))
-    assert row.published is not None
-    target = in_unit(row.published, row.unit)
-    return PublishedFigure(target, half_of_last_digit(row.form.format(target).lstrip("±")))
-
-
-def _as_printed(row: Row, target: PublishedFigure) -> str:
-    """The published figure with the paper's digits, its relation in front."""
-    mark = {"at most": "≤ ", "at least": "≥ "}.get(row.relation, "±" if row.form.startswith("±") else "")
-    digits = max(0, round(-math.log10(2 * target.half)))
-    return ("≈ " if target.about and not mark else mark) + f"{target.value:.{digits}f}"
+        value, half, about = published_figure(published, row.published)
+        figure = PublishedFigure(in_unit(value, row.unit), in_unit(half, row.unit), about)
+    else:
+        assert row.published is not None
+        target = in_unit(row.published, row.unit)
+        figure = PublishedFigure(target, half_of_last_digit(row.form.format(target).lstrip("±")))
+    sign = "±" if row.form.startswith("±") else "≈ " if figure.about else ""
+    mark = {"at most": "≤ ", "at least": "≥ "}.get(row.relation, sign)
+    return figure, f"{mark}{figure.value:.{max(0, round(-math.log10(2 * figure.half)))}f}"
 
 
 def _in_unit(figure: float, unit: str) -> float:

@@ -448,8 +448,6 @@ def test_the_ledger(
         "analytical model with C = 1, error of F_x [N]": "not reproduced; the paper prints no C",
         "analytical model with C = 1, error of T_z [N m]": "within 7 %",
         "analytical model with the fitted C, error of F_x [N]": "not compared; C is fitted to the truth",
-        "phi moved: analytical over table": "not compared; quintics of 20 and 40 ms",
-        "analytical: phi, highest [µrad]": "not compared; quintics of 20 and 40 ms",
         "jumps, analytical, soft, at once: phi, highest [µrad]": "of another design",  # the paper's is a PID
         "jumps, analytical, soft: phi, highest [µrad]": "not compared; with the machine's sample of delay",
         "jumps, soft: largest force [N]": "by construction",

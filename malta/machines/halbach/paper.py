@@ -18,6 +18,7 @@ from malta.machines.halbach.open_loop import (
     FAULTS,
     LAWS,
     MOVE,
+    PRINTED,
     move_reference,
     positions_at_rest,
     sound_moves,
@@ -390,17 +391,12 @@ MAIN = "one of “the two main contributors”, read as a tenth of the rms at le
 FEW = "the laser reads 0.12 µm rms wrong, which no loop here enlarges; the current sensors' noise is a force"
 JUMP = "no set-point weight: a jump of the reference enters the proportional part"
 CLOSED_LOOP: tuple[Row, ...] = (
-    Row(
-        "Fig. 7b: swing, plain PWM",
-        "{:.1f} um",
-        partial(case_merit, "stairs", 2, 3),
-        note="“marginally oscillates”",
-    ),
-    Row(
-        "Fig. 7c: swing, high-resolution PWM",
-        "{:.2f} um",
-        partial(case_merit, "stairs", 3, 3),
-        note="“imperceptible”",
+    *(
+        Row(f"Fig. 7{text} PWM", shown, partial(case_merit, "stairs", case, 3), note=note)
+        for text, shown, case, note in (
+            ("b: swing, plain", "{:.1f} um", 2, "“marginally oscillates”"),
+            ("c: swing, high-resolution", "{:.2f} um", 3, "“imperceptible”"),
+        )
     ),
     Row(
         "Fig. 8: way at constant speed",
@@ -450,36 +446,26 @@ CLOSED_LOOP: tuple[Row, ...] = (
     Row("the same of a quintic in 0.3 s", "{:.2f} s", partial(case_merit, "step", 1, 1)),
     Row("at rest, all sources: rms", "{:.2f} um", partial(case_merit, "step", 0, 2)),
     Row("at rest, all sources: mean error", "{:.3f} um", partial(case_merit, "step", 0, 3)),
-    Row("noise of the laser alone: rms", "{:.2f} um", partial(case_merit, "budget", 0, 0)),
-    Row("noise of the current sensors alone: rms", "{:.2f} um", partial(case_merit, "budget", 1, 0)),
     *(
-        Row(
-            f"noise of {name} alone, of all at rest",
-            "{:.0f} percent",
-            partial(share_of_error, source),
-            0.1,
-            "at least",
-            note=MAIN,
-            why=FEW,
+        Row(f"{text} alone: rms", "{:.2f} um", partial(case_merit, "budget", case, 0), note=note)
+        for text, case, note in (
+            ("noise of the laser", 0, ""),
+            ("noise of the current sensors", 1, ""),
+            ("steps of the current sensors", 2, ""),
+            ("steps of the PWM", 3, "current loops take them out"),
         )
-        for name, source in (("the laser", "laser"), ("the current sensors", "current noise"))
     ),
-    Row(
-        "noise of the current sensors alone, at the best place: rms",
-        "{:.2f} um",
-        partial(merit, "budget", "current noise, at the best place"),
+    *(
+        Row(f"noise of {name} alone, of all", "{:.0f} percent", share, 0.1, "at least", note=MAIN, why=FEW)
+        for name, share in (
+            ("the laser", partial(share_of_error, "laser")),
+            ("the current sensors", partial(share_of_error, "current noise")),
+        )
     ),
-    Row(
-        "the same at the worst place",
-        "{:.2f} um",
-        partial(merit, "budget", "current noise, at the worst place"),
-    ),
-    Row("steps of the current sensors alone: rms", "{:.2f} um", partial(case_merit, "budget", 2, 0)),
-    Row(
-        "steps of the PWM alone: rms",
-        "{:.2f} um",
-        partial(case_merit, "budget", 3, 0),
-        note="current loops take them out",
+    *(
+        Row(f"noise of the current sensors alone, at the {end} place: rms", "{:.2f} um", value)
+        for end in ("best", "worst")
+        for value in (partial(merit, "budget", f"current noise, at the {end} place"),)
     ),
     Row(
         "angles of 24 bits alone: rms",
@@ -502,19 +488,15 @@ CLOSED_LOOP: tuple[Row, ...] = (
 WHY = "no steady change follows from the motor law, and no fault below has both signs and 0 under vector control"
 TRANSIENT = "largest change on the way, of the sign that the paper prints"
 LIFT: tuple[Row, ...] = (
-    Row(
-        "Fig. 10: open loop, steady change",
-        "{:.2f} percent",
-        partial(case_merit, "force", "open loop", 0),
-        "figure_10.open_loop",
-        why=WHY,
-    ),
-    Row(
-        "Fig. 10: position control, steady change",
-        "{:.2f} percent",
-        partial(case_merit, "force", "position control", 0),
-        "figure_10.position_controller",
-        why=WHY,
+    *(
+        Row(
+            f"Fig. 10: {law}, steady change",
+            "{:.2f} percent",
+            partial(case_merit, "force", law, 0),
+            f"figure_10.{PRINTED[law]}",
+            why=WHY,
+        )
+        for law in ("open loop", "position control")
     ),
     Row(
         "Fig. 10 as a transient: open loop, lowest",

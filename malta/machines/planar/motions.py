@@ -119,7 +119,7 @@ AHEAD = "place predicted"
 
 
 def steps_ahead(plant: Plant, controller: Controller, **options: Any) -> Experiment:
-    """The published steps from PLACE with currents for where they will act, by the exact coils and by the table.
+    """The published steps from PLACE with currents for where they will act, by the exact coils.
 
     The same controller, but for its commutation (`commutate_ahead`); design files ask for it by `commutation`.
     """
@@ -127,10 +127,7 @@ def steps_ahead(plant: Plant, controller: Controller, **options: Any) -> Experim
     wanted = step_cases(plant, controller, **moves, **options)[0]
     believed = planar.plant(parameters_of(controller))
     ahead = commutate_ahead(controller, linearize(believed, believed.point(controller.operating_point[0])))
-    flights = [
-        (plant, with_coil_model(ahead, model), wanted._replace(label=f"{model}, {AHEAD}"))
-        for model in ("exact", "table")
-    ]
+    flights = [(plant, with_coil_model(ahead, "exact"), wanted._replace(label=f"exact, {AHEAD}"))]
     cases, cut = fly_all(flights, None, options)
     return Experiment("step", "What is left when currents are where they act?", cases, (), interrupted=cut)
 
