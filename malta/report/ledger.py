@@ -258,7 +258,8 @@ def _printed(row: Row, published: Mapping[str, Any]) -> tuple[PublishedFigure, s
     else:
         assert row.published is not None
         target = in_unit(row.published, row.unit)
-        figure = PublishedFigure(target, half_of_last_digit(row.form.format(target).lstrip("±")))
+        number = re.search(r"-?[\d.]+(?:e[-+]\d+)?", row.form.format(target))  # "proven" has none
+        figure = PublishedFigure(target, half_of_last_digit(number[0] if number else f"{target:g}"))
     sign = "±" if row.form.startswith("±") else "≈ " if figure.about else ""
     mark = {"at most": "≤ ", "at least": "≥ "}.get(row.relation, sign)
     return figure, f"{mark}{figure.value:.{max(0, round(-math.log10(2 * figure.half)))}f}"

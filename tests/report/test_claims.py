@@ -239,6 +239,26 @@ def test_printed_digits_are_those_of_the_file(entry: dict[str, Any], half: float
     assert found.about == about
 
 
+@pytest.mark.parametrize(
+    ("shown", "target", "printed", "half"),
+    [
+        ("±{:.2f} rad/s", 218.92, "±218.92", 0.005),
+        ("{:.0e} urad", 3e-12, "0.000003", 5e-7),
+        ("{:.1f} deg", math.pi / 2, "90.0", 0.05),
+        ("proven percent", 3.0, "300", 0.5),
+        ("{:.0f}", -4.0, "-4", 0.5),
+        ("{:.2f} um", 0.0, "0.00", 0.005),
+    ],
+)
+def test_what_the_text_implies_has_the_digits_that_are_shown(
+    shown: str, target: float, printed: str, half: float
+) -> None:
+    row = Row("a figure", shown, lambda _: math.nan, target)
+    figure, text = claims._printed(row, {})
+    assert text == printed
+    assert figure.half == pytest.approx(half)
+
+
 def test_digits_of_a_table_hold_for_its_figures(published: dict[str, Any]) -> None:
     assert published_figure(published, "table_I.poles.z") == PublishedFigure(0.0, 0.005)
 
