@@ -11,6 +11,7 @@ from malta.machines.halbach import electronics
 from malta.model.plant import FloatArray, Plant
 
 FEWEST, NORMAL = 8, 1.96  # readings; standard deviations of an interval of 95 %
+TURNS = 500  # pitches in a record, at most
 TURN = np.exp(2j * np.pi / 3)  # from a phase to the next
 # The simulated record: places 0.25 mm apart, the currents of Fig. 2, and our assumption of the cell's noise.
 SPAN, PLACES, CURRENTS = 50e-3, 201, (0.0, -0.3593, 0.3593)  # m, and A
@@ -34,7 +35,7 @@ def fit_motor_law(x: FloatArray, i: FloatArray, F: FloatArray) -> MotorFit:
     """Fit A, k and the place of x_0 = 0 of the motor law (1) to forces at known currents. Least squares.
 
     F_x + j F_z = A e^(j k (x - origin)) (I_a + I_b e^(-2 pi j / 3) + I_c e^(2 pi j / 3)). For any k the best A and
-    origin have a closed form; k is sought up to half a turn between neighbouring places.
+    origin have a closed form; k is sought up to half a turn a place, and up to TURNS in the record.
 
     x : n positions, m
     i : n x 3 phase currents, A, or three that are the same everywhere
@@ -69,8 +70,11 @@ def fit_motor_law(x: FloatArray, i: FloatArray, F: FloatArray) -> MotorFit:
     def response(k: float) -> complex:
         return complex(np.exp(-1j * k * (x - middle)) @ weighted) / energy
 
-    grid = np.arange(1, 2 * len(x)) * np.pi / 2 / span  # a quarter of a turn over the record apart
-    start = max(grid, key=lambda k: abs(response(k)))
+    grid = (
+        np.arange(1, min(2 * len(x), 4 * TURNS)) * np.pi / 2 / span
+    )  # a quarter of a turn over the record apart
+    some = slice(None, None, -(-len(x) // (8 * TURNS)))  # of a long record, enough to begin with
+    start = max(grid, key=lambda k: abs(np.exp(-1j * k * x[some]) @ weighted[some]))
     ends = start - grid[0], start + grid[0]
     k = float(
         minimize_scalar(lambda k: -abs(response(k)), bounds=ends, method="bounded", options={"xatol": 1e-9}).x
