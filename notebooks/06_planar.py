@@ -60,25 +60,30 @@ assert abs(largest[0] - 12.39) < 0.1 < 25.67 - largest[2]
 
 # %%
 fitted = coils.Analytical(replace(par, C=coils.compensation(par, truth)))
+plain = coils.Analytical(replace(par, C=1.0))
 table = coils.table(par, truth, 35)
 
 heights = np.full_like(x, par.h)
-errors = {name: 3 * model(x, y, heights) - wrench for name, model in (("fitted", fitted), ("table", table))}
+errors = {
+    name: 3 * model(x, y, heights) - wrench
+    for name, model in (("C = 1", plain), ("fitted", fitted), ("table", table))
+}
 for name, error in errors.items():
     print(
         f"{name}: F_x off by {np.abs(error[..., 0]).max():.3f} N, F_z by {np.abs(error[..., 2]).max():.3f} N"
     )
 assert np.abs(errors["fitted"][..., :3]).max() < 0.08
 assert np.abs(errors["table"][..., :3]).max() < 0.025
+assert np.abs(errors["C = 1"][..., 0]).max() > 1.5
 
 # %% [markdown]
-# A fitted fundamental alone has an error of 0.04 N of 12 N. The paper's error of 0.83 N comes from an amplitude that
-# is 7 % off; fitting removes it.
+# A fitted fundamental alone has an error of 0.04 N of 12 N. Without its factor C the formulas err by 1.5 N. The paper's
+# error of 0.83 N is an amplitude that is 7 % off: it does not print its C, and fitting would have removed the error.
 
 # %%
 figure, panels = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
 shown = {"exact F_z [N]": wrench[..., 2]}
-shown |= {f"|error| of F_z, {name} [mN]": 1e3 * np.abs(error[..., 2]) for name, error in errors.items()}
+shown |= {f"|error| of F_z, {name} [mN]": 1e3 * np.abs(errors[name][..., 2]) for name in ("fitted", "table")}
 for axes, (name, values) in zip(panels, shown.items(), strict=True):
     drawn = axes.pcolormesh(x * 1e3, y * 1e3, values, cmap="Greys", shading="gouraud", rasterized=True)
     figure.colorbar(drawn, ax=axes)

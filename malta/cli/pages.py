@@ -206,8 +206,9 @@ def claims(
     """Print the ledger, a line a claim: what a machine's paper publishes, ours for each design, and a verdict.
 
     All of it is computed now: models, gains, margins, experiments on the simulated machine. A verdict is one word:
-    reproduced, near (within 20 %), kept (a bound, by far), input, differs, partly (of some designs), beside (of
-    another method), ours (the paper prints no such number) or other (no design that is meant to reproduce it).
+    reproduced (to the printed digits, or within 5 % of an "about"), near (within 20 %), kept (a bound), input,
+    differs, partly (of some designs), beside (of another method), ours (the paper prints no such number) or other
+    (no design that is meant to reproduce it).
 
     \b
     Example:  malta claims design/table2.toml

@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
+from decimal import Decimal
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, NamedTuple, cast
 
 from pydantic import Field as Checked, StrictStr
 
@@ -237,20 +238,49 @@ def _published_file(data_file: Path) -> Path:
     return alone if file_exists(alone) and not file_exists(of_its_name) else of_its_name
 
 
-def published_value(content: Mapping[str, Any], key: str) -> float:
-    """A published quantity in SI units by its dotted key: `{ value, unit }`, or a number in a table with a unit.
+class PublishedFigure(NamedTuple):
+    """A figure as a paper prints it."""
+
+    value: float  # SI
+    half: float = 0.0  # SI, half a unit of its last printed digit
+    about: bool = False  # whether the paper says "about", "around" or "approximately"
+
+
+def published_figure(content: Mapping[str, Any], key: str) -> PublishedFigure:
+    """A published quantity by its dotted key: `{ value, unit }`, or a number in a table with a unit; SI units.
+
+    Its digits are those of the file; `digits` beside it, or in a table above it, counts decimals that end in zeros.
+    `about = true` marks what the paper calls about, around or approximately so much.
 
     Raises InputError when the key is missing, the entry is no number, or its unit is unknown.
     """
-    where, unit = "data/published", None
+    where, unit, digits, about = "data/published", None, None, False
     entry: Any = content
     for part in key.split("."):
         if not isinstance(entry, Mapping) or part not in entry:
             raise InputError(where, key, "nothing", "what the paper prints")
-        unit = entry.get("unit", unit)
+        unit, digits = entry.get("unit", unit), entry.get("digits", digits)
         entry = entry[part]
     if isinstance(entry, Mapping):
+        digits, about = entry.get("digits", digits), entry.get("about", False)
         unit, entry = entry.get("unit"), entry.get("value")
     if isinstance(entry, bool) or not isinstance(entry, int | float) or not isinstance(unit, str):
         raise InputError(where, key, f"{entry!r} in {unit}", "a number with a unit")
-    return float(entry) * unit_factor(unit, f"{key}.unit")
+    factor = unit_factor(unit, f"{key}.unit")
+    half = half_of_last_digit(repr(entry)) if digits is None else 0.5 * 10.0**-digits
+    return PublishedFigure(float(entry) * factor, half * factor, about is True)
+
+
+def half_of_last_digit(text: str) -> float:
+    """Half a unit of the last digit of a number as it is written.
+
+    >>> half_of_last_digit("25.67"), half_of_last_digit("205"), half_of_last_digit("2.62e-05")
+    (0.005, 0.5, 5e-08)
+    """
+    exponent = Decimal(text).as_tuple().exponent
+    return float(Decimal(5).scaleb(int(exponent) - 1))
+
+
+def published_value(content: Mapping[str, Any], key: str) -> float:
+    """The value of `published_figure`."""
+    return published_figure(content, key).value

@@ -1,11 +1,16 @@
 """The ledger: every number that a source paper publishes, ours for each design, and a verdict. Computed, not typed.
 
 Published numbers are read from data/published/. Ours come from the same functions that a user calls: model, gains,
-margins, and the experiments on the simulated machine. A verdict follows from the numbers:
+margins, and the experiments on the simulated machine. A verdict follows from the numbers, by one rule for all papers:
 
-    reproduced          equal to the printed digits, or within 5 % of an "about" or of a bound, on its right side
-    smaller, x 19       within a bound, and 19 times smaller than the bound; "larger" likewise
-    within x %          of the published figure, x up to 20
+    A figure agrees with the printed one when they differ by no more than half a unit of the last printed digit, or,
+    where ours is one of chance, by its interval besides. Where the paper says "about", around or approximately
+    (`about = true` beside its figure in data/published/), they may differ by 5 % of it. A bound has to be kept by
+    every digit of ours, too.
+
+    reproduced          ours agrees
+    smaller, x 19       a bound is kept, and ours is 19 times smaller than the bound; "larger" likewise
+    within x %          of the published figure, x up to 20, with the reason
     by construction     agrees, and could not differ: the row restates an input, or what the design was solved for
     not compared        ours is of something else: another method, or another computer
     not reproduced      else, with the reason
@@ -33,7 +38,7 @@ from malta.bound import at_least
 from malta.errors import InputError
 from malta.margins.loop_report import ZONES, LoopReport
 from malta.margins.verify import linear_report
-from malta.model.data import published_value
+from malta.model.data import PublishedFigure, half_of_last_digit, published_figure
 from malta.model.linearize import LinearModel, linearize
 from malta.model.machines import require_part
 from malta.proof.margin import Margin
@@ -44,8 +49,9 @@ from malta.synthesis.spec import Spec
 from malta.synthesis.synthesize import synthesize
 from malta.units import in_unit
 
-CLOSE, NEAR = 0.05, 0.2  # largest relative differences that are "reproduced" and "within x %"
-FACTOR, FAR = ", x ", 1000.0  # in front of a factor from a bound, and the largest one that is shown
+ABOUT, NEAR = 0.05, 0.2  # largest relative differences from an "about", and "within x %"
+# In front of a factor from a bound, below which one it has two decimals, and the largest one that is shown.
+FACTOR, BESIDE, FAR = ", x ", 1.1, 1000.0
 ROUNDING = 1e-9
 OTHER = "of another design"  # no design of the ledger is meant to reproduce the row
 LQG_ONLY = "of an LQG only"
@@ -117,17 +123,19 @@ class DesignRuns(NamedTuple):
     experiments: dict[str, Experiment]
 
 
-def run_design(spec: Spec, names: Sequence[str], progress: Progress | None = None) -> DesignRuns:
+def run_design(spec: Spec, names: Sequence[str], progress: Progress | None, **options: Any) -> DesignRuns:
     """Design a controller, prove its margins, and run the experiments of these names.
 
     progress : called with the share that is done
+    options : of every experiment
     """
     plant = spec.plant
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model, solver="scipy")
+    parts = [progress_of_part(progress, n, len(names)) for n in range(len(names))]
     experiments = {
-        name: experiment(name, plant, controller, progress=progress_of_part(progress, n, len(names)))
-        for n, name in enumerate(names)
+        name: experiment(name, plant, controller, progress=part, **options)
+        for name, part in zip(names, parts, strict=True)
     }
     return DesignRuns(model, controller, linear_report(model, controller, spec.uncertainty), experiments)
 
@@ -153,12 +161,11 @@ class Row(NamedTuple):
     subject: str
     shown: str  # form and unit of both figures: "{:.2f} mm", "{:.1f}" of a number; or "proven percent"
     value: Callable[[Any], float]  # of the machine's evidence; SI
-    # key of data/published/, or a figure that the text implies; None: ours
+    # key of data/published/, or a figure that the text implies, with the digits of `shown`; None: ours
     published: str | float | None = None
-    # "equal" to the printed digits, "at most", "at least", "about"; "beside": not compared
-    relation: str = "about"
+    relation: str = "equal"  # or a bound, "at most" or "at least"; "beside": not compared
     note: str = ""  # where the paper leaves a definition open, or what explains the figures
-    why: str = ""  # the reason why a figure is not reproduced
+    why: str = ""  # the reason why a figure differs
     of_lqg: bool = False  # a PID has no such figure: it shows a dash, and no verdict
     # Whether the figure restates an input, or what a design was solved for; of the machine's evidence.
     by_construction: bool | Callable[[Any], bool] = False
@@ -222,7 +229,6 @@ def claim_of(
     """
     shown = [e for e in found if not row.of_lqg or e.spec.kind == "LQG"]
     figures = [row.value(e) if e in shown else math.nan for e in found]
-    values = [in_unit(figure, row.unit) for figure in figures]
     ours = tuple(_shown(row, figure) for figure in figures)
     unit = {"1": "", "percent": " [%]", "um": " [µm]", "urad": " [µrad]", "deg": " [°]"}.get(
         row.unit, f" [{row.unit}]"
@@ -230,23 +236,39 @@ def claim_of(
     subject = row.subject + unit
     if row.published is None:
         return Claim(subject, "–", ours, "ours" + (f": {row.note}" if row.note else ""), "ours")
-    target = in_unit(
-        published_value(published, row.published) if isinstance(row.published, str) else row.published,
-        row.unit,
-    )
-    printed = row.form.format(target) if row.relation == "equal" else f"{target:.4g}"
-    mark = {"at most": "≤ ", "at least": "≥ "}.get(row.relation, "")
+    target, printed = _printed(row, published)
     judged = [e for e in shown if _is_judged(row, e.spec.name, reproducing)]
     if not judged:
         note = f"; {row.note}" if row.note and shown else ""
-        return Claim(subject, mark + printed, ours, (OTHER if shown else LQG_ONLY) + note, "other")
-    own = [value for value, e in zip(values, found, strict=True) if e in judged]
+        return Claim(subject, printed, ours, (OTHER if shown else LQG_ONLY) + note, "other")
+    own = [_in_unit(figure, row.unit) for figure, e in zip(figures, found, strict=True) if e in judged]
     built = [row.by_construction(e) if callable(row.by_construction) else row.by_construction for e in judged]
     words = [
         verdict_word(row, target, value, by_construction=one) for value, one in zip(own, built, strict=True)
     ]
     verdict = verdict_of(row, words, [e.spec.name for e in judged])
-    return Claim(subject, mark + printed, ours, verdict, word_of(words))
+    return Claim(subject, printed, ours, verdict, word_of(words))
+
+
+def _printed(row: Row, published: Mapping[str, Any]) -> tuple[PublishedFigure, str]:
+    """What the paper prints, or what the row says that its text implies, in the row's unit; and shown so."""
+    if isinstance(row.published, str):
+        value, half, about = published_figure(published, row.published)
+        figure = PublishedFigure(in_unit(value, row.unit), in_unit(half, row.unit), about)
+    else:
+        assert row.published is not None
+        target = in_unit(row.published, row.unit)
+        number = re.search(r"-?[\d.]+(?:e[-+]\d+)?", row.form.format(target))  # "proven" has none
+        figure = PublishedFigure(target, half_of_last_digit(number[0] if number else f"{target:g}"))
+    sign = "±" if row.form.startswith("±") else "≈ " if figure.about else ""
+    mark = {"at most": "≤ ", "at least": "≥ "}.get(row.relation, sign)
+    return figure, f"{mark}{figure.value:.{max(0, round(-math.log10(2 * figure.half)))}f}"
+
+
+def _in_unit(figure: float, unit: str) -> float:
+    """A figure in a unit, with its interval if it is one of chance."""
+    value = in_unit(figure, unit)
+    return Chance(value, in_unit(figure.half, unit)) if isinstance(figure, Chance) else value
 
 
 def _shown(row: Row, figure: float) -> str:
@@ -279,62 +301,69 @@ def word_of(verdicts: Sequence[str]) -> Word:
 
 def verdict_of(row: Row, words: Sequence[str], names: Sequence[str]) -> str:
     """The verdict on the figures of all designs that are judged, from that on each, with notes and reasons."""
-    note = f"; {row.note}" if row.note else ""
+    differs = any("not reproduced" in word or "within" in word for word in words)
+    said = dict.fromkeys((row.note, row.why if differs else ""))  # each once
+    note = "".join(f"; {text}" for text in said if text)
     kinds = {word.partition(FACTOR)[0] for word in words}
     if len(set(words)) == 1:
-        text = words[0] + note
-    elif len(kinds) == 1 and all(FACTOR in word for word in words):
-        text = kinds.pop() + "".join(FACTOR + word.partition(FACTOR)[2] for word in words) + note
-    else:
-        text = "; ".join(f"{name}: {word}" for name, word in zip(names, words, strict=True)) + note
-    return text + (f"; {row.why}" if row.why and "not reproduced" in text else "")
+        return words[0] + note
+    if len(kinds) == 1 and all(FACTOR in word for word in words):
+        return kinds.pop() + "".join(FACTOR + word.partition(FACTOR)[2] for word in words) + note
+    return "; ".join(f"{name}: {word}" for name, word in zip(names, words, strict=True)) + note
 
 
-def verdict_word(row: Row, target: float, value: float, *, by_construction: bool = False) -> str:
-    """The verdict on the figure of one design."""
+def verdict_word(row: Row, target: PublishedFigure, value: float, *, by_construction: bool = False) -> str:
+    """The verdict on the figure of one design, both in the row's unit."""
     word = _comparison(row, target, value)
     if not by_construction or word.startswith("not"):
         return word
     return f"by construction, {word}" if word.endswith("%") else "by construction"
 
 
-def _comparison(row: Row, target: float, value: float) -> str:
+def _comparison(row: Row, target: PublishedFigure, value: float) -> str:
     """What the numbers say, wherever the figure comes from."""
     if row.relation == "beside":
         return "not compared"
     if math.isnan(value):
         return "not reproduced"
+    bound, agrees = target.value, is_reproduced(target, value)
     if row.relation in ("at most", "at least"):
-        kept = value <= target if row.relation == "at most" else value >= target
-        distance = _distance(target, value)
+        kept = value <= bound if row.relation == "at most" else value >= bound
+        distance = _distance(bound, value)
         if kept:
-            return distance or "reproduced"
-        return f"not reproduced: {distance}" if distance else "not reproduced"
-    if row.relation == "equal":
-        if row.form.format(value) == row.form.format(target):
-            return "reproduced"
-        return "not reproduced"
-    off = abs(value / target - 1)
-    if off <= CLOSE + ROUNDING:
+            return "reproduced" if agrees else distance
+        return f"not reproduced: {distance}"
+    if agrees:
         return "reproduced"
+    off = abs(value / bound - 1) if bound else math.inf
     return f"within {math.ceil((off - ROUNDING) * 100)} %" if off <= NEAR + ROUNDING else "not reproduced"
 
 
-def _distance(bound: float, value: float) -> str:
-    """How far a figure is from its bound, in size; "" for one that is close to it.
+def is_reproduced(target: PublishedFigure, value: float) -> bool:
+    """Whether a figure agrees with the published one: the rule of this module.
 
-    >>> _distance(0.83, 0.043), _distance(0.2, 0.2)
-    ('smaller, x 19', '')
+    >>> is_reproduced(PublishedFigure(25.67, 0.005), 24.70), is_reproduced(PublishedFigure(25.0, 0.5, True), 24.0)
+    (False, True)
     """
-    if value == bound:
-        return ""
+    half = max(target.half, ABOUT * abs(target.value) if target.about else 0.0)
+    if isinstance(value, Chance):
+        half += value.half
+    return abs(value - target.value) <= half + ROUNDING * abs(target.value)
+
+
+def _distance(bound: float, value: float) -> str:
+    """How far a figure is from its bound, in size.
+
+    >>> _distance(0.83, 0.043), _distance(4.0, 4.02)
+    ('smaller, x 19', 'larger, x 1.01')
+    """
     if bound == 0 or (value != 0 and (value < 0) != (bound < 0)):  # a product may underflow
         return "on the other side of zero" if bound else "other than zero"
     ratio = abs(value / bound)
-    if abs(ratio - 1) <= CLOSE + ROUNDING:
-        return ""
     size = max(ratio, 1 / ratio) if ratio else math.inf
-    shown = f"> {FAR:.0f}" if size > FAR else f"{size:.1f}" if size < 10 else f"{size:.0f}"
+    shown = f"> {FAR:.0f}" if size > FAR else f"{size:.0f}" if size >= 10 else f"{size:.1f}"
+    if size < BESIDE:  # "x 1.0" would say nothing
+        shown = f"{math.ceil(100 * size - ROUNDING) / 100:.2f}"
     return f"{'larger' if ratio > 1 else 'smaller'}{FACTOR}{shown}"
 
 

@@ -24,7 +24,7 @@ import malta
 from malta.linear.sampling import sample_noise
 from malta.machines.halbach import electronics, electronics as motor, paper as claims, plant as halbach
 from malta.machines.halbach.electronics import IDEAL, Options
-from malta.machines.halbach.experiments import steps_reference
+from malta.machines.halbach.experiments import responses, steps_reference
 from malta.machines.halbach.open_loop import (
     FAULTS,
     LAWS,
@@ -204,6 +204,37 @@ def test_step_of_100_um_with_all_errors(evidence: Mapping[str, Evidence], name: 
     assert 0.7 < jumped < 0.85
 
 
+def test_the_calm_design_answers_what_the_paper_asked() -> None:
+    """Sec. 5.1: response within a minute, no oscillation; at that a stiff loop. What it pays is a slow integral."""
+    c = controller_of("halbach_calm")
+    plant = plant_for(c)
+    step = experiment("step", plant, c)
+    assert found(step, "jumps", "mean overshoot") == pytest.approx(0.029, abs=0.005)
+    assert found(step, "jumps", "mean within 5 % after") < 0.25
+    assert found(step, "jumps", "at rest, rms") < 2.4e-6
+    mean = responses(step.run, 100e-6, 20).mean(axis=0)
+    assert mean[int((mean > 0.95).argmax()) :].min() > 0.985  # it does not swing back, but for noise
+    assert 0.1e-6 < found(step, "jumps", "at rest, mean error") < 0.4e-6
+    reference = partial(steps_reference, distance=100e-6, rise=0.0, count=1, Ts=c.sample_time)
+    run = simulate(plant, c, Scenario("step", 60.0, reference, fidelity="force"))
+    share = run.p[5:, 0] / 100e-6
+    assert share.max() < 1.04
+    assert share[int((share > 0.95).argmax()) :].min() > 0.99
+    assert abs(share[-1] - 1) < 1e-4
+    model = malta.linearize(plant, plant.at())
+    assert malta.verify(model, c, {}).peak_sensitivity["x"] == pytest.approx(2.11, abs=0.01)
+    weak = replace(c, K=np.array([[150.0, 30.0]]), Ki=np.array([[30.0]]))
+    assert malta.verify(model, weak, {}).peak_sensitivity["x"] == pytest.approx(7.06, abs=0.02)
+
+
+def test_what_differs_from_the_paper_is_said(evidence: Mapping[str, Evidence]) -> None:
+    """The laser as a main contributor, and a smoother force under vector control: neither, by any of our designs."""
+    for e in evidence.values():
+        assert claims.share_of_error("laser", e) == pytest.approx(0.03, abs=0.01)
+        assert claims.share_of_error("current noise", e) == pytest.approx(1, abs=0.1)
+        assert claims.vector_over_position(e) == pytest.approx(0.99, abs=0.02)
+
+
 @pytest.mark.parametrize("name", DESIGNS)
 def test_stairs(evidence: Mapping[str, Evidence], printed: dict[str, Any], name: str) -> None:
     """Fig. 7: the second step is dead; closed, it switches between what voltages there are; fine ones are not seen."""
@@ -309,7 +340,8 @@ def test_linear_servo_against_the_motor_on_a_step_of_2_mm(preset: str) -> None:
     e = experiment("identify", halbach.plant(par), controller_of("halbach"))
     rms, first, secant, tangent, *fitted = (merit.value for merit in e.merits)
     # Fitted as the paper did: a line of known stiffness for what is a sine costs 1.8 and 1.3 %, not in the intervals.
-    assert fitted == pytest.approx([3.684, 0.018, 9.29, 0.076, 5.6e-6], rel=0.02)
+    assert fitted[:5] == pytest.approx([3.684, 0.018, 9.29, 0.076, 5.6e-6], rel=0.02)
+    assert fitted[5::2] == pytest.approx([1.6067, 211.0001, 29.778e-3], rel=1e-3)  # of the load cell
     assert abs(fitted[0] - 3.75) > 3 * fitted[1]
     assert 0.005e-3 < rms < first < 0.03e-3
     assert secant == pytest.approx(204.8, abs=0.5)

@@ -223,7 +223,7 @@ NEVER = {
     "simulation": ("proof", "margins"),
 }
 ALLOWED = {
-    ("malta.proof.certificate.check", "malta.gains.certified"),  # as above
+    ("malta.proof.certificate.check", "malta.gains.certified")  # as above
 }
 
 

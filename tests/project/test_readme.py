@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("proven_once")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DESIGNS = {
     "tubular": ("table2", "calibrated", "robust", "tubular_pid"),
-    "halbach": ("halbach_late", "halbach", "halbach_pid"),
+    "halbach": ("halbach_late", "halbach", "halbach_pid", "halbach_calm"),
     "planar": ("planar", "planar_pid"),
 }
 OBSERVED = ("robust_observer",)  # a table of its own on the page of its machine

@@ -5,7 +5,8 @@ stairs   steps of 10 um: open loop and position control, plain and high-resoluti
 ramp     50 mm at constant speed, Fig. 8
 force    the vertical force of a move of 5 mm under three control laws, Fig. 10, sound and with faults
 budget   the error of a motor at rest by source, Sec. 5.1
-identify the step of 2 mm in the open loop from which the paper identified mass and friction, Sec. 2.3
+identify the step of 2 mm in the open loop from which the paper identified mass and friction, Sec. 2.3; A, k and l from
+         a load cell's record, Sec. 2.1
 
 Electronics run period by period at fidelity "phase", which is the default; campaigns run at fidelity "force".
 

@@ -17,6 +17,7 @@ from malta.errors import CheckError, InputError
 from malta.linear.sampling import sample
 from malta.machines.halbach import electronics, electronics as motor
 from malta.machines.halbach.electronics import IDEAL, Options, Pwm
+from malta.machines.halbach.load_cell import FEWEST, NORMAL, fit_motor_law, simulated_record
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
@@ -255,7 +256,8 @@ def identify(
 ) -> Experiment:
     """A step of the open loop at a vertical force of `F_z` (N), beside the linear servo (5) that was fitted to one.
 
-    Mass and friction are fitted to what the laser reads of it, as the paper fitted them: see `fit_servo`.
+    Mass and friction are fitted to what the laser reads of it, as the paper fitted them: see `fit_servo`. A, k and l
+    come from a simulated record of a load cell along the travel, Sec. 2.1: see `fit_motor_law`.
     """
     par: Any = plant.parameters
     believed: Any = controller.parameters
@@ -285,6 +287,7 @@ def identify(
     fitted = (
         servo_step(case.run.t, fit.m, fit.b, K, distance) if fit.m > 0 else np.full(len(linear), math.nan)
     )
+    law = fit_motor_law(*simulated_record(plant))
     merits = (
         Merit("linear servo off by, rms", rms(off), "mm"),
         Merit(
@@ -297,6 +300,15 @@ def identify(
         Merit("friction, fitted", fit.b, "N s/m", better=""),
         Merit("friction, half of its interval", fit.b_half, "N s/m"),
         Merit("fitted servo off by, rms", fit.rms, "um"),
+        *(
+            Merit(f"load cell: {name}{what}", value, unit, better="low" if what else "")
+            for name, unit, found in (
+                ("A", "N/A", (law.A, law.A_half)),
+                ("k", "rad/m", (law.k, law.k_half)),
+                ("l", "mm", (law.pitch, law.pitch_half)),
+            )
+            for what, value in zip(("", ", half of its interval"), found, strict=True)
+        ),
     )
     return Experiment(
         "identify",
@@ -382,9 +394,6 @@ def _variances(J: FloatArray, off: FloatArray, lags: int) -> FloatArray:
     outer = np.linalg.inv(J.T @ J)
     white = outer * (off @ off) / (len(off) - J.shape[1])
     return np.asarray(np.maximum(np.diag(outer @ inner @ outer), np.diag(white)))
-
-
-FEWEST, NORMAL = 8, 1.96  # readings; standard deviations of an interval of 95 %
 
 
 def servo_step(t: FloatArray, m: float, b: float, K: float, distance: float) -> FloatArray:
