@@ -370,8 +370,15 @@ def test_unknown_preset_lists_the_known_ones() -> None:
 
 
 def test_preset_that_leaves_a_value_open_is_refused(tmp_path: Path) -> None:
+    (own,) = [
+        line
+        for line in DATA.read_text(encoding="utf-8").splitlines()
+        if line.startswith("K_A    = { value = 86")
+    ]
     path = edited(
         tmp_path,
+        (own + "\n", ""),
+        ("[presets.table4]", f"{own}\n[presets.table4]"),  # at the end of table1
         ("K_A    = { value = 8330,", "K_D    = { value = 8330,"),
         ('"N/m", tag = "p', '"N/A", tag = "p'),
     )
