@@ -120,8 +120,8 @@ for key, e in drifts.items():
 
 # %%
 tilts = {}
-slow = {"calibrated_slow": malta.gains.read("design/gains/calibrated_slow.json")}
-for key, controller in (controllers | slow).items():
+other = {"calibrated_slow": malta.gains.read("design/gains/calibrated_slow.json")}
+for key, controller in (controllers | other).items():
     e = tilts[key] = malta.experiment("tilt", malta.plant_of(controller.parameters), controller)
     display(malta.report.experiment_figure(e, published, f"build/03_{key}_tilt.png"))
     print(f"{key}, {e}")
