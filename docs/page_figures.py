@@ -335,7 +335,7 @@ def current_noise() -> Figure:
     """Rest and commands of two designs under noise of the current sensors; bars are 95 % intervals over seeds."""
     from malta.machines.tubular.paper.quantities import rests_of_seeds
 
-    noise = np.array([0.0, 5.0, 10.0, 20.0, 50.0])  # mA
+    noise = np.array([0.0, 5.0, 10.0, 13.8, 20.0, 50.0])  # mA
     figure, (motion, force) = new_figure(2, height=3.0)
     for name, style in zip(("calibrated", "robust"), STYLES, strict=False):
         law = malta.gains.read(f"design/gains/{name}.json")

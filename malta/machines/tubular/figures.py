@@ -182,7 +182,7 @@ def tilt_figure(e: Experiment, published: Published | None = None) -> Figure:
     for axes in (tracking, deviation):
         axes.set_yscale("log")
         axes.set_ylim(bottom=0.1)
-    draw_published(deviation, published, "figure_16.deviation", "um", where="below right")
+    draw_published(deviation, published, "figure_16.deviation", "um")
     square_axes(circle)
     square_axes(blow_up, least=1.4 * bound)
     late_part = "second half" if any(map(ended_early, runs_of(e))) else "last period"
