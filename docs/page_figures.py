@@ -358,6 +358,24 @@ def current_noise() -> Figure:
     return figure
 
 
+def cogging_of_two_modules() -> Figure:
+    """The cogging of MALTA's two modules over their distance, of period L_p, and where the presets have them."""
+    figure, (axes,) = new_figure(height=3.2)
+    plain, printed = (malta.read("data/tubular.toml", name) for name in ("table1", "table4"))
+    D = np.linspace(75, 105, 600)  # mm
+    axes.plot(D, np.abs(np.cos(np.pi * D * 1e-3 / plain.L_p)), label="two like modules", **STYLES[0])
+    for par, style in zip((plain, printed), STYLES[1:], strict=False):
+        at = 2e3 * par.l_B
+        axes.axvline(at, label=f"2 l_B of {par.preset}, {at:.1f} mm", **style)
+    for n in (11, 13):
+        axes.annotate(
+            f"{n / 2:g} L_p", (n / 2 * 15, 0.03), ha="left", xytext=(6, 0), textcoords="offset points", **GREY
+        )
+    axes.set_ylim(0, 1.35)
+    finish(axes, "distance of the modules' middles [mm]", "cogging over twice one module's")
+    return figure
+
+
 def bode() -> Figure:
     """The Bode plot of the machine that the tutorial begins with."""
     from malta.files import shipped_path
@@ -511,6 +529,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "stages": stages,
     "frames": frames,
     "current_noise": current_noise,
+    "cogging": cogging_of_two_modules,
     "bode": bode,
     "positioning": positioning,
     "coils": coils,
