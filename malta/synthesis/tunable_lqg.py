@@ -58,8 +58,8 @@ def calibrate(
 
     Returns the weights with the new bases.
 
-    Raises InputError when stiffness_ratio <= 2, axial_ratio or integral_time <= 0, the first mode has no stiffness, or
-    the modes couple.
+    Raises InputError when stiffness_ratio <= 2, axial_ratio or integral_time <= 0, there are more or fewer times than
+    outputs, the first mode has no stiffness, or the modes couple.
 
     >>> import malta
     >>> spec = malta.read_design("design/calibrated.toml")
@@ -78,7 +78,11 @@ def calibrate(
         raise InputError("calibrate", "model", "coupled modes", "decoupled ones: z_ss = 0, zero preload")
     if not stiffness_ratio > 2:
         raise InputError("calibrate", "stiffness_ratio", f"{stiffness_ratio:g}", "more than 2")
-    times = np.broadcast_to(integral_time, len(model.plant.outputs))
+    times, p = np.asarray(integral_time, dtype=float), len(model.plant.outputs)
+    if times.shape not in ((), (p,)):
+        raise InputError(
+            "calibrate", "integral_time", f"{times.size} times", f"one, or one for each of {p} outputs"
+        )
     for name, value in (("axial_ratio", axial_ratio), ("integral_time", float(times.min()))):
         if not value > 0:
             raise InputError("calibrate", name, f"{value:g}", "more than 0")

@@ -347,19 +347,10 @@ def true_radial(e: Evidence) -> Chance:
     return max(e.rests[f"true {name}, rms"] for name in ("x1", "y1", "x2", "y2"))
 
 
-def measured_at_rest(name: str, e: Evidence) -> Chance:
-    """Standard deviation of an output's measurements at rest, m."""
-    return e.rests[f"measured {name}, std"]
-
-
-def read_with_noisy_currents(name: str, e: Evidence) -> Chance:
-    """Standard deviation of an output's measurements at rest with the current sensors' noise, m."""
-    return e.noisy[f"measured {name}, std"]
-
-
-def mean_at_rest(name: str, e: Evidence) -> Chance:
-    """Size of the mean of an output's measurements at rest, m."""
-    return e.rests[f"measured {name}, mean"]
+def at_rest(rests: str, label: str, e: Evidence) -> Chance:
+    """A figure of merit of the hold by its label, m; `rests` is the field of Evidence, with or without noise."""
+    found: Chance = getattr(e, rests)[label]
+    return found
 
 
 def noise_forces(e: Evidence) -> tuple[float, float]:
