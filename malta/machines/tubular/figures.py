@@ -79,7 +79,7 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
         left=0.1,
         right=0.925,
         hspace=0.24,
-        size=(9.0, 8.4),
+        size=(9.0, 6.7),
         top=0.885,
     )
     (position, radial), (error, bearing), (speed, current) = figure.subplots(3, 2, sharex=True)
