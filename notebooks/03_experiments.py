@@ -135,12 +135,12 @@ for key, e in tilts.items():
 
 # %% [markdown]
 # **Judgement.** Fig. 16 is reproduced. With the control law as printed the state feedback pulls a mover that the
-# attraction pulls too: it goes to K1 / (K1 - k) of its reference until the integrals correct it. The figure shows how fast
-# they do. Table II prints their weights, and not what these stand for, so `calibrated` is fitted here: 0.1 s of the base
-# of x keep plane 2 within 4 µm. One second, of `calibrated_slow`, leaves 12 µm, plain SI units 7. The price of the fit is
-# the peak of |S|: 2.31 in place of 2.07, and over the uncertainty up to 4.9 in place of 3.9. The law's own feedforward,
-# which the paper keeps for "known radial disturbances", leaves less than 1 µm with any of them, since the attraction at
-# the reference is known.
+# attraction pulls too: it goes to K1 / (K1 - k) of its reference until the integrals correct it. The figure shows how
+# fast they do. Table II prints their weights, and not what these stand for, so `calibrated` is fitted here: 0.1 s of
+# the base of x keep plane 2 within 4 µm. One second, of `calibrated_slow`, leaves 12 µm, plain SI units 7. The price
+# of the fit is the peak of |S|: 2.31 in place of 2.07, and over the uncertainty up to 4.9 in place of 3.9. The law's
+# own feedforward, which the paper keeps for "known radial disturbances", leaves less than 1 µm with any of them,
+# since the attraction at the reference is known.
 
 # %%
 for key, e in tilts.items():
@@ -213,8 +213,8 @@ assert fastest < 0.85 * sigmoid
 
 # %% [markdown]
 # **Summary.** Every bound of Figs 12 and 13 is met. The noise of Table III is that of the simulated sensors. Fig. 16
-# is reproduced by integrals that are fitted on it, with the law as printed. The payload and the margin of 300 % need other bases
-# than SI units, and the payload costs precision. `malta claims` computes all claims of the paper.
+# is reproduced by integrals that are fitted on it, with the law as printed. The payload and the margin of 300 % need
+# other bases than SI units, and the payload costs precision. `malta claims` computes all claims of the paper.
 
 # %%
 fig, ax = plt.subplots()
