@@ -225,7 +225,7 @@ def loop(
     >>> plant = malta.plant_of(controller.parameters)
     >>> heavy = malta.loop(plant, controller, parameters={"m": 0.6})
     >>> f"slowest pole {heavy.poles.real.max():.2f} rad/s"
-    'slowest pole -6.61 rad/s'
+    'slowest pole -9.89 rad/s'
     """
     chosen_loops(plant, controller, current_loops)
     require_known(parameters or (), units_of(plant.parameters), "loop", found="an unknown parameter")
