@@ -59,7 +59,7 @@ class Loop:
     (True, (41, 41))
     >>> found = loop.margin({"m": 0.2, "K_A": 0.2, "K_B": 0.2, "K_D": 0.2})
     >>> f"{found.lower:.2f} times the box"
-    '1.62 times the box'
+    '1.65 times the box'
     """
 
     plant: Plant
