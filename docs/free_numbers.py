@@ -62,6 +62,21 @@ LQG = (
     Line("uncertainty", ("uncertainty.*",), "printed: Sec. IV-A; shapes no gains", ()),
 )
 SI = Line("bases", ("bases.*",), "free: the printed weights read as plain SI numbers", ())
+HALBACH_PID = (
+    Line("Kp", ("pid.Kp.*",), "free: see the design file"),
+    Line("Ki", ("pid.Ki.*",), "free: see the design file"),
+    Line("Kd", ("pid.Kd.*",), "free: see the design file"),
+    Line("filter of the difference", ("pid.filter*",), "free: a plain difference", ()),
+    Line("sample time", ("sample_time",), "printed: of the laser, Sec. 5.1"),
+    Line("operating point, x", ("operating_point.x",), "printed: the middle", (10.0,)),
+    Line(
+        "dead time in the current loops' design",
+        ("current_loop_delay",),
+        "free: usual in the field",
+        (False,),
+    ),
+    Line("uncertainty", ("uncertainty.*",), "free; shapes no gains", ()),
+)
 OF_DESIGN: dict[str, tuple[Line, ...]] = {
     "table2": (
         *LQG,
@@ -90,16 +105,7 @@ OF_DESIGN: dict[str, tuple[Line, ...]] = {
     "calibrated_slow": (
         Line("bases of the planes' integrals", ("bases.integral.[xy]*",), "free: 1 s of the base of x"),
     ),
-    "halbach_pid": (
-        Line("Kp", ("pid.Kp.*",), "free: see the design file"),
-        Line("Ki", ("pid.Ki.*",), "free: see the design file"),
-        Line("Kd", ("pid.Kd.*",), "free: see the design file"),
-        Line("filter of the difference", ("pid.filter*",), "free: a plain difference", ()),
-        Line("sample time", ("sample_time",), "printed: of the laser, Sec. 5.1"),
-        Line("operating point, x", ("operating_point.x",), "printed: the middle", (10.0,)),
-        Line("dead time in the current loops' design", ("current_loop_delay",), "free: usual in the field", (False,)),
-        Line("uncertainty", ("uncertainty.*",), "free; shapes no gains", ()),
-    ),
+    "halbach_pid": HALBACH_PID,
     "planar_pid": (
         Line("Kp of forces", ("pid.Kp.F_*",), "free: `malta tune`, peak |S| of 1.8"),
         Line("Kp of torques", ("pid.Kp.T_*",), "free: likewise"),

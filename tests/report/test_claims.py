@@ -460,7 +460,6 @@ VERDICTS = {
     "stroke, cogging not compensated: error": "table2: not reproduced: larger, x 9.0; calibrated: smaller, x 3.1",
     "weight carried": "not reproduced",
     "at rest: x1": "table2: by construction, within ",
-    "noise of a bearing's force": BUILT,
     "at rest, current sensors noisy: x1": "not reproduced; ",
     "tilt: SP2 deviates": "table2: not reproduced: larger, x 1.7; calibrated: by construction; ",
     "tilt: SP2, attraction": "smaller, x ",

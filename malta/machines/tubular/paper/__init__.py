@@ -251,6 +251,7 @@ NOISY_REST: tuple[Row, ...] = (
             partial(ours.current_reading, axis, modules),
             f"table_II.process_noise.{force}",
             note=note,
+            why="the variances of both forces agree on the sensors' noise within 1.5 %",
             by_construction=not modules,
         )
         for of, axis, modules, force, note in (
