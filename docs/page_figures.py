@@ -335,7 +335,7 @@ def current_noise() -> Figure:
     """Rest and commands of two designs under noise of the current sensors; bars are 95 % intervals over seeds."""
     from malta.machines.tubular.paper.quantities import rests_of_seeds
 
-    noise = np.array([0.0, 5.0, 10.0, 20.0, 50.0])  # mA
+    noise = np.array([0.0, 5.0, 10.0, 13.8, 20.0, 50.0])  # mA
     figure, (motion, force) = new_figure(2, height=3.0)
     for name, style in zip(("calibrated", "robust"), STYLES, strict=False):
         law = malta.gains.read(f"design/gains/{name}.json")
@@ -355,6 +355,24 @@ def current_noise() -> Figure:
         motion, "noise of a current sensor, rms [mA]", "worst radial motion at rest, rms [µm]", "the mover"
     )
     finish(force, "noise of a current sensor, rms [mA]", "commanded bearing force, rms [N]", "its price")
+    return figure
+
+
+def cogging_of_two_modules() -> Figure:
+    """The cogging of MALTA's two modules over their distance, of period L_p, and where the presets have them."""
+    figure, (axes,) = new_figure(height=3.2)
+    plain, printed = (malta.read("data/tubular.toml", name) for name in ("table1", "table4"))
+    D = np.linspace(75, 105, 600)  # mm
+    axes.plot(D, np.abs(np.cos(np.pi * D * 1e-3 / plain.L_p)), label="two like modules", **STYLES[0])
+    for par, style in zip((plain, printed), STYLES[1:], strict=False):
+        at = 2e3 * par.l_B
+        axes.axvline(at, label=f"2 l_B of {par.preset}, {at:.1f} mm", **style)
+    for n in (11, 13):
+        axes.annotate(
+            f"{n / 2:g} L_p", (n / 2 * 15, 0.03), ha="left", xytext=(6, 0), textcoords="offset points", **GREY
+        )
+    axes.set_ylim(0, 1.35)
+    finish(axes, "distance of the modules' middles [mm]", "cogging over twice one module's")
     return figure
 
 
@@ -511,6 +529,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "stages": stages,
     "frames": frames,
     "current_noise": current_noise,
+    "cogging": cogging_of_two_modules,
     "bode": bode,
     "positioning": positioning,
     "coils": coils,

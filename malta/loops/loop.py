@@ -58,7 +58,7 @@ class Loop:
     (True, (41, 41))
     >>> found = malta.robust_margin(loop, {"m": 0.2, "K_A": 0.2, "K_B": 0.2, "K_D": 0.2})
     >>> f"{found.lower:.2f} times the box"
-    '1.62 times the box'
+    '1.65 times the box'
     """
 
     plant: Plant
@@ -215,7 +215,7 @@ def loop(
     >>> plant = malta.plant_of(controller.parameters)
     >>> heavy = malta.loop(plant, controller, parameters={"m": 0.6})
     >>> f"slowest pole {heavy.poles.real.max():.2f} rad/s"
-    'slowest pole -6.61 rad/s'
+    'slowest pole -9.89 rad/s'
     """
     chosen_loops(plant, controller, current_loops)
     require_known(parameters or (), units_of(plant.parameters), "loop", found="an unknown parameter")

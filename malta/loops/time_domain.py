@@ -122,7 +122,7 @@ def recovery(
     >>> found = malta.loops.recovery(malta.plant_of(controller.parameters), controller)
     >>> x1 = found[0].outputs[0]
     >>> f"1 N of {found[0].name} moves {x1.output} by {x1.largest * 1e6:.1f} um"
-    '1 N of F_x moves x1 by 48.2 um'
+    '1 N of F_x moves x1 by 34.2 um'
     """
     whole = loop_from(plant, controller, position)
     plant = whole.plant

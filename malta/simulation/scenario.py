@@ -110,7 +110,7 @@ class Scenario:
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, hold)
     >>> f"x1 from {1e6 * run.p[0, 0]:.0f} um to {1e6 * run.p[-1, 0]:.1f} um"
-    'x1 from 50 um to -0.9 um'
+    'x1 from 50 um to -7.1 um'
     """
 
     name: str

@@ -40,7 +40,7 @@ def calibrate(
     weights: Weights,
     stiffness_ratio: float,
     axial_ratio: float = 1.0,
-    integral_time: float = 1.0,
+    integral_time: float | Sequence[float] = 1.0,
 ) -> Weights:
     """Find bases of the weights on which the LQR is a given number of times as stiff as the magnets pull.
 
@@ -53,13 +53,13 @@ def calibrate(
     weights : dimensionless weights, whose bases are replaced
     stiffness_ratio : K1 / k of every unstable mode, more than 2 (which is reached at zero weight)
     axial_ratio : w_n of modes without stiffness over the w_n of the first mode
-    integral_time : s; an error integral's base is this times that of the first position (radial) or of its own (modes
-        without stiffness)
+    integral_time : s, one or one for each output: an error integral's base is this times that of the first position
+        (radial) or of its own (modes without stiffness). Free: K1 / k does not depend on it, so fit it on a response
 
     Returns the weights with the new bases.
 
-    Raises InputError when stiffness_ratio <= 2, axial_ratio or integral_time <= 0, the first mode has no stiffness, or
-    the modes couple.
+    Raises InputError when stiffness_ratio <= 2, axial_ratio or integral_time <= 0, there are more or fewer times than
+    outputs, the first mode has no stiffness, or the modes couple.
 
     >>> import malta
     >>> spec = malta.read_design("design/calibrated.toml")
@@ -78,7 +78,12 @@ def calibrate(
         raise InputError("calibrate", "model", "coupled modes", "decoupled ones: z_ss = 0, zero preload")
     if not stiffness_ratio > 2:
         raise InputError("calibrate", "stiffness_ratio", f"{stiffness_ratio:g}", "more than 2")
-    for name, value in (("axial_ratio", axial_ratio), ("integral_time", integral_time)):
+    times, p = np.asarray(integral_time, dtype=float), len(model.plant.outputs)
+    if times.shape not in ((), (p,)):
+        raise InputError(
+            "calibrate", "integral_time", f"{times.size} times", f"one, or one for each of {p} outputs"
+        )
+    for name, value in (("axial_ratio", axial_ratio), ("integral_time", float(times.min()))):
         if not value > 0:
             raise InputError("calibrate", name, f"{value:g}", "more than 0")
     stiffness = np.diag(k)
@@ -90,8 +95,8 @@ def calibrate(
     K1 = w_n**2 + stiffness
     base = np.sqrt(weights.q[:n] * g / ((K1 - stiffness) ** 2 - stiffness**2))
     own = {s.name: i for i, s in enumerate(model.plant.design_states[:n])}
-    integral_base = [base[own.get(s.name, 0)] * integral_time for s in model.plant.outputs]
-    return replace(weights, q_base=np.concatenate([base, base * w_n]), q_i_base=np.array(integral_base))
+    integral_base = times * base[[own.get(s.name, 0) for s in model.plant.outputs]]
+    return replace(weights, q_base=np.concatenate([base, base * w_n]), q_i_base=integral_base)
 
 
 Change = tuple[Any, Any]  # of Q and R

@@ -293,8 +293,8 @@ def test_thrust_off_the_centre_of_gravity_moves_x_as_far_as_the_paper_measures(f
 
 
 def test_offsets_of_current_sensors_move_the_mover_as_far(figure: Figure13) -> None:
-    """Half a percent of the current range is enough, with 20 um in y and half of that in x."""
-    assert 0.015 < figure.causes["d_i"] < 0.03
+    """A percent of the current range is enough, with 20 um in y and half of that in x."""
+    assert 0.03 < figure.causes["d_i"] < 0.06
     run, start = figure.moved["d_i"], WAIT["d_i"]
     assert radial_deviation(run, start=start) == pytest.approx(20e-6, rel=0.02)
     assert radial_deviation(run, (0, 2), start) > 5e-6

@@ -448,7 +448,7 @@ def test_verify_as_json_holds_finite_numbers(run: Run) -> None:
     assert (code, err) == (0, "")
     result = json.loads(out)
     robust = result.pop("robust")  # null where no witness exists
-    assert robust["travel"]["lower"] == pytest.approx(1.6206, abs=1e-3)
+    assert robust["travel"]["lower"] == pytest.approx(1.6278, abs=1e-3)
     found = numbers(result)
     assert len(found) > 60
     assert all(map(math.isfinite, found))

@@ -61,11 +61,13 @@ def test_default_preset_is_table1() -> None:
     assert malta.read(DATA).preset == "table1"
 
 
-def test_presets_differ_in_attraction_and_bearing_distance_only() -> None:
+def test_presets_differ_in_attraction_bearing_distance_and_noise_of_currents_only() -> None:
     table1: Any = malta.read(DATA, "table1")
     table4: Any = malta.read(DATA, "table4")
     assert (table4.K_A, table4.l_B, table4.preset) == (8330.0, 45.347e-3, "table4")
     assert replace(table4, K_A=8626.7, l_B=44.560e-3, preset="table1") == table1
+    noisy: Any = malta.read(DATA, "table1_currents")
+    assert replace(noisy, s_i=0.0, preset="table1") == table1
 
 
 def test_every_value_has_unit_tag_and_source() -> None:
@@ -364,12 +366,19 @@ def test_malformed_file_says_the_line(tmp_path: Path) -> None:
 def test_unknown_preset_lists_the_known_ones() -> None:
     error = refusal(lambda: malta.read(DATA, preset="table9"), DATA)
     assert (error.field, error.found) == ("presets", "no preset 'table9'")
-    assert error.expected == "one of table1, table4"
+    assert error.expected == "one of table1, table4, table1_currents"
 
 
 def test_preset_that_leaves_a_value_open_is_refused(tmp_path: Path) -> None:
+    (own,) = [
+        line
+        for line in DATA.read_text(encoding="utf-8").splitlines()
+        if line.startswith("K_A    = { value = 86")
+    ]
     path = edited(
         tmp_path,
+        (own + "\n", ""),
+        ("[presets.table4]", f"{own}\n[presets.table4]"),  # at the end of table1
         ("K_A    = { value = 8330,", "K_D    = { value = 8330,"),
         ('"N/m", tag = "p', '"N/A", tag = "p'),
     )

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_discrete_lyapunov
 
 import malta
 from malta import references
@@ -48,7 +48,10 @@ NAMES = ("table2", "calibrated")
 
 # Published figures without a row of their own, and why.
 INPUTS = {
-    "table_II": "weights and noise: what the designs are made of, see test_table_II_is_what_is_designed_with",
+    **dict.fromkeys(
+        ("table_II.state", "table_II.input", "table_II.integral", "table_II.sensor_noise"),
+        "what the designs are made of, see test_table_II_is_what_is_designed_with",
+    ),
     "table_I.digits": "how the table is printed",
     "table_III.samples": "an input of the hold, see test_experiments",
     "table_III.mean": "chance over 0.1 s; that ours are as small is tested in test_experiments",
@@ -63,10 +66,10 @@ INPUTS = {
     "thermal.length": "an input of the row on the arm's growth",
     "thermal.strain": "an input of the row on the arm's growth",
 }
-TWINS = {
-    "table_I.poles.y": "table_I.poles.x",
-    "table_I.poles.beta": "table_I.poles.alpha",
-}  # one row for both
+TWINS = {"table_I.poles.y": "table_I.poles.x", "table_I.poles.beta": "table_I.poles.alpha"} | {
+    f"table_II.process_noise.{name}": "table_II.process_noise.fx_B1" for name in ("fy_B1", "fx_B2", "fy_B2")
+}
+# one row for all of them
 
 
 class Found(NamedTuple):
@@ -513,7 +516,7 @@ def test_a_reason_stands_beside_whatever_is_not_reproduced(found: Found) -> None
 BOTH, FIRST, SECOND = (
     "reproduced",
     "calibrated: not reproduced",
-    "table2: not reproduced; calibrated: reproduced",
+    "table2: not reproduced; calibrated: within ",
 )
 BUILT, SOLVED = "by construction; ", "table2: not reproduced; calibrated: by construction"
 VERDICTS = {
@@ -532,19 +535,20 @@ VERDICTS = {
     "stroke: rise": "table2: by construction, within 1 %; calibrated: by construction, within 3 %; ",
     "stroke: overshoot": "smaller, x 6.7, x > 1000",
     "stroke: axial error": "smaller, x 7.2, x 7.0",
-    "stroke: radial deviation": "smaller, x 8.2, x 34",
+    "stroke: radial deviation": "smaller, x 8.2, x 57",
     "stroke: deviation of x1": BUILT,
     "stroke: f/i": BUILT,
     "stroke, cogging not compensated: rise": SOLVED,
     "stroke, cogging not compensated: error": "table2: not reproduced: larger, x 9.0; calibrated: smaller, x 3.1",
     "weight carried": "within 9 %; ",
     "at rest: x1": "table2: by construction, within ",
-    "tilt: SP2 deviates": "not reproduced: larger, x ",
+    "at rest, current sensors noisy: x1": "not reproduced; ",
+    "tilt: SP2 deviates": "table2: not reproduced: larger, x 1.7; calibrated: by construction; ",
     "tilt: SP2, attraction": "smaller, x ",
     "thermal: growth": BUILT,
     "at rest: z measured": "by construction, within 3 %; ",
     "at rest: y1 measured": "by construction, within 2 %; ",
-    "payload picked": "table2: not reproduced: smaller, x 1.7; calibrated: larger, x 3.7; ",
+    "payload picked": "table2: not reproduced: smaller, x 1.7; calibrated: larger, x 5.3; ",
 }
 
 
@@ -607,12 +611,12 @@ def test_the_full_state_share_follows_from_the_ratio(found: Found) -> None:
 
 
 def _radius(design: Design, share: float) -> float:
-    """Spectral radius of the sampled loop, its matrices written out: attraction up, bearing force down by a share of
-    20 %; hold, current loops as lags, one sample of delay, filter, integrals."""
+    """Spectral radius of the sampled loop, its matrices written out: mass and attraction up, bearing force down by a
+    share of 20 %; hold, current loops as lags, one sample of delay, filter, integrals."""
     c, h = design.controller, design.controller.sample_time
     par: Any = design.spec.parameters
     K_A, weaker, l_B, l_S = par.K_A * (1 + 0.2 * share), 1 - 0.2 * share, par.l_B, par.l_S
-    inertia = np.array([par.m] * 3 + [par.I_xx] * 2)[:, None]
+    inertia = np.array([par.m * (1 + 0.2 * share)] * 3 + [par.I_xx] * 2)[:, None]
     V = [[1, 0, 1, 0, 0], [0, 1, 0, 1, 0], [0, 0, 0, 0, 1], [0, l_B, 0, -l_B, 0], [-l_B, 0, l_B, 0, 0]]
     A, B = np.zeros((15, 15)), np.zeros((15, 5))
     A[:5, 5:10] = np.eye(5)
@@ -635,14 +639,14 @@ def _radius(design: Design, share: float) -> float:
 
 @pytest.mark.slow
 def test_the_share_on_the_machine_by_hand(found: Found, designs: dict[str, Design]) -> None:
-    """33 and 162 %: where the largest eigenvalue of matrices written out leaves the unit circle, K_A up, K_B down.
+    """33 and 163 %: the largest eigenvalue of matrices written out leaves the unit circle there, m, K_A up, K_B down.
 
-    The matrices have current loops as lags, and a slow mode leaves, which hardly feels the difference. The mass, which
-    the proof lets vary too, takes another percent.
+    The matrices have current loops as lags. In table2 the mode that leaves is at rest, in `calibrated` at 96 rad/s,
+    where lags differ from PI loops by half a percent of the box.
     """
-    for name, expected in zip(NAMES, (33.4, 162.06), strict=True):
+    for name, expected in zip(NAMES, (33.4, 162.78), strict=True):
         share = found.value("the same, sampled, with observer", name) / 100
-        assert _radius(designs[name], 0.99 * share) < 1 < _radius(designs[name], 1.02 * share)
+        assert _radius(designs[name], 0.98 * share) < 1 < _radius(designs[name], 1.02 * share)
         assert 100 * share == pytest.approx(expected, abs=0.1)
 
 
@@ -652,13 +656,12 @@ def test_the_share_on_the_machine_by_hand(found: Found, designs: dict[str, Desig
 def test_the_share_on_the_machine_simulated(
     found: Found, designs: dict[str, Design], fidelity: Any, beyond: float, grows: bool
 ) -> None:
-    """Inside, 0.1 um off centre decays; outside it grows, with windings as with lags: it is a slow mode that leaves."""
+    """Inside, 0.1 um off centre decays; outside it grows, with windings as with lags: no fast mode leaves."""
     for name, design in designs.items():
         share = beyond * found.value("the same, sampled, with observer", name) / 100
         par: Any = design.spec.parameters
-        corner = replace(
-            par, K_A=par.K_A * (1 + 0.2 * share), K_B=par.K_B * (1 - 0.2 * share), g=0.0, F_c=0.0
-        )
+        up, down = 1 + 0.2 * share, 1 - 0.2 * share
+        corner = replace(par, m=par.m * up, K_A=par.K_A * up, K_B=par.K_B * down, g=0.0, F_c=0.0)
         alone = replace(design.controller.feedforward, v0=0 * design.controller.feedforward.v0)
         start = {"x": 1e-7, "beta": 1e-6}
         scenario = Scenario("corner", 1.0, references.hold, start, fidelity=fidelity)
@@ -719,6 +722,72 @@ def test_current_loops_by_hand(found: Found, designs: dict[str, Design]) -> None
         assert found.value("current loops: phase margin", name) == pytest.approx(180 + math.degrees(phase))
         assert w == pytest.approx(3000, rel=1e-6)
     assert found.claim("current loops: phase margin").ours == ("60.0", "60.0")
+
+
+def test_the_current_sensors_noise_is_that_of_table_II(published: dict[str, Any]) -> None:
+    """The data's 13.8 mA by another route: Lyapunov's equation of a sampled PI loop with a sample of delay."""
+    par, law = (
+        malta.read("data/tubular.toml", "table1_currents"),
+        malta.gains.read("design/gains/calibrated.json"),
+    )
+    loop, h = law.current_loop, law.sample_time
+    assert loop is not None
+    pole, Kp, Ki = math.exp(-par.R * h / par.L), loop.Kp, loop.Ki * h
+    # Current, sum of errors and the voltage that waits; n is the noise of the reading.
+    A = np.array([[pole, 0, (1 - pole) / par.R], [-Ki, 1, 0], [-Kp - Ki, 1, 0]])
+    P = solve_discrete_lyapunov(A, np.outer([0, Ki, Kp + Ki], [0, Ki, Kp + Ki]))
+    reads = math.sqrt(1 + P[0, 0])
+    assert reads == pytest.approx(1.055, abs=5e-4)
+    # (16): 2/3 cos around and along the machine, 1/3 for the zero sequence: 2/3 and sqrt(2)/3 of a phase's noise.
+    printed = published["table_II"]["process_noise"]
+    bearing = math.sqrt(printed["fx_B1"]["value"]) / par.K_B / (2 / 3 * reads)
+    thrust = math.sqrt(printed["f_D"]["value"]) / (2 * par.K_D) / (math.sqrt(2) / 3 * reads)
+    assert par.s_i == pytest.approx(bearing, rel=2e-3)
+    assert par.s_i == pytest.approx(thrust, rel=0.02)
+    evidence: Any = SimpleNamespace(spec=malta.read_design("design/calibrated.toml"), controller=law)
+    for axis, modules, one in (("dd", 0, par.K_B * 2 / 3), ("0q", 2, 2 * par.K_D * math.sqrt(2) / 3)):
+        found = tubular_evidence.current_reading(axis, modules, evidence)
+        assert found == pytest.approx((one * reads * par.s_i) ** 2, rel=1e-4)
+
+
+def test_cogging_of_two_modules_by_hand() -> None:
+    """sin at both modules' middles, summed: near six poles apart 98 % are left, at 5.5 and 6.5 poles nothing."""
+    par: Any = malta.read("data/tubular.toml")
+    z = np.linspace(0, par.L_p, 400)
+
+    def left(distance: float) -> float:
+        both = sum(np.sin(2 * np.pi * (z + side * distance / 2) / par.L_p) for side in (-1, 1))
+        return float(np.abs(both).max() / 2)
+
+    evidence: Any = SimpleNamespace(spec=malta.read_design("design/table2.toml"))
+    assert tubular_evidence.cogging_share(evidence) == pytest.approx(left(2 * par.l_B), abs=1e-4)
+    assert left(2 * par.l_B) == pytest.approx(0.98, abs=5e-3)
+    assert max(left(82.5e-3), left(97.5e-3)) < 1e-9
+
+
+@pytest.mark.slow
+def test_the_fastest_of_the_stroke_is_that_of_the_sigmoid(found: Found) -> None:
+    """Fig. 12(c): 2 ln 9 / 16.2 ms times a quarter of 10 mm, and what a loop makes of it."""
+    sigmoid = 10e-3 / 4 * 2 * math.log(9) / 16.2e-3
+    assert sigmoid == pytest.approx(0.678, abs=1e-3)
+    for name in NAMES:
+        assert found.value("stroke: largest speed", name) == pytest.approx(sigmoid, rel=0.03)
+
+
+def test_table_III_with_noisy_currents_decides_for_the_stiffer_design(published: dict[str, Any]) -> None:
+    """13.8 mA in each phase: `calibrated` reads a third more than Table III, `robust` 9 % more at most."""
+    over = {}
+    for name in ("calibrated", "robust"):
+        law = malta.gains.read(f"design/gains/{name}.json")
+        plant = tubular_evidence.with_noise_of_currents(plant_of(law.parameters))
+        rests = tubular_evidence.rests_of_seeds(plant, law, range(4))
+        printed = published["table_III"]["std"]
+        over[name] = [
+            1e6 * rests[f"measured {k}, std"] / printed[k]["value"] - 1 for k in ("x1", "y1", "x2", "y2")
+        ]
+    assert np.mean(over["calibrated"]) > 0.2
+    assert min(over["calibrated"]) > 0.1
+    assert max(map(abs, over["robust"])) < 0.13
 
 
 @pytest.mark.slow
@@ -808,7 +877,7 @@ def test_a_payload_is_moved_as_the_stroke_is_published(found: Found) -> None:
     assert found.value("payload moved within", "calibrated") == pytest.approx(0.02, abs=0.01)
     # Without bounds the trials do not end at the published 0.2 kg.
     carried = [found.value("payload picked", name) for name in NAMES]
-    assert carried == pytest.approx([0.116, 0.732], rel=0.05)
+    assert carried == pytest.approx([0.116, 1.056], rel=0.05)
 
 
 @pytest.mark.slow
@@ -901,7 +970,7 @@ def test_the_rule_of_thumb_by_hand(found: Found) -> None:
     claim = found.claim("bandwidth over unstable pole: last −3")
     assert claim.verdict.startswith("table2: within 12 %; calibrated: not reproduced; ")
     assert claim.published == f"≈ {400 / 218.92:.2f}"
-    assert found.claim("bandwidth over unstable pole: last 0").verdict.startswith(SECOND)
+    assert found.claim("bandwidth over unstable pole: last 0").verdict.startswith("table2: not reproduced; calibrated: within ")
 
 
 @pytest.mark.slow

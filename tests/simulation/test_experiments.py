@@ -338,15 +338,14 @@ def test_the_circle_errs_as_the_linear_loop_does(design: Design, flown: Flown, k
     assert _merit(merits, "SP2: largest deviation, true") == pytest.approx(plane_2, abs=0.6e-6)
 
 
-@pytest.mark.parametrize(("name", "ratio"), [("table2", 2.0), ("calibrated", 4.0)])
-def test_without_the_attraction_the_mover_goes_too_far(
-    designs: dict[str, Design], flown: Flown, name: str, ratio: float
-) -> None:
+@pytest.mark.parametrize(("name", "ratio"), [("table2", 2.0), ("calibrated_slow", 4.0)])
+def test_without_the_attraction_the_mover_goes_too_far(plant: Plant, name: str, ratio: float) -> None:
     """K1 / (K1 - k) of what is asked until the integrals take it back: twice as far, or 4/3."""
-    design = designs[name]
-    stiffness = (design.model.force_map @ lqr(design.model, design.spec.weights)[:, :5])[0, 0]
-    assert stiffness / design.model.stiffness[0, 0] == pytest.approx(ratio, rel=1e-4)
-    run = _case(flown(name, "tilt"), "feedforward axial").run
+    spec, law = malta.read_design(f"design/{name}.toml"), malta.gains.read(f"design/gains/{name}.json")
+    model = malta.linearize(plant, plant.at())
+    stiffness = (model.force_map @ lqr(model, spec.weights)[:, :5])[0, 0]
+    assert stiffness / model.stiffness[0, 0] == pytest.approx(ratio, rel=1e-4)
+    run = _case(experiment("tilt", plant, law), "feedforward axial").run
     gain = np.hypot(run.p[:, 0], run.p[:, 1]) / 200e-6
     first = gain[(run.t > 10e-3) & (run.t < 60e-3)].max()
     assert first == pytest.approx(ratio / (ratio - 1), rel=0.01)
@@ -357,13 +356,31 @@ def test_without_the_attraction_the_mover_goes_too_far(
         assert 1.15 < last.min() < last.max() < 1.30
 
 
-def test_the_printed_law_breaks_the_published_bound_and_the_attraction_keeps_it(
+def test_integrals_as_fast_as_figure_16_asks_follow_the_circle(
+    plant: Plant, flown: Flown, published: dict[str, Any]
+) -> None:
+    """The law as printed: 0.1 s of integrals in place of 1 s bring plane 2 within 4 um, plane 1 five times nearer."""
+    slow = experiment("tilt", plant, malta.gains.read("design/gains/calibrated_slow.json"))
+    labels = ("SP2: largest deviation, true", "SP1: largest tracking error, true")
+    fitted, before = (
+        [_merit(_case(found, "feedforward axial").merits, label) for label in labels]
+        for found in (flown("calibrated", "tilt"), slow)
+    )
+    assert fitted == pytest.approx([3.63e-6, 9.75e-6], rel=0.03)
+    assert before == pytest.approx([12.3e-6, 52.5e-6], rel=0.03)
+    assert fitted[0] < published_value(published, "figure_16.deviation") < before[0]
+
+
+def test_the_printed_law_keeps_the_published_bound_if_fitted_and_the_attraction_always(
     design: Design, flown: Flown, published: dict[str, Any]
 ) -> None:
     bound = published_value(published, "figure_16.deviation")
     axial, attraction = flown(design.spec.name, "tilt").cases
     label = "SP2: largest deviation, true"
-    assert _merit(axial.merits, label) > 1.5 * bound
+    if design.spec.name == "calibrated":  # is fitted on it
+        assert 0.8 * bound < _merit(axial.merits, label) < bound
+    else:
+        assert _merit(axial.merits, label) > 1.5 * bound
     assert _merit(attraction.merits, label) < 1e-6 < bound
     assert _merit(attraction.merits, "SP2: largest deviation, measured") <= bound
     assert all(case.run.verdict.completed for case in (axial, attraction))
@@ -422,7 +439,8 @@ def test_every_estimator_lifts_the_mover(design: Design, flown: Flown) -> None:
 @pytest.mark.slow
 def test_an_observer_that_knows_nothing_pays_for_the_start(flown: Flown) -> None:
     """Cold, the steady-state filter takes the mover to fly: table2 overshoots by a third of the clearance, calibrated
-    needs three times the current. The Kalman filters begin with a measurement, and wait longer before they lift."""
+    needs three times the current. The Kalman filters begin with a measurement, and wait longer before they lift: the
+    integrals of calibrated, which grow as they wait, take it beyond the centre by 54 um."""
     for name in ("table2", "calibrated"):
         steady, kalman, extended = flown(name, "lift-off").cases
         off = [_merit(case.merits, "off the bearing after") for case in (steady, kalman, extended)]
@@ -430,17 +448,17 @@ def test_an_observer_that_knows_nothing_pays_for_the_start(flown: Flown) -> None
         assert off[1] > 3 * off[0]
         beyond = [_merit(case.merits, "beyond the centre") for case in (steady, kalman, extended)]
         current = [_merit(case.merits, "largest bearing current") for case in (steady, kalman, extended)]
-        assert max(beyond[1:]) < 25e-6
+        assert max(beyond[1:]) < (25e-6 if name == "table2" else 60e-6)
         assert max(current[1:]) < 1.7
         if name == "table2":
             assert beyond[0] > 8 * beyond[1] > 8 * beyond[2]
             assert beyond[0] == pytest.approx(198e-6, rel=0.05)
         else:
             assert current[0] > 2.8 * max(current[1:])
-            # Its first jump falls back by 0.2 mm before it follows; it never passes the centre.
+            # Its first jump falls back by 0.2 mm before it follows, and hardly passes the centre.
             climbed = int(np.argmax(steady.run.p[:200, 1]))
             assert np.min(steady.run.p[climbed:600, 1]) < steady.run.p[climbed, 1] - 0.2e-3
-            assert beyond[0] < 1e-6
+            assert beyond[0] < 5e-6
 
 
 def test_the_rise_is_a_quintic_to_the_centre(plant: Plant) -> None:
@@ -495,7 +513,7 @@ def test_a_picked_mass_sags_as_the_linear_loop_predicts(design: Design, flown: F
         # Full state feedback would give m g / (K1 - k); the observer, which takes the weight for motion, is softer.
         stiff = (design.model.force_map @ lqr(design.model, design.spec.weights)[:, :5])[0, 0]
         alone = extra * 9.81 / (design.plant.mass * (stiff - design.model.stiffness[0, 0]))
-        assert 3 < sag / alone < 10
+        assert 2.5 < sag / alone < 10
 
 
 def test_what_is_carried(design: Design, flown: Flown) -> None:
@@ -658,7 +676,7 @@ def test_the_largest_compliance_is_on_the_curve(design: Design, flown: Flown) ->
     assert around[1] == pytest.approx(worst, rel=1e-9)
     assert around.max() <= worst * (1 + 1e-6)
     assert _merit(found.merits, "smallest dynamic stiffness") * worst == pytest.approx(1)
-    expected = {"table2": 399e-6, "calibrated": 52.2e-6}[design.spec.name]
+    expected = {"table2": 399e-6, "calibrated": 44.3e-6}[design.spec.name]
     assert worst == pytest.approx(expected, rel=0.01)
 
 

@@ -96,7 +96,7 @@ def test_calibrated_stands_on_bases_with_the_noise_of_table_III(
 ) -> None:
     weights = designs["calibrated"].spec.weights
     assert weights.q_base[[0, 2, 3, 7]] == pytest.approx([52.2441e-6, 33.463e-6, 2.51881e-3, 12.6885e-3])
-    assert weights.q_i_base == pytest.approx([52.2441e-6] * 4 + [33.463e-6])
+    assert weights.q_i_base == pytest.approx([5.22441e-6] * 4 + [33.463e-6])
     assert (weights.r_base == 1).all()
     std = published["table_III"]["std"]
     expected = [(std[k]["value"] * 1e-6) ** 2 for k in ("x1", "y1", "x2", "y2", "z")]
@@ -334,7 +334,7 @@ def test_delay_does_not_go_with_backward_euler(tmp_path: Path) -> None:
 def test_unknown_preset_names_the_machine_file(tmp_path: Path) -> None:
     path = edited(tmp_path, ('"table1"', '"table9"'))
     error = refusal(lambda: malta.read_design(path), DATA)
-    assert (error.found, error.expected) == ("no preset 'table9'", "one of table1, table4")
+    assert (error.found, error.expected) == ("no preset 'table9'", "one of table1, table4, table1_currents")
 
 
 def test_missing_machine_file_is_named(tmp_path: Path) -> None:

@@ -185,6 +185,14 @@ def test_calibrate_needs_an_unstable_first_mode(plant: Plant, designs: dict[str,
         malta.synthesis.calibrate(malta.linearize(free, free.at()), designs["table2"].spec.weights, 4.0)
     with pytest.raises(malta.InputError, match="axial_ratio: found -1, expected more than 0"):
         malta.synthesis.calibrate(designs["table2"].model, designs["table2"].spec.weights, 4.0, -1.0)
+    for times, found in (
+        ((0.1, 1.0), "2 times, expected one, or one for each of 5 outputs"),
+        ((1, 1, 1, 1, 0), "0"),
+    ):
+        with pytest.raises(malta.InputError, match=f"integral_time: found {found}"):
+            malta.synthesis.calibrate(
+                designs["table2"].model, designs["table2"].spec.weights, 4.0, integral_time=times
+            )
 
 
 def test_arrays_of_a_controller_are_read_only(designs: dict[str, Design]) -> None:

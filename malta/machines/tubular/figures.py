@@ -64,9 +64,10 @@ if TYPE_CHECKING:
 
 
 def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure:
-    """Axial position, tracking error, radial deviation, currents and thrust of a stroke. Figs 12 and 13."""
+    """Axial position, tracking error and speed, radial deviation, currents and thrust of a stroke. Figs 12 and 13."""
     plant, f, axis, ms = run.plant, stroke_figures(run), run.plant.stroke_output, run.t * 1e3
-    first, last = run.scenario.reference(plant)(np.array([0, run.scenario.duration])).p[:, axis]
+    motion = run.scenario.reference(plant)
+    first, last = motion(np.array([0, run.scenario.duration])).p[:, axis]
     errors = (
         f"axial error {f.axial_error * 1e3:.2f} mm, radial deviation {max(f.radial.values()) * 1e6:.1f} µm"
     )
@@ -78,17 +79,22 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
         left=0.1,
         right=0.925,
         hspace=0.24,
+        size=(9.0, 6.7),
+        top=0.885,
     )
-    (position, radial), (error, current) = figure.subplots(2, 2, sharex=True)
+    (position, radial), (error, bearing), (speed, current) = figure.subplots(3, 2, sharex=True)
     names = [s.name for s in plant.outputs]
     draw_line(position, ms, run.reference[:, axis] * 1e3, label="reference z*", **REFERENCE)
     draw_line(position, ms, run.p[:, axis] * 1e3, label="position z", **STYLES[0])
     draw_line(error, ms, (run.reference[:, axis] - run.p[:, axis]) * 1e3, **STYLES[0])
     off = (run.p - run.reference) * 1e6
     draw_group(radial, ms, {name: off[:, i] for i, name in enumerate(names) if i != axis})
-    forces = [s.name for s in plant.inputs]
-    order = sorted(range(len(forces)), key=lambda i: i != plant.thrust_input)
-    draw_group(current, ms, {forces[i]: run.current[:, i] for i in order})
+    draw_line(speed, ms, motion(run.t).dp[:, axis], **REFERENCE)
+    draw_line(speed, ms, run.x[:, len(plant.states) // 2 + plant.stroke_state], **STYLES[0])
+    forces = {s.name: run.current[:, i] for i, s in enumerate(plant.inputs)}
+    drive = plant.inputs[plant.thrust_input].name
+    draw_line(current, ms, forces.pop(drive), **STYLES[0])
+    draw_group(bearing, ms, forces)
     draw_published(error, published, "figure_12.axial_error", "mm", both=True)
     draw_published(radial, published, "figure_13.radial_deviation", "um", both=True)
     reached = np.array([first, last, run.p[:, axis].min(), run.p[:, axis].max()]) * 1e3
@@ -96,11 +102,13 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     position.set_ylim(reached.min() - margin, reached.max() + margin)
     finish_axes(position, "", "axial position z [mm]", legend=2)
     finish_axes(radial, "", "radial deviation [µm]", legend=4)
-    finish_axes(error, "time [ms]", "axial error z* - z [mm]")
-    finish_axes(current, "time [ms]", "current, by force [A]", legend=5, side="right")
+    finish_axes(error, "", "axial error z* - z [mm]")
+    finish_axes(bearing, "", "bearing current [A]", legend=4)
+    finish_axes(speed, "time [ms]", "axial speed [m/s]")
+    finish_axes(current, "time [ms]", "drive current [A]", side="right")
     constant = plant_of(run.controller.parameters).actuator.force_constant[plant.thrust_input]
     thrust = current.secondary_yaxis("right", functions=(lambda i: i * constant, lambda f: f / constant))
-    thrust.set_ylabel(f"thrust {forces[plant.thrust_input]} [N]")
+    thrust.set_ylabel(f"thrust {drive} [N]")
     return figure
 
 
@@ -174,7 +182,7 @@ def tilt_figure(e: Experiment, published: Published | None = None) -> Figure:
     for axes in (tracking, deviation):
         axes.set_yscale("log")
         axes.set_ylim(bottom=0.1)
-    draw_published(deviation, published, "figure_16.deviation", "um", where="below right")
+    draw_published(deviation, published, "figure_16.deviation", "um")
     square_axes(circle)
     square_axes(blow_up, least=1.4 * bound)
     late_part = "second half" if any(map(ended_early, runs_of(e))) else "last period"

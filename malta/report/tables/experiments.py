@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from malta.identification.windings import Windings
     from malta.merits import Merit
     from malta.model.plant import Plant
-    from malta.report.ledger import Claim, Ledger
+    from malta.report.ledger import Ledger
 
 
 def limits_text(e: Experiment) -> list[str]:
@@ -401,8 +401,7 @@ def finding_cells(one: Finding) -> tuple[str, str, str, str, str]:
 
 
 GAP = 2  # columns of a terminal between those of a line
-LEAST = 30  # letters of a claim that a line shows at least: a terminal with room for fewer has fewer designs a line
-ELLIPSIS = "…"
+LEAST = 30  # letters of a claim that a line has room for: a terminal with fewer has fewer designs a line
 
 
 MEANINGS = {
@@ -418,11 +417,11 @@ MEANINGS = {
 class ClaimLines:
     """A line for each claim: claim, published figure, that of each design, and the verdict in one word.
 
-    Claims that are too long for their line are cut in the middle. Where not all designs fit beside each other, the
-    lines are printed once for as many designs as fit, and then for the others.
+    Names that are too long for their line take several, the figures stand beside the last. Where not all designs fit
+    beside each other, the lines are printed once for as many designs as fit, and then for the others.
 
     ledger : from `malta.ledger`
-    why : below each line the whole claim, where it was cut, and the whole verdict with its reason
+    why : below each line the whole verdict with its reason
     """
 
     ledger: Ledger
@@ -462,38 +461,31 @@ class ClaimLines:
         """Heading, rule and claims for some of the designs."""
         columns = self._columns(designs)
         longest = max(len("claim"), *(len(claim.subject) for claim in self.ledger.claims))
-        room = max(min(self._room(designs, width), longest), 2 * len(ELLIPSIS) + 1)
+        room = max(min(self._room(designs, width), longest), len(INDENT) + 1)
         widths = [max(map(len, column)) for column in columns]
         for row, claim in enumerate((None, *self.ledger.claims)):
             numbers = (
                 " " * GAP + column[row].rjust(n) for column, n in zip(columns[:-1], widths, strict=False)
             )
-            subject = "claim" if claim is None else claim.subject
-            line = _cut(subject, room).ljust(room) + "".join(numbers) + " " * GAP + columns[-1][row]
-            yield line
+            *above, last = _name("claim" if claim is None else claim.subject, room)
+            yield from above
+            yield last.ljust(room) + "".join(numbers) + " " * GAP + columns[-1][row]
             if claim is None:
                 yield "─" * (room + sum(n + GAP for n in widths))
-            elif self.why:
-                yield from _reasons(claim, room, width)
+            elif self.why and claim.verdict != claim.word:
+                yield from (INDENT + line for line in fold(claim.verdict, width - len(INDENT)))
 
 
-def _reasons(claim: Claim, room: int, width: int) -> Iterator[str]:
-    """The whole claim, where its line has it cut, and the whole verdict, as lines that are indented."""
-    whole = f"{claim.subject}: " if len(claim.subject) > room else ""
-    if whole or claim.verdict != claim.word:
-        yield from (INDENT + line for line in fold(whole + claim.verdict, width - len(INDENT)))
+def _name(text: str, room: int) -> list[str]:
+    """A claim's name in lines of `room` letters: whole, the further lines indented.
 
-
-def _cut(text: str, room: int) -> str:
-    """A text in `room` letters, without its middle where it is longer: the end tells rows and units apart.
-
-    >>> _cut("K(p) and pseudo-inverse, table [us]", 24)
-    'K(p) and pse…table [us]'
+    >>> _name("K(p) and pseudo-inverse, table [us]", 24)
+    ['K(p) and', '  pseudo-inverse, table', '  [us]']
     """
     if len(text) <= room:
-        return text
-    end = (room - len(ELLIPSIS)) // 2
-    return text[: room - len(ELLIPSIS) - end].rstrip() + ELLIPSIS + text[len(text) - end :].lstrip()
+        return [text]
+    first, *rest = fold(text, max(room - len(INDENT), 1))
+    return [first, *(INDENT + line for line in rest)]
 
 
 def claims_table(ledger: Ledger, *, why: bool = False) -> ClaimLines:
@@ -502,7 +494,7 @@ def claims_table(ledger: Ledger, *, why: bool = False) -> ClaimLines:
     ledger : from `malta.ledger`
     why : below each line the whole verdict, with its reason
 
-    Returns what `rich.print` prints: a line for each claim, in the width of the terminal.
+    Returns what `rich.print` prints: a line for each claim, two or more for a long name, in the width of the terminal.
 
     >>> import malta, rich
     >>> from malta.report.ledger import Claim, Ledger

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 from scipy.optimize import brentq
 from scipy.special import stdtrit
@@ -15,17 +16,19 @@ from scipy.special import stdtrit
 from malta.campaigns.result import Rate, Yields, rate, yields_of
 from malta.campaigns.run import main_campaign, main_plan, replay
 from malta.errors import CheckError, InputError
+from malta.files import shipped_path
 from malta.identification.learn import learn
 from malta.identification.log import log_of
 from malta.linear.sampling import add_integrals
 from malta.loops.loop import loop_of_model
 from malta.loops.parametric_plants import of_plant
 from malta.loops.time_domain import PLACES, Deviation, noise_of, recovery
+from malta.machines.tubular.drive import AXES, to_axes
 from malta.machines.tubular.experiments.disturbances import hold
 from malta.machines.tubular.experiments.strokes import delayed_stroke, stroke_merits
 from malta.margins.loop_report import LoopReport
 from malta.margins.verify import compensators
-from malta.model.data import plant_of, published_value
+from malta.model.data import plant_of, published_value, read
 from malta.model.linearize import LinearModel, linearize
 from malta.proof.robust import robust_margin
 from malta.report.ledger import Chance, bandwidth, proven_share, run_design
@@ -75,6 +78,7 @@ class Evidence:
     unsettled: Strokes  # of fewer, from the first sample on
     pushed: Strokes  # of fewer, with PUSH times the inertia fed forward
     rests: Mapping[str, Chance]  # figures of merit of the hold: root mean squares over SEEDS
+    noisy: Mapping[str, Chance]  # the same, with the current sensors' noise of Table II(a)
     flights: Mapping[tuple[str, int], Chance]  # first figures of the cases of NOISY: means over FLIGHTS seeds
 
 
@@ -104,8 +108,32 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
             with_inertia(controller, PUSH), spec, published, machines=round(FEWER * machines), settle=True
         ),
         rests_of_seeds(plant, controller, range(SEEDS)),
+        rests_of_seeds(with_noise_of_currents(plant), controller, range(SEEDS)),
         flights_of_seeds(plant, controller, range(FLIGHTS)),
     )
+
+
+def with_noise_of_currents(plant: Plant) -> Plant:
+    """The plant with current sensors as noisy as Table II(a) asks for."""
+    noise = read(shipped_path("data", "tubular.toml"), "table1_currents").s_i
+    return plant_of(replace(plant.parameters, s_i=noise))
+
+
+def current_reading(axis: str, modules: int, e: Evidence) -> float:
+    """Variance of the force, N^2, that the readings of an axis of AXES stand for while a current is held.
+
+    K^2 |row of (16)|^2 s_i^2 mean |S|^2: a sensor reads its noise and what the sampled current loop makes of it.
+
+    modules : whose thrust constant K_D stands for the reading together; 0: that of a bearing, K_B
+    """
+    par: Any = with_noise_of_currents(e.spec.plant).parameters
+    loop, Ts = e.controller.current_loop, e.controller.sample_time
+    assert loop is not None
+    z, pole = np.exp(1j * np.pi * (np.arange(4000) + 0.5) / 4000), math.exp(-par.R * Ts / par.L)
+    open_loop = (loop.Kp + loop.Ki * Ts * z / (z - 1)) * (1 - pole) / par.R / (z * (z - pole))
+    row = np.array(ca.evalf(to_axes(ca.MX(0.0))))[AXES.index(axis)]
+    constant = modules * par.K_D if modules else par.K_B
+    return float((constant * par.s_i) ** 2 * (row @ row) * np.mean(np.abs(1 / (1 + open_loop)) ** 2))
 
 
 class Strokes(NamedTuple):
@@ -271,6 +299,19 @@ def stroke_across(e: Evidence) -> float:
     return max(published_stroke(e).radial[name] for name in ("x1", "x2"))
 
 
+def stroke_speed(e: Evidence) -> float:
+    """Largest axial speed during the stroke, m/s."""
+    plant = e.model.plant
+    rate = len(plant.states) // 2 + plant.stroke_state
+    return float(np.abs(e.experiments["stroke"].run.x[:, rate]).max())
+
+
+def cogging_share(e: Evidence) -> float:
+    """The cogging of two like modules 2 l_B apart over twice one's, of period L_p: |cos(2 pi l_B / L_p)|."""
+    par: Any = e.spec.parameters
+    return abs(math.cos(2 * math.pi * par.l_B / par.L_p))
+
+
 def carried_weight(run: Trajectory) -> float:
     """Sum of the vertical bearing forces at the end of a run, N."""
     return float(run.v[-1, 1] + run.v[-1, 3])
@@ -307,14 +348,10 @@ def true_radial(e: Evidence) -> Chance:
     return max(e.rests[f"true {name}, rms"] for name in ("x1", "y1", "x2", "y2"))
 
 
-def measured_at_rest(name: str, e: Evidence) -> Chance:
-    """Standard deviation of an output's measurements at rest, m."""
-    return e.rests[f"measured {name}, std"]
-
-
-def mean_at_rest(name: str, e: Evidence) -> Chance:
-    """Size of the mean of an output's measurements at rest, m."""
-    return e.rests[f"measured {name}, mean"]
+def at_rest(rests: str, label: str, e: Evidence) -> Chance:
+    """A figure of merit of the hold by its label, m; `rests` is the field of Evidence, with or without noise."""
+    found: Chance = getattr(e, rests)[label]
+    return found
 
 
 def noise_forces(e: Evidence) -> tuple[float, float]:
