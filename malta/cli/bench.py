@@ -71,8 +71,13 @@ def measure(
         str | None, typer.Option(metavar="QUANTITY", help="Largest motion, as 20um.", rich_help_panel=PLAN)
     ] = None,
     band: Annotated[
-        str, typer.Option(metavar="LOW..HIGH", help="Lowest and highest line [Hz].", rich_help_panel=PLAN)
-    ] = "2..400",
+        str | None,
+        typer.Option(
+            metavar="LOW..HIGH",
+            help="Lowest and highest line [Hz]. [by the band of the loop]",
+            rich_help_panel=PLAN,
+        ),
+    ] = None,
     lines: Annotated[int, typer.Option(metavar="N", help="Lines of each input.", rich_help_panel=PLAN)] = 12,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw it: a .png, .svg or .pdf file.")
@@ -198,10 +203,11 @@ def _plan(
     console.print(excitation_tables(first, plant)[0])
     console.print(measurement_plan_table(found))
     size = f" --motion {1e6 * options['motion']:g}um" if "motion" in options else ""
-    low, high = options["band"]
+    if options["band"] is not None:
+        size += " --band {:g}..{:g}".format(*options["band"])
     for k in range(len(found.excitations)):
         shift = f" --shift {k}" if separate else ""
-        rest = f"--periods {first.periods} --band {low:g}..{high:g} --lines {options['lines']}{size}{shift}"
+        rest = f"--periods {first.periods} --lines {options['lines']}{size}{shift}"
         console.print(f"malta excite {gains} {rest} --log flown{k or ''}.npz", soft_wrap=True)
 
 

@@ -66,6 +66,7 @@ WHITE = 5.0  # standard deviations of the correlation between neighbouring lines
 STRAIGHTENED = 12  # estimates at most, each with the curvature and the weights of the one before
 SETTLED = 0.01  # standard deviations: what moves by less is settled
 DIFFERENT = 3.0  # standard deviations between the estimates at the lines and in time
+COMPUTED = 3e-5  # of a value: to which estimates on a right model are computed
 QUIET = 4.0  # power at the lines over the noise, of the output that moves most: below, nothing was excited
 
 
@@ -151,12 +152,13 @@ class Identified:
     def differences(self) -> dict[str, float]:
         """By parameter: the estimate in time less that at the lines, in standard deviations of the larger one.
 
-        Both use the same readings, so that right models differ by much less than the deviation of either.
+        Both use the same readings, so that right models differ by much less than the deviation of either. What either
+        computes to counts as a deviation too: a part of the curvature, and of motion between samples, is left.
         """
         if self.in_time is None:
             return {}
         variance = np.maximum(np.diag(self.covariance), np.diag(self.in_time.covariance))
-        off = (self.in_time.values - self.values) / np.sqrt(variance)
+        off = (self.in_time.values - self.values) / np.sqrt(variance + (COMPUTED * self.values) ** 2)
         return dict(zip(self.names, off.tolist(), strict=True))
 
     @property

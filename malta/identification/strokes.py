@@ -31,7 +31,7 @@ from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.identification.learn import learn
 from malta.identification.log import Log, log_of, require_same_law, sample_excitation
-from malta.identification.measure import cut_loop
+from malta.identification.excite import cut_loop
 from malta.identification.replay import reference_motion
 from malta.loops.loop import Loop, loop
 from malta.model.data import plant_of
