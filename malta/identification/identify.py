@@ -25,6 +25,7 @@ from malta.identification.response import (
     deviations,
     information,
     plant_with,
+    points_of_noise,
     require_parameters,
     units_of_model,
     well_found,
@@ -344,7 +345,8 @@ def _record(plant: Plant, names: tuple[str, ...], log: Log, y: FloatArray, i: Fl
     """The record of a log. Raises CheckError for a log that tells nothing."""
     s = spectrum_of(log, between_neighbours(y), i)
     mean = s.outputs[0].real, s.currents[0].real
-    model = ResponseModel(plant, names, tuple(log.names("i")), *mean, log.sample_time)
+    around = points_of_noise(i[len(i) - round(2 * np.pi / (s.rate * log.sample_time)) :], s.periods)
+    model = ResponseModel(plant, names, tuple(log.names("i")), *mean, log.sample_time, around)
     require_closed_loop(log, float(np.linalg.eigvals(model.matrices(model.start)[0]).real.max()))
     return _Record(model, s)
 
