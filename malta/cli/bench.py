@@ -138,13 +138,17 @@ def _measured(
     identified: Path | None,
 ) -> Measurement:
     """The measurement over the gain file's box, or over the intervals of an identified machine."""
+    from malta.gains.contents import uncertainty_of
+    from malta.gains.encodings import decode
     from malta.identification.data_file import read_identified
     from malta.identification.log_files import read_log
     from malta.identification.measure import measure as measure_loop
+    from malta.model.data import plant_of, published_figures
 
     read = [read_log(log) for log in logs]
     if identified is None:
-        box = read_uncertainty(gains, uncertain, controller.parameters)
+        own = uncertainty_of(decode(gains), published_figures(plant_of(controller.parameters).name))
+        box = read_uncertainty(gains, uncertain, controller.parameters) if own or uncertain else {}
         return measure_loop(controller, *read, uncertainty=box)
     _require_no(uncertain, "--uncertain beside --identified")
     data = read_identified(identified)
@@ -167,7 +171,7 @@ def _print_measurement(found: Measurement, files: list[Path]) -> None:
     print_text(
         console, f"{len(found.w)} lines, {how}; predicted: {found.machines} machines, sampled, of {box}"
     )
-    if not found.refusal:
+    if not found.refusal and found.box:
         print_text(console, "as predicted: |S| and |T| are within the tube at all lines")
     print_written(console, files)
 

@@ -429,6 +429,10 @@ def _learn_from(
     *earlier, log = logs
     read = read_log(log)
     found = learn_thrust(controller, read, parameter=parameter)
+    if out is not None and not found.parameter:
+        raise InputError(
+            "learn", "--out", "no parameter that scales the thrust alone", "its name: --parameter"
+        )
     files = [] if out is None else verify_and_write(found.controller, gains, out)
     if following is not None:
         plant, after = plant_of(controller.parameters), None
@@ -445,7 +449,9 @@ def _learn_from(
     console = make_console()
     half = 1.96 * found.deviation
     print_text(console, f"{log}: the stroke took {found.factor:.4f} +- {half:.4f} times the thrust expected")
-    print_text(console, f"{found.parameter}: {found.before:.5g} -> {found.after:.5g}, as the law believes it")
+    learned = f"{found.parameter}: {found.before:.5g} -> {found.after:.5g}, as the law believes it"
+    alone = "no parameter scales the thrust alone: --parameter NAME learns one that scales other forces too"
+    print_text(console, learned if found.parameter else alone)
     if following is not None and after is not None:
         print_text(
             console,

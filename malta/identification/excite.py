@@ -21,7 +21,7 @@ from malta.identification.response import (
     well_found,
 )
 from malta.model.equilibrium import trim
-from malta.model.plant import ComplexArray, FloatArray, outputs_at
+from malta.model.plant import ComplexArray, FloatArray, Plant, outputs_at
 from malta.simulation.inputs import Multisine, interleaved_multisine
 
 if TYPE_CHECKING:
@@ -110,8 +110,8 @@ def excite(
     """Design an excitation of all axes at once, and predict from the linear loop what it does and what it will find.
 
     Each input has lines of its own, evenly spread in log f, with phases of a low crest factor. The amplitude of an axis
-    is the same at all of its lines. Where none is given, the band follows that of the loop, see `default_band`; a period
-    has two turns of the lowest line and room for all lines, in whole samples.
+    is the same at all of its lines. Where none is given, the band follows that of the loop, see `default_band`, and a
+    period has two turns of the lowest line and room for all lines, in whole samples.
 
     loop : the machine under its controller, where it is held
     force : largest force of each input, N or N m
@@ -206,8 +206,8 @@ def default_band(loop: Loop) -> tuple[float, float]:
     """The lowest and the highest line of an excitation, Hz, where none is given.
 
     The band of an output ends at the highest frequency with |T| = 0.7. The highest line is at 400 Hz, or where that is
-    not within 0.8 to 10 times the band of the fastest output at the nearer of these, and at a quarter of the sampling rate at
-    most. The lowest one is 200 times lower, or at half of the band of the slowest output where that is lower.
+    not within 0.8 to 10 times the band of the fastest output at the nearer of these, and at a quarter of the sampling
+    rate at most. The lowest one is 200 times lower, or at half of the band of the slowest output where that is lower.
 
     >>> import malta
     >>> from malta.identification.excite import default_band
@@ -275,19 +275,19 @@ def predicted_spectra(loop: Loop, model: ResponseModel, signal: Multisine) -> Sp
 
 
 def _bent(model: ResponseModel, signal: Multisine, found: Spectra, periods: int) -> float:
-    """What the machine's curvature adds at the lines, rms of the worst output, over the noise there of so many periods."""
+    """What the machine's curvature adds at the lines over the noise there of so many periods: of the worst output."""
     lines = signal.lines.astype(int)
     whole = np.zeros((2 * lines[-1] + 1, found.y.shape[1] + found.i.shape[1]), dtype=complex)
     whole[0], whole[lines] = np.concatenate([model.y, model.i]), np.hstack([found.y, found.i]) / 2
-    Y, I = np.split(whole, [found.y.shape[1]], axis=1)
-    added = model.beyond_linear(model.start, Y, I, 2 * np.pi / signal.period)[lines]
+    y, i = np.split(whole, [found.y.shape[1]], axis=1)
+    added = model.beyond_linear(model.start, y, i, 2 * np.pi / signal.period)[lines]
     samples = periods * signal.period / model.sample_time
     return float((np.sqrt((np.abs(added) ** 2).mean(axis=0) * samples) / sensor_noise(model.plant)).max())
 
 
 def sensor_noise(plant: Plant) -> FloatArray:
     """The standard deviation of each sensor's noise and steps, SI."""
-    return np.maximum(np.hypot(plant.noise, np.array(plant.resolution) / np.sqrt(12)), QUIET)
+    return np.asarray(np.maximum(np.hypot(plant.noise, np.array(plant.resolution) / np.sqrt(12)), QUIET))
 
 
 def _peaks(signal: Multisine, spectrum: ComplexArray) -> FloatArray:

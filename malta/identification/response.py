@@ -176,7 +176,7 @@ class ResponseModel:
         """
         if not self.plant.second_order:
             return np.zeros_like(outputs)
-        A, B, C, late = self.matrices(theta)
+        A, _, C, late = self.matrices(theta)
         A_0, B_0, C_0, _ = self.matrices(theta, np.zeros((1, len(self.i))))
         count, n = len(outputs), len(self.plant.controlled)
         samples = 4 * count
