@@ -234,7 +234,8 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
     m = believed.mass
     factor = float(beyond @ a / (m * (1 + along) * (a @ a)))
     if loop(believed, controller).sampled_forces.Bd.shape[1] > len(believed.inputs):
-        factor += 1 - _own_factor(controller, believed, log)
+        own, _, moved, needed = _stroke(controller, believed, own_stroke(controller, log))
+        factor += 1 - float(needed @ own / (m * (1 + moved) * (own @ own)))
     noise = float(np.array(believed.noise)[believed.stroke_output])
     deviation = factor * noise * float(np.linalg.norm(curved)) / float(a @ a)
     if not FACTORS[0] < factor < FACTORS[1]:
@@ -248,14 +249,15 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
     return Learned(factor, deviation, name, before, before / factor, taught)
 
 
-def _own_factor(controller: Controller, believed: Plant, log: Log) -> float:
-    """The factor of the gain file's own machine, without noise: not 1 where currents are held that are commutated for
-    the last reading, as they pull like a spring as soon as the machine moves."""
-    motion = reference_motion(log, [s.name for s in believed.outputs], controller.sample_time)
+def own_stroke(controller: Controller, log: Log) -> Log:
+    """The gain file's own machine on the reference of a log, without noise.
+
+    Where currents are held that are commutated for the last reading, they pull like a spring as soon as it moves.
+    """
+    plant = plant_of(controller.parameters)
+    motion = reference_motion(log, [s.name for s in plant.outputs], controller.sample_time)
     scenario = Scenario("stroke", log.samples * controller.sample_time, lambda _: motion, fidelity="force")
-    flown = log_of(simulate(believed, controller, scenario))
-    a, _, along, beyond = _stroke(controller, believed, flown)
-    return float(beyond @ a / (believed.mass * (1 + along) * (a @ a)))
+    return log_of(simulate(plant, controller, scenario))
 
 
 def thrust_constant(plant: Plant) -> str:

@@ -5,7 +5,7 @@
 F is the machine without linearization, integrated over a sample in steps that are short beside its poles, with the
 currents as measured at both ends; constant accelerations that no parameter explains are estimated beside theta, and the
 first state. K is the steady gain of the filter at the place of the log. Missing readings have the weight 0; others 1,
-or with Student's likelihood (nu + 1) / (nu + (e / s)^2), so that an outlier moves neither the filter nor the parameters.
+or with Student's likelihood (nu + 1) / (nu + (e / s)^2), so that an outlier moves neither filter nor parameters.
 
 The slopes of e are those of the linear machine behind the same filter. An error of theirs, of the size of the machine's
 curvature, slows the search and does not move where it ends: sum of (de/dtheta)' w e / s^2 = 0.
