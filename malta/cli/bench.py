@@ -248,7 +248,12 @@ def commission(
     Example:  malta commission design/gains/robust.json --set K_A=9000
     """
     from malta.gains.file import content_of
-    from malta.identification.commission import JOURNAL, commission as commission_machine, steps_of
+    from malta.identification.commission import (
+        JOURNAL,
+        commission as commission_machine,
+        noise_of_design,
+        steps_of,
+    )
     from malta.model.data import plant_of
     from malta.report.page.document import binder_page, binder_text
 
@@ -268,6 +273,10 @@ def commission(
     replace_files({page: binder_page(done).content, text: binder_text(done).encode()})
     files = [Path(entry.log) for entry in done.entries if entry.sha256 and logs is None]
     files += [folder / JOURNAL, page, text]
+    noise = noise_of_design(done, controller)
+    if noise:
+        replace_files({folder / "noise.toml": noise.encode()})
+        files.append(folder / "noise.toml")
     if as_json:
         from malta.cli.documents.others import CommissionOutput
 

@@ -28,6 +28,7 @@ from malta.identification.learn import FACTORS, learn, own_stroke
 from malta.identification.log import Log, log_of
 from malta.identification.log_files import read_log, write_log
 from malta.identification.measure import measure, plan_measurement
+from malta.identification.noise import dc_log, noise_table, process_noise
 from malta.identification.strokes import stroke_of
 from malta.identification.windings import identify_windings
 from malta.loops.classical import disk_sizes
@@ -351,8 +352,48 @@ def general_steps(plant: Plant, box: Mapping[str, float]) -> tuple[Step, ...]:
         "still", "Do the sensors read as quietly as the filter believes?", "the mover held at its place",
         "touchdown", _record_still, judge_noise,
     )  # fmt: skip
-    steps = (noise, loop_step(box))
+    steps = (noise, noise_step(), loop_step(box))
     return (*steps, stroke_step()) if plant.has_stroke else steps
+
+
+def _record_noise(bench: Bench) -> Log:
+    return dc_log(bench.truth, bench.controller.name, bench.controller.sample_time, seed=bench.seed)
+
+
+def noise_step(record: Callable[[Bench], Log] = _record_noise) -> Step:
+    """The step that measures the noise of the current sensors, and what it makes of the forces."""
+    return Step(
+        "noise", "What noise do the currents make of the forces?", "mover out or clamped, 1 A dc in each phase",
+        "a current above 2 A", record, judge_currents,
+    )  # fmt: skip
+
+
+def judge_currents(controller: Controller, log: Log) -> list[Finding]:
+    """The noise of each force by that of the measured currents.
+
+    Of a log without currents, the process noise that the filter was designed for stands, and is named so.
+    """
+    found = process_noise(plant_of(controller.parameters), log)
+    if found:
+        return [Finding(f"noise of {name}", e) for name, e in found.items()]
+    own = 0.0 if controller.noise is None else float(np.sqrt(controller.noise.process.max()))
+    what = "no current sensors: the largest process noise that the gain file has"
+    return [Finding(what, Estimate(own, 0.0))]
+
+
+def noise_of_design(done: Commissioning, controller: Controller) -> str:
+    """The [noise] of a design file by the logs at rest and of the currents; "" where there are none."""
+    logs = {e.name: e.log for e in done.entries if e.passed}
+    still = logs.get("rest") or logs.get("still")
+    process = (
+        process_noise(plant_of(controller.parameters), read_log(Path(logs["noise"])))
+        if "noise" in logs
+        else {}
+    )
+    if still is None or not process:
+        return ""
+    sensor = {name: deviation for name, (_, deviation) in at_rest(read_log(Path(still))).items()}
+    return noise_table(process, sensor, f"{Path(logs['noise']).name}, {Path(still).name}")
 
 
 def _record_still(bench: Bench) -> Log:
