@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -128,8 +128,8 @@ def excite(
 
     Returns an ExcitationPlan.
 
-    Raises InputError for a band with too few lines or above half of the sampling rate, unknown parameters, and an
-    unstable loop.
+    Raises InputError for a band with too few lines or above half of the sampling rate, unknown parameters, an unstable
+    loop, and a machine without limits where no size is given.
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -139,28 +139,33 @@ def excite(
     '10.0 um, K_A to 0.13%'
     """
     plant, m = loop.plant, len(loop.plant.inputs)
-    sizes = {"force": force, "current": current, "motion": motion, "period": period}
-    band = _require(loop, sizes, {"periods": periods, "lines": lines}, band)
+    given = {"force": force, "current": current, "motion": motion, "period": period}
+    band = _require(loop, given, {"periods": periods, "lines": lines}, band)
     if period is None:
         least = max(TURNS / band[0], TURNS * lines * m / (band[1] - band[0]))
         period = float(np.ceil(least / loop.sample_time - 1e-9) * loop.sample_time)
     _require_length(loop, period, periods)
     signal = interleaved_multisine(period, *band, inputs=m, lines=lines, seed=seed, shift=shift)
     limit = np.array(plant.actuator.force_limit)
-    wanted = np.full(m, np.inf if force is None else force)
-    room = np.full(m, np.inf)  # of each command
-    if force is None and current is None and motion is None:
-        current = CURRENT * plant.actuator.current_limit
-        room = COMMAND * limit - np.minimum(np.abs(_held(loop)), COMMAND / 2 * limit)
-    unit = replace(signal, amplitude=(limit / signal.peak)[signal.axis.astype(int)])
+    size = np.where(np.isfinite(limit), limit, 1.0)  # N or N m, of the unit signal
+    share = np.minimum(limit, np.inf if force is None else force) / size
+    limits: list[tuple[Any, float]] = []
+    by_default = force is None and current is None and motion is None
+    unit = replace(signal, amplitude=(size / signal.peak)[signal.axis.astype(int)])
     model = model_at(loop, (*parameters,) or candidates(plant))
     found = predicted_spectra(loop, model, unit)
-    share, axis = np.minimum(wanted / limit, 1.0), unit.axis.astype(int)
-    by_default = bool(np.isfinite(room).all())
-    limits = [(found.v / room, 1.0)] if by_default else []
-    limits += [(part, most) for part, most in ((found.i, current), (found.y, motion)) if most is not None]
+    axis = unit.axis.astype(int)
+    if by_default:
+        current = CURRENT * plant.actuator.current_limit
+        room = COMMAND * limit - np.minimum(np.abs(_held(loop)), COMMAND / 2 * limit)
+        limits = [(found.v / room, 1.0)]
+    sizes = ((found.i, current), (found.y, motion))
+    limits += [(part, most) for part, most in sizes if most is not None and np.isfinite(most)]
     for spectrum, most in limits:  # each input alone, then all together
         share = np.minimum(share, most / np.maximum(_peaks(unit, spectrum).max(axis=1), 1e-300))
+    if not np.isfinite(share).all():
+        expected = "a force, a current or a motion"
+        raise InputError("excite", "force", "none, and a machine without limits", expected)
     for spectrum, most in limits:
         share = share * min(1.0, most / _together(unit, spectrum * share[axis][:, None]).max())
     while by_default and _bent(model, unit, found.times(share[axis]), periods) > BENT:
