@@ -272,11 +272,18 @@ def _explained(
 
 
 def reference_motion(log: Log, names: list[str], sample_time: float) -> Callable[[Any], Motion]:
-    """The reference of a log as a motion of time, s, with its derivatives; raises as `reference_spline`."""
-    spline = reference_spline(log, names, sample_time)
+    """The reference of a log as a motion of time, s, with its derivatives; raises as `reference_spline`.
+
+    An output of which no two successive samples differ but by a jump is at rest between its jumps.
+    """
+    spline, table = reference_spline(log, names, sample_time), log.table("reference", names)
+    moves = np.diff(table, axis=0) != 0
+    jumps = moves.any(axis=0) & ~(moves[1:] & moves[:-1]).any(axis=0)
 
     def motion(t: Any) -> Motion:
-        return Motion(spline(t), spline(t, 1), spline(t, 2))
+        k = np.clip(np.round(np.asarray(t) / sample_time).astype(int), 0, len(table) - 1)
+        moving = (spline(t), spline(t, 1), spline(t, 2))
+        return Motion(*np.where(jumps, (table[k], *np.zeros((2, *table[k].shape))), moving))
 
     return motion
 
