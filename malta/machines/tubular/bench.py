@@ -37,6 +37,7 @@ from malta.identification.commission import (
     stroke_step,
 )
 from malta.identification.log import Log
+from malta.identification.noise import dc_log
 from malta.machines.tubular.drive import hall_signals
 from malta.machines.tubular.experiments.lifting import lift_cases, rest_on_bearing
 from malta.model.data import plant_of
@@ -116,8 +117,13 @@ def _record_rest(bench: Bench) -> Log:
 
 
 def _record_dc(bench: Bench) -> Log:
-    """1 A dc in each module's bearing axis, which presses the mover on its bearing, so that nothing moves."""
+    """1 A dc in each module's bearing axis, which presses the mover on its bearing, so that nothing moves.
+
+    A log without currents where their sensors are ideal.
+    """
     par: Any = bench.controller.parameters
+    if bench.truth.drive.sensors is None:
+        return dc_log(bench.truth, bench.controller.name, bench.controller.sample_time, seed=bench.seed)
     push = np.array([0.0, -par.K_B, 0.0, -par.K_B, 0.0])
     return part_of_log(
         _on_bearing(bench, "noise", 1.0 + SETTLED, lambda t: np.tile(push, (len(t), 1))),
