@@ -23,6 +23,8 @@ from malta.identification.log_files import read_log
 from malta.identification.prediction import current_shares
 from malta.identification.strokes import stroke_of
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 GAINS = sorted((ROOT / "design" / "gains").glob("*.json"))
 EXAMPLES = sorted((ROOT / "examples").glob("*/design/*.toml"))
 DESIGNS = {path.stem: path for path in (*GAINS, *EXAMPLES)}
@@ -244,3 +246,20 @@ def test_a_log_of_the_main_job_is_replayed(name: str, shipped: Any, run: Run, tm
         assert said[machine] in one_sentence(replayed.err)
     else:
         assert machine != "planar"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DESIGNS)
+def test_what_is_drawn_compared_and_exported_of_every_machine(
+    name: str, shipped: Any, run: Run, tmp_path: Path
+) -> None:
+    """plot, compare, export and campaign: a picture, no figure that differs from itself, C, and whole machines."""
+    one = shipped(name)
+    assert run("plot", one.gains, "bode", *one.machine, "--out", tmp_path).code == 0
+    assert len(list(tmp_path.glob("*bode*"))) == 1
+    assert run("compare", one.gains, one.gains, *one.machine).code == 0
+    assert run("export", one.gains, *one.machine, "--no-proof", "--out", tmp_path / "c").code == 0
+    assert any(path.suffix == ".c" for path in (tmp_path / "c").rglob("*"))
+    if name in {path.stem for path in GAINS}:  # the others were written without their uncertainty
+        flown = run("campaign", one.gains, "--samples", "8", "--spread", "1%", "--out", tmp_path / "runs")
+        assert (flown.code, "8 of 8 machines" in flown.out) == (0, True)
