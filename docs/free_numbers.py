@@ -106,6 +106,7 @@ OF_DESIGN: dict[str, tuple[Line, ...]] = {
         Line("bases of the planes' integrals", ("bases.integral.[xy]*",), "free: 1 s of the base of x"),
     ),
     "halbach_pid": HALBACH_PID,
+    "halbach_calm": HALBACH_PID,
     "planar_pid": (
         Line("Kp of forces", ("pid.Kp.F_*",), "free: `malta tune`, peak |S| of 1.8"),
         Line("Kp of torques", ("pid.Kp.T_*",), "free: likewise"),

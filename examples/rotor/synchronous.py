@@ -15,7 +15,7 @@ import numpy as np
 
 import malta
 from malta.errors import CheckError, InputError
-from malta.identification.measure import cut_loop
+from malta.identification.excite import cut_loop
 from malta.model.equilibrium import trim
 
 if TYPE_CHECKING:

@@ -71,8 +71,13 @@ def measure(
         str | None, typer.Option(metavar="QUANTITY", help="Largest motion, as 20um.", rich_help_panel=PLAN)
     ] = None,
     band: Annotated[
-        str, typer.Option(metavar="LOW..HIGH", help="Lowest and highest line [Hz].", rich_help_panel=PLAN)
-    ] = "2..400",
+        str | None,
+        typer.Option(
+            metavar="LOW..HIGH",
+            help="Lowest and highest line [Hz]. [by the band of the loop]",
+            rich_help_panel=PLAN,
+        ),
+    ] = None,
     lines: Annotated[int, typer.Option(metavar="N", help="Lines of each input.", rich_help_panel=PLAN)] = 12,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw it: a .png, .svg or .pdf file.")
@@ -133,13 +138,17 @@ def _measured(
     identified: Path | None,
 ) -> Measurement:
     """The measurement over the gain file's box, or over the intervals of an identified machine."""
+    from malta.gains.contents import uncertainty_of
+    from malta.gains.encodings import decode
     from malta.identification.data_file import read_identified
     from malta.identification.log_files import read_log
     from malta.identification.measure import measure as measure_loop
+    from malta.model.data import plant_of, published_figures
 
     read = [read_log(log) for log in logs]
     if identified is None:
-        box = read_uncertainty(gains, uncertain, controller.parameters)
+        own = uncertainty_of(decode(gains), published_figures(plant_of(controller.parameters).name))
+        box = read_uncertainty(gains, uncertain, controller.parameters) if own or uncertain else {}
         return measure_loop(controller, *read, uncertainty=box)
     _require_no(uncertain, "--uncertain beside --identified")
     data = read_identified(identified)
@@ -162,7 +171,7 @@ def _print_measurement(found: Measurement, files: list[Path]) -> None:
     print_text(
         console, f"{len(found.w)} lines, {how}; predicted: {found.machines} machines, sampled, of {box}"
     )
-    if not found.refusal:
+    if not found.refusal and found.box:
         print_text(console, "as predicted: |S| and |T| are within the tube at all lines")
     print_written(console, files)
 
@@ -198,10 +207,11 @@ def _plan(
     console.print(excitation_tables(first, plant)[0])
     console.print(measurement_plan_table(found))
     size = f" --motion {1e6 * options['motion']:g}um" if "motion" in options else ""
-    low, high = options["band"]
+    if options["band"] is not None:
+        size += " --band {:g}..{:g}".format(*options["band"])
     for k in range(len(found.excitations)):
         shift = f" --shift {k}" if separate else ""
-        rest = f"--periods {first.periods} --band {low:g}..{high:g} --lines {options['lines']}{size}{shift}"
+        rest = f"--periods {first.periods} --lines {options['lines']}{size}{shift}"
         console.print(f"malta excite {gains} {rest} --log flown{k or ''}.npz", soft_wrap=True)
 
 
@@ -238,7 +248,12 @@ def commission(
     Example:  malta commission design/gains/robust.json --set K_A=9000
     """
     from malta.gains.file import content_of
-    from malta.identification.commission import JOURNAL, commission as commission_machine, steps_of
+    from malta.identification.commission import (
+        JOURNAL,
+        commission as commission_machine,
+        noise_of_design,
+        steps_of,
+    )
     from malta.model.data import plant_of
     from malta.report.page.document import binder_page, binder_text
 
@@ -258,6 +273,10 @@ def commission(
     replace_files({page: binder_page(done).content, text: binder_text(done).encode()})
     files = [Path(entry.log) for entry in done.entries if entry.sha256 and logs is None]
     files += [folder / JOURNAL, page, text]
+    noise = noise_of_design(done, controller)
+    if noise:
+        replace_files({folder / "noise.toml": noise.encode()})
+        files.append(folder / "noise.toml")
     if as_json:
         from malta.cli.documents.others import CommissionOutput
 

@@ -158,11 +158,17 @@ def excite(
     motion: Annotated[
         str | None, typer.Option(metavar="QUANTITY", help="Largest motion of any output, as 20um.")
     ] = None,
-    period: Annotated[float, typer.Option(metavar="SECONDS", help="Period of the multisine [s].")] = 1.0,
+    period: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="Period of the multisine [s]. [two turns of the lowest line]"),
+    ] = None,
     periods: Annotated[
         int, typer.Option(metavar="N", help="Periods that are logged, after one in which the loop settles.")
     ] = 10,
-    band: Annotated[str, typer.Option(metavar="LOW..HIGH", help="Lowest and highest line [Hz].")] = "2..400",
+    band: Annotated[
+        str | None,
+        typer.Option(metavar="LOW..HIGH", help="Lowest and highest line [Hz]. [by the band of the loop]"),
+    ] = None,
     lines: Annotated[int, typer.Option(metavar="N", help="Lines of each input.")] = 12,
     parameters: Annotated[
         list[str] | None,
@@ -214,10 +220,9 @@ def excite(
         for name, text in given.items()
         if text is not None
     }
-    low, high = read_band(band)
     plan = plan_excitation(
         loop(plant, controller), **sizes,
-        period=period, periods=periods, band=(low, high), lines=lines, parameters=parameters or (),
+        period=period, periods=periods, band=read_band(band), lines=lines, parameters=parameters or (),
         seed=seed or 0, shift=shift,
     )  # fmt: skip
     console, files = make_console(), []
@@ -248,8 +253,10 @@ def excite(
         print_written(console, files)
 
 
-def read_band(text: str) -> tuple[float, float]:
-    """The ends of a band, Hz. Raises InputError for another form than LOW..HIGH."""
+def read_band(text: str | None) -> tuple[float, float] | None:
+    """The ends of a band, Hz; None for none. Raises InputError for another form than LOW..HIGH."""
+    if text is None:
+        return None
     low, dots, high = text.partition("..")
     try:
         return float(low), float(high)
@@ -423,6 +430,10 @@ def _learn_from(
     *earlier, log = logs
     read = read_log(log)
     found = learn_thrust(controller, read, parameter=parameter)
+    if out is not None and not found.parameter:
+        raise InputError(
+            "learn", "--out", "no parameter that scales the thrust alone", "its name: --parameter"
+        )
     files = [] if out is None else verify_and_write(found.controller, gains, out)
     if following is not None:
         plant, after = plant_of(controller.parameters), None
@@ -439,7 +450,9 @@ def _learn_from(
     console = make_console()
     half = 1.96 * found.deviation
     print_text(console, f"{log}: the stroke took {found.factor:.4f} +- {half:.4f} times the thrust expected")
-    print_text(console, f"{found.parameter}: {found.before:.5g} -> {found.after:.5g}, as the law believes it")
+    learned = f"{found.parameter}: {found.before:.5g} -> {found.after:.5g}, as the law believes it"
+    alone = "no parameter scales the thrust alone: --parameter NAME learns one that scales other forces too"
+    print_text(console, learned if found.parameter else alone)
     if following is not None and after is not None:
         print_text(
             console,

@@ -47,17 +47,16 @@ class Estimate(NamedTuple):
         return f"{self.value:.5g} +- {self.half:.2g}{'' if self.unit == '1' else f' {self.unit}'}"
 
 
-def at_rest(log: Log, group: str = "y") -> dict[str, tuple[Estimate, Estimate]]:
+def at_rest(log: Log, group: str = "y", *, still: bool = False) -> dict[str, tuple[Estimate, Estimate]]:
     """The mean and the standard deviation of each signal of a log at rest.
 
     The deviation is that of successive readings, sigma^2 = mean of (y_k+1 - y_k)^2 / 2, so that a mover which still
     rolls is no noise (von Neumann, Annals of Mathematical Statistics 12(4), 1941). On the touchdown bearing without
-    current they are offset and noise of position sensors, and offsets of current sensors; with the mover out and 1 A
-    dc, the noise of the currents, which times the force constant is that of the forces (the variances of the filter in
-    MALTA's paper, Sec. IV-A).
+    current they are offset and noise of position sensors, and offsets of current sensors.
 
     log : at rest
     group : of columns: "y", "i" or another
+    still : whether nothing but noise moves the signals: the deviation is the plain one, with what is slow in it
 
     Raises InputError for a log without the group, CheckError for one that is too short or has missing samples.
 
@@ -78,7 +77,7 @@ def at_rest(log: Log, group: str = "y") -> dict[str, tuple[Estimate, Estimate]]:
     for signal, values in zip(log.signals[group], log.columns[group].T, strict=True):
         parts = _batches(values, log.source)
         mean = Estimate(float(values.mean()), _half(parts.mean(axis=1)), signal.unit)
-        variance = (np.diff(parts, axis=1) ** 2).mean(axis=1) / 2
+        variance = parts.var(axis=1, ddof=1) if still else (np.diff(parts, axis=1) ** 2).mean(axis=1) / 2
         deviation = float(np.sqrt(variance.mean()))
         spread = _half(variance) / max(2 * deviation, 1e-300)
         found[signal.name] = (mean, Estimate(deviation, spread, signal.unit))

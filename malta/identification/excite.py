@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -22,20 +22,27 @@ from malta.identification.response import (
     well_found,
 )
 from malta.model.equilibrium import trim
-from malta.model.plant import outputs_at
+from malta.model.plant import Plant, outputs_at
 from malta.simulation.inputs import Multisine, interleaved_multisine
 
 if TYPE_CHECKING:
     from malta.loops.loop import Loop
 
-BAND = (2.0, 400.0)  # Hz
+HIGHEST = 400.0  # Hz: the highest line, where the loop's band and the samples allow it
+ABOVE = (0.8, 10.0)  # times the band of the fastest output, between which the highest line is
+SAMPLED = 0.25  # of the sampling rate, above which no line is: motion between samples is as good as seen
+DECADES = 200.0  # times the lowest line: the highest one
+TURNS = 2.0  # of the lowest line in a period
 LINES = 12  # of each input
 PERIODS = 10
+LOWEST, GRID = 1e-5, 500  # of the Nyquist frequency, and points from there on, by which a band is found
 SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
 QUIET = 1e-9  # m or rad: noise of a sensor that has none
 LONGEST = 5e7  # samples of a flight
 WIDE, FAR = 2.0, 5.0  # times the largest motion, deviations of the noise: beyond both another machine flies
 CURRENT = 0.1  # of the current limit: the amplitude where none is given
+BENT = 100.0  # deviations of the noise at the lines, as what curvature adds is computed to a percent of it
+COMMAND = 0.5  # of the force limits, which commands keep within there, with the forces that hold the machine
 
 
 @display
@@ -93,9 +100,9 @@ def excite(
     force: float | None = None,
     current: float | None = None,
     motion: float | None = None,
-    period: float = 1.0,
+    period: float | None = None,
     periods: int = PERIODS,
-    band: tuple[float, float] = BAND,
+    band: tuple[float, float] | None = None,
     lines: int = LINES,
     parameters: Sequence[str] = (),
     seed: int = 0,
@@ -104,15 +111,17 @@ def excite(
     """Design an excitation of all axes at once, and predict from the linear loop what it does and what it will find.
 
     Each input has lines of its own, evenly spread in log f, with phases of a low crest factor. The amplitude of an axis
-    is the same at all of its lines.
+    is the same at all of its lines. Where none is given, the band follows that of the loop, see `default_band`, and a
+    period has two turns of the lowest line and room for all lines, in whole samples.
 
     loop : the machine under its controller, where it is held
     force : largest force of each input, N or N m
-    current : largest current beside the one at rest, A; 10 % of its limit where no size is given
+    current : largest current beside the one at rest, A; where no size is given 10 % of its limit, and commands within
+        half of the force limits, and what the machine's curvature adds at the lines within 100 deviations of the noise
     motion : largest deviation of any output, m or rad; of several limits the strictest counts
-    period : s
+    period : s; None: by the band
     periods : that are logged
-    band : Hz, lowest and highest line
+    band : Hz, lowest and highest line; None: by the loop
     lines : of each input
     parameters : whose accuracy is predicted; (): those that will be found to 50 %, but for masses and lengths
     seed : of the phases
@@ -120,8 +129,8 @@ def excite(
 
     Returns an ExcitationPlan.
 
-    Raises InputError for a band with too few lines or above half of the sampling rate, unknown parameters, and an
-    unstable loop.
+    Raises InputError for a band with too few lines or above half of the sampling rate, unknown parameters, an unstable
+    loop, and a machine without limits where no size is given.
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/robust.json")
@@ -130,25 +139,104 @@ def excite(
     >>> f"{1e6 * max(plan.motion.values()):.1f} um, K_A to {plan.accuracy['K_A']:.2%}"
     '10.0 um, K_A to 0.13%'
     """
-    sizes = {"force": force, "current": current, "motion": motion, "period": period}
-    _require(loop, sizes, {"periods": periods, "lines": lines}, band)
     plant, m = loop.plant, len(loop.plant.inputs)
+    given = {"force": force, "current": current, "motion": motion, "period": period}
+    band = _require(loop, given, {"periods": periods, "lines": lines}, band)
+    if period is None:
+        least = max(TURNS / band[0], TURNS * lines * m / (band[1] - band[0]))
+        period = float(np.ceil(least / loop.sample_time - 1e-9) * loop.sample_time)
+    _require_length(loop, period, periods)
     signal = interleaved_multisine(period, *band, inputs=m, lines=lines, seed=seed, shift=shift)
     limit = np.array(plant.actuator.force_limit)
-    wanted = np.full(m, np.inf if force is None else force)
-    if force is None and current is None and motion is None:
-        current = CURRENT * plant.actuator.current_limit
-    unit = replace(signal, amplitude=(limit / signal.peak)[signal.axis.astype(int)])
+    size = np.where(np.isfinite(limit), limit, 1.0)  # N or N m, of the unit signal
+    share = np.minimum(limit, np.inf if force is None else force) / size
+    limits: list[tuple[Any, float]] = []
+    by_default = force is None and current is None and motion is None
+    unit = replace(signal, amplitude=(size / signal.peak)[signal.axis.astype(int)])
     model = model_at(loop, (*parameters,) or candidates(plant))
     found = predicted_spectra(loop, model, unit)
-    share, axis = np.minimum(wanted / limit, 1.0), unit.axis.astype(int)
-    limits = [(part, most) for part, most in ((found.i, current), (found.y, motion)) if most is not None]
+    axis = unit.axis.astype(int)
+    if by_default:
+        current = CURRENT * plant.actuator.current_limit
+        room = COMMAND * limit - np.minimum(np.abs(_held(loop)), COMMAND / 2 * limit)
+        limits = [(found.v / room, 1.0)]
+    sizes = ((found.i, current), (found.y, motion))
+    limits += [(part, most) for part, most in sizes if most is not None and np.isfinite(most)]
     for spectrum, most in limits:  # each input alone, then all together
         share = np.minimum(share, most / np.maximum(_peaks(unit, spectrum).max(axis=1), 1e-300))
+    if not np.isfinite(share).all():
+        expected = "a force, a current or a motion"
+        raise InputError("excite", "force", "none, and a machine without limits", expected)
     for spectrum, most in limits:
         share = share * min(1.0, most / _together(unit, spectrum * share[axis][:, None]).max())
+    while by_default and _bent(model, unit, found.times(share[axis]), periods) > BENT:
+        share = 0.8 * share
     signal = replace(unit, amplitude=unit.amplitude * share[axis])
     return _plan(loop, model, signal, periods, found.times(share[axis]), named=bool(parameters))
+
+
+class Cut(NamedTuple):
+    """A loop at k frequencies, cut at the law's reading: v = F y + F_d d, y = P v."""
+
+    P: ComplexArray  # k x p x m
+    F: ComplexArray  # k x m x p
+    F_d: ComplexArray  # k x m x m
+
+    @property
+    def S(self) -> ComplexArray:
+        """(I - P F)^-1."""
+        return np.asarray(np.linalg.inv(np.eye(self.P.shape[1]) - self.P @ self.F))
+
+    @property
+    def G(self) -> ComplexArray:
+        """S P F_d, from excitation to readings."""
+        return np.asarray(self.S @ self.P @ self.F_d)
+
+
+def cut_loop(loop: Loop, w: FloatArray) -> Cut:
+    """The machine, the law and how an excitation enters it, at frequencies w, rad/s; w below the Nyquist frequency."""
+    sampled, m = loop.sampled_forces, len(loop.plant.inputs)
+    law, z = sampled.control, np.exp(1j * w * loop.sample_time)[:, None, None]
+    fed = slice(-2 * m, -m)  # of the law's references: the forces that are fed forward
+    p = len(sampled.Cd)
+    P = sampled.Cd @ np.linalg.solve(z * np.eye(len(sampled.Ad)) - sampled.Ad, sampled.Bd)
+    if P.shape[2] > m:  # the readings that currents are commutated for
+        P = np.linalg.solve(np.eye(p) - P[..., m:], P[..., :m])
+    into = np.hstack([law.B_y, law.B_r[:, fed]])
+    F = law.C[:m] @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, into)
+    F = F + np.hstack([law.D_y[:m], law.D_r[:m, fed]])
+    return Cut(np.asarray(P, dtype=complex), F[..., :p], F[..., p:])
+
+
+def default_band(loop: Loop) -> tuple[float, float]:
+    """The lowest and the highest line of an excitation, Hz, where none is given.
+
+    The band of an output ends at the highest frequency with |T| = 0.7. The highest line is at 400 Hz, or where that is
+    not within 0.8 to 10 times the band of the fastest output at the nearer of these, and at a quarter of the sampling
+    rate at most. The lowest one is 200 times lower, or at half of the band of the slowest output where that is lower.
+
+    >>> import malta
+    >>> from malta.identification.excite import default_band
+    >>> for name in ("robust", "halbach"):  # samples of 50 us and of 55 ms
+    ...     controller = malta.gains.read(f"design/gains/{name}.json")
+    ...     low, high = default_band(malta.loop(malta.plant_of(controller.parameters), controller))
+    ...     print(f"{low:.2g} to {high:.3g} Hz")
+    2 to 400 Hz
+    0.023 to 4.55 Hz
+    """
+    bands = output_bands(loop)
+    high = min(max(HIGHEST, ABOVE[0] * bands.max()), ABOVE[1] * bands.max(), SAMPLED / loop.sample_time)
+    return float(min(high / DECADES, bands.min() / 2)), float(high)
+
+
+def output_bands(loop: Loop) -> FloatArray:
+    """By output: the highest frequency at which |T| = 0.7, the others closed, Hz; the lowest that is looked at where it
+    never is."""
+    w = np.geomspace(LOWEST, 1.0, GRID) * np.pi / loop.sample_time
+    S = cut_loop(loop, w).S
+    wide = np.abs(1 - np.einsum("kpp->kp", S)) >= np.sqrt(0.5)
+    last = np.where(wide.any(axis=0), len(w) - 1 - wide[::-1].argmax(axis=0), 0)
+    return np.asarray(w[last] / (2 * np.pi))
 
 
 def model_at(loop: Loop, names: Sequence[str]) -> ResponseModel:
@@ -185,18 +273,27 @@ def predicted_spectra(loop: Loop, model: ResponseModel, signal: Multisine) -> Sp
     w, m = 2 * np.pi * signal.frequencies, len(loop.plant.inputs)
     d = np.zeros((len(w), m), dtype=complex)
     d[np.arange(len(w)), signal.axis.astype(int)] = signal.amplitude * np.exp(1j * signal.phase)
-    sampled = loop.sampled_forces
-    law, z = sampled.control, np.exp(1j * w * loop.sample_time)[:, None, None]
-    fed = slice(-2 * m, -m)  # of the law's references: the forces that are fed forward
-    P = sampled.Cd @ np.linalg.solve(z * np.eye(len(sampled.Ad)) - sampled.Ad, sampled.Bd)
-    states = np.linalg.solve(z * np.eye(len(law.A)) - law.A, np.hstack([law.B_y, law.B_r[:, fed]]))
-    F = law.C @ states + np.hstack([law.D_y, law.D_r[:, fed]])
-    own, sent = F[..., : P.shape[1]], np.einsum("kvm,km->kv", F[..., P.shape[1] :], d)
-    moved = np.einsum("kpv,kv->kp", P, sent)
-    Y = np.linalg.solve(np.eye(P.shape[1]) - P @ own, moved[..., None])[..., 0]
-    V = np.einsum("kvp,kp->kv", own, Y) + sent
+    cut = cut_loop(loop, w)
+    Y = np.einsum("kpm,km->kp", cut.G, d)
+    V = np.einsum("kvp,kp->kv", cut.F, Y) + np.einsum("kvm,km->kv", cut.F_d, d)
     G = model.response(model.start, w)
-    return Spectra(Y, np.einsum("kmp,kp->km", np.linalg.pinv(G), Y), V[:, :m])
+    return Spectra(Y, np.einsum("kmp,kp->km", np.linalg.pinv(G), Y), V)
+
+
+def _bent(model: ResponseModel, signal: Multisine, found: Spectra, periods: int) -> float:
+    """What the machine's curvature adds at the lines over the noise there of so many periods: of the worst output."""
+    lines = signal.lines.astype(int)
+    whole = np.zeros((2 * lines[-1] + 1, found.y.shape[1] + found.i.shape[1]), dtype=complex)
+    whole[0], whole[lines] = np.concatenate([model.y, model.i]), np.hstack([found.y, found.i]) / 2
+    y, i = np.split(whole, [found.y.shape[1]], axis=1)
+    added = model.beyond_linear(model.start, y, i, 2 * np.pi / signal.period)[lines]
+    samples = periods * signal.period / model.sample_time
+    return float((np.sqrt((np.abs(added) ** 2).mean(axis=0) * samples) / sensor_noise(model.plant)).max())
+
+
+def sensor_noise(plant: Plant) -> FloatArray:
+    """The standard deviation of each sensor's noise and steps, SI."""
+    return np.asarray(np.maximum(np.hypot(plant.noise, np.array(plant.resolution) / np.sqrt(12)), QUIET))
 
 
 def _peaks(signal: Multisine, spectrum: ComplexArray) -> FloatArray:
@@ -220,16 +317,14 @@ def _plan(
     """The plan of a signal with what it does in the linear loop."""
     plant = loop.plant
     samples = round(periods * signal.period / loop.sample_time)
-    noise = np.hypot(plant.noise, np.array(plant.resolution) / np.sqrt(12))
+    noise = sensor_noise(plant)
     motion = _together(signal, found.y)
-    variance = np.maximum(noise, QUIET)[None] ** 2 / samples * np.ones((len(found.y), 1))
+    variance = noise[None] ** 2 / samples * np.ones((len(found.y), 1))
     slopes = model.slopes(model.start, 2 * np.pi * signal.frequencies)
     F = information(slopes, found.i / 2, variance)
     chosen = list(range(len(model.names))) if named else well_found(F, model.names, SHARE / 1.96)
     sigma = deviations(F[np.ix_(chosen, chosen)])
-    held = trim(plant, **{name: value for name, value in loop.at.items() if value}).v
-    assert held is not None
-    most = (_together(signal, found.v) + np.abs(held)) / np.array(plant.actuator.force_limit)
+    most = (_together(signal, found.v) + np.abs(_held(loop))) / np.array(plant.actuator.force_limit)
     outputs, inputs = [s.name for s in plant.outputs], [s.name for s in plant.inputs]
     return ExcitationPlan(
         signal,
@@ -242,21 +337,36 @@ def _plan(
     )
 
 
+def _held(loop: Loop) -> FloatArray:
+    """The forces that hold the machine where the loop is."""
+    held = trim(loop.plant, **{name: value for name, value in loop.at.items() if value}).v
+    assert held is not None
+    return np.asarray(held, dtype=float)
+
+
 def _require(
-    loop: Loop, sizes: Mapping[str, float | None], counts: Mapping[str, int], band: tuple[float, float]
-) -> None:
-    """Raise InputError for what no excitation can be."""
+    loop: Loop, sizes: Mapping[str, float | None], counts: Mapping[str, int], band: tuple[float, float] | None
+) -> tuple[float, float]:
+    """The band, by default that of the loop. Raises InputError for what no excitation can be."""
     for name, value in {**sizes, **counts}.items():
         if value is not None and not (np.isfinite(value) and value > 0):
             raise InputError("excite", name, str(value), "a number above 0")
-    period = sizes["period"] or 0.0
-    samples = (counts["periods"] + 1) * period / loop.sample_time
-    if samples > LONGEST:
-        raise InputError("excite", "periods", f"{samples:.3g} samples of all", f"at most {LONGEST:g}")
-    nyquist, whole = 0.5 / loop.sample_time, period / loop.sample_time
-    if not 0 < band[0] < band[1] < nyquist:
-        raise InputError("excite", "band", f"{band[0]:g} to {band[1]:g} Hz", f"rising, below {nyquist:g} Hz")
-    if abs(whole - round(whole)) > 1e-6:
-        raise InputError("excite", "period", f"{whole:g} samples", "a whole number of samples")
     if not loop.stable:
         raise InputError("excite", "loop", "an unstable one", "a loop that holds its machine")
+    nyquist = 0.5 / loop.sample_time
+    if band is None:
+        return default_band(loop)
+    if not 0 < band[0] < band[1] < nyquist:
+        raise InputError("excite", "band", f"{band[0]:g} to {band[1]:g} Hz", f"rising, below {nyquist:g} Hz")
+    return band
+
+
+def _require_length(loop: Loop, period: float, periods: int) -> None:
+    """Raise InputError for a flight that is too long, and a period that is no whole number of samples."""
+    whole = period / loop.sample_time
+    if (periods + 1) * whole > LONGEST:
+        raise InputError(
+            "excite", "periods", f"{(periods + 1) * whole:.3g} samples of all", f"at most {LONGEST:g}"
+        )
+    if abs(whole - round(whole)) > 1e-6:
+        raise InputError("excite", "period", f"{whole:g} samples", "a whole number of samples")

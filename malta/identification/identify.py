@@ -26,6 +26,7 @@ from malta.identification.response import (
     deviations,
     information,
     plant_with,
+    points_of_noise,
     require_parameters,
     units_of_model,
     well_found,
@@ -67,6 +68,7 @@ WHITE = 5.0  # standard deviations of the correlation between neighbouring lines
 STRAIGHTENED = 12  # estimates at most, each with the curvature and the weights of the one before
 SETTLED = 0.01  # standard deviations: what moves by less is settled
 DIFFERENT = 3.0  # standard deviations between the estimates at the lines and in time
+COMPUTED = 3e-5  # of a value: to which estimates on a right model are computed
 QUIET = 4.0  # power at the lines over the noise, of the output that moves most: below, nothing was excited
 
 
@@ -152,12 +154,13 @@ class Identified:
     def differences(self) -> dict[str, float]:
         """By parameter: the estimate in time less that at the lines, in standard deviations of the larger one.
 
-        Both use the same readings, so that right models differ by much less than the deviation of either.
+        Both use the same readings, so that right models differ by much less than the deviation of either. What either
+        computes to counts as a deviation too: a part of the curvature, and of motion between samples, is left.
         """
         if self.in_time is None:
             return {}
         variance = np.maximum(np.diag(self.covariance), np.diag(self.in_time.covariance))
-        off = (self.in_time.values - self.values) / np.sqrt(variance)
+        off = (self.in_time.values - self.values) / np.sqrt(variance + (COMPUTED * self.values) ** 2)
         return dict(zip(self.names, off.tolist(), strict=True))
 
     @property
@@ -343,7 +346,8 @@ def _record(plant: Plant, names: tuple[str, ...], log: Log, y: FloatArray, i: Fl
     """The record of a log. Raises CheckError for a log that tells nothing."""
     s = spectrum_of(log, between_neighbours(y), i)
     mean = s.outputs[0].real, s.currents[0].real
-    model = ResponseModel(plant, names, tuple(log.names("i")), *mean, log.sample_time)
+    around = points_of_noise(i[len(i) - round(2 * np.pi / (s.rate * log.sample_time)) :], s.periods)
+    model = ResponseModel(plant, names, tuple(log.names("i")), *mean, log.sample_time, around)
     require_closed_loop(log, float(np.linalg.eigvals(model.matrices(model.start)[0]).real.max()))
     return _Record(model, s)
 

@@ -15,11 +15,15 @@ from scipy.interpolate import BSpline, make_interp_spline
 from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.identification.log import Log, reference_spline, require_currents, require_same_law
+from malta.identification.log import Log, log_of, reference_spline, require_currents, require_same_law
+from malta.identification.replay import reference_motion
+from malta.loops.loop import loop
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names
 from malta.model.plant import Plant
 from malta.simulation.engine.engines import evaluate
+from malta.simulation.scenario import Scenario
+from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import V0_STEPS
 
@@ -150,8 +154,8 @@ class Learned:
 
     factor : command that was needed over the command that the law's machine needs; above 1 where the drive is weaker
     deviation : standard deviation of the factor by the noise of the position sensor
-    parameter : the force constant of the thrust, by name
-    before, after : its value in the gain file, and the value that the log tells, SI
+    parameter : the force constant of the thrust, by name; "": none scales the thrust alone, and none was named
+    before, after : its value in the gain file, and the value that the log tells, SI; 0 without a parameter
     controller : the law with that value
 
     >>> import dataclasses, malta
@@ -180,7 +184,7 @@ class Learned:
                 "thrust",
                 f"{self.factor:.4f} +- {1.96 * self.deviation:.2g} times the command that was expected",
             ),
-            (self.parameter, f"{self.before:.5g} -> {self.after:.5g}"),
+            (self.parameter or "no parameter by itself", f"{self.before:.5g} -> {self.after:.5g}"),
         )
         return Description(f"Learned for {self.controller.name!r}", rows)
 
@@ -193,6 +197,7 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
     with the thrust f that the law believes the measured currents to make (without currents in the log: its command),
     the force v0(z) that holds the mover at its reading, and the acceleration a_ref of the reference, which is an
     instrument: neither noise nor the error of the stroke biases g. The sum of z'' a_ref is that of z a_ref'', by parts.
+    Of a machine whose currents are held between readings, what its own stroke takes beside 1 is taken off g.
     The law commutates with a force constant K, and its filter predicts from the force that it believes to send; so
     K / g corrects both, where another inertia in the feedforward corrects only one.
 
@@ -200,7 +205,8 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
     log : of a stroke
     parameter : the force constant of the thrust; "": found by its effect on the machine
 
-    Returns a Learned; its controller has the new constant.
+    Returns a Learned; its controller has the new constant, or is the one that flew where no parameter scales the thrust
+    alone, as where magnets make all forces.
 
     Raises InputError for a machine without a stroke, and for a log without one; CheckError for a factor out of reason,
     and a log of another machine.
@@ -222,25 +228,41 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
         )
     require_same_law(log, believed.name, controller.sample_time)
     name = parameter or thrust_constant(believed)
-    if name not in symbolic_names(believed.parameters):
+    if name and name not in symbolic_names(believed.parameters):
         known = " ".join(symbolic_names(believed.parameters))
         raise InputError("learn", name, "an unknown parameter", f"one of {known}")
     a, curved, along, beyond = _stroke(controller, believed, log)
     m = believed.mass
     factor = float(beyond @ a / (m * (1 + along) * (a @ a)))
+    if loop(believed, controller).sampled_forces.Bd.shape[1] > len(believed.inputs):
+        own, _, moved, needed = _stroke(controller, believed, own_stroke(controller, log))
+        factor += 1 - float(needed @ own / (m * (1 + moved) * (own @ own)))
     noise = float(np.array(believed.noise)[believed.stroke_output])
     deviation = factor * noise * float(np.linalg.norm(curved)) / float(a @ a)
     if not FACTORS[0] < factor < FACTORS[1]:
         found = f"{log.source}: the stroke took {factor:.3g} times the thrust that was expected"
         raise CheckError(f"{found}: more than a force constant is wrong")
+    if not name:
+        return Learned(factor, deviation, name, 0.0, 0.0, controller)
     before = float(getattr(believed.parameters, name))
     par: Any = replace(controller.parameters, **{name: before / factor})
     taught = replace(controller, name=f"{controller.name}_learned", parameters=par)
     return Learned(factor, deviation, name, before, before / factor, taught)
 
 
+def own_stroke(controller: Controller, log: Log) -> Log:
+    """The gain file's own machine on the reference of a log, without noise.
+
+    Where currents are held that are commutated for the last reading, they pull like a spring as soon as it moves.
+    """
+    plant = plant_of(controller.parameters)
+    motion = reference_motion(log, [s.name for s in plant.outputs], controller.sample_time)
+    scenario = Scenario("stroke", log.samples * controller.sample_time, lambda _: motion, fidelity="force")
+    return log_of(simulate(plant, controller, scenario))
+
+
 def thrust_constant(plant: Plant) -> str:
-    """The parameter that scales the thrust of a current and no other force. Raises InputError where there is none."""
+    """The parameter that scales the thrust of a current and no other force; "" where there is none."""
     own, k = np.array(plant.actuator.force_constant), plant.thrust_input
     for name in symbolic_names(plant.parameters):
         value = float(getattr(plant.parameters, name))
@@ -254,9 +276,7 @@ def thrust_constant(plant: Plant) -> str:
         wanted = np.where(np.arange(len(own)) == k, 1.01, 1.0)
         if np.allclose(ratio, wanted, rtol=1e-9):
             return name
-    raise InputError(
-        "learn", "parameter", "no parameter that scales the thrust alone", "its name: --parameter"
-    )
+    return ""
 
 
 def _stroke(

@@ -15,7 +15,7 @@ from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.model.plant import Plant, Signal
 from malta.simulation.current_control import reading_errors
-from malta.simulation.inputs import Multisine
+from malta.simulation.inputs import Multisine, initial_values
 from malta.simulation.layout import Loop
 from malta.simulation.simulate import prepare
 from malta.simulation.trajectory import Trajectory
@@ -255,17 +255,24 @@ def _read_currents(run: Trajectory) -> FloatArray:
 
 
 def _lagging_currents(run: Trajectory) -> FloatArray:
-    """Currents of the coils behind their commands: delayed, and lagging by the crossover of the current loops."""
+    """Currents of the coils behind their commands: delayed, and lagging by the crossover of the current loops.
+
+    Until the first command arrives, those flow with which the run began.
+    """
     actuator, Ts = run.plant.actuator, run.controller.sample_time
     delay = actuator.delay(Ts) if run.scenario.delay is None else run.scenario.delay
-    held = np.vstack([np.repeat(run.current[:1], delay, axis=0), run.current])[: len(run.current)]
+    ready = prepare(run.plant, run.controller, run.scenario)
+    first = (
+        run.current[:1] if run.scenario.settle else initial_values(ready.simulation, ready.inputs.given[0])[2]
+    )
+    held = np.vstack([np.tile(first, (delay, 1)), run.current])[: len(run.current)]
     if not np.isfinite(actuator.crossover):
         return np.asarray(held)
     from scipy.signal import lfilter  # half a second to import
 
     decay = float(np.exp(-actuator.crossover * Ts))
-    first = decay * held[:1]
-    return np.asarray(lfilter([0, 1 - decay], [1, -decay], held, axis=0, zi=first)[0])
+    before = np.reshape(first, (1, -1))
+    return np.asarray(lfilter([0, 1 - decay], [1, -decay], held, axis=0, zi=before)[0])
 
 
 def reference_spline(log: Log, names: list[str], sample_time: float) -> Any:

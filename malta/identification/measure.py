@@ -22,7 +22,7 @@ from scipy.stats import norm
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Curves, Description, display
 from malta.errors import InputError
-from malta.identification.excite import LONGEST, ExcitationPlan, excite
+from malta.identification.excite import LONGEST, Cut, ExcitationPlan, cut_loop, excite, sensor_noise
 from malta.identification.log import Log
 from malta.identification.spectra import FEWEST, SIGMA, Columns, Line, columns_of, lines_of
 from malta.loops.classical import Disk, disk_sizes
@@ -36,7 +36,6 @@ SAME_LAW = 0.02  # of a command at the lines, by which the law of the gain file 
 SAMPLES = 32  # machines at random in the box, beside its corners
 NARROW = 0.03  # of its width, by which a sampled tube may be too narrow on either side
 CORNERS = 6  # parameters of which all corners are taken
-QUIET = 1e-9  # m or rad: noise of a sensor that has none
 
 
 class Curve(NamedTuple):
@@ -140,12 +139,17 @@ class Measurement:
 
     @property
     def refusal(self) -> str:
-        """Why the machine is not as predicted: another law, or |S| or |T| outside of the tube; "": it is."""
+        """Why the machine is not as predicted: another law, or |S| or |T| outside of the tube; "": it is.
+
+        Without a box there is no tube: a machine is never exactly that of the gain file.
+        """
         if self.law > SAME_LAW:
             return (
                 f"another law flew, or at its limits: commands at the lines miss those of the gain file by "
                 f"{100 * self.law:.2g} %"
             )
+        if not self.box:
+            return ""
         off = {name: getattr(self, name).outside(self.factor) for name in ("S", "T")}
         name = max(off, key=lambda key: float(off[key].max()))
         k, i = np.unravel_index(int(off[name].argmax()), off[name].shape)
@@ -340,8 +344,7 @@ def _expected(loop: Loop, *, separate: bool, **options: Any) -> MeasurementPlan:
     cut, k = cut_loop(loop, w), np.arange(len(w))
     S, G = cut.S, cut.G
     samples = plans[0].periods * round(plans[0].signal.period / loop.sample_time)
-    sigma = np.sqrt(np.array(plant.noise) ** 2 + np.array(plant.resolution) ** 2 / 12)
-    noisy = S * np.maximum(sigma, QUIET)
+    noisy = S * sensor_noise(plant)
     C = noisy @ noisy.conj().transpose(0, 2, 1) / samples
     variance = np.einsum("kpp->kp", C).real * plans[0].periods
     lines, moved = [], np.zeros((len(plant.inputs), *S.shape[:2]))
@@ -359,39 +362,6 @@ def _expected(loop: Loop, *, separate: bool, **options: Any) -> MeasurementPlan:
         own = power > 0
         coherence[name] = power[own] / (power[own] + variance[own, i])
     return MeasurementPlan(plans, sensors, w, curve.measured, SIGMA * curve.deviation, coherence)
-
-
-class Cut(NamedTuple):
-    """A loop at k frequencies, cut at the law's reading: v = F y + F_d d, y = P v."""
-
-    P: ComplexArray  # k x p x m
-    F: ComplexArray  # k x m x p
-    F_d: ComplexArray  # k x m x m
-
-    @property
-    def S(self) -> ComplexArray:
-        """(I - P F)^-1."""
-        return np.asarray(np.linalg.inv(np.eye(self.P.shape[1]) - self.P @ self.F))
-
-    @property
-    def G(self) -> ComplexArray:
-        """S P F_d, from excitation to readings."""
-        return np.asarray(self.S @ self.P @ self.F_d)
-
-
-def cut_loop(loop: Loop, w: FloatArray) -> Cut:
-    """The machine, the law and how an excitation enters it, at frequencies w, rad/s; w below the Nyquist frequency."""
-    sampled, m = loop.sampled_forces, len(loop.plant.inputs)
-    law, z = sampled.control, np.exp(1j * w * loop.sample_time)[:, None, None]
-    fed = slice(-2 * m, -m)  # of the law's references: the forces that are fed forward
-    p = len(sampled.Cd)
-    P = sampled.Cd @ np.linalg.solve(z * np.eye(len(sampled.Ad)) - sampled.Ad, sampled.Bd)
-    if P.shape[2] > m:  # the readings that currents are commutated for
-        P = np.linalg.solve(np.eye(p) - P[..., m:], P[..., :m])
-    into = np.hstack([law.B_y, law.B_r[:, fed]])
-    F = law.C[:m] @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, into)
-    F = F + np.hstack([law.D_y[:m], law.D_r[:m, fed]])
-    return Cut(np.asarray(P, dtype=complex), F[..., :p], F[..., p:])
 
 
 def machines_of(

@@ -2,10 +2,10 @@
 
     e_k = y_k - h(x_k),    x_k+ = x_k + K w_k e_k,    x_k+1 = F(x_k+, i_k, i_k+1, theta) + process noise
 
-F is the machine without linearization, integrated over a sample with the currents as measured at both ends; constant
-accelerations that no parameter explains are estimated beside theta, and the first state. K is the steady gain of the
-filter at the place of the log. Missing readings have the weight 0; others 1, or with Student's likelihood
-(nu + 1) / (nu + (e / s)^2), so that an outlier moves neither the filter nor the parameters.
+F is the machine without linearization, integrated over a sample in steps that are short beside its poles, with the
+currents as measured at both ends; constant accelerations that no parameter explains are estimated beside theta, and the
+first state. K is the steady gain of the filter at the place of the log. Missing readings have the weight 0; others 1,
+or with Student's likelihood (nu + 1) / (nu + (e / s)^2), so that an outlier moves neither filter nor parameters.
 
 The slopes of e are those of the linear machine behind the same filter. An error of theirs, of the size of the machine's
 curvature, slows the search and does not move where it ends: sum of (de/dtheta)' w e / s^2 = 0.
@@ -43,6 +43,11 @@ SPAN = 7  # readings: a reading's neighbours
 SPIKE = 20.0  # times the usual distance from the median of the neighbours
 OUTLIER = 6.0  # standard deviations
 SLOWEST = 20.0  # over the record's length, rad/s: with which the filter forgets the process noise at least
+STEP, MOST_STEPS = (
+    0.2,
+    32,
+)  # over the fastest pole: about a step of the integration; and steps of a sample at most
+EVEN = 1e-3  # of a sample, over the time constant of a current: what lags by less goes evenly
 BINS = 400  # between the lines, from which the process noise is found
 
 
@@ -163,46 +168,50 @@ class _Shape(NamedTuple):
     currents: tuple[str, ...]
     sample_time: float
     apart: tuple[str, ...]  # parameters that differ from their twins
+    steps: int  # of the integration in a sample
 
 
 class _Equations(NamedTuple):
     """The machine in symbols: all states and parameters, and the currents at both ends of a sample."""
 
-    numbers: Any  # parameters, errors of the sensors, rate of the currents
+    numbers: Any  # parameters, errors of the sensors, shares of the currents
     named: dict[str, Any]  # symbols of parameters and errors
     x: Any
     ends: Any  # currents at the begin of the sample, and at its end
-    slope: Callable[[Any, int], Any]  # (states, half samples since its begin) -> x'
+    slope: Callable[[Any, Any], Any]  # (states, share of the current at the end) -> x'
+    shares: Any  # of the current at the end of a sample at begin, middle and end of each step, and their mean
     read: Any
 
 
 def _equations(shape: _Shape) -> _Equations:
     plant, par = shape.plant, shape.plant.parameters
-    n, m, Ts = len(plant.controlled), len(shape.currents), shape.sample_time
+    n, m = len(plant.controlled), len(shape.currents)
     value = {name: ca.SX.sym(name) for name in symbolic_names(par)}
     error = {s.name: ca.SX.sym(s.name) for s in plant.sensor_errors}
     twins = {name: value[twin] for name, twin in twins_of(par).items() if name not in shape.apart}
     machine = plant.variant(symbolic(par, value | twins))
-    x, i, after, rate = (ca.SX.sym("signal", size) for size in (n, m, m, 1))
+    x, i, after, shares = (ca.SX.sym("signal", size) for size in (n, m, m, 3 * shape.steps + 1))
     axes, keep = [a.name for a in axes_of(plant)], list(plant.controlled)
-    # At half of a sample: 1/2 of a current that goes evenly, more of one that lags, 0 of one that is held.
-    middle = ca.if_else(rate < 0, 0, 1 / (1 + ca.exp(-rate * Ts / 2)))
-    shares = (0, middle, ca.if_else(rate < 0, 0, 1))
 
     def whole(own: Any) -> Any:
         state = ca.SX.zeros(len(plant.states))
         state[keep] = own
         return state
 
-    def slope(z: Any, halves: int) -> Any:
+    def slope(z: Any, share: Any) -> Any:
         flowing, state = ca.SX.zeros(len(axes)), whole(z)
-        flowing[[axes.index(name) for name in shape.currents]] = i + shares[halves] * (after - i)
+        flowing[[axes.index(name) for name in shape.currents]] = i + share * (after - i)
         force = machine.forces(state, flowing) if plant.windings is None else machine.drive.force(flowing)
         return machine.f(state, force, machine.load(state))[keep]
 
     read = machine.sense(whole(x), ca.vertcat(*error.values()))
-    numbers = ca.vertcat(*value.values(), *error.values(), rate)
-    return _Equations(numbers, value | error, x, ca.vertcat(i, after), slope, read)
+    numbers = ca.vertcat(*value.values(), *error.values(), shares)
+    return _Equations(numbers, value | error, x, ca.vertcat(i, after), slope, shares, read)
+
+
+def _between(q: _Equations, shares: Any, constant: Any) -> Callable[[Any, int], Any]:
+    """(states, half steps since its begin) -> x' in a step with these shares of the current."""
+    return lambda z, halves: q.slope(z, shares[halves]) + constant
 
 
 @lru_cache(maxsize=8)
@@ -216,7 +225,9 @@ def _filter_loop(shape: _Shape) -> Loop:
     w = there * (nu + 1) / (nu + (e / s) ** 2)
     better = q.x + K @ (w * e)
     constant = ca.vertcat(ca.SX.zeros(half), d)
-    moved = runge_kutta(lambda z, halves: q.slope(z, halves) + constant, better, shape.sample_time, half)
+    moved, step = better, shape.sample_time / shape.steps
+    for k in range(0, 3 * shape.steps, 3):
+        moved = runge_kutta(_between(q, q.shares[k : k + 3], constant), moved, step, half)
     numbers = ca.vertcat(q.numbers, d, ca.vec(K), s, nu)
     return loop_of(q.x, ca.vertcat(q.ends, y, there), numbers, moved, ca.vertcat(e, w, better))
 
@@ -232,7 +243,7 @@ def _slope_loop(shape: _Shape, names: tuple[str, ...], count: int) -> Loop:
     q = _equations(shape)
     p, half = q.read.numel(), q.x.numel() // 2
     theta = ca.vertcat(*(q.named[name] for name in names))
-    pushed = ca.jacobian(q.slope(q.x, 1)[half:], theta)
+    pushed = ca.jacobian(q.slope(q.x, q.shares[-1])[half:], theta)
     read = ca.jacobian(q.read, theta)
     z = ca.SX.sym("z", 2 * count, len(names))  # real parts, imaginary parts
     values, seen = ca.SX.sym("values", 2 * count), ca.SX.sym("seen", p, 2 * count)
@@ -260,9 +271,13 @@ class _Search(NamedTuple):
 
     @property
     def shape(self) -> _Shape:
+        """What its functions depend on. A step of the integration takes about STEP over the machine's fastest pole."""
         model = self.model
         apart = tuple(name for name in twins_of(model.plant.parameters) if name in model.names)
-        return _Shape(model.plant, model.currents, model.sample_time, apart)
+        A = model.matrices(model.start)[0]
+        fastest = float(np.abs(np.linalg.eigvals(A)).max()) * model.sample_time
+        steps = min(max(1, round(fastest / STEP)), MOST_STEPS)
+        return _Shape(model.plant, model.currents, model.sample_time, apart, steps)
 
 
 class _Flight(NamedTuple):
@@ -273,21 +288,51 @@ class _Flight(NamedTuple):
     x: FloatArray
 
 
-def _numbers(model: ResponseModel, theta: FloatArray) -> FloatArray:
+def current_shares(rate: float, Ts: float, steps: int) -> FloatArray:
+    """Shares of the current at the end of a sample at begin, middle and end of each step of it, and their mean.
+
+    The rest is that at its begin. The shares f of a step have the first two moments of the current, sum of f and of
+    (1 - t) f over it, as Runge and Kutta's method weighs them: so speed and place at its end are right for a current
+    that settles within the step too.
+
+    rate : of the current, 1/s; 0: it goes evenly; infinite: it is held
+    """
+    if np.isinf(rate):
+        return np.zeros(3 * steps + 1)
+    t = np.arange(steps + 1) / steps
+    a = rate * Ts
+    if a < EVEN:
+        f = np.column_stack([t[:-1], (t[:-1] + t[1:]) / 2, t[1:]])
+        return np.append(f.ravel(), 0.5)
+    h, left = a / steps, 1 - np.exp(-a)
+    own = np.exp(-a * t[:-1])
+    # Means over a step of e^(-h s) and of (1 - s) e^(-h s).
+    first = (1 - np.exp(-h)) / h
+    second = (1 - first) / h
+    sums, moments = (1 - own * first) / left, (0.5 - own * second) / left
+    end = (1 - np.exp(-a * t[1:])) / left
+    middle = (6 * sums - end - 6 * moments) / 2
+    f = np.column_stack([6 * moments - 2 * middle, middle, end])
+    return np.append(f.ravel(), sums.mean())
+
+
+def _numbers(model: ResponseModel, theta: FloatArray, steps: int) -> FloatArray:
     """The numbers of a machine, as `_Equations` has them."""
     plant, par = model.plant, model.plant.parameters
     own = dict(zip(model.names, theta.tolist(), strict=True))
     twins = twins_of(par)
     value = [own.get(n, own.get(twins.get(n, ""), float(getattr(par, n)))) for n in symbolic_names(par)]
     error = [own.get(signal.name, 0.0) for signal in plant.sensor_errors]
-    rate = current_rate(plant)
-    return np.array([*value, *error, rate if np.isfinite(rate) else -1.0])
+    shares = current_shares(current_rate(plant), model.sample_time, steps)
+    return np.array([*value, *error, *shares])
 
 
 def _fly(s: _Search, theta: FloatArray, d: FloatArray, x: FloatArray) -> _Flight:
     """Run the filter over the log from the state x."""
     p = s.y.shape[1]
-    numbers = np.concatenate([_numbers(s.model, theta), d, s.linear.K.T.ravel(), s.linear.s, [s.nu]])
+    numbers = np.concatenate(
+        [_numbers(s.model, theta, s.shape.steps), d, s.linear.K.T.ravel(), s.linear.s, [s.nu]]
+    )
     rows = _filter_loop(s.shape)(x, (s.i, s.after, s.y, s.there), numbers)
     if not np.isfinite(rows).all():
         raise FloatingPointError
@@ -328,7 +373,9 @@ def _slopes(s: _Search, modes: _Modes, theta: FloatArray, x: FloatArray) -> Floa
         np.concatenate([part.real, part.imag]) for part in (modes.values, modes.accelerated, modes.corrected)
     )
     seen = np.hstack([modes.seen.real, -modes.seen.imag])
-    numbers = np.concatenate([_numbers(s.model, theta), *(part.T.ravel() for part in (*stacked, seen))])
+    numbers = np.concatenate(
+        [_numbers(s.model, theta, s.shape.steps), *(part.T.ravel() for part in (*stacked, seen))]
+    )
     count, c = len(modes.values), len(theta)
     loop = _slope_loop(s.shape, s.model.names, count)
     return loop(np.zeros(2 * count * c), (s.i, s.after, x), numbers).reshape(len(x), -1, c)

@@ -62,7 +62,8 @@ class LawReplay:
     whiteness : by output: the largest autocorrelation of the innovation over 20 samples, in standard deviations
     same : whether all commands are the logged ones, but for rounding
     own : by output: rms of the innovation of the gain file's own machine on this reference and excitation, SI
-    unlike : by output: by how much an autocorrelation of the innovation differs from that one's, at most
+    unlike : by output: by how much an autocovariance of the innovation differs from that one's, at most, over the
+        larger of both variances; without what noise can explain that a quieter log lacks
     allowed : of `unlike`, from the number of samples
     explained : where the innovations are refused, by parameter: its change as a share of its value, and the share of
         their power beyond the own machine's that this explains
@@ -113,7 +114,7 @@ class LawReplay:
         name = max(self.unlike, key=lambda n: self.unlike[n])
         if self.unlike[name] > self.allowed:
             return (
-                f"the innovation of {name} is not as white as that of the gain file's machine: autocorrelations differ "
+                f"the innovation of {name} is not as white as that of the gain file's machine: autocovariances differ "
                 f"by {self.unlike[name]:.2g}, at most {self.allowed:.2g} is noise"
             )
         return ""
@@ -175,7 +176,12 @@ def replay_law(controller: Controller, log: Log, *, same: bool | None = None) ->
     rms = np.sqrt((late**2).mean(axis=0))
     twin = _Twin(controller, log, (simulation, inputs)) if same else None
     own = late if twin is None else twin.innovation(plant, noise=1.0)[half:]
-    unlike = np.abs(_autocorrelations(late) - _autocorrelations(own)).max(axis=1)
+    powers = [part.var(axis=0)[:, None] for part in (late, own)]
+    parts = [_autocorrelations(part) * power for part, power in zip((late, own), powers, strict=True)]
+    # Noise that a quieter log lacks, as one of a simulation without it, has an autocovariance of its power at most.
+    lacking = np.maximum(powers[1] - powers[0], 0.0)
+    beyond = np.maximum(np.abs(parts[0] - parts[1]) - lacking, 0.0)
+    unlike = (beyond / np.maximum(np.maximum(*powers), 1e-300)).max(axis=1)
     found = LawReplay(
         commands,
         innovation,
@@ -267,11 +273,18 @@ def _explained(
 
 
 def reference_motion(log: Log, names: list[str], sample_time: float) -> Callable[[Any], Motion]:
-    """The reference of a log as a motion of time, s, with its derivatives; raises as `reference_spline`."""
-    spline = reference_spline(log, names, sample_time)
+    """The reference of a log as a motion of time, s, with its derivatives; raises as `reference_spline`.
+
+    An output of which no two successive samples differ but by a jump is at rest between its jumps.
+    """
+    spline, table = reference_spline(log, names, sample_time), log.table("reference", names)
+    moves = np.diff(table, axis=0) != 0
+    jumps = moves.any(axis=0) & ~(moves[1:] & moves[:-1]).any(axis=0)
 
     def motion(t: Any) -> Motion:
-        return Motion(spline(t), spline(t, 1), spline(t, 2))
+        k = np.clip(np.round(np.asarray(t) / sample_time).astype(int), 0, len(table) - 1)
+        moving = (spline(t), spline(t, 1), spline(t, 2))
+        return Motion(*np.where(jumps, (table[k], *np.zeros((2, *table[k].shape))), moving))
 
     return motion
 

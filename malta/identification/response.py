@@ -10,7 +10,7 @@ delay, current loops and law drop out, whatever they are, and what is left is th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -27,6 +27,7 @@ from malta.model.signals import with_lags
 from malta.simulation.engine.engines import evaluate
 
 STEP = 1e-5  # of a scale: for derivatives by differences
+QUIETER = 0.01  # of the variance of all currents: a direction with less of it is left out
 ALIKE = 1e3  # condition number of eigenvectors, which are too much alike above it
 SCALES = {"1": 0.1, "m": 1e-3, "rad": 0.1, "s": 1e-4}  # of a parameter whose value is 0, SI
 
@@ -41,6 +42,8 @@ class ResponseModel:
     y : mean outputs, SI
     i : mean currents, A
     sample_time : s
+    around : points x currents, A: where the machine is linearized beside the mean, so that the mean of A and B is that
+        over the noise which the law makes of the sensors'; a point at 0 of one that is quiet
     """
 
     plant: Plant
@@ -49,6 +52,7 @@ class ResponseModel:
     y: FloatArray
     i: FloatArray
     sample_time: float
+    around: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
 
     @cached_property
     def start(self) -> FloatArray:
@@ -126,17 +130,22 @@ class ResponseModel:
         rate, read = machine.f(x, forces, machine.load(x)), machine.sense(x, errors)
         return theta, x, i, rate, read, machine.sensors
 
-    def matrices(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def matrices(
+        self, theta: FloatArray, around: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """A, B and C of the states of the design model and of lagging readings, and the dead time of readings, s.
 
         theta : parameters, SI
+        around : points beside the mean currents, over which they are means; None: the model's own
         """
-        A, B, C, late = (np.array(M) for M in self._matrices(theta))
+        points = self.around if around is None else around
+        found = self._matrices.map(len(points))(theta, (self.i + points).T)
+        A, B, C, late = (np.array(M).reshape(M.shape[0], len(points), -1).mean(axis=1) for M in found)
         return A, B, C, late
 
     @cached_property
     def _matrices(self) -> ca.Function:
-        """Parameters -> A, B, C of the states of the design model and of lagging readings, and the dead time, s."""
+        """Parameters, currents -> A, B, C of the design model's states and lagging readings, and the dead time, s."""
         theta, x, i, rate, read, sensors = self._equations
         keep, used = list(self.plant.controlled), self._places
         blocks = (
@@ -146,10 +155,10 @@ class ResponseModel:
         )
         late = 0 if sensors is None else sensors.dead_time
         linear = [*with_lags(sensors, *blocks), ca.SX(late)]
-        at = np.zeros(i.numel())
-        at[used] = self.i
-        here = ca.substitute(linear, [x, i], [ca.DM(self.place), ca.DM(at)])
-        return ca.Function("matrices", [theta], [ca.densify(M) for M in here])
+        at, flowing = ca.SX.zeros(i.numel()), ca.SX.sym("flowing", len(used))
+        at[used] = flowing
+        here = ca.substitute(linear, [x, i], [ca.DM(self.place), at])
+        return ca.Function("matrices", [theta, flowing], [ca.densify(M) for M in here])
 
     def beyond_linear(
         self, theta: FloatArray, outputs: ComplexArray, currents: ComplexArray, rate: float
@@ -168,7 +177,8 @@ class ResponseModel:
         """
         if not self.plant.second_order:
             return np.zeros_like(outputs)
-        A, B, C, late = self.matrices(theta)
+        A, _, C, late = self.matrices(theta)
+        A_0, B_0, C_0, _ = self.matrices(theta, np.zeros((1, len(self.i))))
         count, n = len(outputs), len(self.plant.controlled)
         samples = 4 * count
 
@@ -184,8 +194,8 @@ class ResponseModel:
         x = np.hstack([q, signal(moving)])
         f, h = evaluate(self._values.map(samples), np.tile(theta, (samples, 1)), x, i)
         off_x, off_i = x - self.place[list(self.plant.controlled)], i - self.i
-        r = f - off_x @ A[:n, :n].T - off_i @ B[:n].T
-        bent = h - off_x @ C[:, :n].T if C.shape[1] == n else np.zeros_like(h)
+        r = f - off_x @ A_0[:n, :n].T - off_i @ B_0[:n].T
+        bent = h - off_x @ C_0[:, :n].T if C.shape[1] == n else np.zeros_like(h)
         R, H = (np.fft.rfft(part, axis=0)[:count] / samples for part in (r, bent))
         s, wide = 1j * w[1:, None, None], np.zeros((count - 1, len(A), 1), dtype=complex)
         wide[:, :n, 0] = R[1:]
@@ -235,6 +245,19 @@ class ResponseModel:
         """Places of the measured currents among all."""
         known = [s.name for s in axes_of(self.plant)]
         return [known.index(name) for name in self.currents]
+
+
+def points_of_noise(i: FloatArray, periods: int) -> FloatArray:
+    """Points with the covariance of what currents do beside their mean period, and the mean 0: 2 x n of n directions.
+
+    i : k x currents, whole periods
+    """
+    parts = i.reshape(periods, -1, i.shape[1])
+    off = (parts - parts.mean(axis=0)).reshape(i.shape) * np.sqrt(periods / max(periods - 1, 1))
+    values, vectors = np.linalg.eigh(off.T @ off / len(off))
+    loud = values > QUIETER * values.sum()
+    points = (vectors[:, loud] * np.sqrt(loud.sum() * values[loud])).T
+    return np.vstack([points, -points]) if loud.any() else np.zeros((1, i.shape[1]))
 
 
 def current_rate(plant: Plant) -> float:

@@ -20,7 +20,9 @@ over the gain file's,
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
@@ -30,12 +32,13 @@ from scipy.signal import fftconvolve
 from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
+from malta.identification.excite import cut_loop, output_bands
 from malta.identification.learn import learn
 from malta.identification.log import Log, log_of, require_same_law, sample_excitation
-from malta.identification.measure import cut_loop
 from malta.identification.replay import reference_motion
 from malta.loops.loop import Loop, loop
 from malta.model.data import plant_of
+from malta.model.machines import attribute_of
 from malta.model.plant import Plant
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
@@ -48,7 +51,40 @@ POWER = 0.999  # of the acceleration of the reference: it is below that frequenc
 WEAK = 3e-3  # of the force that moves the stroke most: forces that move it less are no patterns
 CHANCE = 2.0  # standard deviations, above which an error is more than noise
 ROUNDS = 4  # strokes of the gain file's own machine, without noise: they leave some 0.2^4 of its error
+TAKEN = 0.25  # of the thrust's limit, by a stroke of a machine without a rise of its own
+ROUGH = 20  # samples of its rise, at least
+LOGISTIC = (
+    2 * math.log(9) / math.sqrt(6 * math.sqrt(3))
+)  # rise (s) of a logistic move by 1 m with 1 m/s2 at most
 LONGEST = 20_000  # samples of a stroke's log
+
+
+def stroke_of(plant: Plant, controller: Controller, distance: float | None = None) -> Scenario:
+    """A stroke that teaches something of the thrust, after a rest: with the machine's own RISE of its experiments.
+
+    Without one the stroke takes a quarter of the thrust's limit at most, and its rise 20 samples and two turns of the
+    highest frequency that its loop follows (|T| = 0.7), at least. The rest takes ten such turns, 0.3 s at least.
+
+    plant : the machine, with a stroke
+    controller : the gain file
+    distance : m; None: two thirds of the way from the middle to an end
+
+    >>> import malta
+    >>> from malta.identification.strokes import stroke_of
+    >>> controller = malta.gains.read("design/gains/halbach.json")  # samples of 55 ms
+    >>> scenario = stroke_of(malta.plant_of(controller.parameters), controller)
+    >>> round(scenario.duration / controller.sample_time)  # of six times the rise
+    120
+    """
+    believed = plant_of(controller.parameters)
+    turn = 1 / float(output_bands(loop(believed, controller))[believed.stroke_output])
+    distance = 2 * plant.travel / 3 if distance is None else distance
+    rise = None
+    if attribute_of(plant, "experiments", "RISE") is None:
+        most = TAKEN * controller.limits.force[believed.thrust_input] / believed.mass
+        rise = max(ROUGH * controller.sample_time, 2 * turn, LOGISTIC * math.sqrt(abs(distance) / most))
+    driven: dict[str, Any] = {} if plant.windings is not None else {"fidelity": "force"}
+    return Scenario.stroke(distance, rise=rise, settle=max(0.3, 10 * turn), **driven)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +307,7 @@ def learn_strokes(
     controller: Controller,
     *,
     strokes: int = 6,
-    distance: float = 10e-3,
+    distance: float | None = None,
     noise: float = 1.0,
     seed: int = 0,
 ) -> LearnedStrokes:
@@ -284,7 +320,7 @@ def learn_strokes(
     plant : the machine, which may differ from the gain file's
     controller : the gain file
     strokes : how many
-    distance : m
+    distance : m; None: two thirds of the way from the middle to an end
     noise : of the sensors, in multiples; 0: without their steps too
     seed : of the noise of the first stroke
 
@@ -301,7 +337,7 @@ def learn_strokes(
     """
     if strokes < 1:
         raise InputError("learn", "strokes", str(strokes), "1 or more")
-    scenario = Scenario.stroke(distance, noise=noise, quantize=noise > 0, settle=0.3)
+    scenario = stroke_of(plant, controller, distance).replace(noise=noise, quantize=noise > 0)
     still = scenario.replace(noise=0.0, quantize=False)
     first = _fly(plant, controller, scenario.replace(seed=seed), None)
     errors, quiet, counts = [first], [_fly(plant, controller, still, None) if noise else first], [0]

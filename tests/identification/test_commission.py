@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from conftest import Run
@@ -18,7 +19,10 @@ from malta.errors import CheckError, InputError
 from malta.identification import calibration, measure as measuring
 from malta.identification.calibration import Estimate
 from malta.identification.commission import JOURNAL, Bench, Finding, Step, commission, read_journal, steps_of
+from malta.identification.noise import dc_log, noise_table, process_noise
 from malta.machines.tubular import bench as tubular
+from malta.model.equilibrium import trim
+from malta.model.plant import outputs_at
 from malta.report.page.document import binder_page, binder_text
 
 if TYPE_CHECKING:
@@ -210,6 +214,66 @@ def test_a_finding_holds_where_all_of_its_interval_does() -> None:
     assert Finding("a", Estimate(1.0, 0.1), 0.9, 1.2).holds
     assert not Finding("a", Estimate(1.0, 0.3), 0.9, 1.2).holds
     assert not Finding("a", Estimate(math.nan, 0.0), 0.0, 1.0).holds
+
+
+def test_noise_of_phase_currents_is_that_of_the_forces() -> None:
+    """By (16) of white noise in each phase: 2/3 in a bearing axis, sqrt(2)/3 in a thrust axis of each module."""
+    par: Any = replace(PLANT.parameters, s_i=14e-3)
+    found = process_noise(malta.plant_of(par), dc_log(malta.plant_of(par), "robust", 5e-5, seed=3))
+    assert list(found) == [s.name for s in PLANT.inputs]
+    for name in ("fx_B1", "fy_B1", "fx_B2", "fy_B2"):
+        assert holds(found[name], par.K_B * 2 / 3 * par.s_i)
+    assert holds(found["f_D"], par.K_D * math.sqrt(2) * math.sqrt(2) / 3 * par.s_i)
+
+
+def test_noise_of_coil_currents_is_that_of_the_forces_where_the_machine_is_held() -> None:
+    """A log of coils whose forces are not linear: the slope of the ball's force at the current that holds it."""
+    malta.machine("examples/ball/ball.py")
+    ball = malta.plant_of(malta.read("examples/ball/ball.toml"))
+    t, random = 1e-4 * np.arange(20_000), np.random.default_rng(0)
+    coils = tuple(s.name for s in ball.actuator.coils)
+    i = 1.0 + random.normal(0, 2e-3, (len(t), len(coils)))
+    log = a_log(t, y=(["y"], 0 * t[:, None]))
+    log = replace(log, columns={**log.columns, "i": i}, signals={**log.signals, "i": ball.actuator.coils})
+    (found,) = process_noise(ball, log).values()
+    point = trim(ball)
+    held = ca.DM(ball.currents(ca.DM(outputs_at(ball, point.x)), ca.DM(point.v)))
+    ends = [float(ca.DM(ball.forces(ca.DM(point.x), held + way * 1e-6))) for way in (1, -1)]
+    assert holds(found, abs(ends[0] - ends[1]) / 2e-6 * 2e-3)
+
+
+def test_a_machine_without_current_sensors_says_so() -> None:
+    (only,) = found_in("noise")
+    assert PLANT.drive.sensors is None
+    assert only == "no current sensors: the largest process noise that the gain file has"
+
+
+def test_the_noise_that_is_written_is_read_by_a_design(tmp_path: Path) -> None:
+    process = {s.name: Estimate(0.05 + 0.001 * k, 0.0, "N") for k, s in enumerate(PLANT.inputs)}
+    sensor = {s.name: Estimate(1e-7 * (k + 1), 0.0, "m") for k, s in enumerate(PLANT.outputs)}
+    text = Path("design/table2.toml").read_text().replace("../data", str(Path("data").resolve()))
+    begin, end = text.index("[noise]"), text.index("sensor = { published")
+    rest = text[end:].partition("\n")[2]
+    path = tmp_path / "measured.toml"
+    path.write_text(text[:begin] + noise_table(process, sensor, "made") + rest)
+    spec: Any = malta.read_design(path)
+    weights = spec.law
+    assert np.sqrt(weights.process_variance) == pytest.approx([e.value for e in process.values()], rel=1e-4)
+    assert np.sqrt(weights.sensor_variance) == pytest.approx([e.value for e in sensor.values()], rel=1e-4)
+
+
+@pytest.mark.slow
+def test_closed_current_loops_have_the_noise_of_table_ii() -> None:
+    """13.8 mA in each sensor: 9.71 mA in a bearing axis (2.55e-3 N^2) and 6.77 mA in a thrust axis, within 2 %."""
+    par: Any = replace(PLANT.parameters, s_i=13.8e-3)
+    step = next(one for one in steps_of(PLANT, {}) if one.name == "noise")
+    log = step.record(Bench(CONTROLLER, malta.plant_of(par), {}, 0))
+    axes = {name: deviation for name, (_, deviation) in calibration.at_rest(log, "i", still=True).items()}
+    for name, wanted in (("i_dd1", 9.71e-3), ("i_qd2", 9.71e-3), ("i_0q1", 6.77e-3), ("i_0q2", 6.77e-3)):
+        assert axes[name].value == pytest.approx(wanted, rel=0.02)
+    found = {finding.name: finding.found for finding in step.judge(CONTROLLER, log)}
+    for name in ("fx_B1", "fy_B1", "fx_B2", "fy_B2"):
+        assert found[f"noise of {name}"].value ** 2 == pytest.approx(2.55e-3, rel=0.04)
 
 
 @pytest.mark.slow

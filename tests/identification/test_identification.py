@@ -416,9 +416,7 @@ def test_a_replay_refuses_what_its_law_did_not_fly() -> None:
     log = logs[0]
     assert malta.identification.replay_law(CONTROLLER, log).refusal == ""
     coloured = malta.identification.replay_law(CONTROLLER, logs[1])
-    assert (
-        "not as white as that of the gain file's machine: autocorrelations differ by 0." in coloured.refusal
-    )
+    assert "not as white as that of the gain file's machine: autocovariances differ by 0." in coloured.refusal
     holes = np.array(log.columns["y"])
     holes[7, 1] = np.nan
     for text, bad in {

@@ -12,8 +12,9 @@ from conftest import Run
 from scipy.linalg import toeplitz
 
 import malta
+from malta.identification.excite import cut_loop
 from malta.identification.log import sample_excitation
-from malta.identification.measure import cut_loop, machines_of
+from malta.identification.measure import machines_of
 from malta.identification.strokes import ThrustPatterns, correction, thrust_patterns
 from malta.loops.loop import Loop
 from malta.synthesis.feedforward import static_feedforward

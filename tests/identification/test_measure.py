@@ -15,7 +15,7 @@ from figure_checks import defects
 
 import malta
 from malta.identification import ExcitationPlan, Log, Measurement, measure as measuring
-from malta.identification.measure import cut_loop
+from malta.identification.excite import cut_loop
 from malta.identification.spectra import interpolate_columns
 from malta.report.figures import measured_figure
 

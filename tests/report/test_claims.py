@@ -970,7 +970,9 @@ def test_the_rule_of_thumb_by_hand(found: Found) -> None:
     claim = found.claim("bandwidth over unstable pole: last −3")
     assert claim.verdict.startswith("table2: within 12 %; calibrated: not reproduced; ")
     assert claim.published == f"≈ {400 / 218.92:.2f}"
-    assert found.claim("bandwidth over unstable pole: last 0").verdict.startswith("table2: not reproduced; calibrated: within ")
+    assert found.claim("bandwidth over unstable pole: last 0").verdict.startswith(
+        "table2: not reproduced; calibrated: within "
+    )
 
 
 @pytest.mark.slow

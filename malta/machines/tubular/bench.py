@@ -27,8 +27,18 @@ from malta.identification.calibration import (
     unstable_pole,
     wave,
 )
-from malta.identification.commission import Bench, Finding, Step, fly, judge_noise, loop_step, stroke_step
+from malta.identification.commission import (
+    Bench,
+    Finding,
+    Step,
+    fly,
+    judge_noise,
+    loop_step,
+    noise_step,
+    stroke_step,
+)
 from malta.identification.log import Log
+from malta.identification.noise import dc_log
 from malta.machines.tubular.drive import hall_signals
 from malta.machines.tubular.experiments.lifting import lift_cases, rest_on_bearing
 from malta.model.data import plant_of
@@ -58,6 +68,7 @@ def steps(box: Mapping[str, float]) -> tuple[Step, ...]:
     return (
         Step("rest", "Do currents read zero, sensors still?", "drive off, mover on its bearing", "a current above 1 A",
              _record_rest, _judge_rest),
+        noise_step(_record_dc),
         Step("ring", "How do the radial sensors read the ring?", on_ring, "a bearing that warms up",
              _record_ring, _judge_ring),
         Step("hall", "Are the axial sensors' signals in quadrature?", "mover moved by hand over 28 mm", "an end stop",
@@ -104,6 +115,21 @@ def part_of_log(log: Log, first: int, last: int | None = None) -> Log:
 
 def _record_rest(bench: Bench) -> Log:
     return _on_bearing(bench, "rest", 0.5)
+
+
+def _record_dc(bench: Bench) -> Log:
+    """1 A dc in each module's bearing axis, which presses the mover on its bearing, so that nothing moves.
+
+    A log without currents where their sensors are ideal.
+    """
+    par: Any = bench.controller.parameters
+    if bench.truth.drive.sensors is None:
+        return dc_log(bench.truth, bench.controller.name, bench.controller.sample_time, seed=bench.seed)
+    push = np.array([0.0, -par.K_B, 0.0, -par.K_B, 0.0])
+    return part_of_log(
+        _on_bearing(bench, "noise", 1.0 + SETTLED, lambda t: np.tile(push, (len(t), 1))),
+        round(SETTLED / bench.controller.sample_time),
+    )
 
 
 def _judge_rest(controller: Controller, log: Log) -> list[Finding]:

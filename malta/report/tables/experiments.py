@@ -219,12 +219,19 @@ def _options(name: str, plant: Plant) -> list[str]:
 # Tables of logs, excitations, identified parameters and replays.
 
 
+def micro(unit: str) -> tuple[float, str]:
+    """How lengths and angles of a machine are shown: what SI is multiplied with, and the unit."""
+    return (1e6, f"u{unit}") if unit in ("m", "rad") else (1.0, unit)
+
+
 def log_table(log: Log) -> Table:
-    """Statistics of the columns of a log; a column that never changes has one number."""
+    """Statistics of the columns of a log, lengths in um; a column that never changes has one number."""
     table = new_table("Signals", "signal", "least", "mean", "largest", "deviation")
-    for heading, (least, mean, largest, deviation) in log.survey.statistics.items():
+    for heading, numbers in log.survey.statistics.items():
+        name, unit = heading[:-1].rsplit(" [", 1)
+        scale, shown = micro(unit)
         if not heading.startswith("flag."):
-            add_row(table, heading, *(f"{value:.4g}" for value in (least, mean, largest, deviation)))
+            add_row(table, f"{name} [{shown}]", *(f"{scale * value:.4g}" for value in numbers))
     return table
 
 
@@ -232,7 +239,7 @@ def excitation_tables(plan: ExcitationPlan, plant: Plant) -> list[Table]:
     """What moves how far, what current flows, and what will be found how well."""
     moved = new_table("What it does, by the linear loop", "signal", "largest", "of its limit")
     for signal in plant.outputs:
-        scale, unit = (1e6, f"u{signal.unit}") if signal.unit in ("m", "rad") else (1.0, signal.unit)
+        scale, unit = micro(signal.unit)
         stop = f"stop beyond {scale * plan.window[signal.name]:.3g}"
         add_row(moved, f"{signal.name} [{unit}]", f"{scale * plan.motion[signal.name]:.4g}", stop)
     for signal, limit in zip(plant.inputs, plant.actuator.force_limit, strict=True):
@@ -321,10 +328,10 @@ def replay_table(found: LawReplay, plant: Plant) -> Table:
         off = f"{found.at_once[signal.name]:.2g}", f"{found.difference[signal.name]:.2g}"
         add_row(table, f"{signal.name} differs by [{signal.unit}]", *off, "", "", "")
     for signal in plant.outputs:
-        name = signal.name
-        own = f"{found.own[name]:.3g}" if found.same else ""
-        cells = f"{found.rms[name]:.3g}", own, f"{found.expected[name]:.3g}", f"{found.whiteness[name]:.2g}"
-        add_row(table, f"innovation of {name}, rms [{signal.unit}]", "", *cells)
+        name, (scale, unit) = signal.name, micro(signal.unit)
+        own = f"{scale * found.own[name]:.3g}" if found.same else ""
+        sizes = f"{scale * found.rms[name]:.3g}", own, f"{scale * found.expected[name]:.3g}"
+        add_row(table, f"innovation of {name}, rms [{unit}]", "", *sizes, f"{found.whiteness[name]:.2g}")
     return table
 
 
@@ -388,7 +395,7 @@ def findings_table(done: Commissioning) -> Table:
 def finding_cells(one: Finding) -> tuple[str, str, str, str, str]:
     """Name, value, half of the interval, limits, and a word where they are not kept."""
     value, half, unit = one.found
-    scale, shown = (1e6, "um") if unit == "m" else (1.0, unit)
+    scale, shown = (1e6, "um") if unit == "m" else (1.0, unit)  # phases of waves are in rad
     name = one.name if unit == "1" else f"{one.name} [{shown}]"
     ends = [f"{scale * end:.4g}" for end in (one.low, one.high) if math.isfinite(end)]
     limits = " .. ".join(ends)
