@@ -3,10 +3,9 @@
 A proof is read in this order: groups (the closed loop, split into groups of states that close loops by themselves) ->
 polynomial (their characteristic polynomials over a box) -> exclusion (no zero at any frequency) -> robust (the margin).
 
-uncertain, systems, box   what a user asks about: systems, compensators, ranges
+box                       what a user asks about, beside systems and compensators (linear/): ranges
 connections               uncertain systems in series, in parallel, in feedback
 robust, search            the margin: witness, proof, certificate
-parametric_plants         a machine's model in its parameters
 polynomial                characteristic polynomials over boxes
 exclusion                 branch and bound over frequency and box; witnesses; Hurwitz's determinants
 multipliers               many parameters: pencils and multipliers
@@ -37,13 +36,13 @@ if TYPE_CHECKING:
     from malta.work import Budget as Budget
 
 _NAMES = {
+    "malta.linear.uncertain": "Compensator UncertainSystem",
     "malta.proof.blocks": "Dynamic",
     "malta.proof.blocks.gain": "Gain",
     "malta.proof.connections": "append feedback interconnect parallel random_systems series",
     "malta.proof.margin": "Margin",
     "malta.proof.rates": "RateBound varying",
     "malta.proof.robust": "Interrupted margin_of_polynomial",
-    "malta.linear.uncertain": "Compensator UncertainSystem",
     "malta.work": "Budget",
 }
 __all__, __getattr__, __dir__ = contents(__name__, _NAMES)

@@ -299,10 +299,10 @@ def _either_form(
     """System, law and ranges of robust_margin(system, compensator, ranges) or of robust_margin(loop, ranges)."""
     if isinstance(system, UncertainSystem):
         if ranges is None:
-            raise InputError("robust_margin", "ranges", "none", "robust_margin(system, compensator, ranges)")
+            raise InputError("robust_margin", "ranges", "None", "values by name, as {'k': 0.2}")
         return system, law_of(system, compensator), ranges
     if not hasattr(system, "uncertain"):
-        raise InputError("robust_margin", "system", describe(system), "a Loop, or what malta.uncertain makes")
+        raise InputError("robust_margin", "system", describe(system), "a malta.uncertain system, or a Loop")
     if ranges is not None or not isinstance(compensator, Mapping):
         found = "more than a Loop and ranges" if ranges is not None else describe(compensator)
         raise InputError("robust_margin", "ranges", found, "robust_margin(loop, ranges), as {'m': 0.2}")
