@@ -45,7 +45,7 @@ def test_what_does_not_go_with_a_loop_is_refused(
 
 def test_neither_a_loop_nor_a_system_is_refused() -> None:
     with pytest.raises(
-        malta.InputError, match="system: found 3, expected a malta.uncertain system, or a Loop"
+        malta.InputError, match=r"system: found 3, expected a malta\.uncertain system, or a Loop"
     ):
         malta.robust_margin(3, {"m": 0.1})  # type: ignore[arg-type]
     spring = malta.uncertain(lambda k: ([[-k]], [[1.0]], [[1.0]]), {"k": 1.0})
