@@ -12,6 +12,7 @@ with E[w n'] = sqrt(2) V W V' C' / b. Near the rates of its poles few samples ar
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -22,10 +23,13 @@ from malta.linear.sampling import eigenvalues
 from malta.model.linearize import LinearModel, linearize
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
-from malta.synthesis.filters import Noisy, covariance, filter_gain, intensities, kalman, sampled_noise
+from malta.synthesis.filters import Noisy, covariance, filter_gain, innovations, intensities, sampled_noise
+from malta.synthesis.riccati import care
 from malta.synthesis.schedule import point_at
 from malta.synthesis.spec import Spec
 
+EPS = float(np.finfo(float).eps)
+DOUBLINGS = 40  # sums of 2^40 samples
 SETTLED = 1e-10  # of a covariance: what may be left of where it began
 SAMPLES = 20_000  # at most, some seconds; what is left then is allowed
 ALLOWED = 1e-7  # of the gain, in units in which covariances are of one size
@@ -78,48 +82,70 @@ def _check_one(spec: Spec, model: LinearModel, L: FloatArray) -> FilterCheck:
     continuous = spec.discretization == "backward-euler"
     A, W, along = intensities(model, weights)
     if continuous:
-        poles = eigenvalues(model.A - kalman(model, weights, solver="scipy") @ model.C)
-        noisy = _sampled_alike(A, model.C, W, np.diag(weights.sensor_variance), poles)
+        V = np.diag(weights.sensor_variance)
+        P, K, _ = care(A.T, model.C.T, W, V, "Kalman filter")
+        noisy = _sampled_alike(A, model.C, W, V, eigenvalues(A - K.T @ model.C))
     else:
         known, integrated = spec.delay + spec.current_lag, spec.discretization == "sampled-data"
         noisy = sampled_noise(model, weights, Ts, known, integrated=integrated)
-    P = covariance(noisy)
+        P = covariance(noisy)
     t, s = np.sqrt(np.where(np.diag(P) > 0, np.diag(P), 1.0)), np.sqrt(weights.sensor_variance)
-    closed = noisy.F @ (np.eye(len(P)) - filter_gain(noisy, P) @ noisy.H)
-    slowest = float(np.abs(eigenvalues(closed)).max())
-    samples = min(math.ceil(math.log(SETTLED) / (2 * math.log(max(slowest, 0.5)))), SAMPLES)
-    P, K = _run(noisy, t, samples)
+    noisy = _in_units(noisy, t, np.sqrt(np.diag(noisy.R)))
+    samples, allowed = _patience(noisy, P / np.outer(t, t))
+    P, K = _run(noisy, samples)
     if continuous:
-        Lc = P @ model.C.T / weights.sensor_variance + along
-        K = np.linalg.solve(np.eye(n) - Ts * (model.A - Lc @ model.C), Ts * Lc)
+        Lc = (P * np.outer(t, t)) @ model.C.T / weights.sensor_variance + along
+        K = np.linalg.solve(np.eye(n) - Ts * (model.A - Lc @ model.C), Ts * Lc) * s / t[:, None]
     stored = len(L) - len(K)  # forces that are known have rows of zeros
-    observer, units = np.vstack([L[:n], L[n + stored :]]), s / t[:, None]
-    apart = float((np.abs(K - observer) * units).max() / (np.abs(observer) * units).max())
-    allowed = ALLOWED + 10 * slowest ** (2 * samples)
+    observer = np.vstack([L[:n], L[n + stored :]]) * s / t[:, None]
+    apart = float(np.abs(K - observer).max() / np.abs(observer).max())
     if not apart <= allowed:
         said = f"after {samples} samples filterpy's gain is {apart:.1e} from the observer's"
         raise CheckError(f"{spec.path}: Kalman filter: {said}, allowed {allowed:.1e}")
     return FilterCheck(samples, apart, allowed)
 
 
-def _run(noisy: Noisy, t: FloatArray, samples: int) -> tuple[FloatArray, FloatArray]:
-    """P after a prediction and K of filterpy's filter after some samples.
+def _in_units(noisy: Noisy, t: FloatArray, s: FloatArray) -> Noisy:
+    """The same with states that count in t and readings that count in s."""
+    F, H, Q, R, M = noisy
+    return Noisy(
+        F * t / t[:, None], H * t / s[:, None], Q / np.outer(t, t), R / np.outer(s, s), M / np.outer(t, s)
+    )
 
-    t : standard deviations that the states are counted in; the filter begins with ones
+
+def _patience(noisy: Noisy, P: FloatArray) -> tuple[int, float]:
+    """How many samples a filter runs that begins with ones, and how far its gain may then be off.
+
+    With F_c = F (I - K H) what it began with shrinks as F_c^k (I - P) F_c'^k, and the rounding of each F P F' adds up
+    as the sum of these.
+
+    P : in the steady state
     """
+    size, one, K = partial(np.linalg.norm, ord=2), np.eye(len(P)), filter_gain(noisy, P)
+    closed = noisy.F @ (one - K @ noisy.H)
+    slowest = float(np.abs(eigenvalues(closed)).max())
+    samples = min(math.ceil(math.log(SETTLED) / (2 * math.log(max(slowest, 0.5)))), SAMPLES)
+    left = size(np.linalg.matrix_power(closed, samples)) ** 2 * size(one - P)
+    kept, power = one, closed
+    for _ in range(DOUBLINGS):
+        kept, power = kept + power @ kept @ power.T, power @ power
+    rounding = EPS * size(kept) * size(noisy.F) ** 2 * size(P)
+    moved = size(np.linalg.solve(innovations(noisy, P), noisy.H)) / np.abs(K).max()
+    return samples, float(ALLOWED + 10 * moved * (left + rounding))
+
+
+def _run(noisy: Noisy, samples: int) -> tuple[FloatArray, FloatArray]:
+    """P after a prediction and K of filterpy's filter after some samples, from a covariance of ones."""
     from filterpy.kalman import KalmanFilter
 
-    F, H, Q, R, M = noisy
-    s = np.sqrt(np.diag(R))
-    run = KalmanFilter(dim_x=len(F), dim_z=len(H))
-    run.F, run.H = F * t / t[:, None], H * t / s[:, None]
-    run.Q, run.R, run.M = Q / np.outer(t, t), R / np.outer(s, s), M / np.outer(t, s)
-    update = run.update_correlated if M.any() else run.update
-    reading = np.zeros((len(H), 1))
+    run = KalmanFilter(dim_x=len(noisy.F), dim_z=len(noisy.H))
+    run.F, run.H, run.Q, run.R, run.M = noisy
+    update = run.update_correlated if noisy.M.any() else run.update
+    reading = np.zeros((len(noisy.H), 1))
     for _ in range(samples):
         run.predict()
         update(reading)
-    return run.P_prior * np.outer(t, t), run.K * t[:, None] / s
+    return run.P_prior, run.K
 
 
 def _sampled_alike(A: FloatArray, C: FloatArray, W: FloatArray, V: FloatArray, poles: ComplexArray) -> Noisy:
@@ -136,6 +162,5 @@ def _sampled_alike(A: FloatArray, C: FloatArray, W: FloatArray, V: FloatArray, p
     pushed = back @ W @ back.T / rate
     H, R = np.sqrt(2) * C @ back, rate * V + C @ pushed @ C.T
     along = np.linalg.solve(R, np.sqrt(2) * C @ pushed).T
-    return Noisy(
-        back @ (one + A / rate) - along @ H, H, 2 * pushed - along @ R @ along.T, R, np.zeros_like(H.T)
-    )
+    Q = 2 * pushed - along @ R @ along.T
+    return Noisy(back @ (one + A / rate) - along @ H, H, (Q + Q.T) / 2, R, np.zeros_like(H.T))

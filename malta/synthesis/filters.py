@@ -175,8 +175,12 @@ def covariance(noisy: Noisy, solver: Solver = "scipy") -> FloatArray:
 
 def filter_gain(noisy: Noisy, P: FloatArray) -> FloatArray:
     """(P H' + M) (H P H' + H M + M' H' + R)^-1."""
-    H, M = noisy.H, noisy.M
-    return np.asarray(np.linalg.solve(H @ P @ H.T + _with_reading(noisy), H @ P + M.T).T)
+    return np.asarray(np.linalg.solve(innovations(noisy, P), noisy.H @ P + noisy.M.T).T)
+
+
+def innovations(noisy: Noisy, P: FloatArray) -> FloatArray:
+    """The variance of the innovations, H P H' + H M + M' H' + R."""
+    return np.asarray(noisy.H @ P @ noisy.H.T + _with_reading(noisy))
 
 
 def _with_reading(noisy: Noisy) -> FloatArray:

@@ -72,6 +72,34 @@ def test_a_filter_too_slow_to_wait_for_is_compared_as_far_as_it_came() -> None:
     assert found.allowed > 100 * ALLOWED
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(25))
+def test_no_sound_observer_is_refused(seed: int) -> None:
+    """Drawn machines, weights over ten decades, samples of 10 us to 10 ms: what filterpy leaves is foreseen."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 4))
+    way: Any = ["backward-euler", "zoh", "sampled-data"][seed % 3]
+    stiffness = rng.normal(size=(n, n)) * 10 ** rng.uniform(0, 5)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [stiffness, -np.diag(rng.uniform(0, 5, n))]])
+    B = np.vstack([np.zeros((n, n)), rng.normal(size=(n, n)) * 10 ** rng.uniform(-2, 2)])
+    cart = malta.linear_machine(A, B, np.hstack([rng.normal(size=(n, n)), np.zeros((n, n))]))
+    model = malta.linearize(cart, cart.at())
+    weights = malta.synthesis.weights(
+        10 ** rng.uniform(-2, 6, 2 * n), 10 ** rng.uniform(-3, 3, n),
+        10 ** rng.uniform(-8, 0, n), 10 ** rng.uniform(-14, -4, n),
+    )  # fmt: skip
+    Ts = 10 ** rng.uniform(-5, -2)
+    base = malta.read_design("design/table2.toml")
+    spec = replace(base, law=weights, sample_time=Ts, discretization=way)
+    try:
+        controller = malta.lqg(model, weights, Ts, spec.discretization)
+    except malta.CheckError as error:
+        pytest.skip(f"no sound design: {error}")
+    found = check_filter(spec, model, controller)
+    assert found.apart < found.allowed / 2
+    assert found.samples == 20_000 or found.allowed < 1e-2
+
+
 PROGRAM = """
 import sys
 from collections import Counter
