@@ -496,11 +496,11 @@ def _largest_error(plant: Plant, log: Log) -> float:
 def judge_stroke(controller: Controller, log: Log) -> list[Finding]:
     """The largest error along the stroke, and the thrust that it took over what the law expects."""
     plant = plant_of(controller.parameters)
-    error, most = _largest_error(plant, log), ERROR * plant.travel
-    what = ""
+    error, most, what = _largest_error(plant, log), ERROR * plant.travel, ""
     if error > most:  # of a law that follows its reference late
         own = _largest_error(plant, own_stroke(controller, log))
-        what, most = (f", {1e3 * own:.3g} mm by design", SLACK * own) if own > most / SLACK else ("", most)
+        if SLACK * own > most:
+            what, most = f", {1e3 * own:.3g} mm by design", SLACK * own
     noise = float(plant.noise[plant.stroke_output])
     taught = learn(controller, log)
     return [

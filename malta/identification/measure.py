@@ -364,9 +364,7 @@ def _expected(loop: Loop, *, separate: bool, **options: Any) -> MeasurementPlan:
     return MeasurementPlan(plans, sensors, w, curve.measured, SIGMA * curve.deviation, coherence)
 
 
-def machines_of(
-    predicted: Loop, box: Mapping[str, float], seed: int, samples: int | None = None
-) -> list[Loop]:
+def machines_of(predicted: Loop, box: Mapping[str, float], seed: int, samples: int = SAMPLES) -> list[Loop]:
     """The machine, and those at the corners and at random places of the box, all under the same law."""
     par = predicted.plant.parameters
     names, shares = list(box), np.array(list(box.values()))
@@ -377,7 +375,7 @@ def machines_of(
     if not names:
         return [predicted]
     corners = list(product((-1.0, 1.0), repeat=len(names))) if len(names) <= CORNERS else []
-    random = np.random.default_rng(seed).uniform(-1, 1, (SAMPLES if samples is None else samples, len(names)))
+    random = np.random.default_rng(seed).uniform(-1, 1, (samples, len(names)))
     places = np.vstack([np.array(corners).reshape(-1, len(names)), random])
     found, at = [predicted], dict[str, Any](predicted.at)
     for place in places:
@@ -449,8 +447,6 @@ def _law_misses(lines: Sequence[Line], cut: Cut, w: FloatArray) -> float:
     for line in lines:
         k = int(np.searchsorted(w, line.w))
         v = cut.F[k] @ line.y + cut.F_d[k] @ line.d
-        off, all_of = (
-            off + float((np.abs(line.v - v) ** 2).sum()),
-            all_of + float((np.abs(line.v) ** 2).sum()),
-        )
+        off += float((np.abs(line.v - v) ** 2).sum())
+        all_of += float((np.abs(line.v) ** 2).sum())
     return float(np.sqrt(off / max(all_of, 1e-300)))

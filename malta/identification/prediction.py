@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -207,11 +207,6 @@ def _equations(shape: _Shape) -> _Equations:
     return _Equations(numbers, value | error, x, ca.vertcat(i, after), slope, shares, read)
 
 
-def _between(q: _Equations, shares: Any, constant: Any) -> Callable[[Any, int], Any]:
-    """(states, half steps since its begin) -> x' in a step with these shares of the current."""
-    return lambda z, halves: q.slope(z, shares[halves]) + constant
-
-
 @lru_cache(maxsize=8)
 def _filter_loop(shape: _Shape) -> Loop:
     """(x; i_k, i_k+1, y, whether it is there; numbers, d, K, s, nu) -> x, (e, w, better x) of each sample."""
@@ -223,9 +218,13 @@ def _filter_loop(shape: _Shape) -> Loop:
     w = there * (nu + 1) / (nu + (e / s) ** 2)
     better = q.x + K @ (w * e)
     constant = ca.vertcat(ca.SX.zeros(half), d)
+
+    def rate(first: int, z: Any, halves: int) -> Any:
+        return q.slope(z, q.shares[first + halves]) + constant
+
     moved, step = better, shape.sample_time / shape.steps
     for k in range(0, 3 * shape.steps, 3):
-        moved = runge_kutta(_between(q, q.shares[k : k + 3], constant), moved, step, half)
+        moved = runge_kutta(partial(rate, k), moved, step, half)
     numbers = ca.vertcat(q.numbers, d, ca.vec(K), s, nu)
     return loop_of(q.x, ca.vertcat(q.ends, y, there), numbers, moved, ca.vertcat(e, w, better))
 
