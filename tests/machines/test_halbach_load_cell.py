@@ -106,7 +106,7 @@ def test_a_motor_that_the_noise_of_the_cell_hides_is_identified_without_its_law(
     weak = plant_of(dataclasses.replace(PAR, A=1e-3))
     e = identify(weak, malta.gains.read("design/gains/halbach.json"))
     found = {merit.label: merit.value for merit in e.merits}
-    assert math.isnan(found["load cell: A"]) and math.isnan(found["load cell: l, half of its interval"])
+    assert all(math.isnan(value) for label, value in found.items() if label.startswith("load cell"))
     assert math.isfinite(found["secant stiffness"])
 
 
