@@ -326,14 +326,13 @@ def _comparison(row: Row, target: PublishedFigure, value: float) -> str:
         return "not compared"
     if math.isnan(value):
         return "not reproduced"
-    bound, agrees = target.value, is_reproduced(target, value)
-    if row.relation in ("at most", "at least"):
-        kept = value <= bound if row.relation == "at most" else value >= bound
-        if not kept:
-            return f"not reproduced: {_distance(bound, value)}"
-        return "reproduced" if agrees else _distance(bound, value)
-    if agrees:
+    bound, bounded = target.value, row.relation in ("at most", "at least")
+    if bounded and not (value <= bound if row.relation == "at most" else value >= bound):
+        return f"not reproduced: {_distance(bound, value)}"
+    if is_reproduced(target, value):
         return "reproduced"
+    if bounded:
+        return _distance(bound, value)
     off = abs(value / bound - 1) if bound else math.inf
     return f"within {math.ceil((off - ROUNDING) * 100)} %" if off <= NEAR + ROUNDING else "not reproduced"
 

@@ -363,18 +363,18 @@ ELECTRONICS: tuple[Row, ...] = (
 
 TEN = "ten times too large: it goes as the step of the voltage, 15 µm × 26.2 µV / 5.86 mV"
 OPEN_LOOP: tuple[Row, ...] = (
-    *(
-        Row(
-            f"smallest motion, {pwm} PWM",
-            shown,
-            partial(merit, "stairs", f"longest dead zone, {pwm} PWM"),
-            f"open_loop.smallest_motion{end}",
-            why=why,
-        )
-        for pwm, shown, end, why in (
-            ("plain", "{:.1f} um", "", ""),
-            ("high-resolution", "{:.3f} um", "_fine", TEN),
-        )
+    Row(
+        "smallest motion, plain PWM",
+        "{:.1f} um",
+        partial(merit, "stairs", "longest dead zone, plain PWM"),
+        "open_loop.smallest_motion",
+    ),
+    Row(
+        "smallest motion, high-resolution PWM",
+        "{:.3f} um",
+        partial(merit, "stairs", "longest dead zone, high-resolution PWM"),
+        "open_loop.smallest_motion_fine",
+        why=TEN,
     ),
     Row(
         "Fig. 7a: second stair of 10 µm",
