@@ -12,7 +12,7 @@ ed., ch. 2 and 7).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -320,19 +320,18 @@ def plan_measurement(
     found = _expected(loop, separate=separate, **options)
     if width is None:
         return found
-    first = found.excitations[0]
-    periods = max(FEWEST, int(np.ceil(min(first.periods * (found.worst / width) ** 2, 1e12))))
-    samples = periods * first.signal.period / loop.sample_time
-    if samples > LONGEST:
-        raise InputError(
-            "measure", "width", f"{samples:.3g} samples for it", f"at most {LONGEST:g}: excite more"
-        )
-    less = float(np.sqrt(first.periods / periods))
-    longer = (
-        replace(one, periods=periods, accuracy={name: less * share for name, share in one.accuracy.items()})
-        for one in found.excitations
-    )
-    return replace(found, excitations=tuple(longer), half_width=less * found.half_width)
+    while True:
+        first = found.excitations[0]
+        periods = max(FEWEST, int(np.ceil(min(first.periods * (found.worst / width) ** 2, 1e12))))
+        samples = periods * first.signal.period / loop.sample_time
+        if samples > LONGEST:
+            raise InputError(
+                "measure", "width", f"{samples:.3g} samples for it", f"at most {LONGEST:g}: excite more"
+            )
+        # Where no size is given, curvature is kept beside the noise: a longer flight is excited less.
+        found = _expected(loop, separate=separate, **options | {"periods": periods})
+        if found.worst <= width * (1 + 1e-9):
+            return found
 
 
 def _expected(loop: Loop, *, separate: bool, **options: Any) -> MeasurementPlan:
@@ -364,7 +363,9 @@ def _expected(loop: Loop, *, separate: bool, **options: Any) -> MeasurementPlan:
     return MeasurementPlan(plans, sensors, w, curve.measured, SIGMA * curve.deviation, coherence)
 
 
-def machines_of(predicted: Loop, box: Mapping[str, float], seed: int, samples: int = SAMPLES) -> list[Loop]:
+def machines_of(
+    predicted: Loop, box: Mapping[str, float], seed: int, samples: int | None = None
+) -> list[Loop]:
     """The machine, and those at the corners and at random places of the box, all under the same law."""
     par = predicted.plant.parameters
     names, shares = list(box), np.array(list(box.values()))
@@ -375,7 +376,7 @@ def machines_of(predicted: Loop, box: Mapping[str, float], seed: int, samples: i
     if not names:
         return [predicted]
     corners = list(product((-1.0, 1.0), repeat=len(names))) if len(names) <= CORNERS else []
-    random = np.random.default_rng(seed).uniform(-1, 1, (samples, len(names)))
+    random = np.random.default_rng(seed).uniform(-1, 1, (SAMPLES if samples is None else samples, len(names)))
     places = np.vstack([np.array(corners).reshape(-1, len(names)), random])
     found, at = [predicted], dict[str, Any](predicted.at)
     for place in places:
