@@ -430,11 +430,7 @@ def _learn_from(
     *earlier, log = logs
     read = read_log(log)
     found = learn_thrust(controller, read, parameter=parameter)
-    if out is not None and not found.parameter:
-        raise InputError(
-            "learn", "--out", "no parameter that scales the thrust alone", "its name: --parameter"
-        )
-    files = [] if out is None else verify_and_write(found.controller, gains, out)
+    files = _write_taught(found.controller, controller, gains, out, "its name: --parameter")
     if following is not None:
         plant, after = plant_of(controller.parameters), None
         for one in (*map(read_log, earlier), read):
@@ -461,6 +457,17 @@ def _learn_from(
             + (f", which the machine of {found.controller.name} needs by itself" if out else ""),
         )
     print_written(console, files)
+
+
+def _write_taught(
+    taught: Controller, flown: Controller, gains: Path, out: Path | None, expected: str
+) -> list[Path]:
+    """Write a law with another force constant, if asked to. Raises InputError where none was learned."""
+    if out is None:
+        return []
+    if taught is flown:
+        raise InputError("learn", "--out", "no parameter that scales the thrust alone", expected)
+    return verify_and_write(taught, gains, out)
 
 
 def _learn_v0(gains: Path, controller: Controller, log: Path, out: Path | None, *, as_json: bool) -> None:
@@ -508,7 +515,9 @@ def _learn_strokes(
     box = read_uncertainty(gains, uncertain, controller.parameters)
     with working("proving that errors shrink"):
         shrinks = contraction(controller, box) if box else None
-    files = [] if out is None else verify_and_write(found.controller, gains, out)
+    files = _write_taught(
+        found.controller, controller, gains, out, "no --out: the force constant is not learned"
+    )
     if as_json:
         from malta.cli.documents.others import learned_strokes_output
 

@@ -356,11 +356,12 @@ def general_steps(plant: Plant, box: Mapping[str, float]) -> tuple[Step, ...]:
     return (*steps, stroke_step()) if plant.has_stroke else steps
 
 
-def _record_noise(bench: Bench) -> Log:
+def record_noise(bench: Bench) -> Log:
+    """The log of `dc_log` on the bench."""
     return dc_log(bench.truth, bench.controller.name, bench.controller.sample_time, seed=bench.seed)
 
 
-def noise_step(record: Callable[[Bench], Log] = _record_noise) -> Step:
+def noise_step(record: Callable[[Bench], Log] = record_noise) -> Step:
     """The step that measures the noise of the current sensors, and what it makes of the forces."""
     return Step(
         "noise", "What noise do the currents make of the forces?", "mover out or clamped, 1 A dc in each phase",
@@ -383,17 +384,13 @@ def judge_currents(controller: Controller, log: Log) -> list[Finding]:
 
 def noise_of_design(done: Commissioning, controller: Controller) -> str:
     """The [noise] of a design file by the logs at rest and of the currents; "" where there are none."""
-    logs = {e.name: e.log for e in done.entries if e.passed}
-    still = logs.get("rest") or logs.get("still")
-    process = (
-        process_noise(plant_of(controller.parameters), read_log(Path(logs["noise"])))
-        if "noise" in logs
-        else {}
-    )
-    if still is None or not process:
+    logs = {e.name: Path(e.log) for e in done.entries if e.passed}
+    still, dc = logs.get("rest", logs.get("still")), logs.get("noise")
+    if still is None or dc is None:
         return ""
-    sensor = {name: deviation for name, (_, deviation) in at_rest(read_log(Path(still))).items()}
-    return noise_table(process, sensor, f"{Path(logs['noise']).name}, {Path(still).name}")
+    process = process_noise(plant_of(controller.parameters), read_log(dc))
+    sensor = {name: deviation for name, (_, deviation) in at_rest(read_log(still)).items()}
+    return noise_table(process, sensor, f"{dc.name}, {still.name}") if process else ""
 
 
 def _record_still(bench: Bench) -> Log:
@@ -499,11 +496,11 @@ def _largest_error(plant: Plant, log: Log) -> float:
 def judge_stroke(controller: Controller, log: Log) -> list[Finding]:
     """The largest error along the stroke, and the thrust that it took over what the law expects."""
     plant = plant_of(controller.parameters)
-    error, most = _largest_error(plant, log), ERROR * plant.travel
-    what = ""
+    error, most, what = _largest_error(plant, log), ERROR * plant.travel, ""
     if error > most:  # of a law that follows its reference late
         own = _largest_error(plant, own_stroke(controller, log))
-        what, most = (f", {1e3 * own:.3g} mm by design", SLACK * own) if own > most / SLACK else ("", most)
+        if SLACK * own > most:
+            what, most = f", {1e3 * own:.3g} mm by design", SLACK * own
     noise = float(plant.noise[plant.stroke_output])
     taught = learn(controller, log)
     return [

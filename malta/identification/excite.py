@@ -22,7 +22,7 @@ from malta.identification.response import (
     well_found,
 )
 from malta.model.equilibrium import trim
-from malta.model.plant import Plant, outputs_at
+from malta.model.plant import OperatingPoint, Plant, outputs_at
 from malta.simulation.inputs import Multisine, interleaved_multisine
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ def excite(
     axis = unit.axis.astype(int)
     if by_default:
         current = CURRENT * plant.actuator.current_limit
-        room = COMMAND * limit - np.minimum(np.abs(_held(loop)), COMMAND / 2 * limit)
+        room = COMMAND * limit - np.minimum(np.abs(np.asarray(_held(loop).v)), COMMAND / 2 * limit)
         limits = [(found.v / room, 1.0)]
     sizes = ((found.i, current), (found.y, motion))
     limits += [(part, most) for part, most in sizes if most is not None and np.isfinite(most)]
@@ -241,9 +241,7 @@ def output_bands(loop: Loop) -> FloatArray:
 
 def model_at(loop: Loop, names: Sequence[str]) -> ResponseModel:
     """The response of a loop's machine where it is held."""
-    plant = loop.plant
-    at = {name: value for name, value in loop.at.items() if value}
-    point = trim(plant, **at)
+    plant, point = loop.plant, _held(loop)
     y = outputs_at(plant, point.x)
     coils = ca.DM(plant.currents(ca.DM(y), ca.DM(point.v)))
     i = np.array(
@@ -324,7 +322,9 @@ def _plan(
     F = information(slopes, found.i / 2, variance)
     chosen = list(range(len(model.names))) if named else well_found(F, model.names, SHARE / 1.96)
     sigma = deviations(F[np.ix_(chosen, chosen)])
-    most = (_together(signal, found.v) + np.abs(_held(loop))) / np.array(plant.actuator.force_limit)
+    most = (_together(signal, found.v) + np.abs(np.asarray(_held(loop).v))) / np.array(
+        plant.actuator.force_limit
+    )
     outputs, inputs = [s.name for s in plant.outputs], [s.name for s in plant.inputs]
     return ExcitationPlan(
         signal,
@@ -337,11 +337,9 @@ def _plan(
     )
 
 
-def _held(loop: Loop) -> FloatArray:
-    """The forces that hold the machine where the loop is."""
-    held = trim(loop.plant, **{name: value for name, value in loop.at.items() if value}).v
-    assert held is not None
-    return np.asarray(held, dtype=float)
+def _held(loop: Loop) -> OperatingPoint:
+    """The machine at rest where the loop is."""
+    return trim(loop.plant, **{name: value for name, value in loop.at.items() if value})
 
 
 def _require(

@@ -231,14 +231,10 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
     if name and name not in symbolic_names(believed.parameters):
         known = " ".join(symbolic_names(believed.parameters))
         raise InputError("learn", name, "an unknown parameter", f"one of {known}")
-    a, curved, along, beyond = _stroke(controller, believed, log)
-    m = believed.mass
-    factor = float(beyond @ a / (m * (1 + along) * (a @ a)))
+    factor, by_noise = _thrust_factor(controller, believed, log)
     if loop(believed, controller).sampled_forces.Bd.shape[1] > len(believed.inputs):
-        own, _, moved, needed = _stroke(controller, believed, own_stroke(controller, log))
-        factor += 1 - float(needed @ own / (m * (1 + moved) * (own @ own)))
-    noise = float(np.array(believed.noise)[believed.stroke_output])
-    deviation = factor * noise * float(np.linalg.norm(curved)) / float(a @ a)
+        factor += 1 - _thrust_factor(controller, believed, own_stroke(controller, log))[0]
+    deviation = factor * float(np.array(believed.noise)[believed.stroke_output]) * by_noise
     if not FACTORS[0] < factor < FACTORS[1]:
         found = f"{log.source}: the stroke took {factor:.3g} times the thrust that was expected"
         raise CheckError(f"{found}: more than a force constant is wrong")
@@ -279,10 +275,8 @@ def thrust_constant(plant: Plant) -> str:
     return ""
 
 
-def _stroke(
-    controller: Controller, believed: Plant, log: Log
-) -> tuple[FloatArray, FloatArray, float, FloatArray]:
-    """a_ref (m/s2), a_ref'' (m/s4), the part of z'' - a_ref along a_ref as a share of it, and f - v0 (N).
+def _thrust_factor(controller: Controller, believed: Plant, log: Log) -> tuple[float, float]:
+    """g of `learn`, and its relative deviation by white noise of 1 m in z.
 
     Raises InputError for a log without a stroke, and CheckError for missing samples.
     """
@@ -301,7 +295,9 @@ def _stroke(
     curved = make_interp_spline(t, a, k=5)(t, 2)
     along = float((z - z_ref) @ curved / (a @ a))
     table = controller.feedforward
-    return a, curved, along, f - np.interp(z, table.z_grid, table.v0[:, thrust])
+    beyond = f - np.interp(z, table.z_grid, table.v0[:, thrust])
+    factor = float(beyond @ a / (believed.mass * (1 + along) * (a @ a)))
+    return factor, float(np.linalg.norm(curved)) / float(a @ a)
 
 
 def believed_thrust(believed: Plant, log: Log) -> FloatArray:

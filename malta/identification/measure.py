@@ -12,7 +12,7 @@ ed., ch. 2 and 7).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -320,19 +320,18 @@ def plan_measurement(
     found = _expected(loop, separate=separate, **options)
     if width is None:
         return found
-    first = found.excitations[0]
-    periods = max(FEWEST, int(np.ceil(min(first.periods * (found.worst / width) ** 2, 1e12))))
-    samples = periods * first.signal.period / loop.sample_time
-    if samples > LONGEST:
-        raise InputError(
-            "measure", "width", f"{samples:.3g} samples for it", f"at most {LONGEST:g}: excite more"
-        )
-    less = float(np.sqrt(first.periods / periods))
-    longer = (
-        replace(one, periods=periods, accuracy={name: less * share for name, share in one.accuracy.items()})
-        for one in found.excitations
-    )
-    return replace(found, excitations=tuple(longer), half_width=less * found.half_width)
+    while True:
+        first = found.excitations[0]
+        periods = max(FEWEST, int(np.ceil(min(first.periods * (found.worst / width) ** 2, 1e12))))
+        samples = periods * first.signal.period / loop.sample_time
+        if samples > LONGEST:
+            raise InputError(
+                "measure", "width", f"{samples:.3g} samples for it", f"at most {LONGEST:g}: excite more"
+            )
+        # Where no size is given, curvature is kept beside the noise: a longer flight is excited less.
+        found = _expected(loop, separate=separate, **options | {"periods": periods})
+        if found.worst <= width * (1 + 1e-9):
+            return found
 
 
 def _expected(loop: Loop, *, separate: bool, **options: Any) -> MeasurementPlan:
@@ -449,8 +448,6 @@ def _law_misses(lines: Sequence[Line], cut: Cut, w: FloatArray) -> float:
     for line in lines:
         k = int(np.searchsorted(w, line.w))
         v = cut.F[k] @ line.y + cut.F_d[k] @ line.d
-        off, all_of = (
-            off + float((np.abs(line.v - v) ** 2).sum()),
-            all_of + float((np.abs(line.v) ** 2).sum()),
-        )
+        off += float((np.abs(line.v - v) ** 2).sum())
+        all_of += float((np.abs(line.v) ** 2).sum())
     return float(np.sqrt(off / max(all_of, 1e-300)))

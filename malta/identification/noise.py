@@ -20,6 +20,8 @@ from malta.identification.response import axes_of
 from malta.model.equilibrium import trim
 from malta.model.plant import Plant, outputs_at
 
+SAMPLES = 20_000  # of a simulated log: they tell a standard deviation to 1 %
+
 
 def process_noise(plant: Plant, log: Log) -> dict[str, Estimate]:
     """The standard deviation of the force of each input that noise of the measured currents makes in a sample.
@@ -67,28 +69,24 @@ def _slopes(plant: Plant, log: Log) -> FloatArray:
     return np.asarray(np.array(slope(at))[:, [known.index(name) for name in measured]])
 
 
-def dc_log(plant: Plant, controller: str, sample_time: float, *, seed: int, samples: int = 20_000) -> Log:
+def dc_log(plant: Plant, controller: str, sample_time: float, *, seed: int) -> Log:
     """The log of a simulated machine with 1 A dc through its phases: what their sensors read, and nothing else moves.
 
     plant : the machine, whose drive may have sensors of its currents: without these the log has no currents
     controller : name of the law
     sample_time : s
     seed : of the noise
-    samples : their number; 20 000 tell a standard deviation to 1 %
     """
-    random = np.random.default_rng(seed)
-    columns = {"y": random.normal(0, np.maximum(plant.noise, 1e-300), (samples, len(plant.outputs)))}
+    random, drive = np.random.default_rng(seed), plant.windings
+    columns = {"y": random.normal(0, np.maximum(plant.noise, 1e-300), (SAMPLES, len(plant.outputs)))}
     signals = {"y": plant.outputs}
-    sensors = None if plant.windings is None else plant.windings.sensors
-    if plant.windings is not None and sensors is not None:
-        i = (
-            1.0
-            + np.array(sensors.offset)
-            + random.normal(0, 1, (samples, len(sensors.offset))) * sensors.noise
-        )
+    if drive is not None and drive.sensors is not None:
+        sensors = drive.sensors
+        noise = sensors.noise * random.normal(size=(SAMPLES, len(drive.phases)))
+        i = 1.0 + np.array(sensors.offset) + noise
         columns["i"] = sensors.step * np.round(i / sensors.step) if sensors.step else i
-        signals["i"] = plant.windings.phases
-    t = sample_time * np.arange(samples)
+        signals["i"] = drive.phases
+    t = sample_time * np.arange(SAMPLES)
     return Log("run noise", plant.name, controller, sample_time, 0.0, t, columns, signals)
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -43,10 +43,8 @@ SPAN = 7  # readings: a reading's neighbours
 SPIKE = 20.0  # times the usual distance from the median of the neighbours
 OUTLIER = 6.0  # standard deviations
 SLOWEST = 20.0  # over the record's length, rad/s: with which the filter forgets the process noise at least
-STEP, MOST_STEPS = (
-    0.2,
-    32,
-)  # over the fastest pole: about a step of the integration; and steps of a sample at most
+STEP = 0.2  # over the fastest pole: about a step of the integration
+MOST_STEPS = 32  # of a sample
 EVEN = 1e-3  # of a sample, over the time constant of a current: what lags by less goes evenly
 BINS = 400  # between the lines, from which the process noise is found
 
@@ -209,11 +207,6 @@ def _equations(shape: _Shape) -> _Equations:
     return _Equations(numbers, value | error, x, ca.vertcat(i, after), slope, shares, read)
 
 
-def _between(q: _Equations, shares: Any, constant: Any) -> Callable[[Any, int], Any]:
-    """(states, half steps since its begin) -> x' in a step with these shares of the current."""
-    return lambda z, halves: q.slope(z, shares[halves]) + constant
-
-
 @lru_cache(maxsize=8)
 def _filter_loop(shape: _Shape) -> Loop:
     """(x; i_k, i_k+1, y, whether it is there; numbers, d, K, s, nu) -> x, (e, w, better x) of each sample."""
@@ -225,9 +218,13 @@ def _filter_loop(shape: _Shape) -> Loop:
     w = there * (nu + 1) / (nu + (e / s) ** 2)
     better = q.x + K @ (w * e)
     constant = ca.vertcat(ca.SX.zeros(half), d)
+
+    def rate(first: int, z: Any, halves: int) -> Any:
+        return q.slope(z, q.shares[first + halves]) + constant
+
     moved, step = better, shape.sample_time / shape.steps
     for k in range(0, 3 * shape.steps, 3):
-        moved = runge_kutta(_between(q, q.shares[k : k + 3], constant), moved, step, half)
+        moved = runge_kutta(partial(rate, k), moved, step, half)
     numbers = ca.vertcat(q.numbers, d, ca.vec(K), s, nu)
     return loop_of(q.x, ca.vertcat(q.ends, y, there), numbers, moved, ca.vertcat(e, w, better))
 
@@ -316,23 +313,21 @@ def current_shares(rate: float, Ts: float, steps: int) -> FloatArray:
     return np.append(f.ravel(), sums.mean())
 
 
-def _numbers(model: ResponseModel, theta: FloatArray, steps: int) -> FloatArray:
+def _numbers(s: _Search, theta: FloatArray) -> FloatArray:
     """The numbers of a machine, as `_Equations` has them."""
-    plant, par = model.plant, model.plant.parameters
+    model, plant, par = s.model, s.model.plant, s.model.plant.parameters
     own = dict(zip(model.names, theta.tolist(), strict=True))
     twins = twins_of(par)
     value = [own.get(n, own.get(twins.get(n, ""), float(getattr(par, n)))) for n in symbolic_names(par)]
     error = [own.get(signal.name, 0.0) for signal in plant.sensor_errors]
-    shares = current_shares(current_rate(plant), model.sample_time, steps)
+    shares = current_shares(current_rate(plant), model.sample_time, s.shape.steps)
     return np.array([*value, *error, *shares])
 
 
 def _fly(s: _Search, theta: FloatArray, d: FloatArray, x: FloatArray) -> _Flight:
     """Run the filter over the log from the state x."""
     p = s.y.shape[1]
-    numbers = np.concatenate(
-        [_numbers(s.model, theta, s.shape.steps), d, s.linear.K.T.ravel(), s.linear.s, [s.nu]]
-    )
+    numbers = np.concatenate([_numbers(s, theta), d, s.linear.K.T.ravel(), s.linear.s, [s.nu]])
     rows = _filter_loop(s.shape)(x, (s.i, s.after, s.y, s.there), numbers)
     if not np.isfinite(rows).all():
         raise FloatingPointError
@@ -373,9 +368,7 @@ def _slopes(s: _Search, modes: _Modes, theta: FloatArray, x: FloatArray) -> Floa
         np.concatenate([part.real, part.imag]) for part in (modes.values, modes.accelerated, modes.corrected)
     )
     seen = np.hstack([modes.seen.real, -modes.seen.imag])
-    numbers = np.concatenate(
-        [_numbers(s.model, theta, s.shape.steps), *(part.T.ravel() for part in (*stacked, seen))]
-    )
+    numbers = np.concatenate([_numbers(s, theta), *(part.T.ravel() for part in (*stacked, seen))])
     count, c = len(modes.values), len(theta)
     loop = _slope_loop(s.shape, s.model.names, count)
     return loop(np.zeros(2 * count * c), (s.i, s.after, x), numbers).reshape(len(x), -1, c)

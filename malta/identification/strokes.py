@@ -53,9 +53,7 @@ CHANCE = 2.0  # standard deviations, above which an error is more than noise
 ROUNDS = 4  # strokes of the gain file's own machine, without noise: they leave some 0.2^4 of its error
 TAKEN = 0.25  # of the thrust's limit, by a stroke of a machine without a rise of its own
 ROUGH = 20  # samples of its rise, at least
-LOGISTIC = (
-    2 * math.log(9) / math.sqrt(6 * math.sqrt(3))
-)  # rise (s) of a logistic move by 1 m with 1 m/s2 at most
+LOGISTIC = 2 * math.log(9) / 108**0.25  # s, rise of a logistic move by 1 m with 1 m/s2 at most
 LONGEST = 20_000  # samples of a stroke's log
 
 
@@ -315,7 +313,7 @@ def learn_strokes(
 
     The first stroke teaches the force constant (`learn`). The second one is sent what the gain file's own machine would
     miss with it, behind delay and current loops (`own_thrust`). Each from the second on teaches the thrust over time
-    that is missing still (`next_stroke`): cogging, what holds the mover on its way. Before each the mover rests 0.3 s.
+    that is missing still (`next_stroke`): cogging, what holds the mover on its way. Before each it rests (`stroke_of`).
 
     plant : the machine, which may differ from the gain file's
     controller : the gain file

@@ -216,13 +216,8 @@ def compensators(
         return own
     believed, weights = plant_of(controller.parameters), weights_of(controller)
     model = linearize(believed, believed.point(controller.operating_point[0]))
-    A, B, C, K, L = (
-        model.A,
-        model.B,
-        model.C,
-        lqr(model, weights, solver="scipy"),
-        kalman(model, weights, solver="scipy"),
-    )
+    A, B, C = model.A, model.B, model.C
+    K, L = lqr(model, weights, solver="scipy"), kalman(model, weights, solver="scipy")
     n, p, m = len(A), len(C), B.shape[1]
     half = believed.coordinates
     summed = integrals_of(model, weights).outputs

@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal, NamedTuple, cast
 
 from pydantic import Field as Checked, StrictStr
 
+from malta.arguments import is_number
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, locate, shipped_path
 from malta.model.checks import check_numbers, line_of
@@ -238,6 +239,9 @@ def _published_file(data_file: Path) -> Path:
     return alone if file_exists(alone) and not file_exists(of_its_name) else of_its_name
 
 
+MOST_DIGITS = 20  # of a published figure behind its point
+
+
 class PublishedFigure(NamedTuple):
     """A figure as a paper prints it."""
 
@@ -252,7 +256,7 @@ def published_figure(content: Mapping[str, Any], key: str) -> PublishedFigure:
     Its digits are those of the file; `digits` beside it, or in a table above it, counts decimals that end in zeros.
     `about = true` marks what the paper calls about, around or approximately so much.
 
-    Raises InputError when the key is missing, the entry is no number, or its unit is unknown.
+    Raises InputError when the key is missing, the entry is no finite number, or its unit or digits are none.
     """
     where, unit, digits, about = "data/published", None, None, False
     entry: Any = content
@@ -264,8 +268,10 @@ def published_figure(content: Mapping[str, Any], key: str) -> PublishedFigure:
     if isinstance(entry, Mapping):
         digits, about = entry.get("digits", digits), entry.get("about", False)
         unit, entry = entry.get("unit"), entry.get("value")
-    if isinstance(entry, bool) or not isinstance(entry, int | float) or not isinstance(unit, str):
+    if not is_number(entry) or not isinstance(unit, str):
         raise InputError(where, key, f"{entry!r} in {unit}", "a number with a unit")
+    if digits is not None and (type(digits) is not int or abs(digits) > MOST_DIGITS):
+        raise InputError(where, f"{key}.digits", repr(digits), f"decimals, at most {MOST_DIGITS}")
     factor = unit_factor(unit, f"{key}.unit")
     half = half_of_last_digit(repr(entry)) if digits is None else 0.5 * 10.0**-digits
     return PublishedFigure(float(entry) * factor, half * factor, about is True)

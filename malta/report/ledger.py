@@ -277,9 +277,9 @@ def _shown(row: Row, figure: float) -> str:
         return "–"
     if row.form == "proven":
         return at_least(figure).percent(unit="")
-    text = row.form.format(in_unit(figure, row.unit))
-    half = in_unit(figure.half, row.unit) if isinstance(figure, Chance) else None
-    return text if half is None else f"{text} ±{row.form.format(half)}"
+    value = _in_unit(figure, row.unit)
+    text = row.form.format(value)
+    return f"{text} ±{row.form.format(value.half)}" if isinstance(value, Chance) else text
 
 
 def _is_judged(row: Row, name: str, reproducing: Sequence[str]) -> bool:
@@ -326,15 +326,13 @@ def _comparison(row: Row, target: PublishedFigure, value: float) -> str:
         return "not compared"
     if math.isnan(value):
         return "not reproduced"
-    bound, agrees = target.value, is_reproduced(target, value)
-    if row.relation in ("at most", "at least"):
-        kept = value <= bound if row.relation == "at most" else value >= bound
-        distance = _distance(bound, value)
-        if kept:
-            return "reproduced" if agrees else distance
-        return f"not reproduced: {distance}"
-    if agrees:
+    bound, bounded = target.value, row.relation in ("at most", "at least")
+    if bounded and not (value <= bound if row.relation == "at most" else value >= bound):
+        return f"not reproduced: {_distance(bound, value)}"
+    if is_reproduced(target, value):
         return "reproduced"
+    if bounded:
+        return _distance(bound, value)
     off = abs(value / bound - 1) if bound else math.inf
     return f"within {math.ceil((off - ROUNDING) * 100)} %" if off <= NEAR + ROUNDING else "not reproduced"
 

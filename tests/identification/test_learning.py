@@ -14,6 +14,7 @@ from scipy.linalg import toeplitz
 import malta
 from malta.identification.excite import cut_loop
 from malta.identification.log import sample_excitation
+from malta.identification.log_files import write_log
 from malta.identification.measure import machines_of
 from malta.identification.strokes import ThrustPatterns, correction, thrust_patterns
 from malta.loops.loop import Loop
@@ -269,3 +270,19 @@ def test_what_the_next_stroke_is_sent_needs_a_stroke_of_this_law() -> None:
         )
     with pytest.raises(malta.CheckError, match="a log of machine rotor"):
         malta.identification.next_stroke(CONTROLLER, replace(log, machine="rotor"))
+
+
+def test_a_law_that_learned_no_constant_is_not_written(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A copy of the gain file would pass for a learned one, from a log and from strokes."""
+    log = malta.identification.log_of(
+        malta.simulate(malta.plant_of(CONTROLLER.parameters), CONTROLLER, malta.Scenario.stroke(10e-3))
+    )
+    monkeypatch.setattr("malta.identification.learn.thrust_constant", lambda _: "")
+    file = write_log(log, tmp_path / "log.npz")
+    for given in ((file,), ("--strokes", "1")):
+        refused = run("learn", "design/gains/robust.json", *given, "--out", tmp_path / "out")
+        assert refused.code == 2
+        assert "no parameter that scales the thrust alone" in refused.err
+        assert not (tmp_path / "out").exists()

@@ -112,6 +112,17 @@ def test_the_plan_expects_the_bands_that_are_found(plan: ExcitationPlan) -> None
         malta.identification.plan_measurement(LOOP, width=-1.0)
 
 
+def test_a_planned_width_is_that_of_the_excitation_that_flies() -> None:
+    """By default a longer flight is excited less: curvature is kept beside the noise."""
+    controller = malta.gains.read("design/gains/halbach.json")
+    loop = malta.loop(malta.plant_of(controller.parameters), controller)
+    width = malta.identification.plan_measurement(loop).worst / 2
+    planned = malta.identification.plan_measurement(loop, width=width)
+    flown = malta.excite(loop, periods=planned.excitations[0].periods)
+    assert flown.signal.amplitude == pytest.approx(planned.excitations[0].signal.amplitude, rel=1e-12)
+    assert planned.worst <= width * (1 + 1e-9)
+
+
 def test_the_verdict_is_of_the_tube(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measuring, "SAMPLES", 3)
     wide = malta.measure(CONTROLLER, log, uncertainty={"K_A": 0.1, "K_B": 0.1, "K_D": 0.1})

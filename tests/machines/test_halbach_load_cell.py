@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import malta
 from malta.machines.halbach import electronics
 from malta.machines.halbach.load_cell import CELL_NOISE, fit_motor_law, simulated_record
+from malta.machines.halbach.open_loop import identify
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import plant_of
 
@@ -83,6 +85,7 @@ X = np.linspace(0, 50e-3, 100)
         (X, CURRENTS[:2], record(X), "currents (2,)"),
         (X, CURRENTS, record(X)[:, :1], "forces (100, 1)"),
         (X, CURRENTS, record(X)[:50], "forces (50, 2)"),
+        (X[0], CURRENTS, record(X), "1 places, currents (3,), forces (100, 2)"),
         (X, 0 * CURRENTS, record(X), "no current"),
         (0 * X, CURRENTS, record(X), "one place"),
         (X, CURRENTS, record(X) * math.nan, "NaN"),
@@ -93,6 +96,18 @@ def test_bad_records_are_refused_in_one_sentence(x: Any, i: Any, F: Any, sentenc
         fit_motor_law(x, i, F)
     assert sentence in str(caught.value)
     assert str(caught.value).isprintable()
+
+
+def test_places_may_be_a_column() -> None:
+    assert fit_motor_law(X[:, None], CURRENTS, record(X)) == fit_motor_law(X, CURRENTS, record(X))
+
+
+def test_a_motor_that_the_noise_of_the_cell_hides_is_identified_without_its_law() -> None:
+    weak = plant_of(dataclasses.replace(PAR, A=1e-3))
+    e = identify(weak, malta.gains.read("design/gains/halbach.json"))
+    found = {merit.label: merit.value for merit in e.merits}
+    assert all(math.isnan(value) for label, value in found.items() if label.startswith("load cell"))
+    assert math.isfinite(found["secant stiffness"])
 
 
 def test_noise_is_no_motor() -> None:

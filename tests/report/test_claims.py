@@ -243,6 +243,28 @@ def test_printed_digits_are_those_of_the_file(entry: dict[str, Any], half: float
 
 
 @pytest.mark.parametrize(
+    ("entry", "sentence"),
+    [
+        (
+            {"value": math.nan, "unit": "N"},
+            "data/published: some.figure: found nan in N, expected a number with a unit",
+        ),
+        ({"value": math.inf, "unit": "N"}, "found inf in N"),
+        ({"value": True, "unit": "N"}, "found True in N"),
+        (
+            {"value": 2.0, "unit": "N", "digits": "2"},
+            "some.figure.digits: found '2', expected decimals, at most 20",
+        ),
+        ({"value": 2.0, "unit": "N", "digits": 400}, "found 400"),
+    ],
+)
+def test_a_figure_that_is_none_is_refused(entry: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(malta.InputError) as caught:
+        published_value({"some": {"figure": entry}}, "some.figure")
+    assert sentence in str(caught.value)
+
+
+@pytest.mark.parametrize(
     ("shown", "target", "printed", "half"),
     [
         ("±{:.2f} rad/s", 218.92, "±218.92", 0.005),

@@ -56,8 +56,8 @@ def fit_motor_law(x: FloatArray, i: FloatArray, F: FloatArray) -> MotorFit:
     """
     from scipy.optimize import minimize_scalar
 
-    x, F = np.asarray(x, dtype=float), np.asarray(F, dtype=float)
-    if not len(x) >= FEWEST or F.shape != (len(x), 2) or np.shape(i) not in ((3,), (len(x), 3)):
+    x, F = np.ravel(np.asarray(x, dtype=float)), np.asarray(F, dtype=float)
+    if len(x) < FEWEST or F.shape != (len(x), 2) or np.shape(i) not in ((3,), (len(x), 3)):
         found = f"{len(x)} places, currents {np.shape(i)}, forces {F.shape}"
         raise InputError("fit_motor_law", "x, i, F", found, f"n >= {FEWEST} places, (3,) or (n, 3), (n, 2)")
     force, current = F @ [1, 1j], np.asarray(i) @ [1, 1 / TURN, TURN] * np.ones(len(x))
@@ -71,9 +71,8 @@ def fit_motor_law(x: FloatArray, i: FloatArray, F: FloatArray) -> MotorFit:
     def response(k: float) -> complex:
         return complex(np.exp(-1j * k * (x - middle)) @ weighted) / energy
 
-    grid = (
-        np.arange(1, min(2 * len(x), 4 * TURNS)) * np.pi / 2 / span
-    )  # a quarter of a turn over the record apart
+    # A quarter of a turn over the record apart.
+    grid = np.arange(1, min(2 * len(x), 4 * TURNS)) * np.pi / 2 / span
     some = slice(None, None, -(-len(x) // (8 * TURNS)))  # of a long record, enough to begin with
     start = max(grid, key=lambda k: abs(np.exp(-1j * k * x[some]) @ weighted[some]))
     ends = start - grid[0], start + grid[0]

@@ -17,7 +17,7 @@ from malta.errors import CheckError, InputError
 from malta.linear.sampling import sample
 from malta.machines.halbach import electronics, electronics as motor
 from malta.machines.halbach.electronics import IDEAL, Options, Pwm
-from malta.machines.halbach.load_cell import FEWEST, NORMAL, fit_motor_law, simulated_record
+from malta.machines.halbach.load_cell import FEWEST, NORMAL, MotorFit, fit_motor_law, simulated_record
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
@@ -287,7 +287,7 @@ def identify(
     fitted = (
         servo_step(case.run.t, fit.m, fit.b, K, distance) if fit.m > 0 else np.full(len(linear), math.nan)
     )
-    law = fit_motor_law(*simulated_record(plant))
+    law = _fit_to_cell(plant)
     merits = (
         Merit("linear servo off by, rms", rms(off), "mm"),
         Merit(
@@ -326,6 +326,14 @@ def _fit_to_readings(run: Trajectory, distance: float, K: float) -> ServoFit:
         return fit_servo(run.t[::FASTER], run.y[::FASTER, 0], distance, K)
     except (CheckError, InputError):
         return ServoFit(*[math.nan] * 5)
+
+
+def _fit_to_cell(plant: Plant) -> MotorFit:
+    """The motor law fitted to a simulated record of a load cell; NaN where the cell's noise hides it."""
+    try:
+        return fit_motor_law(*simulated_record(plant))
+    except CheckError:
+        return MotorFit(*[math.nan] * 8)
 
 
 class ServoFit(NamedTuple):

@@ -332,7 +332,7 @@ def jump(
     by_table = with_coil_model(controller, "table", cells)
     laws = {f"table, {DESIGNED}": by_table, f"table, {LINEAR}": replace(by_table, braking=np.zeros(0))}
     laws |= {f"{model}, {SOFT}": with_coil_model(soft, model, cells) for model in MODELS}
-    cases, cut = _fly_laws(plant, laws, scenario, progress, options)
+    cases, cut = fly_all(_jumps_of(plant, laws, scenario), progress, options)
     merits = tuple(
         Merit(f"rate of approach in {name}", value, "1/s") for name, value in zip("yz", rates, strict=True)
     )
@@ -345,20 +345,15 @@ def soft_jumps(plant: Plant, controller: Controller, *, rate: float = 0.0, **opt
     scenario = scenario_of("jump", DURATION, reference, FORCES | options)
     soft = soften(controller, plant, (rate, rate) if rate else braking_rates(plant, DISTANCE, LIFT))
     laws = {f"{model}, {SOFT}": with_coil_model(soft, model) for model in ("analytical", "table")}
-    cases, cut = _fly_laws(plant, laws, scenario, None, options)
+    cases, cut = fly_all(_jumps_of(plant, laws, scenario), None, options)
     return Experiment("jump", "What do the coil models leave of jumps?", cases, (), interrupted=cut)
 
 
-def _fly_laws(
-    plant: Plant,
-    laws: Mapping[str, Controller],
-    scenario: Scenario,
-    progress: Progress | None,
-    options: Mapping[str, Any],
-) -> tuple[tuple[Case, ...], bool]:
-    """Fly the jumps with laws by their labels."""
-    flights = [(plant, law, PlannedRun(label, scenario, jump_merits)) for label, law in laws.items()]
-    return fly_all(flights, progress, options)
+def _jumps_of(
+    plant: Plant, laws: Mapping[str, Controller], scenario: Scenario
+) -> list[tuple[Plant, Controller, PlannedRun]]:
+    """The jumps with laws by their labels."""
+    return [(plant, law, PlannedRun(label, scenario, jump_merits)) for label, law in laws.items()]
 
 
 def braking_rates(plant: Plant, distance: float, lift: float) -> tuple[float, float]:

@@ -188,7 +188,7 @@ def jump_ratio(e: Evidence) -> float:
 
 def extremes_within(model: str, key: str, e: Evidence) -> float:
     """How many of the extremes of `_ranges` are within those that the paper prints."""
-    rows = _ranges(model, key, "", "")
+    rows = _ranges(model, key)
     printed = [published_value(e.published, str(row.published)) for row in rows]
     return sum(
         row.value(e) <= p if row.relation == "at most" else row.value(e) >= p
@@ -363,36 +363,35 @@ TABLE: tuple[Row, ...] = (
 
 
 PITCH = "the paper prints no coil pitch"
+HOUR = (
+    "ours sums 22 harmonics of an endless array's field at one place; the paper's hour is a finite-element "
+    "model's, whose mesh and number of places it does not print"
+)
 MOVER: tuple[Row, ...] = (
     Row("condition of K(p), at most", "{:.2f}", partial(condition, 16 / 3), note=f"16/3 τ_n; {PITCH}"),
     Row("the same with 14/3 τ_n", "{:.2f}", partial(condition, 14 / 3), note=PITCH),
     Row("the same with 22/3 τ_n", "{:.2f}", partial(condition, WIDE), note="wider than the plate"),
     Row("the same with 4 τ_n", "{:.0f}", partial(condition, 4.0), note="all coils in phase: singular"),
     Row("K K⁺ W − W over W, at most", "{:.0e}", residual, note="over a period at the working height"),
-    Row(
-        "K(p) and pseudo-inverse, table",
-        "{:.1f} us",
-        partial(merit, "timing", "table, compiled"),
-        "table_2.interpolation",
-        "beside",
-        note="compiled, on this computer; the paper's on an NI PXI-1042Q",
-    ),
-    Row(
-        "K(p) and pseudo-inverse, analytical",
-        "{:.1f} us",
-        partial(merit, "timing", "analytical, compiled"),
-        "table_2.analytical",
-        "beside",
-        note="on another computer, as above",
-    ),
-    Row(
-        "K(p) and pseudo-inverse, exact field",
-        "{:.0e} s",
-        partial(merit, "timing", "exact, compiled"),
-        "table_2.fem",
-        "beside",
-        note="ours sums 22 harmonics of an endless array's field at one place; the paper's hour is a finite-element "
-        "model's, whose mesh and number of places it does not print",
+    *(
+        Row(
+            f"K(p) and pseudo-inverse, {text}",
+            shown,
+            partial(merit, "timing", f"{text.partition(' ')[0]}, compiled"),
+            f"table_2.{key}",
+            "beside",
+            note=note,
+        )
+        for text, shown, key, note in (
+            (
+                "table",
+                "{:.1f} us",
+                "interpolation",
+                "compiled, on this computer; the paper's on an NI PXI-1042Q",
+            ),
+            ("analytical", "{:.1f} us", "analytical", "on another computer, as above"),
+            ("exact field", "{:.0e} s", "fem", HOUR),
+        )
     ),
     Row(
         "K(p) and pseudo-inverse with filter and law, table",
@@ -488,31 +487,17 @@ def _jump_rows() -> list[Row]:
     """Rows of the steps as the paper commands them: jumps that saturate."""
     last = partial(case_merit, "jump")
     found = [
-        Row(
-            f"jumps, {DESIGNED}: y within 10 µm after",
-            "{:.1f} ms",
-            partial(last, f"table, {DESIGNED}", "y within 10 um after its step"),
-            note=BRAKES,
-        ),
-        Row(
-            f"jumps, {DESIGNED}: y, overshoot",
-            "{:.1f} um",
-            partial(last, f"table, {DESIGNED}", "y, overshoot"),
-        ),
-        Row(
-            f"jumps, {LINEAR}: y off at 0.1 s",
-            "{:.2f} mm",
-            partial(last, f"table, {LINEAR}", "y, left at the end"),
-            note=SWINGS,
-        ),
-        *(
-            Row(f"jumps, {SOFT}: {text}", "{:.1f} um", partial(last, f"table, {SOFT}", label), note=note)
-            for text, label, note in (
-                ("y off at 0.1 s", "y, left at the end", SLOW),
-                ("y, overshoot", "y, overshoot", ""),
-                ("z off at 0.1 s", "z, left at the end", ""),
-            )
-        ),
+        Row(f"jumps, {law}: {text}", shown, partial(last, f"table, {law}", label), note=note)
+        for law, text, shown, label, note in (
+            (DESIGNED, "y within 10 µm after", "{:.1f} ms", "y within 10 um after its step", BRAKES),
+            (DESIGNED, "y, overshoot", "{:.1f} um", "y, overshoot", ""),
+            (LINEAR, "y off at 0.1 s", "{:.2f} mm", "y, left at the end", SWINGS),
+            (SOFT, "y off at 0.1 s", "{:.1f} um", "y, left at the end", SLOW),
+            (SOFT, "y, overshoot", "{:.1f} um", "y, overshoot", ""),
+            (SOFT, "z off at 0.1 s", "{:.1f} um", "z, left at the end", ""),
+        )
+    ]
+    found.append(
         Row(
             f"jumps, {SOFT}: largest force",
             "{:.0f} N",
@@ -520,10 +505,11 @@ def _jump_rows() -> list[Row]:
             "steps.force_limit",
             note="an input: commands are limited there, and reach it as the paper's do",
             by_construction=True,
-        ),
-    ]
-    for model, key, why in (("analytical", "analytical", RECTANGLES), ("table", "interpolation", MISSING)):
-        found += _ranges(f"{model}, {SOFT}, {AT_ONCE}", key, "jumps, ", why)
+        )
+    )
+    keys = {"analytical": "analytical", "table": "interpolation"}
+    for model, why in (("analytical", RECTANGLES), ("table", MISSING)):
+        found += [row._replace(why=why) for row in _ranges(f"{model}, {SOFT}, {AT_ONCE}", keys[model])]
     found += [
         Row(
             f"jumps, {model}: of 16 extremes within the paper's",
@@ -537,9 +523,8 @@ def _jump_rows() -> list[Row]:
             (f"table, {SOFT}", LATE),
         )
     ]
-    for model, key in (("analytical", "analytical"), ("table", "interpolation")):
-        rows = _ranges(f"{model}, {SOFT}", key, "jumps, ", "")
-        found += [row._replace(relation="beside", note=LATE) for row in rows]
+    for model, key in keys.items():
+        found += [row._replace(relation="beside", note=LATE) for row in _ranges(f"{model}, {SOFT}", key)]
     found += [
         Row(
             f"jumps, {model}, {SLOWER}: T_x, {side}",
@@ -547,7 +532,7 @@ def _jump_rows() -> list[Row]:
             partial(extreme, f"{model}, {SOFT}, {SLOWER}", "T_x", "v", of),
             note=SLOWEST,
         )
-        for model in ("analytical", "table")
+        for model in keys
         for side, of in (("lowest", np.min), ("highest", np.max))
     ]
     found.append(
@@ -566,26 +551,19 @@ def _jump_rows() -> list[Row]:
 DEVIATIONS = (("x", "um"), ("phi", "urad"), ("theta", "urad"), ("psi", "urad"))
 
 
-def _ranges(model: str, key: str, start: str, why: str) -> list[Row]:
-    """Rows of all deviations and forces of a flight whose range the paper prints; subjects begin with `start`."""
-    found = [row for name, unit in DEVIATIONS for row in _range(model, key, name, unit, "p", start, why)]
-    loads = (("F_x", "N"), *WRENCH[3:])
-    return found + [row for name, unit in loads for row in _range(model, key, name, unit, "v", start, why)]
-
-
-def _range(model: str, key: str, name: str, unit: str, series: str, start: str, why: str) -> list[Row]:
-    """Rows of the lowest and the highest value of a deviation or a force: ours within the paper's."""
-    sides = (("lowest", "at least", np.min), ("highest", "at most", np.max))
+def _ranges(model: str, key: str) -> list[Row]:
+    """Rows of the lowest and the highest of each deviation and force whose range the paper prints: ours within it."""
     return [
         Row(
-            f"{start}{model}: {name}, {side}",
+            f"jumps, {model}: {name}, {side}",
             f"{{:.3f}} {unit}",
             partial(extreme, model, name, series, of),
             f"steps.{key}.{side}.{name}",
             relation,
-            why=why,
         )
-        for side, relation, of in sides
+        for series, signals in (("p", DEVIATIONS), ("v", (("F_x", "N"), *WRENCH[3:])))
+        for name, unit in signals
+        for side, relation, of in (("lowest", "at least", np.min), ("highest", "at most", np.max))
     ]
 
 

@@ -35,10 +35,10 @@ from malta.identification.commission import (
     judge_noise,
     loop_step,
     noise_step,
+    record_noise,
     stroke_step,
 )
 from malta.identification.log import Log
-from malta.identification.noise import dc_log
 from malta.machines.tubular.drive import hall_signals
 from malta.machines.tubular.experiments.lifting import lift_cases, rest_on_bearing
 from malta.model.data import plant_of
@@ -124,7 +124,7 @@ def _record_dc(bench: Bench) -> Log:
     """
     par: Any = bench.controller.parameters
     if bench.truth.drive.sensors is None:
-        return dc_log(bench.truth, bench.controller.name, bench.controller.sample_time, seed=bench.seed)
+        return record_noise(bench)
     push = np.array([0.0, -par.K_B, 0.0, -par.K_B, 0.0])
     return part_of_log(
         _on_bearing(bench, "noise", 1.0 + SETTLED, lambda t: np.tile(push, (len(t), 1))),

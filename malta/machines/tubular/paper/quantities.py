@@ -91,6 +91,7 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
     without = replace(controller, feedforward=replace(controller.feedforward, v0=v0))
     slow = simulate(plant, without, Scenario("stroke", 0.4, partial(delayed_stroke, wait=0.0)))
     machines = MACHINES if compiler() else FEW
+    fewer = round(FEWER * machines)
     return Evidence(
         spec,
         model,
@@ -103,10 +104,8 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
         published_value(published, "thermal.length") * published_value(published, "thermal.strain"),
         published,
         fly_strokes(controller, spec, published, machines=machines, settle=True),
-        fly_strokes(controller, spec, published, machines=round(FEWER * machines), settle=False),
-        fly_strokes(
-            with_inertia(controller, PUSH), spec, published, machines=round(FEWER * machines), settle=True
-        ),
+        fly_strokes(controller, spec, published, machines=fewer, settle=False),
+        fly_strokes(with_inertia(controller, PUSH), spec, published, machines=fewer, settle=True),
         rests_of_seeds(plant, controller, range(SEEDS)),
         rests_of_seeds(with_noise_of_currents(plant), controller, range(SEEDS)),
         flights_of_seeds(plant, controller, range(FLIGHTS)),
@@ -391,14 +390,9 @@ def axis_coupling(e: Evidence) -> float:
     return worst
 
 
-def unstable_pole(e: Evidence) -> float:
-    """The largest unstable pole of the design model, rad/s."""
-    return float(e.model.sys.poles().real.max())
-
-
 def bandwidth_over_pole(definition: str, e: Evidence) -> float:
-    """The bandwidth by one of the definitions in BANDWIDTHS over the largest unstable pole."""
-    return bandwidth(definition, e) / unstable_pole(e)
+    """The bandwidth by one of the definitions in BANDWIDTHS over the largest unstable pole of the design model."""
+    return bandwidth(definition, e) / float(e.model.sys.poles().real.max())
 
 
 def braking_power(e: Evidence) -> float:
