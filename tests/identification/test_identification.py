@@ -175,7 +175,8 @@ def test_the_order_of_columns_does_not_matter(log: Log, found: Identified) -> No
     signals = {group: tuple(log.signals[group][k] for k in order) for group, order in turned.items()}
     other = replace(log, columns={**log.columns, **columns}, signals={**log.signals, **signals})
     same = malta.identify(CONTROLLER, other, parameters=ASKED, in_time=False)
-    assert same.values == pytest.approx(found.values, rel=1e-6)
+    # Sums in another order end the least squares, whose slopes are differences, a thousandth of a deviation away.
+    assert same.values == pytest.approx(found.values, rel=1e-5)
     assert malta.identification.replay_law(CONTROLLER, other).same
     lines = malta.measure(CONTROLLER, other).w
     assert len(lines) == len(malta.measure(CONTROLLER, log).w)
@@ -416,7 +417,9 @@ def test_a_replay_refuses_what_its_law_did_not_fly() -> None:
     log = logs[0]
     assert malta.identification.replay_law(CONTROLLER, log).refusal == ""
     coloured = malta.identification.replay_law(CONTROLLER, logs[1])
-    assert "not as white as that of the gain file's machine: autocovariances differ by 0." in coloured.refusal
+    assert (
+        "not as white as that of the gain file's machine: autocorrelations differ by 0." in coloured.refusal
+    )
     holes = np.array(log.columns["y"])
     holes[7, 1] = np.nan
     for text, bad in {
