@@ -139,12 +139,17 @@ class Measurement:
 
     @property
     def refusal(self) -> str:
-        """Why the machine is not as predicted: another law, or |S| or |T| outside of the tube; "": it is."""
+        """Why the machine is not as predicted: another law, or |S| or |T| outside of the tube; "": it is.
+
+        Without a box there is no tube: a machine is never exactly that of the gain file.
+        """
         if self.law > SAME_LAW:
             return (
                 f"another law flew, or at its limits: commands at the lines miss those of the gain file by "
                 f"{100 * self.law:.2g} %"
             )
+        if not self.box:
+            return ""
         off = {name: getattr(self, name).outside(self.factor) for name in ("S", "T")}
         name = max(off, key=lambda key: float(off[key].max()))
         k, i = np.unravel_index(int(off[name].argmax()), off[name].shape)
