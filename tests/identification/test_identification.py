@@ -417,7 +417,6 @@ def test_a_replay_refuses_what_its_law_did_not_fly() -> None:
     log = logs[0]
     assert malta.identification.replay_law(CONTROLLER, log).refusal == ""
     assert malta.identification.replay_law(CONTROLLER, logs[1]).refusal == ""
-    )
     holes = np.array(log.columns["y"])
     holes[7, 1] = np.nan
     for text, bad in {
