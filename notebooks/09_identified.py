@@ -95,7 +95,7 @@ display(
 
 # %%
 joint = {name: found.joint * share for name, share in zip(names, shares.tolist(), strict=True)}
-as_believed = malta.measure(controller, log, uncertainty=joint)
+as_believed = malta.measure(controller, log)
 measured = malta.measure(controller, log, parameters=found.plant.parameters, uncertainty=joint)
 display(measured, measured_figure(measured))
 assert as_believed.refusal

@@ -35,6 +35,7 @@ from malta.synthesis.controller import Controller
 SAME_LAW = 0.02  # of a command at the lines, by which the law of the gain file may miss it
 SAMPLES = 32  # machines at random in the box, beside its corners
 NARROW = 0.03  # of its width, by which a sampled tube may be too narrow on either side
+NEAR = 0.02  # of a predicted magnitude without a tube, by which a linear loop may miss the machine
 CORNERS = 6  # parameters of which all corners are taken
 
 
@@ -65,7 +66,9 @@ class Curve(NamedTuple):
 
     def outside(self, factor: float) -> FloatArray:
         """By how many bands the magnitude is outside of the tube, above 0 where it is; `factor` deviations a band."""
-        off = np.maximum(self.low - self.size, self.size - self.high) - NARROW * (self.high - self.low)
+        width = self.high - self.low
+        room = np.where(width > 0, NARROW * width, NEAR * self.high)
+        off = np.maximum(self.low - self.size, self.size - self.high) - room
         return np.asarray(off / np.maximum(factor * self.deviation, 1e-300) - 1)
 
 
@@ -139,17 +142,12 @@ class Measurement:
 
     @property
     def refusal(self) -> str:
-        """Why the machine is not as predicted: another law, or |S| or |T| outside of the tube; "": it is.
-
-        Without a box there is no tube: a machine is never exactly that of the gain file.
-        """
+        """Why the machine is not as predicted: another law, or |S| or |T| outside of the tube; "": it is."""
         if self.law > SAME_LAW:
             return (
                 f"another law flew, or at its limits: commands at the lines miss those of the gain file by "
                 f"{100 * self.law:.2g} %"
             )
-        if not self.box:
-            return ""
         off = {name: getattr(self, name).outside(self.factor) for name in ("S", "T")}
         name = max(off, key=lambda key: float(off[key].max()))
         k, i = np.unravel_index(int(off[name].argmax()), off[name].shape)

@@ -44,6 +44,7 @@ SETTLED = 0.5  # of a log, after which the start of the filter is forgotten
 LAGS = 20  # samples, over which innovations are tested
 LARGER = 1.2  # times the innovations of the gain file's own machine, beyond which the log's are refused
 ALIKE = 0.1  # by which autocorrelations of both may differ, and 6 standard deviations where that is more
+STILL = 0.1  # of what noise makes of an innovation: one that is as near to that without noise has none
 STEP = 0.01  # of a parameter, by which the machine is moved to see what that changes
 SEED = 1  # of the noise of the gain file's own machine: not that of a simulated log
 
@@ -62,8 +63,8 @@ class LawReplay:
     whiteness : by output: the largest autocorrelation of the innovation over 20 samples, in standard deviations
     same : whether all commands are the logged ones, but for rounding
     own : by output: rms of the innovation of the gain file's own machine on this reference and excitation, SI
-    unlike : by output: by how much an autocovariance of the innovation differs from that one's, at most, over the
-        larger of both variances; without what noise can explain that a quieter log lacks
+    unlike : by output: by how much an autocorrelation of the innovation differs from that one's, at most; 0 where the
+        innovation is that of this machine without noise
     allowed : of `unlike`, from the number of samples
     explained : where the innovations are refused, by parameter: its change as a share of its value, and the share of
         their power beyond the own machine's that this explains
@@ -114,7 +115,7 @@ class LawReplay:
         name = max(self.unlike, key=lambda n: self.unlike[n])
         if self.unlike[name] > self.allowed:
             return (
-                f"the innovation of {name} is not as white as that of the gain file's machine: autocovariances differ "
+                f"the innovation of {name} is not as white as that of the gain file's machine: autocorrelations differ "
                 f"by {self.unlike[name]:.2g}, at most {self.allowed:.2g} is noise"
             )
         return ""
@@ -176,12 +177,11 @@ def replay_law(controller: Controller, log: Log, *, same: bool | None = None) ->
     rms = np.sqrt((late**2).mean(axis=0))
     twin = _Twin(controller, log, (simulation, inputs)) if same else None
     own = late if twin is None else twin.innovation(plant, noise=1.0)[half:]
-    powers = [part.var(axis=0)[:, None] for part in (late, own)]
-    parts = [_autocorrelations(part) * power for part, power in zip((late, own), powers, strict=True)]
-    # Noise that a quieter log lacks, as one of a simulation without it, has an autocovariance of its power at most.
-    lacking = np.maximum(powers[1] - powers[0], 0.0)
-    beyond = np.maximum(np.abs(parts[0] - parts[1]) - lacking, 0.0)
-    unlike = (beyond / np.maximum(np.maximum(*powers), 1e-300)).max(axis=1)
+    unlike = np.abs(_autocorrelations(late) - _autocorrelations(own)).max(axis=1)
+    allowed = max(ALIKE, 6 * float(np.sqrt(2 / len(late))))
+    if twin is not None and (unlike > allowed).any():  # or a flight without noise, as simulations have
+        still = twin.innovation(plant, noise=0.0)[half:]
+        unlike[(late - still).std(axis=0) <= STILL * own.std(axis=0)] = 0.0
     found = LawReplay(
         commands,
         innovation,
@@ -193,7 +193,7 @@ def replay_law(controller: Controller, log: Log, *, same: bool | None = None) ->
         same=same,
         own=dict(zip(names, np.maximum(np.sqrt((own**2).mean(axis=0)), 1e-300).tolist(), strict=True)),
         unlike=dict(zip(names, unlike.tolist(), strict=True)),
-        allowed=max(ALIKE, 6 * float(np.sqrt(2 / len(late)))),
+        allowed=allowed,
         explained={},
     )
     if twin is None or not found.doubt:
