@@ -24,12 +24,10 @@ from malta.model.linearize import LinearModel, linearize
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import Noisy, covariance, filter_gain, innovations, intensities, sampled_noise
-from malta.synthesis.riccati import care
+from malta.synthesis.riccati import EPS, care, lyapunov
 from malta.synthesis.schedule import point_at
 from malta.synthesis.spec import Spec
 
-EPS = float(np.finfo(float).eps)
-DOUBLINGS = 40  # sums of 2^40 samples
 SETTLED = 1e-10  # of a covariance: what may be left of where it began
 SAMPLES = 20_000  # at most, some seconds; what is left then is allowed
 ALLOWED = 1e-7  # of the gain, in units in which covariances are of one size
@@ -80,8 +78,8 @@ def check_filter(spec: Spec, model: LinearModel, controller: Controller) -> Filt
 def _check_one(spec: Spec, model: LinearModel, L: FloatArray) -> FilterCheck:
     n, weights, Ts = len(model.A), spec.weights, spec.sample_time
     continuous = spec.discretization == "backward-euler"
-    A, W, along = intensities(model, weights)
     if continuous:
+        A, W, along = intensities(model, weights)
         V = np.diag(weights.sensor_variance)
         P, K, _ = care(A.T, model.C.T, W, V, "Kalman filter")
         noisy = _sampled_alike(A, model.C, W, V, eigenvalues(A - K.T @ model.C))
@@ -126,10 +124,7 @@ def _patience(noisy: Noisy, P: FloatArray) -> tuple[int, float]:
     slowest = float(np.abs(eigenvalues(closed)).max())
     samples = min(math.ceil(math.log(SETTLED) / (2 * math.log(max(slowest, 0.5)))), SAMPLES)
     left = size(np.linalg.matrix_power(closed, samples)) ** 2 * size(one - P)
-    kept, power = one, closed
-    for _ in range(DOUBLINGS):
-        kept, power = kept + power @ kept @ power.T, power @ power
-    rounding = EPS * size(kept) * size(noisy.F) ** 2 * size(P)
+    rounding = EPS * size(lyapunov(closed.T, one, discrete=True)) * size(noisy.F) ** 2 * size(P)
     moved = size(np.linalg.solve(innovations(noisy, P), noisy.H)) / np.abs(K).max()
     return samples, float(ALLOWED + 10 * moved * (left + rounding))
 
@@ -155,9 +150,9 @@ def _sampled_alike(A: FloatArray, C: FloatArray, W: FloatArray, V: FloatArray, p
 
     poles : of the continuous filter, rad/s: the rate is amid them, and no pole of the machine
     """
-    size, one = np.abs(poles), np.eye(len(A))
+    size, own, one = np.abs(poles), eigenvalues(A), np.eye(len(A))
     rates = np.sqrt(size.max() * size.min()) * np.array([1.0, 1.1, 1.2, 1.3])
-    rate = max(rates, key=lambda one: np.abs(eigenvalues(A) / one - 1).min())
+    rate = max(rates, key=lambda rate: np.abs(own / rate - 1).min())
     back = np.linalg.inv(one - A / rate)
     pushed = back @ W @ back.T / rate
     H, R = np.sqrt(2) * C @ back, rate * V + C @ pushed @ C.T

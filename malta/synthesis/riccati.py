@@ -265,6 +265,8 @@ def _compare(given: _Found, found: _Found, solver: Solver) -> None:
     if found is given:
         return
     apart = np.linalg.norm(given.X - found.X, 2) / np.linalg.norm(found.X, 2)
+    if apart <= GIVEN:  # a condition is 1 or more
+        return
     allowed = GIVEN * _condition(found)
     if not apart <= allowed:
         said = f"the solution of {solver} is {apart:.1e} from its refinement"
@@ -280,7 +282,7 @@ def _condition(found: _Found) -> float:
     A, B, Q, R, _, _, discrete = found.equation
     X, closed = found.X, found.closed
     size = partial(np.linalg.norm, ord=2)
-    back = size(_lyapunov(closed, np.eye(len(A)), discrete=discrete))
+    back = size(lyapunov(closed, np.eye(len(A)), discrete=discrete))
     pushed = size(B @ np.linalg.solve(R + discrete * B.T @ X @ B, B.T)) * size(X)
     terms = (1 + size(A)) ** 2 + pushed * size(closed) ** 2 if discrete else 2 * size(A) + pushed
     return float(back * (terms + size(Q) / size(X)))
@@ -298,7 +300,7 @@ def _refine(found: _Found) -> _Found:
         X, K = best.X, best.K
         F = A - discrete * np.eye(len(A)) - B @ K  # of x+ - x: its products with X are as small as Q
         left = F.T @ X + X @ F + K.T @ R @ K + Q + discrete * F.T @ X @ F
-        better = _evaluate(found.equation, X + _lyapunov(best.closed, _symmetric(left), discrete=discrete))
+        better = _evaluate(found.equation, X + lyapunov(best.closed, _symmetric(left), discrete=discrete))
         if not better.residual < best.residual:  # or NaN
             break
         best = better
@@ -309,15 +311,15 @@ def _stands(found: _Found) -> bool:
     """Whether the closed loop stays stable when rounding moves it: rounding of A - B K, and of Q through X and K."""
     A, B, Q, R, _, _, discrete = found.equation
     size, closed = np.linalg.norm, found.closed
-    P = size(_lyapunov(closed, np.eye(len(A)), discrete=discrete))
-    dX = size(_lyapunov(closed, np.diag(np.abs(Q).sum(1)), discrete=discrete))  # zeros of Q are exact
+    P = size(lyapunov(closed, np.eye(len(A)), discrete=discrete))
+    dX = size(lyapunov(closed, np.diag(np.abs(Q).sum(1)), discrete=discrete))  # zeros of Q are exact
     held = size(closed) if discrete else 1.0
     G = B @ np.linalg.solve(R + discrete * B.T @ found.X @ B, B.T)
     moved = EPS * (size(A) + size(B) * size(found.K) + size(G) * dX * held)
     return bool(2 * moved * held * P < 1)
 
 
-def _lyapunov(F: FloatArray, M: FloatArray, *, discrete: bool) -> FloatArray:
+def lyapunov(F: FloatArray, M: FloatArray, *, discrete: bool) -> FloatArray:
     """P of F'PF - P + M = 0, or of F'P + PF + M = 0: the sum of F'^k M F^k, doubled (Smith, 1968).
 
     Infinite or NaN where F is not stable.

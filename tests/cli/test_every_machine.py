@@ -149,14 +149,18 @@ def test_every_machine_has_a_checklist(name: str, shipped: Any, run: Run) -> Non
     assert [step.name for step in general_steps(plant, {})][:2] == ["still", "noise"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", DESIGNS)
-def test_the_bench_of_every_machine(
-    name: str, shipped: Any, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """excite, log, identify, replay and measure on their defaults: a machine is found in its own log."""
+@pytest.fixture
+def few_machines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tubes of `measure` by four machines in the box: their width is another test's."""
     monkeypatch.setattr(measuring, "SAMPLES", 4)
     monkeypatch.setattr(measuring, "CORNERS", 0)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_machines")
+@pytest.mark.parametrize("name", DESIGNS)
+def test_the_bench_of_every_machine(name: str, shipped: Any, run: Run, tmp_path: Path) -> None:
+    """excite, log, identify, replay and measure on their defaults: a machine is found in its own log."""
     one, log = shipped(name), tmp_path / "excited.npz"
     assert run("excite", one.gains, *one.machine, "--log", log).code == 0
     looked = run("log", log, "--json")
@@ -180,13 +184,10 @@ def test_the_bench_of_every_machine(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_machines")
 @pytest.mark.parametrize("name", DESIGNS)
-def test_the_first_day_of_every_machine(
-    name: str, shipped: Any, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_first_day_of_every_machine(name: str, shipped: Any, run: Run, tmp_path: Path) -> None:
     """commission, then learn from its stroke: the gain file's own machine passes, with the thrust that is expected."""
-    monkeypatch.setattr(measuring, "SAMPLES", 4)
-    monkeypatch.setattr(measuring, "CORNERS", 0)
     one = shipped(name)
     said = run("commission", one.gains, *one.machine, "--out", tmp_path, "--json")
     document = json.loads(said.out)
