@@ -349,7 +349,7 @@ def test_a_touchdown_as_probable_as_by_plain_sampling() -> None:
 def test_noise_alone_is_as_probable_as_by_plain_sampling() -> None:
     """No parameter varies; 0.3545 um along x1 in 50 ms at rest, in one run of a thousand."""
     options = {"fidelity": "force", "duration": 0.05}
-    controller = gains.read("design/gains/calibrated.json")
+    controller = gains.read("design/gains/calibrated_slow.json")
     plan = Plan(controller, "hold", {"m": 0.0}, samples=50_000, seed=99, options=options)
     limit = limit_of(plan, "deviation-x1", 0.3545e-6)
     plain = float((limit.severity(campaign(plan).batch) >= 1).mean())

@@ -71,7 +71,7 @@ def test_machines_without_an_experiment_of_it() -> None:
 
 @pytest.mark.slow
 def test_verify_calls_a_mass_margin_by_its_name(run: Run) -> None:
-    code, out, _ = run("verify", "design/gains/calibrated.json", "--no-worst-case")
+    code, out, _ = run("verify", "design/gains/calibrated_slow.json", "--no-worst-case")
     assert code == 0
     shown = {
         name: [float(number) for number in re.findall(r"[\d.]+", line.partition(name)[2])]
