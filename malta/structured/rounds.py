@@ -195,8 +195,9 @@ def target_of(
 
         m, p = len(plant.inputs), len(plant.outputs)
         nothing = control.ss([[0.0]], np.zeros((1, p)), np.zeros((m, 1)), np.zeros((m, p)), sample_time)
+        stroke = plant.stroke
         own = (
-            [{plant.stroke: share * plant.travel} for share in (0.0, 1.0, -1.0)] if plant.has_stroke else [{}]
+            [{stroke.name: share * stroke.travel} for share in (0.0, 1.0, -1.0)] if plant.has_stroke else [{}]
         )
         zero = controller_of(nothing, plant, name="nothing")
         return Machine(plant, sample_time, tuple(own if places is None else places), zero)

@@ -296,7 +296,7 @@ def test_parameters_of_no_such_form_are_left_to_places() -> None:
     plant = plant_of(controller.parameters)
     of = model_of(plant, plant, ("coil_pitch",))
     with pytest.raises(NotAnalytic):
-        held_machine(of, ("coil_pitch",), np.array([0.04]), (-plant.travel, plant.travel))
+        held_machine(of, ("coil_pitch",), np.array([0.04]), (-plant.stroke.travel, plant.stroke.travel))
 
 
 def test_at_a_position_the_bounds_are_narrower() -> None:
