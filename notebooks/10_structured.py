@@ -22,7 +22,7 @@ from malta import structured
 from malta.structured.loops import to_plane
 from malta.structured.riccati import split_integrals, truncate
 from malta.synthesis.controller import linear_law
-from malta.synthesis.state_space import System
+from malta.linear.system import System
 from malta.synthesis.structure import sample_law
 
 # The project's root, wherever Jupyter was started.

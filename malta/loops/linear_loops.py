@@ -28,7 +28,8 @@ from malta.loops.loop import Loop, loop_along, loop_from
 from malta.model.plant import Plant, Signal
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, LinearLaw, linear_law
-from malta.synthesis.state_space import System, balanced_units, named_system, reference_names, set_point
+from malta.linear.system import System, balanced_units
+from malta.synthesis.state_space import named_system, reference_names, set_point
 
 # The loop of a machine and a controller as systems of python-control: to plot, to simulate, to compute with.
 #

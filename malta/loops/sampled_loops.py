@@ -49,7 +49,7 @@ from malta.model.plant import OperatingPoint, Plant, off_stroke, position_in, wh
 from malta.model.signals import with_lags
 from malta.synthesis.controller import Controller, LinearLaw, law_at, linear_law, with_readings, with_slope
 from malta.synthesis.recovery import StepResponse, step_response
-from malta.synthesis.state_space import System
+from malta.linear.system import System
 
 # The control law of a gain file as the machine runs it, as the compensator of a proof: hold, delay, current loops.
 

@@ -34,7 +34,7 @@ from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.recovery import RecoveryBound, StepResponse, step_response
 from malta.synthesis.requirements import Noise
-from malta.synthesis.state_space import System
+from malta.linear.system import System
 
 AFTER = (0.1, 0.3)  # s
 SHARE = 0.01  # of the largest deviation

@@ -22,7 +22,7 @@ from malta.display import display
 from malta.errors import InputError
 from malta.structured.loops import Channels, ClosedLoop, Pole, gain_slope, noise, peaks_of, response_at
 from malta.synthesis.elements import CALLER
-from malta.synthesis.state_space import System
+from malta.linear.system import System
 
 At = Literal["sensors", "forces"]
 SLOWEST = 6  # poles of a group that a search looks at

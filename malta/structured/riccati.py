@@ -33,7 +33,7 @@ from malta.errors import CheckError, InputError
 from malta.processes import on_one_thread
 from malta.structured.loops import peak_gain
 from malta.synthesis.elements import CALLER
-from malta.synthesis.state_space import System
+from malta.linear.system import System
 
 H_INFINITY = "h_infinity"
 TOLERANCE = 1e-6  # relative, of the smallest gamma

@@ -41,7 +41,8 @@ from malta.structured.loops import Model, model_of, models_of_systems
 from malta.structured.search import ROOM, Look, Task, contradiction, random_starts, rate_of, search
 from malta.synthesis.controller import Controller
 from malta.synthesis.elements import CALLER
-from malta.synthesis.state_space import System, controller_of
+from malta.linear.system import System
+from malta.synthesis.state_space import controller_of
 from malta.synthesis.structure import Structure, places_of, sample_law
 
 Values = Mapping[str, float]

@@ -14,7 +14,7 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.synthesis.state_space import System
+from malta.linear.system import System
 
 CALLER = "structured"
 Matrices = tuple[Any, Any, Any, Any]  # A, B, C and D in CasADi

@@ -59,7 +59,8 @@ from malta.synthesis.spec import (
     Weights,
     pid_signals,
 )
-from malta.synthesis.state_space import System, law_of_errors
+from malta.linear.system import System
+from malta.synthesis.state_space import law_of_errors
 from malta.synthesis.tunable_lqg import lqg
 from malta.tables import Quantity
 from malta.units import to_si

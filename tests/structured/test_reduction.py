@@ -10,7 +10,7 @@ from scipy import linalg
 
 import malta
 from malta.structured.riccati import split_integrals, truncate
-from malta.synthesis.state_space import System
+from malta.linear.system import System
 
 
 def stable(n: int, seed: int) -> System:

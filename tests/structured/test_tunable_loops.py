@@ -21,7 +21,7 @@ from malta.structured.loops import (
     peaks_of,
     response_at,
 )
-from malta.synthesis.state_space import System
+from malta.linear.system import System
 from malta.synthesis.structure import Structure, places_of, sample_law
 
 GOALS = {
