@@ -397,7 +397,7 @@ def _loop_merits(problem: Problem, *, curves: bool) -> list[Merit]:
 
 def _channel_margins(problem: Problem) -> tuple[Merit, Merit]:
     """The smallest phase margin and delay margin of the sensors."""
-    turns = [phase_and_delay(crossings) for crossings in problem.curves.crossings[0]]
+    turns = [phase_and_delay(crossings) for crossings in problem.curves.crossings]
     names = [s.name for s in problem.curves.channels()]
     phase, phase_at = min(zip((turn[0] for turn in turns), names, strict=True))
     delay, delay_at = min(zip((turn[2] for turn in turns), names, strict=True))

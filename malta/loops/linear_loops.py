@@ -24,11 +24,12 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.linear.sampling import eigenvalues
+from malta.linear.system import System, balanced_units
+from malta.loops.classical import Nominal
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.model.plant import Plant, Signal
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, LinearLaw, linear_law
-from malta.linear.system import System, balanced_units
 from malta.synthesis.state_space import named_system, reference_names, set_point
 
 # The loop of a machine and a controller as systems of python-control: to plot, to simulate, to compute with.
@@ -231,6 +232,14 @@ class LinearLoop:
     def responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
         """The functions of frequency of the plant and of the law, see `System.response`."""
         return self.plant.response_function(), self.law.response_function()
+
+    @cached_property
+    def cut(self) -> Nominal:
+        """The loop cut at its sensors and at its forces: what margins are read from."""
+        (A, B, C, D), p, u = self.plant, len(self.outputs), len(self.law.C)
+        return Nominal(
+            System(A, B[:, :u], C[:p], D[:p, :u]), self.law, self.stable, self.sample_time, len(self.inputs)
+        )
 
     def unstable_poles(self, factors: FloatArray, at: Place) -> int:
         """How many poles grow with these factors of the loop gain.

@@ -23,9 +23,11 @@ import numpy as np
 from malta.arrays import ComplexArray, FloatArray, readonly
 from malta.display import display
 from malta.errors import CheckError
+from malta.linear.peaks import in_plane
 from malta.linear.sampling import add_lags, delay_inputs, eigenvalues, sample
+from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
-from malta.loops.classical import Nominal, remembered
+from malta.loops.classical import Nominal
 from malta.loops.parametric_plants import held_gain, of_plant
 from malta.loops.windings import (
     CurrentControl,
@@ -49,7 +51,6 @@ from malta.model.plant import OperatingPoint, Plant, off_stroke, position_in, wh
 from malta.model.signals import with_lags
 from malta.synthesis.controller import Controller, LinearLaw, law_at, linear_law, with_readings, with_slope
 from malta.synthesis.recovery import StepResponse, step_response
-from malta.linear.system import System
 
 # The control law of a gain file as the machine runs it, as the compensator of a proof: hold, delay, current loops.
 
@@ -171,8 +172,8 @@ class SampledLoop:
         return np.asarray(-P @ F)
 
     @cached_property
-    def _responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
-        """P and F as functions of (z - 1) / T: in differences slow poles keep their digits."""
+    def systems(self) -> tuple[System, System]:
+        """P and F in differences, (x+ - x) / T: slow poles keep their digits."""
         c, T = self.control, self.sample_time
         P = System(
             (self.Ad - np.eye(len(self.Ad))) / T,
@@ -180,7 +181,17 @@ class SampledLoop:
             self.Cd,
             np.zeros((len(self.Cd), self.Bd.shape[1])),
         )
-        F = System((c.A - np.eye(len(c.A))) / T, c.B_y / T, c.C, c.D_y)
+        return P, System((c.A - np.eye(len(c.A))) / T, c.B_y / T, c.C, c.D_y)
+
+    @cached_property
+    def cut(self) -> Nominal:
+        """The loop cut at its sensors: what peaks and crossings are read from."""
+        stable = bool(np.abs(eigenvalues(self.closed)).max() < 1)
+        return Nominal(*self.systems, stable, self.sample_time)
+
+    @cached_property
+    def _responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
+        P, F = self.systems
         return P.response_function(), F.response_function()
 
     def sensitivity(self, w: FloatArray) -> ComplexArray:
@@ -194,6 +205,15 @@ class SampledLoop:
         g = np.vstack([pushed, np.zeros((k, pushed.shape[1]))])
         C = np.hstack([self.outputs, np.zeros((len(self.Cd), k))])
         return step_response(self.closed, g, C, self.sample_time)
+
+    def under_load(self, load: FloatArray) -> System:
+        """From a load that is constant throughout each sample to the true outputs; in the s of Tustin's rule."""
+        assert self.pushed is not None
+        k, T = len(self.control.A), self.sample_time
+        push = np.concatenate([self.pushed @ load, np.zeros(k)])[:, None]
+        C = np.hstack([self.outputs, np.zeros((len(self.Cd), k))])
+        A = self.closed
+        return in_plane(System((A - np.eye(len(A))) / T, push / T, C, np.zeros((len(C), 1))), T)
 
     def compliance(self, w: FloatArray, load: FloatArray) -> ComplexArray:
         """True outputs per load at frequencies w, rad/s, of a load that is constant throughout each sample: k x p."""
@@ -469,19 +489,10 @@ def loaded_loop(
         B = np.hstack([into, left])
     T = loop.sample_time
 
-    @remembered
-    def response(w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        # In differences: slow poles lie close to 1, where z - A has lost their digits.
-        s = (np.expm1(1j * np.asarray(w) * T) / T)[:, None, None]
-        return _response(s, loop.Ad, B, loop.Cd, T), _response(s, law.A, law.B_y, law.C, T) + law.D_y
-
-    return Nominal(response, bool(np.abs(eigenvalues(loop.closed)).max() < 1), T, m)
-
-
-def _response(s: ComplexArray, A: FloatArray, B: FloatArray, C: FloatArray, T: float) -> ComplexArray:
-    """C (s - (A - 1) / T)^-1 B / T at s = (z - 1) / T."""
-    eye = np.eye(len(A))
-    return np.asarray(C @ np.linalg.solve(s * eye - (A - eye) / T, (B / T).astype(complex)))
+    # In differences: slow poles lie close to 1, where z - A has lost their digits.
+    P = System((loop.Ad - np.eye(len(loop.Ad))) / T, B / T, loop.Cd, np.zeros((len(loop.Cd), B.shape[1])))
+    F = System((law.A - np.eye(len(law.A))) / T, law.B_y / T, law.C, law.D_y)
+    return Nominal(P, F, bool(np.abs(eigenvalues(loop.closed)).max() < 1), T, m)
 
 
 def _on_top(rows: FloatArray, of: FloatArray) -> FloatArray:

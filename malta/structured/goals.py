@@ -20,9 +20,9 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.display import display
 from malta.errors import InputError
+from malta.linear.system import System
 from malta.structured.loops import Channels, ClosedLoop, Pole, gain_slope, noise, peaks_of, response_at
 from malta.synthesis.elements import CALLER
-from malta.linear.system import System
 
 At = Literal["sensors", "forces"]
 SLOWEST = 6  # poles of a group that a search looks at

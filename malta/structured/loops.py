@@ -20,8 +20,8 @@ from scipy import linalg, sparse
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
-from malta.synthesis.elements import CALLER
 from malta.linear.system import System
+from malta.synthesis.elements import CALLER
 from malta.synthesis.structure import OF_INPUTS, OF_OUTPUTS
 
 # Figures of a stable linear system with their exact derivatives: peaks of its gain, its noise, its poles.

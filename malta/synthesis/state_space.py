@@ -8,16 +8,12 @@ p* ---(+)->| s+ = A s + B u  |--> v          u = p* - y, negative feedback
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy import linalg, sparse
-from scipy.linalg import matrix_balance
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
@@ -154,16 +150,6 @@ def named_system(
     return control.ss(
         A * t / t[:, None], B / t[:, None], C * t, D, Ts, name=name, inputs=inputs, outputs=outputs
     )
-
-
-
-
-
-
-
-
-
-
 
 
 def reference_names(c: Controller) -> list[str]:
