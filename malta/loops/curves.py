@@ -5,7 +5,7 @@
     compliance       loads -> true outputs
 
 The grid of frequencies is logarithmic, to the Nyquist frequency of a sampled loop, finer about lightly damped poles and
-wherever a curve turns, and has every peak and crossing that margins are read at.
+wherever a curve turns. Margins are not read off it: see linear/peaks.py.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ NARROW = 5e-4  # of the frequency: intervals that are not halved, so that none f
 ROUNDS = 3  # of halving
 MOST = 90  # frequencies that a round may add
 AROUND = np.array([-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0])  # half-widths of a resonance
+NARROWEST = 1e-9  # relative half-width of a resonance
 LIGHT = 0.5  # damping below which a pole makes a resonance
 STILL = 1e-7  # of the fastest rate: poles that count as zero
 BELOW = 1e-9  # of the lowest frequency: as far as gain crossings are looked for
@@ -333,8 +334,10 @@ def _grid(loop: LinearLoop) -> FloatArray:
     low = min(known.min() / BEYOND if len(known) else top / 1e4, top / 1e3)
     low = max(low, top / 10**DECADES)
     light = poles[(np.abs(poles.real) < LIGHT * sizes) & (poles.imag > 0)]
-    width = np.maximum(np.abs(light.real) / np.maximum(np.abs(light), 1e-300), 1e-4)
-    near = (np.abs(light)[:, None] * np.exp(width[:, None] * AROUND)).ravel()
+    width = np.maximum(np.abs(light.real) / np.maximum(np.abs(light), 1e-300), NARROWEST)
+    near = (np.abs(light.imag)[:, None] * np.exp(width[:, None] * AROUND)).ravel()
+    closed = loop.closed_poles.imag
+    near = np.concatenate([near, closed[closed > 0]]) if loop.stable else near
     w = np.concatenate([np.geomspace(low, top, BASE), near[(near > low) & (near < top)]])
     return np.unique(w)
 

@@ -30,9 +30,9 @@ from scipy.linalg import matrix_balance
 from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
+from malta.linear.peaks import peak_gain
 from malta.linear.system import System
 from malta.processes import on_one_thread
-from malta.structured.loops import peak_gain
 from malta.synthesis.elements import CALLER
 
 H_INFINITY = "h_infinity"

@@ -17,7 +17,7 @@ over the travel is only judged, as the regulator's natural frequencies are every
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -27,8 +27,8 @@ from scipy import optimize, sparse
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.linear.sampling import sample, sample_noise
 from malta.linear.peaks import fall_frequency, peak_gain
+from malta.linear.sampling import sample, sample_noise
 from malta.loops.classical import tracked_band
 from malta.loops.loop import loop_of_model
 from malta.loops.sampled_loops import SampledLoop
@@ -261,9 +261,7 @@ def loop_figures(spec: Spec, part: Part, loop: SampledLoop) -> dict[str, float]:
     motion = np.sqrt(np.diag(loop.Cd @ covariance(closed, W)[:n, :n] @ loop.Cd.T))
     found |= {f"noise_motion {name}": value for name, value in zip(names, motion.tolist(), strict=True)}
     cut = loop.cut
-    found |= {
-        f"peak_sensitivity {name}": peak_gain(cut.sensitivity(i)).value for i, name in enumerate(names)
-    }
+    found |= {f"peak_sensitivity {name}": peak_gain(cut.sensitivity(i)).value for i, name in enumerate(names)}
     if "bandwidth" in spec.specification:
         found["bandwidth"] = cut.frequency(min(tracked_band(cut), fall_frequency(cut.open, 1.0, last=True)))
     return found

@@ -9,8 +9,8 @@ from hypothesis import given, strategies as st
 from scipy import linalg
 
 import malta
-from malta.structured.riccati import split_integrals, truncate
 from malta.linear.system import System
+from malta.structured.riccati import split_integrals, truncate
 
 
 def stable(n: int, seed: int) -> System:
