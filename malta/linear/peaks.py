@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from malta.arrays import ComplexArray, FloatArray
@@ -24,9 +25,11 @@ from malta.linear.sampling import eigenvalues
 from malta.linear.system import System
 
 RISE = 1e-8  # relative, above the largest gain that was found, at which a search ends
+JOINS = 1e-15  # of the largest entries of its row and column: smaller ones are rounding
 NEAR_AXIS = 1e-4  # |Re| of an eigenvalue over its size, up to which it may lie on the imaginary axis
 SAME = 1e-10  # relative: eigenvalues of that distance are one, of jw and of -jw
 LEVELS = 30  # that are tried at most
+DIRECT = 0.05  # of S: a value at infinite frequency that one may divide by
 GENERIC = 0.7390851332  # of a mean frequency: a place on the axis that is no zero
 CLOSE = 1e-6  # of a candidate's frequency: how far from it a root is looked for first
 STEPS = 60  # of a root by bisection and secants at most
@@ -70,19 +73,23 @@ def of_plane(v: FloatArray, sample_time: float | None) -> FloatArray:
 
 
 def part_of(system: System, rows: Sequence[int], columns: Sequence[int]) -> System:
-    """From some inputs to some outputs, without states that the inputs do not reach or the outputs do not see."""
+    """From some inputs to some outputs, without states that the inputs do not reach or the outputs do not see.
+
+    The system is in balanced units: what is rounding beside the largest entries of its row and column joins nothing.
+    """
     A, B, C, D = system
-    B, C, D = B[:, columns], C[rows], D[np.ix_(rows, columns)]
-    joined = sparse.csr_array((A != 0) | np.eye(len(A), dtype=bool))
-    reached, seen = (B != 0).any(axis=1), (C != 0).any(axis=0)
-    for graph, marks in ((joined, reached), (joined.T, seen)):
-        for _ in range(len(A)):
-            more = marks | (graph @ marks.astype(float) > 0)
-            if (more == marks).all():
+    n = len(A)
+    whole = np.abs(np.block([[A, B[:, columns]], [C[rows], D[np.ix_(rows, columns)]]]))
+    joined = _joined(whole)
+    reached, seen = joined[:n, n:].any(axis=1), joined[n:, :n].any(axis=0)
+    for graph, marks in ((joined[:n, :n], reached), (joined[:n, :n].T, seen)):
+        for _ in range(n):
+            more = graph[:, marks].any(axis=1) & ~marks
+            if not more.any():
                 break
             marks |= more
     x = np.flatnonzero(reached & seen)
-    return System(A[np.ix_(x, x)], B[x], C[:, x], D)
+    return System(A[np.ix_(x, x)], B[x][:, columns], C[rows][:, x], D[np.ix_(rows, columns)])
 
 
 def response_at(system: System, w: FloatArray) -> ComplexArray:
@@ -167,31 +174,57 @@ def peak_gain(system: System) -> Peak:
     return Peak(best, where)
 
 
-def fall_frequency(system: System, level: float, index: int = 0, *, last: bool) -> float:
-    """The frequency at which a singular value of G falls below a level for the first or the last time.
+class Fall(NamedTuple):
+    """What is asked of a singular value: where it falls below a level for the first or the last time."""
 
-    0 where it never reaches the level, infinite where it never falls below.
+    rank: int  # of the singular value, 0 the largest
+    last: bool
 
-    index : of the singular value, 0 the largest
+
+def fall_frequencies(system: System, level: float, asked: Sequence[Fall]) -> list[float]:
+    """The frequencies at which singular values of a square G, in balanced units, fall below a level.
+
+    0 where one never reaches the level, infinite where it never falls below.
     """
-    system = system.balanced
 
     def sizes(w: FloatArray) -> FloatArray:
-        return np.asarray(np.linalg.svd(response_at(system, w), compute_uv=False)[:, index])
+        found = np.linalg.svd(response_at(system, w), compute_uv=False)
+        return np.asarray(np.log(np.maximum(found, TINY) / level))
 
-    c = level_frequencies(system, level)
+    parts = [part_of(system, own, own) for own in joined_channels(system, range(len(system.C)))]
+    c = np.sort(np.concatenate([level_frequencies(part, level) for part in parts]))
     c = c[c > 0]
     w = np.concatenate([c[:1] / 2, np.sqrt(c[1:] * c[:-1]), 2 * c[-1:]]) if len(c) else np.ones(1)
-    above = np.log(np.maximum(sizes(w), TINY) / level)
-    falls = np.flatnonzero((above[:-1] >= 0) & (above[1:] < 0))
+    above = sizes(w)
+    return [_fall(sizes, w, above, one) for one in asked]
+
+
+def _fall(sizes: Callable[[FloatArray], FloatArray], w: FloatArray, above: FloatArray, one: Fall) -> float:
+    mine = above[:, one.rank]
+    falls = np.flatnonzero((mine[:-1] >= 0) & (mine[1:] < 0))
     if not len(falls):
-        return math.inf if above[-1] >= 0 else 0.0
-    k = falls[[-1 if last else 0]]
+        return math.inf if mine[-1] >= 0 else 0.0
+    k = falls[[-1 if one.last else 0]]
+    low, high = (w[k], mine[k]), (w[k + 1], mine[k + 1])
+    return float(_false_position(lambda x: sizes(x)[:, one.rank], low, high)[0])
 
-    def measure(x: FloatArray) -> FloatArray:
-        return np.asarray(np.log(np.maximum(sizes(x), TINY) / level))
 
-    return float(_false_position(measure, (w[k], above[k]), (w[k + 1], above[k + 1]))[0])
+def joined_channels(system: System, channels: Sequence[int]) -> list[list[int]]:
+    """The channels in sets that nothing joins, each its input and output: the norm of all is the largest of a set."""
+    n, c = len(system.A), len(channels)
+    whole = np.abs(
+        np.block(
+            [[system.A, system.B[:, channels]], [system.C[channels], system.D[np.ix_(channels, channels)]]]
+        )
+    )
+    label = sparse.csgraph.connected_components(_joined(whole), directed=False)[1][n : n + c]
+    return [[channels[i] for i in np.flatnonzero(label == k).tolist()] for k in np.unique(label)]
+
+
+def _joined(sizes: FloatArray) -> NDArray[np.bool_]:
+    """Which entries of a matrix in balanced units are more than rounding beside the largest of row and column."""
+    largest = sizes.max(axis=1, initial=0.0)[:, None] * sizes.max(axis=0, initial=0.0)
+    return np.asarray(sizes**2 > JOINS**2 * largest)
 
 
 # Crossings of one channel's loop l = 1 / S - 1, from a realization of its sensitivity S.
@@ -227,8 +260,8 @@ def _at_ends(S: System) -> list[complex]:
 def _axis_zeros(S: System, mirrored: float) -> FloatArray:
     """The frequencies at which S(jw) + S(-jw) - 1 or S(jw) - S(-jw) may be zero, in order.
 
-    With s = s0 + 1 / x the zeros are those of D' - C N (x + N)^-1 N B, N = (s0 - A)^-1: eigenvalues, as D', the value
-    at s0, is not zero.
+    Where the sum is not zero at infinite frequency they are eigenvalues of A - B C / D. Else, with s = s0 + 1 / x, they
+    are those of D' - C N (x + N)^-1 N B, N = (s0 - A)^-1 and D' the value at s0, which is not zero.
     """
     n = len(S.A)
     if not n:
@@ -236,6 +269,8 @@ def _axis_zeros(S: System, mirrored: float) -> FloatArray:
     A = linalg.block_diag(S.A, -S.A)
     B, C = np.vstack([S.B, S.B]), np.hstack([S.C, -mirrored * S.C])
     D = complex(2 * S.D[0, 0] - 1) if mirrored > 0 else 0j
+    if abs(D) > DIRECT * (1 + abs(S.D[0, 0])):
+        return _on_axis(eigenvalues(A - B @ C / D.real))
     sizes = np.abs(np.linalg.eigvals(S.A))
     middle = float(np.exp(np.log(np.maximum(sizes, sizes.max() * 1e-6 + 1e-300)).mean()))
     places = 1j * middle * GENERIC * np.array([1.0, 7.0, 0.13])

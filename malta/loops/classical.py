@@ -9,17 +9,18 @@ from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy import sparse
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import display
 from malta.linear.peaks import (
     Crossing,
+    Fall,
     Peak,
     about_poles,
-    fall_frequency,
+    fall_frequencies,
     gain_crossings,
     in_plane,
+    joined_channels,
     level_frequencies,
     of_plane,
     part_of,
@@ -92,8 +93,8 @@ class Nominal:
 
     @cached_property
     def closed(self) -> System:
-        """The closed loop of `cut_loop`; of a sampled one in the s of Tustin's rule."""
-        return in_plane(cut_loop(self.P, self.F), self.sample_time)
+        """The closed loop of `cut_loop`, in balanced units; of a sampled one in the s of Tustin's rule."""
+        return in_plane(cut_loop(self.P, self.F), self.sample_time).balanced
 
     def frequency(self, v: float) -> float:
         """rad/s, of a frequency of the plane."""
@@ -105,7 +106,7 @@ class Nominal:
         (A, B, C, D), (F_A, F_B, F_C, F_D) = self.P, self.F
         whole = np.block([[A, B @ F_C], [np.zeros((len(F_A), len(A))), F_A]])
         cut = System(whole, np.vstack([B @ F_D, F_B]), np.hstack([C, D @ F_C]), D @ F_D)
-        return in_plane(cut, self.sample_time)
+        return in_plane(cut, self.sample_time).balanced
 
     def response(self, w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """P, k x p x m, and F, k x m x p, at frequencies w, rad/s."""
@@ -194,7 +195,8 @@ def disk_margin(loop: Nominal, kind: Kind) -> Disk:
     chosen = {"forces": [*loop.inputs], "sensors": [*loop.sensors]}
     channels = chosen.get(kind, [*loop.sensors, *loop.inputs])
     found = [
-        _largest_mu(_disk_system(part_of(loop.closed, own, own))) for own in _joined(loop.closed, channels)
+        _largest_mu(_disk_system(part_of(loop.closed, own, own)))
+        for own in joined_channels(loop.closed, channels)
     ]
     mu, at = max(found)
     return Disk(kind, 1 / mu, loop.frequency(at))
@@ -207,29 +209,26 @@ def _disk_system(S: System) -> System:
 
 def peak_of_channels(loop: Nominal, channels: Sequence[int]) -> Peak:
     """The largest sigma_max of the sensitivities of some channels of `loop.closed`, cut at once."""
-    found = [peak_gain(part_of(loop.closed, own, own)) for own in _joined(loop.closed, channels)]
+    found = [peak_gain(part_of(loop.closed, own, own)) for own in joined_channels(loop.closed, channels)]
     value, at = max(found)
     return Peak(value, loop.frequency(at))
 
 
-def tracked_band(loop: Nominal, rank: int | None = None) -> float:
-    """Where the smallest singular value of T first falls below 1 / sqrt(2), a frequency of the plane.
+def tracked_band(loop: Nominal, rank: int | None = None) -> tuple[float, float]:
+    """Where the smallest singular value of T first falls below 1 / sqrt(2), and the largest for the last time, rad/s.
 
     rank : of T, where it is less than the number of sensors
     """
     S, p = part_of(loop.closed, loop.sensors, loop.sensors), len(loop.sensors)
     T = S._replace(D=S.D - np.eye(p))
-    return fall_frequency(T, math.sqrt(0.5), (rank or p) - 1, last=False)
+    smallest, largest = Fall((rank or p) - 1, last=False), Fall(0, last=True)
+    first, last = fall_frequencies(T, math.sqrt(0.5), (smallest, largest))
+    return loop.frequency(first), loop.frequency(last)
 
 
-def _joined(system: System, channels: Sequence[int]) -> list[list[int]]:
-    """The channels in sets that nothing joins: mu of all is the largest of a set."""
-    n, c = len(system.A), len(channels)
-    touch = np.zeros((n + c, n + c), dtype=bool)
-    touch[:n, :n], touch[:n, n:] = system.A != 0, system.B[:, channels] != 0
-    touch[n:, :n], touch[n:, n:] = system.C[channels] != 0, system.D[np.ix_(channels, channels)] != 0
-    label = sparse.csgraph.connected_components(touch, directed=False)[1][n:]
-    return [[channels[i] for i in np.flatnonzero(label == k).tolist()] for k in np.unique(label)]
+def last_crossover(loop: Nominal) -> float:
+    """Where the largest singular value of the loop gain falls below 1 for the last time, rad/s."""
+    return loop.frequency(fall_frequencies(loop.open, 1.0, (Fall(0, last=True),))[0])
 
 
 def _largest_mu(M: System) -> Peak:

@@ -213,7 +213,8 @@ class SampledLoop:
         push = np.concatenate([self.pushed @ load, np.zeros(k)])[:, None]
         C = np.hstack([self.outputs, np.zeros((len(self.Cd), k))])
         A = self.closed
-        return in_plane(System((A - np.eye(len(A))) / T, push / T, C, np.zeros((len(C), 1))), T)
+        system = System((A - np.eye(len(A))) / T, push / T, C, np.zeros((len(C), 1)))
+        return in_plane(system, T).balanced
 
     def compliance(self, w: FloatArray, load: FloatArray) -> ComplexArray:
         """True outputs per load at frequencies w, rad/s, of a load that is constant throughout each sample: k x p."""

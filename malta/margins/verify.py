@@ -15,12 +15,13 @@ from typing import Literal
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.linear.peaks import fall_frequency, part_of, peak_gain
+from malta.linear.peaks import peak_gain
 from malta.linear.sampling import eigenvalues
 from malta.linear.uncertain import Compensator
 from malta.loops.classical import (
     Classical,
     classical_margins,
+    last_crossover,
     nominal_loop,
     peak_of_channels,
     peak_sensitivity,
@@ -140,15 +141,9 @@ def bandwidths_of(
     natural = _natural_frequencies(commanded_model(model, controller), controller)
     if not stable:
         return {key: np.nan for key in BANDWIDTHS if not key.startswith("w_n")} | natural
-    cut, p = machine.cut, len(machine.Cd)
-    S = part_of(cut.closed, cut.sensors, cut.sensors)
-    T = S._replace(D=S.D - np.eye(p))
-    falls = {
-        "sigma_max_T": fall_frequency(T, math.sqrt(0.5), last=True),
-        "sigma_min_T": tracked_band(cut, min(p, len(controller.forces))),
-        "crossover_max": fall_frequency(cut.open, 1.0, last=True),
-    }
-    return {key: cut.frequency(at) for key, at in falls.items()} | natural
+    lowest, highest = tracked_band(machine.cut, min(len(machine.Cd), len(controller.forces)))
+    crossover = last_crossover(machine.cut)
+    return {"sigma_max_T": highest, "sigma_min_T": lowest, "crossover_max": crossover} | natural
 
 
 def _natural_frequencies(model: LinearModel, controller: Controller) -> dict[str, float]:

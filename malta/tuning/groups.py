@@ -24,10 +24,10 @@ from scipy import sparse
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
-from malta.linear.peaks import fall_frequency, peak_gain
+from malta.linear.peaks import peak_gain
 from malta.linear.sampling import add_lags, delay_inputs, sample
 from malta.linear.system import System
-from malta.loops.classical import Nominal, tracked_band
+from malta.loops.classical import Nominal, last_crossover, tracked_band
 from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import disturbance_map, push_through
 from malta.loops.time_domain import covariance, noise_variance
@@ -516,9 +516,9 @@ def _response(
     half = n // 2
     stiffness = group.model.B[half:] @ gain_at_rest(g.K, n, known) - group.model.A[half:, :half]
     w_n = math.sqrt(max(float(np.linalg.eigvals(stiffness).real.min()), 0.0))
-    bandwidth = min(cut.frequency(tracked_band(cut)), w_n)
+    bandwidth = min(tracked_band(cut)[0], w_n)
     if alone:
-        bandwidth = min(bandwidth, cut.frequency(fall_frequency(cut.open, 1.0, last=True)))
+        bandwidth = min(bandwidth, last_crossover(cut))
     return max(peak_gain(cut.sensitivity(i)).value for i in cut.sensors), bandwidth
 
 

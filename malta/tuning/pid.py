@@ -27,9 +27,9 @@ from scipy import optimize, sparse
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.linear.peaks import fall_frequency, peak_gain
+from malta.linear.peaks import peak_gain
 from malta.linear.sampling import sample, sample_noise
-from malta.loops.classical import tracked_band
+from malta.loops.classical import last_crossover, tracked_band
 from malta.loops.loop import loop_of_model
 from malta.loops.sampled_loops import SampledLoop
 from malta.loops.time_domain import covariance
@@ -263,7 +263,7 @@ def loop_figures(spec: Spec, part: Part, loop: SampledLoop) -> dict[str, float]:
     cut = loop.cut
     found |= {f"peak_sensitivity {name}": peak_gain(cut.sensitivity(i)).value for i, name in enumerate(names)}
     if "bandwidth" in spec.specification:
-        found["bandwidth"] = cut.frequency(min(tracked_band(cut), fall_frequency(cut.open, 1.0, last=True)))
+        found["bandwidth"] = min(tracked_band(cut)[0], last_crossover(cut))
     return found
 
 
