@@ -137,6 +137,7 @@ def _integrals_last(law: LinearLaw, count: int) -> LinearLaw | None:
 
 LAST: CurrentLoops = "pi"  # the last stage: the loop that simulations fly by default
 ROUNDING = 1e-9  # of the largest entry
+ABOUT = np.array([-3.0, -1.0, -0.3, 0.0, 0.3, 1.0, 3.0])  # half-widths of a resonance
 DELAYED = 1e-6  # |z| below which a pole is one of pure delay
 
 
@@ -182,6 +183,13 @@ class SampledLoop:
             np.zeros((len(self.Cd), self.Bd.shape[1])),
         )
         return P, System((c.A - np.eye(len(c.A))) / T, c.B_y / T, c.C, c.D_y)
+
+    @property
+    def resonances(self) -> FloatArray:
+        """Frequencies about those of the closed loop's oscillating poles, rad/s, from below their width to above."""
+        z = eigenvalues(self.closed)
+        poles = np.log(z[z.imag > 0]) / self.sample_time
+        return np.asarray((poles.imag[:, None] + np.abs(poles.real)[:, None] * ABOUT).ravel())
 
     @cached_property
     def cut(self) -> Nominal:
