@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -21,6 +21,7 @@ from malta.linear.peaks import (
     gain_crossings,
     in_plane,
     joined_channels,
+    largest_gain,
     level_frequencies,
     of_plane,
     part_of,
@@ -209,8 +210,8 @@ def _disk_system(S: System) -> System:
 
 def peak_of_channels(loop: Nominal, channels: Sequence[int]) -> Peak:
     """The largest sigma_max of the sensitivities of some channels of `loop.closed`, cut at once."""
-    found = [peak_gain(part_of(loop.closed, own, own)) for own in joined_channels(loop.closed, channels)]
-    value, at = max(found)
+    sets = joined_channels(loop.closed, channels)
+    value, at = largest_gain(part_of(loop.closed, own, own) for own in sets)
     return Peak(value, loop.frequency(at))
 
 
@@ -327,25 +328,23 @@ def peak_sensitivity(loop: Nominal, at: Literal["forces", "sensors"]) -> float:
     if not loop.stable:
         return float("nan")
     channels = loop.inputs if at == "forces" else loop.sensors
-    return max(peak_gain(loop.sensitivity(i)).value for i in channels)
+    return largest_gain(loop.sensitivity(i) for i in channels).value
 
 
 def gang_of_four(loop: Nominal) -> list[tuple[float, ...]]:
     """For each sensor i the largest |S_ii|, |T_ii|, |(S P)_ij| (m/N) and |(F S)_ji| (N/m) over frequency."""
 
-    def largest(row: int, column: int, *, less: float = 0.0) -> float:
-        part = part_of(loop.closed, [row], [column])
-        return peak_gain(part._replace(D=part.D - less)).value
+    def peak(row: int, columns: Iterable[int], *, turned: bool = False) -> float:
+        pairs = (((column, row) if turned else (row, column)) for column in columns)
+        return largest_gain(part_of(loop.closed, [k], [j]) for k, j in pairs).value
 
-    return [
-        (
-            largest(i, i),
-            largest(i, i, less=1.0),
-            max(largest(i, j) for j in loop.inputs),
-            max(largest(j, i) for j in loop.inputs),
-        )
-        for i in loop.sensors
-    ]
+    found: list[tuple[float, ...]] = []
+    for i in loop.sensors:
+        S = loop.sensitivity(i)
+        T = S._replace(D=S.D - 1)
+        both = peak_gain(S).value, peak_gain(T).value
+        found.append((*both, peak(i, loop.inputs), peak(i, loop.inputs, turned=True)))
+    return found
 
 
 # The margins of one channel at a time, the others closed, at exact crossings; of unstable open loops as well.

@@ -24,7 +24,7 @@ from scipy import sparse
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
-from malta.linear.peaks import peak_gain
+from malta.linear.peaks import largest_gain
 from malta.linear.sampling import add_lags, delay_inputs, sample
 from malta.linear.system import System
 from malta.loops.classical import Nominal, last_crossover, tracked_band
@@ -519,7 +519,7 @@ def _response(
     bandwidth = min(tracked_band(cut)[0], w_n)
     if alone:
         bandwidth = min(bandwidth, last_crossover(cut))
-    return max(peak_gain(cut.sensitivity(i)).value for i in cut.sensors), bandwidth
+    return largest_gain(cut.sensitivity(i) for i in cut.sensors).value, bandwidth
 
 
 def _noise(group: Group, law: LinearLaw, closed: FloatArray) -> Noise:
