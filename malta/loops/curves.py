@@ -22,6 +22,7 @@ from scipy import linalg
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Curves, Description, display
 from malta.errors import CheckError, require_known
+from malta.linear.system import System, balanced_units
 from malta.loops.classical import (
     ChannelMargins,
     Crossing,
@@ -35,7 +36,6 @@ from malta.loops.classical import (
 from malta.loops.linear_loops import LinearLoop, Place, linear_loop
 from malta.model.plant import Signal
 from malta.processes import on_one_thread
-from malta.synthesis.state_space import System, balanced_units
 
 BASE = 160  # frequencies of the logarithmic grid
 DECADES = 8.0  # at most

@@ -24,6 +24,7 @@ from malta.arrays import ComplexArray, FloatArray, readonly
 from malta.display import display
 from malta.errors import CheckError
 from malta.linear.sampling import add_lags, delay_inputs, eigenvalues, sample
+from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal, remembered
 from malta.loops.parametric_plants import held_gain, of_plant
@@ -49,7 +50,6 @@ from malta.model.plant import OperatingPoint, Plant, off_stroke, position_in, wh
 from malta.model.signals import with_lags
 from malta.synthesis.controller import Controller, LinearLaw, law_at, linear_law, with_readings, with_slope
 from malta.synthesis.recovery import StepResponse, step_response
-from malta.synthesis.state_space import System
 
 # The control law of a gain file as the machine runs it, as the compensator of a proof: hold, delay, current loops.
 

@@ -25,6 +25,7 @@ from malta.arrays import FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError, require_known
 from malta.linear.sampling import sample
+from malta.linear.system import System
 from malta.linear.uncertain import find_peaks
 from malta.loops.linear_loops import LinearLoop
 from malta.loops.loop import Loop, loop_along, loop_from
@@ -34,7 +35,6 @@ from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.recovery import RecoveryBound, StepResponse, step_response
 from malta.synthesis.requirements import Noise
-from malta.synthesis.state_space import System
 
 AFTER = (0.1, 0.3)  # s
 SHARE = 0.01  # of the largest deviation

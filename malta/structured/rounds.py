@@ -24,6 +24,7 @@ import numpy as np
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.linear.sampling import add_lags, delay_inputs, sample
+from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.loop import loop
 from malta.loops.sampled_loops import LAST, SampledLoop, sampled_loop
@@ -41,7 +42,7 @@ from malta.structured.loops import Model, model_of, models_of_systems
 from malta.structured.search import ROOM, Look, Task, contradiction, random_starts, rate_of, search
 from malta.synthesis.controller import Controller
 from malta.synthesis.elements import CALLER
-from malta.synthesis.state_space import System, controller_of
+from malta.synthesis.state_space import controller_of
 from malta.synthesis.structure import Structure, places_of, sample_law
 
 Values = Mapping[str, float]

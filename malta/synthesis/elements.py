@@ -14,7 +14,7 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.synthesis.state_space import System
+from malta.linear.system import System
 
 CALLER = "structured"
 Matrices = tuple[Any, Any, Any, Any]  # A, B, C and D in CasADi
@@ -99,7 +99,8 @@ class Element:
     def system(self) -> System:
         """The element with its present values."""
         made = self.matrices([ca.DM(number) for number in self.numbers])
-        return System(*(np.atleast_2d(np.array(ca.DM(M), dtype=float)) for M in made))
+        A, B, C, D = (np.atleast_2d(np.array(ca.DM(M), dtype=float)) for M in made)
+        return System(A, B, C, D)
 
     @property
     def order(self) -> int:

@@ -43,6 +43,7 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.system import System
 from malta.model.linearize import LinearModel
 from malta.model.plant import Plant, Signal
 from malta.synthesis import elements
@@ -59,7 +60,7 @@ from malta.synthesis.spec import (
     Weights,
     pid_signals,
 )
-from malta.synthesis.state_space import System, law_of_errors
+from malta.synthesis.state_space import law_of_errors
 from malta.synthesis.tunable_lqg import lqg
 from malta.tables import Quantity
 from malta.units import to_si
