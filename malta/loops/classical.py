@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -205,7 +205,7 @@ def disk_margin(loop: Nominal, kind: Kind) -> Disk:
 
 def _disk_system(S: System) -> System:
     """S - 1/2."""
-    return S._replace(D=S.D - np.eye(len(S.D)) / 2)
+    return replace(S, D=S.D - np.eye(len(S.D)) / 2)
 
 
 def peak_of_channels(loop: Nominal, channels: Sequence[int]) -> Peak:
@@ -221,7 +221,7 @@ def tracked_band(loop: Nominal, rank: int | None = None) -> tuple[float, float]:
     rank : of T, where it is less than the number of sensors
     """
     S, p = part_of(loop.closed, loop.sensors, loop.sensors), len(loop.sensors)
-    T = S._replace(D=S.D - np.eye(p))
+    T = replace(S, D=S.D - np.eye(p))
     smallest, largest = Fall((rank or p) - 1, last=False), Fall(0, last=True)
     first, last = fall_frequencies(T, math.sqrt(0.5), (smallest, largest))
     return loop.frequency(first), loop.frequency(last)
@@ -341,7 +341,7 @@ def gang_of_four(loop: Nominal) -> list[tuple[float, ...]]:
     found: list[tuple[float, ...]] = []
     for i in loop.sensors:
         S = loop.sensitivity(i)
-        T = S._replace(D=S.D - 1)
+        T = replace(S, D=S.D - 1)
         both = peak_gain(S).value, peak_gain(T).value
         found.append((*both, peak(i, loop.inputs), peak(i, loop.inputs, turned=True)))
     return found

@@ -23,6 +23,7 @@ from scipy import linalg
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
+from malta.linear.conversion import from_control
 from malta.linear.sampling import eigenvalues
 from malta.linear.system import System, balanced_units
 from malta.loops.classical import Nominal
@@ -152,7 +153,6 @@ CALLER = "loop"
 Place = Literal["sensors", "forces"]
 GONE = 1e-6  # |z| of the poles of pure delay
 STILL = 1e-6  # of a pole's frequency: growth that counts as none
-SAME = 1e-3  # of a response: the error of states that still are those of a transfer function
 ROUNDING = 1e-14  # of a matrix whose eigenvalues are taken
 
 
@@ -379,12 +379,12 @@ def _of_systems(plant: Any, controller: Any, name: str) -> LinearLoop:
     if any(other != dt for other in known):
         raise InputError(CALLER, "dt", " and ".join(map(str, known)), "the same of plant and controller")
     T = (1.0 if dt is True else float(dt)) or None
-    P = _matrices(plant, T)
+    P = from_control(plant, CALLER, plant.name, step=1.0, differences=True)
     p, m = P.D.shape
     if controller is None:
         F = System(np.zeros((0, 0)), np.zeros((0, p)), np.zeros((p, 0)), -np.eye(p))
     else:
-        C = _matrices(controller, T)
+        C = from_control(controller, CALLER, controller.name, step=1.0, differences=True)
         F = System(C.A, -C.B, C.C, -C.D)
     if F.D.shape != (m, p):
         who, (rows, columns) = ("L", P.D.shape) if controller is None else ("C", F.D.shape)
@@ -396,49 +396,3 @@ def _of_systems(plant: Any, controller: Any, name: str) -> LinearLoop:
     driven = System(P.A, np.hstack([P.B, P.B[:, : len(loads)]]), P.C, np.hstack([P.D, P.D[:, : len(loads)]]))
     own = name or (plant.name if controller is None else controller.name)
     return LinearLoop(own, driven, F, (-F.B, -F.D), T, outputs, inputs, loads)
-
-
-def _matrices(system: Any, T: float | None) -> System:
-    """A, B, C and D of a control system, in differences where it is sampled. Raises InputError."""
-    import control  # imports matplotlib and takes a second: only where it is used
-
-    try:
-        found = control.ss(system)
-    except Exception as error:  # many kinds: an improper function, a frequency response without states
-        wanted = "a system with states, or a proper transfer function"
-        raise InputError(CALLER, system.name, f"a {type(system).__name__}", wanted) from error
-    if isinstance(system, control.TransferFunction) and _lost(system, found):
-        if system.ninputs * system.noutputs > 1:
-            wanted = "a system with states: the digits of its coefficients do not suffice for one"
-            raise InputError(CALLER, system.name, "a TransferFunction", wanted)
-        found = control.ss(*_companion(system.num[0][0], system.den[0][0]), system.dt)
-    A, B, C, D = (np.array(M, dtype=float) for M in (found.A, found.B, found.C, found.D))
-    if not all(np.isfinite(M).all() for M in (A, B, C, D)):
-        raise InputError(CALLER, system.name, "NaN or infinity", "finite numbers")
-    return System(A, B, C, D) if T is None else System((A - np.eye(len(A))) / T, B / T, C, D)
-
-
-def _lost(system: Any, found: Any) -> bool:
-    """Whether the states of a transfer function have lost its response, as those of very slow poles or small gains."""
-    poles = np.concatenate([np.roots(den) for row in system.den for den in row]).astype(complex)
-    sampled = system.isdtime(strict=True)
-    sizes = np.abs(np.log(poles[poles != 0]) if sampled else poles)
-    w = np.outer(np.append(sizes[sizes > 0], 1.0), [1e-2, 0.3, 1.7, 1e2]).ravel()
-    points = np.exp(1j * w[w < np.pi]) if sampled else 1j * w
-    with np.errstate(all="ignore"):  # a point may be a pole, to rounding, where the response is infinite
-        wanted, made = (np.atleast_1d(one(points, warn_infinite=False)) for one in (system, found))
-        same = np.abs(made - wanted) <= SAME * np.abs(wanted)
-    return not bool((same | ~np.isfinite(wanted)).all())
-
-
-def _companion(num: FloatArray, den: FloatArray) -> System:
-    """States of a proper transfer function, in units of time and of the output in which its coefficients are near 1."""
-    n = len(den) - 1
-    a = np.asarray(den[1:] / den[0], dtype=float)
-    b = np.append(np.zeros(n + 1 - len(num)), num) / den[0]
-    orders = np.arange(1, n + 1)
-    rate = float((np.abs(a) ** (1 / orders)).max(initial=0.0)) or 1.0
-    A = np.eye(n, k=-1) * rate
-    A[:1] = -a / rate ** (orders - 1.0)
-    c = (b[1:] - b[0] * a) / rate ** (orders - 1.0)
-    return System(A, np.eye(n, 1), c[None, :], np.array([[b[0]]]))

@@ -20,6 +20,7 @@ from scipy import linalg, sparse
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.conversion import from_control
 from malta.linear.peaks import gains_at, level_frequencies, peak_gain, response_at
 from malta.linear.system import System
 from malta.synthesis.elements import CALLER
@@ -169,6 +170,7 @@ def poles_of(A: FloatArray, B2: FloatArray, C2: FloatArray, count: int = 0) -> l
 
 
 ZERO = 1e-9  # of a law's largest entry: a pole of that size is an integral
+ROUNDING = 1e-14  # of the largest entry of A: growth within it is rounding
 JOINS = 1e-12  # of the largest entries of its row and column: smaller ones are rounding
 
 
@@ -220,28 +222,14 @@ def to_plane(system: System, Ts: float) -> System:
 
 def models_of_systems(plants: Any) -> list[Model]:
     """The models of one control system or of several with the same signals. Raises InputError for others."""
-    import control  # imports matplotlib and takes a second: only where it is used
-
     given = list(plants) if isinstance(plants, list | tuple) else [plants]
     found: list[Model] = []
     for k, plant in enumerate(given):
-        try:
-            ss = control.ss(plant)
-        except Exception as error:  # many kinds: an improper function, a frequency response without states
-            wanted = "a system of python-control with states, or several"
-            raise InputError(CALLER, "plant", f"a {type(plant).__name__}", wanted) from error
-        if ss.dt is True:
-            raise InputError(CALLER, "plant.dt", "True", "a sample time in s, or 0")
-        name = f"{ss.name}" if len(given) == 1 else f"model {k + 1}"
-        found.append(
-            model_of(
-                name,
-                System.of(ss),
-                ss.input_labels,
-                ss.output_labels,
-                sample_time=float(ss.dt or 0.0) or None,
-            )
+        own = from_control(
+            plant, CALLER, "plant", expected="a system of python-control with states, or several"
         )
+        name = getattr(plant, "name", "") if len(given) == 1 else f"model {k + 1}"
+        found.append(model_of(name, own, own.inputs, own.outputs, sample_time=own.dt))
     first = found[0]
     for other in found[1:]:
         if (other.inputs, other.outputs, other.sample_time) != (
@@ -342,6 +330,11 @@ class ClosedLoop:
         return max(
             (float(np.linalg.eigvals(A[np.ix_(x, x)]).real.max()) for x in self.groups), default=-math.inf
         )
+
+    @property
+    def stable(self) -> bool:
+        """Whether all poles decay by more than rounding makes of undamped ones."""
+        return self.growth < -ROUNDING * float(np.abs(self.whole[0].A).max(initial=0.0))
 
     def poles(self, count: int = 0) -> list[Pole]:
         """The poles with their derivatives by M, each group by itself; count of each, the slowest first, 0: all."""

@@ -99,7 +99,8 @@ class Element:
     def system(self) -> System:
         """The element with its present values."""
         made = self.matrices([ca.DM(number) for number in self.numbers])
-        return System(*(np.atleast_2d(np.array(ca.DM(M), dtype=float)) for M in made))
+        A, B, C, D = (np.atleast_2d(np.array(ca.DM(M), dtype=float)) for M in made)
+        return System(A, B, C, D)
 
     @property
     def order(self) -> int:
