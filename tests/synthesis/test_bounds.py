@@ -19,12 +19,12 @@ from flint import Ordering, arb, fmpq, fmpq_mpoly_ctx
 from tampering import claiming
 
 import malta
+from malta.checker import check, file as checked_file, loop as checked_loop
 from malta.linear.uncertain import Compensator, closed_loop
 from malta.margins.loop_report import Stage
 from malta.margins.travel import smallest_margin
-from malta.proof import exclusion
+from malta.proof import certificate, exclusion
 from malta.proof.box import below
-from malta.proof.certificate import certificate, check, checked_file, checked_loop
 from malta.proof.groups import loop_of
 from malta.proof.margin import Margin
 from malta.proof.polynomial import characteristic as degrees, enclosure
