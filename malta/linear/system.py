@@ -20,6 +20,7 @@ from scipy import linalg, sparse
 from malta.arguments import describe
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.matrices import system_matrix
 from malta.linear.sampling import delay_inputs, eigenvalues, sample
 
 MANY = 32  # frequencies from which on a Schur form is worth its time
@@ -152,7 +153,7 @@ class System:
 
         Of any number of inputs and outputs (Emami-Naeini and Van Dooren, Automatica 18(4), 1982).
         """
-        A, B, C, D = _without_zeros_at_infinity(*self.balanced)
+        A, B, C, D = _without_zeros_at_infinity(*_scaled(*self.balanced))
         A, B, C, D = _without_zeros_at_infinity(A.T, C.T, B.T, D.T)  # of a D that is square and regular now
         n = len(A)
         if not n:
@@ -226,9 +227,21 @@ def balanced_units(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     """Powers of two t for states x = t xi, in which A t / t', B / t' and C t have rows and columns of like size."""
     n, size = len(A), len(A) + max(B.shape[1], len(C))
     whole = np.zeros((size, size))
-    whole[:n, :n], whole[:n, n : n + B.shape[1]], whole[n : n + len(C), :n] = A, B, C
+    whole[: n + len(C), : n + B.shape[1]] = system_matrix(A, B, C)
     _, (units, _) = linalg.matrix_balance(whole, permute=False, separate=True)
     return np.asarray(units[:n])
+
+
+def _scaled(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The system with inputs and outputs in units in which they are of the size of A: the zeros are the same."""
+    size = float(np.abs(A).max(initial=0.0)) or 1.0
+    rows = np.abs(np.hstack([C, D])).max(axis=1, initial=0.0, keepdims=True)
+    rows = size / np.where(rows > 0, rows, size)
+    columns = np.abs(np.vstack([B, rows * D])).max(axis=0, initial=0.0, keepdims=True)
+    columns = size / np.where(columns > 0, columns, size)
+    return A, B * columns, rows * C, rows * D * columns
 
 
 def _without_zeros_at_infinity(

@@ -24,6 +24,7 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.linear.conversion import from_control
+from malta.linear.matrices import system_matrix
 from malta.linear.sampling import eigenvalues
 from malta.linear.system import System, balanced_units
 from malta.loops.loop import Loop, loop_along, loop_from
@@ -120,7 +121,7 @@ def loop_systems(plant: Plant | Loop, controller: Controller | None = None) -> L
     whole = loop_from(plant, controller)
     plant, controller, loop = whole.plant, whole.controller, whole.sampled_forces
     law, m = loop.control, len(controller.forces)
-    n, k, p = len(loop.Ad), len(law.A), len(loop.Cd)
+    k, p = len(law.A), len(loop.Cd)
     Cd, B1 = loop.Cd, loop.Bd[:, :m]
     Ad = loop.Ad + (loop.Bd[:, m:] @ Cd if loop.Bd.shape[1] > m else 0)  # with what hangs on the reading
     C1, D1, R = law.C[:m], law.D_y[:m], set_point(controller)
@@ -128,8 +129,8 @@ def loop_systems(plant: Plant | Loop, controller: Controller | None = None) -> L
     pushed = np.vstack([B1, np.zeros((k, m))])
     sent = np.vstack([B1 @ law.D_r[:m] @ R, law.B_r @ R])
     y, v = np.hstack([Cd, np.zeros((p, k))]), np.hstack([D1 @ Cd, C1])
-    cut_at_sensors = np.block([[loop.Ad, loop.Bd @ law.C], [np.zeros((k, n)), law.A]])
-    cut_at_forces = np.block([[Ad, np.zeros((n, k))], [law.B_y @ Cd, law.A]])
+    cut_at_sensors = system_matrix(loop.Ad, loop.Bd @ law.C, None, law.A)
+    cut_at_forces = system_matrix(Ad, None, law.B_y @ Cd, law.A)
     forces, outputs = ([s.name for s in signals] for signals in (plant.inputs, plant.outputs))
     Ts, references = controller.sample_time, reference_names(controller)
     one_p, one_m = np.eye(p), np.eye(m)
@@ -352,7 +353,7 @@ def _commanded_system(c: Controller, law: LinearLaw) -> tuple[System, tuple[Floa
     D_old = np.hstack([law.D_r[:, of_stored][:, r] @ stored[r] for r in rows])
     size = p * c.delay
     shift = (np.eye(size, k=-p) - np.eye(size)) / T
-    whole = np.block([[A, B_old], [np.zeros((size, len(A))), shift]])
+    whole = system_matrix(A, B_old, None, shift)
     newest = np.vstack([np.eye(p), np.zeros((size - p, p))]) / T
     driven = System(whole, np.vstack([B_y, np.zeros((size, p))]), np.hstack([C, D_old]), law.D_y)
     return driven, (np.vstack([law.B_r @ R / T, newest]), law.D_r @ R)

@@ -21,6 +21,7 @@ from scipy import linalg, sparse
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.linear.conversion import from_control
+from malta.linear.matrices import system_matrix
 from malta.linear.system import System
 from malta.synthesis.elements import CALLER
 from malta.synthesis.structure import OF_INPUTS, OF_OUTPUTS
@@ -75,7 +76,7 @@ def _crossings(system: System, level: float) -> FloatArray:
     R = D.T @ D - level**2 * np.eye(B.shape[1])
     S = D @ D.T - level**2 * np.eye(len(C))
     own = A - B @ np.linalg.solve(R, D.T @ C)
-    H = np.block([[own, -level * B @ np.linalg.solve(R, B.T)], [level * C.T @ np.linalg.solve(S, C), -own.T]])
+    H = system_matrix(own, -level * B @ np.linalg.solve(R, B.T), level * C.T @ np.linalg.solve(S, C), -own.T)
     found = np.linalg.eigvals(H)
     on_axis = np.abs(found.real) <= NEAR * np.abs(found) + 1e-300
     return np.unique(np.abs(found[on_axis].imag))

@@ -14,6 +14,7 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.matrices import system_matrix
 from malta.linear.system import System
 
 CALLER = "structured"
@@ -126,7 +127,7 @@ class Element:
         def matrices(values: Sequence[Any]) -> Matrices:
             A1, B1, C1, D1 = other.matrices(values[k:])
             A2, B2, C2, D2 = self.matrices(values[:k])
-            A = ca.blockcat([[A2, B2 @ C1], [ca.DM(A1.shape[0], A2.shape[0]), A1]])
+            A = system_matrix(A2, B2 @ C1, None, A1)
             return A, ca.vertcat(B2 @ D1, B1), ca.horzcat(C2, D2 @ C1), D2 @ D1
 
         return _diagram(" ", self, other, matrices)

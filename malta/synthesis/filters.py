@@ -20,6 +20,7 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.matrices import system_matrix
 from malta.linear.sampling import add_lags, delay_inputs, sample, sample_noise
 from malta.processes import on_one_thread
 from malta.synthesis.riccati import Solver, care, dare
@@ -215,7 +216,7 @@ def sampled_noise(model: Linear, weights: Weights, Ts: float, delay: int, *, int
         if weights.coordinates == "positions":  # forces that make these accelerations
             back = np.linalg.inv(model.B[n // 2 :])
             drift = back @ drift @ back.T
-        Ad = np.block([[Ad, Bd], [np.zeros((m, n)), np.eye(m)]])
+        Ad = system_matrix(Ad, Bd, None, np.eye(m))
         W = np.asarray(linalg.block_diag(W, drift))
         C, S = np.hstack([C, np.zeros((p, m))]), np.vstack([S, np.zeros((m, p))])
     return Noisy(Ad, C, W, V, S)

@@ -17,6 +17,7 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.matrices import system_matrix
 from malta.linear.system import System, balanced_units
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
@@ -94,7 +95,7 @@ def law_of_errors(
         **part,
         name=name,
         states=(*states, *(Signal(s.name + ERROR, s.unit) for s in plant.outputs)),
-        Ad=np.block([[A, -B], [np.zeros((p, n + p))]]),
+        Ad=system_matrix(A, -B),
         Bd=np.zeros((n + p, m)),
         Cd=np.zeros((p, n + p)),
         K=np.hstack([-C, D]),

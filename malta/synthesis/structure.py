@@ -43,6 +43,7 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.matrices import system_matrix
 from malta.linear.system import System
 from malta.model.linearize import LinearModel
 from malta.model.plant import Plant, Signal
@@ -172,7 +173,7 @@ class Structure:
             a, b, c, d = made[element.name]
             D = D + left @ d @ right
             A, B, C = [*A, a], [*B, b @ right], [*C, left @ c]
-        theta = ca.densify(ca.blockcat([[D, ca.horzcat(*C)], [ca.vertcat(*B), ca.diagcat(*A)]]))
+        theta = ca.densify(system_matrix(D, ca.horzcat(*C), ca.vertcat(*B), ca.diagcat(*A)))
         return ca.Function("theta", [numbers], [theta, ca.jacobian(theta, numbers)])
 
     @cached_property
