@@ -80,8 +80,13 @@ class System:
                 raise InputError("System", field, " ".join(names), f"{size} names, or none")
 
     def __iter__(self) -> Iterator[FloatArray]:
+        return iter(self.matrices)
+
+    @property
+    def matrices(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """A, B, C and D of the same system solved for x'."""
         own = self.explicit
-        return iter((own.A, own.B, own.C, own.D))
+        return own.A, own.B, own.C, own.D
 
     @cached_property
     def explicit(self) -> System:
@@ -118,6 +123,19 @@ class System:
             except np.linalg.LinAlgError as error:
                 raise CheckError("no states: the matrix of the new ones is singular") from error
         return System(A, B, C, D, None, self.dt, (), self.inputs, self.outputs)
+
+    def to_control(self, name: str | None = None) -> Any:
+        """Make a control.StateSpace: the same matrices and names, with E solved for.
+
+        Where states are in unlike units hand over `balanced`: python-control's responses, by slycot's Hessenberg form,
+        lose digits else. At 1 rad/s |S| of the planar motor's PID came out 1800 times too large.
+        """
+        import control  # imports matplotlib and takes a second: only where it is used
+
+        A, B, C, D = self
+        fields = ("states", "inputs", "outputs")
+        names = {field: list(getattr(self, field)) for field in fields if getattr(self, field)}
+        return control.ss(A, B, C, D, self.dt or 0, name=name, **names)
 
     def part(self, outputs: Sequence[int | str], inputs: Sequence[int | str]) -> System:
         """The system between some signals, by index or name. Raises InputError for unknown names."""

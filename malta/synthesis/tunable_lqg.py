@@ -31,7 +31,6 @@ from malta.linear.system import System
 from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
 from malta.synthesis.elements import CALLER, Bounds, Element, Matrices, keep_sign
-from malta.synthesis.filters import Lagged
 from malta.synthesis.lqg import check_sizes, out_of_reach
 from malta.synthesis.riccati import Solution, care
 from malta.synthesis.spec import Weights
@@ -178,11 +177,7 @@ def _sizes(plant: System, weights: Weights) -> dict[str, float]:
 def _model_of(name: str, model: Any) -> System:
     """A model as a system with names. Raises InputError."""
     if isinstance(model, LinearModel):
-        plant = model.plant
-        signals = plant.design_states, plant.inputs, plant.outputs
-        names = [tuple(s.name for s in of) for of in signals]
-        through = np.zeros((len(model.C), model.B.shape[1]))
-        return System(model.A, model.B, model.C, through, None, None, *names)
+        return model.system
     if hasattr(model, "A"):
         found = from_control(model, CALLER, name)
         if found.dt is not None or found.D.any():
@@ -205,7 +200,7 @@ def _require_fit(name: str, plant: System, weights: Weights) -> None:
         raise InputError(CALLER, f"{name}.weights", found, "weights of signals, without a drift")
     A, B, C = plant.A, plant.B, plant.C
     with relocate_errors(CALLER, f"{name}.{{}}"):
-        check_sizes(Lagged(A, B, C, np.zeros((len(A), len(C)))), weights)
+        check_sizes(plant, weights)
     reason = out_of_reach(A, B, C, plant.states)
     if reason:
         raise InputError(CALLER, name, reason, "a plant that its inputs stabilize and its outputs show")
