@@ -1,4 +1,4 @@
-"""Systems from python-control and to it: all states and all poles stay, whatever else is installed."""
+"""Systems of python-control: all states and all poles stay, whatever else is installed."""
 
 from __future__ import annotations
 
@@ -85,26 +85,3 @@ def _numbers(source: Any, where: str, field: str) -> tuple[FloatArray, FloatArra
         raise InputError(where, field, "NaN or infinity", "finite numbers")
     n = A.shape[0] if A.size else 0
     return A.reshape(n, n), B.reshape(n, D.shape[1]), C.reshape(len(D), n), D
-
-
-def to_control(system: System, name: str | None = None) -> Any:
-    """Make a control.StateSpace: the same matrices and names, with E solved for.
-
-    Its states are in balanced units, powers of two: python-control's responses, by slycot's Hessenberg form, lose
-    digits else. At 1 rad/s |S| of the planar motor's PID came out 1800 times too large.
-
-    Raises CheckError where E is singular.
-
-    >>> import numpy as np
-    >>> from malta.linear.conversion import to_control
-    >>> from malta.linear.system import System
-    >>> one = np.eye(1)
-    >>> to_control(System(-one, one, one, 0 * one, None, 0.1), "lag").dt
-    0.1
-    """
-    import control  # imports matplotlib and takes a second: only where it is used
-
-    A, B, C, D = system.balanced
-    fields = ("states", "inputs", "outputs")
-    names = {field: list(getattr(system, field)) for field in fields if getattr(system, field)}
-    return control.ss(A, B, C, D, system.dt or 0, name=name, **names)

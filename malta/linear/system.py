@@ -20,6 +20,7 @@ from scipy import linalg, sparse
 from malta.arguments import describe
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.matrices import system_matrix
 from malta.linear.sampling import delay_inputs, eigenvalues, sample
 
 MANY = 32  # frequencies from which on a Schur form is worth its time
@@ -79,8 +80,13 @@ class System:
                 raise InputError("System", field, " ".join(names), f"{size} names, or none")
 
     def __iter__(self) -> Iterator[FloatArray]:
+        return iter(self.matrices)
+
+    @property
+    def matrices(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """A, B, C and D of the same system solved for x'."""
         own = self.explicit
-        return iter((own.A, own.B, own.C, own.D))
+        return own.A, own.B, own.C, own.D
 
     @cached_property
     def explicit(self) -> System:
@@ -118,6 +124,19 @@ class System:
                 raise CheckError("no states: the matrix of the new ones is singular") from error
         return System(A, B, C, D, None, self.dt, (), self.inputs, self.outputs)
 
+    def to_control(self, name: str | None = None) -> Any:
+        """Make a control.StateSpace: the same matrices and names, with E solved for.
+
+        Where states are in unlike units hand over `balanced`: python-control's responses, by slycot's Hessenberg form,
+        lose digits else. At 1 rad/s |S| of the planar motor's PID came out 1800 times too large.
+        """
+        import control  # imports matplotlib and takes a second: only where it is used
+
+        A, B, C, D = self
+        fields = ("states", "inputs", "outputs")
+        names = {field: list(getattr(self, field)) for field in fields if getattr(self, field)}
+        return control.ss(A, B, C, D, self.dt or 0, name=name, **names)
+
     def part(self, outputs: Sequence[int | str], inputs: Sequence[int | str]) -> System:
         """The system between some signals, by index or name. Raises InputError for unknown names."""
         rows, columns = _picked(outputs, self.outputs, "outputs"), _picked(inputs, self.inputs, "inputs")
@@ -152,7 +171,7 @@ class System:
 
         Of any number of inputs and outputs (Emami-Naeini and Van Dooren, Automatica 18(4), 1982).
         """
-        A, B, C, D = _without_zeros_at_infinity(*self.balanced)
+        A, B, C, D = _without_zeros_at_infinity(*_scaled(*self.balanced))
         A, B, C, D = _without_zeros_at_infinity(A.T, C.T, B.T, D.T)  # of a D that is square and regular now
         n = len(A)
         if not n:
@@ -226,9 +245,21 @@ def balanced_units(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     """Powers of two t for states x = t xi, in which A t / t', B / t' and C t have rows and columns of like size."""
     n, size = len(A), len(A) + max(B.shape[1], len(C))
     whole = np.zeros((size, size))
-    whole[:n, :n], whole[:n, n : n + B.shape[1]], whole[n : n + len(C), :n] = A, B, C
+    whole[: n + len(C), : n + B.shape[1]] = system_matrix(A, B, C)
     _, (units, _) = linalg.matrix_balance(whole, permute=False, separate=True)
     return np.asarray(units[:n])
+
+
+def _scaled(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The system with inputs and outputs in units in which they are of the size of A: the zeros are the same."""
+    size = float(np.abs(A).max(initial=0.0)) or 1.0
+    rows = np.abs(np.hstack([C, D])).max(axis=1, initial=0.0, keepdims=True)
+    rows = size / np.where(rows > 0, rows, size)
+    columns = np.abs(np.vstack([B, rows * D])).max(axis=0, initial=0.0, keepdims=True)
+    columns = size / np.where(columns > 0, columns, size)
+    return A, B * columns, rows * C, rows * D * columns
 
 
 def _without_zeros_at_infinity(

@@ -110,8 +110,6 @@ class UncertainSystem:
         >>> motor.state_space(J=1e-3).poles().real.tolist()
         [-100.0]
         """
-        import control
-
         p = self.nominal.copy()
         for name, value in values.items():
             require_known([name], self.names, "state_space", found="an unknown parameter")
@@ -122,7 +120,8 @@ class UncertainSystem:
             found = [np.full((1, 1), np.nan)]
         if not all(np.isfinite(M).all() for M in found):
             raise InputError("state_space", "matrices", "no value there", "parameters within their limits")
-        return control.ss(*found, 0 if self.sample_time is None else self.sample_time)
+        A, B, C, D = found
+        return System(A, B, C, D, None, self.sample_time).to_control()
 
 
 @dataclass(frozen=True, eq=False)

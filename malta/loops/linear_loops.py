@@ -24,6 +24,7 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.linear.conversion import from_control
+from malta.linear.matrices import system_matrix
 from malta.linear.sampling import eigenvalues
 from malta.linear.system import System, balanced_units
 from malta.loops.classical import Nominal
@@ -31,7 +32,7 @@ from malta.loops.loop import Loop, loop_along, loop_from
 from malta.model.plant import Plant, Signal
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, LinearLaw, linear_law
-from malta.synthesis.state_space import named_system, reference_names, set_point
+from malta.synthesis.law_system import reference_names, set_point
 
 # The loop of a machine and a controller as systems of python-control: to plot, to simulate, to compute with.
 #
@@ -121,7 +122,7 @@ def loop_systems(plant: Plant | Loop, controller: Controller | None = None) -> L
     whole = loop_from(plant, controller)
     plant, controller, loop = whole.plant, whole.controller, whole.sampled_forces
     law, m = loop.control, len(controller.forces)
-    n, k, p = len(loop.Ad), len(law.A), len(loop.Cd)
+    k, p = len(law.A), len(loop.Cd)
     Cd, B1 = loop.Cd, loop.Bd[:, :m]
     Ad = loop.Ad + (loop.Bd[:, m:] @ Cd if loop.Bd.shape[1] > m else 0)  # with what hangs on the reading
     C1, D1, R = law.C[:m], law.D_y[:m], set_point(controller)
@@ -129,21 +130,26 @@ def loop_systems(plant: Plant | Loop, controller: Controller | None = None) -> L
     pushed = np.vstack([B1, np.zeros((k, m))])
     sent = np.vstack([B1 @ law.D_r[:m] @ R, law.B_r @ R])
     y, v = np.hstack([Cd, np.zeros((p, k))]), np.hstack([D1 @ Cd, C1])
-    cut_at_sensors = np.block([[loop.Ad, loop.Bd @ law.C], [np.zeros((k, n)), law.A]])
-    cut_at_forces = np.block([[Ad, np.zeros((n, k))], [law.B_y @ Cd, law.A]])
-    forces, outputs = ([s.name for s in signals] for signals in (plant.inputs, plant.outputs))
-    Ts, references = controller.sample_time, reference_names(controller)
-    one_p, one_m = np.eye(p), np.eye(m)
+    cut_at_sensors = system_matrix(loop.Ad, loop.Bd @ law.C, None, law.A)
+    cut_at_forces = system_matrix(Ad, None, law.B_y @ Cd, law.A)
+    forces, outputs = (tuple(s.name for s in signals) for signals in (plant.inputs, plant.outputs))
+    references, one_p, one_m = tuple(reference_names(controller)), np.eye(p), np.eye(m)
+
+    def system(name: str, inputs: Names, outputs: Names, A: Any, B: Any, C: Any, D: Any = 0) -> Any:
+        through = np.zeros((len(C), B.shape[1])) + D
+        made = System(A, B, C, through, None, controller.sample_time, (), inputs, outputs)
+        return made.balanced.to_control(name)
+
     return LoopSystems(
-        P=named_system("P", forces, outputs, Ts, Ad, B1, Cd),
-        F=named_system("F", outputs, forces, Ts, law.A, law.B_y, C1, D1),
-        L=named_system("L", outputs, outputs, Ts, cut_at_sensors, read, -y),
-        S=named_system("S", outputs, outputs, Ts, loop.closed, read, y, one_p),
-        T=named_system("T", outputs, outputs, Ts, loop.closed, read, -y),
-        L_forces=named_system("L_forces", forces, forces, Ts, cut_at_forces, pushed, -v),
-        S_forces=named_system("S_forces", forces, forces, Ts, loop.closed, pushed, v, one_m),
-        T_forces=named_system("T_forces", forces, forces, Ts, loop.closed, pushed, -v),
-        tracking=named_system("tracking", references, outputs, Ts, loop.closed, sent, y),
+        P=system("P", forces, outputs, Ad, B1, Cd),
+        F=system("F", outputs, forces, law.A, law.B_y, C1, D1),
+        L=system("L", outputs, outputs, cut_at_sensors, read, -y),
+        S=system("S", outputs, outputs, loop.closed, read, y, one_p),
+        T=system("T", outputs, outputs, loop.closed, read, -y),
+        L_forces=system("L_forces", forces, forces, cut_at_forces, pushed, -v),
+        S_forces=system("S_forces", forces, forces, loop.closed, pushed, v, one_m),
+        T_forces=system("T_forces", forces, forces, loop.closed, pushed, -v),
+        tracking=system("tracking", references, outputs, loop.closed, sent, y),
         plant=plant,
         controller=controller,
     )
@@ -151,6 +157,7 @@ def loop_systems(plant: Plant | Loop, controller: Controller | None = None) -> L
 
 CALLER = "loop"
 Place = Literal["sensors", "forces"]
+Names = tuple[str, ...]
 GONE = 1e-6  # |z| of the poles of pure delay
 STILL = 1e-6  # of a pole's frequency: growth that counts as none
 ROUNDING = 1e-14  # of a matrix whose eigenvalues are taken
@@ -361,7 +368,7 @@ def _commanded_system(c: Controller, law: LinearLaw) -> tuple[System, tuple[Floa
     D_old = np.hstack([law.D_r[:, of_stored][:, r] @ stored[r] for r in rows])
     size = p * c.delay
     shift = (np.eye(size, k=-p) - np.eye(size)) / T
-    whole = np.block([[A, B_old], [np.zeros((size, len(A))), shift]])
+    whole = system_matrix(A, B_old, None, shift)
     newest = np.vstack([np.eye(p), np.zeros((size - p, p))]) / T
     driven = System(whole, np.vstack([B_y, np.zeros((size, p))]), np.hstack([C, D_old]), law.D_y)
     return driven, (np.vstack([law.B_r @ R / T, newest]), law.D_r @ R)

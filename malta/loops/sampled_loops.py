@@ -23,6 +23,7 @@ import numpy as np
 from malta.arrays import ComplexArray, FloatArray, readonly
 from malta.display import display
 from malta.errors import CheckError
+from malta.linear.matrices import system_matrix
 from malta.linear.peaks import in_plane
 from malta.linear.sampling import add_lags, delay_inputs, eigenvalues, sample
 from malta.linear.system import System
@@ -164,7 +165,8 @@ class SampledLoop:
     def closed(self) -> FloatArray:
         """State matrix of the closed loop, states of the machine first."""
         c = self.control
-        return np.block([[self.Ad + self.Bd @ c.D_y @ self.Cd, self.Bd @ c.C], [c.B_y @ self.Cd, c.A]])
+        through = self.Ad + self.Bd @ c.D_y @ self.Cd
+        return np.asarray(system_matrix(through, self.Bd @ c.C, c.B_y @ self.Cd, c.A))
 
     def loop_gain(self, w: FloatArray) -> ComplexArray:
         """The loop gain at the sensors, L = -P F, at the frequencies w (rad/s): k x p x p."""
@@ -321,7 +323,7 @@ def _driven(
     phi, share = C[-m:], None
     link = link_at_rest(plant, windings, point, axis_map(believed, point)) if point.loaded else None
     if link is not None:
-        A = np.block([[A, B @ link.share[:, None]], [link.by_phi @ phi, np.array([[link.rate]])]])
+        A = system_matrix(A, B @ link.share[:, None], (link.by_phi @ phi)[None], np.array([[link.rate]]))
         B, phi, share = np.vstack([B, link.by_w[None]]), _pad(phi, len(A)), link.share
     Ad, Bd = sample_driven((A, B, phi), control.loop, windings.R, Ts, delay, share)
     return readonly(A), readonly(Ad), readonly(Bd), control

@@ -32,6 +32,7 @@ from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.linear.conversion import from_control
 from malta.linear.interconnection import append, gain, interconnect, lft, series
+from malta.linear.matrices import system_matrix
 from malta.linear.peaks import peak_gain
 from malta.linear.reduction import balanced_reduction
 from malta.linear.system import System
@@ -208,7 +209,7 @@ def _riccati(
         return np.zeros((0, 0)), 0.0
     inner = np.linalg.solve(R, np.hstack([S.T, B.T]))
     G, own = B @ inner[:, n:], A - B @ inner[:, :n]
-    H = np.block([[own, -G], [-(Q - S @ inner[:, :n]), -own.T]])
+    H = system_matrix(own, -G, -(Q - S @ inner[:, :n]), -own.T)
     _, (scale, _) = matrix_balance(H, permute=False, separate=True)
     t = np.sqrt(scale[:n] / scale[n:])  # symplectic: states by t, costates by 1 / t
     t = 2.0 ** np.round(np.log2(t))
@@ -382,10 +383,7 @@ def shape_loop(plant: Any, before: Any = 1.0, after: Any = 1.0) -> Synthesized:
     '1.4142'
     """
     G = from_control(plant, "shape_loop", "plant")
-    W1, W2 = (
-        _shaping(one, size, name)
-        for one, size, name in ((before, G.D.shape[1], "before"), (after, len(G.D), "after"))
-    )
+    W1, W2 = _shaping(before, G.D.shape[1], "before"), _shaping(after, len(G.D), "after")
     shaped = series(W1, G, W2)
     A, B, C, D = _system_of(shaped)
     if D.any():
@@ -404,11 +402,9 @@ def shape_loop(plant: Any, before: Any = 1.0, after: Any = 1.0) -> Synthesized:
     back = np.linalg.inv(inner.T)
     F = -B.T @ X
     own = System(A + B @ F + gamma**2 * back @ Z @ C.T @ C, gamma**2 * back @ Z @ C.T, F, np.zeros((m, p)))
-    eye = np.eye(p)  # w = (r, d): y = r - G (u + d); z = (u, y)
-    four = System(
-        A, np.hstack([np.zeros((n, p)), B, B]), np.vstack([np.zeros((m, n)), -C, -C]),
-        np.block([[np.zeros((m, p + m)), np.eye(m)], [eye, np.zeros((p, 2 * m))], [eye, np.zeros((p, 2 * m))]]),
-    )  # fmt: skip
+    # w = (r, d): y = r - G (u + d); z = (u, y)
+    direct = system_matrix(np.zeros((m, p + m)), np.eye(m), np.tile(np.eye(p, p + m), (2, 1)))
+    four = System(A, np.hstack([np.zeros((n, p)), B, B]), np.vstack([np.zeros((m, n)), -C, -C]), direct)
     norm, w = _checked(four, own, gamma)
     coupling = float(np.abs(np.linalg.eigvals(X @ Z)).max(initial=0.0)) / (gamma**2 - 1)
     return Synthesized(series(W2, own, W1), best, norm, w, coupling, max(x[1], z[1]))
@@ -425,17 +421,14 @@ SLOW = 1.0  # rad/s: a pole below counts as an integral
 def split_integrals(law: System) -> tuple[System, System]:
     """Split a continuous law into its integrals, with their poles at 0, and the rest, with D.
 
-        Poles below 1 rad/s count as integrals. The sum of both is the law, but for these poles.
+    Poles below 1 rad/s count as integrals. The sum of both is the law, but for these poles.
 
-        >>> from malta.linear.conversion import from_control
-    from malta.linear.interconnection import append, gain, interconnect, lft, series
-    from malta.linear.reduction import balanced_reduction
-    from malta.linear.system import System
-        >>> import numpy as np
-        >>> law = System(np.diag([0.0, -10.0]), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1)))
-        >>> integrals, rest = split_integrals(law)
-        >>> integrals.A.tolist(), rest.A.round(6).tolist()
-        ([[0.0]], [[-10.0]])
+    >>> from malta.linear.system import System
+    >>> import numpy as np
+    >>> law = System(np.diag([0.0, -10.0]), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1)))
+    >>> integrals, rest = split_integrals(law)
+    >>> integrals.A.tolist(), rest.A.round(6).tolist()
+    ([[0.0]], [[-10.0]])
     """
     A, B, C, D = law.balanced
     S, Z, k = linalg.schur(A, sort=lambda re, im: bool(np.hypot(re, im) < SLOW))
@@ -448,18 +441,15 @@ def split_integrals(law: System) -> tuple[System, System]:
 def truncate(law: System, order: int) -> System:
     """Leave out states of a stable law, those of the smallest Hankel singular values sigma: balanced truncation.
 
-            |G - G_r| <= 2 (sigma_(order+1) + ... + sigma_n)
+        |G - G_r| <= 2 (sigma_(order+1) + ... + sigma_n)
 
-        Raises InputError for an unstable law, and for an order that it does not have.
+    Raises InputError for an unstable law, and for an order that it does not have.
 
-        >>> from malta.linear.conversion import from_control
-    from malta.linear.interconnection import append, gain, interconnect, lft, series
-    from malta.linear.reduction import balanced_reduction
-    from malta.linear.system import System
-        >>> import numpy as np
-        >>> law = System(np.diag([-1.0, -100.0]), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1)))
-        >>> truncate(law, 1).A.round(2).tolist()
-        [[-1.02]]
+    >>> from malta.linear.system import System
+    >>> import numpy as np
+    >>> law = System(np.diag([-1.0, -100.0]), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1)))
+    >>> truncate(law, 1).A.round(2).tolist()
+    [[-1.04]]
     """
     if not 0 <= order <= len(law.A):
         raise InputError(CALLER, "order", str(order), f"0 to {len(law.A)}, of the law")

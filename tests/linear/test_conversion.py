@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import malta
-from malta.linear.conversion import from_control, to_control
+from malta.linear.conversion import from_control
 
 
 def read(source: Any, **options: Any) -> Any:
@@ -177,7 +177,7 @@ def test_complex_numbers_are_refused() -> None:
 def test_there_and_back() -> None:
     names = {"states": ["a", "b"], "inputs": ["u"], "outputs": ["y"]}
     given = control.ss([[0, 1], [-1e6, -1]], [[0], [1]], [[1, 0]], [[0.5]], 0.1, name="one", **names)
-    back = to_control(read(given), "one")
+    back = read(given).to_control("one")
     assert (back.state_labels, back.input_labels, back.output_labels) == (["a", "b"], ["u"], ["y"])
     assert (back.dt, back.name) == (0.1, "one")
     z = np.exp(1j * np.array([0.1, 1.0]))
