@@ -27,6 +27,7 @@ from malta.linear.conversion import from_control
 from malta.linear.matrices import system_matrix
 from malta.linear.sampling import eigenvalues
 from malta.linear.system import System, balanced_units
+from malta.loops.classical import Nominal
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.model.plant import Plant, Signal
 from malta.processes import on_one_thread
@@ -238,6 +239,14 @@ class LinearLoop:
     def responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
         """The functions of frequency of the plant and of the law, see `System.response`."""
         return self.plant.response_function(), self.law.response_function()
+
+    @cached_property
+    def cut(self) -> Nominal:
+        """The loop cut at its sensors and at its forces: what margins are read from."""
+        (A, B, C, D), p, u = self.plant, len(self.outputs), len(self.law.C)
+        return Nominal(
+            System(A, B[:, :u], C[:p], D[:p, :u]), self.law, self.stable, self.sample_time, len(self.inputs)
+        )
 
     def unstable_poles(self, factors: FloatArray, at: Place) -> int:
         """How many poles grow with these factors of the loop gain.

@@ -22,8 +22,9 @@ from malta.display import display
 from malta.errors import InputError
 from malta.linear.conversion import from_control
 from malta.linear.interconnection import append, series
+from malta.linear.peaks import response_at
 from malta.linear.system import System
-from malta.structured.loops import Channels, ClosedLoop, Pole, gain_slope, noise, peaks_of, response_at
+from malta.structured.loops import Channels, ClosedLoop, Pole, gain_slope, noise, peaks_of
 from malta.synthesis.elements import CALLER
 
 At = Literal["sensors", "forces"]

@@ -33,10 +33,10 @@ from malta.errors import CheckError, InputError
 from malta.linear.conversion import from_control
 from malta.linear.interconnection import append, gain, interconnect, lft, series
 from malta.linear.matrices import system_matrix
+from malta.linear.peaks import peak_gain
 from malta.linear.reduction import balanced_reduction
 from malta.linear.system import System
 from malta.processes import on_one_thread
-from malta.structured.loops import peak_gain
 from malta.synthesis.elements import CALLER
 
 H_INFINITY = "h_infinity"

@@ -13,16 +13,9 @@ from hypothesis import given, settings, strategies as st
 
 import malta
 from malta import structured
+from malta.linear.peaks import peak_gain, response_at
 from malta.linear.system import System
-from malta.structured.loops import (
-    ClosedLoop,
-    Model,
-    models_of_systems,
-    noise,
-    peak_gain,
-    peaks_of,
-    response_at,
-)
+from malta.structured.loops import ClosedLoop, Model, models_of_systems, noise, peaks_of
 from malta.synthesis.structure import Structure, places_of, sample_law
 
 GOALS = {

@@ -192,8 +192,8 @@ def bandwidth_table(margins: LoopReport, published: Published | None) -> Table:
     <BLANKLINE>
      definition                              rad/s       Hz
      ──────────────────────────────────────────────────────
-     last -3 dB of sigma_max(T)              652.0   103.76
-     first -3 dB of sigma_min(T)             652.0   103.76
+     last -3 dB of sigma_max(T)              652.3   103.82
+     first -3 dB of sigma_min(T)             652.3   103.82
      last 0 dB of sigma_max(L)               290.8    46.29
      regulator's fastest natural frequency   247.4    39.37
      regulator's slowest natural frequency   247.4    39.37
