@@ -19,10 +19,11 @@ from scipy import linalg
 
 import malta
 from malta import structured
+from malta.linear.reduction import minimal
+from malta.linear.system import System
 from malta.structured.loops import to_plane
 from malta.structured.riccati import split_integrals, truncate
 from malta.synthesis.controller import linear_law
-from malta.synthesis.state_space import System
 from malta.synthesis.structure import sample_law
 
 # The project's root, wherever Jupyter was started.
@@ -68,8 +69,8 @@ T, F = robust.sample_time, linear_law(robust)
 GROUPS = {"x": [0, 2], "y": [1, 3], "z": [4]}  # sensors and actuators that the law joins
 parts = {}
 for group, k in GROUPS.items():
-    whole = control.ss(F.A, -F.B_y[:, k], F.C[k], -F.D_y[np.ix_(k, k)], T)
-    parts[group] = split_integrals(to_plane(System.of(control.minreal(whole, 1e-9, verbose=False)), T))
+    whole = System(F.A, -F.B_y[:, k], F.C[k], -F.D_y[np.ix_(k, k)], None, T)
+    parts[group] = split_integrals(to_plane(minimal(whole).system, T))
 assert [len(rest.A) for _, rest in parts.values()] == [6, 6, 3]
 truncations = {}
 for states in (6, 5, 4):  # beside the integrals, in x and in y

@@ -199,19 +199,8 @@ def crossovers(curves: LoopCurves) -> list[tuple[float, float] | None]:
 
     The others are closed. The margin is the angle from -1 to the loop, 0 to 2 pi.
     """
-    found: list[tuple[float, float] | None] = []
-    for L in curves.responses.alone("sensors").T:
-        size = np.log(np.abs(L))
-        at = np.flatnonzero(np.diff(size > 0))
-        if not len(at):
-            found.append(None)
-            continue
-        k = int(at[-1])
-        share = size[k] / (size[k] - size[k + 1])
-        w = math.exp(float(np.interp(share, [0, 1], np.log(curves.w[k : k + 2]))))
-        angle = float(np.angle(L[k]) + share * np.angle(L[k + 1] / L[k]))
-        found.append((w, (angle + math.pi) % (2 * math.pi)))
-    return found
+    last = [crossings[-1] if crossings else None for crossings in curves.crossings]
+    return [c and (c.frequency, float(np.angle(c.value) + math.pi) % (2 * math.pi)) for c in last]
 
 
 def run_document(problem: Problem, view: View) -> dict[str, Any] | None:
@@ -397,7 +386,7 @@ def _loop_merits(problem: Problem, *, curves: bool) -> list[Merit]:
 
 def _channel_margins(problem: Problem) -> tuple[Merit, Merit]:
     """The smallest phase margin and delay margin of the sensors."""
-    turns = [phase_and_delay(crossings) for crossings in problem.curves.crossings[0]]
+    turns = [phase_and_delay(crossings) for crossings in problem.curves.crossings]
     names = [s.name for s in problem.curves.channels()]
     phase, phase_at = min(zip((turn[0] for turn in turns), names, strict=True))
     delay, delay_at = min(zip((turn[2] for turn in turns), names, strict=True))

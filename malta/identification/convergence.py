@@ -34,10 +34,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, signal
 
-from malta.arrays import ComplexArray, FloatArray
+from malta.arrays import ComplexArray
 from malta.errors import InputError
 from malta.identification.strokes import FORCE
 from malta.linear.branches import INTERVALS, Interval
+from malta.linear.interconnection import gain as of_gain, series
+from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem, closed_loop
 from malta.loops.loop import loop
 from malta.model.data import plant_of
@@ -51,26 +53,6 @@ ALIKE = 1e-6  # by which V T_0 may miss z^-r B
 ON_CIRCLE = 1e-9  # by which a zero of T_0 has to be off the circle
 
 
-class Filter(NamedTuple):
-    """x+ = A x + B u, y = C x + D u of one input and one output."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-
-    def after(self, first: Filter) -> Filter:
-        """The two in series."""
-        A = np.block([[first.A, np.zeros((len(first.A), len(self.A)))], [self.B @ first.C, self.A]])
-        B, C = np.vstack([first.B, self.B @ first.D]), np.hstack([self.D @ first.C, self.C])
-        return Filter(A, B, C, self.D @ first.D)
-
-    def response(self, z: ComplexArray) -> ComplexArray:
-        """At k places z."""
-        states = np.linalg.solve(z[:, None, None] * np.eye(len(self.A)) - self.A, self.B)
-        return np.asarray((self.C @ states + self.D)[:, 0, 0])
-
-
 class Axis(NamedTuple):
     """The states through which one sum of errors moves the stroke, as a loop of their own."""
 
@@ -80,7 +62,7 @@ class Axis(NamedTuple):
     stroke: int  # the reading of the stroke
 
     @property
-    def response(self) -> Filter:
+    def response(self) -> System:
         """T_0 / (z - 1): from the sum to the stroke, of the nominal parameters."""
         Ts = self.law.sample_time
         assert Ts is not None
@@ -90,7 +72,7 @@ class Axis(NamedTuple):
         B[n - len(self.law.A) + self.summed] = 1
         out = self.system.every(self.system.nominal)[2][0][self.stroke]
         C[0, : len(out)] = out
-        return Filter(A, B, C, np.zeros((1, 1)))
+        return System(A, B, C, np.zeros((1, 1)), None, Ts)
 
 
 def contraction(controller: Controller, box: Mapping[str, float], *, time: float | None = None) -> Gain:
@@ -241,7 +223,7 @@ def _reached(flow: NDArray[np.bool_], start: int) -> NDArray[np.bool_]:
     return found
 
 
-def _missed(axis: Axis, inverse: Filter, passed: Filter) -> float | None:
+def _missed(axis: Axis, inverse: System, passed: System) -> float | None:
     """A proven bound of |z^-r B - V T_0| over all frequencies; None where nothing is proven."""
     system, law = _learning(axis, inverse, passed, 1.0)
     channel = (law.C.shape[0] - 1, law.B.shape[1] - 1)
@@ -249,21 +231,21 @@ def _missed(axis: Axis, inverse: Filter, passed: Filter) -> float | None:
     return worst_case_gain(system, law, own, of="effort", channel=channel, tolerance=TOLERANCE).upper
 
 
-def _inverse(axis: Axis) -> tuple[Filter, Filter] | None:
+def _inverse(axis: Axis) -> tuple[System, System] | None:
     """V and z^-r B, in floating point; None where there is no V."""
     of = axis.response
     n, r, answer = len(of.A), 1, of.B
     while not (of.C @ answer).any() and r < n:  # samples until the stroke answers: so many zeros are missing
         r, answer = r + 1, of.A @ answer
-    M, E = np.block([[of.A - np.eye(n), of.B], [of.C, of.D]]), np.diag([*[1.0] * n, 0.0])
-    eigenvalues: Any = linalg.eigvals(M, E)
-    zeros, poles = 1 + eigenvalues[np.isfinite(eigenvalues)], np.linalg.eigvals(of.A).astype(complex)
+    zeros, poles = 1 + replace(of, A=of.A - np.eye(n)).zeros, np.linalg.eigvals(of.A).astype(complex)
     zeros = zeros[np.argsort(np.abs(zeros))[: n - r]]
     outside = np.abs(zeros) > 1
     if len(zeros) < n - r or (np.abs(np.abs(zeros) - 1) < ON_CIRCLE).any():
         return None
     far, at = zeros[outside].conj(), np.exp(1j * np.array([0.01, 0.02]) * np.pi)
-    scale = np.prod(at[:, None] - poles, axis=1) / np.prod(at[:, None] - zeros, axis=1) * of.response(at)
+    scale = (
+        np.prod(at[:, None] - poles, axis=1) / np.prod(at[:, None] - zeros, axis=1) * of.response(at)[:, 0, 0]
+    )
     kept = np.concatenate([zeros[~outside], 1 / far, np.zeros(r)])
     one = np.ones((1, 1))
     try:
@@ -272,25 +254,25 @@ def _inverse(axis: Axis) -> tuple[Filter, Filter] | None:
     except ValueError:  # rounding has parted zeros or poles that are conjugate
         return None
     for _ in range(r):
-        passed = Filter(0 * one, one, one, 0 * one).after(passed)
+        passed = series(passed, System(0 * one, one, one, 0 * one))
     return inverse, passed
 
 
-def _filter(zeros: ComplexArray, poles: ComplexArray, gain: float) -> Filter:
+def _filter(zeros: ComplexArray, poles: ComplexArray, gain: float) -> System:
     """As many zeros as poles, as sections of second order in z - 1: slow ones lie close to 1."""
-    found = Filter(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.full((1, 1), gain))
+    found = of_gain(np.full((1, 1), gain))
     if not len(poles):
         return found
     sections: Any = signal.zpk2sos(zeros, poles, 1.0)  # type: ignore[arg-type]  # complex ones in pairs
     for b0, b1, b2, _, a1, a2 in sections:
         c1, c2 = b1 - a1 * b0, b2 - a2 * b0
         A = np.array([[-1 - a1, -(1 + a1 + a2)], [1.0, 1.0]])
-        section = Filter(A, np.array([[1.0], [0.0]]), np.array([[c1, c1 + c2]]), np.array([[b0]]))
-        found = section.after(found)
+        section = System(A, np.array([[1.0], [0.0]]), np.array([[c1, c1 + c2]]), np.array([[b0]]))
+        found = series(found, section)
     return found
 
 
-def _learning(axis: Axis, V: Filter, passed: Filter, share: float) -> tuple[UncertainSystem, Compensator]:
+def _learning(axis: Axis, V: System, passed: System, share: float) -> tuple[UncertainSystem, Compensator]:
     """The axis with one more reading w and one more command e_out = (z^-r B - share T V) w, both last."""
     system, c = axis.system, axis.law
     n, (m, q), more = len(c.A), c.D.shape, len(V.A) + len(passed.A)

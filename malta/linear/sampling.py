@@ -7,6 +7,7 @@ from scipy import linalg
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError
+from malta.linear.matrices import system_matrix
 
 LARGEST = 1e8  # entry of a matrix whose exponential is taken
 
@@ -20,10 +21,8 @@ def eigenvalues(M: FloatArray) -> ComplexArray:
 
 def sample(A: FloatArray, B: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:
     """Zero-order hold: Ad = e^(A Ts), Bd = integral of e^(A s) B over one sample; of a stack of systems each."""
-    n, m = B.shape[-2:]
-    held = np.zeros((*A.shape[:-2], n + m, n + m))
-    held[..., :n, :n], held[..., :n, n:] = A, B
-    E = _exponential(held * Ts)
+    n = B.shape[-2]
+    E = _exponential(system_matrix(A, B) * Ts)
     return E[..., :n, :n], E[..., :n, n:]
 
 
@@ -42,15 +41,13 @@ def delay_inputs(Ad: FloatArray, Bd: FloatArray, delay: int) -> tuple[FloatArray
 def add_lags(A: FloatArray, B: FloatArray, rate: float) -> tuple[FloatArray, FloatArray]:
     """The continuous system whose inputs follow as first-order lags, rate / (s + rate); they are states after x."""
     n, m = B.shape[-2:]
-    lagged = np.zeros((*A.shape[:-2], n + m, n + m))
-    lagged[..., :n, :n], lagged[..., :n, n:], lagged[..., n:, n:] = A, B, -rate * np.eye(m)
-    return lagged, np.vstack([np.zeros((n, m)), rate * np.eye(m)])
+    return system_matrix(A, B, None, -rate * np.eye(m)), np.vstack([np.zeros((n, m)), rate * np.eye(m)])
 
 
 def add_integrals(Ad: FloatArray, Bd: FloatArray, Cd: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:
     """The sampled system with e+ = e - Ts y+ appended, the controller's own sums of the measured errors."""
     p = len(Cd)
-    A = np.block([[Ad, np.zeros((len(Ad), p))], [-Ts * Cd @ Ad, np.eye(p)]])
+    A = system_matrix(Ad, None, -Ts * Cd @ Ad, np.eye(p))
     return A, np.vstack([Bd, -Ts * Cd @ Bd])
 
 
@@ -61,10 +58,8 @@ def sample_cost(
 
     Van Loan, IEEE Trans. Autom. Control 23(3), 1978; the weights of MATLAB's lqrd.
     """
-    n, m = B.shape
-    F = np.zeros((n + m, n + m))
-    F[:n, :n], F[:n, n:] = A, B
-    Wd = sample_noise(F.T, linalg.block_diag(Q, R), Ts)
+    n = len(A)
+    Wd = sample_noise(system_matrix(A, B).T, linalg.block_diag(Q, R), Ts)
     return Wd[:n, :n], Wd[:n, n:], Wd[n:, n:]
 
 
@@ -74,7 +69,7 @@ def sample_noise(A: FloatArray, W: FloatArray, Ts: float) -> FloatArray:
     The integral of e^(A s) W e^(A' s) over a sample, from one exponential; W counts in its largest entry.
     """
     n, size = len(A), np.abs(W).max() or 1.0
-    E = _exponential(np.block([[-A, W / size], [np.zeros((n, n)), A.T]]) * Ts)
+    E = _exponential(system_matrix(-A, W / size, None, A.T) * Ts)
     W = E[n:, n:].T @ E[:n, n:] * size
     return np.asarray((W + W.T) / 2)
 

@@ -19,6 +19,7 @@ import numpy as np
 from malta.arguments import by_name, describe, interval, is_number, matrix, number, plural, positive
 from malta.arrays import readonly
 from malta.errors import InputError, require_known
+from malta.linear.conversion import from_control, is_transfer
 from malta.linear.uncertain import Compensator, UncertainSystem
 
 # Algebraic equations of a descriptor system: zero rows of E, solved for the states of its zero columns.
@@ -236,25 +237,11 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
     """
 
     wanted = "a Compensator, a proper control.StateSpace or TransferFunction, or a gain matrix"
-    if hasattr(law, "num_list") or hasattr(law, "num_array"):
-        import control
-
-        try:
-            law = control.ss(law)
-        except Exception as error:  # improper, or of several inputs and outputs
-            first = str(error).strip().split("\n")[0]
-            raise InputError("compensator", "law", f"a TransferFunction ({first})", wanted) from error
     if isinstance(law, Compensator):
         found = law
-    elif all(hasattr(law, name) for name in ("A", "B", "C", "D", "dt")):
-        if law.dt is True:
-            raise InputError("compensator", "dt", "True", "0, or a sample time in seconds")
-        T = None if not law.dt else float(law.dt)
-        A, B, C, D = (np.asarray(M, dtype=float) for M in (law.A, law.B, law.C, law.D))
-        n, D = len(A), np.atleast_2d(D)
-        found = Compensator(A, B.reshape(n, D.shape[1]), C.reshape(len(D), n), D, sample_time=T)
-    elif hasattr(law, "ninputs") or isinstance(law, bool | None):  # a response, which has no states
-        raise InputError("compensator", "law", describe(law), wanted)
+    elif is_transfer(law) or hasattr(law, "dt") or hasattr(law, "ninputs") or isinstance(law, bool | None):
+        own = from_control(law, "compensator", "law", expected=wanted)
+        found = Compensator(own.A, own.B, own.C, own.D, sample_time=own.dt)
     else:
         D = matrix("compensator", "law", law, wanted)
         found = Compensator(np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((len(D), 0)), D)

@@ -6,20 +6,20 @@ u = H F y                                 a control law F, and the lag, hold and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from malta.arguments import number
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError, require_known
 from malta.linear.sampling import add_lags, delay_inputs, sample
+from malta.linear.system import System
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +110,6 @@ class UncertainSystem:
         >>> motor.state_space(J=1e-3).poles().real.tolist()
         [-100.0]
         """
-        import control
-
         p = self.nominal.copy()
         for name, value in values.items():
             require_known([name], self.names, "state_space", found="an unknown parameter")
@@ -122,7 +120,8 @@ class UncertainSystem:
             found = [np.full((1, 1), np.nan)]
         if not all(np.isfinite(M).all() for M in found):
             raise InputError("state_space", "matrices", "no value there", "parameters within their limits")
-        return control.ss(*found, 0 if self.sample_time is None else self.sample_time)
+        A, B, C, D = found
+        return System(A, B, C, D, None, self.sample_time).to_control()
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,6 +303,22 @@ def _resolvent(s: ComplexArray, A: FloatArray, B: FloatArray) -> ComplexArray:
     return found
 
 
+def open_systems(system: UncertainSystem, law: Compensator, p: FloatArray) -> tuple[System, System]:
+    """y = P u, with lag, hold and delay, and u = F y at one row of parameters; in differences when sampled."""
+    m, T = len(law.D), law.sample_time
+    A, B, C, D = (M[0] for M in _plant(system, law, np.asarray(p, dtype=float).tobytes()))
+    q, n = len(C) - m, len(A)
+    B, C, D = B[:, :m], C[:q], D[:q, :m]
+    if T is not None and law.delay:
+        stored = m * law.delay  # commands, the oldest first
+        whole, into, out = np.zeros((n + stored,) * 2), np.zeros((n + stored, m)), np.zeros((q, n + stored))
+        whole[:n, :n], whole[:n, n : n + m] = A, B
+        whole[n:, n:] = (np.eye(stored, k=m) - np.eye(stored)) / T
+        into[-m:], out[:, :n], out[:, n : n + m] = np.eye(m) / T, C, D
+        A, B, C, D = whole, into, out, np.zeros((q, m))
+    return System(A, B, C, D), System(*difference_form(law), law.C, law.D)
+
+
 Sides = tuple["FloatArray", "FloatArray", "FloatArray", "FloatArray"]
 
 
@@ -344,42 +359,3 @@ def _law(law: Compensator, w: bytes) -> tuple[ComplexArray, ComplexArray, Comple
     F_A, F_B = difference_form(law)
     F = law.C @ _resolvent(s, F_A[None], F_B[None]) + law.D
     return s, turned, np.asarray(F, dtype=complex)
-
-
-def find_peaks(
-    sizes: Callable[[FloatArray], FloatArray],
-    w: FloatArray,
-    values: FloatArray | None = None,
-    own: Callable[[FloatArray, NDArray[np.int_]], FloatArray] | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """The largest value of each column of sizes(w) (k x n) over the frequencies w, and where it lies (rad/s).
-
-    The grid is refined three times around each peak. values : sizes(w), where they are known; own : own(w, k) is
-    column k[j] at w[j] alone, where that is less work than sizes(w)
-    """
-    values = (sizes(w) if values is None else values).T
-    around = np.tile(w, (len(values), 1))
-    for _ in range(3):
-        k = values.argmax(axis=1)
-        rows = np.arange(len(k))
-        low, high = around[rows, np.maximum(k - 1, 0)], around[rows, np.minimum(k + 1, around.shape[1] - 1)]
-        around = np.geomspace(low, high, 17, axis=1)
-        if own is None:
-            values = sizes(around.ravel()).reshape(*around.shape, -1)[rows, :, rows]
-        else:
-            values = own(around.ravel(), np.repeat(rows, around.shape[1])).reshape(around.shape)
-    return values.max(axis=1), around[rows, values.argmax(axis=1)]
-
-
-def crossing_frequency(w: FloatArray, size: FloatArray, level: float, *, last: bool = False) -> float:
-    """The frequency at which `size` falls below `level` for the first or the last time, rad/s.
-
-    It is interpolated on a log-log line between grid points: 0 when `size` never reaches the level, the last entry of
-    w when it never falls below.
-    """
-    falls = np.flatnonzero((size[:-1] >= level) & (size[1:] < level))
-    if not len(falls):
-        return float(w[-1] if size[-1] >= level else 0.0)
-    k = falls[-1 if last else 0]
-    (a, b), (wa, wb) = np.log(size[k : k + 2] / level), np.log(w[k : k + 2])
-    return float(np.exp(wa + (wb - wa) * a / (a - b)))

@@ -3,67 +3,118 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import display
-from malta.linear.uncertain import Compensator, UncertainSystem, find_peaks, instability, responses
+from malta.linear.interconnection import append, connect, series
+from malta.linear.peaks import (
+    Crossing,
+    Fall,
+    Peak,
+    about_poles,
+    fall_frequencies,
+    gain_crossings,
+    in_plane,
+    joined_channels,
+    largest_gain,
+    level_frequencies,
+    of_plane,
+    part_of,
+    peak_gain,
+    phase_crossings,
+    response_at,
+)
+from malta.linear.sampling import eigenvalues
+from malta.linear.system import System
+from malta.linear.uncertain import Compensator, UncertainSystem, instability, open_systems
 
 ROUNDS = 60  # of the balance of a matrix at most
 BALANCED = 1e-9  # relative difference of norms of rows and columns
+LEVELS = 12  # of a disk of several channels at most
+INSIDE = np.linspace(0.0, 1.0, 9)  # of an interval between two levels
+RISE = 1e-7  # relative, above the smallest disk that was found, at which its search ends
 
 
-Response = Callable[["FloatArray"], tuple["ComplexArray", "ComplexArray"]]
+def cut_loop(P: System, F: System) -> System:
+    """The closed loop y = P u + n, u = F y + d, from (n, d) to (y, u): the sensitivities and the gang of four.
+
+        [ S    S P      ]      S = (1 - P F)^-1
+        [ F S  S_forces ]      S_forces = (1 - F P)^-1
+
+    Raises InputError where 1 - P F is singular at infinite frequency.
+    """
+    p, m = P.D.shape
+    crossed = np.zeros((m + p, p + m))
+    crossed[:m, p:], crossed[m:, :p] = np.eye(m), np.eye(p)
+    closed = connect(append(P, F), crossed, crossed, np.eye(p + m), "loop")
+    return replace(closed, D=closed.D + np.eye(p + m))
 
 
-class Nominal(NamedTuple):
-    """A nominal loop y = P u, u = F y by its responses, positive feedback.
+@dataclass(frozen=True, eq=False)
+class Nominal:
+    """A nominal loop y = P u, u = F y, positive feedback, by matrices; of sampled loops in differences.
 
-    response : frequencies w (rad/s) -> P, k x p x m, and F, k x m x p
+    P : from the inputs u to the sensors
+    F : the law
     stable : whether the loop is stable
     sample_time : s; None: continuous
     forces : how many of the inputs u, the first ones, are forces of the law; None: all. The others, as currents that
         are held for a sample, hang on readings: at the forces they are part of the machine
     """
 
-    response: Response
+    P: System
+    F: System
     stable: bool
     sample_time: float | None
     forces: int | None = None
 
     @property
-    def frequencies(self) -> FloatArray:
-        """A grid up to the Nyquist frequency, rad/s."""
-        return np.geomspace(1e-2, 1e5 if self.sample_time is None else np.pi / self.sample_time, 400)
+    def sensors(self) -> range:
+        """The channels of `closed` at the sensors."""
+        return range(len(self.P.C))
 
+    @property
+    def inputs(self) -> range:
+        """The channels of `closed` at the forces."""
+        p, m = len(self.P.C), self.P.B.shape[1] if self.forces is None else self.forces
+        return range(p, p + m)
 
-def remembered(response: Response) -> Response:
-    """The same responses, each grid of frequencies computed once: every margin begins with the same."""
-    known: dict[bytes, tuple[ComplexArray, ComplexArray]] = {}
+    @cached_property
+    def closed(self) -> System:
+        """The closed loop of `cut_loop`, in balanced units; of a sampled one in the s of Tustin's rule."""
+        return in_plane(cut_loop(self.P, self.F), self.sample_time).balanced
 
-    def lookup(w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        key = w.tobytes()
-        if key not in known:
-            known[key] = response(w)
-        return known[key]
+    def frequency(self, v: float) -> float:
+        """rad/s, of a frequency of the plane."""
+        return float(of_plane(np.array(v), self.sample_time))
 
-    return lookup
+    @cached_property
+    def open(self) -> System:
+        """The loop gain P F at the sensors, positive feedback; of a sampled loop in the s of Tustin's rule."""
+        return in_plane(series(self.F, self.P), self.sample_time).balanced
+
+    def response(self, w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """P, k x p x m, and F, k x m x p, at frequencies w, rad/s."""
+        T, s = self.sample_time, np.asarray(1j * np.asarray(w, dtype=float))
+        if T is not None:
+            s = np.asarray(np.expm1(s * T) / T)
+        return self.P.response(s), self.F.response(s)
+
+    def sensitivity(self, channel: int) -> System:
+        """S of one channel of `closed`, the others closed."""
+        return part_of(self.closed, [channel], [channel])
 
 
 def nominal_loop(system: UncertainSystem, law: Compensator) -> Nominal:
     """A loop at its nominal parameters."""
-
-    @remembered
-    def response(w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        r = responses(system, law, system.nominal, w)
-        return r.G_y, r.F
-
     stable = bool(instability(system, law, system.nominal)[0] < 0)
-    return Nominal(response, stable, law.sample_time)
+    return Nominal(*open_systems(system, law, system.nominal), stable, law.sample_time)
 
 
 @dataclass(frozen=True)
@@ -96,15 +147,12 @@ class Classical(NamedTuple):
 
 def classical_margins(loop: Nominal, sensors: Sequence[str]) -> Classical:
     """The disk margins, delay margins and the gang of four of a stable loop; `sensors` names the rows of y."""
-    w = loop.frequencies
-    P, F = loop.response(w)
-    disks = [disk_margin(loop, kind) for kind in ("forces", "sensors", "forces and sensors")]
-    disks += disk_margins_alone(loop, sensors)
-    delays = delay_margins(P @ F, w).tolist()
+    kinds: tuple[Kind, ...] = ("forces", "sensors", "forces and sensors")
+    disks = [disk_margin(loop, kind) for kind in kinds] + disk_margins_alone(loop, sensors)
     return Classical(
         tuple(disks),
-        dict(zip(sensors, delays, strict=True)),
-        dict(zip(sensors, gang_of_four(P, F, loop.forces), strict=True)),
+        dict(zip(sensors, delay_margins(loop), strict=True)),
+        dict(zip(sensors, gang_of_four(loop), strict=True)),
     )
 
 
@@ -125,55 +173,101 @@ def worst_of(margins: Sequence[Classical | None]) -> Classical | None:
     )
 
 
-def disk_margin(loop: Nominal, kind: Literal["forces", "sensors", "forces and sensors"]) -> Disk:
+Kind = Literal["forces", "sensors", "forces and sensors"]
+
+
+def disk_margin(loop: Nominal, kind: Kind) -> Disk:
     """The symmetric disk margin of the nominal loop, of all channels at once, each with its own factor.
 
     With the loop's positive feedback Q, factors (1 + d/2) / (1 - d/2) keep it stable while |d| < 1 / mu(M),
     M = (1 - Q)^-1 - 1/2 (Seiler, Packard, Gahinet 2020). For several channels mu is bounded above by a balanced
     D M D^-1, so the margin is a lower bound; for one channel it is exact.
     """
+    chosen = {"forces": [*loop.inputs], "sensors": [*loop.sensors]}
+    channels = chosen.get(kind, [*loop.sensors, *loop.inputs])
+    found = [
+        _largest_mu(_disk_system(part_of(loop.closed, own, own)))
+        for own in joined_channels(loop.closed, channels)
+    ]
+    mu, at = max(found)
+    return Disk(kind, 1 / mu, loop.frequency(at))
+
+
+def _disk_system(S: System) -> System:
+    """S - 1/2."""
+    return replace(S, D=S.D - np.eye(len(S.D)) / 2)
+
+
+def peak_of_channels(loop: Nominal, channels: Sequence[int]) -> Peak:
+    """The largest sigma_max of the sensitivities of some channels of `loop.closed`, cut at once."""
+    sets = joined_channels(loop.closed, channels)
+    value, at = largest_gain(part_of(loop.closed, own, own) for own in sets)
+    return Peak(value, loop.frequency(at))
+
+
+def tracked_band(loop: Nominal, rank: int | None = None) -> tuple[float, float]:
+    """Where the smallest singular value of T first falls below 1 / sqrt(2), and the largest for the last time, rad/s.
+
+    rank : of T, where it is less than the number of sensors
+    """
+    S, p = part_of(loop.closed, loop.sensors, loop.sensors), len(loop.sensors)
+    T = replace(S, D=S.D - np.eye(p))
+    smallest, largest = Fall((rank or p) - 1, last=False), Fall(0, last=True)
+    first, last = fall_frequencies(T, math.sqrt(0.5), (smallest, largest))
+    return loop.frequency(first), loop.frequency(last)
+
+
+def last_crossover(loop: Nominal) -> float:
+    """Where the largest singular value of the loop gain falls below 1 for the last time, rad/s."""
+    return loop.frequency(fall_frequencies(loop.open, 1.0, (Fall(0, last=True),))[0])
+
+
+def _largest_mu(M: System) -> Peak:
+    """The largest balanced norm over frequency, and where: of one channel exact, else by levels at fixed scales.
+
+    Where a balanced norm exceeds a level, so does the norm with the scales of any other frequency, up to the rounding
+    of the balance: between frequencies at which that norm is the level nothing is missed.
+    """
+    if len(M.D) == 1:
+        return peak_gain(M)
+    M = M.balanced
 
     def sizes(w: FloatArray) -> FloatArray:
-        P, F = loop.response(w)
-        if kind == "forces":
-            Q = loop_at_forces(P, F, loop.forces)
-        elif kind == "sensors":
-            Q = P @ F
-        else:
-            P_m, F_m, held = _divided(P, F, loop.forces)
-            Q = np.block([[held, P_m], [F_m, np.zeros((len(w), F_m.shape[1], F_m.shape[1]))]])
-        return np.asarray(balanced_norm(_disk_matrix(Q))[:, None])
+        return balanced_norm(response_at(M, w))
 
-    (mu,), (at,) = find_peaks(sizes, loop.frequencies)
-    return Disk(kind, float(1 / mu), float(at))
-
-
-def _divided(
-    P: ComplexArray, F: ComplexArray, forces: int | None
-) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """P and F of the forces alone, and what readings do to outputs besides."""
-    m = P.shape[-1] if forces is None else forces
-    return P[..., :m], F[:, :m], P[..., m:] @ F[:, m:]
+    w = np.concatenate([[0.0, np.inf], about_poles(eigenvalues(M.A))])
+    found = sizes(w)
+    best, where = float(found.max()), float(w[found.argmax()])
+    for _ in range(LEVELS):
+        d = balance_scales(response_at(M, np.array([where])))[0]
+        scaled = System(M.A, M.B / d, M.C * d[:, None], M.D * d[:, None] / d)
+        ends = level_frequencies(scaled, best * (1 + RISE))
+        if not len(ends):
+            break
+        ends = np.concatenate([ends[:1] / 2, ends, 2 * ends[-1:]])
+        w = (ends[:-1, None] + np.diff(ends)[:, None] * INSIDE).ravel()
+        found = sizes(w)
+        if not found.max() > best * (1 + RISE):
+            break
+        best, where = float(found.max()), float(w[found.argmax()])
+    return Peak(best, where)
 
 
 def loop_at_forces(P: ComplexArray, F: ComplexArray, forces: int | None) -> ComplexArray:
     """The loop from forces to forces, positive feedback: what else hangs on readings belongs to the machine."""
-    P_m, F_m, held = _divided(P, F, forces)
-    if F_m.shape[1] < F.shape[1]:
-        P_m = np.linalg.solve(np.eye(P.shape[1]) - held, P_m)
+    m = P.shape[-1] if forces is None else forces
+    P_m, F_m = P[..., :m], F[:, :m]
+    if m < F.shape[1]:
+        P_m = np.linalg.solve(np.eye(P.shape[1]) - P[..., m:] @ F[:, m:], P_m)
     return np.asarray(F_m @ P_m)
 
 
 def disk_margins_alone(loop: Nominal, sensors: Sequence[str]) -> list[Disk]:
     """The symmetric disk margin of each sensor alone, in the order of the rows of y."""
-
-    def sizes(w: FloatArray) -> FloatArray:
-        P, F = loop.response(w)
-        return np.asarray(np.abs(np.einsum("kii->ki", _disk_matrix(P @ F))[:, : len(sensors)]))
-
-    peaks = zip(*find_peaks(sizes, loop.frequencies), strict=True)
+    peaks = [peak_gain(_disk_system(loop.sensitivity(i))) for i in loop.sensors]
     return [
-        Disk(f"{name} alone", float(1 / mu), float(at)) for name, (mu, at) in zip(sensors, peaks, strict=True)
+        Disk(f"{name} alone", 1 / mu, loop.frequency(at))
+        for name, (mu, at) in zip(sensors, peaks, strict=True)
     ]
 
 
@@ -182,13 +276,8 @@ def disk_sizes(S: ComplexArray) -> FloatArray:
     return np.asarray(1 / balanced_norm(S - np.eye(S.shape[-1]) / 2))
 
 
-def _disk_matrix(Q: ComplexArray) -> ComplexArray:
-    eye = np.eye(Q.shape[-1])
-    return np.asarray(np.linalg.inv(eye - Q) - eye / 2)
-
-
-def balanced_norm(M: ComplexArray) -> FloatArray:
-    """sigma_max of D M D^-1, D diagonal so that norms of rows and columns agree (Osborne): an upper bound of mu."""
+def balance_scales(M: ComplexArray) -> FloatArray:
+    """The d, k x n, with which norms of rows and columns of d_i M_ij / d_j agree (Osborne)."""
     size = np.abs(M)
     d = np.ones((*size.shape[:2], 1))
     off = (size * (1 - np.eye(size.shape[-1]))) ** 2
@@ -201,62 +290,51 @@ def balanced_norm(M: ComplexArray) -> FloatArray:
         d = d * ratio**0.25
         if np.abs(ratio - 1).max(initial=0.0) < BALANCED:
             break
-    return np.asarray(np.linalg.svd(M * d / d.swapaxes(1, 2), compute_uv=False)[:, 0])
+    return np.asarray(d[..., 0])
 
 
-def delay_margins(L: ComplexArray, w: FloatArray) -> FloatArray:
-    """The delay margin of each channel with the others closed, s: the smallest phi(w) / w at its gain crossovers.
+def balanced_norm(M: ComplexArray) -> FloatArray:
+    """sigma_max of D M D^-1 with the scales of `balance_scales`: an upper bound of mu, k of k matrices."""
+    d = balance_scales(M)
+    return np.asarray(np.linalg.svd(M * d[:, :, None] / d[:, None], compute_uv=False)[:, 0])
 
-    L : k x p x p, the loop y = L y at the frequencies w (rad/s). Infinite for a channel without a crossover.
+
+def delay_margins(loop: Nominal) -> list[float]:
+    """The delay margin of each sensor with the others closed, s: the smallest phi(w) / w at its gain crossovers.
+
+    Infinite for a channel without a crossover.
     """
-    eye = np.eye(L.shape[-1])
-    S = np.einsum("kii->ki", np.linalg.inv(eye - L))
-    alone = 1 / S - 1  # the open loop of one channel, negative feedback
-    size = np.log(np.abs(alone))
-    phase = np.unwrap(np.angle(alone), axis=0)
-    found = np.full(L.shape[-1], np.inf)
-    for i in range(len(found)):
-        k = np.flatnonzero(np.sign(size[1:, i]) != np.sign(size[:-1, i]))
-        share = size[k, i] / (size[k, i] - size[k + 1, i])
-        at = w[k] * (w[k + 1] / w[k]) ** share
-        angle = phase[k, i] + share * (phase[k + 1, i] - phase[k, i])
-        if len(k):
-            found[i] = (np.mod(angle + np.pi, 2 * np.pi) / at).min()
-    return found
+    return [phase_and_delay(crossings_at(loop, i))[2] for i in loop.sensors]
+
+
+def crossings_at(loop: Nominal, channel: int) -> tuple[Crossing, ...]:
+    """The gain crossings of one channel of `loop.closed`, the others closed, rad/s."""
+    found = gain_crossings(loop.sensitivity(channel).balanced)
+    return tuple(Crossing(loop.frequency(w), value) for w, value in found)
 
 
 def peak_sensitivity(loop: Nominal, at: Literal["forces", "sensors"]) -> float:
     """The largest |S_ii| over all frequencies and channels at nominal parameters; NaN for an unstable loop."""
     if not loop.stable:
         return float("nan")
-
-    def sizes(w: FloatArray) -> FloatArray:
-        P, F = loop.response(w)
-        Q = loop_at_forces(P, F, loop.forces) if at == "forces" else P @ F
-        S = np.linalg.inv(np.eye(Q.shape[-1]) - Q)
-        return np.asarray(np.abs(np.einsum("kii->ki", S)))
-
-    return float(find_peaks(sizes, loop.frequencies)[0].max())
+    channels = loop.inputs if at == "forces" else loop.sensors
+    return largest_gain(loop.sensitivity(i) for i in channels).value
 
 
-def gang_of_four(P: ComplexArray, F: ComplexArray, forces: int | None = None) -> list[tuple[float, ...]]:
-    """For each sensor i the largest |S_ii|, |T_ii|, |(S P)_ij| (m/N) and |(F S)_ji| (N/m) over frequency.
+def gang_of_four(loop: Nominal) -> list[tuple[float, ...]]:
+    """For each sensor i the largest |S_ii|, |T_ii|, |(S P)_ij| (m/N) and |(F S)_ji| (N/m) over frequency."""
 
-    forces : how many of the inputs are forces, as in `Nominal`
-    """
-    S = np.linalg.inv(np.eye(P.shape[1]) - P @ F)
-    T = np.eye(P.shape[1]) - S
-    P_m, F_m, _ = _divided(P, F, forces)
-    compliance, noise = np.abs(S @ P_m), np.abs(F_m @ S)
-    return [
-        (
-            float(np.abs(S[:, i, i]).max()),
-            float(np.abs(T[:, i, i]).max()),
-            float(compliance[:, i].max()),
-            float(noise[:, :, i].max()),
-        )
-        for i in range(P.shape[1])
-    ]
+    def peak(row: int, columns: Iterable[int], *, turned: bool = False) -> float:
+        pairs = (((column, row) if turned else (row, column)) for column in columns)
+        return largest_gain(part_of(loop.closed, [k], [j]) for k, j in pairs).value
+
+    found: list[tuple[float, ...]] = []
+    for i in loop.sensors:
+        S = loop.sensitivity(i)
+        T = replace(S, D=S.D - 1)
+        both = peak_gain(S).value, peak_gain(T).value
+        found.append((*both, peak(i, loop.inputs), peak(i, loop.inputs, turned=True)))
+    return found
 
 
 # The margins of one channel at a time, the others closed, at exact crossings; of unstable open loops as well.
@@ -267,15 +345,6 @@ def gang_of_four(P: ComplexArray, F: ComplexArray, forces: int | None = None) ->
 
 
 FARTHEST = 1e6  # factors of gain beyond which a margin counts as infinite
-STEPS = 6  # of the false position at each crossing
-PEAKS = 2  # parabolas through the three values about each peak
-
-
-class Crossing(NamedTuple):
-    """A place at which |l| = 1 or l is real and negative."""
-
-    frequency: float  # rad/s
-    value: complex  # l there
 
 
 @dataclass(frozen=True)
@@ -308,111 +377,7 @@ class ChannelMargins:
         return 1 / self.peak_sensitivity
 
 
-class Seen(NamedTuple):
-    """What channels see: l and S_ii at frequencies, k x channels each."""
-
-    w: FloatArray  # rad/s, ascending; the last is the Nyquist frequency of a sampled loop
-    loop: ComplexArray
-    S: ComplexArray
-
-
-See = Callable[["FloatArray"], Seen]
-
-
-def find_crossings(see: See, seen: Seen) -> tuple[list[list[Crossing]], list[list[Crossing]]]:
-    """Gain and phase crossings of each channel between the frequencies of `seen`, by false position."""
-    turn = seen.loop.imag
-    with np.errstate(divide="ignore"):
-        size = np.log(np.abs(seen.loop))
-    behind = (seen.loop.real[1:] < 0) | (seen.loop.real[:-1] < 0)
-    found: list[tuple[list[list[Crossing]], Any, bool]] = []
-    channels = seen.loop.shape[1]
-    for values, also, phase in ((size, True, False), (turn, behind, True)):
-        ends = np.sign(values[:-1]) * np.sign(values[1:]) < 0
-        found.append(([[] for _ in range(channels)], np.argwhere(ends & also), phase))
-    rows = [(k, i, phase) for _, where, phase in found for k, i in where.tolist()]
-    if rows:
-        k, i, phase = np.array(rows).T
-        w, values = _false_position(see, seen, k, i, phase == 1)
-        for at, value, channel, of_phase in zip(w.tolist(), values.tolist(), i, phase, strict=True):
-            if not math.isnan(at) and (not of_phase or value.real < 0):
-                found[of_phase][0][channel].append(Crossing(at, value))
-    return found[0][0], found[1][0]
-
-
-def _false_position(
-    see: See, seen: Seen, k: FloatArray, i: FloatArray, phase: FloatArray
-) -> tuple[FloatArray, ComplexArray]:
-    """Roots of log|l_i|, or of Im l_i where `phase`, in the intervals k of the grid (Illinois); and l there.
-
-    NaN where the sign changes at a pole on the axis: there the measure grows instead of vanishing.
-    """
-
-    def measure(values: ComplexArray) -> FloatArray:
-        with np.errstate(divide="ignore"):
-            return np.where(phase, values.imag, np.log(np.abs(values)))
-
-    rows = np.arange(len(k))
-    a, b = np.log(seen.w[k]), np.log(seen.w[k + 1])
-    f, g = measure(seen.loop[k, i]), measure(seen.loop[k + 1, i])
-    largest = np.maximum(np.abs(f), np.abs(g))
-    kept = np.zeros(len(k))  # the end that stayed: -1 a, 1 b
-    for _ in range(STEPS):
-        x = np.where(f == g, (a + b) / 2, b - g * (b - a) / np.where(f == g, 1, g - f))
-        values = see(np.exp(x)).loop[rows, i]
-        h = measure(values)
-        left = h * f > 0
-        g = np.where(left & (kept == 1), g / 2, np.where(left, g, h))
-        f = np.where(~left & (kept == -1), f / 2, np.where(left, h, f))
-        a, b, kept = np.where(left, x, a), np.where(left, b, x), np.where(left, 1.0, -1.0)
-    return np.where(np.abs(h) > largest, np.nan, np.exp(x)), values
-
-
-def find_tops(see: See, seen: Seen, measure: Callable[[Seen], FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """The largest measure of each channel and its frequency, between the frequencies of `seen` as well."""
-    values = measure(seen)
-    k = values.argmax(axis=0)
-    rows = np.arange(values.shape[1])
-    best, at = values[k, rows], seen.w[k]
-    inner = np.clip(k, 1, max(len(seen.w) - 2, 1))
-    if len(seen.w) < 3:
-        return best, at
-    x = np.log(np.stack([seen.w[inner + d] for d in (-1, 0, 1)]))
-    y = np.stack([values[inner + d, rows] for d in (-1, 0, 1)])
-    for _ in range(PEAKS):
-        edge = 1e-3 * (x[2] - x[0])
-        tip = np.clip(_vertex(x, y), x[0] + edge, x[2] - edge)
-        found = measure(see(np.exp(tip)))[rows, rows]
-        better = found > best
-        best, at = np.where(better, found, best), np.where(better, np.exp(tip), at)
-        x, y = _about_top(x, y, tip, found)
-    return best, at
-
-
-def _vertex(x: FloatArray, y: FloatArray) -> FloatArray:
-    """The top of the parabolas through three points each (3 x n); the middle point where there is none."""
-    left, right = (y[1] - y[0]) / (x[1] - x[0]), (y[2] - y[1]) / (x[2] - x[1])
-    bend = (right - left) / (x[2] - x[0])
-    safe = np.where(bend < 0, bend, -1)
-    return np.asarray(np.where(bend < 0, (x[0] + x[1]) / 2 - left / (2 * safe), x[1]))
-
-
-def _about_top(
-    x: FloatArray, y: FloatArray, tip: FloatArray, found: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """The highest of four points with its neighbours, columns of 3 x n; points that coincide are moved apart."""
-    tip = np.where(np.abs(tip - x[1]) < 1e-9, x[1] + 1e-3 * (x[2] - x[1]), tip)
-    order = np.argsort(np.vstack([x, tip]), axis=0)
-    x, y = (
-        np.take_along_axis(np.vstack([x, tip]), order, 0),
-        np.take_along_axis(np.vstack([y, found]), order, 0),
-    )
-    middle = np.clip(y.argmax(axis=0), 1, 2)
-    pick = np.stack([middle - 1, middle, middle + 1])
-    return np.take_along_axis(x, pick, 0), np.take_along_axis(y, pick, 0)
-
-
-def gain_range(crossings: list[Crossing]) -> tuple[tuple[float, float], tuple[float, float]]:
+def gain_range(crossings: Sequence[Crossing]) -> tuple[tuple[float, float], tuple[float, float]]:
     """The factors about 1 that no crossing lies between, and the frequencies of both bounds."""
     factors = [(-1 / c.value.real, c.frequency) for c in crossings if c.value.real < 0]
     below = max((f for f in factors if 1 / FARTHEST < f[0] < 1), default=(0.0, math.nan))
@@ -420,7 +385,7 @@ def gain_range(crossings: list[Crossing]) -> tuple[tuple[float, float], tuple[fl
     return (below[0], above[0]), (below[1], above[1])
 
 
-def phase_and_delay(crossings: list[Crossing]) -> tuple[float, float, float, float]:
+def phase_and_delay(crossings: Sequence[Crossing]) -> tuple[float, float, float, float]:
     """The smallest turn (rad) and the shortest delay (s) that reach -1, each with its frequency."""
     turns, delays = [], []
     for w, value in crossings:
@@ -431,32 +396,31 @@ def phase_and_delay(crossings: list[Crossing]) -> tuple[float, float, float, flo
     return *min(turns, default=none), *min(delays, default=none)
 
 
-def margins_of_channel(
-    name: str,
-    crossings: tuple[list[Crossing], list[Crossing]],
-    tops: tuple[tuple[float, float], tuple[float, float]],
-    unstable: tuple[int, int],
-) -> ChannelMargins:
-    """The margins of a channel from its crossings, largest |S - 1/2| and |S|, and unstable poles, open and closed."""
-    (half, half_at), (peak, peak_at) = tops
-    stable = unstable[1] == 0
-    nan = math.nan
+def channel_margins(loop: Nominal, channel: int, name: str, unstable: tuple[int, int]) -> ChannelMargins:
+    """The margins of one channel of `loop.closed`, the others closed.
+
+    unstable : poles of the loop that grow, with this channel open and closed
+    """
+    S, stable, nan = loop.sensitivity(channel).balanced, unstable[1] == 0, math.nan
+    gains = crossings_at(loop, channel)
+    phases = tuple(Crossing(loop.frequency(w), value) for w, value in phase_crossings(S))
     values: dict[str, Any] = dict.fromkeys(("phase", "phase_frequency", "delay", "delay_frequency"), nan)
-    gain, at = (nan, nan), (nan, nan)
+    gain, at, half, peak = (nan, nan), (nan, nan), Peak(nan, nan), Peak(nan, nan)
     if stable:
-        gain, at = gain_range(crossings[1])
-        values = dict(zip(values, phase_and_delay(crossings[0]), strict=True))
+        gain, at = gain_range(phases)
+        values = dict(zip(values, phase_and_delay(gains), strict=True))
+        half, peak = peak_gain(_disk_system(S)), peak_gain(S)
     return ChannelMargins(
         channel=name,
         stable=stable,
         gain=gain,
         gain_frequency=at,
         **values,
-        disk=Disk(name, 1 / half if stable else nan, half_at if stable else nan),
-        peak_sensitivity=peak if stable else nan,
-        peak_frequency=peak_at if stable else nan,
+        disk=Disk(name, 1 / half.value, loop.frequency(half.frequency)),
+        peak_sensitivity=peak.value,
+        peak_frequency=loop.frequency(peak.frequency),
         unstable_poles=unstable[0],
         encirclements=unstable[0] - unstable[1],
-        gain_crossings=tuple(crossings[0]),
-        phase_crossings=tuple(crossings[1]),
+        gain_crossings=gains,
+        phase_crossings=phases,
     )

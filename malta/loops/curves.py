@@ -5,7 +5,7 @@
     compliance       loads -> true outputs
 
 The grid of frequencies is logarithmic, to the Nyquist frequency of a sampled loop, finer about lightly damped poles and
-wherever a curve turns, and has every peak and crossing that margins are read at.
+wherever a curve turns. Margins are not read off it: see linear/peaks.py.
 """
 
 from __future__ import annotations
@@ -22,20 +22,12 @@ from scipy import linalg
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Curves, Description, display
 from malta.errors import CheckError, require_known
-from malta.loops.classical import (
-    ChannelMargins,
-    Crossing,
-    See,
-    Seen,
-    find_crossings,
-    find_tops,
-    loop_at_forces,
-    margins_of_channel,
-)
+from malta.linear.peaks import Crossing
+from malta.linear.system import System, balanced_units
+from malta.loops.classical import ChannelMargins, channel_margins, crossings_at, loop_at_forces
 from malta.loops.linear_loops import LinearLoop, Place, linear_loop
 from malta.model.plant import Signal
 from malta.processes import on_one_thread
-from malta.synthesis.state_space import System, balanced_units
 
 BASE = 160  # frequencies of the logarithmic grid
 DECADES = 8.0  # at most
@@ -45,6 +37,7 @@ NARROW = 5e-4  # of the frequency: intervals that are not halved, so that none f
 ROUNDS = 3  # of halving
 MOST = 90  # frequencies that a round may add
 AROUND = np.array([-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0])  # half-widths of a resonance
+NARROWEST = 1e-9  # relative half-width of a resonance
 LIGHT = 0.5  # damping below which a pole makes a resonance
 STILL = 1e-7  # of the fastest rate: poles that count as zero
 BELOW = 1e-9  # of the lowest frequency: as far as gain crossings are looked for
@@ -159,9 +152,10 @@ class LoopCurves:
         return LoopCurves(self.loop, _merge(self.responses, respond(self.loop, more)))
 
     @cached_property
-    def crossings(self) -> tuple[list[list[Crossing]], list[list[Crossing]]]:
-        """The gain and the phase crossings of each channel at the sensors, the others closed."""
-        return find_crossings(*_seen(self, "sensors"))
+    def crossings(self) -> tuple[tuple[Crossing, ...], ...]:
+        """The gain crossings of each channel at the sensors, the others closed."""
+        cut = self.loop.cut
+        return tuple(crossings_at(cut, i) for i in cut.sensors)
 
     @cached_property
     def margins(self) -> tuple[ChannelMargins, ...]:
@@ -340,60 +334,25 @@ def _grid(loop: LinearLoop) -> FloatArray:
     low = min(known.min() / BEYOND if len(known) else top / 1e4, top / 1e3)
     low = max(low, top / 10**DECADES)
     light = poles[(np.abs(poles.real) < LIGHT * sizes) & (poles.imag > 0)]
-    width = np.maximum(np.abs(light.real) / np.maximum(np.abs(light), 1e-300), 1e-4)
-    near = (np.abs(light)[:, None] * np.exp(width[:, None] * AROUND)).ravel()
+    width = np.maximum(np.abs(light.real) / np.maximum(np.abs(light), 1e-300), NARROWEST)
+    near = (np.abs(light.imag)[:, None] * np.exp(width[:, None] * AROUND)).ravel()
+    closed = loop.closed_poles.imag
+    near = np.concatenate([near, closed[closed > 0]]) if loop.stable else near
     w = np.concatenate([np.geomspace(low, top, BASE), near[(near > low) & (near < top)]])
     return np.unique(w)
 
 
 def _margins(curves: LoopCurves, at: Place) -> tuple[ChannelMargins, ...]:
-    """The margins of each channel: crossings and peaks between the frequencies of the grid, and at its ends."""
-    loop, (see, seen) = curves.loop, _seen(curves, at)
-    gain, phase = curves.crossings if at == "sensors" else find_crossings(see, seen)
-    ends = _ends(see, curves.w, continuous=loop.sample_time is None)
-    half, half_at = find_tops(see, seen, lambda found: np.abs(found.S - 0.5))
-    peak, peak_at = find_tops(see, seen, lambda found: np.abs(found.S))
-    growing = int((loop.closed_poles.real >= 0).sum())
-    made = []
+    """The margins of each channel."""
+    loop, cut = curves.loop, curves.loop.cut
+    growing, made = int((loop.closed_poles.real >= 0).sum()), []
     for i, signal in enumerate(curves.channels(at)):
         factors = np.ones(len(curves.channels(at)))
         factors[i] = 0.0
-        crossings = gain[i], sorted([*phase[i], *ends[i]])
-        tops = (float(half[i]), float(half_at[i])), (float(peak[i]), float(peak_at[i]))
-        made.append(
-            margins_of_channel(signal.name, crossings, tops, (loop.unstable_poles(factors, at), growing))
-        )
+        channel = (cut.sensors if at == "sensors" else cut.inputs)[i]
+        unstable = loop.unstable_poles(factors, at), growing
+        made.append(channel_margins(cut, channel, signal.name, unstable))
     return tuple(made)
-
-
-def _seen(curves: LoopCurves, at: Place) -> tuple[See, Seen]:
-    """What the channels see of the loop: at any frequencies, and at those of the grid."""
-    loop, r = curves.loop, curves.responses
-
-    def see(w: FloatArray) -> Seen:
-        if at == "forces":
-            found = respond(loop, w)
-            return Seen(w, found.alone(at), _diagonal(found.S_forces))
-        with np.errstate(all="ignore"):
-            L, S = _at_sensors(loop, *(response(loop.frequencies(w)) for response in loop.responses))
-            return Seen(w, _diagonal(L @ S) / _diagonal(S), _diagonal(S))
-
-    seen = Seen(r.w, r.alone(at), _diagonal(r.cut(at)[1]))
-    if loop.sample_time is not None and r.w[-1] > 0.999999 * curves.nyquist:
-        seen.loop[-1] = seen.loop[-1].real
-    return see, seen
-
-
-def _ends(see: Any, w: FloatArray, *, continuous: bool) -> list[list[Crossing]]:
-    """Crossings at zero frequency and at the Nyquist frequency or infinity, where l is real."""
-    far = w[-1] * (1e6 if continuous else 1.0)
-    values = see(np.array([w[0] * 1e-4, far])).loop
-    found: list[list[Crossing]] = [[] for _ in range(values.shape[1])]
-    for row, frequency in zip(values, (0.0, np.inf if continuous else float(w[-1])), strict=True):
-        for i, value in enumerate(row.tolist()):
-            if np.isfinite(value) and value.real < 0 and abs(value.imag) < 1e-2 * abs(value.real):
-                found[i].append(Crossing(frequency, complex(value.real)))
-    return found
 
 
 def _zeros(loop: LinearLoop, L: System) -> ComplexArray:

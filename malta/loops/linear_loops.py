@@ -23,12 +23,16 @@ from scipy import linalg
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
+from malta.linear.conversion import from_control
+from malta.linear.matrices import system_matrix
 from malta.linear.sampling import eigenvalues
+from malta.linear.system import System, balanced_units
+from malta.loops.classical import Nominal
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.model.plant import Plant, Signal
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, LinearLaw, linear_law
-from malta.synthesis.state_space import System, balanced_units, named_system, reference_names, set_point
+from malta.synthesis.law_system import reference_names, set_point
 
 # The loop of a machine and a controller as systems of python-control: to plot, to simulate, to compute with.
 #
@@ -118,7 +122,7 @@ def loop_systems(plant: Plant | Loop, controller: Controller | None = None) -> L
     whole = loop_from(plant, controller)
     plant, controller, loop = whole.plant, whole.controller, whole.sampled_forces
     law, m = loop.control, len(controller.forces)
-    n, k, p = len(loop.Ad), len(law.A), len(loop.Cd)
+    k, p = len(law.A), len(loop.Cd)
     Cd, B1 = loop.Cd, loop.Bd[:, :m]
     Ad = loop.Ad + (loop.Bd[:, m:] @ Cd if loop.Bd.shape[1] > m else 0)  # with what hangs on the reading
     C1, D1, R = law.C[:m], law.D_y[:m], set_point(controller)
@@ -126,21 +130,26 @@ def loop_systems(plant: Plant | Loop, controller: Controller | None = None) -> L
     pushed = np.vstack([B1, np.zeros((k, m))])
     sent = np.vstack([B1 @ law.D_r[:m] @ R, law.B_r @ R])
     y, v = np.hstack([Cd, np.zeros((p, k))]), np.hstack([D1 @ Cd, C1])
-    cut_at_sensors = np.block([[loop.Ad, loop.Bd @ law.C], [np.zeros((k, n)), law.A]])
-    cut_at_forces = np.block([[Ad, np.zeros((n, k))], [law.B_y @ Cd, law.A]])
-    forces, outputs = ([s.name for s in signals] for signals in (plant.inputs, plant.outputs))
-    Ts, references = controller.sample_time, reference_names(controller)
-    one_p, one_m = np.eye(p), np.eye(m)
+    cut_at_sensors = system_matrix(loop.Ad, loop.Bd @ law.C, None, law.A)
+    cut_at_forces = system_matrix(Ad, None, law.B_y @ Cd, law.A)
+    forces, outputs = (tuple(s.name for s in signals) for signals in (plant.inputs, plant.outputs))
+    references, one_p, one_m = tuple(reference_names(controller)), np.eye(p), np.eye(m)
+
+    def system(name: str, inputs: Names, outputs: Names, A: Any, B: Any, C: Any, D: Any = 0) -> Any:
+        through = np.zeros((len(C), B.shape[1])) + D
+        made = System(A, B, C, through, None, controller.sample_time, (), inputs, outputs)
+        return made.balanced.to_control(name)
+
     return LoopSystems(
-        P=named_system("P", forces, outputs, Ts, Ad, B1, Cd),
-        F=named_system("F", outputs, forces, Ts, law.A, law.B_y, C1, D1),
-        L=named_system("L", outputs, outputs, Ts, cut_at_sensors, read, -y),
-        S=named_system("S", outputs, outputs, Ts, loop.closed, read, y, one_p),
-        T=named_system("T", outputs, outputs, Ts, loop.closed, read, -y),
-        L_forces=named_system("L_forces", forces, forces, Ts, cut_at_forces, pushed, -v),
-        S_forces=named_system("S_forces", forces, forces, Ts, loop.closed, pushed, v, one_m),
-        T_forces=named_system("T_forces", forces, forces, Ts, loop.closed, pushed, -v),
-        tracking=named_system("tracking", references, outputs, Ts, loop.closed, sent, y),
+        P=system("P", forces, outputs, Ad, B1, Cd),
+        F=system("F", outputs, forces, law.A, law.B_y, C1, D1),
+        L=system("L", outputs, outputs, cut_at_sensors, read, -y),
+        S=system("S", outputs, outputs, loop.closed, read, y, one_p),
+        T=system("T", outputs, outputs, loop.closed, read, -y),
+        L_forces=system("L_forces", forces, forces, cut_at_forces, pushed, -v),
+        S_forces=system("S_forces", forces, forces, loop.closed, pushed, v, one_m),
+        T_forces=system("T_forces", forces, forces, loop.closed, pushed, -v),
+        tracking=system("tracking", references, outputs, loop.closed, sent, y),
         plant=plant,
         controller=controller,
     )
@@ -148,9 +157,9 @@ def loop_systems(plant: Plant | Loop, controller: Controller | None = None) -> L
 
 CALLER = "loop"
 Place = Literal["sensors", "forces"]
+Names = tuple[str, ...]
 GONE = 1e-6  # |z| of the poles of pure delay
 STILL = 1e-6  # of a pole's frequency: growth that counts as none
-SAME = 1e-3  # of a response: the error of states that still are those of a transfer function
 ROUNDING = 1e-14  # of a matrix whose eigenvalues are taken
 
 
@@ -230,6 +239,14 @@ class LinearLoop:
     def responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
         """The functions of frequency of the plant and of the law, see `System.response`."""
         return self.plant.response_function(), self.law.response_function()
+
+    @cached_property
+    def cut(self) -> Nominal:
+        """The loop cut at its sensors and at its forces: what margins are read from."""
+        (A, B, C, D), p, u = self.plant, len(self.outputs), len(self.law.C)
+        return Nominal(
+            System(A, B[:, :u], C[:p], D[:p, :u]), self.law, self.stable, self.sample_time, len(self.inputs)
+        )
 
     def unstable_poles(self, factors: FloatArray, at: Place) -> int:
         """How many poles grow with these factors of the loop gain.
@@ -351,7 +368,7 @@ def _commanded_system(c: Controller, law: LinearLaw) -> tuple[System, tuple[Floa
     D_old = np.hstack([law.D_r[:, of_stored][:, r] @ stored[r] for r in rows])
     size = p * c.delay
     shift = (np.eye(size, k=-p) - np.eye(size)) / T
-    whole = np.block([[A, B_old], [np.zeros((size, len(A))), shift]])
+    whole = system_matrix(A, B_old, None, shift)
     newest = np.vstack([np.eye(p), np.zeros((size - p, p))]) / T
     driven = System(whole, np.vstack([B_y, np.zeros((size, p))]), np.hstack([C, D_old]), law.D_y)
     return driven, (np.vstack([law.B_r @ R / T, newest]), law.D_r @ R)
@@ -369,12 +386,12 @@ def _of_systems(plant: Any, controller: Any, name: str) -> LinearLoop:
     if any(other != dt for other in known):
         raise InputError(CALLER, "dt", " and ".join(map(str, known)), "the same of plant and controller")
     T = (1.0 if dt is True else float(dt)) or None
-    P = _matrices(plant, T)
+    P = from_control(plant, CALLER, plant.name, step=1.0, differences=True)
     p, m = P.D.shape
     if controller is None:
         F = System(np.zeros((0, 0)), np.zeros((0, p)), np.zeros((p, 0)), -np.eye(p))
     else:
-        C = _matrices(controller, T)
+        C = from_control(controller, CALLER, controller.name, step=1.0, differences=True)
         F = System(C.A, -C.B, C.C, -C.D)
     if F.D.shape != (m, p):
         who, (rows, columns) = ("L", P.D.shape) if controller is None else ("C", F.D.shape)
@@ -386,49 +403,3 @@ def _of_systems(plant: Any, controller: Any, name: str) -> LinearLoop:
     driven = System(P.A, np.hstack([P.B, P.B[:, : len(loads)]]), P.C, np.hstack([P.D, P.D[:, : len(loads)]]))
     own = name or (plant.name if controller is None else controller.name)
     return LinearLoop(own, driven, F, (-F.B, -F.D), T, outputs, inputs, loads)
-
-
-def _matrices(system: Any, T: float | None) -> System:
-    """A, B, C and D of a control system, in differences where it is sampled. Raises InputError."""
-    import control  # imports matplotlib and takes a second: only where it is used
-
-    try:
-        found = control.ss(system)
-    except Exception as error:  # many kinds: an improper function, a frequency response without states
-        wanted = "a system with states, or a proper transfer function"
-        raise InputError(CALLER, system.name, f"a {type(system).__name__}", wanted) from error
-    if isinstance(system, control.TransferFunction) and _lost(system, found):
-        if system.ninputs * system.noutputs > 1:
-            wanted = "a system with states: the digits of its coefficients do not suffice for one"
-            raise InputError(CALLER, system.name, "a TransferFunction", wanted)
-        found = control.ss(*_companion(system.num[0][0], system.den[0][0]), system.dt)
-    A, B, C, D = (np.array(M, dtype=float) for M in (found.A, found.B, found.C, found.D))
-    if not all(np.isfinite(M).all() for M in (A, B, C, D)):
-        raise InputError(CALLER, system.name, "NaN or infinity", "finite numbers")
-    return System(A, B, C, D) if T is None else System((A - np.eye(len(A))) / T, B / T, C, D)
-
-
-def _lost(system: Any, found: Any) -> bool:
-    """Whether the states of a transfer function have lost its response, as those of very slow poles or small gains."""
-    poles = np.concatenate([np.roots(den) for row in system.den for den in row]).astype(complex)
-    sampled = system.isdtime(strict=True)
-    sizes = np.abs(np.log(poles[poles != 0]) if sampled else poles)
-    w = np.outer(np.append(sizes[sizes > 0], 1.0), [1e-2, 0.3, 1.7, 1e2]).ravel()
-    points = np.exp(1j * w[w < np.pi]) if sampled else 1j * w
-    with np.errstate(all="ignore"):  # a point may be a pole, to rounding, where the response is infinite
-        wanted, made = (np.atleast_1d(one(points, warn_infinite=False)) for one in (system, found))
-        same = np.abs(made - wanted) <= SAME * np.abs(wanted)
-    return not bool((same | ~np.isfinite(wanted)).all())
-
-
-def _companion(num: FloatArray, den: FloatArray) -> System:
-    """States of a proper transfer function, in units of time and of the output in which its coefficients are near 1."""
-    n = len(den) - 1
-    a = np.asarray(den[1:] / den[0], dtype=float)
-    b = np.append(np.zeros(n + 1 - len(num)), num) / den[0]
-    orders = np.arange(1, n + 1)
-    rate = float((np.abs(a) ** (1 / orders)).max(initial=0.0)) or 1.0
-    A = np.eye(n, k=-1) * rate
-    A[:1] = -a / rate ** (orders - 1.0)
-    c = (b[1:] - b[0] * a) / rate ** (orders - 1.0)
-    return System(A, np.eye(n, 1), c[None, :], np.array([[b[0]]]))

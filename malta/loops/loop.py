@@ -129,7 +129,7 @@ class Loop:
             "current loops": pi,
             "lag of the current loops": not pi and math.isfinite(actuator.crossover),
             "lag of the sensors": bool(sensors.lagging),
-            "dead time of the sensors": sensors is not None and sensors.dead_time > 0,
+            "dead time of the sensors": sensors.dead_time > 0,
         }
         *first, last = ["hold", *(words for words, there in stands.items() if there)]
         text = f"with {', '.join(first)} and {last}" if first else f"with {last}"

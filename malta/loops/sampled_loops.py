@@ -23,9 +23,12 @@ import numpy as np
 from malta.arrays import ComplexArray, FloatArray, readonly
 from malta.display import display
 from malta.errors import CheckError
+from malta.linear.matrices import system_matrix
+from malta.linear.peaks import in_plane
 from malta.linear.sampling import add_lags, delay_inputs, eigenvalues, sample
+from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
-from malta.loops.classical import Nominal, remembered
+from malta.loops.classical import Nominal
 from malta.loops.parametric_plants import held_gain, of_plant
 from malta.loops.windings import (
     CurrentControl,
@@ -49,7 +52,6 @@ from malta.model.plant import OperatingPoint, Plant, off_stroke, position_in, wh
 from malta.model.sensors import with_lags
 from malta.synthesis.controller import Controller, LinearLaw, law_at, linear_law, with_readings, with_slope
 from malta.synthesis.recovery import StepResponse, step_response
-from malta.synthesis.state_space import System
 
 # The control law of a gain file as the machine runs it, as the compensator of a proof: hold, delay, current loops.
 
@@ -136,6 +138,7 @@ def _integrals_last(law: LinearLaw, count: int) -> LinearLaw | None:
 
 LAST: CurrentLoops = "pi"  # the last stage: the loop that simulations fly by default
 ROUNDING = 1e-9  # of the largest entry
+ABOUT = np.array([-3.0, -1.0, -0.3, 0.0, 0.3, 1.0, 3.0])  # half-widths of a resonance
 DELAYED = 1e-6  # |z| below which a pole is one of pure delay
 
 
@@ -162,7 +165,8 @@ class SampledLoop:
     def closed(self) -> FloatArray:
         """State matrix of the closed loop, states of the machine first."""
         c = self.control
-        return np.block([[self.Ad + self.Bd @ c.D_y @ self.Cd, self.Bd @ c.C], [c.B_y @ self.Cd, c.A]])
+        through = self.Ad + self.Bd @ c.D_y @ self.Cd
+        return np.asarray(system_matrix(through, self.Bd @ c.C, c.B_y @ self.Cd, c.A))
 
     def loop_gain(self, w: FloatArray) -> ComplexArray:
         """The loop gain at the sensors, L = -P F, at the frequencies w (rad/s): k x p x p."""
@@ -171,8 +175,8 @@ class SampledLoop:
         return np.asarray(-P @ F)
 
     @cached_property
-    def _responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
-        """P and F as functions of (z - 1) / T: in differences slow poles keep their digits."""
+    def systems(self) -> tuple[System, System]:
+        """P and F in differences, (x+ - x) / T: slow poles keep their digits."""
         c, T = self.control, self.sample_time
         P = System(
             (self.Ad - np.eye(len(self.Ad))) / T,
@@ -180,7 +184,24 @@ class SampledLoop:
             self.Cd,
             np.zeros((len(self.Cd), self.Bd.shape[1])),
         )
-        F = System((c.A - np.eye(len(c.A))) / T, c.B_y / T, c.C, c.D_y)
+        return P, System((c.A - np.eye(len(c.A))) / T, c.B_y / T, c.C, c.D_y)
+
+    @property
+    def resonances(self) -> FloatArray:
+        """Frequencies about those of the closed loop's oscillating poles, rad/s, from below their width to above."""
+        z = eigenvalues(self.closed)
+        poles = np.log(z[z.imag > 0]) / self.sample_time
+        return np.asarray((poles.imag[:, None] + np.abs(poles.real)[:, None] * ABOUT).ravel())
+
+    @cached_property
+    def cut(self) -> Nominal:
+        """The loop cut at its sensors: what peaks and crossings are read from."""
+        stable = bool(np.abs(eigenvalues(self.closed)).max() < 1)
+        return Nominal(*self.systems, stable, self.sample_time)
+
+    @cached_property
+    def _responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
+        P, F = self.systems
         return P.response_function(), F.response_function()
 
     def sensitivity(self, w: FloatArray) -> ComplexArray:
@@ -194,6 +215,16 @@ class SampledLoop:
         g = np.vstack([pushed, np.zeros((k, pushed.shape[1]))])
         C = np.hstack([self.outputs, np.zeros((len(self.Cd), k))])
         return step_response(self.closed, g, C, self.sample_time)
+
+    def under_load(self, load: FloatArray) -> System:
+        """From a load that is constant throughout each sample to the true outputs; in the s of Tustin's rule."""
+        assert self.pushed is not None
+        k, T = len(self.control.A), self.sample_time
+        push = np.concatenate([self.pushed @ load, np.zeros(k)])[:, None]
+        C = np.hstack([self.outputs, np.zeros((len(self.Cd), k))])
+        A = self.closed
+        system = System((A - np.eye(len(A))) / T, push / T, C, np.zeros((len(C), 1)))
+        return in_plane(system, T).balanced
 
     def compliance(self, w: FloatArray, load: FloatArray) -> ComplexArray:
         """True outputs per load at frequencies w, rad/s, of a load that is constant throughout each sample: k x p."""
@@ -292,7 +323,7 @@ def _driven(
     phi, share = C[-m:], None
     link = link_at_rest(plant, windings, point, axis_map(believed, point)) if point.loaded else None
     if link is not None:
-        A = np.block([[A, B @ link.share[:, None]], [link.by_phi @ phi, np.array([[link.rate]])]])
+        A = system_matrix(A, B @ link.share[:, None], (link.by_phi @ phi)[None], np.array([[link.rate]]))
         B, phi, share = np.vstack([B, link.by_w[None]]), _pad(phi, len(A)), link.share
     Ad, Bd = sample_driven((A, B, phi), control.loop, windings.R, Ts, delay, share)
     return readonly(A), readonly(Ad), readonly(Bd), control
@@ -469,19 +500,10 @@ def loaded_loop(
         B = np.hstack([into, left])
     T = loop.sample_time
 
-    @remembered
-    def response(w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        # In differences: slow poles lie close to 1, where z - A has lost their digits.
-        s = (np.expm1(1j * np.asarray(w) * T) / T)[:, None, None]
-        return _response(s, loop.Ad, B, loop.Cd, T), _response(s, law.A, law.B_y, law.C, T) + law.D_y
-
-    return Nominal(response, bool(np.abs(eigenvalues(loop.closed)).max() < 1), T, m)
-
-
-def _response(s: ComplexArray, A: FloatArray, B: FloatArray, C: FloatArray, T: float) -> ComplexArray:
-    """C (s - (A - 1) / T)^-1 B / T at s = (z - 1) / T."""
-    eye = np.eye(len(A))
-    return np.asarray(C @ np.linalg.solve(s * eye - (A - eye) / T, (B / T).astype(complex)))
+    # In differences: slow poles lie close to 1, where z - A has lost their digits.
+    P = System((loop.Ad - np.eye(len(loop.Ad))) / T, B / T, loop.Cd, np.zeros((len(loop.Cd), B.shape[1])))
+    F = System((law.A - np.eye(len(law.A))) / T, law.B_y / T, law.C, law.D_y)
+    return Nominal(P, F, bool(np.abs(eigenvalues(loop.closed)).max() < 1), T, m)
 
 
 def _on_top(rows: FloatArray, of: FloatArray) -> FloatArray:

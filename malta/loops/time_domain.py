@@ -24,8 +24,9 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError, require_known
+from malta.linear.peaks import of_plane, part_of, peak_gain
 from malta.linear.sampling import sample
-from malta.linear.uncertain import find_peaks
+from malta.linear.system import System
 from malta.loops.linear_loops import LinearLoop
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.loops.sampled_loops import SampledLoop
@@ -34,7 +35,6 @@ from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.recovery import RecoveryBound, StepResponse, step_response
 from malta.synthesis.requirements import Noise
-from malta.synthesis.state_space import System
 
 AFTER = (0.1, 0.3)  # s
 SHARE = 0.01  # of the largest deviation
@@ -194,8 +194,9 @@ def _deviations(
 ) -> tuple[Deviation, ...]:
     """What a load does to each output."""
     answer, Ts = unit_loads.of(load), loop.sample_time
-    w = np.geomspace(1e-2, np.pi / Ts, 240)
-    peaks, at = find_peaks(lambda some: np.abs(loop.compliance(some, load)), w)
+    system = loop.under_load(load)
+    peaks = [peak_gain(part_of(system, [k], [0])) for k in range(len(system.C))]
+    at = of_plane(np.array([peak.frequency for peak in peaks]), Ts)
     reached, settled, left = answer.largest, answer.within(SHARE), [answer.left(t) for t in after]
     moves = reached[:, 0] > 1e-12 * float(reached.max())  # what rounding moves stands still
     return tuple(
@@ -206,7 +207,7 @@ def _deviations(
             left=tuple(float(rest[k, 0]) if moves[k] else 0.0 for rest in left),
             settled=float(settled[k, 0]) if moves[k] else 0.0,
             final=float(answer.final[k, 0]),
-            compliance=float(peaks[k]),
+            compliance=peaks[k].value,
             frequency=float(at[k]),
         )
         for k, s in enumerate(plant.outputs)

@@ -24,6 +24,7 @@ import numpy as np
 
 from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError
+from malta.linear.matrices import system_matrix
 from malta.linear.sampling import delay_inputs, sample
 from malta.linear.uncertain import Compensator
 from malta.model.data import plant_of
@@ -194,7 +195,7 @@ def with_windings(plant: Plant, k: Windings, x: Any, A: Any, B: Any, C: Any) -> 
     induced = ca.horzcat(induced, kind(m, A.shape[1] - induced.shape[1]))
     acting = kind(B) @ ca.DM(np.linalg.inv(k.modes))
     return (
-        ca.blockcat([[kind(A), acting], [-induced / L, -R / L * kind.eye(m)]]),
+        system_matrix(kind(A), acting, -induced / L, -R / L * kind.eye(m)),
         ca.vertcat(kind(*B.shape), k.R / L * kind.eye(m)),
         ca.diagcat(kind(C), kind.eye(m)),
     )
@@ -222,9 +223,9 @@ def forecast_as_forces(law: LinearLaw, k: CurrentControl, Ts: float) -> LinearLa
     C_e, D_e, a = both.C[m:] / gain, both.D_y[m:] / gain, k.loop.Kp / gain
     rows = np.flatnonzero(np.hstack([C_e, D_e]).any(axis=1))
     C_e, D_e, into = C_e[rows], D_e[rows], np.eye(m)[:, rows]
-    n, r = len(law.A), law.B_r.shape[1]
+    r = law.B_r.shape[1]
     return law._replace(
-        A=np.block([[law.A, np.zeros((n, len(rows)))], [(a - 1) * C_e, a * np.eye(len(rows))]]),
+        A=system_matrix(law.A, None, (a - 1) * C_e, a * np.eye(len(rows))),
         B_y=np.vstack([law.B_y, (a - 1) * D_e]),
         B_r=np.vstack([law.B_r, np.zeros((len(rows), r))]),
         C=np.hstack([law.C + into @ C_e, into]),
@@ -258,8 +259,8 @@ def sample_driven(
     sums = np.zeros((m, len(Ad)))
     sums[:, : len(A)] = -loop.Ki * Ts * phi
     one, gain = np.eye(m), loop.Kp + loop.Ki * Ts
-    closed = np.block([[Ad + Bd @ read, Bd / R], [sums, one]])
-    return closed, np.block([[gain / R * Bd, Bd / R], [loop.Ki * Ts * one, np.zeros((m, m))]])
+    closed = system_matrix(Ad + Bd @ read, Bd / R, sums, one)
+    return closed, system_matrix(gain / R * Bd, Bd / R, loop.Ki * Ts * one)
 
 
 def with_current_control(c: Compensator, k: CurrentControl, late: int = 0) -> Compensator:
@@ -275,8 +276,8 @@ def with_current_control(c: Compensator, k: CurrentControl, late: int = 0) -> Co
     if not len(C_e):
         C_e, D_e = np.zeros_like(C), np.zeros_like(D)
     one, p = np.eye(m), D.shape[1]
-    A = np.block([[c.A, np.zeros((len(c.A), m))], [slope * C, one]])
-    B = np.block([[c.B, np.zeros((len(c.A), m))], [slope * D, -slope * one]])
+    A = system_matrix(c.A, None, slope * C, one)
+    B = system_matrix(c.B, None, slope * D, -slope * one)
     order = _before_integrals(len(c.A), m, c.integrals)
     return replace(
         c,

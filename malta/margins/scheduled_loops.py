@@ -35,6 +35,7 @@ from scipy import linalg
 from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
 from malta.linear.expressions import BALLS, NotAnalytic, Program, program
+from malta.linear.matrices import system_matrix
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.parametric_plants import of_plant
 from malta.loops.windings import CurrentLoops, chosen_loops
@@ -155,14 +156,13 @@ class _MovingNorms:
     def __init__(self, own: Sequence[_Cell], P: Any) -> None:
         self.own, n = own, own[0].n
         M = middle(own[0].every(arb(own[0].low))[0])
-        m = len(M) - n
         X = np.linalg.inv(np.linalg.cholesky(middle(P)[:n, :n])).T
         back = np.linalg.inv(X)
         inputs = np.linalg.norm(back @ M[:n, n:], axis=0)
         rate = np.linalg.norm(back @ M[:n, :n] @ X, 2)
         size = np.where(inputs > 0, rate / np.where(inputs > 0, inputs, 1), 1.0)
         self.X = ball(X)
-        self.U = ball(np.block([[X, np.zeros((n, m))], [np.zeros((m, n)), np.diag(size)]]))
+        self.U = ball(linalg.block_diag(X, np.diag(size)))
         self.back = self.U.inv()
         self.speed = self.slope = 0.0
         for cell in own:
@@ -223,9 +223,9 @@ def _expressions(
     u = around @ ca.horzcat(F_D @ C, F_C)
     y = ca.horzcat(C, ca.SX(C.shape[0], k)) + D @ u
     acting = [j for j in range(B.shape[1]) if B[:, j].nnz()]
-    M = ca.blockcat([[A, B[:, acting]], [ca.SX(len(acting), n + len(acting))]])
+    M = system_matrix(A, B[:, acting])
     L = ca.vertcat(ca.SX(n, n + k), ca.horzcat(ca.SX(k, n), ca.SX(F_A)) + F_B @ y)
-    R = ca.vertcat(ca.horzcat(ca.SX.eye(n), ca.SX(n, k)), u[acting, :])
+    R = system_matrix(ca.SX.eye(n), ca.SX(n, k), u[acting, :n], u[acting, n:])
     assert T is not None
     if units is None:
         return ca.Function("parts", [q], [ca.densify(x) for x in (M, L, R)]), T, n
@@ -366,7 +366,7 @@ def _with_channels(
     A, B, C = (ca.SX(M) for M in system.matrices.call([p]))
     m, outputs = B.shape[1], C.shape[0]
     if math.isfinite(crossover):
-        A = ca.blockcat([[A, B], [ca.SX(m, A.shape[0]), -crossover * ca.SX.eye(m)]])
+        A = system_matrix(A, B, None, -crossover * ca.SX.eye(m))
         B = ca.vertcat(ca.SX(B.shape[0], m), crossover * ca.SX.eye(m))
         C = ca.horzcat(C, ca.SX(outputs, m))
     n, share = A.shape[0], (p[-1] - a) / (b - a)

@@ -18,7 +18,8 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from malta.arrays import FloatArray
+from malta.linear.matrices import system_matrix
+from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.sampled_loops import LAST
 from malta.loops.windings import chosen_loops, current_control, force_modes, windings_of
@@ -54,16 +55,6 @@ class GainBox(NamedTuple):
     axes: tuple[tuple[int, ...], ...] = ()
     reason: str = ""
     searched: bool = True
-
-
-class _OpenLaw(NamedTuple):
-    """The law with the tuned part of its forces as an input: s+ = A s + B y + B_q q, v_n = C s + D y, v_1 likewise."""
-
-    A: FloatArray
-    B: FloatArray
-    B_q: FloatArray
-    tuned: tuple[FloatArray, FloatArray]
-    fixed: tuple[FloatArray, FloatArray]
 
 
 @on_one_thread
@@ -115,8 +106,11 @@ def _unfit(plant: Plant, c: Controller, uncertainty: Ranges) -> str:
     return ""
 
 
-def _opened(c: Controller) -> _OpenLaw:
-    """Steps 1 to 6 of synthesis/controller.py, deviations alone: states xi_pred, and e where it is fed back."""
+def _opened(c: Controller) -> System:
+    """The law with the tuned part of its forces as an input q after y, and an output v_n before the fixed part v_1.
+
+    Steps 1 to 6 of synthesis/controller.py, deviations alone: states xi_pred, and e where it is fed back.
+    """
     n, m, p, Ts = len(c.states), len(c.forces), len(c.measurements), c.sample_time
     summed = list(c.summed)
     sums = len(summed)
@@ -127,7 +121,8 @@ def _opened(c: Controller) -> _OpenLaw:
     C, D = (-(c.K - unity) @ x + Ki @ e for x, e in zip(hat, total, strict=True))
     C_1, D_1 = (-unity @ x for x in hat)
     A, B = (np.vstack([c.Ad @ x + c.Bd @ one, e]) for x, one, e in zip(hat, (C_1, D_1), total, strict=True))
-    return _OpenLaw(A, B, np.vstack([c.Bd, np.zeros((sums, m))]), (C, D), (C_1, D_1))
+    B, none = np.hstack([B, np.vstack([c.Bd, np.zeros((sums, m))])]), np.zeros((m, m))
+    return System(A, B, np.vstack([C, C_1]), system_matrix(D, none, D_1, none), None, Ts)
 
 
 def tuned_loop(plant: Plant, c: Controller, system: UncertainSystem) -> tuple[UncertainSystem, Compensator]:
@@ -141,20 +136,20 @@ def tuned_loop(plant: Plant, c: Controller, system: UncertainSystem) -> tuple[Un
     emf = np.zeros((m, n)), np.zeros((m, p))
     if len(k.emf[0]):
         emf[0][:, : k.emf[0].shape[1]], emf[1][:] = k.emf
-    (C_n, D_n), (C_1, D_1) = law.tuned, law.fixed
+    (C_n, C_1), (D_n, D_1), law_B = np.split(law.C, 2), np.split(law.D[:, :p], 2), law.B[:, :p]
     # as with_current_control: inputs y and phi, further states I, outputs w
-    A = np.block([[law.A, np.zeros((n, m))], [slope * S @ C_1, one]])
-    B = np.block([[law.B, np.zeros((n, m))], [slope * S @ D_1, -slope * one]])
-    B_q = np.vstack([law.B_q, slope * S])
+    A = system_matrix(law.A, None, slope * S @ C_1, one)
+    B = system_matrix(law_B, np.zeros((n, m)), slope * S @ D_1, -slope * one)
+    B_q = np.vstack([law.B[:, p:], slope * S])
     C = np.hstack([gain * S @ C_1 + emf[0], one]) / R
     D = np.hstack([gain * S @ D_1 + emf[1], -gain * one]) / R
     C_n, D_n = np.hstack([C_n, np.zeros((m, m))]), np.hstack([D_n, np.zeros((m, m))])
-    n, none = len(A), np.zeros((m, m))
+    none = np.zeros((m, m))
     behind = Compensator(  # states without q, and w without q
-        np.block([[A, np.zeros((n, m))], [C, none]]),
-        np.block([[B, A @ B_q], [D, C @ B_q]]),
-        np.block([[np.zeros((m, n)), one], [C_n, none]]),
-        np.block([[np.zeros((m, p + m)), gain * S / R], [D_n, C_n @ B_q]]),
+        system_matrix(A, None, C, none),
+        system_matrix(B, A @ B_q, D, C @ B_q),
+        system_matrix(np.zeros((m, len(A))), one, C_n, none),
+        system_matrix(np.zeros((m, p + m)), gain * S / R, D_n, C_n @ B_q),
         sample_time=Ts,
     )
     parameters, rate = ca.SX.sym("p", len(system.names) + 1), FAST / Ts

@@ -9,17 +9,25 @@ import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.peaks import peak_gain
 from malta.linear.sampling import eigenvalues
-from malta.linear.uncertain import Compensator, crossing_frequency, find_peaks
-from malta.loops.classical import Classical, classical_margins, nominal_loop, peak_sensitivity, worst_of
+from malta.linear.uncertain import Compensator
+from malta.loops.classical import (
+    Classical,
+    classical_margins,
+    last_crossover,
+    nominal_loop,
+    peak_of_channels,
+    peak_sensitivity,
+    tracked_band,
+    worst_of,
+)
 from malta.loops.loop import loop_of_model
 from malta.loops.own_model import controller_poles
 from malta.loops.parametric_plants import of_plant
@@ -114,32 +122,16 @@ def machine_report(model: LinearModel, controller: Controller) -> LoopReport:
     )
 
 
-@lru_cache(maxsize=4)  # peaks and bandwidths need it; loops compare by identity
-def _on_grid(loop: SampledLoop) -> tuple[FloatArray, ComplexArray, ComplexArray]:
-    """Frequencies up to half of sampling, rad/s, and the loop gain and the sensitivity there."""
-    w = np.geomspace(1e-2, np.pi / loop.sample_time, 240)
-    L = loop.loop_gain(w)
-    return w, L, np.linalg.inv(np.eye(len(loop.Cd)) + L)
-
-
 def stage_of(name: str, stage: SampledLoop, sensors: list[str]) -> Stage:
     """The peak sensitivities and the spectral radius of a loop; the peaks of an unstable one are NaN."""
     radius = float(np.abs(eigenvalues(stage.closed)).max())
     if radius >= 1:
         return Stage(name, dict.fromkeys([*sensors, "sigma_max"], np.nan), np.nan, radius)
 
-    def sizes(S: ComplexArray) -> FloatArray:
-        return np.column_stack([np.abs(np.einsum("kii->ki", S)), _singular_values(S)[:, 0]])
-
-    def own(near: FloatArray, k: NDArray[np.int_]) -> FloatArray:
-        S, i = stage.sensitivity(near), np.minimum(k, len(sensors) - 1)
-        found, all_of_them = np.abs(S[np.arange(len(S)), i, i]), k == len(sensors)
-        found[all_of_them] = _singular_values(S[all_of_them])[:, 0]
-        return found
-
-    w, _, S = _on_grid(stage)
-    peaks, at = find_peaks(lambda near: sizes(stage.sensitivity(near)), w, sizes(S), own)
-    return Stage(name, dict(zip([*sensors, "sigma_max"], peaks.tolist(), strict=True)), float(at[-1]), radius)
+    cut = stage.cut
+    peaks = {name: peak_gain(cut.sensitivity(i)).value for i, name in enumerate(sensors)}
+    largest = peak_of_channels(cut, cut.sensors)
+    return Stage(name, peaks | {"sigma_max": largest.value}, largest.frequency, radius)
 
 
 def bandwidths_of(
@@ -149,17 +141,9 @@ def bandwidths_of(
     natural = _natural_frequencies(commanded_model(model, controller), controller)
     if not stable:
         return {key: np.nan for key in BANDWIDTHS if not key.startswith("w_n")} | natural
-    w, L, S = _on_grid(machine)
-    T = _singular_values(np.eye(len(machine.Cd)) - S)
-    half = np.sqrt(0.5)
-    return {
-        "sigma_max_T": crossing_frequency(w, T[:, 0], half, last=True),
-        "sigma_min_T": crossing_frequency(
-            w, T[:, min(L.shape[1], len(controller.forces)) - 1], half, last=False
-        ),
-        "crossover_max": crossing_frequency(w, _singular_values(L)[:, 0], 1.0, last=True),
-        **natural,
-    }
+    lowest, highest = tracked_band(machine.cut, min(len(machine.Cd), len(controller.forces)))
+    crossover = last_crossover(machine.cut)
+    return {"sigma_max_T": highest, "sigma_min_T": lowest, "crossover_max": crossover} | natural
 
 
 def _natural_frequencies(model: LinearModel, controller: Controller) -> dict[str, float]:
@@ -173,10 +157,6 @@ def _natural_frequencies(model: LinearModel, controller: Controller) -> dict[str
     closed = model.force_map @ K - model.stiffness
     w_n = np.sqrt(np.maximum(eigenvalues(closed).real, 0))
     return {"w_n_max": float(w_n.max()), "w_n_min": float(w_n.min())}
-
-
-def _singular_values(G: ComplexArray) -> FloatArray:
-    return np.asarray(np.linalg.svd(G, compute_uv=False))
 
 
 # The margin at each stage of a design, from full state feedback to the machine's own loop.

@@ -32,6 +32,7 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.matrices import system_matrix
 from malta.model.actuator import Actuator
 from malta.model.data import plant_of
 from malta.model.machines import machine_names
@@ -386,7 +387,7 @@ def _states_at_rest(A: FloatArray, B: FloatArray, C: FloatArray, coordinates: in
         return np.asarray(rests @ np.linalg.pinv(C @ rests))[: half or n]
     if half and p == half and np.linalg.matrix_rank(C[:, :half]) == half:
         return np.asarray(np.linalg.inv(C[:, :half]))
-    whole = np.block([[A, B], [C, np.zeros((p, B.shape[1]))]])
+    whole = system_matrix(A, B, C)
     asked = np.vstack([np.zeros((n, p)), np.eye(p)])
     return np.asarray(np.linalg.lstsq(whole, asked, rcond=None)[0][: half or n])
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError
+from malta.linear.system import System
 from malta.model.equilibrium import chain, commanded, trace
 from malta.model.plant import OperatingPoint, Plant
 from malta.model.signals import InverseCheck, Mismatch
@@ -69,18 +70,14 @@ class LinearModel:
     @cached_property
     def sys(self) -> Any:
         """The model as a control.StateSpace with named states, inputs and outputs."""
-        import control  # imports matplotlib and takes a second: only where it is used
+        return self.system.to_control(self.plant.name)
 
-        return control.ss(
-            self.A,
-            self.B,
-            self.C,
-            np.zeros((self.C.shape[0], self.B.shape[1])),
-            name=self.plant.name,
-            states=[s.name for s in self.plant.design_states],
-            inputs=[s.name for s in self.plant.inputs],
-            outputs=[s.name for s in self.plant.outputs],
-        )
+    @property
+    def system(self) -> System:
+        """The model as a system with the names of its signals."""
+        signals = self.plant.design_states, self.plant.inputs, self.plant.outputs
+        names = (tuple(s.name for s in of) for of in signals)
+        return System(self.A, self.B, self.C, np.zeros((len(self.C), self.B.shape[1])), None, None, *names)
 
     @property
     def stiffness(self) -> FloatArray:

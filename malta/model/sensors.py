@@ -16,6 +16,7 @@ from typing import Any
 import casadi as ca
 
 from malta.errors import InputError
+from malta.linear.matrices import system_matrix
 from malta.model.signals import DEFAULT, CasadiFn, Signal
 
 
@@ -92,7 +93,7 @@ def with_lags(sensors: Sensors, A: Any, B: Any, C: Any) -> tuple[Any, Any, Any]:
         return A, B, C
     n, k, kind = A.shape[0], len(late), ca.SX
     rate = ca.diag(ca.vertcat(*(1 / kind(sensors.lag[i]) for i in late)))
-    A = ca.blockcat([[kind(A), kind(n, k)], [rate @ kind(C)[late, :], -rate]])
+    A = system_matrix(kind(A), None, rate @ kind(C)[late, :], -rate)
     out = ca.horzcat(kind(C), kind(C.shape[0], k))
     for row, i in enumerate(late):
         out[i, :] = 0

@@ -11,15 +11,17 @@ of any other, and `malta.linear_machine` makes a machine of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
-from malta.arguments import describe, plural
+from malta.arguments import describe
 from malta.arrays import readonly
-from malta.errors import InputError, require_known
+from malta.errors import InputError
+from malta.linear import interconnection
+from malta.linear.system import System
 from malta.linear.systems import compensator_of
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.proof.box import box_of
@@ -28,18 +30,6 @@ if TYPE_CHECKING:
     from malta.proof.margin import Ranges
 
 MOST_SYSTEMS = 100_000
-LARGEST_LOOP = 4  # signals of an algebraic loop, whose matrix is inverted by minors
-
-
-@dataclass(frozen=True, eq=False)
-class _Parts:
-    """Matrices in the symbols of all parameters."""
-
-    A: Any
-    B: Any
-    C: Any
-    D: Any
-    E: Any
 
 
 def series(*systems: Any) -> UncertainSystem:
@@ -62,26 +52,8 @@ def series(*systems: Any) -> UncertainSystem:
     >>> print(malta.robust_margin(lagging, control.tf([-40, -800], [1, 80]), {"m": 0.5}))
     proven 197.57 %, lost at 197.58 % at 168.5 rad/s
     """
-    caller = "series"
-    whole = _Connection.of(systems, caller)
-    found = whole.parts[0]
-    for k, after in enumerate(whole.parts[1:], 2):
-        if after.B.shape[1] != found.C.shape[0]:
-            before = plural(found.C.shape[0], "output")
-            raise InputError(
-                caller, f"system {k}", plural(after.B.shape[1], "input"), f"as many as the {before} before"
-            )
-        found = _Parts(
-            ca.vertcat(
-                ca.horzcat(found.A, ca.SX(found.A.shape[0], after.A.shape[0])),
-                ca.horzcat(after.B @ found.C, after.A),
-            ),
-            ca.vertcat(found.B, after.B @ found.D),
-            ca.horzcat(after.D @ found.C, after.C),
-            after.D @ found.D,
-            ca.diagcat(found.E, after.E),
-        )  # fmt: skip
-    return whole.system(found)
+    whole = _Connection.of(systems, "series")
+    return whole.system(interconnection.series(*whole.parts))
 
 
 def append(*systems: Any) -> UncertainSystem:
@@ -98,7 +70,7 @@ def append(*systems: Any) -> UncertainSystem:
     [[0.0, 0.0], [0.0, 3.0]]
     """
     whole = _Connection.of(systems, "append")
-    return whole.system(whole.side_by_side())
+    return whole.system(interconnection.append(*whole.parts))
 
 
 def parallel(*systems: Any) -> UncertainSystem:
@@ -114,13 +86,7 @@ def parallel(*systems: Any) -> UncertainSystem:
     0.5
     """
     whole = _Connection.of(systems, "parallel")
-    first = whole.parts[0].D.shape
-    for k, part in enumerate(whole.parts, 1):
-        if part.D.shape != first:
-            raise InputError("parallel", f"system {k}", f"shape {part.D.shape}", f"{first}, as the first")
-    both, count = whole.side_by_side(), len(systems)
-    into, out = ca.repmat(ca.DM.eye(first[1]), count, 1), ca.repmat(ca.DM.eye(first[0]), 1, count)
-    return whole.system(_Parts(both.A, both.B @ into, out @ both.C, out @ both.D @ into, both.E))
+    return whole.system(interconnection.parallel(*whole.parts))
 
 
 def feedback(system: Any, law: Any, sign: int = -1) -> UncertainSystem:
@@ -149,27 +115,7 @@ def feedback(system: Any, law: Any, sign: int = -1) -> UncertainSystem:
     whole = _Connection.of((system, law), caller)
     if sign not in (-1, 1):
         raise InputError(caller, "sign", describe(sign), "-1 or 1")
-    G, K = whole.parts
-    if K.D.shape != G.D.shape[::-1]:
-        raise InputError(caller, "law", f"shape {K.D.shape}", f"{G.D.shape[::-1]}, from y to u")
-    # e = u + sign (C_K x_K + D_K y), y = C_G x_G + D_G e, so that Q e = u + sign (C_K x_K + D_K C_G x_G)
-    Q = ca.SX.eye(G.D.shape[1]) - sign * K.D @ G.D
-    e_from_x = _solve(Q, sign * ca.horzcat(K.D @ G.C, K.C), caller)
-    e_from_u = _solve(Q, ca.SX.eye(G.D.shape[1]), caller)
-    n, k = G.A.shape[0], K.A.shape[0]
-    y_from_x = ca.horzcat(G.C, ca.SX(G.C.shape[0], k)) + G.D @ e_from_x
-    y_from_u = G.D @ e_from_u
-    return whole.system(
-        _Parts(
-            ca.vertcat(
-                ca.horzcat(G.A, ca.SX(n, k)) + G.B @ e_from_x, ca.horzcat(ca.SX(k, n), K.A) + K.B @ y_from_x
-            ),
-            ca.vertcat(G.B @ e_from_u, K.B @ y_from_u),
-            y_from_x,
-            y_from_u,
-            ca.diagcat(G.E, K.E),
-        )
-    )
+    return whole.system(interconnection.feedback(whole.parts[0], whole.parts[1], sign))
 
 
 def interconnect(
@@ -204,37 +150,11 @@ def interconnect(
     caller = "interconnect"
     named = [_named(one, caller) for one in systems]
     whole = _Connection.of([system for system, _, _ in named], caller)
-    taken, given = ([name for one in named for name in one[k]] for k in (1, 2))
-    into, out = _names_of(inputs), _names_of(outputs)
-    for field, names, known in (("inputs", into, taken), ("outputs", out, given)):
-        require_known(names, known, caller, field)
-    if len(set(given)) < len(given):
-        raise InputError(caller, "systems", f"outputs {' '.join(given)}", "outputs with names that differ")
-    for name in taken:
-        if name not in given and name not in into:
-            raise InputError(
-                caller,
-                "systems",
-                f"an input {name!r} that nothing feeds",
-                "an output or an input of its name",
-            )
-    both = whole.side_by_side()
-    M, N, P = (
-        ca.sparsify(ca.DM([[float(a == b) for b in columns] for a in rows]))
-        for rows, columns in ((taken, given), (taken, into), (out, given))
-    )
-    # v = M w + N u, w = C x + D v: (I - M D) v = M C x + N u
-    through = M @ both.D
-    v_from_x, v_from_u = (_passed_on(through, ca.SX(right), caller) for right in (M @ both.C, N))
-    return whole.system(
-        _Parts(
-            both.A + both.B @ v_from_x,
-            both.B @ v_from_u,
-            P @ (both.C + both.D @ v_from_x),
-            P @ both.D @ v_from_u,
-            both.E,
-        )
-    )
+    parts = [
+        replace(part, inputs=tuple(into), outputs=tuple(out))
+        for part, (_, into, out) in zip(whole.parts, named, strict=True)
+    ]
+    return whole.system(interconnection.interconnect(parts, _names_of(inputs), _names_of(outputs)))
 
 
 def _named(one: Any, caller: str) -> tuple[Any, list[str], list[str]]:
@@ -259,17 +179,6 @@ def _named(one: Any, caller: str) -> tuple[Any, list[str], list[str]]:
 
 def _names_of(names: Sequence[str] | str) -> list[str]:
     return [names] if isinstance(names, str) else list(names)
-
-
-def _passed_on(through: Any, right: Any, caller: str) -> Any:
-    """(I - through)^-1 right: by its powers, which end where no signal passes through a loop at once."""
-    total = power = right
-    for _ in range(through.shape[0]):
-        power = ca.sparsify(through @ power)
-        if not power.nnz():
-            return total
-        total = total + power
-    return _solve(ca.SX.eye(through.shape[0]) - through, right, caller)
 
 
 def random_systems(system: UncertainSystem, count: int, ranges: Ranges, seed: int = 0) -> list[Any]:
@@ -305,20 +214,6 @@ def random_systems(system: UncertainSystem, count: int, ranges: Ranges, seed: in
     return [system.state_space(**dict(zip(system.names, row, strict=True))) for row in drawn.tolist()]
 
 
-def _solve(Q: Any, right: Any, caller: str) -> Any:
-    """Q^-1 times a matrix, of symbols; Q of a loop without direct paths is 1."""
-    if ca.sparsify(Q - ca.SX.eye(Q.shape[0])).nnz() == 0:
-        return right
-    if Q.shape[0] > LARGEST_LOOP:
-        found = f"an algebraic loop of {Q.shape[0]} signals"
-        raise InputError(caller, "D", found, f"at most {LARGEST_LOOP}, or a system without a direct path")
-    if ca.sparsify(ca.simplify(ca.det(Q))).nnz() == 0:
-        raise InputError(
-            caller, "D", "an algebraic loop without a solution", "I - sign D_K D_G that is not singular"
-        )
-    return ca.inv_minor(Q) @ right
-
-
 @dataclass(frozen=True, eq=False)
 class _Connection:
     """Systems in the symbols of their common parameters."""
@@ -330,7 +225,7 @@ class _Connection:
     sample_time: float | None
     approximate: str
     positive: tuple[Any, ...]
-    parts: tuple[_Parts, ...]
+    parts: tuple[System, ...]
 
     @classmethod
     def of(cls, systems: Sequence[Any], caller: str) -> _Connection:
@@ -364,13 +259,11 @@ class _Connection:
             tuple(_parts(one, symbols) for one in systems),
         )  # fmt: skip
 
-    def side_by_side(self) -> _Parts:
-        return _Parts(*(ca.diagcat(*(getattr(part, letter) for part in self.parts)) for letter in "ABCDE"))
-
-    def system(self, found: _Parts) -> UncertainSystem:
+    def system(self, found: System) -> UncertainSystem:
         """The uncertain system of matrices in the common symbols; E and D only where there are any."""
-        A, B, C, D, E = (ca.sparsify(M) for M in (found.A, found.B, found.C, found.D, found.E))
-        plain_E = ca.sparsify(E - ca.SX.eye(E.shape[0])).nnz() == 0
+        A, B, C, D = (ca.sparsify(M) for M in (found.A, found.B, found.C, found.D))
+        E = None if found.E is None else ca.sparsify(found.E)
+        plain_E = E is None or ca.sparsify(E - ca.SX.eye(E.shape[0])).nnz() == 0
         matrices = [A, B, C] if plain_E and not D.nnz() else [A, B, C, D] if plain_E else [A, B, C, D, E]
         positive = ca.Function("positive", [self.p], [ca.vertcat(*self.positive)]) if self.positive else None
         return UncertainSystem(
@@ -406,15 +299,15 @@ def _own(one: UncertainSystem, symbols: dict[str, Any]) -> Any:
     return ca.vertcat(*(symbols[name] for name in one.names))
 
 
-def _parts(one: Any, symbols: dict[str, Any]) -> _Parts:
+def _parts(one: Any, symbols: dict[str, Any]) -> System:
     """The matrices of one system; those of a known one are constant."""
     if isinstance(one, UncertainSystem):
         A, B, C, *more = one.matrices.call([_own(one, symbols)])
         D = more[0] if more else ca.SX(C.shape[0], B.shape[1])
-        return _Parts(A, B, C, D, more[1] if len(more) > 1 else ca.SX.eye(A.shape[0]))
+        return System(A, B, C, D, more[1] if len(more) > 1 else None)
     shape = (one.noutputs, one.ninputs) if hasattr(one, "ninputs") else np.shape(getattr(one, "D", one))
     outputs, inputs = shape if len(shape) == 2 else (1, 1)
     law = compensator_of(one, inputs, outputs)
-    n = len(law.A)
     A, B, C, D = (ca.SX(ca.sparsify(ca.DM(M))) for M in (law.A, law.B, law.C, law.D))
-    return _Parts(A, B.reshape((n, inputs)), C.reshape((outputs, n)), D, ca.SX.eye(n))
+    n = A.shape[0]
+    return System(A, B.reshape((n, inputs)), C.reshape((outputs, n)), D)

@@ -20,9 +20,12 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.display import display
 from malta.errors import InputError
-from malta.structured.loops import Channels, ClosedLoop, Pole, gain_slope, noise, peaks_of, response_at
+from malta.linear.conversion import from_control
+from malta.linear.interconnection import append, series
+from malta.linear.peaks import response_at
+from malta.linear.system import System
+from malta.structured.loops import Channels, ClosedLoop, Pole, gain_slope, noise, peaks_of
 from malta.synthesis.elements import CALLER
-from malta.synthesis.state_space import System
 
 At = Literal["sensors", "forces"]
 SLOWEST = 6  # poles of a group that a search looks at
@@ -160,9 +163,7 @@ def tracking(
     for one in (time, peak, steady):
         _require_positive("tracking", one)
     w = 2 / time
-    W = System(
-        *(np.array([[v]]) for v in (-w * steady / peak, 1.0, w / peak - w * steady / peak**2, 1 / peak))
-    )
+    W = _first_order(-w * steady / peak, 1.0, w / peak - w * steady / peak**2, 1 / peak)
     made = partial(_each_channel, name := f"tracking {time:g} s", "sensors", channels, 1.0, 0.0, W=W)
     return Goal(name, made, unit=f"2 / w = {time:g} s")
 
@@ -257,28 +258,22 @@ def _require_positive(name: str, value: float) -> None:
 
 def _weight_of(weight: Any) -> System:
     """A stable proper weight with one input and one output."""
-    import control  # imports matplotlib and takes a second: only where it is used
-
-    try:
-        found = System.of(control.ss(weight))
-    except Exception as error:  # many kinds, as improper ones
-        wanted = "a proper control system with one input and one output"
-        raise InputError(CALLER, "weight", f"a {type(weight).__name__}", wanted) from error
-    if found.D.shape != (1, 1) or (len(found.A) and np.linalg.eigvals(found.A).real.max() >= 0):
+    wanted = "a proper control system with one input and one output"
+    found = from_control(weight, CALLER, "weight", expected=wanted)
+    if found.D.shape != (1, 1) or not found.stable:
         raise InputError(
             CALLER, "weight", "an unstable one or one of several signals", "a stable one of one signal"
         )
     return found
 
 
+def _first_order(a: float, b: float, c: float, d: float) -> System:
+    return System(np.array([[a]]), np.array([[b]]), np.array([[c]]), np.array([[d]]))
+
+
 def _weighted(system: System, W: System) -> System:
     """W behind each output."""
-    k = len(system.D)
-    A, B, C, D = (np.kron(np.eye(k), M) for M in W)
-    return System(
-        np.block([[system.A, np.zeros((len(system.A), len(A)))], [B @ system.C, A]]),
-        np.vstack([system.B, B @ system.D]), np.hstack([D @ system.C, C]), D @ system.D,
-    )  # fmt: skip
+    return series(system, append(*[W] * len(system.D)))
 
 
 def _figures_of(
@@ -291,7 +286,7 @@ def _figures_of(
 ) -> list[Figure]:
     """The peaks of factor W (G - shift)."""
     system, by = found
-    shifted = system._replace(D=system.D - shift * np.eye(*system.D.shape))
+    shifted = replace(system, D=system.D - shift * np.eye(*system.D.shape))
     figures = []
     for peak in peaks_of(shifted if W is None else _weighted(shifted, W)):
         at = 1.0 if W is None else complex(response_at(W, np.array([peak.w]))[0, 0, 0])
@@ -334,11 +329,11 @@ def _noise(
     columns = [(k, level) for signal, level in levels.items() for k in loop.columns(signal)]
     size = np.array([level for _, level in columns])
     system, by = loop.part(loop.rows(outputs), [k for k, _ in columns])
-    system, by = system._replace(B=system.B * size, D=system.D * size), by._replace(D21=by.D21 * size)
+    system, by = replace(system, B=system.B * size, D=system.D * size), by._replace(D21=by.D21 * size)
     T = loop.model.sample_time
     if T is not None:
         k = len(system.D)
-        system = _weighted(system, System(*(np.array([[v]]) for v in (-2 / T, 1.0, 2 / math.sqrt(T), 0.0))))
+        system = _weighted(system, _first_order(-2 / T, 1.0, 2 / math.sqrt(T), 0.0))
         wide = np.zeros((k, by.B2.shape[1]))
         by = Channels(np.vstack([by.B2, by.D12]), np.hstack([by.C2, np.zeros((len(by.C2), k))]), wide, by.D21)
     value, slope = noise(system, by)

@@ -20,8 +20,10 @@ from scipy import linalg, sparse
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.conversion import from_control
+from malta.linear.peaks import gains_at, level_frequencies, peak_gain, response_at
+from malta.linear.system import System
 from malta.synthesis.elements import CALLER
-from malta.synthesis.state_space import System
 from malta.synthesis.structure import OF_INPUTS, OF_OUTPUTS
 
 # Figures of a stable linear system with their exact derivatives: peaks of its gain, its noise, its poles.
@@ -34,12 +36,9 @@ from malta.synthesis.structure import OF_INPUTS, OF_OUTPUTS
 # All are differentiated by a matrix M that acts as A + B2 M C2 does: the output of each derivative has the shape of M.
 
 
-RISE = 1e-7  # relative, above the largest gain that was found, at which a search ends
-NEAR = 1e-6  # |Re| of an eigenvalue over its size, up to which it may lie on the imaginary axis
 ROUNDS = 9  # of the refinement of a peak
 POINTS = 9  # in each of them
 SHARES = (0.7, 0.85, 0.95, 0.99)  # of the largest gain: maxima are looked for between their crossings
-LEVELS = 30  # at most
 
 
 class Peak(NamedTuple):
@@ -49,66 +48,6 @@ class Peak(NamedTuple):
     value: float
     left: ComplexArray
     right: ComplexArray
-
-
-def response_at(system: System, w: FloatArray) -> ComplexArray:
-    """G(jw) at k frequencies in rad/s, infinite ones among them: k x outputs x inputs."""
-    found = np.broadcast_to(system.D.astype(complex), (len(w), *system.D.shape)).copy()
-    finite = np.isfinite(w)
-    if len(system.A) and finite.any():
-        resolvent = 1j * w[finite, None, None] * np.eye(len(system.A)) - system.A
-        found[finite] += system.C @ np.linalg.solve(resolvent, system.B.astype(complex))
-    return found
-
-
-def _sizes(system: System, w: FloatArray) -> FloatArray:
-    G = response_at(system, w)
-    if 1 in G.shape[1:]:
-        return np.asarray(np.linalg.norm(G, axis=(1, 2)))
-    return np.asarray(np.linalg.norm(G, 2, axis=(1, 2)))
-
-
-def _crossings(system: System, level: float) -> FloatArray:
-    """The frequencies at which a singular value of G may be equal to a level, in order: eigenvalues near jw."""
-    A, B, C, D = system
-    R = D.T @ D - level**2 * np.eye(B.shape[1])
-    S = D @ D.T - level**2 * np.eye(len(C))
-    own = A - B @ np.linalg.solve(R, D.T @ C)
-    H = np.block([[own, -level * B @ np.linalg.solve(R, B.T)], [level * C.T @ np.linalg.solve(S, C), -own.T]])
-    found = np.linalg.eigvals(H)
-    on_axis = np.abs(found.real) <= NEAR * np.abs(found) + 1e-300
-    return np.unique(np.abs(found[on_axis].imag))
-
-
-def peak_gain(system: System) -> tuple[float, float]:
-    """The largest gain of a stable system over all frequencies, and where it lies: (value, rad/s).
-
-    Its levels rise from gains that were found, until the Hamiltonian matrix has no imaginary eigenvalues at RISE above
-    the last one (Bruinsma and Steinbuch).
-    """
-    system = system.balanced
-    w = np.array([0.0, np.inf])
-    if len(system.A):
-        poles = np.linalg.eigvals(system.A)
-        w = np.concatenate([w, np.abs(poles), np.abs(poles.imag)])
-    sizes = _sizes(system, w)
-    if not np.isfinite(sizes).all():
-        return math.inf, float(w[~np.isfinite(sizes)][0])
-    k = int(sizes.argmax())
-    best, where = float(sizes[k]), float(w[k])
-    if not len(system.A) or best == 0.0:
-        return best, where
-    for _ in range(LEVELS):
-        ends = _crossings(system, best * (1 + RISE))
-        if not len(ends):
-            return best, where
-        w = np.concatenate([ends, np.sqrt(ends[1:] * ends[:-1]), ends[:1] / 2, 2 * ends[-1:]])
-        sizes = _sizes(system, w)
-        k = int(sizes.argmax())
-        if not sizes[k] > best * (1 + RISE):
-            return max(best, float(sizes[k])), where if best >= sizes[k] else float(w[k])
-        best, where = float(sizes[k]), float(w[k])
-    return best, where
 
 
 def peaks_of(system: System) -> list[Peak]:
@@ -123,11 +62,11 @@ def peaks_of(system: System) -> list[Peak]:
         return []
     scale = where if 0 < where < math.inf else _middle_of(system)
     poles = np.linalg.eigvals(system.A) if len(system.A) else np.zeros(0)
-    levels = [_crossings(system, share * best) for share in SHARES] if len(poles) else []
+    levels = [level_frequencies(system, share * best) for share in SHARES] if len(poles) else []
     w = np.concatenate([np.abs(poles), [where], *levels])
     at = np.unique(np.concatenate([[0.0, math.pi], 2 * np.arctan(w / scale)]))
     angle = np.unique(np.concatenate([at, (at[1:] + at[:-1]) / 2]))
-    sizes = _sizes(system, _frequency(angle, scale))
+    sizes = gains_at(system, _frequency(angle, scale))
     before, after = np.append(-np.inf, sizes[:-1]), np.append(sizes[1:], -np.inf)
     tops = np.flatnonzero((sizes >= before) & (sizes > after) & (sizes > SHARES[0] * best))
     low, high = angle[np.maximum(tops - 1, 0)], angle[np.minimum(tops + 1, len(angle) - 1)]
@@ -156,7 +95,7 @@ def _refined(system: System, low: FloatArray, high: FloatArray, scale: float) ->
     where = high
     for _ in range(ROUNDS):
         angle = np.linspace(low, high, POINTS, axis=1)
-        sizes = _sizes(system, _frequency(angle.ravel(), scale)).reshape(angle.shape)
+        sizes = gains_at(system, _frequency(angle.ravel(), scale)).reshape(angle.shape)
         k = sizes.argmax(axis=1)
         where = angle[rows, k]
         low, high = angle[rows, np.maximum(k - 1, 0)], angle[rows, np.minimum(k + 1, POINTS - 1)]
@@ -231,6 +170,7 @@ def poles_of(A: FloatArray, B2: FloatArray, C2: FloatArray, count: int = 0) -> l
 
 
 ZERO = 1e-9  # of a law's largest entry: a pole of that size is an integral
+ROUNDING = 1e-14  # of the largest entry of A: growth within it is rounding
 JOINS = 1e-12  # of the largest entries of its row and column: smaller ones are rounding
 
 
@@ -282,28 +222,14 @@ def to_plane(system: System, Ts: float) -> System:
 
 def models_of_systems(plants: Any) -> list[Model]:
     """The models of one control system or of several with the same signals. Raises InputError for others."""
-    import control  # imports matplotlib and takes a second: only where it is used
-
     given = list(plants) if isinstance(plants, list | tuple) else [plants]
     found: list[Model] = []
     for k, plant in enumerate(given):
-        try:
-            ss = control.ss(plant)
-        except Exception as error:  # many kinds: an improper function, a frequency response without states
-            wanted = "a system of python-control with states, or several"
-            raise InputError(CALLER, "plant", f"a {type(plant).__name__}", wanted) from error
-        if ss.dt is True:
-            raise InputError(CALLER, "plant.dt", "True", "a sample time in s, or 0")
-        name = f"{ss.name}" if len(given) == 1 else f"model {k + 1}"
-        found.append(
-            model_of(
-                name,
-                System.of(ss),
-                ss.input_labels,
-                ss.output_labels,
-                sample_time=float(ss.dt or 0.0) or None,
-            )
+        own = from_control(
+            plant, CALLER, "plant", expected="a system of python-control with states, or several"
         )
+        name = getattr(plant, "name", "") if len(given) == 1 else f"model {k + 1}"
+        found.append(model_of(name, own, own.inputs, own.outputs, sample_time=own.dt))
     first = found[0]
     for other in found[1:]:
         if (other.inputs, other.outputs, other.sample_time) != (
@@ -404,6 +330,11 @@ class ClosedLoop:
         return max(
             (float(np.linalg.eigvals(A[np.ix_(x, x)]).real.max()) for x in self.groups), default=-math.inf
         )
+
+    @property
+    def stable(self) -> bool:
+        """Whether all poles decay by more than rounding makes of undamped ones."""
+        return self.growth < -ROUNDING * float(np.abs(self.whole[0].A).max(initial=0.0))
 
     def poles(self, count: int = 0) -> list[Pole]:
         """The poles with their derivatives by M, each group by itself; count of each, the slowest first, 0: all."""

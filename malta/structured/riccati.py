@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,10 +30,14 @@ from scipy.linalg import matrix_balance
 from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
+from malta.linear.conversion import from_control
+from malta.linear.interconnection import append, gain, interconnect, lft, series
+from malta.linear.matrices import system_matrix
+from malta.linear.peaks import peak_gain
+from malta.linear.reduction import balanced_reduction
+from malta.linear.system import System
 from malta.processes import on_one_thread
-from malta.structured.loops import peak_gain
 from malta.synthesis.elements import CALLER
-from malta.synthesis.state_space import System
 
 H_INFINITY = "h_infinity"
 TOLERANCE = 1e-6  # relative, of the smallest gamma
@@ -142,7 +146,7 @@ def h_infinity(plant: Any, outputs: int, inputs: int) -> Synthesized:
     if solved is None:
         raise CheckError(f"{H_INFINITY}: the equations have no solution just above gamma = {best:.6g}")
     law = back(_central(problem, solved))
-    norm, w = _checked(own, law, p2, m2, solved.gamma)
+    norm, w = _checked(own, law, solved.gamma)
     return Synthesized(law, best, norm, w, solved.coupling, solved.residual)
 
 
@@ -150,16 +154,15 @@ def _system_of(plant: Any) -> System:
     """A, B, C and D of a continuous system. Raises InputError."""
     if getattr(plant, "dt", None) not in (None, 0):
         raise InputError(H_INFINITY, "plant", f"a sample time of {plant.dt} s", "a continuous system")
-    given = (plant.A, plant.B, plant.C, plant.D) if hasattr(plant, "A") else plant
+    if hasattr(plant, "dt"):
+        return from_control(plant, H_INFINITY, "plant")
     try:
-        found = System(*(np.atleast_2d(np.asarray(M, dtype=float)) for M in given))
-        fits = found.B.shape == (len(found.A), found.D.shape[1]) and found.C.shape == (
-            len(found.D),
-            len(found.A),
-        )
-    except (TypeError, ValueError):
+        A, B, C, D = (np.atleast_2d(np.asarray(M, dtype=float)) for M in plant)
+        found = System(A, B, C, D)
+        fits = all(np.isfinite(M).all() for M in found)
+    except (TypeError, ValueError, IndexError):
         fits = False
-    if not fits or not all(np.isfinite(M).all() for M in found):
+    if not fits:
         raise InputError(H_INFINITY, "plant", "matrices that do not fit, or no numbers", "A, B, C and D")
     return found
 
@@ -206,7 +209,7 @@ def _riccati(
         return np.zeros((0, 0)), 0.0
     inner = np.linalg.solve(R, np.hstack([S.T, B.T]))
     G, own = B @ inner[:, n:], A - B @ inner[:, :n]
-    H = np.block([[own, -G], [-(Q - S @ inner[:, :n]), -own.T]])
+    H = system_matrix(own, -G, -(Q - S @ inner[:, :n]), -own.T)
     _, (scale, _) = matrix_balance(H, permute=False, separate=True)
     t = np.sqrt(scale[:n] / scale[n:])  # symplectic: states by t, costates by 1 / t
     t = 2.0 ** np.round(np.log2(t))
@@ -289,27 +292,12 @@ def _central(p: _Problem, s: _Solved) -> System:
     return System(A, B1, C1, D11)
 
 
-def lower_loop(P: System, K: System, p2: int, m2: int) -> System:
-    """A generalized plant closed by u = K y. Raises CheckError where 1 - D22 K is singular."""
-    A, B, C, D = P
-    p1, m1 = len(D) - p2, D.shape[1] - m2
-    B2, C2, D12, D21, D22 = B[:, m1:], C[p1:], D[:p1, m1:], D[p1:, :m1], D[p1:, m1:]
+def _checked(P: System, K: System, gamma: float) -> tuple[float, float]:
+    """The norm of the closed loop. Raises CheckError where it has no solution, is unstable, or above gamma."""
     try:
-        inner = np.linalg.inv(np.eye(m2) - K.D @ D22)
-    except np.linalg.LinAlgError as error:
+        closed = lft(P, K)
+    except InputError as error:
         raise CheckError(f"{H_INFINITY}: the loop has no solution at infinite frequency") from error
-    of_x, of_k, of_w = inner @ K.D @ C2, inner @ K.C, inner @ K.D @ D21
-    return System(
-        np.block([[A + B2 @ of_x, B2 @ of_k], [K.B @ (C2 + D22 @ of_x), K.A + K.B @ D22 @ of_k]]),
-        np.vstack([B[:, :m1] + B2 @ of_w, K.B @ (D21 + D22 @ of_w)]),
-        np.hstack([C[:p1] + D12 @ of_x, D12 @ of_k]),
-        D[:p1, :m1] + D12 @ of_w,
-    )
-
-
-def _checked(P: System, K: System, p2: int, m2: int, gamma: float) -> tuple[float, float]:
-    """The norm of the closed loop. Raises CheckError where it is unstable, or above gamma."""
-    closed = lower_loop(P, K, p2, m2)
     growth = float(np.linalg.eigvals(closed.A).real.max(initial=-math.inf))
     if not growth < 0:
         raise CheckError(f"{H_INFINITY}: the closed loop has a pole with Re = {growth:.3g} 1/s")
@@ -337,49 +325,38 @@ def mixed_sensitivity(plant: Any, of_error: Any, of_input: Any = None, of_output
     >>> f"{found.gamma:.2f}"  # Skogestad and Postlethwaite, example 2.17: 1.37
     '1.37'
     """
-    import control  # imports matplotlib and takes a second: only where it is used
-
-    G = control.ss(plant)
-    p, m = G.noutputs, G.ninputs
-    given = [("of_error", of_error, p), ("of_input", of_input, m), ("of_output", of_output, p)]
-    sides: list[System | None] = []
-    for name, weight, size in given:
+    G = from_control(plant, "mixed_sensitivity", "plant")
+    p, m = G.D.shape
+    signals = {
+        letter: tuple(f"{letter}{i}" for i in range(n))
+        for letter, n in zip("reyu", (p, p, p, m), strict=True)
+    }
+    minus = replace(
+        gain(np.hstack([np.eye(p), -np.eye(p)])), inputs=signals["r"] + signals["y"], outputs=signals["e"]
+    )
+    parts = [replace(G, inputs=signals["u"], outputs=signals["y"]), minus]
+    for name, weight, letter in (
+        ("of_error", of_error, "e"),
+        ("of_input", of_input, "u"),
+        ("of_output", of_output, "y"),
+    ):
         if weight is None:
-            sides.append(None)
             continue
-        W = control.ss(weight) if hasattr(weight, "dt") else control.ss([], [], [], [[float(weight)]])
-        if W.ninputs == 1 and size > 1:
-            W = control.append(*[W] * size)
-        if W.ninputs != size:
-            raise InputError("mixed_sensitivity", name, f"{W.ninputs} signals", f"1 or {size}")
-        sides.append(System.of(W))
-    return h_infinity(_augmented(_system_of(G), sides), p, m)
+        size, W = len(signals[letter]), _weight_of(weight, name)
+        if W.D.shape[1] == 1 and size > 1:
+            W = append(*[W] * size)
+        if W.D.shape[1] != size:
+            raise InputError("mixed_sensitivity", name, f"{W.D.shape[1]} signals", f"1 or {size}")
+        outputs = tuple(f"{name}{i}" for i in range(len(W.D)))
+        parts.append(replace(W, inputs=signals[letter], outputs=outputs))
+    read = [name for W in parts[2:] for name in W.outputs]
+    whole = interconnect(parts, signals["r"] + signals["u"], [*read, *signals["e"]])
+    return h_infinity(whole, p, m)
 
 
-def _augmented(G: System, sides: list[System | None]) -> System:
-    """w = r, u -> W1 (r - G u), W2 u, W3 G u, and y = r - G u."""
-    A, B, C, D = G
-    p, m = D.shape
-    n = len(A)
-    take = [(-C, np.eye(p), -D), (np.zeros((m, n)), np.zeros((m, p)), np.eye(m)), (C, np.zeros((p, p)), D)]
-    rows_A, rows_B, rows_C, rows_D = [], [], [], []
-    used = [(W, t) for W, t in zip(sides, take, strict=True) if W is not None]
-    k = sum(len(W.A) for W, _ in used)
-    first = n
-    for W, (of_x, of_r, of_u) in used:
-        own = np.zeros((len(W.A), n + k))
-        out = np.zeros((len(W.D), n + k))
-        own[:, :n], own[:, first : first + len(W.A)] = W.B @ of_x, W.A
-        out[:, :n], out[:, first : first + len(W.A)] = W.D @ of_x, W.C
-        rows_A.append(own)
-        rows_B.append(np.hstack([W.B @ of_r, W.B @ of_u]))
-        rows_C.append(out)
-        rows_D.append(np.hstack([W.D @ of_r, W.D @ of_u]))
-        first += len(W.A)
-    whole_A = np.vstack([np.hstack([A, np.zeros((n, k))]), *rows_A])
-    whole_B = np.vstack([np.hstack([np.zeros((n, p)), B]), *rows_B])
-    whole_C = np.vstack([*rows_C, np.hstack([-C, np.zeros((p, k))])])
-    return System(whole_A, whole_B, whole_C, np.vstack([*rows_D, np.hstack([np.eye(p), -D])]))
+def _weight_of(weight: Any, field: str) -> System:
+    """A control system, or a number."""
+    return from_control(weight, CALLER, field) if hasattr(weight, "dt") else gain(np.array([[float(weight)]]))
 
 
 @on_one_thread
@@ -405,12 +382,9 @@ def shape_loop(plant: Any, before: Any = 1.0, after: Any = 1.0) -> Synthesized:
     >>> f"{found.gamma:.4f}"
     '1.4142'
     """
-    import control  # imports matplotlib and takes a second: only where it is used
-
-    def system(one: Any) -> Any:
-        return control.ss(one) if hasattr(one, "dt") else one
-
-    shaped = control.ss(system(after) * control.ss(plant) * system(before))
+    G = from_control(plant, "shape_loop", "plant")
+    W1, W2 = _shaping(before, G.D.shape[1], "before"), _shaping(after, len(G.D), "after")
+    shaped = series(W1, G, W2)
     A, B, C, D = _system_of(shaped)
     if D.any():
         raise InputError("shape_loop", "plant", "a plant with D", "a strictly proper one")
@@ -428,16 +402,17 @@ def shape_loop(plant: Any, before: Any = 1.0, after: Any = 1.0) -> Synthesized:
     back = np.linalg.inv(inner.T)
     F = -B.T @ X
     own = System(A + B @ F + gamma**2 * back @ Z @ C.T @ C, gamma**2 * back @ Z @ C.T, F, np.zeros((m, p)))
-    eye = np.eye(p)  # w = (r, d): y = r - G (u + d); z = (u, y)
-    four = System(
-        A, np.hstack([np.zeros((n, p)), B, B]), np.vstack([np.zeros((m, n)), -C, -C]),
-        np.block([[np.zeros((m, p + m)), np.eye(m)], [eye, np.zeros((p, 2 * m))], [eye, np.zeros((p, 2 * m))]]),
-    )  # fmt: skip
-    norm, w = _checked(four, own, p, m, gamma)
-    whole = control.ss(*own)
-    whole = control.ss(system(before) * whole * system(after))
+    # w = (r, d): y = r - G (u + d); z = (u, y)
+    direct = system_matrix(np.zeros((m, p + m)), np.eye(m), np.tile(np.eye(p, p + m), (2, 1)))
+    four = System(A, np.hstack([np.zeros((n, p)), B, B]), np.vstack([np.zeros((m, n)), -C, -C]), direct)
+    norm, w = _checked(four, own, gamma)
     coupling = float(np.abs(np.linalg.eigvals(X @ Z)).max(initial=0.0)) / (gamma**2 - 1)
-    return Synthesized(System.of(whole), best, norm, w, coupling, max(x[1], z[1]))
+    return Synthesized(series(W2, own, W1), best, norm, w, coupling, max(x[1], z[1]))
+
+
+def _shaping(one: Any, size: int, field: str) -> System:
+    """A control system, or a number for all signals."""
+    return from_control(one, "shape_loop", field) if hasattr(one, "dt") else gain(float(one) * np.eye(size))
 
 
 SLOW = 1.0  # rad/s: a pole below counts as an integral
@@ -448,7 +423,7 @@ def split_integrals(law: System) -> tuple[System, System]:
 
     Poles below 1 rad/s count as integrals. The sum of both is the law, but for these poles.
 
-    >>> from malta.synthesis.state_space import System
+    >>> from malta.linear.system import System
     >>> import numpy as np
     >>> law = System(np.diag([0.0, -10.0]), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1)))
     >>> integrals, rest = split_integrals(law)
@@ -470,20 +445,14 @@ def truncate(law: System, order: int) -> System:
 
     Raises InputError for an unstable law, and for an order that it does not have.
 
-    >>> from malta.synthesis.state_space import System
+    >>> from malta.linear.system import System
     >>> import numpy as np
     >>> law = System(np.diag([-1.0, -100.0]), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1)))
     >>> truncate(law, 1).A.round(2).tolist()
-    [[-1.02]]
+    [[-1.04]]
     """
-    A, B, C, D = law
-    if not 0 <= order <= len(A):
-        raise InputError(CALLER, "order", str(order), f"0 to {len(A)}, of the law")
-    if len(A) and not np.linalg.eigvals(A).real.max() < 0:
+    if not 0 <= order <= len(law.A):
+        raise InputError(CALLER, "order", str(order), f"0 to {len(law.A)}, of the law")
+    if not law.stable:
         raise InputError(CALLER, "law", "an unstable one", "a stable one: split off its integrals")
-    P = linalg.cholesky(linalg.solve_continuous_lyapunov(A, -B @ B.T), lower=True)
-    Q = linalg.cholesky(linalg.solve_continuous_lyapunov(A.T, -C.T @ C), lower=True)
-    U, sizes, V = linalg.svd(Q.T @ P)
-    left = (U[:, :order] / np.sqrt(sizes[:order])).T @ Q.T
-    right = P @ V[:order].T / np.sqrt(sizes[:order])
-    return System(left @ A @ right, left @ B, C @ right, D)
+    return balanced_reduction(law, order).system

@@ -24,6 +24,7 @@ import numpy as np
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.linear.sampling import add_lags, delay_inputs, sample
+from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.loop import loop
 from malta.loops.sampled_loops import LAST, SampledLoop, sampled_loop
@@ -41,7 +42,7 @@ from malta.structured.loops import Model, model_of, models_of_systems
 from malta.structured.search import ROOM, Look, Task, contradiction, random_starts, rate_of, search
 from malta.synthesis.controller import Controller
 from malta.synthesis.elements import CALLER
-from malta.synthesis.state_space import System, controller_of
+from malta.synthesis.state_space import controller_of
 from malta.synthesis.structure import Structure, places_of, sample_law
 
 Values = Mapping[str, float]
@@ -154,10 +155,7 @@ class Machine:
 
     def controller(self, law: System, name: str) -> Controller:
         """The law of errors as a controller, sampled by Tustin's rule."""
-        import control  # imports matplotlib and takes a second: only where it is used
-
-        sampled = control.ss(*sample_law(law, self.sample_time), self.sample_time, name=name)
-        return controller_of(sampled, self.plant, name=name)
+        return controller_of(sample_law(law, self.sample_time), self.plant, name=name)
 
     def margin(self, law: System, ranges: Ranges, time: float | None) -> Margin:
         return travel_margin(self.plant, self.controller(law, "structured"), ranges, time=time)
@@ -191,10 +189,10 @@ def target_of(
     if isinstance(plant, Plant):
         if sample_time is None:
             raise InputError(CALLER, "sample_time", "none", "the sample time of the machine's law, s")
-        import control  # imports matplotlib and takes a second: only where it is used
-
         m, p = len(plant.inputs), len(plant.outputs)
-        nothing = control.ss([[0.0]], np.zeros((1, p)), np.zeros((m, 1)), np.zeros((m, p)), sample_time)
+        nothing = System(
+            np.zeros((1, 1)), np.zeros((1, p)), np.zeros((m, 1)), np.zeros((m, p)), None, sample_time
+        )
         stroke = plant.stroke
         own = (
             [{stroke.name: share * stroke.travel} for share in (0.0, 1.0, -1.0)] if plant.has_stroke else [{}]

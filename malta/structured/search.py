@@ -239,7 +239,7 @@ class Task:
         for model in self.models:
             loop = ClosedLoop(model, theta)
             try:
-                if model.goals and not loop.growth < 0:
+                if model.goals and not loop.stable:
                     return None
             except (CheckError, np.linalg.LinAlgError):
                 return None

@@ -305,8 +305,8 @@ class Controller:
 
     @cached_property
     def sys(self) -> Any:
-        """The law without saturation as a discrete control.StateSpace: see state_space.law_system."""
-        from malta.synthesis.state_space import law_system
+        """The law without saturation as a discrete control.StateSpace: see law_system.law_system."""
+        from malta.synthesis.law_system import law_system
 
         return law_system(self)
 

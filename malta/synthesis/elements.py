@@ -14,7 +14,9 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.synthesis.state_space import System
+from malta.linear.interconnection import feedback, parallel
+from malta.linear.matrices import system_matrix
+from malta.linear.system import System
 
 CALLER = "structured"
 Matrices = tuple[Any, Any, Any, Any]  # A, B, C and D in CasADi
@@ -99,7 +101,8 @@ class Element:
     def system(self) -> System:
         """The element with its present values."""
         made = self.matrices([ca.DM(number) for number in self.numbers])
-        return System(*(np.atleast_2d(np.array(ca.DM(M), dtype=float)) for M in made))
+        A, B, C, D = (np.atleast_2d(np.array(ca.DM(M), dtype=float)) for M in made)
+        return System(A, B, C, D)
 
     @property
     def order(self) -> int:
@@ -125,7 +128,7 @@ class Element:
         def matrices(values: Sequence[Any]) -> Matrices:
             A1, B1, C1, D1 = other.matrices(values[k:])
             A2, B2, C2, D2 = self.matrices(values[:k])
-            A = ca.blockcat([[A2, B2 @ C1], [ca.DM(A1.shape[0], A2.shape[0]), A1]])
+            A = system_matrix(A2, B2 @ C1, None, A1)
             return A, ca.vertcat(B2 @ D1, B1), ca.horzcat(C2, D2 @ C1), D2 @ D1
 
         return _diagram(" ", self, other, matrices)
@@ -135,9 +138,7 @@ class Element:
         k = len(self.numbers)
 
         def matrices(values: Sequence[Any]) -> Matrices:
-            A1, B1, C1, D1 = self.matrices(values[:k])
-            A2, B2, C2, D2 = other.matrices(values[k:])
-            return ca.diagcat(A1, A2), ca.vertcat(B1, B2), ca.horzcat(C1, C2), D1 + D2
+            return parallel(_expressions(self, values[:k]), _expressions(other, values[k:])).matrices
 
         return _diagram(" + ", self, other, matrices)
 
@@ -149,18 +150,14 @@ class Element:
         k = len(self.numbers)
 
         def matrices(values: Sequence[Any]) -> Matrices:
-            A1, B1, C1, D1 = (ca.SX(M) for M in self.matrices(values[:k]))
-            A2, B2, C2, D2 = (ca.SX(M) for M in other.matrices(values[k:]))
-            E = ca.inv(ca.SX.eye(D1.shape[0]) + D1 @ D2)  # y = E (C1 x1 - D1 C2 x2 + D1 u)
-            C, D = ca.horzcat(E @ C1, -E @ D1 @ C2), E @ D1
-            into = ca.vertcat(B1, ca.SX(B2.shape[0], B1.shape[1]))
-            back = ca.vertcat(-B1 @ D2, B2)
-            A = ca.diagcat(A1, A2)
-            n1 = A1.shape[0]
-            A[:n1, n1:] = -B1 @ C2
-            return A + back @ C, into + back @ D, C, D
+            return feedback(_expressions(self, values[:k]), _expressions(other, values[k:])).matrices
 
         return _diagram(" / ", self, other, matrices)
+
+
+def _expressions(element: Element, values: Sequence[Any]) -> System:
+    A, B, C, D = (ca.SX(M) for M in element.matrices(values))
+    return System(A, B, C, D)
 
 
 def _diagram(

@@ -20,7 +20,9 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.matrices import system_matrix
 from malta.linear.sampling import add_lags, delay_inputs, sample, sample_noise
+from malta.linear.system import System
 from malta.processes import on_one_thread
 from malta.synthesis.riccati import Solver, care, dare
 from malta.synthesis.spec import Coordinates, Weights
@@ -29,7 +31,7 @@ from malta.synthesis.spec import Coordinates, Weights
 
 
 class Linear(Protocol):
-    """xi' = A xi + B v + E (y_k - p), p = C xi: a LinearModel, or the part of one that nothing joins to the rest."""
+    """xi' = A xi + B v, p = C xi: a LinearModel, or a system; a model with held currents has E (y_k - p) beside it."""
 
     @property
     def A(self) -> FloatArray: ...
@@ -38,23 +40,14 @@ class Linear(Protocol):
     @property
     def C(self) -> FloatArray: ...
     @property
-    def E(self) -> FloatArray: ...
+    def E(self) -> FloatArray | None: ...
 
 
-class Lagged(NamedTuple):
-    """A linear model whose forces follow their commands as first-order lags, and are states after x."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    E: FloatArray
-
-
-def with_lags(model: Linear, rate: float) -> Lagged:
-    """The model with lags rate / (s + rate) before its inputs, rate in rad/s."""
+def with_lags(model: Linear, rate: float) -> System:
+    """The model with lags rate / (s + rate) before its inputs, rate in rad/s; these forces are states after x."""
     A, B = add_lags(model.A, model.B, rate)
     C = np.hstack([model.C, np.zeros((len(model.C), B.shape[1]))])
-    return Lagged(A, B, C, np.zeros((len(A), len(C))))
+    return System(A, B, C, np.zeros((len(C), B.shape[1])))
 
 
 class Held(NamedTuple):
@@ -66,7 +59,7 @@ class Held(NamedTuple):
 
 def between_samples(model: Linear) -> Held:
     """What a linear model is between samples; E is in the reach of the inputs."""
-    if not model.E.any():
+    if model.E is None or isinstance(model, System) or not model.E.any():
         return Held(model.A, np.zeros((model.B.shape[1], len(model.C))))
     return Held(model.A - model.E @ model.C, np.linalg.lstsq(model.B, model.E, rcond=None)[0])
 
@@ -215,7 +208,7 @@ def sampled_noise(model: Linear, weights: Weights, Ts: float, delay: int, *, int
         if weights.coordinates == "positions":  # forces that make these accelerations
             back = np.linalg.inv(model.B[n // 2 :])
             drift = back @ drift @ back.T
-        Ad = np.block([[Ad, Bd], [np.zeros((m, n)), np.eye(m)]])
+        Ad = system_matrix(Ad, Bd, None, np.eye(m))
         W = np.asarray(linalg.block_diag(W, drift))
         C, S = np.hstack([C, np.zeros((p, m))]), np.vstack([S, np.zeros((m, p))])
     return Noisy(Ad, C, W, V, S)

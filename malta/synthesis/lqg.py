@@ -33,6 +33,7 @@ from scipy import linalg
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.matrices import system_matrix
 from malta.linear.sampling import add_integrals, eigenvalues, sample, sample_cost
 from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
@@ -149,7 +150,7 @@ def _mode_text(mode: LostMode, states: Sequence[str]) -> str:
 
 def _rank_at_rest(A: FloatArray, B: FloatArray, C: FloatArray) -> int:
     """The rank of [A B; C 0], rows and columns scaled to 1."""
-    system = np.block([[A, B], [C, np.zeros((len(C), B.shape[1]))]])
+    system = system_matrix(A, B, C)
     for axis in (1, 0, 1):
         size = np.linalg.norm(system, axis=axis, keepdims=True)
         system = system / np.where(size > 0, size, 1.0)
@@ -212,7 +213,7 @@ def lqi(
     n, k, Ki = len(model.A), len(summed), np.zeros((model.B.shape[1], len(model.C)))
     if not summed:
         return lqr(model, weights, solver=solver), Ki
-    A = np.block([[model.A, np.zeros((n, k))], [-model.C[summed], np.zeros((k, k))]])
+    A = system_matrix(model.A, None, -model.C[summed])
     B = np.vstack([model.B, np.zeros((k, model.B.shape[1]))])
     gain = care(A, B, linalg.block_diag(weights.Q, Q_i), weights.R, "LQI", solver=solver).K
     Ki[:, summed] = -gain[:, n:]
@@ -246,8 +247,7 @@ def continuous_poles(model: LinearModel, weights: Weights) -> dict[str, ComplexA
         poles["LQR"] = eigenvalues(model.A - model.B @ lqr(model, weights, solver="scipy"))
     if summed := integrals_of(model, weights).outputs:
         K, Ki = lqi(model, weights, solver="scipy")
-        rest = np.zeros((len(summed), len(summed)))
-        integrating = np.block([[model.A - model.B @ K, model.B @ Ki[:, summed]], [-model.C[summed], rest]])
+        integrating = system_matrix(model.A - model.B @ K, model.B @ Ki[:, summed], -model.C[summed])
         poles["LQR with integrals"] = eigenvalues(integrating)
     poles["Kalman filter"] = eigenvalues(model.A - kalman(model, weights, solver="scipy") @ model.C)
     return {name: np.sort_complex(values) for name, values in poles.items()}
@@ -285,7 +285,7 @@ def gains(
     if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d; v takes d off, as forces under way have
         p, pushed = len(Cd), np.zeros((len(Ad), m))
         pushed[:n] = sample(between_samples(model).A, model.B, Ts)[1]
-        Ad = np.block([[Ad, pushed], [np.zeros((m, len(Ad))), np.eye(m)]])
+        Ad = system_matrix(Ad, pushed, None, np.eye(m))
         Bd, Cd = np.vstack([Bd, np.zeros((m, m))]), np.hstack([Cd, np.zeros((p, m))])
         K = np.hstack([K, np.eye(m) + K[:, n:].reshape(m, known, m).sum(axis=1)])
     return Gains(Ad, Bd, Cd, K, Ki, L)
@@ -503,7 +503,7 @@ def _sampled_regulator(
     Ad, Bd, Cd = sampled_model(model, Ts, d)
     if d:
         rest = m * (d - 1)
-        Q = linalg.block_diag(np.block([[Q, N], [N.T, R - commanded]]), np.zeros((rest, rest)))
+        Q = linalg.block_diag(system_matrix(Q, N, N.T, R - commanded), np.zeros((rest, rest)))
         N, R = np.zeros((n + m * d, m)), commanded
     else:
         pull, acting = still.H @ model.C, R - commanded

@@ -28,6 +28,7 @@ from pydantic import Field, StrictStr
 
 from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError, require_known
+from malta.linear.matrices import system_matrix
 from malta.model.plant import Plant, Signal
 from malta.tables import Quantity, Record, entry
 from malta.units import is_unit_of, to_si, units_like
@@ -100,7 +101,7 @@ def step_response(M: FloatArray, g: FloatArray, C: FloatArray, Ts: float) -> Ste
     radius = float(np.abs(np.linalg.eigvals(M)).max(initial=0.0))
     if not radius < 1:
         raise CheckError(f"an unstable loop, |lambda| = {radius:.6f}, has no answer to a constant load")
-    step = np.block([[M, g], [np.zeros((w, n)), np.eye(w)]])
+    step = system_matrix(M, g, None, np.eye(w))
     out = np.hstack([C, np.zeros((len(C), w))])
     samples = math.log(SETTLED) / math.log(max(radius, 1e-3))
     octaves = min(1 + max(math.ceil(math.log2(samples / (BLOCK * BLOCKS))), 0), LONGEST)

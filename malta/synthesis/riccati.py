@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from malta.errors import CheckError, InputError
+from malta.linear.matrices import system_matrix
 from malta.linear.sampling import eigenvalues
 
 if TYPE_CHECKING:
@@ -405,12 +406,9 @@ def _touch(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatA
 
     What a model's trigonometry leaves of exact zeros, 1e-20 of the loop's own stiffness, joins nothing.
     """
-    m = B.shape[1]
     r = np.sqrt(np.diag(R))
     t = _balance(A, (B / r) @ (B / r).T, Q)
-    scaled = np.abs(
-        np.block([[A * t / t[:, None], B / r / t[:, None]], [N.T * t / r[:, None], np.zeros((m, m))]])
-    )
+    scaled = np.abs(system_matrix(A * t / t[:, None], B / r / t[:, None], N.T * t / r[:, None]))
     weights = np.abs(linalg.block_diag(Q, R))
     own = np.sqrt(np.diag(weights))  # zero beside an entry: indefinite, and joined
     large = np.sqrt(np.outer(scaled.max(axis=1, initial=0), scaled.max(axis=0, initial=0)))

@@ -8,24 +8,19 @@ p* ---(+)->| s+ = A s + B u  |--> v          u = p* - y, negative feedback
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
-import casadi as ca
 import numpy as np
-from scipy import linalg, sparse
-from scipy.linalg import matrix_balance
 
-from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError
-from malta.model.data import plant_of
+from malta.linear.conversion import from_control
+from malta.linear.matrices import system_matrix
+from malta.linear.system import System
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import OperatingPoint, Plant, Signal, outputs_at
+from malta.model.plant import OperatingPoint, Plant, Signal
 from malta.processes import on_one_thread
-from malta.synthesis.controller import Controller, linear_law
+from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import machine_part
 
 CALLER = "controller_of"
@@ -60,27 +55,22 @@ def controller_of(
     >>> controller.sample_time, malta.verify(model, controller).stable
     (0.001, True)
     """
-    A, B, C, D, Ts = _discrete(sys)
+    wanted = 'a discrete control.StateSpace, as control.c2d(sys, Ts, "tustin") gives it'
+    law = from_control(sys, CALLER, "sys", expected=wanted)
+    if law.dt is None:
+        raise InputError(CALLER, "sys", f"dt = {getattr(sys, 'dt', None)}", wanted)
     p, m = len(plant.outputs), len(plant.inputs)
-    if D.shape != (m, p):
-        found, wanted = f"{D.shape[1]} inputs and {D.shape[0]} outputs", f"{p} errors and {m} forces"
-        raise InputError(CALLER, "sys", found, f"{wanted} of the {plant.name}")
-    if not all(np.isfinite(M).all() for M in (A, B, C, D)):
-        raise InputError(CALLER, "sys", "NaN or infinity", "finite numbers")
+    if law.D.shape != (m, p):
+        found, shape = f"{law.D.shape[1]} inputs and {law.D.shape[0]} outputs", f"{p} errors and {m} forces"
+        raise InputError(CALLER, "sys", found, f"{shape} of the {plant.name}")
     model = linearize(plant, plant.at() if point is None else point)
-    return law_of_errors(System(A, B, C, D), sys.state_labels, model, Ts, name=name or sys.name)
+    return law_of_errors(law, model, law.dt, name=name or getattr(sys, "name", ""))
 
 
 def law_of_errors(
-    law: System,
-    labels: Sequence[str],
-    model: LinearModel,
-    Ts: float,
-    *,
-    name: str,
-    position_feedforward: bool = False,
+    law: System, model: LinearModel, Ts: float, *, name: str, position_feedforward: bool = False
 ) -> Controller:
-    """A sampled law s+ = A s + B u, v = C s + D u of the errors u = p* - y as a controller; labels: of its states."""
+    """A sampled law s+ = A s + B u, v = C s + D u of the errors u = p* - y as a controller."""
     A, B, C, D = law
     plant, n, (m, p) = model.plant, len(A), D.shape
     part = machine_part(
@@ -92,12 +82,13 @@ def law_of_errors(
     )
     # xi* = 0: there are no rates at the samples for the feedforward to correct.
     part["feedforward"] = replace(part["feedforward"], rate=np.zeros_like(part["feedforward"].rate))
+    labels = law.states or [f"x[{i}]" for i in range(n)]
     states = (Signal(label, "1") for label in labels)
     return Controller(
         **part,
         name=name,
         states=(*states, *(Signal(s.name + ERROR, s.unit) for s in plant.outputs)),
-        Ad=np.block([[A, -B], [np.zeros((p, n + p))]]),
+        Ad=system_matrix(A, -B),
         Bd=np.zeros((n + p, m)),
         Cd=np.zeros((p, n + p)),
         K=np.hstack([-C, D]),
@@ -107,190 +98,3 @@ def law_of_errors(
         noise=None,
         tracks="errors",
     )
-
-
-def _discrete(sys: Any) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
-    """A, B, C, D and the sample time of a discrete system. Raises InputError."""
-    wanted = 'a discrete control.StateSpace, as control.c2d(sys, Ts, "tustin") gives it'
-    if not all(hasattr(sys, key) for key in ("A", "B", "C", "D", "dt", "state_labels")):
-        raise InputError(CALLER, "sys", f"a {type(sys).__name__}", wanted)
-    if sys.dt is True or not sys.dt:
-        raise InputError(CALLER, "sys", f"dt = {sys.dt}", wanted)
-    A, B, C, D = (np.asarray(M, dtype=float) for M in (sys.A, sys.B, sys.C, sys.D))
-    return A, B, C, D, float(sys.dt)
-
-
-def law_system(c: Controller) -> Any:
-    """The control law without saturation as a discrete control.StateSpace with names.
-
-    Inputs: the measurements by their names, then what they should be, as "z_ref", at rest (p*' = 0). Outputs: the
-    forces, without v0, and of v_ff with what holds the machine there. Negative feedback is inside: v = F y + R p*, and
-    the loop gain at the sensors is -P F.
-    States: those of the controller, then its sums of errors, in units as named_system has them.
-    """
-    law, R = linear_law(c), set_point(c)
-    sums = [f"{s.name}[i]" for s in c.measurements]
-    inputs = [*(s.name for s in c.measurements), *reference_names(c)]
-    forces = [s.name for s in c.forces]
-    B, D = np.hstack([law.B_y, law.B_r @ R]), np.hstack([law.D_y, law.D_r @ R])
-    made = named_system(c.name, inputs, forces, c.sample_time, law.A, B, law.C, D)
-    made.set_states([*(s.name for s in c.states), *sums][: len(law.A)])
-    return made
-
-
-def named_system(
-    name: str, inputs: list[str], outputs: list[str], Ts: float, A: Any, B: Any, C: Any, D: Any = 0
-) -> Any:
-    """A control.StateSpace, its states in balanced units: powers of two of SI.
-
-    python-control's responses, by slycot's Hessenberg form, lose digits else: at 1 rad/s |S| of the planar motor's PID
-    comes out 1800 times too large, and its LQG wrong by a hundredth.
-    """
-    import control  # imports matplotlib and takes a second: only where it is used
-
-    D = np.zeros((len(C), B.shape[1])) + D
-    t = balanced_units(A, B, C)
-    return control.ss(
-        A * t / t[:, None], B / t[:, None], C * t, D, Ts, name=name, inputs=inputs, outputs=outputs
-    )
-
-
-def balanced_units(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
-    """Powers of two t for states x = t xi, in which A t / t', B / t' and C t have rows and columns of like size."""
-    n, size = len(A), len(A) + max(B.shape[1], len(C))
-    whole = np.zeros((size, size))
-    whole[: n + len(C), : n + B.shape[1]] = np.block([[A, B], [C, np.zeros((len(C), B.shape[1]))]])
-    _, (units, _) = matrix_balance(whole, permute=False, separate=True)
-    return np.asarray(units[:n])
-
-
-class System(NamedTuple):
-    """x' = A x + B u, y = C x + D u; of a sampled system (x+ - x) / T = A x + B u."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-
-    @classmethod
-    def of(cls, source: Any) -> System:
-        """The matrices of a control.StateSpace."""
-        return cls(*(np.array(M, dtype=float) for M in (source.A, source.B, source.C, source.D)))
-
-    @property
-    def balanced(self) -> System:
-        """The same system with states in balanced units."""
-        if not len(self.A):
-            return self
-        t = balanced_units(self.A, self.B, self.C)
-        return System(self.A * t / t[:, None], self.B / t[:, None], self.C * t, self.D)
-
-    def response(self, s: ComplexArray) -> ComplexArray:
-        """C (s - A)^-1 B + D at k complex frequencies s, in differences (z - 1) / T: k x outputs x inputs.
-
-        NaN at a frequency that no double number tells from a pole.
-        """
-        return self.response_function()(s)
-
-    def response_function(self) -> Callable[[ComplexArray], ComplexArray]:
-        """The function `response`, for several calls: what does not depend on the frequencies is computed once."""
-        A, B, C, D = self.balanced
-        label = sparse.csgraph.connected_components(A != 0, directed=False)[1] if len(A) else np.zeros(0)
-        states = [np.flatnonzero(label == k) for k in np.unique(label)]  # sets that nothing joins
-        parts = [_JoinedStates(A[np.ix_(i, i)], B[i], C[:, i]) for i in states]
-
-        def response(s: ComplexArray) -> ComplexArray:
-            through = np.tile(D.astype(complex), (len(s), 1, 1))
-            return np.asarray(sum((part.response(s) for part in parts), through))
-
-        return response
-
-
-MANY = 32  # frequencies from which on a Schur form is worth its time
-SLOW = 1e-6  # of the norm of A: frequencies below it, where the Schur form has lost digits of slow poles
-
-
-@dataclass(frozen=True, eq=False)
-class _JoinedStates:
-    """C (s - A)^-1 B of states that are joined."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-
-    @cached_property
-    def schur(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """T, Z^H B and C Z of A = Z T Z^H, T upper triangular."""
-        T, Z = linalg.schur(self.A, output="complex")
-        return T, Z.conj().T @ self.B, self.C @ Z
-
-    def response(self, s: ComplexArray) -> ComplexArray:
-        """At each s; NaN at a frequency that no double number tells from a pole."""
-        used = np.flatnonzero(self.B.any(axis=0))
-        solved = np.empty((len(s), len(self.C), len(used)), dtype=complex)
-        fast = np.zeros(len(s), dtype=bool)
-        if len(s) >= MANY:
-            fast = np.abs(s) > SLOW * np.linalg.norm(self.A)
-            fast &= np.abs(s[:, None] - np.diag(self.schur[0])).min(axis=1) > 0
-            solved[fast] = self._substituted(s[fast], used)
-        if not fast.all():
-            solved[~fast] = self.C @ _resolvent(s[~fast], self.A, self.B[:, used])
-        found = np.zeros((len(s), len(self.C), self.B.shape[1]), dtype=complex)
-        found[:, :, used] = solved
-        return found
-
-    def _substituted(self, s: ComplexArray, used: Any) -> ComplexArray:
-        """C Z (s - T)^-1 Z^H B of some inputs, from the last row of T upwards, all frequencies at once."""
-        T, B, C = self.schur
-        X = np.empty((len(T), len(used), len(s)), dtype=complex)
-        for i in range(len(T) - 1, -1, -1):
-            later = T[i, i + 1 :] @ X[i + 1 :].reshape(len(T) - i - 1, X[0].size)
-            X[i] = (B[i, used, None] + later.reshape(X[0].shape)) / (s - T[i, i])
-        return np.asarray(np.tensordot(C, X, 1).transpose(2, 0, 1))
-
-
-def _resolvent(s: ComplexArray, A: FloatArray, B: FloatArray) -> ComplexArray:
-    """(s - A)^-1 B at each s; NaN at a frequency that no double number tells from a pole."""
-    matrices = s[:, None, None] * np.eye(len(A)) - A
-    try:
-        return np.asarray(np.linalg.solve(matrices, B.astype(complex)))
-    except np.linalg.LinAlgError:  # a frequency on a pole: beside it
-        beside = matrices + 1e-9 * s[:, None, None] * np.eye(len(A))
-        found = np.full((len(s), *B.shape), np.nan, dtype=complex)
-        for k, one in enumerate(beside):
-            with suppress(np.linalg.LinAlgError):
-                found[k] = np.linalg.solve(one, B)
-        return found
-
-
-def reference_names(c: Controller) -> list[str]:
-    """What the references of the measurements are called in systems."""
-    return [f"{s.name}_ref" for s in c.measurements]
-
-
-def set_point(c: Controller) -> FloatArray:
-    """r = (p*, xi*, v_ff, v0) of the law by p* at rest, near the operating point.
-
-    At rest the forces behind the lag of the design model are v_ff, and the stored forces are v_ff and what currents
-    commutated for the reference make beside it, as in the references of a simulation.
-    """
-    n, m, p = len(c.states), len(c.forces), len(c.measurements)
-    R = np.zeros((p + n + 2 * m, p))
-    R[:p] = np.eye(p)
-    if c.tracks == "states":
-        plant = plant_of(c.parameters)
-        y = ca.SX.sym("y", p)
-        q = ca.densify(ca.jacobian(plant.position_of(y), y))
-        here = outputs_at(plant, plant.point(c.operating_point[0]).x)
-        X = np.array(ca.Function("X", [y], [q])(here))
-        R[p : p + len(X)] = X
-        v_ff, mechanical = R[p + n : p + n + m], len(c.A)
-        if c.feedforward.position.size:
-            v_ff[:] = c.feedforward.position @ X
-        known = c.lagging + c.delay
-        past = R[p + mechanical : p + mechanical + m * known].reshape(known, m, p)
-        past[:] = v_ff
-        if c.delay:
-            newest = mechanical + m * (known - 1)
-            past[c.lagging :] += c.Ad[newest : newest + m, : len(X)] @ X
-    return R

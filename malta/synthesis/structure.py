@@ -43,6 +43,8 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.matrices import system_matrix
+from malta.linear.system import System
 from malta.model.linearize import LinearModel
 from malta.model.plant import Plant, Signal
 from malta.synthesis import elements
@@ -59,7 +61,7 @@ from malta.synthesis.spec import (
     Weights,
     pid_signals,
 )
-from malta.synthesis.state_space import System, law_of_errors
+from malta.synthesis.state_space import law_of_errors
 from malta.synthesis.tunable_lqg import lqg
 from malta.tables import Quantity
 from malta.units import to_si
@@ -171,7 +173,7 @@ class Structure:
             a, b, c, d = made[element.name]
             D = D + left @ d @ right
             A, B, C = [*A, a], [*B, b @ right], [*C, left @ c]
-        theta = ca.densify(ca.blockcat([[D, ca.horzcat(*C)], [ca.vertcat(*B), ca.diagcat(*A)]]))
+        theta = ca.densify(system_matrix(D, ca.horzcat(*C), ca.vertcat(*B), ca.diagcat(*A)))
         return ca.Function("theta", [numbers], [theta, ca.jacobian(theta, numbers)])
 
     @cached_property
@@ -216,11 +218,12 @@ def sample_law(law: System, Ts: float) -> System:
     """
     one, half = np.eye(len(law.A)), law.A * Ts / 2
     if not len(one):
-        return law
+        return replace(law, dt=Ts)
     if np.abs(np.linalg.eigvals(one - half)).min() < 1e-12:
         raise InputError(CALLER, "law", "a pole at 2 / Ts", "poles that a sampled law can have")
     back = linalg.inv(one - half)
-    return System(back @ (one + half), back @ law.B * Ts, law.C @ back, law.D + law.C @ back @ law.B * Ts / 2)
+    D = law.D + law.C @ back @ law.B * Ts / 2
+    return System(back @ (one + half), back @ law.B * Ts, law.C @ back, D, None, Ts)
 
 
 OF_INPUTS = ("reference", "load", "disturbance")
@@ -556,4 +559,5 @@ def structured_controller(
         for k in range(place.element.order)
     ]
     sampled = sample_law(structure.system(x), Ts)
-    return law_of_errors(sampled, labels, model, Ts, name=name, position_feedforward=position_feedforward)
+    sampled = replace(sampled, states=tuple(labels))
+    return law_of_errors(sampled, model, Ts, name=name, position_feedforward=position_feedforward)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -25,10 +25,12 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors
+from malta.linear.conversion import from_control
+from malta.linear.matrices import system_matrix
+from malta.linear.system import System
 from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
 from malta.synthesis.elements import CALLER, Bounds, Element, Matrices, keep_sign
-from malta.synthesis.filters import Lagged
 from malta.synthesis.lqg import check_sizes, out_of_reach
 from malta.synthesis.riccati import Solution, care
 from malta.synthesis.spec import Weights
@@ -102,17 +104,6 @@ def calibrate(
 Change = tuple[Any, Any]  # of Q and R
 
 
-class _Model(NamedTuple):
-    """x' = A x + B u, y = C x, with names of x, u and y."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    states: Sequence[str]
-    inputs: Sequence[str]
-    outputs: Sequence[str]
-
-
 def lqg(name: str, model: Any, weights: Weights, *, bounds: Bounds | None = None) -> Element:
     """The LQG of a plant with weights that are tuned: from all errors to all inputs, of the order of its model.
 
@@ -154,7 +145,7 @@ def lqg(name: str, model: Any, weights: Weights, *, bounds: Bounds | None = None
         L = ca.reshape(ca.vertcat(*v[m * (n + k) :]), p, n).T
         K, G = rows[:, :n], rows[:, n:]
         A, B, C = (ca.DM(M) for M in (plant.A, plant.B, plant.C))
-        whole = ca.vertcat(ca.horzcat(A - B @ K - L @ C, B @ G), ca.DM(k, n + k))
+        whole = system_matrix(A - B @ K - L @ C, B @ G)
         return whole, ca.vertcat(L, ca.DM(np.eye(p)[summed])), ca.horzcat(K, -G), ca.DM(m, p)
 
     parameters = (replace(one, name=f"{name}.{one.name}") for one in keep_sign(name, bounds, **starts))
@@ -166,7 +157,7 @@ def lqg(name: str, model: Any, weights: Weights, *, bounds: Bounds | None = None
     return found
 
 
-def _sizes(plant: _Model, weights: Weights) -> dict[str, float]:
+def _sizes(plant: System, weights: Weights) -> dict[str, float]:
     """The parameters at which a search starts, without those of states and integrals whose weight is 0."""
     tables = (
         ("state", plant.states, weights.q, weights.q_base),
@@ -183,49 +174,44 @@ def _sizes(plant: _Model, weights: Weights) -> dict[str, float]:
     }
 
 
-def _model_of(name: str, model: Any) -> _Model:
-    """A, B, C and names of a model. Raises InputError."""
+def _model_of(name: str, model: Any) -> System:
+    """A model as a system with names. Raises InputError."""
     if isinstance(model, LinearModel):
-        plant = model.plant
-        signals = plant.design_states, plant.inputs, plant.outputs
-        states, inputs, outputs = ([s.name for s in of] for of in signals)
-        return _Model(model.A, model.B, model.C, states, inputs, outputs)
-    named = hasattr(model, "A")
-    if named and (getattr(model, "dt", None) not in (None, 0) or np.any(model.D)):
-        raise InputError(
-            CALLER, name, f"a model with dt = {model.dt}, or with D", "a continuous one without D"
-        )
-    given = (model.A, model.B, model.C) if named else model
-    A, B, C = (np.atleast_2d(np.asarray(M, dtype=float)) for M in given)
+        return model.system
+    if hasattr(model, "A"):
+        found = from_control(model, CALLER, name)
+        if found.dt is not None or found.D.any():
+            kind = f"a model with dt = {model.dt}, or with D"
+            raise InputError(CALLER, name, kind, "a continuous one without D")
+        return found
+    A, B, C = (np.atleast_2d(np.asarray(M, dtype=float)) for M in model)
     n, shapes = len(A), [M.shape for M in (A, B, C)]
     if shapes != [(n, n), (n, B.shape[1]), (len(C), n)] or not all(np.isfinite(M).all() for M in (A, B, C)):
         raise InputError(CALLER, name, f"A, B and C of shapes {shapes}", "matrices that fit, of numbers")
-    if named:
-        return _Model(A, B, C, model.state_labels, model.input_labels, model.output_labels)
     sides = zip("xuy", (n, B.shape[1], len(C)), strict=True)
-    states, inputs, outputs = ([f"{letter}{i}" for i in range(size)] for letter, size in sides)
-    return _Model(A, B, C, states, inputs, outputs)
+    numbered = [tuple(f"{letter}{i}" for i in range(size)) for letter, size in sides]
+    return System(A, B, C, np.zeros((len(C), B.shape[1])), None, None, *numbered)
 
 
-def _require_fit(name: str, plant: _Model, weights: Weights) -> None:
+def _require_fit(name: str, plant: System, weights: Weights) -> None:
     """Raise InputError for weights that are not of this plant, and for a plant that no LQG stabilizes."""
     if weights.coordinates != "signals" or weights.drift_variance.size:
         found = weights.coordinates if weights.coordinates != "signals" else "a drift"
         raise InputError(CALLER, f"{name}.weights", found, "weights of signals, without a drift")
     A, B, C = plant.A, plant.B, plant.C
     with relocate_errors(CALLER, f"{name}.{{}}"):
-        check_sizes(Lagged(A, B, C, np.zeros((len(A), len(C)))), weights)
+        check_sizes(plant, weights)
     reason = out_of_reach(A, B, C, plant.states)
     if reason:
         raise InputError(CALLER, name, reason, "a plant that its inputs stabilize and its outputs show")
 
 
 def _regulator(
-    plant: _Model, weighted: Sequence[int], summed: Sequence[int], sizes: FloatArray
+    plant: System, weighted: Sequence[int], summed: Sequence[int], sizes: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """The gain of states and integrals, and its derivative by their sizes and by those of the inputs."""
     n, k, m = len(plant.A), len(summed), len(plant.inputs)
-    A = np.block([[plant.A, np.zeros((n, k))], [-plant.C[list(summed)], np.zeros((k, k))]])
+    A = system_matrix(plant.A, None, -plant.C[list(summed)])
     B = np.vstack([plant.B, np.zeros((k, m))])
     count = len(weighted)
     Q, R = np.zeros(n + k), sizes[count:] ** -2.0
@@ -238,7 +224,7 @@ def _regulator(
     return solution.K, np.stack([dK.ravel() for dK in _slopes(A, B, np.diag(R), solution, changes)], axis=1)
 
 
-def _filter(plant: _Model, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _filter(plant: System, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The gain of the filter, and its derivative by the standard deviations of process and sensors."""
     A, B, C = plant.A, plant.B, plant.C
     m, p = B.shape[1], len(C)

@@ -24,8 +24,10 @@ from scipy import sparse
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
+from malta.linear.peaks import largest_gain
 from malta.linear.sampling import add_lags, delay_inputs, sample
-from malta.linear.uncertain import crossing_frequency
+from malta.linear.system import System
+from malta.loops.classical import Nominal, last_crossover, tracked_band
 from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import disturbance_map, push_through
 from malta.loops.time_domain import covariance, noise_variance
@@ -160,8 +162,6 @@ class Group:
     slope: FloatArray  # of v0(z), which acts against them: inputs x outputs
     forecast: FloatArray  # of induced voltages, that current controllers take off: inputs x states, or none
     corners: SampledMachine | None  # levels x corners
-    w: FloatArray  # rad/s
-    response: ComplexArray  # of the nominal machine at w
     variance: FloatArray  # of a measurement, m2
     places: tuple[Place, ...]  # where loads act from outside: operating point and ends; or none
     role: tuple[Any, ...]  # what the requirements see in it: stroke, thrust, bounds of its signals
@@ -221,8 +221,6 @@ def groups_of(spec: Spec) -> list[Group]:
         forecast = np.zeros((0, 0)) if driven is None else driven.induced[np.ix_(j, i)]
         nominal = _sample(spec, driven, _cut(spec, driven, held, (i, j, o)), forecast)
         places = tuple(_place(spec, driven, *at, (i, j, o), forecast) for at in trims)
-        w = _frequencies(spec.sample_time)
-        lag = np.exp(1j * w * spec.sample_time)[:, None, None] * np.eye(len(nominal.Ad)) - nominal.Ad
         found.append(
             Group(
                 tuple(i.tolist()),
@@ -233,8 +231,6 @@ def groups_of(spec: Spec) -> list[Group]:
                 slope[np.ix_(j, o)],
                 forecast if forecast.any() else np.zeros((0, 0)),
                 _corners(spec, driven, systems, (i, j, o), forecast) if systems else None,
-                w,
-                np.asarray(nominal.Cd @ np.linalg.solve(lag, nominal.Bd)),
                 noise_variance(plant)[o],
                 places,
                 (*_role(spec, j, o), *_pushes(spec, o, places)),
@@ -266,11 +262,6 @@ def _components(spec: Spec, positions: Sequence[Mapping[str, float]]) -> list[tu
             )
         found.append((i, j, o))
     return found
-
-
-def _frequencies(Ts: float) -> FloatArray:
-    """rad/s, at which the loops of a trial are looked at."""
-    return np.concatenate([np.geomspace(0.05, 50, 30), np.geomspace(60, 0.2 / Ts, 240), [1 / Ts, 2 / Ts]])
 
 
 def _role(spec: Spec, inputs: Any, outputs: Any) -> tuple[Any, ...]:
@@ -520,20 +511,17 @@ def _response(
 
     Of several groups, the loop gain's last crossing is that of the widest: it binds a group that stands alone.
     """
-    z = np.exp(1j * group.w * Ts)[:, None, None]
-    F = law.C @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B_y) + law.D_y
-    eye = np.eye(len(group.outputs))
-    S = np.linalg.inv(eye - group.response @ F)
-    T = np.linalg.svd(eye - S, compute_uv=False)
+    M, k = group.nominal, len(law.A)
+    P = System((M.Ad - np.eye(len(M.Ad))) / Ts, M.Bd / Ts, M.Cd, np.zeros((len(M.Cd), M.Bd.shape[1])))
+    cut = Nominal(P, System((law.A - np.eye(k)) / Ts, law.B_y / Ts, law.C, law.D_y), True, Ts)
     n = len(group.states)
     half = n // 2
     stiffness = group.model.B[half:] @ gain_at_rest(g.K, n, known) - group.model.A[half:, :half]
     w_n = math.sqrt(max(float(np.linalg.eigvals(stiffness).real.min()), 0.0))
-    bandwidth = min(crossing_frequency(group.w, T[:, -1], math.sqrt(0.5)), w_n)
+    bandwidth = min(tracked_band(cut)[0], w_n)
     if alone:
-        L = np.linalg.svd(group.response @ F, compute_uv=False)
-        bandwidth = min(bandwidth, crossing_frequency(group.w, L[:, 0], 1.0, last=True))
-    return float(np.abs(np.einsum("kii->ki", S)).max()), bandwidth
+        bandwidth = min(bandwidth, last_crossover(cut))
+    return largest_gain(cut.sensitivity(i) for i in cut.sensors).value, bandwidth
 
 
 def _noise(group: Group, law: LinearLaw, closed: FloatArray) -> Noise:

@@ -17,7 +17,7 @@ over the travel is only judged, as the regulator's natural frequencies are every
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -27,8 +27,9 @@ from scipy import optimize, sparse
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.peaks import peak_gain
 from malta.linear.sampling import sample, sample_noise
-from malta.linear.uncertain import crossing_frequency
+from malta.loops.classical import last_crossover, tracked_band
 from malta.loops.loop import loop_of_model
 from malta.loops.sampled_loops import SampledLoop
 from malta.loops.time_domain import covariance
@@ -259,34 +260,11 @@ def loop_figures(spec: Spec, part: Part, loop: SampledLoop) -> dict[str, float]:
     W[:n, :n] += part.shaken
     motion = np.sqrt(np.diag(loop.Cd @ covariance(closed, W)[:n, :n] @ loop.Cd.T))
     found |= {f"noise_motion {name}": value for name, value in zip(names, motion.tolist(), strict=True)}
-    turning = np.angle(poles[poles.imag > 0]) / Ts  # where peaks are that a grid might miss
-    w = np.sort(np.concatenate([np.geomspace(1e-3 / Ts, np.pi / Ts, 120), turning]))
-    peaks = _peaks(lambda w: np.log(np.abs(np.einsum("kii->ki", loop.sensitivity(w)))), w)
-    found |= {f"peak_sensitivity {name}": peak for name, peak in zip(names, peaks.tolist(), strict=True)}
+    cut = loop.cut
+    found |= {f"peak_sensitivity {name}": peak_gain(cut.sensitivity(i)).value for i, name in enumerate(names)}
     if "bandwidth" in spec.specification:
-        L = loop.loop_gain(w)
-        T = np.linalg.svd(np.eye(len(own)) - np.linalg.inv(np.eye(len(own)) + L), compute_uv=False)
-        gain = np.linalg.svd(L, compute_uv=False)
-        found["bandwidth"] = min(
-            crossing_frequency(w, T[:, -1], math.sqrt(0.5)), crossing_frequency(w, gain[:, 0], 1.0, last=True)
-        )
+        found["bandwidth"] = min(tracked_band(cut)[0], last_crossover(cut))
     return found
-
-
-def _peaks(logs: Callable[[FloatArray], FloatArray], w: FloatArray) -> FloatArray:
-    """Largest values along frequency, a column each, of their logarithms on a grid.
-
-    A search leaves several peaks as large. So each is looked at, on the parabola of three values close by: what comes
-    out changes smoothly, where zooming into the largest value of a grid would jump.
-    """
-    y = logs(w)
-    k = np.flatnonzero(((y[1:-1] >= y[:-2]) & (y[1:-1] >= y[2:])).any(axis=1))
-    fine = logs(np.geomspace(w[k], w[k + 2], 17, axis=1).ravel()).reshape(len(k), 17, y.shape[1])
-    low, top, high = fine[:, :-2], fine[:, 1:-1], fine[:, 2:]
-    bent = 2 * top - low - high
-    inside = (top >= low) & (top >= high) & (bent > 0)
-    tip = top + np.where(inside, (low - high) ** 2 / np.where(inside, 8 * bent, 1.0), 0.0)
-    return np.asarray(np.exp(np.maximum(tip.max(axis=(0, 1), initial=-np.inf), y.max(axis=0))))
 
 
 def loads_of(spec: Spec) -> Loads:

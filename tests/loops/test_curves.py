@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import control
@@ -14,7 +13,6 @@ from conftest import ROOT
 from flight import default_of
 
 import malta
-from malta.loops.classical import delay_margins, find_tops
 from malta.loops.curves import LoopCurves, loop_curves, respond
 from malta.loops.linear_loops import linear_loop
 from malta.loops.locus import root_locus, stability_changes
@@ -259,9 +257,23 @@ def test_peaks_are_those_of_verify(machine: Machine, curves: LoopCurves) -> None
     assert same(np.sort_complex(curves.poles["closed_loop"]), np.sort_complex(poles), 1e-6)
 
 
-def test_delay_margins_are_those_of_the_tables(curves: LoopCurves) -> None:
-    found = delay_margins(-curves.responses.L, curves.w)
-    assert [m.delay for m in curves.margins] == pytest.approx(found.tolist(), rel=1e-3)
+def test_delay_margins_are_those_of_the_tables(machine: Machine, curves: LoopCurves) -> None:
+    """By the loop of the curves, and by that of the report."""
+    found = malta.loop(*machine).classical
+    assert [m.delay for m in curves.margins] == pytest.approx([*found.delay.values()], rel=1e-6)
+    assert [m.disk.size for m in curves.margins] == pytest.approx([d.size for d in found.disks[3:]], rel=1e-6)
+
+
+def test_delay_margins_are_between_points_of_the_grid(curves: LoopCurves) -> None:
+    """By interpolation of phase and size between two frequencies."""
+    w, alone = curves.w, curves.responses.alone("sensors")
+    for margins, L in zip(curves.margins, alone.T, strict=True):
+        size, phase = np.log(np.abs(L)), np.unwrap(np.angle(L))
+        k = np.flatnonzero(np.sign(size[1:]) != np.sign(size[:-1]))
+        share = size[k] / (size[k] - size[k + 1])
+        at = w[k] * (w[k + 1] / w[k]) ** share
+        angle = phase[k] + share * (phase[k + 1] - phase[k])
+        assert margins.delay == pytest.approx((np.mod(angle + np.pi, 2 * np.pi) / at).min(), rel=1e-3)
 
 
 def test_the_grid_ends_at_the_nyquist_frequency_and_has_the_peaks(curves: LoopCurves) -> None:
@@ -438,17 +450,3 @@ def test_stability_that_changes_from_sample_to_sample() -> None:
     values = np.arange(4.0)
     found = stability_changes(poles, values, np.array([poles(v) for v in values]), None)
     assert found == pytest.approx((0.5, 1.5, 2.5), abs=1e-6)
-
-
-def test_a_top_between_three_frequencies() -> None:
-    """A parabola over log w, with its top of 1 at 1 rad/s beside the middle one."""
-
-    def see(w: Any) -> Any:
-        return SimpleNamespace(w=np.asarray(w))
-
-    def measure(seen: Any) -> Any:
-        return np.atleast_2d(1 - np.log(seen.w) ** 2).T
-
-    best, at = find_tops(see, see(np.exp([-1.0, 0.2, 1.0])), measure)
-    assert best == pytest.approx([1.0], abs=1e-9)
-    assert at == pytest.approx([1.0], rel=1e-4)

@@ -20,8 +20,10 @@ import malta
 from malta import gains
 from malta.cli.main import app, main
 from malta.errors import InputError
+from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem, closed_loop, instability, responses
 from malta.loops.classical import (
+    Nominal,
     balanced_norm,
     classical_margins,
     delay_margins,
@@ -137,7 +139,7 @@ def test_what_is_proven_over_the_travel_is_proven_at_its_places() -> None:
 @pytest.mark.parametrize("name", DESIGNS)
 def test_gang_of_four_by_its_definition(name: str) -> None:
     system, law = _sampled(name)
-    w = np.geomspace(1e-2, np.pi / 50e-6, 400)
+    w = np.geomspace(1e-2, np.pi / 50e-6, 12_000)
     P, _, _, F = responses(system, law, system.nominal, w)
     S = np.linalg.inv(np.eye(5) - P @ F)
     T = -P @ F @ S
@@ -149,7 +151,8 @@ def test_gang_of_four_by_its_definition(name: str) -> None:
             np.abs(S @ P)[:, i].max(),
             np.abs(F @ S)[:, :, i].max(),
         )
-        assert figures == pytest.approx(expected, rel=1e-9)
+        assert figures == pytest.approx(expected, rel=1e-5)
+        assert all(found >= (1 - 1e-7) * seen for found, seen in zip(figures, expected, strict=True))
 
 
 @pytest.mark.parametrize("name", DESIGNS)
@@ -242,10 +245,12 @@ def test_delay_margins_in_whole_samples(name: str) -> None:
 
 def test_delay_margin_of_an_integrator() -> None:
     """L = 10 / s crosses over at 10 rad/s with 90 degrees to go: pi / 20 s."""
-    w = np.geomspace(1e-2, 1e4, 2000)
-    L = -10 / (1j * w)[:, None, None]
-    assert delay_margins(L, w) == pytest.approx(np.pi / 20, rel=1e-4)
-    assert delay_margins(0.5 * np.ones((5, 1, 1)) + 0j, w[:5])[0] == np.inf
+    one, none = np.eye(1), np.zeros((1, 1))
+    integrator = System(none, one, one, none)
+    law = System(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), -10 * one)
+    assert delay_margins(Nominal(integrator, law, True, None)) == pytest.approx([np.pi / 20], rel=1e-12)
+    half = System(law.A, law.B, law.C, 0.05 * one)
+    assert delay_margins(Nominal(half, law, True, None)) == [np.inf]
 
 
 @pytest.mark.parametrize("name", CHAINED)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import control
 import numpy as np
 import pytest
@@ -9,8 +11,9 @@ from hypothesis import given, strategies as st
 from scipy import linalg
 
 import malta
+from malta.linear.conversion import from_control
+from malta.linear.system import System
 from malta.structured.riccati import split_integrals, truncate
-from malta.synthesis.state_space import System
 
 
 def stable(n: int, seed: int) -> System:
@@ -36,7 +39,7 @@ def test_the_error_is_within_twice_the_singular_values_left_out(n: int, seed: in
 
 def test_integrals_and_the_rest_are_the_law() -> None:
     pid = control.tf([2.0, 30.0, 400.0], [1e-3, 1.0, 0.0])
-    law = System.of(control.ss(pid))
+    law = from_control(pid, "test", "pid")
     integrals, rest = split_integrals(law)
     assert (len(integrals.A), len(rest.A)) == (1, 1)
     s = 1j * np.geomspace(1, 1e5, 50)
@@ -48,4 +51,4 @@ def test_what_cannot_be_truncated_is_refused() -> None:
     with pytest.raises(malta.InputError, match="0 to 3"):
         truncate(law, 4)
     with pytest.raises(malta.InputError, match="unstable"):
-        truncate(law._replace(A=-law.A), 2)
+        truncate(replace(law, A=-law.A), 2)

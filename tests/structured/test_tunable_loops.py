@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import control
 import numpy as np
@@ -12,16 +13,9 @@ from hypothesis import given, settings, strategies as st
 
 import malta
 from malta import structured
-from malta.structured.loops import (
-    ClosedLoop,
-    Model,
-    models_of_systems,
-    noise,
-    peak_gain,
-    peaks_of,
-    response_at,
-)
-from malta.synthesis.state_space import System
+from malta.linear.peaks import peak_gain, response_at
+from malta.linear.system import System
+from malta.structured.loops import ClosedLoop, Model, models_of_systems, noise, peaks_of
 from malta.synthesis.structure import Structure, places_of, sample_law
 
 GOALS = {
@@ -103,7 +97,7 @@ def test_a_peak_that_a_grid_misses_is_found() -> None:
 @given(st.integers(0, 10_000), st.integers(1, 5))
 def test_noise_is_the_impulse_response(seed: int, n: int) -> None:
     system = stable_system(seed, n, 2, 2)
-    system = system._replace(A=system.A - np.eye(n), D=np.zeros((2, 2)))
+    system = replace(system, A=system.A - np.eye(n), D=np.zeros((2, 2)))
     t = np.linspace(0, 14, 7001)
     values, vectors = np.linalg.eig(system.A)
     inner = np.einsum(

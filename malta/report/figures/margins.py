@@ -316,7 +316,9 @@ def _draw_compliance(
 ) -> None:
     """Amplitude of the same outputs over frequency, under a load of amplitude 1 N or 1 N m."""
     names = [s.name for s in plant.outputs]
-    w: FloatArray = np.geomspace(1.0, 0.3 * np.pi / loop.sample_time, POINTS)
+    top = 0.3 * np.pi / loop.sample_time
+    turning = loop.resonances
+    w: FloatArray = np.union1d(np.geomspace(1.0, top, POINTS), turning[(turning > 1) & (turning < top)])
     series = {}
     for load, output in lines:
         amplitude = np.abs(loop.compliance(w, load_vector(plant, load.name, load.load)))

@@ -1,0 +1,36 @@
+"""The matrix [A B; C D] of a system, and systems with more states: inputs that are held or follow, integrals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+
+def system_matrix(A: Any, B: Any = None, C: Any = None, D: Any = None) -> Any:
+    """[A B; C D] of numbers, of stacks of them, or of CasADi expressions; None: zeros, in a square whole.
+
+    >>> import numpy as np
+    >>> from malta.linear.matrices import system_matrix
+    >>> system_matrix(np.eye(1), None, 2 * np.eye(1)).tolist()
+    [[1.0, 0.0], [2.0, 0.0]]
+    """
+    given = [M for M in (A, B, C, D) if M is not None]
+    n, m = A.shape[-2:]
+    rows, columns = (
+        [M.shape[axis] for M in sides if M is not None] for axis, sides in ((-2, (C, D)), (-1, (B, D)))
+    )
+    k, p = (rows or columns)[0], (columns or rows)[0]
+    if any(isinstance(M, ca.SX | ca.MX | ca.DM) for M in given):
+        kind = next(type(M) for M in given if isinstance(M, ca.SX | ca.MX | ca.DM))
+        shapes = ((n, m), (n, p), (k, m), (k, p))
+        parts = [kind(*shape) if M is None else M for M, shape in zip((A, B, C, D), shapes, strict=True)]
+        return ca.blockcat([parts[:2], parts[2:]])
+    whole = np.zeros(
+        (*np.broadcast_shapes(*(M.shape[:-2] for M in given)), n + k, m + p), np.result_type(*given)
+    )
+    for M, at in zip((A, B, C, D), ((0, 0), (0, m), (n, 0), (n, m)), strict=True):
+        if M is not None:
+            whole[..., at[0] : at[0] + M.shape[-2], at[1] : at[1] + M.shape[-1]] = M
+    return whole
