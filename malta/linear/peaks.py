@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from malta.arrays import ComplexArray, FloatArray
+from malta.linear.matrices import system_matrix
 from malta.linear.sampling import eigenvalues
 from malta.linear.system import System
 
@@ -82,8 +83,7 @@ def part_of(system: System, rows: Sequence[int], columns: Sequence[int]) -> Syst
     """
     A, B, C, D = system
     n = len(A)
-    whole = np.abs(np.block([[A, B[:, columns]], [C[rows], D[np.ix_(rows, columns)]]]))
-    joined = _joined(whole)
+    joined = _joined(np.abs(system_matrix(A, B[:, columns], C[rows], D[np.ix_(rows, columns)])))
     reached, seen = joined[:n, n:].any(axis=1), joined[n:, :n].any(axis=0)
     for graph, marks in ((joined[:n, :n], reached), (joined[:n, :n].T, seen)):
         for _ in range(n):
@@ -132,8 +132,8 @@ def level_frequencies(system: System, level: float) -> FloatArray:
     S = D @ D.T - level**2 * np.eye(len(C))
     try:
         own = A - B @ np.linalg.solve(R, D.T @ C)
-        H = np.block(
-            [[own, -level * B @ np.linalg.solve(R, B.T)], [level * C.T @ np.linalg.solve(S, C), -own.T]]
+        H = system_matrix(
+            own, -level * B @ np.linalg.solve(R, B.T), level * C.T @ np.linalg.solve(S, C), -own.T
         )
     except np.linalg.LinAlgError:  # the level is reached at infinite frequency
         return np.zeros(0)
@@ -240,11 +240,8 @@ def _fall(sizes: Callable[[FloatArray], FloatArray], w: FloatArray, above: Float
 def joined_channels(system: System, channels: Sequence[int]) -> list[list[int]]:
     """The channels in sets that nothing joins, each its input and output: the norm of all is the largest of a set."""
     n, c = len(system.A), len(channels)
-    whole = np.abs(
-        np.block(
-            [[system.A, system.B[:, channels]], [system.C[channels], system.D[np.ix_(channels, channels)]]]
-        )
-    )
+    A, B, C, D = system
+    whole = np.abs(system_matrix(A, B[:, channels], C[channels], D[np.ix_(channels, channels)]))
     label = sparse.csgraph.connected_components(_joined(whole), directed=False)[1][n : n + c]
     return [[channels[i] for i in np.flatnonzero(label == k).tolist()] for k in np.unique(label)]
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import display
+from malta.linear.matrices import system_matrix
 from malta.linear.peaks import (
     Crossing,
     Fall,
@@ -105,7 +106,7 @@ class Nominal:
     def open(self) -> System:
         """The loop gain P F at the sensors, positive feedback; of a sampled loop in the s of Tustin's rule."""
         (A, B, C, D), (F_A, F_B, F_C, F_D) = self.P, self.F
-        whole = np.block([[A, B @ F_C], [np.zeros((len(F_A), len(A))), F_A]])
+        whole = system_matrix(A, B @ F_C, None, F_A)
         cut = System(whole, np.vstack([B @ F_D, F_B]), np.hstack([C, D @ F_C]), D @ F_D)
         return in_plane(cut, self.sample_time).balanced
 
