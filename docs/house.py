@@ -21,6 +21,7 @@ GROUND = "ground floor"  # modules beside the packages
 ORDER = (
     *(
         GROUND,
+        "checker",
         "linear",
         "model",
         "synthesis",

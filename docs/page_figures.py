@@ -22,7 +22,7 @@ from matplotlib.patches import Circle, Rectangle
 from scipy.special import comb
 
 import malta
-from malta.proof.certificate import certificate
+from malta.proof import certificate
 from malta.proof.robust import law_of
 from malta.proof.weak_coupling import taylor
 

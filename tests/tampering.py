@@ -8,7 +8,7 @@ from typing import Any
 
 from flint import fmpq
 
-from malta.proof.certificate import checked_file
+from malta.checker import file as checked_file
 
 
 def written(content: dict[str, Any], folder: Path, *, signed: bool = True) -> Path:

@@ -35,11 +35,11 @@ from malta.errors import CheckError, InputError, shorten
 
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
+    from malta.checker.check import Verdict
     from malta.cli.documents.others import CheckOutput
     from malta.identification.data_file import IdentifiedData
     from malta.loops.windings import CurrentLoops
     from malta.margins.loop_report import LoopReport
-    from malta.proof.certificate.check import Verdict
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 
@@ -176,12 +176,12 @@ def _write_certificate(path: Path, gains: Path, found: LoopReport) -> Path:
     """Write the certificate of the margin over the travel."""
     from malta.gains.certified import origin_of
     from malta.margins.travel import travel_loops
-    from malta.proof.certificate import certificate
+    from malta.proof.certificate import write_certificate
 
     plant, controller, box, stage = found.plant, found.controller, found.uncertainty, found.current_loops
     places, over = travel_loops(plant, controller, tuple(box), stage)
     origin = origin_of(gains, plant, controller, stage, len(places))
-    return certificate.write(path, places, box, over, found.travel, origin)
+    return write_certificate(path, places, box, over, found.travel, origin)
 
 
 def _draw(found: LoopReport, folder: Path) -> list[Path]:
@@ -240,7 +240,7 @@ def check(
     \b
     Example:  malta check build/table2.json --gains design/gains/table2.json
     """
-    from malta.proof.certificate.check import check as check_certificate
+    from malta.gains.certified import check as check_certificate
 
     with working(f"checking {file}"):
         box = None if gains is None else _box_of(gains, uncertain, machine)

@@ -1,7 +1,7 @@
 """What a certificate claims beside what a gain file says: machine, law, stage, box, travel and loops.
 
-The checker of the proof (margins/check.py) imports nothing that found it. Whose loop it is has to come from the gain
-file, through the machine's model, which is what is proven: this module rebuilds that, with the code of `malta verify`.
+The checker of the proof (malta/checker) imports nothing of malta. Whose loop it is has to come from the gain file,
+through the machine's model, which is what is proven: this module rebuilds that, with the code of `malta verify`.
 Boxes are compared as exact numbers, loops to the last digit.
 """
 
@@ -9,12 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from malta.bound import at_least
+from malta.checker.check import Verdict, check as prove_again
+from malta.checker.file import LONG, Claim, Document, Loop, Origin as Named, Parameter, Places, double
 from malta.errors import CheckError, InputError, shorten
 from malta.files import locate
 from malta.gains.contents import uncertainty_of
@@ -28,19 +31,32 @@ from malta.model.data import plant_of, published_figures
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
 from malta.proof.box import box_of, sides_of
-from malta.proof.certificate.certificate import Origin, loops_of
-from malta.proof.certificate.checked_file import (
-    LONG,
-    Claim,
-    Document,
-    Loop,
-    Origin as Named,
-    Parameter,
-    Places,
-    double,
-)
+from malta.proof.certificate import Origin, loops_of, refused_as_input
 from malta.proof.margin import Ranges
 from malta.synthesis.controller import Controller
+
+
+def check(
+    path: str | Path,
+    gains: str | Path | None = None,
+    seconds: float = 600.0,
+    uncertain: Mapping[str, float | tuple[float, float]] | None = None,
+) -> Verdict:
+    """Whether a certificate holds; with `gains`, whether what it claims is of that gain file and its box.
+
+    path : of the certificate
+    gains : a gain file, from which loops, box and travel are rebuilt; None: those in the certificate are believed
+    seconds : s, the longest check of the proof
+    uncertain : share or interval (SI) of each parameter that the claim counts in; None: those in the gain file, else
+        those of the machine's paper
+
+    Raises InputError for files that are no certificates or no gain files, and for `uncertain` without `gains`.
+    """
+    if gains is None and uncertain is not None:
+        raise InputError("check", "uncertain", "no gain file", "the gain file whose uncertainty it is")
+    compare = None if gains is None else partial(disagreement, gains=gains, uncertain=uncertain)
+    with refused_as_input():
+        return prove_again(path, seconds, compare)
 
 
 def origin_of(

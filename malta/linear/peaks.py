@@ -83,7 +83,8 @@ def part_of(system: System, rows: Sequence[int], columns: Sequence[int]) -> Syst
     """
     A, B, C, D = system
     n = len(A)
-    joined = _joined(np.abs(system_matrix(A, B[:, columns], C[rows], D[np.ix_(rows, columns)])))
+    whole = np.abs(system_matrix(A, B[:, columns], C[rows], D[np.ix_(rows, columns)]))
+    joined = _joined(whole)
     reached, seen = joined[:n, n:].any(axis=1), joined[n:, :n].any(axis=0)
     for graph, marks in ((joined[:n, :n], reached), (joined[:n, :n].T, seen)):
         for _ in range(n):
@@ -132,9 +133,8 @@ def level_frequencies(system: System, level: float) -> FloatArray:
     S = D @ D.T - level**2 * np.eye(len(C))
     try:
         own = A - B @ np.linalg.solve(R, D.T @ C)
-        H = system_matrix(
-            own, -level * B @ np.linalg.solve(R, B.T), level * C.T @ np.linalg.solve(S, C), -own.T
-        )
+        over, under = B @ np.linalg.solve(R, B.T), C.T @ np.linalg.solve(S, C)
+        H = system_matrix(own, -level * over, level * under, -own.T)
     except np.linalg.LinAlgError:  # the level is reached at infinite frequency
         return np.zeros(0)
     return _on_axis(np.linalg.eigvals(H)) if np.isfinite(H).all() else np.zeros(0)
@@ -240,8 +240,8 @@ def _fall(sizes: Callable[[FloatArray], FloatArray], w: FloatArray, above: Float
 def joined_channels(system: System, channels: Sequence[int]) -> list[list[int]]:
     """The channels in sets that nothing joins, each its input and output: the norm of all is the largest of a set."""
     n, c = len(system.A), len(channels)
-    A, B, C, D = system
-    whole = np.abs(system_matrix(A, B[:, channels], C[channels], D[np.ix_(channels, channels)]))
+    square = system.part(channels, channels)
+    whole = np.abs(system_matrix(square.A, square.B, square.C, square.D))
     label = sparse.csgraph.connected_components(_joined(whole), directed=False)[1][n : n + c]
     return [[channels[i] for i in np.flatnonzero(label == k).tolist()] for k in np.unique(label)]
 

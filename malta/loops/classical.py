@@ -12,7 +12,7 @@ import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import display
-from malta.linear.matrices import system_matrix
+from malta.linear.interconnection import append, connect, series
 from malta.linear.peaks import (
     Crossing,
     Fall,
@@ -47,21 +47,13 @@ def cut_loop(P: System, F: System) -> System:
         [ S    S P      ]      S = (1 - P F)^-1
         [ F S  S_forces ]      S_forces = (1 - F P)^-1
 
-    Raises numpy.linalg.LinAlgError where 1 - P F is singular at infinite frequency.
+    Raises InputError where 1 - P F is singular at infinite frequency.
     """
-    A, B, C, D = P
-    F_A, F_B, F_C, F_D = F
-    p, m, n, k = len(C), B.shape[1], len(A), len(F_A)
-    W = np.linalg.inv(np.eye(p) - D @ F_D)
-    y = W @ np.hstack([C, D @ F_C, np.eye(p), D])  # of x, s, n, d
-    u = F_D @ y
-    u[:, n : n + k] += F_C
-    u[:, n + k + p :] += np.eye(m)
-    moved = np.vstack([B @ u, F_B @ y])
-    moved[:n, :n] += A
-    moved[n:, n : n + k] += F_A
-    out = np.vstack([y, u])
-    return System(moved[:, : n + k], moved[:, n + k :], out[:, : n + k], out[:, n + k :])
+    p, m = P.D.shape
+    crossed = np.zeros((m + p, p + m))
+    crossed[:m, p:], crossed[m:, :p] = np.eye(m), np.eye(p)
+    closed = connect(append(P, F), crossed, crossed, np.eye(p + m), "loop")
+    return replace(closed, D=closed.D + np.eye(p + m))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +97,7 @@ class Nominal:
     @cached_property
     def open(self) -> System:
         """The loop gain P F at the sensors, positive feedback; of a sampled loop in the s of Tustin's rule."""
-        (A, B, C, D), (F_A, F_B, F_C, F_D) = self.P, self.F
-        whole = system_matrix(A, B @ F_C, None, F_A)
-        cut = System(whole, np.vstack([B @ F_D, F_B]), np.hstack([C, D @ F_C]), D @ F_D)
-        return in_plane(cut, self.sample_time).balanced
+        return in_plane(series(self.F, self.P), self.sample_time).balanced
 
     def response(self, w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """P, k x p x m, and F, k x m x p, at frequencies w, rad/s."""

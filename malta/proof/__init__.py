@@ -11,7 +11,7 @@ exclusion                 branch and bound over frequency and box; witnesses; Hu
 multipliers               many parameters: pencils and multipliers
 weak_coupling             held currents anywhere in the travel: coupled axes
 blocks                    unmodelled dynamics and worst-case gains
-certificate               the proof as a file, and the checker of its own
+certificate               the proof as a file, for the folder malta/checker
 """
 
 from typing import TYPE_CHECKING
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from malta.linear.uncertain import Compensator as Compensator, UncertainSystem as UncertainSystem
     from malta.proof.blocks import Dynamic as Dynamic
     from malta.proof.blocks.gain import Gain as Gain
+    from malta.proof.certificate import write_certificate as write_certificate
     from malta.proof.connections import (
         append as append,
         feedback as feedback,
@@ -39,6 +40,7 @@ _NAMES = {
     "malta.linear.uncertain": "Compensator UncertainSystem",
     "malta.proof.blocks": "Dynamic",
     "malta.proof.blocks.gain": "Gain",
+    "malta.proof.certificate": "write_certificate",
     "malta.proof.connections": "append feedback interconnect parallel random_systems series",
     "malta.proof.margin": "Margin",
     "malta.proof.rates": "RateBound varying",

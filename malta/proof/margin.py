@@ -46,8 +46,8 @@ class Margin:
     witness : parameters with which the loop is at its limit of stability, SI; None without one
     moved : the witness minus the nominal values, SI
     sensitivity : share of each parameter in the margin; the shares add up to 1
-    certificate : cells and directions of the proof, which `malta.proof.certificate.check` checks again; or multipliers,
-        of which `malta.proof.certificate.checked_multipliers` does
+    certificate : cells and directions of the proof; or multipliers, which `malta.proof.multipliers.checked` checks
+        again. `malta.proof.write_certificate` writes a proof as a file
     seconds : s, time of the search
     work : units of work that the search took, which do not depend on the computer
     reason : why nothing, or less than asked for, is proven

@@ -36,7 +36,8 @@ from malta.proof.groups import A, B, C, E, UncertainLoop, loop_of
 from malta.proof.loss import first_loss, loss_beside
 from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.problem import CoefficientPolynomial, OfLoop, OfSeveral, Problem, is_nominal_stable
-from malta.proof.search import Question, Standing, search
+from malta.proof.question import Question, Standing
+from malta.proof.search import search
 from malta.work import AGAIN, MORE, Budget, in_rounds, is_past
 
 # A loop in the coordinates in which its parameters act apart: x = S x', exactly, found from how the parameters enter.

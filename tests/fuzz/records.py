@@ -21,14 +21,15 @@ from malta.campaigns.plan import Plan
 from malta.campaigns.rare import rare_event, read_design_point, write_event
 from malta.campaigns.run import campaign
 from malta.campaigns.store import MANIFEST, block_name, read_plan, seal
+from malta.checker import file as checked_file
 from malta.firmware.signals import Target
 from malta.firmware.sources import LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
+from malta.gains.certified import check
 from malta.identification.calibration import Estimate
 from malta.identification.commission import Commissioning, Entry, Finding, read_journal
 from malta.linear.uncertain import Compensator
 from malta.machines.tubular.experiments.strokes import forces_of, record
-from malta.proof.certificate import certificate, checked_file
-from malta.proof.certificate.check import check
+from malta.proof import certificate
 from malta.report import campaign_tables
 from malta.report.page.document import binder_page, binder_text
 from malta.report.page.motion import motion_page, read_motion

@@ -16,7 +16,7 @@ from conftest import refusal
 import malta
 from malta.campaigns.store import read_manifest
 from malta.files import read_file, replace_files, scratch_folder, temporary_name, writer
-from malta.proof.certificate import checked_file
+from malta.gains.certified import check
 from malta.tables import load_toml
 
 
@@ -182,7 +182,7 @@ def readers(path: Path) -> list[Callable[[], object]]:
         lambda: malta.identification.read_log(path.with_suffix(".csv")),
         lambda: malta.identification.read_log(path.with_suffix(".npz")),
         lambda: read_manifest(path),
-        lambda: checked_file.content_of(path),
+        lambda: check(path),
     ]
 
 

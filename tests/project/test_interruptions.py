@@ -203,10 +203,10 @@ def test_ctrl_c_names_the_files_that_are_complete(
     def cut(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("malta.proof.certificate.check.check", cut)
+    monkeypatch.setattr("malta.gains.certified.check", cut)
     said = run("check", "nothing.json")
     assert said == (130, "", "malta: interrupted; nothing was written\n")
-    monkeypatch.setattr("malta.proof.certificate.check.check", written_then_cut)
+    monkeypatch.setattr("malta.gains.certified.check", written_then_cut)
     said = run("check", "nothing.json")
     stands = f"complete: {tmp_path / 'done.json'}; all other files stand as they were"
     assert said.err == f"malta: interrupted; {stands}\n"

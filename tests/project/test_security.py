@@ -8,11 +8,11 @@ from pathlib import Path
 
 from malta import files, tables, units
 from malta.campaigns import plan
+from malta.checker import check, file as checked_file
 from malta.cli import output
 from malta.gains import encodings
 from malta.identification import log_files
 from malta.model import signals
-from malta.proof.certificate import check, checked_file
 from malta.simulation import inputs, scenario
 from malta.simulation.engine import compiled
 

@@ -19,7 +19,7 @@ from malta.linear.expressions import POINTS, NotAnalytic, program
 from malta.loops.parametric_plants import of_plant
 from malta.model import Actuator, Plant, Signal, si
 from malta.proof.box import ENDS, FAR, box_of, within_branches
-from malta.proof.certificate.certificate import certificate_of
+from malta.proof.certificate import certificate_of
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import copy
 import json
 import math
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import flint
 import numpy as np
 import pytest
 from conftest import Run
@@ -21,14 +23,14 @@ from flint import arb, fmpq
 from tampering import claiming, written
 
 import malta
+from malta.checker.check import tiled
+from malta.checker.loop import determinant_bounds
 from malta.errors import CheckError, InputError
-from malta.gains.certified import origin_of
+from malta.gains.certified import check, origin_of
 from malta.linear.uncertain import Compensator
 from malta.loops.sampled_loops import LAST
 from malta.margins.travel import travel_loops, travel_margin
-from malta.proof.certificate import certificate
-from malta.proof.certificate.check import check, tiled
-from malta.proof.certificate.checked_loop import determinant_bounds
+from malta.proof import certificate
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -52,7 +54,7 @@ def shipped(name: str, folder: Path) -> tuple[Path, dict[str, Any]]:
     margin = travel_margin(plant, controller, ranges)
     places, over = travel_loops(plant, controller, tuple(ranges))
     origin = origin_of(gains, plant, controller, LAST, len(places))
-    path = certificate.write(folder / "certificate.json", places, ranges, over, margin, origin)
+    path = certificate.write_certificate(folder / "certificate.json", places, ranges, over, margin, origin)
     assert path.stat().st_size < 1_000_000
     content = json.loads(path.read_text())
     assert isinstance(content, dict)
@@ -87,7 +89,9 @@ def test_a_continuous_loop(tmp_path: Path) -> None:
     system, law = spring(), gain(1.0)
     margin = malta.robust_margin(system, law, {"m": 0.1, "k": 0.1})
     assert margin.upper == pytest.approx(7.5, rel=1e-6)
-    path = certificate.write(tmp_path / "c.json", [(system, law)], {"m": 0.1, "k": 0.1}, None, margin)
+    path = certificate.write_certificate(
+        tmp_path / "c.json", [(system, law)], {"m": 0.1, "k": 0.1}, None, margin
+    )
     found = check(path)
     assert found.ok
     assert found.claim == pytest.approx(0.999 * 7.5, rel=2e-3)
@@ -97,12 +101,12 @@ def test_a_continuous_loop(tmp_path: Path) -> None:
 def test_less_is_claimed_where_the_whole_margin_is_not_proven(tmp_path: Path) -> None:
     system, law, box = spring(), gain(1.0), {"m": 0.1, "k": 0.1}
     margin = replace(malta.robust_margin(system, law, box), lower=8.0)  # more than there is: 7.5
-    found = check(certificate.write(tmp_path / "c.json", [(system, law)], box, None, margin))
+    found = check(certificate.write_certificate(tmp_path / "c.json", [(system, law)], box, None, margin))
     assert found.ok
     assert found.claim == pytest.approx(0.9 * 8.0)
     margin = replace(margin, lower=400.0)
     with pytest.raises(CheckError, match="no certificate: a parameter that divides reaches zero"):
-        certificate.write(tmp_path / "c.json", [(system, law)], box, None, margin)
+        certificate.write_certificate(tmp_path / "c.json", [(system, law)], box, None, margin)
 
 
 @pytest.mark.parametrize(("delay", "lag"), [(0, None), (2, None), (1, 50.0)])
@@ -112,7 +116,9 @@ def test_a_sampled_loop_with_delay_and_lag(tmp_path: Path, delay: int, lag: floa
         sample_time=0.05, delay=delay, lag=lag,
     )  # fmt: skip
     margin = malta.robust_margin(spring(), own, {"m": 0.3, "k": 0.3})
-    path = certificate.write(tmp_path / "c.json", [(spring(), own)], {"m": 0.3, "k": 0.3}, None, margin)
+    path = certificate.write_certificate(
+        tmp_path / "c.json", [(spring(), own)], {"m": 0.3, "k": 0.3}, None, margin
+    )
     found = check(path)
     assert found.ok, found.failures
     assert margin.lower is not None
@@ -125,7 +131,7 @@ def test_groups_and_several_loops(tmp_path: Path) -> None:
     )
     loops = [(system, gain(-1.0, -g)) for g in (1.0, 2.0)]
     margins = [malta.robust_margin(*loop, {"a": (0.0, 0.2)}) for loop in loops]
-    path = certificate.write(tmp_path / "c.json", loops, {"a": (0.0, 0.2)}, None, margins[0])
+    path = certificate.write_certificate(tmp_path / "c.json", loops, {"a": (0.0, 0.2)}, None, margins[0])
     found = check(path)
     assert found.ok, found.failures
     assert len(found.groups) == 4
@@ -137,7 +143,9 @@ def test_an_expression_without_a_rule_is_refused(tmp_path: Path) -> None:
     system = malta.uncertain(lambda a: ([[-1 - ca.sin(a)]], [[1]], [[1]]), {"a": 0.1})
     margin = malta.robust_margin(system, gain(-1.0), {"a": (0.0, 0.2)})
     with pytest.raises(InputError, match="found sin"):
-        certificate.write(tmp_path / "c.json", [(system, gain(-1.0))], {"a": (0.0, 0.2)}, None, margin)
+        certificate.write_certificate(
+            tmp_path / "c.json", [(system, gain(-1.0))], {"a": (0.0, 0.2)}, None, margin
+        )
 
 
 def masses() -> Any:
@@ -153,7 +161,7 @@ def test_a_diagonal_descriptor(tmp_path: Path) -> None:
     system, law, box = masses(), gain(1.0), {"m": 0.1, "k": 0.1}
     margin = malta.robust_margin(system, law, box)
     assert margin.upper == pytest.approx(7.5, rel=1e-6)
-    path = certificate.write(tmp_path / "c.json", [(system, law)], box, None, margin)
+    path = certificate.write_certificate(tmp_path / "c.json", [(system, law)], box, None, margin)
     found = check(path)
     assert found.ok, found.failures
     assert found.claim == pytest.approx(0.999 * 7.5, rel=2e-3)
@@ -168,7 +176,9 @@ def test_a_mass_that_may_vanish_is_refused(tmp_path: Path) -> None:
     # (p s + p) x: stable, but at p = 0 it is no equation at all; E and A cancel in E^-1 A
     system = malta.uncertain(lambda p: ([[-p]], [[p]], [[1]], [[0]], [[p]]), {"p": 1.0})
     margin = malta.robust_margin(system, gain(-1.0), {"p": 0.1}, budget=malta.proof.Budget(1))
-    path = certificate.write(tmp_path / "c.json", [(system, gain(-1.0))], {"p": 0.1}, None, margin)
+    path = certificate.write_certificate(
+        tmp_path / "c.json", [(system, gain(-1.0))], {"p": 0.1}, None, margin
+    )
     assert check(path).ok
     content = json.loads(path.read_text())
     claiming(content, 20.0)
@@ -197,7 +207,7 @@ def test_what_certificates_do_not_cover(tmp_path: Path, system: Any, law: float,
     margin = malta.robust_margin(*loop, {"a": (0.0, 0.2)})
     assert margin.lower is not None
     with pytest.raises(InputError, match=re.escape(why)):
-        certificate.write(tmp_path / "c.json", [loop], {"a": (0.0, 0.2)}, None, margin)
+        certificate.write_certificate(tmp_path / "c.json", [loop], {"a": (0.0, 0.2)}, None, margin)
 
 
 def test_many_parameters_are_said_to_be_too_many(tmp_path: Path) -> None:
@@ -210,7 +220,7 @@ def test_many_parameters_are_said_to_be_too_many(tmp_path: Path) -> None:
     box = dict.fromkeys(names, 0.1)
     margin = replace(malta.robust_margin(system, gain(-1.0), box, budget=malta.proof.Budget(0.1)), lower=1.0)
     with pytest.raises(InputError, match="found 14 that act on one group, expected at most 13"):
-        certificate.write(tmp_path / "c.json", [(system, gain(-1.0))], box, None, margin)
+        certificate.write_certificate(tmp_path / "c.json", [(system, gain(-1.0))], box, None, margin)
 
 
 # couplings that are rounding
@@ -245,7 +255,7 @@ def cross(coupling: float, **options: Any) -> Compensator:
 def test_rounding_between_groups_is_bounded(tmp_path: Path, system: Any, law: Compensator) -> None:
     margin = malta.robust_margin(system, law, {"k": 0.1})
     assert margin.lower is not None
-    path = certificate.write(tmp_path / "c.json", [(system, law)], {"k": 0.1}, None, margin)
+    path = certificate.write_certificate(tmp_path / "c.json", [(system, law)], {"k": 0.1}, None, margin)
     found = check(path)
     assert found.ok, found.failures
     assert found.claim == pytest.approx(0.999 * margin.lower)
@@ -257,7 +267,7 @@ def test_a_coupling_that_is_more_than_rounding_is_refused(tmp_path: Path, coupli
     # (k - 1) (2 k - 1) > coupling^2 is what the loop needs; the claim without coupling reaches down to k = 1.003
     law, box = cross(1e-15), {"k": 0.1}
     margin = malta.robust_margin(springs(0.0), law, box)
-    path = certificate.write(tmp_path / "c.json", [(springs(0.0), law)], box, None, margin)
+    path = certificate.write_certificate(tmp_path / "c.json", [(springs(0.0), law)], box, None, margin)
     content = json.loads(path.read_text())
     gains = content["loops"][0]["compensator"]["D"]
     gains[0][1] = gains[1][0] = coupling
@@ -270,7 +280,7 @@ def test_a_coupling_that_is_more_than_rounding_is_refused(tmp_path: Path, coupli
 def test_couplings_within_a_hold_are_refused(tmp_path: Path) -> None:
     system, law = springs(0.0), cross(1e-15, sample_time=0.05)
     margin = malta.robust_margin(system, law, {"k": 0.1})
-    path = certificate.write(tmp_path / "c.json", [(system, law)], {"k": 0.1}, None, margin)
+    path = certificate.write_certificate(tmp_path / "c.json", [(system, law)], {"k": 0.1}, None, margin)
     content = json.loads(path.read_text())
     content["loops"][0]["A"].append([1, 2, content["loops"][0]["A"][0][2]])
     found = check(written(content, tmp_path))
@@ -432,36 +442,71 @@ def test_fields_that_are_wrong(
 # the parts of the proof
 
 
-def test_the_checker_shares_no_code_with_the_search() -> None:
-    """Of malta, its three files import each other and the errors; one line asks for the loop of a gain file."""
-    folder = ROOT / "malta" / "proof" / "certificate"
-    beside = []
-    for name in ("check", "checked_loop", "checked_file"):
-        for node in ast.walk(ast.parse((folder / f"{name}.py").read_text())):
-            modules = [str(node.module)] if isinstance(node, ast.ImportFrom) else []
-            modules += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            own = (
-                "malta.errors",
-                "malta.proof.certificate.checked_loop",
-                "malta.proof.certificate.checked_file",
-            )
-            beside += [module for module in modules if module.startswith("malta") and module not in own]
-    assert beside == ["malta.gains.certified"]
+def test_the_checker_is_a_folder_that_imports_flint_alone() -> None:
+    """Beside the standard library and its own three files."""
+    outside = set()
+    for path in sorted((ROOT / "malta" / "checker").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.level:
+                assert node.module in ("check", "file", "loop")
+            elif isinstance(node, ast.ImportFrom):
+                outside.add(str(node.module).partition(".")[0])
+            elif isinstance(node, ast.Import):
+                outside.update(alias.name.partition(".")[0] for alias in node.names)
+    assert outside - set(sys.stdlib_module_names) == {"flint"}
 
 
-def test_a_proof_is_checked_without_the_rest_of_malta(tmp_path: Path) -> None:
-    system, box = spring(), {"m": 0.1, "k": 0.1}
-    margin = malta.robust_margin(system, gain(1.0), box)
-    path = certificate.write(tmp_path / "c.json", [(system, gain(1.0))], box, None, margin)
-    program = (
-        "import sys; from malta.proof.certificate.check import check\n"
-        f"assert check({str(path)!r}).ok\n"
-        "print(*sorted(name for name in sys.modules if name.startswith(('malta.proof.', 'malta.loops'))))"
-    )
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    own = "malta.proof.certificate"
-    loaded = [own, *(f"{own}.{name}" for name in ("check", "checked_file", "checked_loop"))]
-    assert ended.stdout.split() == loaded
+# Site packages without malta: the folder and flint are all that can be imported.
+ALONE = """
+import importlib.util, runpy, sys
+from pathlib import Path
+sys.path += [{folder!r}]
+flint = importlib.util.spec_from_file_location("flint", {flint!r}, submodule_search_locations=[{home!r}])
+sys.modules["flint"] = importlib.util.module_from_spec(flint)
+flint.loader.exec_module(sys.modules["flint"])
+assert importlib.util.find_spec("malta") is None and importlib.util.find_spec("numpy") is None
+sys.argv = ["checker", *sys.argv[1:]]
+runpy.run_module("checker", run_name="__main__", alter_sys=True)
+"""
+
+
+def elsewhere(folder: Path, *arguments: str) -> tuple[int, str, str]:
+    """The exit code and the texts of the checker, copied to a folder and run without malta."""
+    shutil.copytree(ROOT / "malta" / "checker", folder / "checker", dirs_exist_ok=True)
+    program = ALONE.format(folder=str(folder), flint=flint.__file__, home=str(Path(flint.__file__).parent))
+    command = [sys.executable, "-I", "-S", "-c", program, *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+    return ended.returncode, ended.stdout, ended.stderr
+
+
+def test_the_folder_checks_a_shipped_certificate_elsewhere(document: dict[str, Any], tmp_path: Path) -> None:
+    whole = written(document, tmp_path)
+    code, out, err = elsewhere(tmp_path, str(whole))
+    assert (code, err) == (0, "")
+    first_line, *_, last = out.splitlines()
+    assert first_line.startswith("halbach, law halbach, sampled every ")
+    assert last == f"stable in {document['claim']['lower']!r} of the box: holds"
+
+    changed = copy.deepcopy(document)
+    raised(changed)
+    code, out, err = elsewhere(tmp_path, str(written(changed, tmp_path)))
+    assert (code, out.splitlines()[-1].endswith("does not hold")) == (1, True)
+    assert err.count("\n") == 1
+
+    changed = copy.deepcopy(document)  # with a seal of its own
+    first(changed)["cells"][0][4] = -first(changed)["cells"][0][4]
+    first(changed)["cells"][0][5] = -first(changed)["cells"][0][5]
+    code, out, err = elsewhere(tmp_path, str(written(changed, tmp_path)))
+    assert (code, "zero is not excluded from cell 1\n" in err) == (1, True)
+
+    cut = tmp_path / "cut.json"
+    cut.write_text(json.dumps(document)[:-100])
+    code, out, err = elsewhere(tmp_path, str(cut))
+    assert (code, out) == (2, "")
+    assert err.startswith(f"{cut}: found no JSON (")
+    code, out, err = elsewhere(tmp_path, str(tmp_path / "none.json"))
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert elsewhere(tmp_path)[0] == 2
 
 
 def test_a_check_ends_in_time(document: dict[str, Any], tmp_path: Path) -> None:
@@ -557,7 +602,9 @@ def test_a_design_whose_rounding_couples_all_states(tmp_path: Path) -> None:
     margin = malta.proof.Margin(3.2, math.inf, None, None, {}, {}, (), 0.0)  # below what `verify` proves, 3.9
     places, over = travel_loops(plant, controller, tuple(ranges))
     origin = origin_of(gains, plant, controller, "lag", len(places))
-    found = check(certificate.write(tmp_path / "c.json", places, ranges, over, margin, origin), gains)
+    found = check(
+        certificate.write_certificate(tmp_path / "c.json", places, ranges, over, margin, origin), gains
+    )
     assert found.ok, found.failures
     assert found.claim == pytest.approx(0.999 * 3.2)
     assert (

@@ -17,13 +17,14 @@ from flint import fmpq
 from tampering import claiming, written
 
 import malta
+from malta.checker import file as checked_file
+from malta.checker.check import Verdict
 from malta.errors import InputError
-from malta.gains.certified import origin_of
+from malta.gains.certified import check, origin_of
 from malta.loops.windings import CurrentLoops
 from malta.margins import travel
 from malta.margins.travel import travel_loops
-from malta.proof.certificate import certificate, checked_file
-from malta.proof.certificate.check import Verdict, check
+from malta.proof import certificate
 from malta.report.tables.design import claim_share
 
 pytestmark = pytest.mark.usefixtures("proven_once")
@@ -45,7 +46,7 @@ def certified(
     places, over = travel_loops(plant, controller, tuple(ranges), stage)
     margin = malta.proof.Margin(lower, math.inf, None, None, {}, {}, (), 0.0)
     origin = origin_of(gains, plant, controller, stage, len(places))
-    return certificate.write(path, places, ranges, over, margin, origin)
+    return certificate.write_certificate(path, places, ranges, over, margin, origin)
 
 
 @pytest.fixture(scope="module")

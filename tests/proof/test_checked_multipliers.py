@@ -14,8 +14,8 @@ import pytest
 from test_many_parameters import asked, chain, ranges
 
 import malta
-from malta.proof.certificate.checked_multipliers import refusal
 from malta.proof.multipliers import Blocks, Multiplier
+from malta.proof.multipliers.checked import refusal
 from malta.proof.multipliers.structured import Proof, Shown, worst
 from malta.work import WorkUp, work_limit
 

@@ -181,7 +181,7 @@ def merits_text(lower: float | None) -> str:
 def certificate_text(lower: float | None) -> str:
     from flint import fmpq
 
-    from malta.proof.certificate.checked_file import Claim
+    from malta.checker.file import Claim
     from malta.report.tables.design import claim_share
 
     share = 0.0 if lower is None or math.isinf(lower) else lower

@@ -19,12 +19,12 @@ from flint import Ordering, arb, fmpq, fmpq_mpoly_ctx
 from tampering import claiming
 
 import malta
+from malta.checker import check, file as checked_file, loop as checked_loop
 from malta.linear.uncertain import Compensator, closed_loop
 from malta.margins.loop_report import Stage
 from malta.margins.travel import smallest_margin
-from malta.proof import exclusion
+from malta.proof import certificate, exclusion
 from malta.proof.box import below
-from malta.proof.certificate import certificate, check, checked_file, checked_loop
 from malta.proof.groups import loop_of
 from malta.proof.margin import Margin
 from malta.proof.polynomial import characteristic as degrees, enclosure
@@ -398,21 +398,21 @@ def _field(value: Any) -> checked_file.Field:
 
 def test_fields_of_certificates_have_bounds() -> None:
     for value in (1e-91, -1e-300, 1e91, math.inf, math.nan, 2**53 + 1, "0x1p-400", "x" * 41, True):
-        with pytest.raises(malta.InputError):
+        with pytest.raises(checked_file.Unreadable):
             _field(value).number()
     assert _field(0).number() == _field("0x0p0").number() == 0
     for whole in (-1, 5, 10**9, 1.0, True):
-        with pytest.raises(malta.InputError, match="a whole number from 0 to 4"):
+        with pytest.raises(checked_file.Unreadable, match="a whole number from 0 to 4"):
             _field(whole).whole(0, 4)
     for power in (33.0, -33.0, 0.5):
-        with pytest.raises(malta.InputError, match="a whole power up to 32"):
+        with pytest.raises(checked_file.Unreadable, match="a whole power up to 32"):
             checked_file.step(_field(["constpow", 0, [0], power]), 1, 1)
     assert checked_file.step(_field(["constpow", 0, [0], 32.0]), 1, 1)[0] == "constpow"
     several: tuple[Any, ...] = ([1], [1, 2, 3], {}, None)
     for items in several:
-        with pytest.raises(malta.InputError, match="a list of 2 to 2 items"):
+        with pytest.raises(checked_file.Unreadable, match="a list of 2 to 2 items"):
             _field(items).items(2)
-    with pytest.raises(malta.InputError, match="low, high"):
+    with pytest.raises(checked_file.Unreadable, match="low, high"):
         _field([2.0, 1.0]).pair()
 
 
@@ -420,7 +420,7 @@ def test_certificates_have_a_size(tmp_path: Path) -> None:
     path = tmp_path / "c.json"
     path.write_bytes(b" " * (checked_file.LARGEST + 1))
     with pytest.raises(
-        malta.InputError, match="found 4000001 bytes, expected a certificate of at most 4000000"
+        checked_file.Unreadable, match="found 4000001 bytes, expected a certificate of at most 4000000"
     ):
         check.check(path)
 

@@ -15,6 +15,7 @@ from malta.report.ledger import Word
 from malta.units import identifier
 
 if TYPE_CHECKING:
+    from malta.checker.file import Claim
     from malta.identification.dump import ExactReplay
     from malta.identification.identify import Identified
     from malta.identification.log import Log
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from malta.identification.strokes import LearnedStrokes
     from malta.identification.windings import Windings
     from malta.proof.blocks.gain import Gain
-    from malta.proof.certificate.checked_file import Claim
     from malta.synthesis.spec import Spec
     from malta.tuning.tune import Tuned
 
@@ -71,7 +71,7 @@ class CheckOutput(Part):
 
 def certified_part(claim: Claim) -> CertifiedPart:
     """What a certificate says that it is of."""
-    from malta.proof.certificate.checked_file import double
+    from malta.checker.file import double
 
     o, places, T = claim.origin, claim.places, claim.sample_time
     names = None if o is None else (o.machine, o.preset, o.law, o.sha256, o.current_loops)

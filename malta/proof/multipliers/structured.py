@@ -73,7 +73,7 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Proof:
-    """A proof by multipliers, which `checked_multipliers.refusal` checks again: boxes, the smallest first."""
+    """A proof by multipliers, which `multipliers.checked.refusal` checks again: boxes, the smallest first."""
 
     rows: tuple[Rows, ...]
     box: Box

@@ -13,6 +13,7 @@ from rich.text import Text
 from scipy import sparse
 
 from malta.bound import at_least, at_most
+from malta.checker.file import Claim, double, inside
 from malta.display import RADIANS, frequency
 from malta.loops.time_domain import SHARE, Recovery, furthest
 from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, Outcome, zone
@@ -20,7 +21,6 @@ from malta.model.data import published_value
 from malta.model.linearize import LinearModel
 from malta.model.machines import FINE
 from malta.model.parameters import box_words
-from malta.proof.certificate.checked_file import Claim, double, inside
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
 from malta.report.tables import COLOURS, Paragraph, add_row, new_table
 from malta.report.tables.experiments import experiment_table

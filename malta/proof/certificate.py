@@ -1,6 +1,6 @@
 """The proof of a margin as a file, which `check` confirms: matrices, parameters, claim, and the cells of each group.
 
-The cells come from the same branch and bound as the margin, for the polynomial that check.py builds by itself. The
+The cells come from the same branch and bound as the margin, for the polynomial that malta/checker builds by itself. The
 claim is a little below the lower bound of the margin: the largest of a few shares that is proven.
 """
 
@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,24 +18,15 @@ import numpy as np
 from flint import arb, ctx
 from scipy import linalg, sparse
 
+from malta.checker import file as checked_file
+from malta.checker.check import BITS, MOST_NODES, balls, bernstein, interpolated, within
+from malta.checker.file import Loop, double
+from malta.checker.loop import SIDES, Polynomial, Refused, Table, balanced, expressions, height, split
 from malta.errors import CheckError, InputError
 from malta.files import replace_files, version
 from malta.linear.expressions import FIELD, exact
 from malta.linear.systems import compensator_of
 from malta.proof.box import Box, below, box_of
-from malta.proof.certificate import checked_file
-from malta.proof.certificate.check import BITS, MOST_NODES, balls, bernstein, interpolated, within
-from malta.proof.certificate.checked_file import Loop, double
-from malta.proof.certificate.checked_loop import (
-    SIDES,
-    Polynomial,
-    Refused,
-    Table,
-    balanced,
-    expressions,
-    height,
-    split,
-)
 from malta.proof.exclusion import Growth, advance, start
 from malta.proof.groups import E, UncertainLoop, loop_of
 from malta.proof.polynomial.family import Family, binary
@@ -182,7 +174,7 @@ class Origin:
     places: checked_file.Places | None  # of the loops, where they are several
 
 
-def write(
+def write_certificate(
     path: str | Path,
     places: Places,
     ranges: Ranges,
@@ -196,7 +188,16 @@ def write(
     ranges, over : the box and the intervals that do not grow, as for `robust_margin`
     origin : the machine and the law, from `malta.gains.certified.origin_of`; None: matrices of no machine
 
+    Returns the path. `malta check`, or the folder malta/checker wherever it lies, proves the claim again.
+
     Raises InputError for loops that certificates do not cover, CheckError when nothing is proven.
+
+    >>> import malta
+    >>> motor, F = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0}), [[0.5]]
+    >>> margin = malta.robust_margin(motor, F, {"k": 0.1})  # lost at k = 2
+    >>> path = malta.proof.write_certificate("build/motor.json", [(motor, F)], {"k": 0.1}, None, margin)
+    >>> path.name
+    'motor.json'
     """
     content = certificate_of(places, ranges, over, margin, origin)
     replace_files({Path(path): (json.dumps(content, separators=(",", ":")) + "\n").encode()})
@@ -294,15 +295,29 @@ def _prove(places: Places, box: Box, margin: float) -> tuple[float, list[dict[st
     raise last
 
 
-def loops_of(places: Places) -> tuple[checked_file.Loop, ...]:
+def loops_of(places: Places) -> tuple[Loop, ...]:
     """Loops as a certificate has them, without their groups. Raises InputError for those that it cannot have."""
     found = []
     for system, law in places:
         described = _description(loop_of(system, _law(system, law)))
         states = len(described["compensator"]["A"]) + described["shape"][0]
-        field = checked_file.Field(Path("certificate"), "", described | {"groups": [], "units": [0] * states})
-        found.append(checked_file.loop(field, len(system.names)))
+        found.append(_as_read(described | {"groups": [], "units": [0] * states}, len(system.names)))
     return tuple(found)
+
+
+def _as_read(described: dict[str, Any], inputs: int) -> Loop:
+    """A loop as the checker reads it. Raises InputError for what no certificate may have."""
+    with refused_as_input():
+        return checked_file.loop(checked_file.Field(Path("certificate"), "", described), inputs)
+
+
+@contextmanager
+def refused_as_input() -> Iterator[None]:
+    """Within the block what the checker cannot read is an InputError, as of every other reader."""
+    try:
+        yield
+    except checked_file.Unreadable as error:
+        raise InputError(error.where, error.field, error.found, error.expected) from error
 
 
 def _law(system: UncertainSystem, law: Any) -> Compensator:
@@ -341,8 +356,8 @@ def _loop(system: UncertainSystem, law: Any, box: Box, lower: float) -> dict[str
     described = _description(loop_of(system, _law(system, law)))
     count, before = len(box.names), ctx.prec
 
-    def read() -> checked_file.Loop:
-        return checked_file.loop(checked_file.Field(Path("certificate"), "", described), count)
+    def read() -> Loop:
+        return _as_read(described, count)
 
     try:
         described |= {

@@ -1,10 +1,10 @@
 """A margin certificate checked: in balls with outward rounding, from the certificate's matrices alone.
 
-Whose matrices and whose box these are, a gain file says, from which the rest of malta rebuilds them (gains/certified).
+Whose matrices and whose box these are, the certificate cannot know: a caller says it by `compare`.
 
-This file shares no code with the search that found the margin, and trusts no floating-point number. A stable loop
+This folder shares no code with the search that found the margin, and trusts no floating-point number. A stable loop
 becomes unstable over a connected box only where its characteristic polynomial a(s; p) has a zero s = jw, w = infinity
-among them. So for every loop and every group of states (`checked_loop`)
+among them. So for every loop and every group of states (`loop`)
 
 1. the nominal loop is stable, by Routh's scheme,
 2. the cells of the certificate tile all frequencies x box(lower), 1 / w for the high ones,
@@ -18,16 +18,15 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from flint import acb, arb, arb_mat, arb_poly, ctx, fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 
-from malta.errors import InputError
-from malta.proof.certificate.checked_file import Axis, Claim, Document, Part, double, inside, read
-from malta.proof.certificate.checked_loop import Polynomial, Refused, split
+from .file import Axis, Claim, Document, Part, double, inside, read
+from .loop import Polynomial, Refused, split
 
 BITS = 256  # of the coefficients; cells need fewer
 CELL_BITS = 160
@@ -45,7 +44,7 @@ class Verdict:
     groups : one line for each group of states
     failures : one sentence for each that does not hold
     stated : the claim with its box, in exact numbers; of the certificate's own making unless `compared`
-    compared : whether a gain file has this machine, law, stage, box and travel
+    compared : whether `compare` found this machine, law, stage, box and travel to be those that are wanted
     """
 
     ok: bool
@@ -57,33 +56,24 @@ class Verdict:
 
 
 def check(
-    path: str | Path,
-    gains: str | Path | None = None,
-    seconds: float = 600.0,
-    uncertain: Mapping[str, float | tuple[float, float]] | None = None,
+    path: str | Path, seconds: float = 600.0, compare: Callable[[Document], str] | None = None
 ) -> Verdict:
-    """Whether a certificate holds; with `gains`, whether what it claims is of that gain file and its box.
+    """Whether a certificate holds.
 
     path : of the certificate
-    gains : a gain file, from which loops, box and travel are rebuilt; None: those in the certificate are believed
     seconds : s, the longest check of the proof
-    uncertain : share or interval (SI) of each parameter that the claim counts in; None: those in the gain file, else
-        those of the machine's paper
+    compare : says in a sentence where the claim is not the one that its reader wants, "" where it is; None: loops and
+        box in the certificate are believed
 
-    Raises InputError for files that are no certificates or no gain files, and for `uncertain` without `gains`.
+    Raises Unreadable for files that are no certificates.
     """
     document = read(Path(path))
-    stated, refused = document.claim, _contradiction(document)
-    if gains is None and uncertain is not None:
-        raise InputError("check", "uncertain", "no gain file", "the gain file whose uncertainty it is")
-    if not refused and gains is not None:
-        # the one place where the checker asks the rest of malta
-        from malta.gains.certified import disagreement
-
-        refused = disagreement(document, gains, uncertain)
+    refused = _contradiction(document)
+    if not refused and compare is not None:
+        refused = compare(document)
     lines, failures = ([], [refused]) if refused else _proofs(document, time.monotonic() + seconds)
-    claim, compared = double(stated.lower), gains is not None and not refused
-    return Verdict(not failures, claim, tuple(lines), tuple(failures), stated, compared)
+    claim, compared = double(document.claim.lower), compare is not None and not refused
+    return Verdict(not failures, claim, tuple(lines), tuple(failures), document.claim, compared)
 
 
 def _contradiction(document: Document) -> str:

@@ -19,7 +19,7 @@ from typing import Any
 
 from flint import Ordering, acb, arb, arb_mat, arb_poly, fmpq_mpoly_ctx
 
-from malta.proof.certificate.checked_file import Group, Loop
+from .file import Group, Loop
 
 MOST_TERMS = 2000  # of an expression
 SIDES = {"A": (0, 0), "K": (0, 0), "F": (0, 1), "H": (1, 0), "L": (1, 1)}  # rows, columns: 0 of x, 1 of xi

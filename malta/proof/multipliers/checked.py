@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from flint import acb, acb_mat, arb, arb_mat, fmpq
 
+from malta.checker.check import tiled
 from malta.linear.expressions import exact
-from malta.proof.certificate.check import tiled
 from malta.proof.multipliers import SMALL, SMALLEST, Branch
 from malta.proof.polynomial.enclosure import precision
 

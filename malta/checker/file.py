@@ -15,8 +15,6 @@ from typing import Any
 
 from flint import fmpq
 
-from malta.errors import InputError
-
 FORMAT, VERSION = "malta margin certificate", 2
 LARGEST = 4_000_000  # bytes of a certificate
 STAGES = ("lag", "pi")  # of current loops: first-order lags, or the sampled PI controllers of the gain file
@@ -25,6 +23,15 @@ ARITY = {
     "assign": 1, "neg": 1, "sq": 1, "twice": 1, "inv": 1, "constpow": 1,
     "add": 2, "sub": 2, "mul": 2, "div": 2, "input": 0, "const": 0,
 }  # fmt: skip
+
+
+class Unreadable(ValueError):
+    """A file that is no certificate: where, which field, what was found there, what was expected."""
+
+    def __init__(self, where: str | Path, field: str, found: str, expected: str) -> None:
+        self.where, self.field, self.found, self.expected = str(where), field, found, expected
+        subject = ": ".join(filter(None, (self.where, field)))
+        super().__init__(f"{subject}: found {found}, expected {expected}")
 
 
 @dataclass(frozen=True)
@@ -161,14 +168,14 @@ class Field:
     name: str
     value: Any
 
-    def wrong(self, expected: str) -> InputError:
-        return InputError(self.file, self.name, repr(self.value)[:60], expected)
+    def wrong(self, expected: str) -> Unreadable:
+        return Unreadable(self.file, self.name, repr(self.value)[:60], expected)
 
     def __getitem__(self, key: str) -> Field:
         if not isinstance(self.value, dict):
             raise self.wrong(f"a table with {key}")
         if key not in self.value:
-            raise InputError(self.file, f"{self.name}.{key}".lstrip("."), "nothing", "a value")
+            raise Unreadable(self.file, f"{self.name}.{key}".lstrip("."), "nothing", "a value")
         return Field(self.file, f"{self.name}.{key}".lstrip("."), self.value[key])
 
     def items(self, least: int, most: int | None = None) -> list[Field]:
@@ -348,20 +355,20 @@ def digest(content: dict[str, object]) -> str:
 
 
 def content_of(path: Path) -> dict[str, Any]:
-    """The JSON of a certificate. Raises InputError for what is none, and for pipes and devices."""
+    """The JSON of a certificate. Raises Unreadable for what is none, and for pipes and devices."""
     try:
         if not (path.is_file() or path.is_dir()) and path.exists():
-            raise InputError(path, "", "a pipe or a device", "a certificate")
+            raise Unreadable(path, "", "a pipe or a device", "a certificate")
         size = path.stat().st_size
         if size > LARGEST:
-            raise InputError(path, "", f"{size} bytes", f"a certificate of at most {LARGEST}")
+            raise Unreadable(path, "", f"{size} bytes", f"a certificate of at most {LARGEST}")
         content = json.loads(path.read_bytes().decode())
-    except InputError:
+    except Unreadable:
         raise
     except OSError as error:
-        raise InputError(path, "", error.strerror or "an unreadable file", "a certificate") from error
+        raise Unreadable(path, "", error.strerror or "an unreadable file", "a certificate") from error
     except (ValueError, RecursionError) as error:
-        raise InputError(path, "", f"no JSON ({str(error)[:80]})", "a certificate") from error
+        raise Unreadable(path, "", f"no JSON ({str(error)[:80]})", "a certificate") from error
     f = Field(path, "", content)
     if f["format"].value != FORMAT or f["version"].value != VERSION:
         raise f["version"].wrong(f"{FORMAT}, version {VERSION}")
@@ -370,7 +377,7 @@ def content_of(path: Path) -> dict[str, Any]:
 
 
 def read(path: Path) -> Document:
-    """A certificate. Raises InputError for files that cannot be read, and fields that are missing or wrong."""
+    """A certificate. Raises Unreadable for files that cannot be read, and fields that are missing or wrong."""
     content = content_of(path)
     f = Field(path, "", content)
     several = f["loops"].items(1, 20)
