@@ -27,7 +27,7 @@ def from_control(
     """Read a control.StateSpace, a TransferFunction of any size or a System, with its names and all of its poles.
 
     where, field : the caller and its argument, for refusals
-    step : s, what a sample time of True stands for; None: that is refused
+    step : s, what a sample time of True or None stands for; None: True is refused, and None is continuous
     differences : of a sampled system in differences, with its sample time in `dt` all the same
     expected : for refusals
 
@@ -45,7 +45,7 @@ def from_control(
     dt = getattr(source, "dt", None)
     if dt is True and step is None:
         raise InputError(where, "dt", "True", "0, or a sample time in seconds")
-    T = None if not dt else step if dt is True else float(dt)
+    T = step if dt is True or dt is None else float(dt) or None
     if is_transfer(source):
         found = _of_transfer(source, where, field, T, expected)
         if T is not None and not differences:
@@ -55,7 +55,8 @@ def from_control(
         if differences and T is not None:
             found = replace(found, A=(found.A - np.eye(len(found.A))) / T, B=found.B / T)
     else:
-        kind = describe(source) if not hasattr(source, "ninputs") else f"a {type(source).__name__}"
+        plain = isinstance(source, float | int | str | None)
+        kind = describe(source) if plain else f"a {type(source).__name__}"
         raise InputError(where, field, kind, expected)
     names = {
         f: tuple(getattr(source, f"{f[:-1]}_labels", None) or ()) for f in ("states", "inputs", "outputs")

@@ -17,13 +17,13 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import linalg
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Curves, Description, display
-from malta.errors import CheckError, require_known
+from malta.errors import require_known
+from malta.linear.interconnection import series
 from malta.linear.peaks import Crossing
-from malta.linear.system import System, balanced_units
+from malta.linear.system import System
 from malta.loops.classical import ChannelMargins, channel_margins, crossings_at, loop_at_forces
 from malta.loops.linear_loops import LinearLoop, Place, linear_loop
 from malta.model.plant import Signal
@@ -42,7 +42,6 @@ LIGHT = 0.5  # damping below which a pole makes a resonance
 STILL = 1e-7  # of the fastest rate: poles that count as zero
 BELOW = 1e-9  # of the lowest frequency: as far as gain crossings are looked for
 FAR_BELOW = 10  # frequencies from there to the lowest
-HUGE = 1e9  # times the fastest rate: zeros that count as infinite
 
 
 class Responses(NamedTuple):
@@ -187,13 +186,13 @@ class LoopCurves:
         there are fewer of them, since L at the sensors has no full rank then."""
         loop, p = self.loop, len(self.loop.outputs)
         P, F = loop.plant, loop.law
-        u, n, k = len(F.C), len(P.A), len(F.A)
-        B, C, D = P.B[:, :u], P.C[:p], P.D[:p, :u]
-        if u < p:
-            A = np.block([[F.A, F.B @ C], [np.zeros((n, k)), P.A]])
-            return _zeros(loop, System(A, np.vstack([F.B @ D, B]), np.hstack([F.C, F.D @ C]), F.D @ D))
-        A = np.block([[P.A, B @ F.C], [np.zeros((k, n)), F.A]])
-        return _zeros(loop, System(A, np.vstack([B @ F.D, F.B]), np.hstack([C, D @ F.C]), D @ F.D))
+        u, T = len(F.C), loop.sample_time
+        P = System(P.A, P.B[:, :u], P.C[:p], P.D[:p, :u])
+        s = (series(P, F) if u < p else series(F, P)).zeros
+        if T is None:
+            return s
+        z = 1 + T * s
+        return np.asarray(np.log1p(T * s[(np.abs(z) > 1e-6) & (np.abs(z) < 1e3)]) / T)
 
     @property
     def description(self) -> Description:
@@ -353,27 +352,3 @@ def _margins(curves: LoopCurves, at: Place) -> tuple[ChannelMargins, ...]:
         unstable = loop.unstable_poles(factors, at), growing
         made.append(channel_margins(cut, channel, signal.name, unstable))
     return tuple(made)
-
-
-def _zeros(loop: LinearLoop, L: System) -> ComplexArray:
-    """Finite zeros of a square system: where [A - s, B; C, D] is singular."""
-    n, p = len(L.A), len(L.D)
-    t = balanced_units(L.A, L.B, L.C)
-    A, B, C = L.A * t / t[:, None], L.B / t[:, None], L.C * t
-    size = max(float(np.abs(A).max(initial=0.0)), 1e-300)
-    rows = np.maximum(np.abs(np.hstack([C, L.D])).max(axis=1, initial=0.0), 1e-300)[:, None]
-    columns = np.maximum(np.abs(np.vstack([B, L.D])).max(axis=0, initial=0.0), 1e-300)
-    M = np.block([[A / size, B / columns], [C / rows, L.D / rows / columns]])
-    N = np.zeros_like(M)
-    N[:n, :n] = np.eye(n)
-    try:
-        alpha, beta = linalg.eigvals(M, N, homogeneous_eigvals=True)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise CheckError(f"{loop.name}: the zeros cannot be computed ({error})") from error
-    finite = np.abs(beta) > np.abs(alpha) / HUGE
-    s = size * alpha[finite] / beta[finite]
-    if loop.sample_time is None:
-        return np.asarray(s[np.abs(s) < 1e4 * size * p])
-    z = 1 + loop.sample_time * s
-    s = s[(np.abs(z) > 1e-6) & (np.abs(z) < 1e3)]
-    return np.asarray(np.log1p(loop.sample_time * s) / loop.sample_time)

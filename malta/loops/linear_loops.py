@@ -24,6 +24,7 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.linear.conversion import from_control
+from malta.linear.interconnection import gain
 from malta.linear.matrices import system_matrix
 from malta.linear.sampling import eigenvalues
 from malta.linear.system import System, balanced_units
@@ -375,31 +376,43 @@ def _commanded_system(c: Controller, law: LinearLaw) -> tuple[System, tuple[Floa
 
 
 def _is_system(source: Any) -> bool:
-    """Whether this is a linear system of python-control."""
-    return all(hasattr(source, key) for key in ("ninputs", "noutputs", "dt", "input_labels", "poles"))
+    """Whether this is a linear system: a record, or of python-control."""
+    return isinstance(source, System) or all(
+        hasattr(source, key) for key in ("ninputs", "noutputs", "dt", "input_labels", "poles")
+    )
 
 
 def _of_systems(plant: Any, controller: Any, name: str) -> LinearLoop:
-    """A loop of control systems: P and C of the errors, or L alone."""
-    known = [one.dt for one in (plant, controller) if one is not None and one.dt is not None]
+    """A loop of systems, of python-control or records: P and C of the errors, or L alone."""
+    given = [one for one in (plant, controller) if one is not None]
+    known = [dt for dt in map(_time_of, given) if dt is not None]
     dt = known[0] if known else 0
     if any(other != dt for other in known):
         raise InputError(CALLER, "dt", " and ".join(map(str, known)), "the same of plant and controller")
     T = (1.0 if dt is True else float(dt)) or None
-    P = from_control(plant, CALLER, plant.name, step=1.0, differences=True)
+    names = [
+        getattr(one, "name", kind)
+        for one, kind in zip(given, ("P" if controller else "L", "C"), strict=False)
+    ]
+    P, *C = (
+        from_control(one, CALLER, own, step=T, differences=True)
+        for one, own in zip(given, names, strict=True)
+    )
     p, m = P.D.shape
-    if controller is None:
-        F = System(np.zeros((0, 0)), np.zeros((0, p)), np.zeros((p, 0)), -np.eye(p))
-    else:
-        C = from_control(controller, CALLER, controller.name, step=1.0, differences=True)
-        F = System(C.A, -C.B, C.C, -C.D)
+    F = System(C[0].A, -C[0].B, C[0].C, -C[0].D) if C else gain(-np.eye(p))
     if F.D.shape != (m, p):
-        who, (rows, columns) = ("L", P.D.shape) if controller is None else ("C", F.D.shape)
-        wanted = "as many of both" if controller is None else f"{p} inputs and {m} outputs"
+        who, (rows, columns) = ("C", F.D.shape) if C else ("L", P.D.shape)
+        wanted = f"{p} inputs and {m} outputs" if C else "as many of both"
         raise InputError(CALLER, who, f"{columns} inputs and {rows} outputs", wanted)
-    outputs = tuple(Signal(label, "1") for label in plant.output_labels)
-    inputs = tuple(Signal(label, "1") for label in plant.input_labels)
-    loads = inputs if controller is not None else ()
+    outputs, inputs = (
+        tuple(Signal(label, "1") for label in labels or [f"{letter}[{i}]" for i in range(size)])
+        for labels, letter, size in ((P.outputs, "y", p), (P.inputs, "u", m))
+    )
+    loads = inputs if C else ()
     driven = System(P.A, np.hstack([P.B, P.B[:, : len(loads)]]), P.C, np.hstack([P.D, P.D[:, : len(loads)]]))
-    own = name or (plant.name if controller is None else controller.name)
-    return LinearLoop(own, driven, F, (-F.B, -F.D), T, outputs, inputs, loads)
+    return LinearLoop(name or names[-1], driven, F, (-F.B, -F.D), T, outputs, inputs, loads)
+
+
+def _time_of(system: Any) -> Any:
+    """The sample time; 0 continuous, None of gains and of what fits any."""
+    return (system.dt or 0) if isinstance(system, System) and len(system.A) else system.dt

@@ -24,6 +24,7 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError, require_known
+from malta.linear.matrices import system_matrix
 from malta.linear.peaks import of_plane, part_of, peak_gain
 from malta.linear.sampling import sample
 from malta.linear.system import System
@@ -281,7 +282,7 @@ def _respond_for_a_while(
     growth = max(float(loop.closed_poles.real.max()), 1e-3 * float(np.abs(loop.closed_poles).max()))
     stride = max(1, round(math.log(GROWN) / growth / dt / SAMPLES))
     n, w = g.shape
-    one = np.block([[M, g], [np.zeros((w, n)), np.eye(w)]])
+    one = system_matrix(M, g, None, np.eye(w))
     step, out = np.linalg.matrix_power(one, stride), np.hstack([system.C, system.D])
     count = max(2, min(SAMPLES, math.ceil(math.log(GROWN) / growth / dt / stride)))
     state, found = np.vstack([np.zeros((n, w)), np.eye(w)]), []

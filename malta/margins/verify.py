@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from malta.errors import CheckError, InputError
+from malta.linear.matrices import system_matrix
 from malta.linear.peaks import peak_gain
 from malta.linear.sampling import eigenvalues
 from malta.linear.uncertain import Compensator
@@ -221,7 +222,7 @@ def compensators(
     stages["LQG"] = Compensator(A - B @ K - L @ C, L, -K, np.zeros((m, p))), False
     last = stages["LQG"][0]
     if summed:
-        observer = np.block([[A - B @ K_i - L @ C, B @ Ki], [np.zeros((k, n + k))]])
+        observer = system_matrix(A - B @ K_i - L @ C, B @ Ki)
         last = Compensator(observer, np.vstack([L, e]), np.hstack([-K_i, Ki]), np.zeros((m, p)), integrals=k)
         stages["LQGI"] = last, False
     if np.isfinite(plant.actuator.crossover):

@@ -56,15 +56,15 @@ def controller_of(
     (0.001, True)
     """
     wanted = 'a discrete control.StateSpace, as control.c2d(sys, Ts, "tustin") gives it'
+    if hasattr(sys, "dt") and (sys.dt is True or not sys.dt):
+        raise InputError(CALLER, "sys", f"dt = {sys.dt}", wanted)
     law = from_control(sys, CALLER, "sys", expected=wanted)
-    if law.dt is None:
-        raise InputError(CALLER, "sys", f"dt = {getattr(sys, 'dt', None)}", wanted)
     p, m = len(plant.outputs), len(plant.inputs)
     if law.D.shape != (m, p):
         found, shape = f"{law.D.shape[1]} inputs and {law.D.shape[0]} outputs", f"{p} errors and {m} forces"
         raise InputError(CALLER, "sys", found, f"{shape} of the {plant.name}")
     model = linearize(plant, plant.at() if point is None else point)
-    return law_of_errors(law, model, law.dt, name=name or getattr(sys, "name", ""))
+    return law_of_errors(law, model, sys.dt, name=name or getattr(sys, "name", ""))
 
 
 def law_of_errors(

@@ -27,6 +27,7 @@ from scipy import optimize, sparse
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.linear.matrices import system_matrix
 from malta.linear.peaks import peak_gain
 from malta.linear.sampling import sample, sample_noise
 from malta.loops.classical import last_crossover, tracked_band
@@ -190,7 +191,7 @@ def _forecast(model: LinearModel, controller: Controller, machine: SampledLoop) 
 def parts_of(whole: Part) -> list[Part]:
     """Split a machine into parts that nothing joins to each other."""
     n, m = len(whole.Ad), len(whole.Cd)
-    M = np.abs(np.block([[whole.Ad, whole.Bd], [whole.Cd, np.zeros((m, whole.Bd.shape[1]))]]))
+    M = np.abs(system_matrix(whole.Ad, whole.Bd, whole.Cd))
     least = JOINS * np.sqrt(np.outer(M.max(axis=1), M.max(axis=0)))
     counts = least < M
     touch = np.zeros((n + m, n + m), dtype=bool)

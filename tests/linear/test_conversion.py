@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import Any
 
@@ -12,6 +13,7 @@ from hypothesis import given, settings, strategies as st
 
 import malta
 from malta.linear.conversion import from_control
+from malta.linear.system import System
 
 
 def read(source: Any, **options: Any) -> Any:
@@ -139,6 +141,10 @@ def test_sample_times() -> None:
         read(law)
     assert read(law, step=1.0).dt == 1.0
     assert read(control.ss([[0.5]], [[1]], [[1]], 0, None)).dt is None
+    unknown = control.ss([[0.5]], [[1]], [[1]], 0, None)
+    assert read(unknown, step=0.1, differences=True).poles.tolist() == [-5.0]
+    sampled = malta.loops.loop_curves(unknown, control.ss([], [], [], [[0.2]], 0.1)).loop
+    assert sampled.closed_poles.real.item() == pytest.approx(math.log(0.3) / 0.1)
     slow = read(control.tf([1], [1, -1 + 1e-14], 1e-3), differences=True)
     assert slow.poles.real.item() == pytest.approx((-1 + (1 - 1e-14)) / 1e-3, rel=1e-12)
 
@@ -182,3 +188,14 @@ def test_there_and_back() -> None:
     assert (back.dt, back.name) == (0.1, "one")
     z = np.exp(1j * np.array([0.1, 1.0]))
     np.testing.assert_allclose(back(z), given(z), rtol=1e-13)
+
+
+def test_a_loop_of_records_is_that_of_python_control() -> None:
+    P, C = control.tf([1], [1, 0, -1]), control.tf([40, 30], [1, 20])
+    found = malta.loops.loop_curves(read(P), read(C)).loop
+    expected = malta.loops.loop_curves(P, C).loop
+    np.testing.assert_allclose(found.closed_poles, expected.closed_poles, rtol=1e-12)
+    assert [s.name for s in found.outputs] == [s.name for s in expected.outputs]
+    bare = System(*read(P).matrices)
+    assert [s.name for s in malta.loops.loop_curves(bare, read(C)).loop.outputs] == ["y[0]"]
+    assert (malta.robust_margin(PLANT, read(-C), {"k": 0.5}).lower or 0) > 0
