@@ -2,13 +2,19 @@
 
 A row is a package, a column one that it imports; the number counts the modules that do. What lies above the diagonal
 would import upwards.
+
+Beside the picture it prints what must be read to use a function: the lines and files of its module and of all that
+these import, transitively, inside of functions too, but not for types alone. Strings and entry points are not seen.
 """
 
 from __future__ import annotations
 
 import ast
+import importlib
 import sys
 from collections import Counter
+from collections.abc import Iterable, Mapping
+from operator import attrgetter
 from pathlib import Path
 
 import matplotlib as mpl
@@ -36,6 +42,12 @@ ORDER = (
     *("campaigns", "tuning", "structured", "identification", "report", "app", "machines", "cli"),
 )
 
+USES = {
+    "gains.read": ("gains.read",),
+    **{name: (name,) for name in ("simulate", "robust_margin", "export_c", "verify")},
+    "kernel": ("linearize", "trim", "lqg", "synthesize", "loop", "simulate", "read_design", "gains.read"),
+}
+
 
 def room_of(module: str) -> str:
     """The package of a module, as malta.proof.box; the ground floor of malta.units."""
@@ -57,6 +69,64 @@ def survey() -> tuple[Counter[str], Counter[str], Counter[tuple[str, str]]]:
             continue
         imports.update((own, other) for other in found - {own})
     return files, lines, imports
+
+
+def modules() -> dict[str, ast.Module]:
+    """The trees of malta's modules by name."""
+    found = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        name = ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__")
+        found[name] = ast.parse(path.read_text(encoding="utf-8"))
+    return found
+
+
+def imported(tree: ast.AST) -> set[str]:
+    """The names of modules, and of what may be modules, that the code of a tree imports when it runs."""
+    if isinstance(tree, ast.If) and "TYPE_CHECKING" in ast.unparse(tree.test):
+        return set().union(*map(imported, tree.orelse))
+    if isinstance(tree, ast.ImportFrom) and tree.module:
+        return {tree.module, *(f"{tree.module}.{entry.name}" for entry in tree.names)}
+    if isinstance(tree, ast.Import):
+        return {entry.name for entry in tree.names}
+    return set().union(*map(imported, ast.iter_child_nodes(tree)))
+
+
+def reached(names: Iterable[str], imports: Mapping[str, set[str]]) -> set[str]:
+    """These modules and all that they import, transitively, without the page of contents."""
+    found, left = set[str](), [name for name in names if name in imports]
+    while left:
+        name = left.pop()
+        if name not in found and name != "malta":
+            found.add(name)
+            left += imports[name]
+    return found
+
+
+def measures() -> dict[str, str]:
+    """Lines and files that functions need, and how much is said more than once, as the picture's text."""
+    trees = modules()
+    imports = {name: imported(tree) & trees.keys() for name, tree in trees.items()}
+    paths = {name: ROOT.parent.joinpath(*name.split(".")) for name in trees}
+    files = {
+        name: path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        for name, path in paths.items()
+    }
+    lines = {name: file.read_text(encoding="utf-8").count("\n") for name, file in files.items()}
+    found = {}
+    for use, names in USES.items():
+        needed = reached(
+            (attrgetter(name)(importlib.import_module("malta")).__module__ for name in names), imports
+        )
+        found[use] = f"{sum(lines[name] for name in needed)} lines, {len(needed)} files"
+    classes = [node for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    fields = [
+        {ast.unparse(entry.target) for entry in one.body if isinstance(entry, ast.AnnAssign)}
+        for one in classes
+    ]
+    found["records with A and B"] = str(sum({"A", "B"} <= own for own in fields))
+    found["names of several classes"] = str(sum(n > 1 for n in Counter(one.name for one in classes).values()))
+    found["malta"] = f"{sum(lines.values())} lines, {len(lines)} files"
+    return found
 
 
 def size(lines: int) -> str:
@@ -92,4 +162,6 @@ if __name__ == "__main__":
     mpl.rcParams.update({"svg.hashsalt": "malta", "svg.fonttype": "none"})
     target = Path(sys.argv[1]) if sys.argv[1:] else FILE
     house().savefig(target, metadata={"Date": None}, facecolor="white")
+    for what, much in measures().items():
+        print(f"{what:26}{much}")
     print(target)

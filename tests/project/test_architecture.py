@@ -12,7 +12,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 from conftest import ROOT
-from house import ORDER as PACKAGES
+from house import ORDER as PACKAGES, imported, reached
 
 import malta
 
@@ -233,3 +233,28 @@ def test_rooms_keep_to_what_they_know() -> None:
         if {*module.split(".")[:2]} & {*NEVER.get(package_of(module_of(path)) or "", ())}
     }
     assert broken == set()
+
+
+def test_what_a_function_needs_is_counted_by_what_runs() -> None:
+    """Imports inside functions count, those for types alone do not; a circle of imports ends."""
+    text = """
+from __future__ import annotations
+from typing import TYPE_CHECKING
+if TYPE_CHECKING:
+    from malta.b import B
+else:
+    from malta.c import C
+def f():
+    from malta import d
+    import malta.e
+"""
+    found = imported(ast.parse(text))
+    assert {"malta.c", "malta.d", "malta.e"} <= found
+    assert "malta.b" not in found
+    imports = {
+        "malta": {"malta.z"},
+        "malta.c": {"malta.d"},
+        "malta.d": {"malta.c", "malta"},
+        "malta.z": set[str](),
+    }
+    assert reached(["malta.c", "malta.x"], imports) == {"malta.c", "malta.d"}
