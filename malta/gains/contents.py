@@ -18,10 +18,10 @@ from malta.model.linear import LinearSystem, linear_machine
 from malta.model.machines import machine
 from malta.model.parameters import later_parameters, units_of
 from malta.model.plant import Parameters, Plant, Signal, outputs_at
+from malta.model.signals import Coordinates
 from malta.synthesis.controller import (
     Commutation,
     Controller,
-    Coordinates,
     Cost,
     CurrentLoop,
     Feedforward,

@@ -11,7 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, StrictInt, StrictStr
 
-from malta.synthesis.controller import Coordinates, Tracks
+from malta.model.signals import Coordinates
+from malta.synthesis.controller import Tracks
 from malta.tables import Finite, Positive, Quantity, Record, entry
 
 Vector = list[Finite]

@@ -58,13 +58,13 @@ from malta.display import display
 from malta.errors import InputError
 from malta.model.equations import note
 from malta.model.plant import Parameters, Plant, Signal, outputs_at
+from malta.model.signals import Coordinates
 from malta.synthesis.schedule import SCHEDULED, Schedule, interpolate
 
 if TYPE_CHECKING:
     from malta.synthesis.filters import Gains
 
 
-Coordinates = Literal["signals", "positions"]
 Tracks = Literal["states", "errors"]
 # How a sum takes what is added to it: plainly here, with what rounding loses in firmware of single precision.
 Add = Callable[[Any, Any], Any]

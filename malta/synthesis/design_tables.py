@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, create_model
 
 from malta.errors import InputError
-from malta.synthesis.controller import Coordinates
+from malta.model.signals import Coordinates
 from malta.synthesis.recovery import RecoveryTable
 from malta.synthesis.requirements import Requirement
 from malta.synthesis.spec import Discretization, PidAxes, Place

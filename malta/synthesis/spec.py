@@ -23,7 +23,7 @@ from malta.errors import InputError, require_known
 from malta.model.data import plant_of
 from malta.model.parameters import box_words, fingerprint, replace_fields
 from malta.model.plant import Parameters, Plant, Signal
-from malta.synthesis.controller import Coordinates
+from malta.model.signals import Coordinates
 from malta.units import to_si
 
 if TYPE_CHECKING:
