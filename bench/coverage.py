@@ -110,7 +110,7 @@ def flown(bench: Bench, true: dict[str, float], seed: int, run: int) -> malta.id
     alike = {name: true[twin] for name, twin in ALIKE[bench.name].items()}
     plant = malta.plant_of(replace(par, **true, **alike))
     scenario = malta.Scenario.excited(bench.plan.signal, bench.plan.duration, seed=seed, run=run)
-    if plant.windings is None:
+    if plant.actuator.windings is None:
         scenario = scenario.replace(fidelity="force")
     return malta.identification.log_of(malta.simulate(plant, bench.controller, scenario))
 

@@ -109,7 +109,7 @@ def identification(runs: int) -> list[Result]:
         found["squares"] = squares(controller, log)[0]
 
     def by_subspace() -> None:
-        found["subspace"] = subspace(log, malta.plant_of(controller.parameters).mass)
+        found["subspace"] = subspace(log, malta.plant_of(controller.parameters).stroke.mass)
 
     minute, own, other, third = medians(
         lambda: ours(long, "minute"),

@@ -76,7 +76,7 @@ def given(plant: Plant, c: Controller, s: Scenario) -> tuple[list[Any], Vector, 
     uniform = math.sqrt(3) * erf(normals(keys(s.seed, np.atleast_1d(s.run))[0], count, 1) / math.sqrt(2))
     periods = _periods(count, c)
     noise = normals(keys(s.seed, -1 - np.atleast_1d(s.run))[0], periods, 2)
-    return np.hstack(motion).tolist(), (uniform[:, 0] * plant.noise[0]).tolist(), noise.tolist()
+    return np.hstack(motion).tolist(), (uniform[:, 0] * plant.sensors.noise[0]).tolist(), noise.tolist()
 
 
 def _periods(readings: int, c: Controller) -> int:

@@ -38,7 +38,7 @@ class Workload(NamedTuple):
 
     @property
     def sigma(self) -> FloatArray:
-        return self.noise * np.array(plant(self.par).noise)
+        return self.noise * np.array(plant(self.par).sensors.noise)
 
     @property
     def varied(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

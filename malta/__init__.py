@@ -59,7 +59,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
 # Names that go with the next minor version, and what to write for them.
 _NOW_OF = {
     "app": "app_widget",
-    "model": "Actuator InverseCheck LateSensors LinearModel OperatingPoint Plant Signal check_parameters in_unit"
+    "model": "Actuator InverseCheck LinearModel OperatingPoint Plant Signal check_parameters in_unit"
     " published si",
     "synthesis": "Controller Weights calibrate controller_of kalman lqi lqr weights",
     "proof": "Compensator Dynamic Gain Margin UncertainSystem margin_of_polynomial",
@@ -74,6 +74,7 @@ _NOW_OF = {
 }
 _OLD = {
     **{name: f"malta.{package}.{name}" for package, names in _NOW_OF.items() for name in names.split()},
+    "LateSensors": "malta.model.Sensors",
     "Margins": "malta.margins.LoopReport",
     "Robustness": "malta.margins.LoopReport",
 }

@@ -28,7 +28,7 @@ def contents(
         if name in gone:
             told = f"{package}.{name} goes: write {gone[name]}"
             warnings.warn(told, DeprecationWarning, stacklevel=3)  # of who calls the package's `__getattr__`
-            return attrgetter(gone[name].partition(".")[2])(import_module(package))
+            return attrgetter(gone[name].removeprefix(f"{package}."))(import_module(package))
         if name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         place = places[name]  # `fromlist`: a module as well, as `from place import name` finds it

@@ -58,7 +58,7 @@ for spec in specs.values():
     ratio = stiffness[[0, 3]] / model.stiffness.diagonal()[[0, 3]]
     w_n[spec.name] = float(np.sqrt((stiffness - model.stiffness.diagonal()).max()))
     q, r = spec.weights.Q[0, 0], spec.weights.R[0, 0]
-    pull = plant.mass * model.stiffness[0, 0]  # 2 K_A
+    pull = plant.stroke.mass * model.stiffness[0, 0]  # 2 K_A
     print(
         f"{spec.name}: q / (r / 2) = {2 * q / r:.3g} against (2 K_A)^2 = {pull**2:.3g} N2/m2, "
         f"K1/k = {ratio[0]:.4f} (x, y), {ratio[1]:.4f} (alpha, beta)"
@@ -127,7 +127,7 @@ for name, controller in controllers.items():
         f"{name}: peak |S| {peaks[0]:.1f} of the sampled loop, {peaks[1]:.1f} in z on the machine; "
         f"1 N along z moves it by {moved[name] * 1e3:.2f} mm, cogging has {slope:.0f} N/m"
     )
-assert moved["table2"] > plant.travel > 10 * moved["calibrated"]
+assert moved["table2"] > plant.stroke.travel > 10 * moved["calibrated"]
 assert all(m.stable for m in margins.values())
 assert abs(margins["table2"].stages[0].peak_sensitivity["sigma_max"] - 7) < 0.1
 assert margins["table2"].peak_sensitivity["z"] > 20

@@ -107,7 +107,7 @@ assert truncations[16] == 0
 # judged and proven again.
 
 # %%
-level = np.sqrt(np.square(plant.noise) + np.square(plant.resolution) / 12)
+level = np.sqrt(np.square(plant.sensors.noise) + np.square(plant.sensors.resolution) / 12)
 sensors = {f"reference {s.name}": one for s, one in zip(plant.outputs, level, strict=True)}
 goals = [
     structured.sensitivity(2.0),

@@ -46,7 +46,7 @@ def derivative_at_rest(plant: Plant, c: Controller, position: FloatArray, least:
     """
     rest = malta.Scenario("rest", 0.1, malta.references.hold, fidelity=default_of(plant))
     s = setup_of(plant, c, rest)
-    count = max(least, 16 * steps_of(plant, c, rest) if plant.electronics else 0)
+    count = max(least, 16 * steps_of(plant, c, rest) if plant.actuator.electronics else 0)
     p = period_of(plant, c, s, numbers_of(plant, c, count), constant=True)
     period, sizes = chain(p, c, count, 1), layout_of(plant, c, s)
     S, U = ca.MX.sym("S", period.size1_in(0)), ca.MX.sym("U", period.size1_in(1))
@@ -90,7 +90,7 @@ def derivative_at_rest(plant: Plant, c: Controller, position: FloatArray, least:
 def _start(plant: Plant, c: Controller, s: Any, position: FloatArray) -> FloatArray:
     """The state of machine and controller near rest."""
     hold = malta.trim(plant, **{x.name: v for x, v in zip(plant.states, position.tolist(), strict=True)}).u
-    current = malta.plant_of(c.parameters).currents(plant.h(ca.DM(position), 0), ca.DM(hold))
+    current = malta.plant_of(c.parameters).actuator.currents(plant.h(ca.DM(position), 0), ca.DM(hold))
     known = np.zeros(len(c.states))
     if c.tracks == "states":
         known[: len(c.A)] = position[list(plant.controlled)]

@@ -9,7 +9,6 @@ import casadi as ca
 import numpy as np
 
 import malta
-from malta.model.signals import late_sensors
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -62,12 +61,16 @@ def bench(par: Any) -> Plant:
         h=lambda x, _: x[0],
         load=lambda _: -9.81 * par.m,
         preload=lambda _: ca.DM([par.preload]),
-        currents=currents,
-        forces=lambda x, i: par.C * (par.bias + i) ** 2 / (par.g0 - x[0]) ** 2,
-        sensors=late_sensors((par.lag,), 0.0),
         actuator=malta.model.Actuator(
-            (malta.model.Signal("i", "A"),), (), par.I_max, force_limit=(40.0,), dead_time=par.dead_time
+            (malta.model.Signal("i", "A"),),
+            (),
+            par.I_max,
+            force_limit=(40.0,),
+            dead_time=par.dead_time,
+            currents=currents,
+            forces=lambda x, i: par.C * (par.bias + i) ** 2 / (par.g0 - x[0]) ** 2,
         ),
+        sensors=malta.model.Sensors(lag=(par.lag,)),
     )
 
 
@@ -97,16 +100,16 @@ def two_coils(par: Any) -> Plant:
         h=lambda x, _: x[:2],
         load=lambda _: -9.81 * par.m,
         preload=lambda _: ca.DM([par.preload, 0.1]),
-        currents=lambda y, v: ca.DM(right) @ v / (par.C * 1e5) * (1 + 10 * y[0]),
-        forces=forces,
         actuator=malta.model.Actuator(
             tuple(malta.model.Signal(f"i{k}", "A") for k in range(3)),
             (),
             current_limit=60.0,
             force_limit=(40.0, 20.0),
             dead_time=par.dead_time,
+            currents=lambda y, v: ca.DM(right) @ v / (par.C * 1e5) * (1 + 10 * y[0]),
+            forces=forces,
         ),
-        sensors=late_sensors((par.lag, 0.5 * par.lag), 0.0),
+        sensors=malta.model.Sensors(lag=(par.lag, 0.5 * par.lag)),
     )
 
 

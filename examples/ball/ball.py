@@ -11,7 +11,7 @@ from typing import Any
 
 import casadi as ca
 
-from malta.model import Actuator, Plant, Signal, check_parameters, si
+from malta.model import Actuator, Contacts, Plant, Sensors, Signal, check_parameters, si
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,14 @@ def plant(par: Parameters) -> Plant:
         f=lambda x, u, w: ca.vertcat(x[1], (u + w) / par.m),
         h=lambda x, _: x[0],
         load=lambda _: -par.m * par.g,
-        forces=lambda x, i: magnets(par, x[0], i),
-        actuator=Actuator((Signal("i", "A"),), (k_i,), current_limit=par.I_max, dead_time=par.T_d),
-        contacts=("stop",),
-        contact=lambda x: ca.fabs(x[0]) / par.q_max,
-        noise=(par.s_y,),
+        actuator=Actuator(
+            (Signal("i", "A"),), (k_i,), par.I_max, dead_time=par.T_d, forces=lambda x, i: pull(par, x[0], i)
+        ),
+        contacts=Contacts(("stop",), lambda x: ca.fabs(x[0]) / par.q_max),
+        sensors=Sensors(noise=(par.s_y,)),
     )
 
 
-def magnets(par: Parameters, q: Any, i: Any) -> Any:
-    """The force of both magnets, N, upwards."""
+def pull(par: Parameters, q: Any, i: Any) -> Any:
+    """The pull of both magnets, N, upwards."""
     return par.C * (((par.I_0 + i) / (par.s - q)) ** 2 - ((par.I_0 - i) / (par.s + q)) ** 2)

@@ -34,7 +34,7 @@ import numpy as np
 from scipy import linalg
 
 from malta import InputError
-from malta.model import Actuator, Plant, Signal, check_parameters, si
+from malta.model import Actuator, Contacts, Plant, Sensors, Signal, check_parameters, si
 
 FILE = Path(__file__).resolve().parent / "matrices.csv"
 NODE = 0.1  # m, between two nodes of matrices.csv
@@ -137,16 +137,17 @@ def plant(par: Parameters, bending: int = BENDING) -> Plant:
         f=lambda x, u, w: motion(par, m, x, lever.T @ u + discs.T @ w),
         h=lambda x, _: reading @ x[:n],
         position_of=lambda y: upright @ y,
-        forces=lambda x, i: magnets(par, lever @ x[:n], i),
         actuator=Actuator(
             coils=tuple(Signal(f"i_{axis}", "A") for axis in AXES),
             force_constant=(par.k_i,) * 4,
             current_limit=par.I_max,
             dead_time=par.T_d,
+            forces=lambda x, i: magnets(par, lever @ x[:n], i),
         ),
-        contacts=("retainer bearing A", "retainer bearing B"),
-        contact=lambda x: used(par, lever @ x[:n]),
-        noise=(par.s_n,) * 4,
+        contacts=Contacts(
+            names=("retainer bearing A", "retainer bearing B"), contact=lambda x: used(par, lever @ x[:n])
+        ),
+        sensors=Sensors(noise=(par.s_n,) * 4),
         over={"Omega": (0.0, par.Omega_max)},
         variant=lambda other: plant(other, bending),
     )

@@ -13,7 +13,7 @@ from typing import Any
 
 import casadi as ca
 
-from malta.model import Actuator, Plant, Signal, check_parameters, si
+from malta.model import Actuator, Contacts, Plant, Sensors, Signal, check_parameters, si
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,6 @@ def plant(par: Any) -> Plant:
         position_of=lambda y: ca.vertcat(y[0], 0, -slope * y[0]),  # all states at rest at y
         preload=lambda x: par.R * (held + x[2]),
         actuator=Actuator((Signal("u", "V"),), (1.0,), current_limit=par.U_max, dead_time=par.T_d),
-        contacts=("stop",),
-        contact=lambda x: ca.fabs(x[0]) / par.q_max,
-        noise=(par.s_y, par.s_i)[: len(outputs)],
+        contacts=Contacts(("stop",), lambda x: ca.fabs(x[0]) / par.q_max),
+        sensors=Sensors(noise=(par.s_y, par.s_i)[: len(outputs)]),
     )

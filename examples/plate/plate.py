@@ -13,7 +13,17 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from malta.model import Actuator, Allocation, Plant, Signal, allocation, check_parameters, si
+from malta.model import (
+    Actuator,
+    Allocation,
+    Contacts,
+    Plant,
+    Sensors,
+    Signal,
+    allocation,
+    check_parameters,
+    si,
+)
 
 CORNERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))  # of the coils, in a and b
 SENSORS = ((1, 0), (-1, 0), (0, 1))  # of the sensors, in a and b
@@ -73,8 +83,6 @@ def plant(par: Any) -> Plant:
         f=lambda x, u, w: ca.vertcat(x[3:6], (u + w + tilts * x[:3]) / ca.vertcat(par.m, par.J_x, par.J_y)),
         h=lambda x, _: heights @ x[:3],
         position_of=lambda y: ca.solve(heights, y),
-        currents=lambda _, v: made.currents(v / lever) / par.k_f,
-        forces=lambda _, i: T @ i,
         actuator=Actuator(
             tuple(Signal(f"i{k}", "A") for k in (1, 2, 3, 4)),
             (),
@@ -83,8 +91,9 @@ def plant(par: Any) -> Plant:
                 par.I_max * par.k_f * r * d for r, d in zip(reach, (1, par.b, par.a), strict=True)
             ),
             dead_time=par.T_d,
+            currents=lambda _, v: made.currents(v / lever) / par.k_f,
+            forces=lambda _, i: T @ i,
         ),
-        contacts=("corner",),
-        contact=lambda x: ca.mmax(ca.fabs(corners(x))) / par.gap,
-        noise=(par.s_y,) * 3,
+        contacts=Contacts(("corner",), lambda x: ca.mmax(ca.fabs(corners(x))) / par.gap),
+        sensors=Sensors(noise=(par.s_y,) * 3),
     )

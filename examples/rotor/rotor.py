@@ -33,7 +33,7 @@ from typing import Any
 import casadi as ca
 
 from malta import InputError
-from malta.model import Actuator, Plant, Signal, check_parameters, si
+from malta.model import Actuator, Contacts, Plant, Sensors, Signal, check_parameters, si
 
 MU_0 = 4e-7 * math.pi  # V s/(A m)
 
@@ -101,15 +101,20 @@ def plant(par: Parameters) -> Plant:
         h=lambda x, _: reading @ x[:4],
         position_of=lambda y: ca.solve(reading, y),
         load=lambda _: gravity(par),
-        forces=lambda x, i: magnets(par, lever @ x[:4], i),
         actuator=Actuator(
-            coils=CURRENTS, force_constant=(par.k_i,) * 4, current_limit=par.I_max, dead_time=par.T_d
+            coils=CURRENTS,
+            force_constant=(par.k_i,) * 4,
+            current_limit=par.I_max,
+            dead_time=par.T_d,
+            forces=lambda x, i: magnets(par, lever @ x[:4], i),
         ),
-        contacts=("retainer bearing A", "retainer bearing B"),
-        contact=lambda x: used(par, x),
-        cushioned=(True, True),
-        bearing=lambda x: retainers(par, x),
-        noise=(par.s_n,) * 4,
+        contacts=Contacts(
+            names=("retainer bearing A", "retainer bearing B"),
+            contact=lambda x: used(par, x),
+            cushioned=(True, True),
+            bearing=lambda x: retainers(par, x),
+        ),
+        sensors=Sensors(noise=(par.s_n,) * 4),
         over={"Omega": (0.0, par.Omega_max)},
         variant=plant,
     )

@@ -64,7 +64,7 @@ def identify_unbalance(plant: Plant, log: Log) -> Unbalance:
         raise InputError("unbalance", "Omega", f"{par.Omega:g} rad/s", "a rotor that turns")
     place = trim(plant)
     x, i, w = (ca.SX.sym("signal", size) for size in (8, 4, 4))
-    moved = plant.f(x, plant.forces(x, i), w + plant.load(x))
+    moved = plant.f(x, plant.actuator.forces(x, i), w + plant.load(x))
     slopes = ca.Function("slopes", [x, i, w], [ca.jacobian(moved, v) for v in (x, i, w)])
     A, B, W = (np.array(m) for m in slopes(place.x, place.v / par.k_i, np.zeros(4)))
     half = par.Omega * log.sample_time / 2

@@ -210,8 +210,8 @@ def _place_fields(files: Files) -> Iterator[Field]:
     plant, content = files.spec.plant, files.content
     for name, q in content["operating_point"].items():
         reach = 2 * abs(q["value"]) or 1.0
-        if name == plant.stroke:
-            reach = plant.travel / to_si(1.0, q["unit"], "m", "", name)
+        if name == plant.stroke.name:
+            reach = plant.stroke.travel / to_si(1.0, q["unit"], "m", "", name)
         yield Field(
             f"operating_point.{name}", "Operating point", name, q["value"], q["unit"], "linear", -reach, reach
         )

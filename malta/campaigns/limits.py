@@ -126,7 +126,7 @@ def middle_run(plan: Plan) -> Batch:
 def _touchdown(plan: Plan, _: Bounds) -> Callable[[Batch], FloatArray]:
     """Each contact's share of the clearance, 0 at that of the machine in the middle, so that contacts compare."""
     middle = middle_run(plan)
-    if not plan.plant.contacts:
+    if not plan.plant.contacts.names:
         raise InputError(
             "campaign", "limit touchdown", f"a {plan.plant.name} without contacts", "a merit's bound"
         )

@@ -270,7 +270,7 @@ class Plan:
         machine = self.controller.parameters if self.parameters is None else self.parameters
         units = units_of(machine)
         order = [name for name in units if name in self.spread]
-        errors = [signal.name for signal in plant_of(machine).sensor_errors]
+        errors = [signal.name for signal in plant_of(machine).sensors.errors]
         for name, value in {
             "parameters": machine,
             "options": {"noise": 1.0} | dict(self.options),

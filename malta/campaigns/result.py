@@ -227,7 +227,7 @@ def every_figure(found: Campaign, published: Mapping[str, Any] | None = None) ->
     ]
     listed += [
         finding(name.removeprefix("touchdown at "), CLEARANCE, "percent", batch.contact[:, k])
-        for k, name in enumerate(plant.contacts)
+        for k, name in enumerate(plant.contacts.names)
     ]
     return [*listed, finding("", "limited commands", "percent", batch.saturated.max(axis=1, initial=0.0))]
 
@@ -249,7 +249,7 @@ def runs_within_bounds(
 
 def unit_of(plan: Plan, name: str) -> str:
     """The unit in which a varied value is displayed."""
-    errors = {signal.name: signal.unit for signal in plan.plant.sensor_errors} | differences(plan.parameters)
+    errors = {signal.name: signal.unit for signal in plan.plant.sensors.errors} | differences(plan.parameters)
     shown = {"1": "percent", "m": "um", "rad": "deg"}
     return shown.get(errors[name], errors[name]) if name in errors else units_of(plan.parameters)[name]
 

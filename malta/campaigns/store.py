@@ -354,6 +354,6 @@ def figure_shapes(plan: Plan) -> dict[str, tuple[int, ...]]:
         "last": (p,),
         "force": (m,),
         "saturated": (m,),
-        "contact": (len(plant.contacts),),
+        "contact": (len(plant.contacts.names),),
     }
     return {name: rows.get(name, ()) for name in Batch.__dataclass_fields__}

@@ -221,7 +221,9 @@ def run_study(study: Study, setting: Setting) -> None:
     if outcome.note:
         print_note(outcome.note)
     plan = setting.plan
-    if not (plan.plant.tabulated or is_compiled(plan.plant, plan.controller, planned_run(plan).scenario)):
+    if not (
+        plan.plant.actuator.tabulated or is_compiled(plan.plant, plan.controller, planned_run(plan).scenario)
+    ):
         print_note(NO_COMPILER)
 
 
@@ -499,7 +501,7 @@ def _report(gains: Path, found: Summary, worst: int, *, as_json: bool) -> None:
         print_tables(gains, found, worst)
         print_written(make_console(), files)
     plan = found.plan
-    if "virtual machine" in found.engines and not plant_of(plan.controller.parameters).tabulated:
+    if "virtual machine" in found.engines and not plant_of(plan.controller.parameters).actuator.tabulated:
         print_note(NO_COMPILER)
     if found.interrupted:
         print_note(

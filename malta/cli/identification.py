@@ -283,7 +283,7 @@ def _fly(plan: ExcitationPlan, plant: Plant, controller: Controller, path: Path,
     from malta.simulation.simulate import simulate
 
     scenario = Scenario.excited(plan.signal, plan.duration, seed=seed or 0)
-    if plant.windings is None:
+    if plant.actuator.windings is None:
         scenario = scenario.replace(fidelity="force")
     with progress_bar("excited", insists=False) as progress:
         run = simulate(plant, controller, scenario, progress=progress)
@@ -487,7 +487,7 @@ def _learn_v0(gains: Path, controller: Controller, log: Path, out: Path | None, 
     low, high = 1e3 * found.z[0], 1e3 * found.z[-1]
     print_text(
         console,
-        f"{log}: v0({plant.stroke}) of {plant.thrust} from {low:.3g} to {high:.3g} mm changes by "
+        f"{log}: v0({plant.stroke.name}) of {plant.stroke.thrust} from {low:.3g} to {high:.3g} mm changes by "
         f"{found.change.min():.3g} to {found.change.max():.3g} N, each +- {1.96 * found.deviation.max():.2g} N",
     )
     print_written(console, files)

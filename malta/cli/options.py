@@ -111,7 +111,7 @@ def read_entries(option: str, texts: list[str]) -> dict[str, Any]:
 
 def read_sensor_errors(texts: list[str] | None, plant: Plant) -> dict[str, float]:
     """Read `--sensor NAME=VALUE`, errors of a machine's sensors, in SI; raises as `read_assignments` does."""
-    return read_assignments("--sensor", texts, {error.name: error.unit for error in plant.sensor_errors})
+    return read_assignments("--sensor", texts, {error.name: error.unit for error in plant.sensors.errors})
 
 
 def read_shares(

@@ -327,7 +327,9 @@ def _conclude(gains: Path, simulation: Simulation, engine: str) -> None:
     from malta.model.data import plant_of
 
     result = simulation.experiment
-    runs = [case.run for case in result.cases if not plant_of(case.run.controller.parameters).tabulated]
+    runs = [
+        case.run for case in result.cases if not plant_of(case.run.controller.parameters).actuator.tabulated
+    ]
     if engine == "auto" and any(run.engine == "virtual machine" for run in runs):
         print_note("no C compiler: simulated on CasADi's virtual machine, some ten times slower")
     if result.interrupted:

@@ -230,7 +230,7 @@ def folder_files(
 
 def _example_context(t: Target) -> dict[str, Any]:
     """How long the example runs, and its stroke."""
-    if not (t.believed.has_stroke and t.believed.travel > 0):
+    if not (t.believed.has_stroke and t.believed.stroke.travel > 0):
         return {"example_samples": EXAMPLE_SAMPLES}
     end, rise = example_stroke(t)
     return {

@@ -274,7 +274,7 @@ _REPLACED = ("xi_hat", "v", "saturated", "current", "met", "command")
 def _record(plant: Plant, c: Controller, setup: Setup, p: Period) -> ca.Function:
     """(state, given, y, outputs) -> row: what the machine knows of a sample, and what the C commanded."""
     sizes = layout_of(plant, c, setup)
-    kind = ca.MX if plant.tabulated else ca.SX
+    kind = ca.MX if plant.actuator.tabulated else ca.SX
     state, given = kind.sym("state", p.decide.size1_in(0)), kind.sym("given", p.decide.size1_in(1))
     y = kind.sym("y", p.decide.size1_in(2))
     count = command_size(plant, setup)

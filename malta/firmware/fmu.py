@@ -263,7 +263,7 @@ def _command_at_rest(m: Machine) -> list[float]:
     plant, c = m.plant, m.target.controller
     x = ca.DM(_at_rest(m))
     z = float(x[plant.stroke_state]) if plant.has_stroke else 0.0
-    current = plant.currents(plant.h(x, 0), ca.DM(c.feedforward.at(z)))
+    current = plant.actuator.currents(plant.h(x, 0), ca.DM(c.feedforward.at(z)))
     whole = initial_state(plant, c, replace(m.setup, delay=1), x, ca.DM.zeros(len(c.states)), current)
     held = command_field(m.target).size
     return [float(v) for v in np.array(ca.evalf(whole[-held:])).ravel()]

@@ -69,7 +69,7 @@ class Machine:
             references.hold,
             fidelity=self.target.fidelity,
             disturbance=wrench,
-            bearing=any(self.plant.cushioned),
+            bearing=any(self.plant.contacts.cushioned),
         )
         return simulation_of(self.plant, self.target.controller, scenario)
 
@@ -149,7 +149,7 @@ def wrench_fields(m: Machine) -> list[Field]:
 
 def noise_channels(m: Machine) -> int:
     """Normal numbers of a sample; none for sensors with uniform noise, which a master adds to the readings."""
-    return 0 if m.plant.uniform else len(m.plant.outputs) + read_currents(m.plant, m.setup)
+    return 0 if m.plant.sensors.uniform else len(m.plant.outputs) + read_currents(m.plant, m.setup)
 
 
 def state_field(m: Machine, name: str, meaning: str) -> Field:
@@ -174,7 +174,7 @@ def reading_fields(m: Machine) -> list[Field]:
         ]
     else:
         fields.append(Field("i_coil", plant.actuator.coils, "currents of the coils"))
-    contacts = tuple(Signal(name, "1") for name in plant.contacts)
+    contacts = tuple(Signal(name, "1") for name in plant.contacts.names)
     return [
         *fields,
         Field("force", plant.inputs, "forces that act"),
@@ -214,7 +214,7 @@ def _place(m: Machine) -> ca.Function:
 def _begin(m: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
     plant, c = m.variable, m.target.controller
     x, v0, cold = ca.SX.sym("x", len(plant.states)), ca.SX.sym("v0", len(c.forces)), ca.SX.sym("cold")
-    current = (1 - cold) * m.plant.currents(plant.h(x, 0), v0)
+    current = (1 - cold) * m.plant.actuator.currents(plant.h(x, 0), v0)
     whole = initial_state(plant, c, m.setup, x, ca.SX.zeros(len(c.states)), current)
     parts = _split(whole, {**m.sizes.machine, **m.sizes.controller})
     return {"x": x, "v0": v0, "cold": cold}, {

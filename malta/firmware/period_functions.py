@@ -293,7 +293,7 @@ def table_size(t: Target) -> int:
 def places_in_table(t: Target, place: Any) -> Any:
     """(u, v) of each reading of the table, where the currents are commutated for `place`."""
     with recorded_look_ups() as found, recorded_equations():  # whose notes are of the symbols of this call
-        t.believed.currents(place, ca.SX.sym("v", len(t.controller.forces)))
+        t.believed.actuator.currents(place, ca.SX.sym("v", len(t.controller.forces)))
     return ca.vertcat(*(x for one in found for x in (one.u, one.v)))
 
 
@@ -304,7 +304,7 @@ def currents(t: Target, place: Any, v: Any, table: Any) -> tuple[Any, Any]:
     """
     unread = recorded_equations() if t.look_ups else nullcontext()  # values before they are looked up
     with recorded_look_ups() as found, unread:
-        wanted = ca.SX(t.believed.currents(place, v))
+        wanted = ca.SX(t.believed.actuator.currents(place, v))
     if found:
         wanted = ca.substitute(wanted, ca.vertcat(*(one.values for one in found)), table)
     meaning = "i_wanted: currents that make v where y_used says that the machine is"
@@ -390,7 +390,7 @@ def _state_on_reference(t: Target, reference: dict[str, Any], v0: Any) -> dict[s
         note("expect", "xi_pred = (q*, dq*, memory of forces under way)", xi_pred=state["xi_pred"])
     if t.driven:
         drive, x = plant.drive, placed(plant, state_reference(plant)(p, dp))
-        i = drive.command(plant.currents(p, v0))
+        i = drive.command(plant.actuator.currents(p, v0))
         state["u_integral"] = plant.actuator.R * i
         note("hold_currents", "u_integral = R i_axes of the currents for v0", u_integral=state["u_integral"])
         state["i_last"] = drive.to_phases(x) @ i if t.fidelity == "phase" else i

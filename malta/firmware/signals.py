@@ -75,14 +75,14 @@ class Target:
 
         Raises InputError for several tables.
         """
-        if not self.believed.tabulated:
+        if not self.believed.actuator.tabulated:
             return ()
         y, v = (
             ca.SX.sym("y", len(self.controller.measurements)),
             ca.SX.sym("v", len(self.controller.forces)),
         )
         with recorded_look_ups() as found:
-            self.believed.currents(y, v)
+            self.believed.actuator.currents(y, v)
         if any(one.nodes is not found[0].nodes for one in found):
             raise InputError("export", self.controller.name, "currents from several tables", "one table")
         return tuple(found)
@@ -95,7 +95,7 @@ class Target:
     @property
     def has_set_points(self) -> bool:
         """Whether the machine's own electronics take set points in place of currents."""
-        return self.fidelity == "phase" and self.believed.electronics is not None
+        return self.fidelity == "phase" and self.believed.actuator.electronics is not None
 
     @property
     def driven(self) -> bool:
@@ -255,13 +255,13 @@ def place_of_readings(plant: Plant, y: Any) -> Any:
 def used_clearances(plant: Plant) -> Callable[[int, float], FloatArray]:
     """(index of an output, its reading) -> used share of each clearance, while the other outputs read zero."""
     x = ca.SX.sym("x", len(plant.states))
-    contact = ca.Function("contact", [x], [ca.densify(ca.vertcat(plant.contact(x), 0))])
+    contact = ca.Function("contact", [x], [ca.densify(ca.vertcat(plant.contacts.contact(x), 0))])
 
     def share_used(k: int, reading: float) -> FloatArray:
         p = np.zeros(len(plant.outputs))
         p[k] = reading
         state = placed(plant, ca.DM(plant.position_of(ca.DM(p))))
-        return np.array(contact(state)).ravel()[: len(plant.contacts)]
+        return np.array(contact(state)).ravel()[: len(plant.contacts.names)]
 
     return share_used
 
@@ -274,10 +274,10 @@ def reading_ranges(plant: Plant) -> FloatArray:
     motor that turns. Beyond, a reading is refused.
     """
     share_used, sizes = used_clearances(plant), 10.0 ** np.arange(-7, 0.01, 0.05)
-    ranges, nowhere = [], 1.0 if plant.contacts else UNBOUNDED
+    ranges, nowhere = [], 1.0 if plant.contacts.names else UNBOUNDED
     for k, _ in enumerate(plant.outputs):
         reach = next((size for size in sizes if share_used(k, size).max(initial=0.0) >= 1), math.inf)
-        if plant.has_stroke and k == plant.stroke_output and plant.travel:
-            reach = max(plant.travel, reach if math.isfinite(reach) else 0.0)
+        if plant.has_stroke and k == plant.stroke_output and plant.stroke.travel:
+            reach = max(plant.stroke.travel, reach if math.isfinite(reach) else 0.0)
         ranges.append(2 * reach if math.isfinite(reach) else nowhere)
     return readonly(ranges)

@@ -188,7 +188,7 @@ def piece_records(p: Program) -> list[dict[str, Any]]:
 def _limit_context(t: Target) -> dict[str, Any]:
     """What references, tables and strokes may be."""
     plant = t.believed
-    stroke = plant.has_stroke and plant.travel > 0
+    stroke = plant.has_stroke and plant.stroke.travel > 0
     longest = min(LONGEST_RISE, MOST_SAMPLES * t.controller.sample_time / RISES)
     return {
         "limit_lines": _limit_lines(t),
@@ -420,7 +420,7 @@ def example_stroke(t: Target) -> tuple[float, float]:
     """
     k, Ts = t.believed.stroke_output, t.controller.sample_time
     limits = reference_limits(t)
-    way = min(t.believed.travel / 10, limits.position[k] / ROOM)
+    way = min(t.believed.stroke.travel / 10, limits.position[k] / ROOM)
     speed, acceleration = limits.speed[k] / ROOM, limits.acceleration[k] / ROOM
     by_acceleration = float(np.sqrt(QUINTIC_ACCELERATION * way / acceleration))
     rise = max(SHORTEST_RISE * Ts, QUINTIC_SPEED * way / speed, by_acceleration, 0.02)

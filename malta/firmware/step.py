@@ -165,9 +165,9 @@ def _chosen(fields: Sequence[Field], names: Sequence[str]) -> list[Field]:
 
 def _transformations(plant: Plant) -> list[Staged]:
     """Axes from phases and back, of a machine with windings, and the position of two Hall sensors half a pole apart."""
-    if plant.windings is None:
+    if plant.actuator.windings is None:
         return []
-    drive, x = plant.windings, ca.SX.sym("x", len(plant.states))
+    drive, x = plant.actuator.windings, ca.SX.sym("x", len(plant.states))
     i_phase, u = ca.SX.sym("i_phase", len(drive.phases)), ca.SX.sym("u", len(drive.axes))
     hall = {name: ca.SX.sym(name) for name in ("sine", "cosine", "z_last", "pole")}
     return [

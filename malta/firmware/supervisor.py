@@ -56,8 +56,8 @@ def gains_without(t: Target) -> Gains:
     """
     c, plant = t.controller, t.believed
     places = np.zeros(1)
-    if plant.has_stroke and plant.travel:
-        places = np.linspace(-plant.travel, plant.travel, PLACES)
+    if plant.has_stroke and plant.stroke.travel:
+        places = np.linspace(-plant.stroke.travel, plant.stroke.travel, PLACES)
     plain = c.tracks == "states" and c.schedule is None
     if c.noise is None or c.cost is None or not plain or len(c.measurements) < 2:
         return Gains(places, {})
@@ -421,7 +421,9 @@ def absent_monitors(t: Target) -> dict[str, str]:
 
 def reading_deviations(plant: Plant) -> FloatArray:
     """Standard deviations of readings: noise, and steps of the resolution as even noise, q / sqrt(12)."""
-    return np.asarray(np.hypot(np.array(plant.noise), np.array(plant.resolution) / math.sqrt(12)))
+    return np.asarray(
+        np.hypot(np.array(plant.sensors.noise), np.array(plant.sensors.resolution) / math.sqrt(12))
+    )
 
 
 def repetition_probabilities(plant: Plant) -> list[float]:
@@ -431,7 +433,7 @@ def repetition_probabilities(plant: Plant) -> list[float]:
     do not repeat. Of a sensor without noise: 1, it may repeat for ever.
     """
     found = []
-    for noise, step in zip(plant.noise, plant.resolution, strict=True):
+    for noise, step in zip(plant.sensors.noise, plant.sensors.resolution, strict=True):
         inside = math.erf(step / (2 * math.sqrt(2) * noise)) if noise else 1.0
         found.append(min(max(inside, 1e-12), 1.0))
     return found
@@ -451,7 +453,7 @@ def touch_bounds(plant: Plant) -> FloatArray:
 
     Infinite where nothing is met.
     """
-    bounds = np.where(np.array(plant.cushioned, dtype=bool), TOUCH, 1.0)
+    bounds = np.where(np.array(plant.contacts.cushioned, dtype=bool), TOUCH, 1.0)
     shares = used_clearances(plant)
 
     def share_used(k: int, reading: float) -> float:
@@ -557,9 +559,9 @@ def largest_reading(t: Target) -> float:
     axes = np.abs(np.array(ca.DM(drive.command(ca.DM(t.controller.limits.current))))).ravel()
     if t.fidelity == "dq":
         return float(axes.max())
-    places = np.linspace(-plant.travel, plant.travel, 101) if plant.has_stroke else np.zeros(1)
+    places = np.linspace(-plant.stroke.travel, plant.stroke.travel, 101) if plant.has_stroke else np.zeros(1)
     largest = 0.0
     for place in places:
-        x = plant.at(**({plant.stroke: place} if plant.has_stroke else {})).x
+        x = plant.at(**({plant.stroke.name: place} if plant.has_stroke else {})).x
         largest = max(largest, float((np.abs(np.array(ca.DM(drive.to_phases(ca.DM(x))))) @ axes).max()))
     return largest

@@ -79,7 +79,7 @@ def _flight(t: Target, *, stroke: bool) -> dict[str, FloatArray]:
     c, plant = t.controller, t.believed
     lasts = SAMPLES * c.sample_time
     options: Any = {"noise": 1.0, "fidelity": "force" if not t.driven else t.fidelity}
-    if stroke and plant.has_stroke and plant.travel:
+    if stroke and plant.has_stroke and plant.stroke.travel:
         scenario = Scenario.stroke(_distance(t, lasts / 6), rise=lasts / 6, duration=lasts, **options)
     else:
         scenario = Scenario("hold", lasts, references.hold, **options)
@@ -95,7 +95,7 @@ def _distance(t: Target, rise: float) -> float:
     """The way of a stroke, m, with half of the largest acceleration of references: a = D k^2 / (6 sqrt(3))."""
     k = 2 * math.log(9) / rise
     most = float(reference_limits(t).acceleration[t.believed.stroke_output])
-    return float(min(STROKE * t.believed.travel, 0.5 * most * 6 * math.sqrt(3) / k**2))
+    return float(min(STROKE * t.believed.stroke.travel, 0.5 * most * 6 * math.sqrt(3) / k**2))
 
 
 def readings_of(t: Target, run: Trajectory) -> dict[str, FloatArray]:
@@ -320,7 +320,7 @@ def _moved(t: Target) -> dict[str, Any]:
 
 def _strokes(t: Target) -> dict[str, Any]:
     """Where strokes of the test end; a logistic one is within 2e-6 of its way."""
-    if not (t.believed.has_stroke and t.believed.travel > 0):
+    if not (t.believed.has_stroke and t.believed.stroke.travel > 0):
         return {}
     most = float(reference_limits(t).position[t.believed.stroke_output])
     shares = {"stroke_end": 0.5, "stroke_near": 0.499, "stroke_over": 0.501, "stroke_beyond": 1.01}

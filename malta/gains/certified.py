@@ -82,9 +82,9 @@ def origin_of(
         shorten(text, LONG) for text in (plant.name, plant.parameters.preset, controller.name)
     )
     named = Named(machine, preset, design, content_sha256(law), stage)
-    units = units_of(plant.parameters) | ({plant.stroke: "m"} if plant.has_stroke else {})
-    at = tuple(exact(share * plant.travel) for share in ENDS)
-    return Origin(named, units, Places(plant.stroke, "m", at) if loops > 1 else None)
+    units = units_of(plant.parameters) | ({plant.stroke.name: "m"} if plant.has_stroke else {})
+    at = tuple(exact(share * plant.stroke.travel) for share in ENDS)
+    return Origin(named, units, Places(plant.stroke.name, "m", at) if loops > 1 else None)
 
 
 def disagreement(
@@ -149,7 +149,7 @@ def _places_text(places: Places | None) -> str:
 def _of_other_values(claim: Claim, plant: Plant, units: Mapping[str, str], gains: str) -> str:
     """Whether each parameter is one of the machine, in its unit and about its value."""
     for p in claim.parameters:
-        if p.name not in units or (p.name == plant.stroke and claim.places is not None):
+        if p.name not in units or (p.name == plant.stroke.name and claim.places is not None):
             return f"{p.name} is no parameter of the loop of {gains}"
         if p.unit != units[p.name]:
             return f"the unit of {p.name} is {p.unit}, that of {gains} is {units[p.name]}"
@@ -179,7 +179,7 @@ def _less(claim: Claim, plant: Plant, ranges: Ranges, own: Origin, gains: str) -
             )
         first, last = given[name].sides(claim.lower)
         if not (first <= low and high <= last):
-            what = "travel" if name == plant.stroke else "box"
+            what = "travel" if name == plant.stroke.name else "box"
             found, wanted = _ends(first, last, own, name), _ends(low, high, own, name)
             return f"its {what} is too small: {name} from {found} {at}, that of {gains} from {wanted}"
     return ""
@@ -195,7 +195,7 @@ def _of_other_loops(
     """Whether the loops are those that the gain file's law closes on its machine, to the last digit."""
     claim = document.claim
     still = {p.name for p in claim.parameters if not (p.down or p.up)}
-    along = {plant.stroke, *(name for name in plant.over if name in still)}
+    along = {plant.stroke.name, *(name for name in plant.over if name in still)}
     names = tuple(p.name for p in claim.parameters if p.name not in along)
     try:
         places, _ = travel_loops(plant, controller, names, stage)
@@ -215,4 +215,4 @@ def _bare(loop: Loop) -> Loop:
 
 def _nominal(plant: Plant, name: str) -> float:
     """The value of a parameter of the machine, SI; 0 for the position along the travel."""
-    return 0.0 if name == plant.stroke else float(getattr(plant.parameters, name))
+    return 0.0 if name == plant.stroke.name else float(getattr(plant.parameters, name))

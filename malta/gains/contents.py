@@ -21,6 +21,7 @@ from malta.model.plant import Parameters, Plant, Signal, outputs_at
 from malta.synthesis.controller import (
     Commutation,
     Controller,
+    Coordinates,
     Cost,
     CurrentLoop,
     Feedforward,
@@ -31,7 +32,6 @@ from malta.synthesis.controller import (
     stored_forces,
 )
 from malta.synthesis.schedule import SCHEDULED, Schedule
-from malta.synthesis.spec import Coordinates
 
 # The table of a machine from plain matrices in a gain file, from and to its parameters.
 

@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, StrictInt, StrictStr
 
-from malta.synthesis.controller import Tracks
-from malta.synthesis.spec import Coordinates
+from malta.synthesis.controller import Coordinates, Tracks
 from malta.tables import Finite, Positive, Quantity, Record, entry
 
 Vector = list[Finite]

@@ -349,7 +349,7 @@ def wave(log: Log, plant: Plant, period: float) -> tuple[Estimate, Estimate]:
     """
     if not plant.has_stroke:
         raise InputError("wave", "machine", f"a {plant.name}, which has no stroke", "one with a stroke")
-    z, f = log.table("y", [plant.stroke])[:, 0], log.table("v", [plant.thrust])[:, 0]
+    z, f = log.table("y", [plant.stroke.name])[:, 0], log.table("v", [plant.stroke.thrust])[:, 0]
     if np.ptp(z) < TURN * period:
         raise CheckError(f"{log.source}: a stroke of {np.ptp(z):.3g} m, a period is {period:g} m")
     turn = 2 * np.pi * z / period

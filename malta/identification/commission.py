@@ -339,7 +339,7 @@ def fly(bench: Bench, scenario: Scenario, *, ends: Iterable[str] = ENDS) -> Log:
     """Fly a scenario with the bench's noise, steps and errors of sensors. Raises CheckError where it ends otherwise."""
     own: dict[str, Any] = {"noise": 1.0, "quantize": True, "seed": bench.seed}
     own["sensor_errors"] = dict(bench.errors) or None
-    own |= {} if bench.truth.windings is not None else {"fidelity": "force"}
+    own |= {} if bench.truth.actuator.windings is not None else {"fidelity": "force"}
     run = simulate(bench.truth, bench.controller, scenario.replace(**own))
     if run.verdict.name not in ends:
         raise CheckError(f"{scenario.name}: {run.verdict.name} at {run.verdict.time:.4g} s")
@@ -413,7 +413,7 @@ def judge_noise(controller: Controller, log: Log) -> list[Finding]:
     found = at_rest(log)
     return [
         Finding(f"noise of {s.name}", found[s.name][1], 0.0, NOISY * math.hypot(noise, step) + 1e-12)
-        for s, noise, step in zip(plant.outputs, plant.noise, plant.resolution, strict=True)
+        for s, noise, step in zip(plant.outputs, plant.sensors.noise, plant.sensors.resolution, strict=True)
     ]
 
 
@@ -464,7 +464,7 @@ def judge_drive(controller: Controller, log: Log) -> list[Finding]:
 
     None of a machine without windings, and where the log has no voltages.
     """
-    if plant_of(controller.parameters).windings is None or not log.names("u"):
+    if plant_of(controller.parameters).actuator.windings is None or not log.names("u"):
         return []
     found = identify_windings(controller, log)
     R, L, dead_time = found.believed
@@ -490,18 +490,20 @@ def _record_stroke(bench: Bench) -> Log:
 
 def _largest_error(plant: Plant, log: Log) -> float:
     """Of the stroke, m."""
-    return float(np.abs(log.table("y", [plant.stroke]) - log.table("reference", [plant.stroke])).max())
+    return float(
+        np.abs(log.table("y", [plant.stroke.name]) - log.table("reference", [plant.stroke.name])).max()
+    )
 
 
 def judge_stroke(controller: Controller, log: Log) -> list[Finding]:
     """The largest error along the stroke, and the thrust that it took over what the law expects."""
     plant = plant_of(controller.parameters)
-    error, most, what = _largest_error(plant, log), ERROR * plant.travel, ""
+    error, most, what = _largest_error(plant, log), ERROR * plant.stroke.travel, ""
     if error > most:  # of a law that follows its reference late
         own = _largest_error(plant, own_stroke(controller, log))
         if SLACK * own > most:
             what, most = f", {1e3 * own:.3g} mm by design", SLACK * own
-    noise = float(plant.noise[plant.stroke_output])
+    noise = float(plant.sensors.noise[plant.stroke_output])
     taught = learn(controller, log)
     return [
         Finding(f"largest axial error{what}", Estimate(error, 2 * noise, "m"), 0, most),

@@ -243,9 +243,9 @@ def model_at(loop: Loop, names: Sequence[str]) -> ResponseModel:
     """The response of a loop's machine where it is held."""
     plant, point = loop.plant, _held(loop)
     y = outputs_at(plant, point.x)
-    coils = ca.DM(plant.currents(ca.DM(y), ca.DM(point.v)))
+    coils = ca.DM(plant.actuator.currents(ca.DM(y), ca.DM(point.v)))
     i = np.array(
-        coils if plant.windings is None else ca.evalf(ca.densify(plant.drive.command(coils)))
+        coils if plant.actuator.windings is None else ca.evalf(ca.densify(plant.drive.command(coils)))
     ).ravel()
     currents = tuple(s.name for s in axes_of(plant))
     return ResponseModel(plant, require_parameters(plant, names), currents, y, i, loop.sample_time)
@@ -291,7 +291,8 @@ def _bent(model: ResponseModel, signal: Multisine, found: Spectra, periods: int)
 
 def sensor_noise(plant: Plant) -> FloatArray:
     """The standard deviation of each sensor's noise and steps, SI."""
-    return np.asarray(np.maximum(np.hypot(plant.noise, np.array(plant.resolution) / np.sqrt(12)), QUIET))
+    noise, steps = plant.sensors.noise, np.array(plant.sensors.resolution)
+    return np.asarray(np.maximum(np.hypot(noise, steps / np.sqrt(12)), QUIET))
 
 
 def _peaks(signal: Multisine, spectrum: ComplexArray) -> FloatArray:

@@ -268,7 +268,7 @@ def identify(
     found = _estimate_straightened(records, log, dropped)
     filled = robust or bool(np.isnan(y).any())
     wanted = filled or (in_time and not found.refusal)
-    if not wanted or plant.sensors is not None or not plant.second_order:
+    if not wanted or plant.sensors.late or not plant.second_order:
         return found
     predicted = _predicted(model, spectrum, found, i, y, robust=robust)
     if filled:  # once more, with predictions in their place

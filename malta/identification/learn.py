@@ -103,30 +103,33 @@ def learn_v0(controller: Controller, log: Log) -> LearnedV0:
             "learn", "machine", f"a {plant.name}, which has no stroke", "a machine with a stroke"
         )
     require_same_law(log, plant.name, controller.sample_time)
-    stroke, k, table = plant.stroke, plant.thrust_input, controller.feedforward
+    stroke, k, table = plant.stroke.name, plant.thrust_input, controller.feedforward
     z, f = log.table("y", [stroke])[:, 0], believed_thrust(plant, log)
     if not (np.isfinite(z).all() and np.isfinite(f).all()) or log.survey.gaps:
         raise CheckError(f"{log.source}: samples are missing")
     t = controller.sample_time * np.arange(log.samples)
     way = reference_spline(log, [stroke], controller.sample_time)
     z_ref, speed, slope = (way(t, order)[:, 0] for order in range(3))
-    inertia = plant.mass * float(np.abs(slope).max())
+    inertia = plant.stroke.mass * float(np.abs(slope).max())
     if inertia > SLOW * controller.limits.force[k]:
         found = f"a stroke that accelerates the mover by {inertia:.3g} N"
         raise InputError(
             log.source, f"ref.{stroke}", found, f"at most {SLOW * controller.limits.force[k]:.3g} N"
         )
-    phi = _splines(float(z_ref.min()), float(z_ref.max()), plant.travel / V0_STEPS, log.source)
+    phi = _splines(float(z_ref.min()), float(z_ref.max()), plant.stroke.travel / V0_STEPS, log.source)
     at, bent = phi(z_ref), phi(z_ref, 2) * speed[:, None] ** 2 + phi(z_ref, 1) * slope[:, None]
     missing = f - np.interp(z, table.z_grid, table.v0[:, k])
     normal = np.linalg.inv(at.T @ at)
-    c = normal @ (at.T @ missing - plant.mass * bent.T @ z)
+    c = normal @ (at.T @ missing - plant.stroke.mass * bent.T @ z)
     inside = (table.z_grid >= z_ref.min()) & (table.z_grid <= z_ref.max())
     places = phi(np.clip(table.z_grid, z_ref.min(), z_ref.max()))
     noise = float(
-        np.hypot(plant.noise[plant.stroke_output], plant.resolution[plant.stroke_output] / np.sqrt(12))
+        np.hypot(
+            plant.sensors.noise[plant.stroke_output],
+            plant.sensors.resolution[plant.stroke_output] / np.sqrt(12),
+        )
     )
-    scatter = plant.mass * noise * np.linalg.norm(places @ normal @ bent.T, axis=1)
+    scatter = plant.stroke.mass * noise * np.linalg.norm(places @ normal @ bent.T, axis=1)
     v0 = table.v0.copy()
     v0[:, k] += places @ c
     taught = replace(controller, name=f"{controller.name}_learned", feedforward=replace(table, v0=v0))
@@ -234,7 +237,7 @@ def learn(controller: Controller, log: Log, *, parameter: str = "") -> Learned:
     factor, by_noise = _thrust_factor(controller, believed, log)
     if loop(believed, controller).sampled_forces.Bd.shape[1] > len(believed.inputs):
         factor += 1 - _thrust_factor(controller, believed, own_stroke(controller, log))[0]
-    deviation = factor * float(np.array(believed.noise)[believed.stroke_output]) * by_noise
+    deviation = factor * float(np.array(believed.sensors.noise)[believed.stroke_output]) * by_noise
     if not FACTORS[0] < factor < FACTORS[1]:
         found = f"{log.source}: the stroke took {factor:.3g} times the thrust that was expected"
         raise CheckError(f"{found}: more than a force constant is wrong")
@@ -280,7 +283,7 @@ def _thrust_factor(controller: Controller, believed: Plant, log: Log) -> tuple[f
 
     Raises InputError for a log without a stroke, and CheckError for missing samples.
     """
-    stroke, thrust, Ts = believed.stroke, believed.thrust_input, controller.sample_time
+    stroke, thrust, Ts = believed.stroke.name, believed.thrust_input, controller.sample_time
     z_ref, z = log.table("reference", [stroke])[:, 0], log.table("y", [stroke])[:, 0]
     f = believed_thrust(believed, log)
     if not (np.isfinite(z).all() and np.isfinite(f).all()) or log.survey.gaps:
@@ -288,7 +291,7 @@ def _thrust_factor(controller: Controller, believed: Plant, log: Log) -> tuple[f
     t = Ts * np.arange(len(z_ref))
     a = reference_spline(log, [stroke], Ts)(t, 2)[:, 0]
     largest = float(np.abs(a).max())
-    if believed.mass * largest < SMALLEST * controller.limits.force[thrust]:
+    if believed.stroke.mass * largest < SMALLEST * controller.limits.force[thrust]:
         found = f"{largest:.3g} m/s2 at most in ref.{stroke}"
         raise InputError(log.source, "reference", found, "a stroke that takes 5 % of the thrust's limit")
     # By parts: a_ref and its slope vanish at both ends of a stroke.
@@ -296,14 +299,14 @@ def _thrust_factor(controller: Controller, believed: Plant, log: Log) -> tuple[f
     along = float((z - z_ref) @ curved / (a @ a))
     table = controller.feedforward
     beyond = f - np.interp(z, table.z_grid, table.v0[:, thrust])
-    factor = float(beyond @ a / (believed.mass * (1 + along) * (a @ a)))
+    factor = float(beyond @ a / (believed.stroke.mass * (1 + along) * (a @ a)))
     return factor, float(np.linalg.norm(curved)) / float(a @ a)
 
 
 def believed_thrust(believed: Plant, log: Log) -> FloatArray:
     """The thrust that the law believes the measured currents to make, N; its command where no current is measured."""
-    if believed.windings is None or not log.names("i"):
-        return np.asarray(log.table("v", [believed.thrust])[:, 0])
+    if believed.actuator.windings is None or not log.names("i"):
+        return np.asarray(log.table("v", [believed.stroke.thrust])[:, 0])
     axes = [s.name for s in believed.drive.axes]
     whole = np.zeros((log.samples, len(axes)))
     require_currents(log, axes)

@@ -56,13 +56,14 @@ def process_noise(plant: Plant, log: Log) -> dict[str, Estimate]:
 
 def _slopes(plant: Plant, log: Log) -> FloatArray:
     """How the forces follow the currents of a log where the machine is held, inputs x currents."""
-    point, measured, drive = trim(plant), log.names("i"), plant.windings
+    point, measured, drive = trim(plant), log.names("i"), plant.actuator.windings
     x, phases = ca.DM(point.x), [] if drive is None else [s.name for s in drive.phases]
     known = phases if phases and measured == phases else [s.name for s in axes_of(plant)]
     require_currents(log, known)
     i = ca.SX.sym("i", len(known))
     if drive is None:
-        force, at = plant.forces(x, i), plant.currents(ca.DM(outputs_at(plant, point.x)), ca.DM(point.v))
+        at = plant.actuator.currents(ca.DM(outputs_at(plant, point.x)), ca.DM(point.v))
+        force = plant.actuator.forces(x, i)
     else:
         force, at = drive.force(drive.to_axes(x) @ i if known == phases else i), ca.DM.zeros(len(known))
     slope = ca.Function("slope", [i], [ca.densify(ca.jacobian(ca.vertcat(force), i))])
@@ -77,8 +78,8 @@ def dc_log(plant: Plant, controller: str, sample_time: float, *, seed: int) -> L
     sample_time : s
     seed : of the noise
     """
-    random, drive = np.random.default_rng(seed), plant.windings
-    columns = {"y": random.normal(0, np.maximum(plant.noise, 1e-300), (SAMPLES, len(plant.outputs)))}
+    random, drive = np.random.default_rng(seed), plant.actuator.windings
+    columns = {"y": random.normal(0, np.maximum(plant.sensors.noise, 1e-300), (SAMPLES, len(plant.outputs)))}
     signals = {"y": plant.outputs}
     if drive is not None and drive.sensors is not None:
         sensors = drive.sensors

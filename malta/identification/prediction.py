@@ -185,7 +185,7 @@ def _equations(shape: _Shape) -> _Equations:
     plant, par = shape.plant, shape.plant.parameters
     n, m = len(plant.controlled), len(shape.currents)
     value = {name: ca.SX.sym(name) for name in symbolic_names(par)}
-    error = {s.name: ca.SX.sym(s.name) for s in plant.sensor_errors}
+    error = {s.name: ca.SX.sym(s.name) for s in plant.sensors.errors}
     twins = {name: value[twin] for name, twin in twins_of(par).items() if name not in shape.apart}
     machine = plant.variant(symbolic(par, value | twins))
     x, i, after, shares = (ca.SX.sym("signal", size) for size in (n, m, m, 3 * shape.steps + 1))
@@ -199,10 +199,11 @@ def _equations(shape: _Shape) -> _Equations:
     def slope(z: Any, share: Any) -> Any:
         flowing, state = ca.SX.zeros(len(axes)), whole(z)
         flowing[[axes.index(name) for name in shape.currents]] = i + share * (after - i)
-        force = machine.forces(state, flowing) if plant.windings is None else machine.drive.force(flowing)
+        wound = plant.actuator.windings is not None
+        force = machine.drive.force(flowing) if wound else machine.actuator.forces(state, flowing)
         return machine.f(state, force, machine.load(state))[keep]
 
-    read = machine.sense(whole(x), ca.vertcat(*error.values()))
+    read = machine.sensors.sense(whole(x), ca.vertcat(*error.values()))
     numbers = ca.vertcat(*value.values(), *error.values(), shares)
     return _Equations(numbers, value | error, x, ca.vertcat(i, after), slope, shares, read)
 
@@ -319,7 +320,7 @@ def _numbers(s: _Search, theta: FloatArray) -> FloatArray:
     own = dict(zip(model.names, theta.tolist(), strict=True))
     twins = twins_of(par)
     value = [own.get(n, own.get(twins.get(n, ""), float(getattr(par, n)))) for n in symbolic_names(par)]
-    error = [own.get(signal.name, 0.0) for signal in plant.sensor_errors]
+    error = [own.get(signal.name, 0.0) for signal in plant.sensors.errors]
     shares = current_shares(current_rate(plant), model.sample_time, s.shape.steps)
     return np.array([*value, *error, *shares])
 

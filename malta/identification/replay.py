@@ -170,7 +170,7 @@ def replay_law(controller: Controller, log: Log, *, same: bool | None = None) ->
     off = np.abs(commands - v)
     late = innovation[half:]
     names, forces = [s.name for s in plant.outputs], [s.name for s in plant.inputs]
-    noise = np.sqrt(np.array(plant.noise) ** 2 + np.array(plant.resolution) ** 2 / 12)
+    noise = np.sqrt(np.array(plant.sensors.noise) ** 2 + np.array(plant.sensors.resolution) ** 2 / 12)
     largest = off[half:].max(axis=0)
     if same is None:
         same = bool((largest <= SAME * controller.limits.force).all())
@@ -227,7 +227,7 @@ class _Twin:
 
     def innovation(self, plant: Plant, noise: float) -> FloatArray:
         """Innovations of the law on this machine, k x p. Raises CheckError where it does not fly to the end."""
-        fidelity: Any = "force" if plant.windings is None else "dq"
+        fidelity: Any = "force" if plant.actuator.windings is None else "dq"
         scenario = self.given[0].scenario.replace(
             noise=noise, quantize=noise > 0, fidelity=fidelity, seed=SEED
         )

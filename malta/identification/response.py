@@ -23,7 +23,7 @@ from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names, twins_of
 from malta.model.plant import Plant, symbolic
-from malta.model.signals import with_lags
+from malta.model.sensors import with_lags
 from malta.simulation.engine.engines import evaluate
 
 STEP = 1e-5  # of a scale: for derivatives by differences
@@ -124,10 +124,10 @@ class ResponseModel:
             n: symbols[twin] for n, twin in twins_of(par).items() if twin in symbols and n not in symbols
         }
         machine = plant.variant(symbolic(par, of_machine | twins))
-        errors = ca.vertcat(*(symbols.get(s.name, 0) for s in plant.sensor_errors))
+        errors = ca.vertcat(*(symbols.get(s.name, 0) for s in plant.sensors.errors))
         x, i = ca.SX.sym("x", len(plant.states)), ca.SX.sym("i", len(axes_of(plant)))
-        forces = machine.forces(x, i) if plant.windings is None else machine.drive.force(i)
-        rate, read = machine.f(x, forces, machine.load(x)), machine.sense(x, errors)
+        forces = machine.actuator.forces(x, i) if plant.actuator.windings is None else machine.drive.force(i)
+        rate, read = machine.f(x, forces, machine.load(x)), machine.sensors.sense(x, errors)
         return theta, x, i, rate, read, machine.sensors
 
     def matrices(
@@ -153,8 +153,7 @@ class ResponseModel:
             ca.jacobian(rate, i)[keep, used],
             ca.jacobian(read, x)[:, keep],
         )
-        late = 0 if sensors is None else sensors.dead_time
-        linear = [*with_lags(sensors, *blocks), ca.SX(late)]
+        linear = [*with_lags(sensors, *blocks), ca.SX(sensors.dead_time)]
         at, flowing = ca.SX.zeros(i.numel()), ca.SX.sym("flowing", len(used))
         at[used] = flowing
         here = ca.substitute(linear, [x, i], [ca.DM(self.place), at])
@@ -263,14 +262,14 @@ def points_of_noise(i: FloatArray, periods: int) -> FloatArray:
 def current_rate(plant: Plant) -> float:
     """With which a current goes from one measured value to the next, 1/s; 0: evenly; infinite: it is held."""
     actuator = plant.actuator
-    if plant.windings is None:
+    if plant.actuator.windings is None:
         return actuator.crossover
     return actuator.R / actuator.L if actuator.L else 0.0
 
 
 def axes_of(plant: Plant) -> tuple[Any, ...]:
     """The signals of the currents that a log may have: axes of the drive, or coils of a machine without windings."""
-    return plant.actuator.coils if plant.windings is None else plant.drive.axes
+    return plant.actuator.coils if plant.actuator.windings is None else plant.drive.axes
 
 
 def transfer(A: FloatArray, C: FloatArray, B: FloatArray, z: ComplexArray) -> ComplexArray:
@@ -288,7 +287,7 @@ def units_of_model(plant: Plant) -> dict[str, str]:
     """The SI units of what may be a parameter of a response: fields of the record, and errors of the sensors."""
     fields: dict[str, Any] = plant.parameters.__dataclass_fields__
     units = {name: str(fields[name].metadata["unit"]) for name in symbolic_names(plant.parameters)}
-    return units | {s.name: s.unit for s in plant.sensor_errors}
+    return units | {s.name: s.unit for s in plant.sensors.errors}
 
 
 def plant_with(plant: Plant, values: Mapping[str, float]) -> Plant:

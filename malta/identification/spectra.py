@@ -205,7 +205,7 @@ def straightened(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Spectr
 def in_axes(log: Log, plant: Plant) -> Log:
     """The log in the machine's order, with currents of the drive's axes where it has those of all phases."""
     log = in_order(log, plant)
-    if plant.windings is None or log.names("i") != [s.name for s in plant.drive.phases]:
+    if plant.actuator.windings is None or log.names("i") != [s.name for s in plant.drive.phases]:
         return log
     y, i = ca.SX.sym("y", len(plant.outputs)), ca.SX.sym("i", len(plant.drive.phases))
     turned = ca.Function("axes", [y, i], [plant.drive.to_axes(place_of_readings(plant, y)) @ i])
@@ -306,7 +306,7 @@ def weights_of(model: ResponseModel, s: Spectrum, theta: FloatArray) -> ComplexA
     """
     e = residuals_of(model, s, theta).between
     shape: ComplexArray = np.tile(np.eye(e.shape[2], dtype=complex), (len(s.lines), 1, 1))
-    if model.plant.second_order and model.plant.sensors is None:
+    if model.plant.second_order and not model.plant.sensors.late:
         noise = noise_of(model, s, theta, e)
         at = np.column_stack([s.lines, s.between])  # lines x (1 + NEIGHBOURS)
         factors = np.linalg.cholesky(noise_covariances(model, theta, noise, s.rate * at.ravel()))
@@ -505,7 +505,7 @@ def explained_at_lines(parts: Sequence[tuple[ResponseModel, Spectrum, FloatArray
     parts : of each log: the machine, the spectrum without curvature, and the parameters that were found, SI
     """
     plant, names = parts[0][0].plant, parts[0][0].names
-    gains = (error.name for error in plant.sensor_errors if error.unit == "1")
+    gains = (error.name for error in plant.sensors.errors if error.unit == "1")
     alone = ((twin,) for twin in twins_of(plant.parameters))  # a twin among others would not follow its twin
     found = {}
     for group in ((*acting(plant), *gains), *alone):

@@ -76,12 +76,12 @@ def stroke_of(plant: Plant, controller: Controller, distance: float | None = Non
     """
     believed = plant_of(controller.parameters)
     turn = 1 / float(output_bands(loop(believed, controller))[believed.stroke_output])
-    distance = 2 * plant.travel / 3 if distance is None else distance
+    distance = 2 * plant.stroke.travel / 3 if distance is None else distance
     rise = None
     if attribute_of(plant, "experiments", "RISE") is None:
-        most = TAKEN * controller.limits.force[believed.thrust_input] / believed.mass
+        most = TAKEN * controller.limits.force[believed.thrust_input] / believed.stroke.mass
         rise = max(ROUGH * controller.sample_time, 2 * turn, LOGISTIC * math.sqrt(abs(distance) / most))
-    driven: dict[str, Any] = {} if plant.windings is not None else {"fidelity": "force"}
+    driven: dict[str, Any] = {} if plant.actuator.windings is not None else {"fidelity": "force"}
     return Scenario.stroke(distance, rise=rise, settle=max(0.3, 10 * turn), **driven)
 
 
@@ -188,13 +188,13 @@ def next_stroke(
     require_same_law(log, plant.name, controller.sample_time)
     if log.samples > LONGEST:
         raise InputError(log.source, "t", f"{log.samples} samples", f"one stroke, at most {LONGEST} samples")
-    reference, y = (log.table(group, [plant.stroke])[:, 0] for group in ("reference", "y"))
+    reference, y = (log.table(group, [plant.stroke.name])[:, 0] for group in ("reference", "y"))
     if not np.isfinite(y).all() or log.survey.gaps:
         raise CheckError(f"{log.source}: samples are missing")
     found = thrust_patterns(loop(plant, controller), reference) if patterns is None else patterns
     sent: FloatArray = np.zeros(log.samples)
-    if plant.thrust in log.names("excitation"):
-        sent = log.table("excitation", [plant.thrust])[:, 0]
+    if plant.stroke.thrust in log.names("excitation"):
+        sent = log.table("excitation", [plant.stroke.thrust])[:, 0]
     e = reference - y
     seen = found.U.T @ e
     beside = float(((e - found.U @ seen) ** 2).sum())
@@ -246,7 +246,7 @@ def own_thrust(controller: Controller, flown: Scenario, patterns: ThrustPatterns
         sent = sample_excitation(Ts, plant, thrust)
         run = simulate(plant, controller, flown.replace(noise=0.0, quantize=False, excitation=sent))
         log = log_of(run)
-        e = (log.table("reference", [plant.stroke]) - log.table("y", [plant.stroke]))[:, 0]
+        e = (log.table("reference", [plant.stroke.name]) - log.table("y", [plant.stroke.name]))[:, 0]
         seen = patterns.U.T @ e
         errors.append(float(np.linalg.norm(seen)) / len(e) ** 0.5)
         if len(errors) == 2 and not errors[1] < errors[0]:
@@ -263,7 +263,7 @@ def first_thrust(controller: Controller, log: Log) -> FloatArray:
     plant = plant_of(controller.parameters)
     motion = reference_motion(log, [s.name for s in plant.outputs], controller.sample_time)
     flown = Scenario("stroke", log.samples * controller.sample_time, lambda _: motion)
-    reference = log.table("reference", [plant.stroke])[:, 0]
+    reference = log.table("reference", [plant.stroke.name])[:, 0]
     return own_thrust(controller, flown, thrust_patterns(loop(plant, controller), reference))
 
 
@@ -341,7 +341,7 @@ def learn_strokes(
     errors, quiet, counts = [first], [_fly(plant, controller, still, None) if noise else first], [0]
     log = log_of(first)
     law = learn(controller, log).controller
-    reference = log.table("reference", [plant.stroke])[:, 0]
+    reference = log.table("reference", [plant.stroke.name])[:, 0]
     patterns = thrust_patterns(loop(plant_of(law.parameters), law), reference)
     thrust, after = own_thrust(law, scenario, patterns), None
     for k in range(1, strokes):

@@ -164,7 +164,7 @@ def identify_windings(controller: Controller, log: Log) -> Windings:
     with windings
     """
     plant = plant_of(controller.parameters)
-    if plant.windings is None or controller.current_loop is None:
+    if plant.actuator.windings is None or controller.current_loop is None:
         found = f"a {plant.name}, which has no model of them"
         raise InputError("identify", "windings", found, "a machine with windings")
     require_log(log, plant.name, controller.sample_time)

@@ -69,8 +69,8 @@ class Loop:
     @cached_property
     def model(self) -> LinearModel:
         """The machine's linear model at rest under its loads. Raises CheckError where no command holds it."""
-        along = {name: value for name, value in self.at.items() if name != self.plant.stroke}
-        return loaded_model(self.plant, self.at.get(self.plant.stroke, 0.0), tuple(along.items()))
+        along = {name: value for name, value in self.at.items() if name != self.plant.stroke.name}
+        return loaded_model(self.plant, self.at.get(self.plant.stroke.name, 0.0), tuple(along.items()))
 
     @cached_property
     def sampled(self) -> SampledLoop:
@@ -128,8 +128,8 @@ class Loop:
             "delay": actuator.delay(self.sample_time) > 0,
             "current loops": pi,
             "lag of the current loops": not pi and math.isfinite(actuator.crossover),
-            "lag of the sensors": sensors is not None and bool(sensors.lagging),
-            "dead time of the sensors": sensors is not None and sensors.dead_time > 0,
+            "lag of the sensors": bool(sensors.lagging),
+            "dead time of the sensors": sensors.dead_time > 0,
         }
         *first, last = ["hold", *(words for words, there in stands.items() if there)]
         text = f"with {', '.join(first)} and {last}" if first else f"with {last}"
@@ -237,7 +237,7 @@ def loop_along(plant: Plant, controller: Controller, position: float | None = No
     """The loop at a position of the stroke, m; None: at the controller's operating point."""
     at = position_at(plant, plant.point(controller.operating_point[0]).x)
     if position is not None and plant.has_stroke:
-        at[plant.stroke] = position
+        at[plant.stroke.name] = position
     return _remembered(plant, controller, tuple(at.items()))
 
 

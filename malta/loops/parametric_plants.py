@@ -26,7 +26,7 @@ from malta.model.equilibrium import commanded
 from malta.model.linearize import is_commutated, jacobians, linearize
 from malta.model.parameters import shape_parameters, twins_of, units_of
 from malta.model.plant import Plant, position_in, symbolic
-from malta.model.signals import LateSensors, with_lags
+from malta.model.sensors import Sensors, with_lags
 from malta.work import check_clock
 
 # The command at which a machine's preload acts, as a function of its parameters.
@@ -213,19 +213,21 @@ def of_plant(
     """
     par = plant.parameters
     _check_names(plant, names)
-    if believed is not None and believed.tabulated:
+    if believed is not None and believed.actuator.tabulated:
         found = "a controller that looks up a table"
         raise InputError("uncertain", "believed", found, "one whose currents are a formula")
     x0 = plant.at(**(at or {})).x
     position = position_in(plant, x0)
-    own_states = tuple((name, x) for name, x in (at or {}).items() if name != plant.stroke)
-    of = model_of(plant, believed or plant, tuple(name for name in names if name != plant.stroke), own_states)
+    own_states = tuple((name, x) for name, x in (at or {}).items() if name != plant.stroke.name)
+    of = model_of(
+        plant, believed or plant, tuple(name for name in names if name != plant.stroke.name), own_states
+    )
     check_clock()
     p = ca.SX.sym("p", len(names))
-    own = [k for k, name in enumerate(names) if name != plant.stroke]
+    own = [k for k, name in enumerate(names) if name != plant.stroke.name]
     symbols = {names[k]: p[k] for k in own}
-    z = p[names.index(plant.stroke)] if plant.stroke in names else position
-    nominal = [position if name == plant.stroke else getattr(par, name) for name in names]
+    z = p[names.index(plant.stroke.name)] if plant.stroke.name in names else position
+    nominal = [position if name == plant.stroke.name else getattr(par, name) for name in names]
     short, positive, why = None, None, ""
     if is_commutated(plant) or not program(of).rational:
         short = _expanded_matrices(of, p, z, np.array(nominal, dtype=float), held)
@@ -262,16 +264,15 @@ def of_plant(
     )
 
 
-def _sensors_in(plant: Plant, symbols: Mapping[str, Any]) -> LateSensors | None:
+def _sensors_in(plant: Plant, symbols: Mapping[str, Any]) -> Sensors:
     """The sensors of a plant in symbols of some parameters.
 
     Raises InputError for an uncertain lag whose nominal value is none.
     """
-    if plant.sensors is None and all(getattr(plant.parameters, name) for name in symbols):
-        return None  # no uncertain parameter is a lag of 0 s
+    if not plant.sensors.late and all(getattr(plant.parameters, name) for name in symbols):
+        return plant.sensors  # no uncertain parameter is a lag of 0 s
     sensors = in_symbols(plant, symbols).sensors
-    nominal = [] if plant.sensors is None else plant.sensors.lagging
-    if sensors is not None and sensors.lagging != nominal:
+    if sensors.lagging != plant.sensors.lagging:
         raise InputError(
             "uncertain", "sensors", "an uncertain lag of 0 s", "one above 0 s, set in the machine"
         )
@@ -280,7 +281,7 @@ def _sensors_in(plant: Plant, symbols: Mapping[str, Any]) -> LateSensors | None:
 
 def _check_names(plant: Plant, names: Any) -> None:
     """Raise InputError unless the names are those of parameters that may be symbols, or of the stroke."""
-    known = [*units_of(plant.parameters), *((plant.stroke,) if plant.has_stroke else ())]
+    known = [*units_of(plant.parameters), *((plant.stroke.name,) if plant.has_stroke else ())]
     if not isinstance(names, tuple | list):
         raise InputError("uncertain", "names", describe(names), "names of parameters, as a tuple or a list")
     require_known(names, known, "uncertain", found="an unknown parameter")

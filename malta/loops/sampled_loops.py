@@ -49,7 +49,7 @@ from malta.model.data import plant_of
 from malta.model.equilibrium import trace, trim
 from malta.model.linearize import LinearModel, is_commutated, linearize
 from malta.model.plant import OperatingPoint, Plant, off_stroke, position_in, whole_samples
-from malta.model.signals import with_lags
+from malta.model.sensors import with_lags
 from malta.synthesis.controller import Controller, LinearLaw, law_at, linear_law, with_readings, with_slope
 from malta.synthesis.recovery import StepResponse, step_response
 
@@ -265,7 +265,7 @@ def sampled_loop(
     model, law = commanded_model(model, controller), linear_law(controller)
     plant, late = model.plant, 0
     A, B, C, true = _between_samples(model, sensors=sensors)
-    if sensors and plant.sensors is not None:
+    if sensors:
         late = whole_samples(plant, controller.sample_time)
     if feedforward:
         law = with_slope(law, feedforward_slope(model, controller))
@@ -299,7 +299,7 @@ def _between_samples(
     A, B, C, lags = model.A, model.B, model.C, model.plant.sensors
     if model.E.any():
         A, B = A - model.E @ C, np.hstack([B, model.E])
-    if not sensors or lags is None:
+    if not sensors or not lags.late:
         return A, B, C, None
     A, B, read = (np.array(ca.DM(M)) for M in with_lags(lags, A, B, C))
     return A, B, read, C
@@ -381,7 +381,7 @@ def disturbance_map(model: LinearModel) -> FloatArray:
 
 def _disturbances(plant: Plant, _believed: None, loaded: bool) -> tuple[list[Any], list[Any]]:
     """(x, u) -> the slope of the rates by disturbances, under the loads or without them."""
-    kind = ca.MX if plant.tabulated else ca.SX
+    kind = ca.MX if plant.actuator.tabulated else ca.SX
     sizes = {"x": len(plant.states), "u": len(plant.inputs), "w": len(plant.disturbances)}
     x, u, w = (kind.sym(name, size) for name, size in sizes.items())
     slope = ca.densify(ca.jacobian(plant.f(x, u, w + plant.load(x) if loaded else w), w))
@@ -471,7 +471,7 @@ def loaded_model(plant: Plant, position: float, others: tuple[tuple[str, float],
 
     Raises CheckError when no input holds the machine there.
     """
-    along = {plant.stroke: position} if plant.has_stroke else {}
+    along = {plant.stroke.name: position} if plant.has_stroke else {}
     return linearize(plant, trim(plant, **along, **dict(others)))
 
 
@@ -484,8 +484,8 @@ def loaded_loop(
 
     Raises CheckError when no input holds the machine there.
     """
-    others = tuple((name, x) for name, x in at.items() if name != plant.stroke)
-    model = loaded_model(plant, at.get(plant.stroke, 0.0), others)
+    others = tuple((name, x) for name, x in at.items() if name != plant.stroke.name)
+    model = loaded_model(plant, at.get(plant.stroke.name, 0.0), others)
     loop = machine_loop(model, controller, current_loops, forces_alone=True)
     m, B, law = len(controller.forces), loop.Bd, loop.control
     into, rest = B[:, :m], B[:, m:]

@@ -186,7 +186,7 @@ def _answer_along(plant: Plant, controller: Controller, position: float | None) 
 
 def worst_along(plant: Plant, controller: Controller, bound: RecoveryBound) -> tuple[float, float]:
     """The same at the worst of PLACES positions of the travel, and that position, m."""
-    positions = np.linspace(-plant.travel, plant.travel, PLACES).tolist()
+    positions = np.linspace(-plant.stroke.travel, plant.stroke.travel, PLACES).tolist()
     return max((bounded_deviation(plant, controller, bound, z), z) for z in positions)
 
 
@@ -347,7 +347,7 @@ def covariance(A: FloatArray, W: FloatArray) -> FloatArray:
 
 def noise_variance(plant: Plant) -> FloatArray:
     """Return the variance of one measurement of each output: the sensors' noise, and q^2 / 12 of their steps."""
-    variance: FloatArray = np.array(plant.noise) ** 2 + np.array(plant.resolution) ** 2 / 12
+    variance: FloatArray = np.array(plant.sensors.noise) ** 2 + np.array(plant.sensors.resolution) ** 2 / 12
     return variance
 
 

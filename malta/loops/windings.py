@@ -73,7 +73,7 @@ def chosen_loops(plant: Plant, controller: Controller, current_loops: CurrentLoo
 
 
 def _driven(plant: Plant, controller: Controller) -> bool:
-    return plant.windings is not None and controller.current_loop is not None
+    return plant.actuator.windings is not None and controller.current_loop is not None
 
 
 BRAKING = "the limited speed at which far errors are approached (`braking`)"
@@ -92,7 +92,7 @@ def _missing_current_loops(plant: Plant, controller: Controller, current_loops: 
     """What it leaves out of the current loops."""
     if current_loops == "lag" and _driven(plant, controller):
         return "the PI current controllers, for which first-order lags at their crossover stand"
-    if plant.electronics is not None and plant.windings is None:
+    if plant.actuator.electronics is not None and plant.actuator.windings is None:
         return "the electronics' own current controllers, for which first-order lags at their crossover stand"
     if _driven(plant, controller) and is_commutated(plant_of(controller.parameters)):
         return "PI current loops of currents that depend on the reading, for which first-order lags stand"
@@ -139,7 +139,7 @@ def axis_map(plant: Plant, point: OperatingPoint) -> FloatArray:
 def _axis_slope(plant: Plant, _believed: None) -> tuple[list[Any], list[Any]]:
     """(x, v) -> M."""
     x, v = ca.SX.sym("x", len(plant.states)), ca.SX.sym("v", len(plant.inputs))
-    axes = plant.drive.command(plant.currents(plant.h(x, 0), v))
+    axes = plant.drive.command(plant.actuator.currents(plant.h(x, 0), v))
     return [x, v], [ca.densify(ca.jacobian(axes, v))]
 
 
@@ -318,7 +318,7 @@ def link_at_rest(plant: Plant, k: Windings, point: OperatingPoint, M: FloatArray
     """The link of a machine that holds its loads; None where no current flows, and the link has no part in the loop."""
     drive, R = plant.drive, plant.actuator.R
     y = plant.h(ca.DM(point.x), 0)
-    i = np.array(ca.DM(drive.command(plant.currents(y, ca.DM(_command(point)))))).ravel()
+    i = np.array(ca.DM(drive.command(plant.actuator.currents(y, ca.DM(_command(point)))))).ravel()
     u, weight = R * i, np.array(drive.weight)
     power, Rs, V0 = float(weight @ (u * i)), drive.supply_resistance, drive.link_voltage
     if power == 0:

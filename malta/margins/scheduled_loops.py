@@ -307,9 +307,8 @@ def _moved(plant: Plant, variable: str, par: Any) -> Plant:
         h=lambda x, u: base.h(there(x), u),
         load=lambda x: base.load(there(x)),
         preload=lambda x: base.preload(there(x)),
-        forces=lambda x, i: base.forces(there(x), i),
-        stroke="",
-        thrust="",
+        actuator=replace(base.actuator, forces=lambda x, i: base.actuator.forces(there(x), i)),
+        stroke=replace(base.stroke, name="", thrust=""),
         over={},
     )
 

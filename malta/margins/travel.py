@@ -115,8 +115,8 @@ def extent_of(plant: Plant, names: Iterable[str] = (), controller: Controller | 
         units = {s.name: s.unit for s in plant.outputs} | units
         over = {schedule.variable: (float(schedule.places[0]), float(schedule.places[-1]))} | over
         return Extent(over=over, units={name: units[name] for name in over})
-    stroke = plant.stroke if plant.has_stroke else ""
-    return Extent(stroke, plant.travel, over, {name: units[name] for name in over})
+    stroke = plant.stroke.name if plant.has_stroke else ""
+    return Extent(stroke, plant.stroke.travel, over, {name: units[name] for name in over})
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class LoopAlong:
         if controller.schedule is not None:
             at = position_at(plant, point_at(plant, x, course, position).x)
         elif plant.has_stroke:
-            at = {plant.stroke: position}
+            at = {plant.stroke.name: position}
         elif course:
             there = plant.variant(replace(par, **{course: position}))
         return there, at | off_stroke(plant, x)
@@ -194,7 +194,8 @@ class LoopAlong:
 def positions_of(plant: Plant, extent: Extent, shares: Iterable[float]) -> tuple[tuple[float, ...], ...]:
     """The places of a machine (SI): +- each share of its travel; else the ends and the own value of a parameter."""
     if extent.stroke:
-        return tuple(tuple(dict.fromkeys((share * plant.travel, -share * plant.travel))) for share in shares)
+        travel = plant.stroke.travel
+        return tuple(tuple(dict.fromkeys((share * travel, -share * travel))) for share in shares)
     own = own_position(plant, extent, {})
     return tuple((value,) for value in sorted({own, *extent.over.get(extent.course, ())}))
 
@@ -335,19 +336,19 @@ def _loops_along(loop: LoopAlong) -> list[tuple[UncertainSystem, Compensator]]:
     if controller.schedule is not None:
         return [every.at(z) for z in controller.schedule.places.tolist()]
     if not (plant.has_stroke and _is_long(loop)):
-        at = {plant.stroke: 0.0} if plant.has_stroke else {}
+        at = {plant.stroke.name: 0.0} if plant.has_stroke else {}
         at |= off_stroke(plant, plant.point(controller.operating_point[0]).x)
         names = [*loop.names, *extent.intervals]
         whole = machine_system(plant, controller, names, at, loop.current_loops)
         if not plant.has_stroke or whole[0].matrices.n_instructions() < LONG:
             return [whole]
-    return [every.at(share * plant.travel) for share in ENDS]
+    return [every.at(share * plant.stroke.travel) for share in ENDS]
 
 
 def _is_long(loop: LoopAlong) -> bool:
     """Whether the model along the travel is too long for an expansion."""
     believed = plant_of(loop.controller.parameters)
-    held = is_commutated(believed) and not believed.tabulated
+    held = is_commutated(believed) and not believed.actuator.tabulated
     return held and model_of(loop.plant, believed, loop.names).n_instructions() > LONGEST
 
 
@@ -358,14 +359,14 @@ def margin_anywhere(loop: LoopAlong, position: float | None = None) -> HeldLoop 
     law = machine_law(plant, controller, loop.current_loops)
     if not _is_long(loop) or law.delay != 1 or law.lag is not None:
         return None
-    if plant.sensors is not None:  # the axes have no states for readings
+    if plant.sensors.late:  # the axes have no states for readings
         return None
     if off_stroke(plant, plant.point(controller.operating_point[0]).x):
         return None
     along = loop.loops
     try:
         if position is None:
-            travel = (-plant.travel, plant.travel)
+            travel = (-plant.stroke.travel, plant.stroke.travel)
             of = model_of(plant, plant_of(controller.parameters), tuple(loop.names))
             machine = held_machine(of, loop.names, along[0][0].nominal, travel)
         else:
@@ -402,7 +403,7 @@ def place_margin(
     if not plant.has_stroke or controller.schedule is not None:
         return robust_margin(*whole.at(position), ranges)
     if len(whole.loops) == 1:
-        there = {plant.stroke: position}
+        there = {plant.stroke.name: position}
         return margin_at(*whole.loops[0], ranges, there, tolerance=TOLERANCE, wider=travel)
     loop = whole.at(position)
     if (problem := margin_anywhere(whole, position)) is not None:

@@ -99,7 +99,7 @@ def _unfit(plant: Plant, c: Controller, uncertainty: Ranges) -> str:
         return "a law of errors has no gains K and L"
     if chosen_loops(plant, c, LAST) != "pi" or plant.actuator.delay(c.sample_time) != 1:
         return "its commands do not act a sample later by PI current loops"
-    if is_commutated(believed) or plant.sensors is not None:
+    if is_commutated(believed) or plant.sensors.late:
         return "its currents are held for a reading, or its sensors read late"
     if (np.abs(c.Ki) == 1).any():
         return "an entry of Ki is 1, which no factor changes"

@@ -5,26 +5,29 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
+    from malta.model.actuator import Actuator as Actuator
     from malta.model.coils import Allocation as Allocation, allocation as allocation
+    from malta.model.contacts import Contacts as Contacts
     from malta.model.data import published as published
     from malta.model.linearize import LinearModel as LinearModel
     from malta.model.parameters import check_parameters as check_parameters, si as si
-    from malta.model.plant import (
-        Actuator as Actuator,
-        OperatingPoint as OperatingPoint,
-        Plant as Plant,
-        Signal as Signal,
-    )
-    from malta.model.signals import InverseCheck as InverseCheck, LateSensors as LateSensors
+    from malta.model.plant import OperatingPoint as OperatingPoint, Plant as Plant, Signal as Signal
+    from malta.model.sensors import Sensors as Sensors
+    from malta.model.signals import InverseCheck as InverseCheck
+    from malta.model.stroke import Stroke as Stroke
     from malta.units import in_unit as in_unit
 
 _NAMES = {
+    "malta.model.actuator": "Actuator",
     "malta.model.coils": "Allocation allocation",
+    "malta.model.contacts": "Contacts",
     "malta.model.data": "published",
     "malta.model.linearize": "LinearModel",
     "malta.model.parameters": "check_parameters si",
-    "malta.model.plant": "Actuator OperatingPoint Plant Signal",
-    "malta.model.signals": "InverseCheck LateSensors",
+    "malta.model.plant": "OperatingPoint Plant Signal",
+    "malta.model.sensors": "Sensors",
+    "malta.model.signals": "InverseCheck",
+    "malta.model.stroke": "Stroke",
     "malta.units": "in_unit",
 }
-__all__, __getattr__, __dir__ = contents(__name__, _NAMES)
+__all__, __getattr__, __dir__ = contents(__name__, _NAMES, {"LateSensors": "malta.model.Sensors"})

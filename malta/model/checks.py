@@ -8,6 +8,7 @@ import re
 import sysconfig
 import traceback
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ from malta.model.plant import Plant, outputs_themselves, symbolic
 def check_signals(plant: Plant) -> None:
     """Raise InputError unless the names and lengths of a plant's fields fit each other."""
     names = {
-        key: [s.name for s in getattr(plant, key)]
-        for key in ("states", "inputs", "outputs", "disturbances", "sensor_errors")
+        key: [s.name for s in attrgetter(key)(plant)]
+        for key in ("states", "inputs", "outputs", "disturbances", "sensors.errors")
     }
     for key, own in names.items():
         if len(set(own)) < len(own):
@@ -32,27 +33,25 @@ def check_signals(plant: Plant) -> None:
     for key in ("states", "inputs", "outputs"):
         if not names[key]:
             raise InputError(plant.name, key, "none", "at least one")
-    sizes = {"noise": "outputs", "resolution": "outputs", "inertia": "inputs"}
-    for key, of in sizes.items():
-        if len(getattr(plant, key)) != len(names[of]):
-            found = f"{len(getattr(plant, key))} entries"
+    by_sensor = ("sensors.lag", "sensors.noise", "sensors.resolution")
+    for key, of in {**dict.fromkeys(by_sensor, "outputs"), "inertia": "inputs"}.items():
+        found = f"{len(attrgetter(key)(plant))} entries"
+        if len(attrgetter(key)(plant)) != len(names[of]):
             raise InputError(plant.name, key, found, f"{len(names[of])}, one for each of the {of}")
-    if plant.sensors is not None:
-        lags, late = plant.sensors.lag, plant.sensors.dead_time
-        if len(lags) != len(names["outputs"]):
-            expected = f"{len(names['outputs'])}, one for each of the outputs"
-            raise InputError(plant.name, "sensors.lag", f"{len(lags)} entries", expected)
-        times = [time for time in (*lags, late) if isinstance(time, int | float)]
-        if not all(0 <= time < math.inf for time in times):
-            raise InputError(plant.name, "sensors", f"lags and dead time {times} s", "times of 0 s or more")
+    late = (*plant.sensors.lag, plant.sensors.dead_time)
+    times = [time for time in late if isinstance(time, int | float)]
+    if not all(0 <= time < math.inf for time in times):
+        raise InputError(plant.name, "sensors", f"lags and dead time {times} s", "times of 0 s or more")
     both = [name for name in names["outputs"] if name in names["states"]]
-    if plant.stroke not in ("", *both):
+    if plant.stroke.name not in ("", *both):
         expected = "an output that is a state of the same name" + (f", as {' '.join(both)}" if both else "")
-        raise InputError(plant.name, "stroke", repr(plant.stroke), expected)
-    if plant.thrust not in ("", *names["inputs"]):
-        raise InputError(plant.name, "thrust", repr(plant.thrust), "one of " + " ".join(names["inputs"]))
-    if bool(plant.stroke) != bool(plant.thrust):
-        raise InputError(plant.name, "stroke", repr(plant.stroke), "stroke and thrust, or neither")
+        raise InputError(plant.name, "stroke.name", repr(plant.stroke.name), expected)
+    if plant.stroke.thrust not in ("", *names["inputs"]):
+        raise InputError(
+            plant.name, "stroke.thrust", repr(plant.stroke.thrust), "one of " + " ".join(names["inputs"])
+        )
+    if bool(plant.stroke.name) != bool(plant.stroke.thrust):
+        raise InputError(plant.name, "stroke", repr(plant.stroke.name), "stroke and thrust, or neither")
     _check_intervals(plant)
     for name in plant.uncontrolled:
         if name not in names["states"]:
@@ -78,7 +77,7 @@ def check_numbers(plant: Plant) -> None:
 
 def check_equations(plant: Plant) -> None:
     """Raise InputError when a function of a plant fails or returns a wrong number of entries."""
-    kind = ca.MX if plant.tabulated else ca.SX
+    kind = ca.MX if plant.actuator.tabulated else ca.SX
     x, u = kind.sym("x", len(plant.states)), kind.sym("u", len(plant.inputs))
     w, y = kind.sym("w", len(plant.disturbances)), kind.sym("y", len(plant.outputs))
     i = kind.sym("i", len(plant.actuator.coils))
@@ -86,9 +85,9 @@ def check_equations(plant: Plant) -> None:
         "f": (lambda: plant.f(x, u, w), len(plant.states), "states"),
         "h": (lambda: plant.h(x, u), len(plant.outputs), "outputs"),
         "load": (lambda: plant.load(x), len(plant.disturbances), "disturbances"),
-        "currents": (lambda: plant.currents(y, u), len(plant.actuator.coils), "coils"),
-        "forces": (lambda: plant.forces(x, i), len(plant.inputs), "inputs"),
-        "contact": (lambda: plant.contact(x), len(plant.contacts), "contacts"),
+        "actuator.currents": (lambda: plant.actuator.currents(y, u), len(plant.actuator.coils), "coils"),
+        "actuator.forces": (lambda: plant.actuator.forces(x, i), len(plant.inputs), "inputs"),
+        "contacts.contact": (lambda: plant.contacts.contact(x), len(plant.contacts.names), "contacts"),
     }
     for name, question in asked.items():
         found = _check_size(plant, name, *question)
@@ -171,7 +170,7 @@ def check_symbols(plant: Plant) -> None:
 
     CasADi returns NaN without an error when a function takes a symbol for a number, as `math.sin(par.slope)` does.
     """
-    if plant.tabulated:  # its table holds numbers; using symbols raises an error there
+    if plant.actuator.tabulated:  # its table holds numbers; using symbols raises an error there
         return
     names = symbolic_names(plant.parameters)
     bad = _fault_with_symbols(plant, names)
@@ -191,13 +190,20 @@ def _fault_with_symbols(plant: Plant, names: Sequence[str]) -> str:
         return "plant"
     x, u, w = ca.DM(plant.at().x), ca.DM.zeros(len(plant.inputs)), ca.DM.zeros(len(plant.disturbances))
     y, i = ca.DM(plant.h(x, u)), ca.DM.zeros(len(plant.actuator.coils))
-    at = {"f": (x, u, w), "h": (x, u), "load": (x,), "currents": (y, u), "forces": (x, i), "contact": (x,)}
+    at = {
+        "f": (x, u, w),
+        "h": (x, u),
+        "load": (x,),
+        "actuator.currents": (y, u),
+        "actuator.forces": (x, i),
+        "contacts.contact": (x,),
+    }
     for key, arguments in at.items():
         try:
-            found = ca.SX(getattr(machine, key)(*map(ca.SX, arguments)))
+            found = ca.SX(attrgetter(key)(machine)(*map(ca.SX, arguments)))
         except Exception:  # likewise
             return key
-        numbers = ca.Function(key, [ca.vertcat(*symbols.values())], [found])(ca.DM(values))
-        if ca.DM(numbers).is_regular() < ca.DM(getattr(plant, key)(*arguments)).is_regular():
+        numbers = ca.Function("found", [ca.vertcat(*symbols.values())], [found])(ca.DM(values))
+        if ca.DM(numbers).is_regular() < ca.DM(attrgetter(key)(plant)(*arguments)).is_regular():
             return key
     return ""

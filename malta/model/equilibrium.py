@@ -82,7 +82,7 @@ def register(plant: Plant, build: Callable[[Any], Plant]) -> None:
     The check is of the functions, not of numbers: one for all plants that differ in numbers. Raises InputError as
     `checks.check_symbols`.
     """
-    if plant.tabulated:  # its table holds numbers, and symbols raise an error there
+    if plant.actuator.tabulated:  # its table holds numbers, and symbols raise an error there
         return
     family = _family_of(plant, build)
     if family not in _checked:
@@ -93,7 +93,7 @@ def register(plant: Plant, build: Callable[[Any], Plant]) -> None:
 
 def is_checked(plant: Plant, build: Callable[[Any], Plant]) -> bool:
     """Whether a plant of the same family, whose functions have the same sizes, was registered before."""
-    return not plant.tabulated and _family_of(plant, build) in _checked
+    return not plant.actuator.tabulated and _family_of(plant, build) in _checked
 
 
 def check_values(plant: Plant) -> None:
@@ -112,9 +112,8 @@ def _functions(plant: Plant, _believed: None) -> tuple[Expressions, Expressions]
         ca.SX.sym(name, size)
         for name, size in zip("xuwyi", (*sizes.values(), len(plant.actuator.coils)), strict=True)
     )
-    found = (
-        plant.f(x, u, w), plant.h(x, u), plant.load(x), plant.currents(y, u), plant.forces(x, i), plant.contact(x),
-    )  # fmt: skip
+    own = (plant.f(x, u, w), plant.h(x, u), plant.load(x))
+    found = (*own, plant.actuator.currents(y, u), plant.actuator.forces(x, i), plant.contacts.contact(x))
     return [x, u, w, y, i], [ca.densify(ca.SX(one)) for one in found]
 
 
@@ -352,7 +351,7 @@ def exceeded_limit(plant: Plant, point: OperatingPoint) -> str:
         if abs(v) > most * (1 + LIMIT_ROUNDING):
             return f"the command {s.name} = {v:.4g} {s.unit} is beyond its limit of {most:.4g} {s.unit}"
     wanted = trace(_currents_wanted, plant)(point.x, point.v)[0].ravel()
-    carried = np.array(ca.evalf(ca.vertcat(plant.limited(ca.DM(wanted))))).ravel()
+    carried = np.array(ca.evalf(ca.vertcat(plant.actuator.limited(ca.DM(wanted))))).ravel()
     carried = np.clip(carried, -plant.actuator.current_limit, plant.actuator.current_limit)
     missed = np.abs(carried - wanted)
     k = int(missed.argmax())
@@ -391,7 +390,7 @@ def _named(plant: Plant, x: FloatArray) -> str:
 def chain(plant: Plant, believed: Plant | None) -> tuple[ca.Function, ca.Function]:
     """(x, v) -> inputs that the currents of v make; (x, v) -> these currents, A."""
     x, v, i = _currents_of(plant, believed)
-    made = ca.Function("inputs", [x, v], [ca.densify(plant.forces(x, i))])
+    made = ca.Function("inputs", [x, v], [ca.densify(plant.actuator.forces(x, i))])
     return made, ca.Function("currents", [x, v], [ca.densify(i)])
 
 
@@ -475,7 +474,7 @@ def _made(
     """(x, v) -> inputs that the currents of v make; of the states and the commands alone that are used, if any are."""
     symbols = _symbols(plant, believed)
     x, v = (one * ca.DM(used) if used else one for one, used in zip(symbols, (states, commands), strict=True))
-    return symbols, [ca.cse(ca.densify(plant.forces(x, _currents(plant, believed, x, v))))]
+    return symbols, [ca.cse(ca.densify(plant.actuator.forces(x, _currents(plant, believed, x, v))))]
 
 
 def _currents_of(plant: Plant, believed: Plant | None) -> tuple[Any, Any, Any]:
@@ -485,12 +484,12 @@ def _currents_of(plant: Plant, believed: Plant | None) -> tuple[Any, Any, Any]:
 
 
 def _symbols(plant: Plant, believed: Plant | None) -> list[Any]:
-    kind = ca.MX if (believed or plant).tabulated else ca.SX
+    kind = ca.MX if (believed or plant).actuator.tabulated else ca.SX
     return [kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))]
 
 
 def _currents(plant: Plant, believed: Plant | None, x: Any, v: Any) -> Any:
-    return (believed or plant).currents(plant.h(x, type(x).zeros(len(plant.inputs))), v)
+    return (believed or plant).actuator.currents(plant.h(x, type(x).zeros(len(plant.inputs))), v)
 
 
 def _currents_wanted(plant: Plant, believed: Plant | None) -> tuple[list[Any], list[Any]]:
@@ -505,7 +504,7 @@ def _effect_missed(plant: Plant, believed: Plant | None, loaded: bool) -> tuple[
     kind = type(x)
     w = plant.load(x) if loaded else kind.zeros(len(plant.disturbances))
     u = kind.sym("u", len(plant.inputs))
-    left = _rates_of(plant, x, ca.densify(plant.forces(x, i)), w) - _rates_of(plant, x, u, w)
+    left = _rates_of(plant, x, ca.densify(plant.actuator.forces(x, i)), w) - _rates_of(plant, x, u, w)
     return [ca.vertcat(x, u), v], [left, ca.jacobian(left, v)]
 
 

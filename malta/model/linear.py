@@ -33,10 +33,12 @@ from scipy import linalg
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.matrices import system_matrix
+from malta.model.actuator import Actuator
 from malta.model.data import plant_of
 from malta.model.machines import machine_names
 from malta.model.parameters import check_parameters, si, symbolic_names
-from malta.model.plant import Actuator, Parameters, Plant, Signal
+from malta.model.plant import Parameters, Plant, Signal
+from malta.model.sensors import Sensors
 
 LONGEST = 4000  # characters of a formula
 FUNCTIONS = {
@@ -353,9 +355,9 @@ def plant(par: Any) -> Plant:
             current_limit=math.inf,
             force_limit=s.limit,
             dead_time=s.dead_time,
+            limited=lambda i: i,
         ),
-        limited=lambda i: i,
-        noise=s.noise,
+        sensors=Sensors(noise=s.noise),
     )
     return made
 

@@ -140,7 +140,7 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
 
 def _derivatives(plant: Plant, believed: Plant | None, loaded: bool) -> tuple[list[Any], list[Any]]:
     """(x, u, v) -> what `jacobians` returns, under the loads or without them."""
-    kind = ca.MX if (believed or plant).tabulated else ca.SX
+    kind = ca.MX if (believed or plant).actuator.tabulated else ca.SX
     sizes = {"x": len(plant.states), "u": len(plant.inputs), "v": len(plant.inputs)}
     x, u, v = (kind.sym(name, size) for name, size in sizes.items())
     w = plant.load(x) if loaded else kind.zeros(len(plant.disturbances))
@@ -179,7 +179,7 @@ def jacobians(
     C = ca.jacobian(plant.h(x, u), x)
     kind = type(x)
     y, i = kind.sym("y", C.shape[0]), kind.sym("i", len(plant.actuator.coils))
-    made, wanted = plant.forces(x, i), (believed or plant).currents(y, v)
+    made, wanted = plant.actuator.forces(x, i), (believed or plant).actuator.currents(y, v)
     here = ca.densify(plant.h(x, u))  # a coil may be zero always: substitute asks for equal patterns
     carried = ca.densify(ca.substitute([wanted], [y], [here])[0])
 
@@ -226,11 +226,11 @@ def check_inverse(plant: Plant) -> InverseCheck:
 def _clearance(plant: Plant, index: int, sign: float) -> float:
     """How far a state may go either way, SI: to the first contact or the end of the travel; 0 without any."""
     if plant.has_stroke and index == plant.stroke_state:
-        return sign * plant.travel
-    if not plant.contacts:
+        return sign * plant.stroke.travel
+    if not plant.contacts.names:
         return 0.0
     x = ca.SX.sym("x", len(plant.states))
-    share = ca.Function("contact", [x], [ca.densify(plant.contact(x))])
+    share = ca.Function("contact", [x], [ca.densify(plant.contacts.contact(x))])
 
     def is_free(distance: float) -> bool:
         there = np.zeros(len(plant.states))
@@ -273,7 +273,7 @@ def _mismatch(plant: Plant, functions: Any, index: int, ends: tuple[float, float
                 if not (np.isfinite(i).all() and np.isfinite(u).all()):
                     continue
                 if not np.allclose(
-                    np.array(ca.evalf(ca.vertcat(plant.limited(ca.DM(i))))).ravel(), i, rtol=1e-9
+                    np.array(ca.evalf(ca.vertcat(plant.actuator.limited(ca.DM(i))))).ravel(), i, rtol=1e-9
                 ):
                     continue
                 j = int((np.abs(u - v) / limits).argmax())
@@ -292,6 +292,8 @@ def _mismatch(plant: Plant, functions: Any, index: int, ends: tuple[float, float
 @lru_cache(maxsize=64)  # tracing the currents is slow
 def is_commutated(plant: Plant) -> bool:
     """Whether a machine's currents depend on the measured position, so that holding them changes the loop."""
-    kind = ca.MX if plant.tabulated else ca.SX
+    kind = ca.MX if plant.actuator.tabulated else ca.SX
     y, v = kind.sym("y", len(plant.outputs)), kind.sym("v", len(plant.inputs))
-    return bool(ca.which_depends(plant.currents(y, v), y, 1, True) != [False] * len(plant.actuator.coils))
+    return bool(
+        ca.which_depends(plant.actuator.currents(y, v), y, 1, True) != [False] * len(plant.actuator.coils)
+    )

@@ -7,11 +7,10 @@ machine moves by f(x, u, w + load(x)), and the controller is designed for f(x, u
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cache, cached_property, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -20,75 +19,14 @@ from numpy.typing import ArrayLike
 from malta.arrays import FloatArray, readonly
 from malta.display import Description, display, quantity
 from malta.errors import InputError
+from malta.model.actuator import Actuator
+from malta.model.contacts import Contacts
 from malta.model.equations import Body
+from malta.model.flat_fields import GROUPS, refuse_flat, refuse_reading
 from malta.model.parameters import Parameters as Parameters
-from malta.model.signals import (
-    CasadiFn,
-    Drive,
-    Electronics,
-    InverseCheck,
-    LateSensors,
-    Signal as Signal,
-    require_short,
-    split_dead_time,
-)
-
-DEFAULT: Any = None  # stands for a function that follows from the other fields
-
-
-@dataclass(frozen=True)
-class Actuator:
-    """The coils that make the inputs: their current loops and limits.
-
-    The current loop is a PI controller on 1 / (L s + R), designed for `crossover` and `phase_margin`. Without a
-    crossover currents follow their commands at once, and of the fields after `current_limit` only `dead_time` counts.
-
-    coils : their currents, A
-    force_constant : N/A, of each input; empty when inputs share coils
-    current_limit : A, of each coil
-    force_limit : of each input, N or N m; (): by the current limit
-    voltage_limit : V; inf: none
-    R : ohm
-    L : H
-    crossover : rad/s, of the current loops; inf: currents follow their commands at once
-    phase_margin : rad, of the current loops
-    sample_time : s, of the current loops
-    loop_delay : s, dead time of the current loops
-    dead_time : s, from measurement to force
-
-    >>> import malta
-    >>> current = malta.model.Signal("i", "A")
-    >>> coil = malta.model.Actuator((current,), (38.0,), current_limit=3, dead_time=1e-4)
-    >>> coil.force_limit, coil.delay(Ts=50e-6)  # N; samples
-    ((114.0,), 2)
-    """
-
-    coils: tuple[Signal, ...]
-    force_constant: tuple[float, ...]
-    current_limit: float
-    force_limit: tuple[float, ...] = ()
-    voltage_limit: float = math.inf
-    R: float = 0.0
-    L: float = 0.0
-    crossover: float = math.inf
-    phase_margin: float = math.pi / 2
-    sample_time: float = 0.0
-    loop_delay: float = 0.0
-    dead_time: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not self.force_limit:
-            limits = tuple(self.current_limit * constant for constant in self.force_constant)
-            object.__setattr__(self, "force_limit", limits)
-
-    def delay(self, Ts: float) -> int:
-        """Whole samples of delay from measurement to force: the dead time minus the half sample of the hold.
-
-        Ts : sample time, s
-
-        Raises InputError for more than MOST_DELAY.
-        """
-        return require_short("machine", "dead time", max(0, round(self.dead_time / Ts - 0.5)))
+from malta.model.sensors import Sensors, split_dead_time
+from malta.model.signals import DEFAULT, CasadiFn, Drive, InverseCheck, Signal as Signal
+from malta.model.stroke import Stroke
 
 
 @display
@@ -99,9 +37,8 @@ class Plant:
         x' = f(x, u, w + load(x)),    y = h(x, u)
 
     `states` are positions, then their rates in the same order (`second_order`); a machine with other states has no
-    natural frequencies, no PID and no feedforward of speeds. The inputs are forces. `currents(y, v)` returns the coil
-    currents for the forces v at the measured position y. They are held for one sample, while the forces of these
-    currents, `forces(x, i)`, change with the state.
+    natural frequencies, no PID and no feedforward of speeds. The inputs are forces; what makes and limits them is the
+    `actuator`, what reads the outputs the `sensors`.
 
     Only the fields without a default are required. `malta.plant_of` checks that the fields fit each other.
 
@@ -112,41 +49,26 @@ class Plant:
     outputs : p
     f : (x, u, w) -> x'
     h : (x, u) -> y
-    actuator : coils, limits and current loops
+    actuator : `Actuator`: coils, their currents, forces and limits, current loops
     variant : the same machine with other parameters: its own function `plant`
     disturbances : w, forces and torques from outside
     uncontrolled : states that no input reaches, as the rotation of a round mover: simulated, but not designed for
     load : x -> w of gravity and cogging; default: zero
     position_of : y -> controlled positions at rest (of other states than (q, q'): all states), inverse of h; default: y
     preload : x -> inputs that act at the operating point of the design model; default: those of commands of zero
-    currents : (y, inputs) -> coil currents, A; default: by the force constants
-    forces : (x, coil currents) -> inputs; default: by the force constants
-    limited : coil currents -> coil currents within their limits
-    tabulated : whether `currents` uses a look-up table, so that only CasADi MX works
-    windings : model of the windings; None: none
-    electronics : options of the machine -> electronics; None: those of the drive
-    contacts : surfaces that the mover may touch
-    contact : x -> used share of each clearance; 1 at contact
-    cushioned : of each contact: whether a touchdown bearing carries it
-    bearing : x -> w of the touchdown bearings; zero without contact
-    sense : (x, sensor errors) -> y without noise; default: h
-    sensor_errors : systematic errors of the sensors
-    sensors : `malta.model.LateSensors`, lags and dead time of the sensors; None: they read at once
-    noise : of each sensor, rms of a sample, in the unit of the output; default: zero
-    uniform : whether the noise is uniform; else normal
-    resolution : of each sensor, in the unit of the output; 0: not quantized
+    sensors : `Sensors`: noise, resolution, errors, lags and dead time
+    contacts : `Contacts`: surfaces that the mover may touch
+    stroke : `Stroke`: the output that travels, and what drives it; default: the machine has none
     inertia : of each input: factor of p*'' of the same output in the feedforward
-    mass : kg, moved by the `thrust` input
-    thrust : the input that drives the stroke
-    stroke : the output that the stroke moves; "": the machine has no stroke, travel, thrust and mass
-    travel : of the stroke, either way, m
     over : intervals of parameters that proofs cover, SI, as any speed of a rotor: {"Omega": (0, 2094)}
     bodies : () -> what pictures of the machine in motion show, see `malta motion`; None: no pictures
 
+    Raises InputError for a field of a group that stands at the machine itself, as noise=..., and names its group.
+
     >>> import malta
     >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
-    >>> plant.second_order, plant.stroke, plant.travel, plant.uncontrolled
-    (True, 'z', 0.015, ('gamma', 'gamma_dot'))
+    >>> plant.second_order, plant.stroke.travel, plant.uncontrolled
+    (True, 0.015, ('gamma', 'gamma_dot'))
     """
 
     name: str
@@ -163,42 +85,41 @@ class Plant:
     load: CasadiFn = DEFAULT
     position_of: CasadiFn = DEFAULT
     preload: CasadiFn = DEFAULT
-    currents: CasadiFn = DEFAULT
-    forces: CasadiFn = DEFAULT
-    limited: CasadiFn = DEFAULT
-    tabulated: bool = False
-    windings: Drive | None = None
-    electronics: Callable[[Any], Electronics] | None = None
-    contacts: tuple[str, ...] = ()
-    contact: CasadiFn = DEFAULT
-    cushioned: tuple[bool, ...] = ()
-    bearing: CasadiFn = DEFAULT
-    sense: CasadiFn = DEFAULT
-    sensor_errors: tuple[Signal, ...] = ()
-    sensors: LateSensors | None = None
-    noise: tuple[float, ...] = ()
-    uniform: bool = False
-    resolution: tuple[float, ...] = ()
+    sensors: Sensors = field(default_factory=Sensors)
+    contacts: Contacts = field(default_factory=Contacts)
+    stroke: Stroke = field(default_factory=Stroke)
     inertia: tuple[float, ...] = ()
-    mass: float = 0.0
-    thrust: str = ""
-    stroke: str = ""
-    travel: float = 0.0
     over: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     bodies: Callable[[], Sequence[Body]] | None = None
 
+    if not TYPE_CHECKING:
+
+        def __new__(cls, *_: Any, **given: Any) -> Plant:
+            """Refuse the fields that are in groups now, with a sentence. It goes with version 0.4, as __getattr__."""
+            refuse_flat(given)
+            return super().__new__(cls)
+
+        def __getattr__(self, name: str) -> Any:
+            """Say in which group a field is, for the names that a plant had before it had groups."""
+            return refuse_reading(name)
+
     def __post_init__(self) -> None:
+        refuse_flat({name: getattr(self, name) for name in GROUPS}, self.name)
         for name, value in _defaults(self).items():
-            given = getattr(self, name)
+            group, _, entry = name.rpartition(".")
+            record = getattr(self, group) if group else self
+            given = getattr(record, entry)
             if given is DEFAULT or given == ():
-                object.__setattr__(self, name, value)
+                if group:
+                    record, entry, value = self, group, replace(record, **{entry: value})
+                object.__setattr__(record, entry, value)
 
     @property
     def drive(self) -> Drive:
         """The windings. Raises InputError for a machine without a model of them."""
-        if self.windings is None:
+        if self.actuator.windings is None:
             raise InputError(self.name, "drive", "none", "a machine whose windings are modelled")
-        return self.windings
+        return self.actuator.windings
 
     @property
     def controlled(self) -> tuple[int, ...]:
@@ -235,38 +156,38 @@ class Plant:
     @property
     def has_stroke(self) -> bool:
         """Whether one of the outputs is a stroke."""
-        return bool(self.stroke)
+        return bool(self.stroke.name)
 
     @property
     def stroke_output(self) -> int:
         """The index of the stroke among the outputs. Raises InputError for a machine without a stroke."""
-        return self._index("stroke", self.outputs)
+        return self._index(self.stroke.name, self.outputs)
 
-    def _index(self, field: str, signals: tuple[Signal, ...]) -> int:
+    def _index(self, name: str, signals: tuple[Signal, ...]) -> int:
         """The index of the stroke or the thrust among signals."""
-        if not getattr(self, field):
-            raise InputError(self.name, field, "none", "a machine with a stroke")
-        return [s.name for s in signals].index(getattr(self, field))
+        if not name:
+            raise InputError(self.name, "stroke", "none", "a machine with a stroke")
+        return [s.name for s in signals].index(name)
 
     @property
     def leading_output(self) -> int:
         """The index of the stroke among the outputs; 0 for a machine without a stroke."""
-        return self.stroke_output if self.stroke else 0
+        return self.stroke_output if self.has_stroke else 0
 
     @property
     def leading_input(self) -> int:
         """The index of the thrust among the inputs; 0 for a machine without a stroke."""
-        return self.thrust_input if self.stroke else 0
+        return self.thrust_input if self.has_stroke else 0
 
     @property
     def stroke_state(self) -> int:
         """The index of the stroke among the states. Raises InputError for a machine without a stroke."""
-        return self._index("stroke", self.states)
+        return self._index(self.stroke.name, self.states)
 
     @property
     def thrust_input(self) -> int:
         """The index of the thrust among the inputs. Raises InputError for a machine without a stroke."""
-        return self._index("thrust", self.inputs)
+        return self._index(self.stroke.thrust, self.inputs)
 
     def nlsys(self) -> Any:
         """The machine as a continuous control.NonlinearIOSystem with named signals, evaluated by CasADi.
@@ -280,7 +201,7 @@ class Plant:
         """
         import control  # imports matplotlib and takes a second: only where it is used
 
-        m, kind = len(self.inputs), ca.MX if self.tabulated else ca.SX
+        m, kind = len(self.inputs), ca.MX if self.actuator.tabulated else ca.SX
         x, u = kind.sym("x", len(self.states)), kind.sym("u", m + len(self.disturbances))
         rate = ca.Function("rate", [x, u], [ca.densify(self.f(x, u[:m], u[m:] + self.load(x)))])
         outputs = ca.Function("outputs", [x, u], [ca.densify(self.h(x, u[:m]))])
@@ -378,8 +299,8 @@ class Plant:
         rows = [(kind, " ".join(signal.name for signal in signals)) for kind, signals in names.items()]
         rows.append(("disturbances", " ".join(signal.name for signal in self.disturbances)))
         if self.has_stroke:
-            rows.append(("stroke", f"{self.stroke}, {quantity(self.travel, 'm')} either way"))
-        rows.append(("contacts", " ".join(self.contacts) or "none"))
+            rows.append(("stroke", f"{self.stroke.name}, {quantity(self.stroke.travel, 'm')} either way"))
+        rows.append(("contacts", " ".join(self.contacts.names) or "none"))
         limits = (
             quantity(limit, s.unit) for limit, s in zip(self.actuator.force_limit, self.inputs, strict=False)
         )
@@ -391,21 +312,20 @@ def _defaults(plant: Plant) -> dict[str, Any]:
     """The defaults of a plant's optional fields, by name."""
     m, p, w = len(plant.inputs), len(plant.outputs), len(plant.disturbances)
     actuator = plant.actuator
-    constants, limit = actuator.force_constant, actuator.current_limit
     return {
         "load": partial(_zeros, w),
         "position_of": outputs_themselves,
-        "preload": lambda x: plant.forces(x, plant.currents(plant.h(x, ca.DM.zeros(m)), ca.DM.zeros(m))),
-        "currents": lambda _, v: v / ca.vertcat(*constants),
-        "forces": lambda _, i: ca.vertcat(*constants) * i,
-        "limited": lambda i: ca.fmax(ca.fmin(i, limit), -limit),
-        "contact": partial(_zeros, 0),
-        "cushioned": (False,) * len(plant.contacts),
-        "bearing": partial(_zeros, w),
-        "sense": lambda x, _: plant.h(x, 0),
-        "noise": (0.0,) * p,
-        "resolution": (0.0,) * p,
+        "preload": lambda x: actuator.forces(
+            x, actuator.currents(plant.h(x, ca.DM.zeros(m)), ca.DM.zeros(m))
+        ),
         "inertia": (0.0,) * m,
+        "contacts.contact": partial(_zeros, 0),
+        "contacts.cushioned": (False,) * len(plant.contacts.names),
+        "contacts.bearing": partial(_zeros, w),
+        "sensors.sense": lambda x, _: plant.h(x, 0),
+        "sensors.lag": (0.0,) * p,
+        "sensors.noise": (0.0,) * p,
+        "sensors.resolution": (0.0,) * p,
     }
 
 
@@ -423,8 +343,6 @@ def whole_samples(plant: Plant, Ts: float) -> int:
 
     Raises InputError for a dead time that is not a whole number of samples.
     """
-    if plant.sensors is None:
-        return 0
     whole, rest = split_dead_time(plant.sensors.dead_time, Ts)
     if rest:
         found = f"{plant.sensors.dead_time * 1e6:g} us of dead time of its sensors"
@@ -447,7 +365,7 @@ def position_in(plant: Plant, x: ArrayLike) -> float:
 
 def position_at(plant: Plant, x: ArrayLike) -> dict[str, float]:
     """The position along the stroke by name, an argument of `plant.at`, and the other states that are not zero."""
-    return ({plant.stroke: position_in(plant, x)} if plant.has_stroke else {}) | off_stroke(plant, x)
+    return ({plant.stroke.name: position_in(plant, x)} if plant.has_stroke else {}) | off_stroke(plant, x)
 
 
 def outputs_at(plant: Plant, x: ArrayLike) -> FloatArray:
@@ -458,7 +376,7 @@ def outputs_at(plant: Plant, x: ArrayLike) -> FloatArray:
 def off_stroke(plant: Plant, x: ArrayLike) -> dict[str, float]:
     """The states by name that are not zero, without the stroke."""
     pairs = zip(plant.states, np.asarray(x).tolist(), strict=True)
-    return {s.name: value for s, value in pairs if value and s.name != plant.stroke}
+    return {s.name: value for s, value in pairs if value and s.name != plant.stroke.name}
 
 
 @display

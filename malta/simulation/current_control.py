@@ -11,9 +11,10 @@ import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray
+from malta.model.actuator import Actuator
 from malta.model.data import plant_of
 from malta.model.equations import note
-from malta.model.plant import Actuator, placed
+from malta.model.plant import placed
 from malta.model.signals import Drive
 from malta.simulation.layout import Loop, Setup, Signals
 from malta.synthesis.controller import Add
@@ -131,7 +132,11 @@ def control_currents(
         i_axes=read,
     )
     note("current_errors", "epsilon = commanded less measured currents of the axes", epsilon=error)
-    Q = believed.drive.turned(believed.forces(estimate, current)) if s.turning else ca.SX.eye(len(drive.axes))
+    Q = (
+        believed.drive.turned(believed.actuator.forces(estimate, current))
+        if s.turning
+        else ca.SX.eye(len(drive.axes))
+    )
     waiting = controller["u_limited"]
     step = g["Ki_current"] * g["control_time"] * (1 - waiting) * (Q @ error)
     integral = add(controller["u_integral"], step)

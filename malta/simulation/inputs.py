@@ -206,7 +206,7 @@ def countering_forces(believed: Plant, motion: Motion, wrench: FloatArray) -> Fl
 @lru_cache(maxsize=16)
 def _effects(plant: Plant) -> ca.Function:
     """Controlled states -> df/dv and df/dw of these states, each as one column."""
-    kind = ca.MX if plant.tabulated else ca.SX
+    kind = ca.MX if plant.actuator.tabulated else ca.SX
     chosen = list(plant.controlled)
     controlled = kind.sym("x", len(chosen))
     x = placed(plant, controlled)
@@ -398,7 +398,7 @@ def sensor_noise(run: Simulation, stages: list[tuple[int, Plant]], t: FloatArray
     drawn: FloatArray = np.zeros((len(t), len(noise_scales(plant, setup))))
     if scenario.noise:
         drawn = normals_of_parts(keys(scenario.seed, np.atleast_1d(scenario.run)), *drawn.shape)
-        if plant.uniform:
+        if plant.sensors.uniform:
             drawn = math.sqrt(3) * erf(drawn / math.sqrt(2))
         for k, (first, now) in enumerate(stages):
             last = stages[k + 1][0] if k + 1 < len(stages) else len(t)
@@ -454,6 +454,6 @@ def initial_values(run: Simulation, first: FloatArray) -> tuple[FloatArray, ...]
 @lru_cache(maxsize=16)
 def _holding_currents(plant: Plant, believed: Plant) -> ca.Function:
     """(x, v) -> coil currents (A) that the controller commands for forces v while the machine is at x."""
-    kind = ca.MX if believed.tabulated else ca.SX
+    kind = ca.MX if believed.actuator.tabulated else ca.SX
     x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))
-    return ca.Function("currents", [x, v], [ca.densify(believed.currents(plant.h(x, 0), v))])
+    return ca.Function("currents", [x, v], [ca.densify(believed.actuator.currents(plant.h(x, 0), v))])

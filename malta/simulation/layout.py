@@ -117,7 +117,11 @@ def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
     if s.outside:
         given |= {"xi_hat": n}
     row = {"x": len(plant.states), "p": p, "y": p, "xi_hat": n, "v": m, "force": m, "saturated": m}
-    row |= {"contact": len(plant.contacts), "current": coils, "met": 1 + (len(fast.flags) if fast else 0)}
+    row |= {
+        "contact": len(plant.contacts.names),
+        "current": coils,
+        "met": 1 + (len(fast.flags) if fast else 0),
+    }
     if driven:
         row |= {"i": axes, "u": axes, "link": 1}
     if s.fidelity == "phase":
@@ -140,7 +144,9 @@ def places_of(sizes: Mapping[str, int], begin: int = 0) -> dict[str, slice]:
 def ending_columns(plant: Plant, c: Controller, s: Setup) -> tuple[int, ...]:
     """The columns of a row whose contacts end a run; a contact that a touchdown bearing cushions ends none."""
     first = columns_of_row(plant, c, s)["contact"].start
-    return tuple(first + i for i, cushioned in enumerate(plant.cushioned) if not (s.bearing and cushioned))
+    return tuple(
+        first + i for i, cushioned in enumerate(plant.contacts.cushioned) if not (s.bearing and cushioned)
+    )
 
 
 def numbers_of(
@@ -153,7 +159,7 @@ def numbers_of(
     """
     machine = {k: ca.DM(getattr(plant.parameters, k)) for k in acting_names(plant.parameters)}
     loop = c.current_loop or CurrentLoop(0.0, 0.0, 0.0)
-    known = dict.fromkeys((signal.name for signal in plant.sensor_errors), 0.0) | dict(errors or {})
+    known = dict.fromkeys((signal.name for signal in plant.sensors.errors), 0.0) | dict(errors or {})
     return {
         **{f"machine.{name}": ca.DM(value) for name, value in machine.items()},
         **gains_of(c),
@@ -182,16 +188,16 @@ def with_symbols(plant: Plant, values: Mapping[str, ca.DM]) -> tuple[Plant, dict
 
 def electronics_of(plant: Plant, s: Setup) -> Electronics | None:
     """The electronics of the machine in fidelity `phase`; None where it has none, and in other fidelities."""
-    if s.fidelity != "phase" or plant.electronics is None:
+    if s.fidelity != "phase" or plant.actuator.electronics is None:
         return None
-    return plant.electronics(s.electronics)
+    return plant.actuator.electronics(s.electronics)
 
 
 def fidelities(plant: Plant) -> tuple[Fidelity, ...]:
     """The fidelities in which a machine can be simulated."""
-    if plant.windings is not None:
+    if plant.actuator.windings is not None:
         return FIDELITIES
-    return ("force",) if plant.electronics is None else ("force", "phase")
+    return ("force",) if plant.actuator.electronics is None else ("force", "phase")
 
 
 def read_currents(plant: Plant, s: Setup) -> int:
@@ -205,13 +211,13 @@ def noise_scales(plant: Plant, s: Setup) -> tuple[Any, ...]:
     A run draws as many numbers a sample. So the noise of the outputs is another one where currents are read.
     """
     if not s.current_sensors or plant.drive.sensors is None:
-        return (*plant.noise, *[0.0] * read_currents(plant, s))
-    return (*plant.noise, *[plant.drive.sensors.noise] * read_currents(plant, s))
+        return (*plant.sensors.noise, *[0.0] * read_currents(plant, s))
+    return (*plant.sensors.noise, *[plant.drive.sensors.noise] * read_currents(plant, s))
 
 
 def _winding_counts(plant: Plant) -> tuple[int, int]:
     """Number of axes and phases of the drive."""
-    drive = plant.windings
+    drive = plant.actuator.windings
     return (0, 0) if drive is None else (len(drive.axes), len(drive.phases))
 
 

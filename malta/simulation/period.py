@@ -78,7 +78,7 @@ def motion(loop: Loop, signals: Signals, x: Any, inputs: Any) -> Any:
     """x' under the inputs, the machine's loads and what acts from outside."""
     plant, s = loop.plant, loop.setup
     w = plant.load(x) + _outside(loop, signals)
-    return plant.f(x, inputs, w + plant.bearing(x) if s.bearing else w)
+    return plant.f(x, inputs, w + plant.contacts.bearing(x) if s.bearing else w)
 
 
 def _outside(loop: Loop, signals: Signals) -> Any:
@@ -100,7 +100,9 @@ def _move(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
     if s.fidelity == "force":
         currents = _lagging_currents(plant.actuator.crossover, machine["i_coil"], held, h)
         half = len(plant.states) // 2 if plant.second_order else 0
-        moved = runge_kutta(lambda x, n: motion(loop, signals, x, plant.forces(x, currents[n])), x, h, half)
+        moved = runge_kutta(
+            lambda x, n: motion(loop, signals, x, plant.actuator.forces(x, currents[n])), x, h, half
+        )
         return ca.vertcat(moved, currents[2])
     n, count = len(plant.states), machine["i" if s.fidelity == "dq" else "i_phase"].numel()
     slope = _axis_slope if s.fidelity == "dq" else _phase_slope
@@ -302,7 +304,7 @@ def initial_state(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, c
         values |= {"i": i, "i_phase": T @ i, "u_integral": actuator.R * i, "link": drive.link_voltage}
         if s.turning:
             believed = plant_of(c.parameters)
-            Q = believed.drive.turned(believed.forces(x, current))
+            Q = believed.drive.turned(believed.actuator.forces(x, current))
             values["u_integral"] = Q @ values["u_integral"]
         values["command"] = share if s.fidelity == "dq" else 0.5 + T @ share
     values["under_way"] = ca.repmat(values["command"], s.delay, 1)
@@ -314,7 +316,7 @@ def initial_state(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, c
 def _decide_function(loop: Loop, theta: Any, sizes: Layout) -> ca.Function:
     """The function `decide` of Period: in CasADi's SX; in MX where the controller looks something up in a table."""
     plant = loop.plant
-    kind = ca.MX if plant_of(loop.controller.parameters).tabulated else ca.SX
+    kind = ca.MX if plant_of(loop.controller.parameters).actuator.tabulated else ca.SX
     if kind is ca.MX:
         constants = {name: ca.MX(ca.DM(value)) for name, value in loop.numbers.items()}
         loop, theta = loop._replace(numbers=constants), ca.MX(0, 1)
@@ -325,7 +327,7 @@ def _decide_function(loop: Loop, theta: Any, sizes: Layout) -> ca.Function:
     y, v0 = read[:outputs], kind.sym("v0", len(plant.inputs))
     x = machine["x"]
     after, command, row = _control_law(loop, signals, y, v0, read[outputs:])
-    row = {"x": x, "p": plant.h(x, 0), "y": y, "contact": plant.contact(x)} | row
+    row = {"x": x, "p": plant.h(x, 0), "y": y, "contact": plant.contacts.contact(x)} | row
     decided = [
         ca.vertcat(*(after[name] for name in sizes.controller)),
         command,
@@ -374,7 +376,7 @@ def _control_law(
     after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": frozen_axes(g, saturated)}
     # The controller commutates with the machine of its gain file. The simulated machine limits the currents, and the
     # gain file does: the smaller limit counts.
-    wanted = believed.currents(place, v)
+    wanted = believed.actuator.currents(place, v)
     current, fast = limited_currents(plant, wanted, g["current_limit"]), electronics_of(plant, s)
     met = [ca.mmax(ca.fabs(current - wanted)) > 0]
     row: dict[str, Any] = {"xi_hat": xi_hat, "v": v, "saturated": saturated, "current": current}
@@ -383,10 +385,10 @@ def _control_law(
         electric_state = {name: machine[name] for name in fast.state}
         met.append(fast.met(electric_state))
         row |= {"i_phase": machine["i_coil"], "duty": fast.duty(electric_state)}
-        row["force"] = plant.forces(machine["x"], machine["i_coil"])
+        row["force"] = plant.actuator.forces(machine["x"], machine["i_coil"])
     elif s.fidelity == "force":
         command = keep_if_missed(s, signals, current)
-        row["force"] = plant.forces(machine["x"], machine["i_coil"])
+        row["force"] = plant.actuator.forces(machine["x"], machine["i_coil"])
     else:
         # A law of errors has no states: the measured outputs stand for them, moving as the reference does.
         known = xi_hat if c.tracks == "states" else state_reference(believed)(y, given["dp_ref"])
@@ -409,7 +411,7 @@ def limited_currents(plant: Plant, wanted: Any, limit: Any) -> Any:
     A machine may scale its currents together, which ends within its limit but for the last digit.
     """
     most = ca.fmin(limit, plant.actuator.current_limit)
-    return ca.fmax(ca.fmin(plant.limited(wanted), most), -most)
+    return ca.fmax(ca.fmin(plant.actuator.limited(wanted), most), -most)
 
 
 def law_reference(c: Controller, believed: Plant, g: Mapping[str, Any], given: Mapping[str, Any]) -> Any:

@@ -30,7 +30,7 @@ TINY = 1e-6  # share of a step that rounding may take from the clock
 def signals(loop: Loop, x: Any) -> Any:
     """The outputs at a state with the errors of the sensors."""
     plant = loop.plant
-    return plant.sense(x, loop.numbers["errors"]) if loop.setup.sensed else plant.h(x, 0)
+    return plant.sensors.sense(x, loop.numbers["errors"]) if loop.setup.sensed else plant.h(x, 0)
 
 
 def measurement(loop: Loop, machine: Mapping[str, Any], noise: Any) -> Any:
@@ -44,7 +44,7 @@ def measurement(loop: Loop, machine: Mapping[str, Any], noise: Any) -> Any:
     y = now + noise
     if not s.quantize:
         return y
-    steps = plant.resolution
+    steps = plant.sensors.resolution
     return ca.vertcat(
         *(
             y[i] if _is_zero(step) else ca.if_else(step > 0, step * ca.floor(y[i] / step + 0.5), y[i])
@@ -61,9 +61,7 @@ def step_readings(loop: Loop, machine: Mapping[str, Any], x: Any) -> dict[str, A
     before, after = signals(loop, machine["x"]), signals(loop, x)
     states: dict[str, Any] = {}
     if s.lagging:
-        sensors = loop.plant.sensors
-        lags = (0.0,) * after.numel() if sensors is None else sensors.lag
-        after = _lag_outputs(machine["lagged"], before, after, lags, h)
+        after = _lag_outputs(machine["lagged"], before, after, loop.plant.sensors.lag, h)
         before, states = machine["lagged"], {"lagged": after}
     if s.late is not None:
         states |= _late(loop, machine, before, after)
@@ -93,7 +91,6 @@ def _lag_outputs(s: Any, before: Any, after: Any, lags: tuple[Any, ...], h: Any)
 def _late(loop: Loop, machine: Mapping[str, Any], before: Any, after: Any) -> dict[str, Any]:
     """The blocks of late readings and the clock after a step in which the readings went from `before` to `after`."""
     plant, _, s, g = loop
-    assert plant.sensors is not None
     assert s.late is not None
     Ts, h, p = g["control_time"], g["substep"], after.numel()
     rest = plant.sensors.dead_time - s.late * Ts

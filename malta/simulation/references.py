@@ -169,9 +169,9 @@ def stroke(
     check_rise(rise)
     axis = plant.stroke_output
     for name, value in (("start", start), ("end", end)):
-        if not abs(value) <= plant.travel:
+        if not abs(value) <= plant.stroke.travel:
             raise InputError(
-                "stroke", name, f"{value} m", f"a position within the travel of +-{plant.travel} m"
+                "stroke", name, f"{value} m", f"a position within the travel of +-{plant.stroke.travel} m"
             )
 
     def at(t: FloatArray) -> Motion:

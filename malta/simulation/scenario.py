@@ -15,7 +15,7 @@ from malta.display import display
 from malta.errors import InputError
 from malta.model.parameters import replace_fields, units_of
 from malta.model.plant import Plant
-from malta.model.signals import require_short, split_dead_time
+from malta.model.sensors import require_short, split_dead_time
 from malta.simulation import references
 from malta.simulation.layout import FIDELITIES, Fidelity, Setup, electronics_of, fidelities
 from malta.simulation.references import Profile, Reference
@@ -312,7 +312,7 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
     if s.fidelity not in able:
         expected = "one of " + ", ".join(able) + f" for a {plant.name}"
         raise InputError(s.where, "fidelity", s.fidelity, expected)
-    own = plant.electronics is not None and s.fidelity == "phase"
+    own = plant.actuator.electronics is not None and s.fidelity == "phase"
     if s.electronics is not None and not own:
         found = f"options of electronics at fidelity {s.fidelity}"
         raise InputError(s.where, "electronics", found, "a machine that has some, at phase")
@@ -329,7 +329,7 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         field, found = ("scheduled", "C of the reading") if s.scheduled else ("estimator", s.estimator)
         expected = "the filter of the gain file, beside a law that is scheduled"
         raise InputError(s.where, field, found, expected)
-    known = [signal.name for signal in plant.sensor_errors]
+    known = [signal.name for signal in plant.sensors.errors]
     for name, value in (s.sensor_errors or {}).items():
         if name not in known:
             where = s.where
@@ -337,7 +337,7 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         if not math.isfinite(value):
             raise InputError(s.where, f"sensor_errors.{name}", repr(value), "a finite number")
     driven, machines = s.fidelity != "force" and not own, machines_of(plant, s)
-    dead_time = 0.0 if plant.sensors is None else plant.sensors.dead_time
+    dead_time = plant.sensors.dead_time
     if dead_time and own:
         found = "sensors with a dead time beside electronics of their own pace"
         raise InputError(s.where, "fidelity", found, "force, or sensors without dead time")
@@ -358,7 +358,7 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         outside=s.estimator != "steady-state",
         anticipated=s.anticipated is not None,
         open_loop=s.open_loop,
-        lagging=any(machine.sensors is not None and bool(machine.sensors.lagging) for machine in machines),
+        lagging=any(machine.sensors.lagging for machine in machines),
         late=late,
         current_sensors=driven and any(machine.drive.sensors is not None for machine in machines),
         electronics=s.electronics,

@@ -216,7 +216,7 @@ def _nonlinear_prediction(c: Controller) -> Callable[..., tuple[FloatArray, Floa
     h = c.sample_time / 4
 
     def rate(z: Any, _: int) -> Any:
-        return believed.f(z, u, believed.load(z) + believed.bearing(z))
+        return believed.f(z, u, believed.load(z) + believed.contacts.bearing(z))
 
     z = x
     for _ in range(4):

@@ -59,12 +59,12 @@ def judge(
     lost = np.atleast_1d(~np.isfinite(rows).all(axis=1))
     touching = contact >= 1
     if run.setup.bearing:
-        touching = touching & ~np.array(plant.cushioned)
+        touching = touching & ~np.array(plant.contacts.cushioned)
     stopped = np.flatnonzero(lost | touching.any(axis=1))
     if not len(stopped):
         return rows, None
     k = int(stopped[0])
-    name = "diverged" if lost[k] else plant.contacts[int(np.where(touching[k], contact[k], 0).argmax())]
+    name = "diverged" if lost[k] else plant.contacts.names[int(np.where(touching[k], contact[k], 0).argmax())]
     return rows[: k + 1], Verdict(name, float(t[k]))
 
 
@@ -81,7 +81,7 @@ def bearing_verdict(plant: Plant, contact: FloatArray, t: FloatArray) -> Verdict
             return None
         return Verdict("not lifted", float(t[len(contact) - 1]))
     k = int(touching.any(axis=1).argmax())
-    return Verdict(plant.contacts[int(contact[k].argmax())], float(t[k]))
+    return Verdict(plant.contacts.names[int(contact[k].argmax())], float(t[k]))
 
 
 def columns_of(run: Simulation, rows: FloatArray, name: str) -> FloatArray:
@@ -172,14 +172,14 @@ class Trajectory:
         """Heat in the windings, W, shape (k,): R i^2 summed over phases, or over axes with their weights."""
         if self.i_phase.size:
             return np.asarray(self.plant.actuator.R * (self.i_phase**2).sum(axis=1))
-        if self.plant.windings is None:
+        if self.plant.actuator.windings is None:
             return np.asarray(self.plant.actuator.R * (self.current**2).sum(axis=1))
         return np.asarray(self.plant.actuator.R * self.axis_currents**2 @ np.array(self.plant.drive.weight))
 
     @property
     def electrical_power(self) -> FloatArray:
         """Power into the windings, W, shape (k,); empty in fidelity `force`."""
-        if not self.i.size or self.plant.windings is None:
+        if not self.i.size or self.plant.actuator.windings is None:
             return np.empty(0)
         delay = min(setup_of(self.plant, self.controller, self.scenario).delay, len(self.u) - 1)
         acting = np.vstack([np.repeat(self.u[:1], delay, axis=0), self.u[: len(self.u) - delay]])
@@ -188,7 +188,7 @@ class Trajectory:
     @property
     def axis_currents(self) -> FloatArray:
         """Currents of the transformation's axes, A, k x axes; in fidelity `force` those that make the acting forces."""
-        if self.i.size or self.plant.windings is None:
+        if self.i.size or self.plant.actuator.windings is None:
             return self.i
         drive, constants = self.plant.drive, np.array(self.plant.actuator.force_constant)
         symbol = ca.SX.sym("i", len(constants))
@@ -210,7 +210,7 @@ class Trajectory:
         for s, column in zip(self.plant.inputs, self.v.T, strict=False):
             largest = float(np.abs(column).max(initial=0.0))
             found.append(Merit(f"largest command {s.name}", largest, s.unit, signal=s.name))
-        if self.plant.contacts:
+        if self.plant.contacts.names:
             closest = float(self.contact.max(initial=0.0))
             found.append(Merit("nearest contact", closest, "percent", relation="at most", bound=1.0))
         return tuple(found)
@@ -223,7 +223,7 @@ class Trajectory:
         for signal, largest, rms in zip(plant.outputs, figures[::2], figures[1::2], strict=False):
             sizes = (quantity(one.value, signal.unit) for one in (largest, rms))
             rows.append((f"p - p* of {signal.name}", "{} at most, {} rms".format(*sizes)))
-        if plant.contacts:
+        if plant.contacts.names:
             rows.append((figures[-1].label, f"{figures[-1].phrase()} of a clearance"))
         rows.append(("limits reached", ", ".join(self.limits) or "none"))
         off, size = self.p - self.reference, [one.value for one in figures[::2]]
@@ -254,7 +254,7 @@ def label_rows(
     for array in (rows, given, t):
         array.flags.writeable = False  # the trajectory's series are views of them
     columns = columns_of_row(plant, controller, setup)
-    if setup.bearing and (verdict is None or verdict.name in plant.contacts):
+    if setup.bearing and (verdict is None or verdict.name in plant.contacts.names):
         verdict = bearing_verdict(plant, rows[:, columns["contact"]], t) or verdict
     before = scenario.settling_samples(controller.sample_time)
     kept = slice(before if done > before else 0, done)
@@ -337,7 +337,7 @@ def save(run: Trajectory, path: str | Path) -> Path:
 
     The archive has t, verdict, and for every series an array and its columns as "name [unit]" in <series>_columns.
     """
-    path, drive = Path(path), run.plant.windings
+    path, drive = Path(path), run.plant.actuator.windings
     axes, phases = ((), run.plant.actuator.coils) if drive is None else (drive.axes, drive.phases)
     columns = {
         "reference": run.plant.outputs,

@@ -74,7 +74,7 @@ def tune_design(
     shares = (0.0, 1.0, -1.0) if plant.has_stroke else (None,)
     places = [
         dict(spec.operating_point)
-        | ({} if share is None else {plant.stroke: share * plant.travel})
+        | ({} if share is None else {plant.stroke.name: share * plant.stroke.travel})
         | dict(zip(plant.over, ends, strict=True))
         for share in shares
         for ends in itertools.product(*plant.over.values())

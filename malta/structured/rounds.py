@@ -193,8 +193,9 @@ def target_of(
         nothing = System(
             np.zeros((1, 1)), np.zeros((1, p)), np.zeros((m, 1)), np.zeros((m, p)), None, sample_time
         )
+        stroke = plant.stroke
         own = (
-            [{plant.stroke: share * plant.travel} for share in (0.0, 1.0, -1.0)] if plant.has_stroke else [{}]
+            [{stroke.name: share * stroke.travel} for share in (0.0, 1.0, -1.0)] if plant.has_stroke else [{}]
         )
         zero = controller_of(nothing, plant, name="nothing")
         return Machine(plant, sample_time, tuple(own if places is None else places), zero)

@@ -62,9 +62,9 @@ from malta.synthesis.schedule import SCHEDULED, Schedule, interpolate
 
 if TYPE_CHECKING:
     from malta.synthesis.filters import Gains
-    from malta.synthesis.spec import Coordinates
 
 
+Coordinates = Literal["signals", "positions"]
 Tracks = Literal["states", "errors"]
 # How a sum takes what is added to it: plainly here, with what rounding loses in firmware of single precision.
 Add = Callable[[Any, Any], Any]

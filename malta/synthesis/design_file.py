@@ -370,7 +370,7 @@ def _loads(content: DesignFile, spec: Spec) -> Loads | None:
     force: FloatArray = np.zeros(len(plant.inputs))
     if table.force_noise is not None:
         force = bases(table.force_noise, plant.inputs, path, "cost.force_noise", "inputs")
-    sensor: FloatArray = np.sqrt(np.square(plant.noise) + np.square(plant.resolution) / 12)
+    sensor: FloatArray = np.sqrt(np.square(plant.sensors.noise) + np.square(plant.sensors.resolution) / 12)
     if table.sensor_noise is not None:
         sensor = bases(table.sensor_noise, plant.outputs, path, "cost.sensor_noise", "measured signals")
     load = bases(table.load, plant.inputs, path, "cost.load", "inputs")

@@ -12,9 +12,10 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.linear.sampling import sample
+from malta.model.actuator import Actuator
 from malta.model.equilibrium import holding_commands, load_balance
 from malta.model.linearize import LinearModel
-from malta.model.plant import Actuator, Plant, off_stroke
+from malta.model.plant import Plant, off_stroke
 from malta.synthesis.controller import Commutation, Controller, CurrentLoop, Feedforward, Limits
 from malta.synthesis.filters import between_samples
 
@@ -173,8 +174,8 @@ def static_feedforward(plant: Plant) -> Feedforward:
     """
     m, p, rates = len(plant.inputs), len(plant.outputs), plant.coordinates
     if plant.has_stroke:
-        half = max(V0_STEPS, round(plant.travel / V0_STEP))
-        z_grid = np.linspace(-plant.travel, plant.travel, 2 * half + 1)
+        half = max(V0_STEPS, round(plant.stroke.travel / V0_STEP))
+        z_grid = np.linspace(-plant.stroke.travel, plant.stroke.travel, 2 * half + 1)
         along = np.tile(plant.state({}), (len(z_grid), 1))
         along[:, plant.stroke_state] = z_grid
         v0 = load_balance(plant, along)

@@ -24,8 +24,9 @@ from malta.linear.matrices import system_matrix
 from malta.linear.sampling import add_lags, delay_inputs, sample, sample_noise
 from malta.linear.system import System
 from malta.processes import on_one_thread
+from malta.synthesis.controller import Coordinates
 from malta.synthesis.riccati import Solver, care, dare
-from malta.synthesis.spec import Coordinates, Weights
+from malta.synthesis.spec import Weights
 
 # The design model between samples: currents that are held, forces behind the lag of the current loops.
 

@@ -203,10 +203,10 @@ def groups_of(spec: Spec) -> list[Group]:
             spec.path, "search", what, "a PID, or a machine whose forces do not depend on where it is"
         )
     loaded = linearize(plant, trim(plant, **spec.operating_point))
-    position = spec.operating_point.get(plant.stroke, 0.0)
-    along = sorted({position, -plant.travel, plant.travel}) if plant.has_stroke else []
-    beside = {name: x for name, x in spec.operating_point.items() if name != plant.stroke}
-    positions = [{plant.stroke: z} | beside for z in along] or [beside]
+    position = spec.operating_point.get(plant.stroke.name, 0.0)
+    along = sorted({position, -plant.stroke.travel, plant.stroke.travel}) if plant.has_stroke else []
+    beside = {name: x for name, x in spec.operating_point.items() if name != plant.stroke.name}
+    positions = [{plant.stroke.name: z} | beside for z in along] or [beside]
     slope = _slope(plant, position)
     names = tuple(spec.uncertainty)
     proven = "margin" in spec.specification
@@ -293,15 +293,17 @@ def _loaded_places(spec: Spec) -> list[tuple[LinearModel, FloatArray]]:
     plant = spec.plant
     along: list[Mapping[str, float]] = [spec.operating_point] if spec.recovery else []
     if any(bound.anywhere for bound in spec.recovery.values()):
-        along += [{plant.stroke: -plant.travel}, {plant.stroke: plant.travel}]
-    return [(linearize(plant, trim(plant, **at)), _slope(plant, at.get(plant.stroke, 0.0))) for at in along]
+        along += [{plant.stroke.name: -plant.stroke.travel}, {plant.stroke.name: plant.stroke.travel}]
+    return [
+        (linearize(plant, trim(plant, **at)), _slope(plant, at.get(plant.stroke.name, 0.0))) for at in along
+    ]
 
 
 def _driven(spec: Spec) -> Driven | None:
     """The windings of a machine that current controllers drive, as in its own loop; None for lagging currents."""
     plant = spec.plant
     loop = current_loop_of(plant.actuator, current_loop_delay=spec.current_loop_delay)
-    if plant.windings is None or loop is None:
+    if plant.actuator.windings is None or loop is None:
         return None
     point = plant.at(**spec.operating_point)
     windings = windings_of(plant, plant, point, np.eye(len(plant.inputs)))

@@ -446,7 +446,7 @@ def tune(
         )
     if not spec.specification:
         raise InputError(spec.path, "specification", "nothing", "a table of what the design shall reach")
-    if spec.plant.sensors is not None:
+    if spec.plant.sensors.late:
         found = "sensors that read late"
         raise InputError(spec.path, "machine", found, "sensors without lag: verify takes the lag of a design")
     if not spec.search:

@@ -110,7 +110,7 @@ def test_a_stroke_follows_the_thrust_the_samples_and_the_band(name: str, shipped
     scenario = stroke_of(plant, controller)
     t = controller.sample_time * np.arange(scenario.samples(controller.sample_time))
     motion = scenario.reference(plant)(t)
-    most = np.abs(motion.ddp[:, plant.stroke_output]).max() * plant.mass
+    most = np.abs(motion.ddp[:, plant.stroke_output]).max() * plant.stroke.mass
     share = most / controller.limits.force[plant.thrust_input]
     assert 0.05 < share < (0.6 if plant.name == "tubular" else 0.2501)
     moving = np.abs(motion.dp[:, plant.stroke_output]) > 1e-6 * np.abs(motion.dp).max()
@@ -195,9 +195,9 @@ def test_the_first_day_of_every_machine(name: str, shipped: Any, run: Run, tmp_p
     controller = one.controller
     plant = malta.plant_of(controller.parameters)
     findings = {f["name"]: f for step in document["steps"] for f in step["findings"]}
-    for signal, noise, step in zip(plant.outputs, plant.noise, plant.resolution, strict=True):
+    for signal, noise, step in zip(plant.outputs, plant.sensors.noise, plant.sensors.resolution, strict=True):
         measured = findings[f"noise of {signal.name}"]
-        least = noise / (1.05 if plant.uniform else 1.0) - 2 * measured["half"]
+        least = noise / (1.05 if plant.sensors.uniform else 1.0) - 2 * measured["half"]
         assert least <= measured["value"] <= 1.5 * math.hypot(noise, step)
     if not plant.has_stroke:
         refused = run("learn", one.gains, tmp_path / "loop.npz", *one.machine)
@@ -224,7 +224,7 @@ def test_a_weak_drive_is_told_whatever_holds_the_machine(name: str, shipped: Any
     assert found.factor == pytest.approx(1 / 0.95, abs=5e-3)
     own = log_of(malta.simulate(plant, controller, stroke_of(plant, controller).replace(settle=0.0)))
     error = np.abs(own_stroke(controller, own).columns["y"] - own.columns["y"]).max()
-    assert error < 1e-3 * plant.travel
+    assert error < 1e-3 * plant.stroke.travel
 
 
 @pytest.mark.slow

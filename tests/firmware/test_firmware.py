@@ -141,7 +141,7 @@ def test_it_flies_as_the_simulation_does(name: str, distance: float) -> None:
     """With phase currents and duty cycles where the machine has them: every signal within 1e-12 of its range."""
     c = controller(name)
     plant = malta.plant_of(c.parameters)
-    fidelity: Any = "force" if plant.windings is None else "phase"
+    fidelity: Any = "force" if plant.actuator.windings is None else "phase"
     scenario = malta.Scenario.stroke(distance, fidelity=fidelity, noise=1.0, duration=0.05)
     own = malta.simulate(plant, c, scenario)
     flown = malta.simulate(plant, c, scenario, engine=engine_of_c())

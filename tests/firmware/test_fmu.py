@@ -260,7 +260,7 @@ def test_a_machine_with_another_parameter_flies_as_simulated(
     par: Any = silent(t).parameters
     value = 1.1 * getattr(par, parameter)
     other = t.believed.variant(replace(par, **{parameter: value}))
-    noise = 0.0 if other.uniform else 1.0
+    noise = 0.0 if other.sensors.uniform else 1.0
     s = scenario(t, noise=noise, seed=3)
     run = malta.simulate(other, t.controller, s)
     usual = malta.simulate(silent(t), t.controller, s)

@@ -105,7 +105,7 @@ class Bench:
         off = self.now in ("OFF", "OFFSETS", "SENSORS", "FAULT")
         for _ in range(samples):
             place = self.rest if off else view(self.state.reference, "p")
-            noise, steps = np.array(self.plant.noise), np.array(self.plant.resolution)
+            noise, steps = np.array(self.plant.sensors.noise), np.array(self.plant.sensors.resolution)
             read = place + noise * self.rng.normal(size=len(noise))
             read = np.where(steps > 0, np.round(read / np.where(steps > 0, steps, 1)) * steps, read)
             for k, value in (y or {}).items():
@@ -175,7 +175,9 @@ def test_states_follow_each_other_without_jumps(name: str) -> None:
             v.append(view(bench.outputs, "v").copy())
     whole = ["OFF", "OFFSETS", "SENSORS", "LIFT", "SETTLE", "OPERATE", "LANDING", "OFF"]
     assert bench.seen == whole
-    assert np.abs(p[0] - bench.rest).max() < 4 * max(bench.plant.noise) / math.sqrt(TIMES.check) + 1e-9
+    assert (
+        np.abs(p[0] - bench.rest).max() < 4 * max(bench.plant.sensors.noise) / math.sqrt(TIMES.check) + 1e-9
+    )
     assert np.abs(p[-1] - p[0]).max() < 1e-12
     steps, rates = np.diff(p, axis=0), np.array(dp)
     assert np.abs(steps - Ts * (rates[1:] + rates[:-1]) / 2).max() < 1e-9
@@ -193,7 +195,7 @@ def test_the_first_command_balances_the_machine_at_rest() -> None:
         pass
     limit = bench.t.controller.limits.force
     plant, par = bench.plant, bench.plant.parameters
-    pull = 2 * par.K_A * 0.6e-3 + plant.mass * par.g  # type: ignore[attr-defined]
+    pull = 2 * par.K_A * 0.6e-3 + plant.stroke.mass * par.g  # type: ignore[attr-defined]
     v = view(bench.outputs, "v")
     assert v[1] + v[3] == pytest.approx(pull, rel=0.15)
     assert (np.abs(v) < 0.35 * limit).all()
@@ -576,7 +578,7 @@ def test_limits_of_references_are_those_of_the_machine() -> None:
     """A tenth less than the way to a touchdown and than the travel; all that the forces can do."""
     limits = reference_limits(TARGETS["robust"])
     assert limits.position == pytest.approx([0.9 * 0.7 * 0.6e-3] * 4 + [0.9 * 15e-3], rel=1e-6)
-    m = TARGETS["robust"].believed.mass
+    m = TARGETS["robust"].believed.stroke.mass
     assert limits.acceleration[4] == pytest.approx(2 * 5.2 * 5.0 / m)
     assert limits.speed[4] == pytest.approx(math.sqrt(4 * limits.acceleration[4] * 13.5e-3))
 
@@ -907,7 +909,7 @@ def test_faults_are_chosen_by_a_word_and_fly_with_their_own_engine() -> None:
 def test_a_cushioned_clearance_is_used_up_at_a_share_of_it() -> None:
     """Contact is linear in a reading: radial ones are at TOUCH of where they would be without a touchdown bearing."""
     plant = malta.plant_of(TARGETS["robust"].controller.parameters)
-    hard = touch_bounds(replace(plant, cushioned=(False,) * len(plant.contacts)))
+    hard = touch_bounds(replace(plant, contacts=replace(plant.contacts, cushioned=(False,) * 3)))
     assert touch_bounds(plant) / hard == pytest.approx([TOUCH, TOUCH, TOUCH, TOUCH, 1], rel=1e-6)
 
 

@@ -199,9 +199,9 @@ def _log_rows() -> tuple[tuple[str, ...], Any]:
     """The columns of a slow stroke there and back of the tubular machine."""
     plant = _plan().plant
     t = np.linspace(0, 6, 1200)
-    z = -0.99 * plant.travel * np.cos(np.pi * t / 3)
-    forces = np.outer(1 + z / plant.travel, [0.1, 1.0, -0.2, 2.0, 0.5])
-    headings = ("t [s]", f"{plant.stroke} [m]", *(f"{s.name} [{s.unit}]" for s in plant.inputs))
+    z = -0.99 * plant.stroke.travel * np.cos(np.pi * t / 3)
+    forces = np.outer(1 + z / plant.stroke.travel, [0.1, 1.0, -0.2, 2.0, 0.5])
+    headings = ("t [s]", f"{plant.stroke.name} [m]", *(f"{s.name} [{s.unit}]" for s in plant.inputs))
     return headings, np.column_stack([t, z, forces])
 
 

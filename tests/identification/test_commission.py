@@ -237,8 +237,8 @@ def test_noise_of_coil_currents_is_that_of_the_forces_where_the_machine_is_held(
     log = replace(log, columns={**log.columns, "i": i}, signals={**log.signals, "i": ball.actuator.coils})
     (found,) = process_noise(ball, log).values()
     point = trim(ball)
-    held = ca.DM(ball.currents(ca.DM(outputs_at(ball, point.x)), ca.DM(point.v)))
-    ends = [float(ca.DM(ball.forces(ca.DM(point.x), held + way * 1e-6))) for way in (1, -1)]
+    held = ca.DM(ball.actuator.currents(ca.DM(outputs_at(ball, point.x)), ca.DM(point.v)))
+    ends = [float(ca.DM(ball.actuator.forces(ca.DM(point.x), held + way * 1e-6))) for way in (1, -1)]
     assert holds(found, abs(ends[0] - ends[1]) / 2e-6 * 2e-3)
 
 

@@ -51,7 +51,7 @@ def varied(plant: Plant, names: tuple[str, ...], values: Any) -> Plant:
 
 
 def along(plant: Plant, share: float) -> dict[str, float]:
-    return {plant.stroke: share * plant.travel} if plant.has_stroke else {}
+    return {plant.stroke.name: share * plant.stroke.travel} if plant.has_stroke else {}
 
 
 def distance(ours: ComplexArray, flown: ComplexArray) -> float:
@@ -61,7 +61,7 @@ def distance(ours: ComplexArray, flown: ComplexArray) -> float:
 
 def check_machine_loop(plant: Plant, c: Controller, share: float) -> None:
     at = along(plant, share)
-    ours = machine_loop(loaded_model(plant, at.get(plant.stroke, 0.0)), c)
+    ours = machine_loop(loaded_model(plant, at.get(plant.stroke.name, 0.0)), c)
     flown = derivative_at_rest(plant, c, plant.at(**at).x)
     assert distance(poles(ours.closed, c.sample_time), poles(flown, c.sample_time)) < SAME
 

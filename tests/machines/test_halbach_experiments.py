@@ -112,7 +112,9 @@ def test_noise_of_the_design_is_that_of_the_sensors() -> None:
     par = malta.read("data/halbach.toml")
     weights = malta.read_design("design/halbach.toml").weights
     assert weights.process_variance[0] == pytest.approx(electronics.force_noise(par) / par.T_laser, rel=1e-3)
-    assert math.sqrt(weights.sensor_variance[0]) == pytest.approx(halbach.plant(par).noise[0], rel=1e-3)
+    assert math.sqrt(weights.sensor_variance[0]) == pytest.approx(
+        halbach.plant(par).sensors.noise[0], rel=1e-3
+    )
 
 
 def _closed(e: Evidence) -> tuple[FloatArray, FloatArray]:

@@ -58,9 +58,14 @@ def _flat(value: Any) -> FloatArray:
 def test_signals_and_numbers_of_the_record(par: Parameters, plant: Plant) -> None:
     assert [s.name for s in plant.states] == ["x", "x_dot"]
     assert [s.name for s in plant.actuator.coils] == ["i_a", "i_b", "i_c"]
-    assert (plant.thrust, plant.stroke, plant.stroke_state, plant.thrust_input) == ("F_x", "x", 0, 0)
-    assert plant.noise[0] == pytest.approx(115.5e-9, rel=1e-3)  # of +-200 nm, uniform
-    assert plant.uniform
+    assert (plant.stroke.thrust, plant.stroke.name, plant.stroke_state, plant.thrust_input) == (
+        "F_x",
+        "x",
+        0,
+        0,
+    )
+    assert plant.sensors.noise[0] == pytest.approx(115.5e-9, rel=1e-3)  # of +-200 nm, uniform
+    assert plant.sensors.uniform
     assert plant.actuator.crossover == pytest.approx(451, rel=1e-3)
     assert plant.actuator.force_limit == (2.0,)
     assert plant.actuator.voltage_limit == 6.0
@@ -78,12 +83,12 @@ def test_functions_of_the_record_give_finite_numbers(plant: Plant) -> None:
         plant.load(x),
         plant.position_of(ca.DM([1e-3])),
         plant.preload(x),
-        plant.currents(ca.DM([1e-3]), ca.DM([0.3])),
-        plant.forces(x, i),
-        plant.limited(i),
-        plant.contact(x),
-        plant.bearing(x),
-        plant.sense(x, ca.DM([1e-6])),
+        plant.actuator.currents(ca.DM([1e-3]), ca.DM([0.3])),
+        plant.actuator.forces(x, i),
+        plant.actuator.limited(i),
+        plant.contacts.contact(x),
+        plant.contacts.bearing(x),
+        plant.sensors.sense(x, ca.DM([1e-6])),
     ]
     assert [len(_flat(v)) for v in values] == [2, 1, 1, 1, 1, 3, 1, 3, 1, 1, 1]
     assert all(np.isfinite(_flat(v)).all() for v in values)
@@ -92,8 +97,8 @@ def test_functions_of_the_record_give_finite_numbers(plant: Plant) -> None:
 @given(x=PLACE, v=FORCE)
 def test_currents_make_the_force_they_are_made_for(x: float, v: float) -> None:
     plant = halbach.plant(malta.read("data/halbach.toml"))
-    i = plant.currents(ca.DM([x]), ca.DM([v]))
-    np.testing.assert_allclose(_flat(plant.forces(ca.DM([x, 0.3]), i)), [v], rtol=0, atol=1e-12)
+    i = plant.actuator.currents(ca.DM([x]), ca.DM([v]))
+    np.testing.assert_allclose(_flat(plant.actuator.forces(ca.DM([x, 0.3]), i)), [v], rtol=0, atol=1e-12)
     assert abs(_flat(i).sum()) < 1e-13
 
 
@@ -101,7 +106,7 @@ def test_currents_make_the_force_they_are_made_for(x: float, v: float) -> None:
 def test_limited_currents_keep_their_ratio_and_their_sum(i: list[float]) -> None:
     plant = halbach.plant(malta.read("data/halbach.toml"))
     wanted = np.array([*i, -sum(i)])
-    found = _flat(plant.limited(ca.DM(wanted)))
+    found = _flat(plant.actuator.limited(ca.DM(wanted)))
     assert np.abs(found).max() <= plant.actuator.current_limit * (1 + 1e-15)
     assert abs(found.sum()) < 1e-13
     if np.abs(wanted).max() <= plant.actuator.current_limit:
@@ -131,10 +136,8 @@ def test_held_currents_are_a_spring(par: Parameters, plant: Plant, place: float,
     assert model.C.tolist() == [[1, 0]]
     # The same from forces and currents by differences.
     d = 1e-7
-    F = [
-        _flat(plant.forces(ca.DM([place, 0]), believed.currents(ca.DM([place + s * d]), ca.DM([0]))))[0]
-        for s in (-1, 1)
-    ]
+    i = [believed.actuator.currents(ca.DM([place + s * d]), ca.DM([0])) for s in (-1, 1)]
+    F = [_flat(plant.actuator.forces(ca.DM([place, 0]), one))[0] for one in i]
     assert (F[1] - F[0]) / (2 * d) == pytest.approx(H, rel=1e-6)
     assert H * (1 + error) == pytest.approx(motor.stiffness(par, par.F_z))
 
@@ -145,7 +148,9 @@ def test_a_weak_phase_leaves_a_stiffness_that_goes_with_the_place(par: Parameter
     slopes = []
 
     def made(x: float, v: float) -> float:
-        return float(_flat(true.forces(ca.DM([x, 0]), believed.currents(ca.DM([x]), ca.DM([v]))))[0])
+        return float(
+            _flat(true.actuator.forces(ca.DM([x, 0]), believed.actuator.currents(ca.DM([x]), ca.DM([v]))))[0]
+        )
 
     for place in np.linspace(0, math.pi / par.k, 7):
         model = malta.linearize(true, true.at(x=place), believed)
@@ -291,8 +296,8 @@ def test_300_periods_against_the_ones_written_out(par: Parameters, o: Options) -
 @pytest.mark.parametrize("offset", [0.0, 1e-3])
 def test_what_loops_are_told(par: Parameters, plant: Plant, offset: float) -> None:
     """PlannedRun Id and Iq, and the Park angle; an error of the reading is one of the angle, k times as large."""
-    y = plant.sense(ca.DM([2e-3, 0]), ca.DM([offset]))
-    told = electronics.electronics(par).held(plant.currents(y, ca.DM(0.7)), y)
+    y = plant.sensors.sense(ca.DM([2e-3, 0]), ca.DM([offset]))
+    told = electronics.electronics(par).held(plant.actuator.currents(y, ca.DM(0.7)), y)
     angle = par.k * (2e-3 + offset)
     expected = [0.7 / par.A, par.F_z / par.A, math.cos(angle), math.sin(angle)]
     np.testing.assert_allclose(_flat(told), expected, rtol=0, atol=1e-12)
@@ -300,7 +305,7 @@ def test_what_loops_are_told(par: Parameters, plant: Plant, offset: float) -> No
 
 @pytest.mark.parametrize("o", OPTIONS, ids=str)
 def test_it_starts_with_rolling_means_full_of_what_flows(par: Parameters, plant: Plant, o: Options) -> None:
-    i = plant.currents(ca.DM([2e-3]), ca.DM([0]))
+    i = plant.actuator.currents(ca.DM([2e-3]), ca.DM([0]))
     e = electronics.electronics(par, o)
     found = _arrays(e.start(ca.DM([2e-3, 0]), i))
     assert {name: len(value) for name, value in found.items()} == dict(e.state)
@@ -325,7 +330,7 @@ def test_it_starts_in_a_steady_state(par: Parameters, loops: bool) -> None:
     p = replace(par, r_a=0.9, r_c=1.3) if loops else par
     e, machine = electronics.electronics(p, o), halbach.plant(p)
     y = ca.DM([4e-3])
-    x, i = ca.DM([4e-3, 0]), machine.currents(y, ca.DM([0]))
+    x, i = ca.DM([4e-3, 0]), machine.actuator.currents(y, ca.DM([0]))
     state, told = e.start(x, i), e.held(i, y)
     period = _period(e)
     at = [_flat(x), _flat(i), np.concatenate([_flat(state[name]) for name in e.state])]
@@ -347,7 +352,7 @@ def test_limits_are_kept_in_mind(par: Parameters) -> None:
         ((0.0, 60.0), [1, 1]),
     ):
         i = motor.phase_currents(par, 0.0, *forces)
-        far = ca.DM(i) if flags[1] else machine.currents(place, ca.DM([0]))
+        far = ca.DM(i) if flags[1] else machine.actuator.currents(place, ca.DM([0]))
         state = e.start(ca.DM([0, 0]), far)
         z = [np.zeros(2), _flat(far), np.concatenate([_flat(state[name]) for name in e.state])]
         for _ in range(3):
@@ -382,17 +387,17 @@ def test_plant_in_symbols_of_its_parameters(par: Parameters) -> None:
             a.phase_margin,
             a.sample_time,
             a.dead_time,
-            *plant.noise,
-            *plant.resolution,
+            *plant.sensors.noise,
+            *plant.sensors.resolution,
             *plant.inertia,
         )
-        numbers += (plant.mass, plant.travel)
+        numbers += (plant.stroke.mass, plant.stroke.travel)
         made = (
             plant.f(x, u, w),
-            plant.currents(x[0], u),
-            plant.forces(x, i),
-            plant.limited(i),
-            plant.contact(x),
+            plant.actuator.currents(x[0], u),
+            plant.actuator.forces(x, i),
+            plant.actuator.limited(i),
+            plant.contacts.contact(x),
         )
         return ca.vertcat(*made, *numbers)
 
@@ -404,7 +409,7 @@ def test_plant_in_symbols_of_its_parameters(par: Parameters) -> None:
 def test_electronics_in_symbols_of_the_parameters(par: Parameters, o: Options) -> None:
     numeric = replace(par, **FAULTY)
     record, symbols, values = _symbols(numeric)
-    build = halbach.plant(record).electronics
+    build = halbach.plant(record).actuator.electronics
     assert build is not None
     e = build(o)
     x, i, state, told = _random(par, o, 5)

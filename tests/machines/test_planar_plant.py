@@ -55,9 +55,9 @@ def test_the_record_fits_together(machine: Plant) -> None:
     assert len(machine.actuator.coils) == 16
     assert machine.design_states == machine.states
     assert machine.stroke_output == machine.thrust_input == 1
-    assert not machine.tabulated
+    assert not machine.actuator.tabulated
     hover = machine.at()
-    assert column(machine.contact(hover.x)).max() == 0
+    assert column(machine.contacts.contact(hover.x)).max() == 0
     assert column(machine.f(hover.x, hover.u, machine.load(hover.x))) == pytest.approx(
         np.zeros(12), abs=1e-12
     )
@@ -70,7 +70,7 @@ def test_the_state_counts_height_from_the_working_height(par: planar.Parameters,
     for z in (-par.h, 0.0, 1e-3):
         x = np.array([6e-3, 4e-3, z, *np.zeros(9)])
         K = commutation.wrench_matrix(par, coils.simulation_model(par), x[:3] + np.array([0, 0, par.h]))
-        np.testing.assert_allclose(column(machine.forces(x, i)), K @ i, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(column(machine.actuator.forces(x, i)), K @ i, rtol=0, atol=1e-11)
 
 
 def test_the_computation_takes_one_period(par: planar.Parameters, machine: Plant) -> None:
@@ -91,25 +91,25 @@ def test_a_level_mover_gets_what_it_asks_for(
 ) -> None:
     """forces(x, currents(x, W)) = W within 1e-9 of 1000 N, with the exact coil model."""
     x = np.array([*p, *np.zeros(9)])
-    made = column(machine.forces(x, machine.currents(x[:6], W)))
+    made = column(machine.actuator.forces(x, machine.actuator.currents(x[:6], W)))
     np.testing.assert_allclose(made, W, rtol=0, atol=1e-9)
 
 
 def test_commutation_ignores_angles(machine: Plant) -> None:
     """As (33): the mover of K(p) is level. Tilted by 1 to 3 mrad it misses 2.6 N and 3.1 N m, of 400 N."""
-    i = column(machine.currents(TILTED[:6], WRENCH))
-    np.testing.assert_array_equal(i, column(machine.currents([*TILTED[:3], 0, 0, 0], WRENCH)))
-    missed = np.abs(column(machine.forces(TILTED, i)) - WRENCH)
+    i = column(machine.actuator.currents(TILTED[:6], WRENCH))
+    np.testing.assert_array_equal(i, column(machine.actuator.currents([*TILTED[:3], 0, 0, 0], WRENCH)))
+    missed = np.abs(column(machine.actuator.forces(TILTED, i)) - WRENCH)
     assert missed[:3].max() == pytest.approx(2.64, abs=0.01)
     assert missed[3:].max() == pytest.approx(3.08, abs=0.01)
 
 
 def stiffness(machine: Plant, believed: Plant, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(H, S) at the hover: d forces(x, currents(y, v)) / dy at y = x, and d forces(x, i) / dx; N/m ... N m/rad."""
-    kind = ca.MX if believed.tabulated else ca.SX
+    kind = ca.MX if believed.actuator.tabulated else ca.SX
     x_, y = kind.sym("x", 12), kind.sym("y", 6)
     v = machine.preload(x)
-    made = machine.forces(x_, believed.currents(y, v))
+    made = machine.actuator.forces(x_, believed.actuator.currents(y, v))
     slopes = ca.Function("slopes", [x_, y], [ca.jacobian(made, y), ca.jacobian(made, x_)[:, :6]])
     H, S = (np.array(value) for value in slopes(x, x[:6]))
     return H, S
@@ -139,12 +139,12 @@ def test_the_named_coil_model_commutates(par: planar.Parameters, order: int, cel
     """currents() is K(p)^+ W of the coil model that numpy has too; the table's in MX alone."""
     own = replace(par, order=order, cells=cells)
     machine = plant_of(own)
-    assert machine.tabulated == (cells > 0)
+    assert machine.actuator.tabulated == (cells > 0)
     model: coils.CoilModel = coils.Analytical(par) if order == 1 else coils.simulation_model(par, order)
     if cells:
         model = coils.table(par, model, cells)
     y, W = ca.MX.sym("y", 6), ca.MX.sym("W", 6)
-    given = ca.Function("given", [y, W], [machine.currents(y, W)])
+    given = ca.Function("given", [y, W], [machine.actuator.currents(y, W)])
     for p in np.random.default_rng(1).uniform([-0.1, -0.1, -1e-3], [0.1, 0.1, 4e-3], (10, 3)):
         expected = commutation.currents(
             commutation.wrench_matrix(par, model, p + np.array([0, 0, par.h])), WRENCH
@@ -158,10 +158,11 @@ def test_the_truth_is_not_what_the_controller_believes(par: planar.Parameters, m
     for name, own in (("analytical", replace(par, order=1)), ("table", replace(par, cells=35))):
         believed = plant_of(own)
         i = np.linspace(-3, 3, 16)
-        np.testing.assert_array_equal(column(believed.forces(TILTED, i)), column(machine.forces(TILTED, i)))
+        forces, same = (column(one.actuator.forces(TILTED, i)) for one in (believed, machine))
+        np.testing.assert_array_equal(forces, same)
         y, v = ca.MX.sym("y", 6), ca.MX.sym("v", 6)
-        carried = ca.Function("i", [y, v], [believed.currents(y, v)])(AT[:6], machine.at().u)
-        error = column(machine.forces(AT, carried)) - machine.at().u
+        carried = ca.Function("i", [y, v], [believed.actuator.currents(y, v)])(AT[:6], machine.at().u)
+        error = column(machine.actuator.forces(AT, carried)) - machine.at().u
         missed[name] = float(np.abs(error[:3]).max())
     assert missed == pytest.approx({"analytical": 0.181, "table": 0.102}, abs=1e-3)
 
@@ -215,10 +216,10 @@ def test_symbols_give_the_numbers(par: planar.Parameters, order: int) -> None:
     def everything(machine: Plant) -> list[Any]:
         return [
             machine.f(x, v, w + machine.load(x)),
-            machine.forces(x, i),
-            machine.currents(x[:6], v),
-            machine.limited(i),
-            machine.contact(x),
+            machine.actuator.forces(x, i),
+            machine.actuator.currents(x[:6], v),
+            machine.actuator.limited(i),
+            machine.contacts.contact(x),
             machine.preload(x),
         ]
 
@@ -242,9 +243,9 @@ def test_shaping_parameters_stay_numbers(par: planar.Parameters) -> None:
 def test_a_table_does_not_go_with_symbols(par: planar.Parameters) -> None:
     """The truth of such a machine is there, its look-up is refused in a sentence."""
     machine = planar.plant(symbolic(replace(par, cells=35), {"m": ca.SX.sym("m")}))
-    assert column(machine.forces(AT, np.ones(16))).shape == (6,)
+    assert column(machine.actuator.forces(AT, np.ones(16))).shape == (6,)
     with pytest.raises(malta.CheckError, match="cells has to be 0"):
-        machine.currents(AT[:6], WRENCH)
+        machine.actuator.currents(AT[:6], WRENCH)
 
 
 # --- Limits ---
@@ -253,9 +254,9 @@ def test_a_table_does_not_go_with_symbols(par: planar.Parameters) -> None:
 def test_currents_are_limited_together(par: planar.Parameters, machine: Plant) -> None:
     """Twice the limit becomes the limit, in the same direction, as numpy has it; less is left as it is."""
     i = np.linspace(-1, 1, 16) * 2 * par.I_max
-    np.testing.assert_allclose(column(machine.limited(ca.DM(i))), i / 2, rtol=1e-15)
+    np.testing.assert_allclose(column(machine.actuator.limited(ca.DM(i))), i / 2, rtol=1e-15)
     np.testing.assert_allclose(commutation.limit_currents(par, i), i / 2, rtol=1e-15)
-    np.testing.assert_array_equal(column(machine.limited(ca.DM(i / 4))), i / 4)
+    np.testing.assert_array_equal(column(machine.actuator.limited(ca.DM(i / 4))), i / 4)
 
 
 def test_a_pitch_that_cannot_be_inverted_has_no_plant(par: planar.Parameters) -> None:
@@ -276,12 +277,12 @@ def test_a_pitch_that_cannot_be_inverted_has_no_plant(par: planar.Parameters) ->
 )
 def test_contacts(machine: Plant, x: dict[str, float], shares: tuple[float, float, float]) -> None:
     """1 mm of air under a plate of 400 mm: 5 mrad, or 2.5 mrad at half the gap; 4 mm upwards; 100 mm in the plane."""
-    found = column(machine.contact(machine.at(**x).x))
+    found = column(machine.contacts.contact(machine.at(**x).x))
     assert found == pytest.approx(
         shares, abs=2e-4
     )  # the plate's lower face is 6.4 mm off the centre of gravity
-    assert len(machine.contacts) == len(machine.cushioned) == 3
-    np.testing.assert_array_equal(column(machine.bearing(machine.at(**x).x)), np.zeros(6))
+    assert len(machine.contacts.names) == len(machine.contacts.cushioned) == 3
+    np.testing.assert_array_equal(column(machine.contacts.bearing(machine.at(**x).x)), np.zeros(6))
 
 
 # --- Size ---
@@ -290,5 +291,5 @@ def test_contacts(machine: Plant, x: dict[str, float], shares: tuple[float, floa
 def test_the_models_are_small_enough_to_compile(machine: Plant) -> None:
     """A Runge-Kutta step holds forces() four times: 6000 operations each; currents() takes 3300."""
     x, i, v = ca.SX.sym("x", 12), ca.SX.sym("i", 16), ca.SX.sym("v", 6)
-    assert ca.Function("forces", [x, i], [machine.forces(x, i)]).n_instructions() < 6000
-    assert ca.Function("currents", [x, v], [machine.currents(x[:6], v)]).n_instructions() < 3500
+    assert ca.Function("forces", [x, i], [machine.actuator.forces(x, i)]).n_instructions() < 6000
+    assert ca.Function("currents", [x, v], [machine.actuator.currents(x[:6], v)]).n_instructions() < 3500

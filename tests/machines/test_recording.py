@@ -46,7 +46,7 @@ def _log(plant: Plant, way: float = 3.0, friction: float = 0.0, reach: float = 1
     t = np.arange(0, 2 * way, way / 6000)
     motion = slow_stroke(plant, way)(t)
     z, speed = reach * motion.p[:, 4], motion.dp[:, 4]
-    v = FORCES * (1 + z[:, None] / plant.travel) + friction * np.sign(speed)[:, None]
+    v = FORCES * (1 + z[:, None] / plant.stroke.travel) + friction * np.sign(speed)[:, None]
     return ForceLog("stand.csv", t, z, v)
 
 
@@ -63,10 +63,10 @@ def _write_csv(log: ForceLog, path: Path, headings: tuple[str, ...], scale: floa
 def test_what_the_table_can_hold_is_recorded_exactly(plant: Plant, friction: float) -> None:
     """Friction is in the difference between the ways and not in v0."""
     found = record(_log(plant, friction=friction), plant)
-    wanted = FORCES * (1 + found.z_grid[:, None] / plant.travel)
+    wanted = FORCES * (1 + found.z_grid[:, None] / plant.stroke.travel)
     assert np.abs(found.v0 - wanted).max() < 1e-9 + 1e-3 * friction  # at the ends of the stroke the sign is 0
     assert np.abs(found.apart - friction).max() < 1e-9 + 1e-3 * friction
-    assert found.z_grid[-1] == -found.z_grid[0] == pytest.approx(0.98 * plant.travel)
+    assert found.z_grid[-1] == -found.z_grid[0] == pytest.approx(0.98 * plant.stroke.travel)
     assert np.diff(found.z_grid).max() <= 0.25e-3
 
 
@@ -78,7 +78,7 @@ def test_several_strokes_are_averaged(plant: Plant) -> None:
     v = np.concatenate([one.v + 0.2, one.v - 0.2])[3000:]
     log = ForceLog("two.csv", np.arange(len(z)) * 5e-4, z + 15e-6 * rng.standard_normal(len(z)), v)
     found = record(log, plant)
-    wanted = FORCES * (1 + found.z_grid[:, None] / plant.travel)
+    wanted = FORCES * (1 + found.z_grid[:, None] / plant.stroke.travel)
     late = found.z_grid > 0.1e-3  # the first way up lacks the lower half
     assert np.abs(found.v0 - wanted)[late].max() < 0.02
 

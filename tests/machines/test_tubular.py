@@ -419,17 +419,23 @@ def test_sensor_matrix_is_invertible_everywhere(par: tubular.Parameters, z: floa
 
 def test_contact_is_one_at_touchdown(par: tubular.Parameters, plant: Plant) -> None:
     """A share of exactly 1 at r_max in both planes, in the one plane that a tilted mover reaches, and at the stop."""
-    assert np.array(plant.contact(plant.at(x=par.r_max).x)).ravel().tolist() == [1, 1, 0]
-    assert np.array(plant.contact(plant.at(y=-par.r_max).x)).ravel().tolist() == [1, 1, 0]
-    assert np.array(plant.contact(plant.at(z=-par.z_max).x)).ravel().tolist() == [0, 0, 1]
+    assert np.array(plant.contacts.contact(plant.at(x=par.r_max).x)).ravel().tolist() == [1, 1, 0]
+    assert np.array(plant.contacts.contact(plant.at(y=-par.r_max).x)).ravel().tolist() == [1, 1, 0]
+    assert np.array(plant.contacts.contact(plant.at(z=-par.z_max).x)).ravel().tolist() == [0, 0, 1]
     beta = math.atan(par.r_max / (2 * par.l_S))  # about the point where the axis crosses plane 2
     tilted = plant.at(x=-par.l_S * math.tan(beta), beta=beta).x
-    np.testing.assert_allclose(np.array(plant.contact(tilted)).ravel(), [1, 0, 0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        np.array(plant.contacts.contact(tilted)).ravel(), [1, 0, 0], rtol=0, atol=1e-13
+    )
     small_angle = tubular.plant(par, small_angle=True)
-    share = small_angle.contact(small_angle.at(beta=par.r_max / par.l_S).x)  # where l_S beta is the clearance
+    share = small_angle.contacts.contact(
+        small_angle.at(beta=par.r_max / par.l_S).x
+    )  # where l_S beta is the clearance
     np.testing.assert_allclose(np.array(share).ravel(), [1, 1, 0], rtol=0, atol=1e-13)
     diagonal = plant.at(x=0.6 * par.r_max, y=0.8 * par.r_max).x
-    np.testing.assert_allclose(np.array(plant.contact(diagonal)).ravel(), [1, 1, 0], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        np.array(plant.contacts.contact(diagonal)).ravel(), [1, 1, 0], rtol=0, atol=1e-15
+    )
 
 
 def test_limits_of_force(plant: Plant) -> None:

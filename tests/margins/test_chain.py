@@ -297,7 +297,7 @@ def test_the_last_stage_is_the_machine_of_verify(name: str) -> None:
     largest = max(v for k, v in margins.peak_sensitivity.items() if k != "sigma_max")
     found = robustness(plant, c, malta.read_design(f"design/{name}.toml").uncertainty, proof=False)
     assert found.chain[-1].peak == pytest.approx(largest, rel=1e-6)
-    loaded = 2 if plant.windings is not None else 1
+    loaded = 2 if plant.actuator.windings is not None else 1
     assert [link.loaded for link in found.chain] == [False] * (len(found.chain) - loaded) + [True] * loaded
     assert found.places[0].peak == pytest.approx(largest, rel=1e-6)  # the middle
 

@@ -8,8 +8,11 @@ from typing import Any
 import control
 import numpy as np
 import pytest
+from light_loops import drawn_loop
 
 import malta
+from malta.linear.system import System
+from malta.loops.classical import Nominal, balanced_norm, disk_margin
 
 Ts = 1e-4
 LEAD = control.c2d(control.ss(control.tf([20.0, 3 * 2e3], [1 / 6000.0, 1])), Ts, "tustin")
@@ -94,3 +97,26 @@ def test_curves_have_the_margins_of_a_narrow_mode(w: float, zeta: float) -> None
     assert margins.gain[1] == pytest.approx((-1 / real).min(), rel=1e-6)
     drawn = np.abs(found.responses.S[:, 0, 0]).max()
     assert drawn == pytest.approx(margins.peak_sensitivity, rel=1e-3)
+
+
+def check_disks(seed: int) -> None:
+    """The disk of all sensors at once is that of the largest balanced norm on a dense grid, never above it."""
+    drawn = drawn_loop(seed)
+    p, w = len(drawn.C), drawn.grid()
+    plant = System(drawn.A, drawn.B, drawn.C, np.zeros((p, p)))
+    law = System(np.zeros((0, 0)), np.zeros((0, p)), np.zeros((p, 0)), -np.eye(p))
+    found = disk_margin(Nominal(plant, law, True, drawn.T), "sensors").size
+    S = np.linalg.inv(np.eye(p) + drawn.gain(w))
+    seen = 1 / balanced_norm(S - np.eye(p) / 2).max()
+    assert (1 - 3e-4) * seen <= found <= (1 + 1e-6) * seen
+
+
+@pytest.mark.parametrize("seed", [3])
+def test_no_disk_is_missed(seed: int) -> None:
+    check_disks(seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(100, 160))
+def test_no_disk_of_sixty_is_missed(seed: int) -> None:
+    check_disks(seed)

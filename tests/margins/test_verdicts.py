@@ -241,7 +241,7 @@ def test_the_first_line_says_what_stands_in_the_loop_and_what_is_left_out() -> N
     cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
     weights = malta.synthesis.weights(q=[1e4, 0], r=[1], w=[1], v=[1e-8])
     law = malta.lqg(malta.linearize(cart, cart.at()), weights, Ts=1e-3)
-    late = replace(cart, sensors=malta.model.LateSensors((2e-3,), dead_time=1e-3))
+    late = replace(cart, sensors=malta.model.Sensors((2e-3,), dead_time=1e-3))
     assert malta.loop(cart, law).contents == "with hold"
     assert malta.loop(late, law).contents == "with hold, lag of the sensors and dead time of the sensors"
 

@@ -134,5 +134,5 @@ def test_a_coil_that_is_never_used_does_not_break_the_linear_model() -> None:
     """A structural zero among the currents."""
     three = malta.read_design(PLATE / "three_coils.toml").plant
     v = ca.SX.sym("v", 3)
-    assert ca.sparsify(ca.SX(three.currents(ca.SX.zeros(3), v))).nnz() < 4
+    assert ca.sparsify(ca.SX(three.actuator.currents(ca.SX.zeros(3), v))).nnz() < 4
     assert three.check().exact

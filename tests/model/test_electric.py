@@ -511,12 +511,12 @@ def test_the_machines_sensors_have_these_errors(par: tubular.Parameters, plant: 
     x[:5] = 30e-6, -20e-6, 3e-3, 1e-4, -2e-4
     p = _flat(plant.h(ca.DM(x), 0))
     errors = np.array([0.01, -0.02, 0.03, 0.0, 1e-6, 2e-6, 0.0, -3e-6, 0.02, 0.01, 1.0])
-    y = _flat(plant.sense(ca.DM(x), ca.DM(errors)))
+    y = _flat(plant.sensors.sense(ca.DM(x), ca.DM(errors)))
     assert y[:4] == pytest.approx((1 + errors[:4]) * p[:4] + errors[4:8], abs=1e-18)
     assert y[4] == pytest.approx(_hall(p[4], p[[0, 2]], p[[1, 3]], errors[8:]), abs=1e-16)
     level = np.zeros(12)
     level[2] = 7e-3
-    assert _flat(plant.sense(ca.DM(level), ca.DM(np.zeros(11)))) == pytest.approx(
+    assert _flat(plant.sensors.sense(ca.DM(level), ca.DM(np.zeros(11)))) == pytest.approx(
         [0, 0, 0, 0, 7e-3], abs=1e-16
     )
     assert par.L_p == 15e-3

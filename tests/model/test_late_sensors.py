@@ -22,7 +22,7 @@ from malta.loops.time_domain import recovery
 from malta.margins.travel import travel_margin
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
-from malta.model.signals import LateSensors, split_dead_time, with_lags
+from malta.model.sensors import Sensors, split_dead_time, with_lags
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 
@@ -142,7 +142,7 @@ def test_lags_multiply_the_transfer_function(n: int, p: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     A, B, C = rng.normal(size=(n, n)), rng.normal(size=(n, 2)), rng.normal(size=(p, n))
     lag = tuple(float(rng.choice([0.0, rng.uniform(0.1, 2)])) for _ in range(p))
-    longer = [np.array(ca.DM(M)) for M in with_lags(LateSensors(lag, 0.0), A, B, C)]
+    longer = [np.array(ca.DM(M)) for M in with_lags(Sensors(lag, 0.0), A, B, C)]
     s = complex(*rng.normal(size=2)) * 3
     short = C @ np.linalg.solve(s * np.eye(n) - A, B)
     found = longer[2] @ np.linalg.solve(s * np.eye(len(longer[0])) - longer[0], longer[1])

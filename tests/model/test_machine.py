@@ -631,7 +631,7 @@ def test_bearings_push_inwards_and_never_pull(
     l_1, l_2 = float(-(par.l_S + z)), float(par.l_S - z)
     x[[6, 10]] = np.linalg.solve([[1, l_1], [1, l_2]], dp[[0, 2]])
     x[[7, 9]] = np.linalg.solve([[1, -l_1], [1, -l_2]], dp[[1, 3]])
-    wrench = np.array(ca.evalf(plant.bearing(ca.SX(x)))).ravel()
+    wrench = np.array(ca.evalf(plant.contacts.bearing(ca.SX(x)))).ravel()
     true = np.array(plant.h(ca.DM(x), 0)).ravel()
     # F = F_1 + F_2 and T = sum of (r_i - r, l_i) x F_i, both without an axial part.
     T_y, T_x = wrench[4], wrench[3]

@@ -35,7 +35,7 @@ def rate(
     plant: Plant, believed: Plant, x: FloatArray, y: FloatArray, v: FloatArray, *, loaded: bool
 ) -> FloatArray:
     """x' of the whole chain from a command v at a reading y."""
-    u = plant.forces(ca.DM(x), believed.currents(ca.DM(y), ca.DM(v)))
+    u = plant.actuator.forces(ca.DM(x), believed.actuator.currents(ca.DM(y), ca.DM(v)))
     w = plant.load(ca.DM(x)) if loaded else ca.DM.zeros(len(plant.disturbances))
     return np.array(ca.DM(ca.vertcat(plant.f(ca.DM(x), u, w)))).ravel()
 
@@ -77,6 +77,11 @@ def test_the_linear_model_is_the_derivative_of_the_chain(name: str, differ: bool
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-8 * np.abs(A).max())
 
 
+def _with(plant: Plant, **functions: Any) -> Plant:
+    """The machine with other functions of its actuator."""
+    return replace(plant, actuator=replace(plant.actuator, **functions))
+
+
 @pytest.mark.parametrize("name", MACHINES)
 def test_trim_is_at_rest_with_the_forces_that_its_command_makes(name: str) -> None:
     """f(x, forces(x, currents(h(x), v)), load) is rounding, and the point's inputs are those of its command."""
@@ -86,7 +91,9 @@ def test_trim_is_at_rest_with_the_forces_that_its_command_makes(name: str) -> No
     assert point.v is not None
     y = np.array(plant.h(ca.DM(point.x), 0)).ravel()
     assert abs(rate(plant, plant, point.x, y, point.v, loaded=True)).max() < 1e-9
-    made = np.array(plant.forces(ca.DM(point.x), plant.currents(ca.DM(y), ca.DM(point.v)))).ravel()
+    made = np.array(
+        plant.actuator.forces(ca.DM(point.x), plant.actuator.currents(ca.DM(y), ca.DM(point.v)))
+    ).ravel()
     np.testing.assert_allclose(point.u, made, rtol=1e-12, atol=1e-12)
     exact = name == "inverse"
     assert np.allclose(point.u, point.v, rtol=1e-9) == exact
@@ -131,7 +138,7 @@ def test_limits_that_bind_are_named() -> None:
     heavy = replace(BENCH, m=5.0, I_max=1e3)
     with pytest.raises(malta.CheckError, match=r"command f = 49.05 N is beyond its limit of 40 N"):
         malta.trim(bench(heavy))
-    one_way = replace(bench(BENCH), limited=lambda i: ca.fmax(i, 0))
+    one_way = _with(bench(BENCH), limited=lambda i: ca.fmax(i, 0))
     with pytest.raises(malta.CheckError, match=r"the current i = -.* A is limited to 0 A"):
         malta.trim(replace(one_way, load=lambda _: -0.5))
 
@@ -152,7 +159,7 @@ def test_a_missing_preload_is_named() -> None:
 def test_a_command_is_found_from_another_start() -> None:
     """Where the currents of the wanted force are not defined, shares of the limits are tried."""
     plant = bench(BENCH)
-    shifted = replace(plant, currents=lambda y, v: plant.currents(y, v - 10))
+    shifted = _with(plant, currents=lambda y, v: plant.actuator.currents(y, v - 10))
     point = malta.trim(shifted, x=1e-3)
     assert point.v == pytest.approx(malta.trim(plant, x=1e-3).u + 10, rel=1e-9)
 
@@ -246,7 +253,7 @@ def test_the_check_says_where_currents_are_no_inverse() -> None:
     assert worst.made == pytest.approx(made, rel=1e-12)
     assert worst.share == pytest.approx(abs(made - worst.command) / ball.actuator.force_limit[0], rel=1e-12)
     assert len(str(found).splitlines()) == 2
-    linear = replace(ball, forces=lambda _, i: 4 * par.C * par.I_0 / par.s**2 * i)
+    linear = _with(ball, forces=lambda _, i: 4 * par.C * par.I_0 / par.s**2 * i)
     assert linear.check().exact
     assert str(linear.check()) == "ball: `currents` is the inverse of `forces` along q"
 
@@ -321,7 +328,8 @@ def test_a_payload_ends_where_no_command_carries_it() -> None:
 
     def clipped(par: Any) -> Plant:
         plant = bench(par)
-        return replace(plant, variant=clipped, currents=lambda y, v: ca.fmin(plant.currents(y, v), 2.5))
+        weak = _with(plant, currents=lambda y, v: ca.fmin(plant.actuator.currents(y, v), 2.5))
+        return replace(weak, variant=clipped)
 
     most = BENCH.C * 4.0**2 / BENCH.g0**2
     assert held_payload(clipped(BENCH)) == pytest.approx(most / 9.81 - BENCH.m, rel=1e-6)

@@ -175,7 +175,7 @@ def test_angles_and_torques_have_panels_and_units_of_their_own(
     ]
     assert "x2 y2 " in figure.texts[-1].get_text()
     figures.save(figure, tmp_path / "run.png")
-    free = replace(turning, contacts=())
+    free = replace(turning, contacts=malta.model.Contacts())
     alone = report.experiment_figure(replace(e, cases=(Case("a", replace(run, plant=free), ()),)))
     assert alone.axes[5].get_ylabel() == "currents, from least to largest [A]"
 
@@ -184,7 +184,7 @@ def test_the_words_of_a_machine(plant: Plant, toy: Plant) -> None:
     assert [group.name for group in outputs_of(plant)] == ["axial", "radial"]
     assert [group.name for group in inputs_of(plant)] == ["thrust", "bearing force"]
     assert (stroke_unit(plant), stroke_unit(toy)) == ("mm", "um")
-    one = replace(toy, outputs=(toy.outputs[0],), stroke="x1")
+    one = replace(toy, outputs=(toy.outputs[0],), stroke=malta.model.Stroke("x1"))
     assert [group.name for group in lateral_outputs(one)] == ["x1"]
 
 

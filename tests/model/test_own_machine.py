@@ -86,7 +86,7 @@ def test_a_record_finds_its_own_plant(folder: Path) -> None:
     par = malta.read(folder / "lev.toml")
     assert isinstance(par, module.Parameters)
     plant = malta.plant_of(par)
-    assert (plant.name, plant.has_stroke, plant.contacts) == ("lev", False, ("stop",))
+    assert (plant.name, plant.has_stroke, plant.contacts.names) == ("lev", False, ("stop",))
     spec = malta.read_design(folder / "design" / "lev.toml")
     model = malta.linearize(plant, plant.at())
     controller = malta.synthesize(spec, model)
@@ -145,7 +145,7 @@ def test_wrong_data_is_one_sentence(folder: Path, run: Run) -> None:
 def test_a_plant_is_written_about_its_operating_point(folder: Path, run: Run) -> None:
     """1 mm above the middle: another stiffness, a pull that the current has to balance, and it stands there."""
     file = folder / "lev.py"
-    text = file.read_text(encoding="utf-8").replace("magnets(par, x[0], i)", "magnets(par, 1e-3 + x[0], i)")
+    text = file.read_text(encoding="utf-8").replace("pull(par, x[0], i)", "pull(par, 1e-3 + x[0], i)")
     file.write_text(text, encoding="utf-8")
     par = malta.read(folder / "lev.toml")
     plant = malta.plant_of(par)
@@ -191,8 +191,8 @@ def test_a_changed_file_is_loaded_again(folder: Path) -> None:
     file = folder / "lev.py"
     file.write_text(file.read_text(encoding="utf-8").replace('("stop",)', '("floor",)'), encoding="utf-8")
     after = malta.read(folder / "lev.toml")
-    assert malta.plant_of(after).contacts == ("floor",)
-    assert malta.plant_of(before).contacts == ("stop",)
+    assert malta.plant_of(after).contacts.names == ("floor",)
+    assert malta.plant_of(before).contacts.names == ("stop",)
     assert malta.machine("lev") is malta.machine(file)
     assert machines.name_of(malta.machine(file)) == "lev"
 

@@ -53,9 +53,9 @@ def test_signals_are_twelve_five_five_and_six(plant: Plant) -> None:
     assert [s.name for s in plant.design_states] == [n for n in names if not n.startswith("gamma")]
     assert plant.controlled == (0, 1, 2, 3, 4, 6, 7, 8, 9, 10)
     assert (len(plant.inputs), len(plant.outputs), len(plant.disturbances)) == (5, 5, 6)
-    assert len(plant.noise) == len(plant.resolution) == len(plant.outputs)
-    assert plant.thrust in {s.name for s in plant.inputs}
-    assert plant.stroke in {s.name for s in plant.outputs}
+    assert len(plant.sensors.noise) == len(plant.sensors.resolution) == len(plant.outputs)
+    assert plant.stroke.thrust in {s.name for s in plant.inputs}
+    assert plant.stroke.name in {s.name for s in plant.outputs}
 
 
 def test_at_sets_the_named_states_and_no_other(plant: Plant) -> None:

@@ -18,7 +18,7 @@ from malta.model import machines
 from malta.synthesis.lqg import lost_modes
 
 F = "f=lambda x, u, w: ca.vertcat(x[1], (u + w) / par.m)"
-FORCES = "        forces=lambda x, i: magnets(par, x[0], i),\n"
+FORCES = "forces=lambda x, i: pull(par, x[0], i)"
 H = "h=lambda x, _: x[0]"
 SAMPLE = '{ value = 200, unit = "us" }'
 
@@ -94,7 +94,7 @@ DESIGNS = {
     "no force": (
         [
             (F, F.replace("(u + w)", "500 * par.m * x[0] + w")),
-            (FORCES, FORCES.replace("magnets(par, x[0], i)", "0 * i")),
+            (FORCES, FORCES.replace("pull(par, x[0], i)", "0 * i")),
         ],
         "no force moves the mode with the pole 7.071 rad/s of q q_dot",
     ),

@@ -134,7 +134,7 @@ def test_stroke_meets_the_published_bounds(design: Design, published: dict[str, 
     assert max(figures.radial["x1"], figures.radial["x2"]) < 1e-15
     assert min(figures.radial["y1"], figures.radial["y2"]) > 0.3e-6
     weight = run.v[-1, 1] + run.v[-1, 3]
-    assert weight == pytest.approx(design.plant.mass * 9.81, rel=2e-3)
+    assert weight == pytest.approx(design.plant.stroke.mass * 9.81, rel=2e-3)
 
 
 def test_stroke_of_table2_agrees_with_an_independent_simulation(designs: dict[str, Design]) -> None:

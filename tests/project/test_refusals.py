@@ -20,7 +20,7 @@ from malta.campaigns.run import campaign
 from malta.campaigns.store import block_name, seal
 from malta.errors import LONGEST, InputError, shorten
 from malta.files import file_exists
-from malta.model.signals import MOST_DELAY
+from malta.model.sensors import MOST_DELAY
 from malta.simulation.experiments import PlannedRun, fly_all
 from malta.simulation.scenario import Scenario
 from malta.tuning.search import Journal

@@ -12,7 +12,7 @@ from malta.checker import check, file as checked_file
 from malta.cli import output
 from malta.gains import encodings
 from malta.identification import log_files
-from malta.model import signals
+from malta.model import sensors
 from malta.simulation import inputs, scenario
 from malta.simulation.engine import compiled
 
@@ -25,7 +25,7 @@ LIMITS = {
     "members of an archive": tables.MANY,
     "tables in tables": tables.DEEPEST,
     "a unit": units.LONGEST,
-    "a delay": signals.MOST_DELAY,
+    "a delay": sensors.MOST_DELAY,
     "steps in a sample": scenario.MOST_SUBSTEPS,
     "runs of a series together": inputs.LONGEST,
     "runs of a campaign": plan.MOST,

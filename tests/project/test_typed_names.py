@@ -41,7 +41,7 @@ STATES, FORCES, SENSORS, LOADS = (
 )
 REQUIREMENTS = [name for name, one in requirements_for(PLANT).items() if "LQG" in one.laws]
 METRE = {"value": 1.0, "unit": "m"}
-SENSOR_ERRORS = [error.name for error in PLANT.sensor_errors]
+SENSOR_ERRORS = [error.name for error in PLANT.sensors.errors]
 LOG = malta.identification.log_of(
     malta.simulate(PLANT, CONTROLLER, malta.Scenario("still", 0.001, malta.references.hold))
 )

@@ -196,7 +196,7 @@ def test_compliance_of_the_flagship_in_its_travel() -> None:
     block = Block("compliance", "sensors", (4,), (4,), ONE)
     for _ in range(60):
         p = s.nominal * (1 + np.array([0.2, 0.2, 0]) * np.clip(rng.uniform(-2, 2, 3), -1, 1))
-        p[-1] = rng.uniform(-plant.travel, plant.travel)
+        p[-1] = rng.uniform(-plant.stroke.travel, plant.stroke.travel)
         worst = max(worst, float(np.abs(transfer(Signals(responses(s, law, p, w)), [block])).max()))
     assert 0.9 * m.lower < worst <= m.upper
 

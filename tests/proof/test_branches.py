@@ -47,9 +47,13 @@ def levitated(par: Par, guarded: bool = True) -> Plant:
         f=lambda x, u, _: ca.vertcat(x[1], -u / par.m),
         h=lambda x, _: x[0],
         preload=lambda _: 9.81 * par.m - par.lift,
-        forces=lambda x, i: par.C * (i / (par.gap + x[0])) ** 2,
-        currents=currents,
-        actuator=Actuator((Signal("i", "A"),), (2.0,), current_limit=5.0),
+        actuator=Actuator(
+            (Signal("i", "A"),),
+            (2.0,),
+            current_limit=5.0,
+            forces=lambda x, i: par.C * (i / (par.gap + x[0])) ** 2,
+            currents=currents,
+        ),
     )
 
 

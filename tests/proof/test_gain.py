@@ -76,7 +76,7 @@ def test_no_machine_of_the_box_exceeds_what_is_proven(at: Any) -> None:
     rng, w, worst = np.random.default_rng(1), np.geomspace(100, math.pi / law.sample_time, 200), 0.0
     for _ in range(60):
         p = s.nominal * (1 + np.array([*box.values(), 0]) * np.clip(rng.uniform(-2, 2, 5), -1, 1))
-        p[-1] = rng.uniform(-plant.travel, plant.travel)
+        p[-1] = rng.uniform(-plant.stroke.travel, plant.stroke.travel)
         P, _, _, F = responses(s, law, p, w)
         Q = P @ F if at == "sensors" else F @ P  # with currents among the sensors
         S = np.linalg.inv(np.eye(Q.shape[-1]) - Q)

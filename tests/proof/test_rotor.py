@@ -306,7 +306,9 @@ def test_a_parameter_taken_for_a_number_is_named(plant: Plant, par: Any) -> None
         check_symbols(build(par))
 
     def refusing(p: Any) -> Plant:
-        return replace(plant, parameters=p, variant=refusing, mass=1.0 if p.e_u > 1 else 2.0)
+        return replace(
+            plant, parameters=p, variant=refusing, stroke=malta.model.Stroke(mass=1.0 if p.e_u > 1 else 2.0)
+        )
 
     with pytest.raises(malta.InputError, match=r"rotor: plant: found e_u, taken for a number"):
         check_symbols(refusing(par))

@@ -84,5 +84,5 @@ def test_gains_of_a_pid_may_scatter_while_the_loop_stays_stable() -> None:
             factors[list(axis)] += value
         law = machine_law(plant, scaled(c, factors), point=plant.at())
         p = system.nominal * (1 + 0.2 * np.sign(rng.uniform(-1, 1, len(system.nominal))))
-        p[list(system.names).index("z")] = rng.uniform(-plant.travel, plant.travel)
+        p[list(system.names).index("z")] = rng.uniform(-plant.stroke.travel, plant.stroke.travel)
         assert instability(system, law, p[None])[0] < 0

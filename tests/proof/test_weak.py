@@ -128,7 +128,7 @@ def test_the_machine_lies_within_its_enclosure(name: str) -> None:
     Z, beside, E, shares, b = h.bounds([arb(low).union(arb(high)) for low, high in sides.tolist()])
     closest = 0.0
     for _ in range(60):
-        y, p = rng.uniform(-plant.travel, plant.travel), rng.uniform(*sides.T)
+        y, p = rng.uniform(-plant.stroke.travel, plant.stroke.travel), rng.uniform(*sides.T)
         z, e, B = sampled(name, y, p)
         own = values(h.lead, p)
         assert (np.abs(z) <= Z + 1e-9 * Z.max()).all()
@@ -246,7 +246,7 @@ def test_the_planar_motor_is_proven_between_places() -> None:
     box, rng = box_at(problem), np.random.default_rng(4)
     sides = box.sides(found.lower)
     corners = np.array(list(itertools.product(*sides)))
-    for y in rng.uniform(-plant.travel, plant.travel, 3):
+    for y in rng.uniform(-plant.stroke.travel, plant.stroke.travel, 3):
         system, law = LoopAlong(plant, controller, NAMES).at(float(y))
         assert (
             instability(
@@ -296,7 +296,7 @@ def test_parameters_of_no_such_form_are_left_to_places() -> None:
     plant = plant_of(controller.parameters)
     of = model_of(plant, plant, ("coil_pitch",))
     with pytest.raises(NotAnalytic):
-        held_machine(of, ("coil_pitch",), np.array([0.04]), (-plant.travel, plant.travel))
+        held_machine(of, ("coil_pitch",), np.array([0.04]), (-plant.stroke.travel, plant.stroke.travel))
 
 
 def test_at_a_position_the_bounds_are_narrower() -> None:

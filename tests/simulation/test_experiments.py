@@ -89,8 +89,8 @@ def test_defaults_are_the_published_figures(plant: Plant, published: dict[str, A
         (default("tilt", "radius"), "figure_16.radius"),
         (default("thermal", "drift"), "thermal.drift"),
         (max(default("payload", "masses")), "position_controller.payload"),
-        (plant.travel, "travel.z_ss"),
-        (plant.resolution[0], "figure_14.resolution"),
+        (plant.stroke.travel, "travel.z_ss"),
+        (plant.sensors.resolution[0], "figure_14.resolution"),
         (plant.actuator.crossover, "current_controller.crossover"),
         (plant.actuator.phase_margin, "current_controller.phase_margin"),
     ):
@@ -149,7 +149,7 @@ def test_heat_is_the_same_in_phases_and_in_axes(design: Design, flown: Flown) ->
     run = phase.run
     in_axes = run.plant.actuator.R * run.i**2 @ np.array(run.plant.drive.weight)
     assert run.copper_loss == pytest.approx(in_axes, rel=1e-9)
-    held = run.plant.actuator.R * 2 * 2.25 * (run.plant.mass * 9.81 / 2 / 5.2) ** 2  # the weight alone
+    held = run.plant.actuator.R * 2 * 2.25 * (run.plant.stroke.mass * 9.81 / 2 / 5.2) ** 2  # the weight alone
     assert run.copper_loss[0] == pytest.approx(held, rel=0.05)
     assert _merit(dq.merits, label) > 10 * held * 0.1
 
@@ -229,7 +229,7 @@ def _rest(design: Design) -> Rest:
     """The Lyapunov recursion of the closed loop under sensor noise, from zero: its slow integrals are not stationary
     after 0.4 s. The sum of the last 2000 measurements is carried along as five more states."""
     stage, plant = machine_loop(design.model, design.controller), design.plant
-    white = np.square(plant.noise) + np.square(plant.resolution) / 12
+    white = np.square(plant.sensors.noise) + np.square(plant.sensors.resolution) / 12
     A, n = stage.closed, len(stage.closed)
     B = np.vstack([stage.Bd @ stage.control.D_y, stage.control.B_y])
     C = np.hstack([stage.Cd, np.zeros((5, len(stage.control.A)))])
@@ -254,8 +254,8 @@ def test_measured_is_noise_and_steps_and_motion(design: Design, flown: Flown) ->
     plant = design.plant
     for k, signal in enumerate(plant.outputs):
         measured = _merit(found.merits, f"measured {signal.name}, std")
-        sigma = math.hypot(plant.noise[k], p[:, k].std())
-        expected = _stepped(p[:, k].mean(), sigma, plant.resolution[k])
+        sigma = math.hypot(plant.sensors.noise[k], p[:, k].std())
+        expected = _stepped(p[:, k].mean(), sigma, plant.sensors.resolution[k])
         assert measured == pytest.approx(expected, rel=0.1)
     assert _stepped(0.0, 0.35e-6, 1e-6) < 0.9 * math.hypot(0.35e-6, 1e-6 / math.sqrt(12))
     assert found.run.y[:, :4] == pytest.approx(np.round(found.run.y[:, :4], 6), abs=1e-12)
@@ -400,7 +400,7 @@ def test_rest_on_the_bearing_is_an_equilibrium(plant: Plant, par: Any) -> None:
     assert -resting["y"] - par.r_max == pytest.approx(depth, rel=1e-9)
     assert depth == pytest.approx(3.49e-6, abs=0.01e-6)
     x = ca.SX.sym("x", 12)
-    rate = ca.Function("rate", [x], [plant.f(x, ca.SX.zeros(5), plant.load(x) + plant.bearing(x))])
+    rate = ca.Function("rate", [x], [plant.f(x, ca.SX.zeros(5), plant.load(x) + plant.contacts.bearing(x))])
     assert np.abs(np.array(rate(plant.at(**resting).x))).max() < 1e-9
 
 
@@ -502,7 +502,7 @@ def _pushed(
 @pytest.mark.parametrize("extra", [0.05, 0.1, 0.15, 0.2])
 def test_a_picked_mass_sags_as_the_linear_loop_predicts(design: Design, flown: Flown, extra: float) -> None:
     """The weight of the mass as a step of force on the heavier mover, at z = -5 mm where it is picked."""
-    heavy = plant_of(replace(design.spec.parameters, m=design.plant.mass + extra))
+    heavy = plant_of(replace(design.spec.parameters, m=design.plant.stroke.mass + extra))
     model = malta.linearize(heavy, heavy.at(z=-5e-3))
     sag = np.abs(_pushed(model, design, "F_y", -extra * 9.81, 9000, -5e-3)[:, :4]).max()
     case = _case(flown(design.spec.name, "payload", **LINEAR), f"{extra * 1e3:.0f} g")
@@ -512,7 +512,7 @@ def test_a_picked_mass_sags_as_the_linear_loop_predicts(design: Design, flown: F
         assert _merit(case.merits, "largest sag after the pick") == pytest.approx(sag, rel=1e-3)
         # Full state feedback would give m g / (K1 - k); the observer, which takes the weight for motion, is softer.
         stiff = (design.model.force_map @ lqr(design.model, design.spec.weights)[:, :5])[0, 0]
-        alone = extra * 9.81 / (design.plant.mass * (stiff - design.model.stiffness[0, 0]))
+        alone = extra * 9.81 / (design.plant.stroke.mass * (stiff - design.model.stiffness[0, 0]))
         assert 2.5 < sag / alone < 10
 
 
@@ -645,11 +645,11 @@ def test_compliance_ends_as_a_free_mass(design: Design) -> None:
     """At 1 and 2 kHz 1 / (m w^2); a force on the centre of gravity turns nothing."""
     w = 2 * math.pi * np.array([1000.0, 2000.0])
     found = compliance(design.plant, design.controller, w)
-    assert found * design.plant.mass * w**2 == pytest.approx([1, 1], rel=0.005)
+    assert found * design.plant.stroke.mass * w**2 == pytest.approx([1, 1], rel=0.005)
     assert compliance(design.plant, design.controller, w, output=2) == pytest.approx(found, rel=1e-3)
     assert compliance(design.plant, design.controller, w, output=4).max() < 1e-12 * found.max()
     along = compliance(design.plant, design.controller, w, output=4, wrench="F_z")
-    assert along * design.plant.mass * w**2 == pytest.approx([1, 1], rel=0.005)
+    assert along * design.plant.stroke.mass * w**2 == pytest.approx([1, 1], rel=0.005)
 
 
 def test_compliance_begins_at_zero_as_the_integrals_say(design: Design) -> None:
@@ -698,10 +698,10 @@ def test_a_push_along_the_stroke_begins_as_a_free_mass(design: Design, flown: Fl
     t = run.t[at : at + 41] - run.t[at]
     z = run.p[at : at + 41, 4] - run.p[at, 4]
     assert np.abs(run.p[: at + 1, 4]).max() < 1e-11
-    assert z[10:21] == pytest.approx(t[10:21] ** 2 / (2 * design.plant.mass), rel=0.01)
+    assert z[10:21] == pytest.approx(t[10:21] ** 2 / (2 * design.plant.stroke.mass), rel=0.01)
     if design.spec.name == "table2":
         assert run.verdict.name == "axial end stop"
-        free = math.sqrt(2 * 15e-3 * design.plant.mass)
+        free = math.sqrt(2 * 15e-3 * design.plant.stroke.mass)
         assert free < run.verdict.time - 0.02 < 1.1 * free
     else:
         assert run.verdict.completed
@@ -736,10 +736,10 @@ def test_vibration_is_linear_in_the_housings_acceleration(design: Design, flown:
     found = _merit(case.merits, "amplitude of y1")
     w = np.array([2 * math.pi * 50])
     curve = compliance(design.plant, design.controller, w, output=1, wrench="F_y")
-    assert found == pytest.approx(design.plant.mass * float(curve[0]), rel=2e-3)
+    assert found == pytest.approx(design.plant.stroke.mass * float(curve[0]), rel=2e-3)
     sizes = []
     for size in (1.0, 10.0):
-        push = partial(_shaken, size=size, mass=design.plant.mass)
+        push = partial(_shaken, size=size, mass=design.plant.stroke.mass)
         scenario = Scenario("shaken", 0.3, references.hold, disturbance=push, **QUIET)
         run = simulate(design.plant, design.controller, scenario)
         sizes.append(float(np.abs(run.p[run.t > 0.2, 1]).max()))
@@ -839,11 +839,11 @@ def test_noise_times_ten_is_ten_times_the_noise(design: Design, flown: Flown) ->
     run = _case(flown(design.spec.name, "faults", during="hold"), "noise of all sensors x 10").run
     noise = run.y - run.p
     before, after = noise[:STRUCK].std(axis=0), noise[STRUCK:].std(axis=0)
-    steps = np.array(design.plant.resolution) / math.sqrt(12)
+    steps = np.array(design.plant.sensors.resolution) / math.sqrt(12)
     assert before == pytest.approx(
-        np.hypot(design.plant.noise, steps), rel=0.15
+        np.hypot(design.plant.sensors.noise, steps), rel=0.15
     )  # x1 rests in the middle of a step
-    assert after == pytest.approx(np.hypot(10 * np.array(design.plant.noise), steps), rel=0.05)
+    assert after == pytest.approx(np.hypot(10 * np.array(design.plant.sensors.noise), steps), rel=0.05)
 
 
 def test_a_stuck_sensor_repeats_itself(design: Design, flown: Flown) -> None:
@@ -881,7 +881,9 @@ def test_the_open_phase_of_the_list_carries_the_weight(designs: dict[str, Design
     names = [s.name for s in design.plant.drive.phases]
     listed = _case(flown("calibrated", "faults", during="hold"), "phase 21_1 open").run
     carried = abs(listed.i_phase[STRUCK - 100, names.index("i_21_1")])
-    assert carried == pytest.approx(design.plant.mass * 9.81 / 2 / 5.2 * math.sin(2 * math.pi / 3), rel=0.05)
+    assert carried == pytest.approx(
+        design.plant.stroke.mass * 9.81 / 2 / 5.2 * math.sin(2 * math.pi / 3), rel=0.05
+    )
     assert 0.005 < listed.verdict.time - 0.05 < 0.025
     assert np.abs(listed.i_phase[STRUCK + 10 :, names.index("i_21_1")]).max() < 1e-6
     idle = Scenario(
@@ -1110,5 +1112,5 @@ def test_a_plan_of_other_design_data_is_flown_as_well(designs: dict[str, Design]
     lighter = plant_of(replace(design.spec.parameters, m=0.33))
     found = experiment("stroke", lighter, design.controller)
     assert not found.failed
-    assert found.run.plant.mass == pytest.approx(0.33)
+    assert found.run.plant.stroke.mass == pytest.approx(0.33)
     assert _merit(found.merits, "axial error") < 0.6e-3

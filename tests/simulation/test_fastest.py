@@ -54,7 +54,7 @@ def stroke(plant: Plant, par: tubular.Parameters) -> FastestStroke:
 
 def bang_bang(plant: Plant, distance: float = DISTANCE) -> float:
     """2 sqrt(d / a), s: the current jumps, nothing cogs."""
-    return 2 * math.sqrt(distance * plant.mass / plant.actuator.force_limit[plant.thrust_input])
+    return 2 * math.sqrt(distance * plant.stroke.mass / plant.actuator.force_limit[plant.thrust_input])
 
 
 def shooting(par: tubular.Parameters, distance: float) -> float:
@@ -134,7 +134,7 @@ def test_shooting_on_switching_times_takes_as_long(par: tubular.Parameters, dist
 def test_without_resistance_the_closed_form(smooth: Plant, period: float) -> None:
     plant = with_actuator(smooth, R=0.0, sample_time=period)
     drive = plant.actuator
-    a = drive.force_limit[plant.thrust_input] / plant.mass
+    a = drive.force_limit[plant.thrust_input] / plant.stroke.mass
     t_j = drive.current_limit * drive.L / drive.voltage_limit
     t_a = -t_j / 2 + math.sqrt(t_j**2 / 4 + DISTANCE / a)
     stroke = fastest_stroke(plant, DISTANCE, 0.0)
@@ -219,7 +219,7 @@ def test_the_whole_machine_arrives(plant: Plant, par: tubular.Parameters, stroke
 
 def flown(plant: Plant, par: tubular.Parameters, stroke: FastestStroke) -> Any:
     """All six degrees of freedom and the current, under the stroke's voltage and the bearing forces that hold."""
-    grid = np.linspace(-plant.travel, plant.travel, 3)
+    grid = np.linspace(-plant.stroke.travel, plant.stroke.travel, 3)
     holding = load_balance(plant, np.array([plant.at(z=z).x for z in grid]))[:, :4]  # linear in z
 
     def rate(t: float, y: FloatArray) -> FloatArray:
@@ -336,7 +336,7 @@ def test_meshes_shares_and_axes_are_refused(plant: Plant, stroke: FastestStroke)
     with pytest.raises(
         malta.InputError, match="x: found an axis that other inputs push, expected fx_B1 alone"
     ):
-        fastest_stroke(replace(plant, stroke="x", thrust="fx_B1"), 1e-4, 0.0)
+        fastest_stroke(replace(plant, stroke=replace(plant.stroke, name="x", thrust="fx_B1")), 1e-4, 0.0)
 
 
 def test_an_answer_that_fails_its_check_is_none(

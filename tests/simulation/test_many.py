@@ -114,7 +114,7 @@ def test_each_run_is_what_simulate_makes_of_it(calibrated: Design, fidelity: Fid
     assert batch.deviation.shape == (11, 5)
     assert np.ptp(batch.overshoot) > 1e-4
     assert np.ptp(batch.rise) > 0.1e-3
-    drawn = normals(keys(5, np.array([3]))[0], len(runs[3].t), 5) * calibrated.plant.noise
+    drawn = normals(keys(5, np.array([3]))[0], len(runs[3].t), 5) * calibrated.plant.sensors.noise
     assert np.abs(runs[3].y - runs[3].p - drawn)[:, 4].max() < 1e-18
 
 

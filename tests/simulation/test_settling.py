@@ -110,7 +110,7 @@ def test_noise_of_parts_and_recordings_go_on_across_the_beginning() -> None:
 def test_a_rest_takes_off_what_v0_does_not_know() -> None:
     """A mover 20 % heavier: the integrals of the flagship carry the rest of the weight before the stroke."""
     plant, controller = _machine()
-    masses = {"m": np.array([1.2 * plant.mass])}
+    masses = {"m": np.array([1.2 * plant.stroke.mass])}
     at_once, settled = (
         malta.simulation.simulate_many(plant, controller, malta.Scenario.stroke(settle=rest), masses)
         .deviation[0, :4]

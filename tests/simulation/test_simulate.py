@@ -204,7 +204,7 @@ def test_noise_is_the_machines_and_repeats_with_its_seed(designs: dict[str, Desi
     scenario = replace(_held("hold", 4000), noise=1.0)
     run = malta.simulate(design.plant, design.controller, scenario)
     noise = run.y - run.p
-    assert noise.std(axis=0) == pytest.approx(design.plant.noise, rel=0.05)
+    assert noise.std(axis=0) == pytest.approx(design.plant.sensors.noise, rel=0.05)
     again = malta.simulate(design.plant, design.controller, scenario)
     assert np.array_equal(run.y, again.y)
     other = malta.simulate(design.plant, design.controller, replace(scenario, seed=1))
@@ -218,7 +218,7 @@ def test_the_noise_of_a_hold_is_what_the_linear_loop_predicts(designs: dict[str,
     A = stage.closed
     B = np.vstack([stage.Bd @ stage.control.D_y, stage.control.B_y])
     C = np.hstack([stage.Cd, np.zeros((5, len(stage.control.A)))])
-    W = B @ np.diag(np.square(design.plant.noise)) @ B.T
+    W = B @ np.diag(np.square(design.plant.sensors.noise)) @ B.T
     predicted = np.sqrt(np.diag(C @ linalg.solve_discrete_lyapunov(A, W, method="bilinear") @ C.T))
     run = malta.simulate(design.plant, design.controller, replace(_held("hold", 40_000), noise=1.0, delay=1))
     found = np.sqrt((run.p[4000:] ** 2).mean(axis=0))
@@ -377,10 +377,12 @@ def test_bearings_carry_the_mover_and_the_end_of_the_travel_does_not(design: Des
     for bearing, engine in product((False, True), engines):
         scenario = Scenario("slide", 4e-3, references.hold, start, fidelity="force", bearing=bearing)
         run = malta.simulate(plant, design.controller, scenario, engine=engine)
-        assert run.verdict.name == plant.contacts[2]
+        assert run.verdict.name == plant.contacts.names[2]
         assert run.t[-1] == run.verdict.time < 1e-3
     t, free, resting = np.arange(4.0), [0.2, 0.0, 0.0], [1.2, 0.0, 0.0]
     found = bearing_verdict(plant, np.array([resting, resting, free, resting]), t)
     assert found == Verdict("not lifted", 3.0)
     assert bearing_verdict(plant, np.array([resting, resting, free, free]), t) is None
-    assert bearing_verdict(plant, np.array([free, resting, free, free]), t) == Verdict(plant.contacts[0], 1.0)
+    assert bearing_verdict(plant, np.array([free, resting, free, free]), t) == Verdict(
+        plant.contacts.names[0], 1.0
+    )

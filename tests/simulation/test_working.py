@@ -81,7 +81,7 @@ def _symbolic(design: Design) -> tuple[Any, Any, Any, Any]:
     """The machine's rates, its states, its currents and the symbols of its numbers."""
     plant, _, theta = with_symbols(design.plant, numbers_of(design.plant, design.controller, 4))
     x, i = ca.SX.sym("x", 12), ca.SX.sym("i", 5)
-    return ca.densify(plant.f(x, plant.forces(x, i), plant.load(x))), x, i, theta
+    return ca.densify(plant.f(x, plant.actuator.forces(x, i), plant.load(x))), x, i, theta
 
 
 # What expressions prove of themselves
@@ -360,5 +360,5 @@ def test_a_contact_that_a_bearing_cushions_ends_nothing(designs: dict[str, Desig
         for bearing in (False, True)
     ]
     apart, cushioned = (ending_columns(design.plant, design.controller, setup) for setup in setups)
-    assert len(apart) == len(design.plant.contacts)
+    assert len(apart) == len(design.plant.contacts.names)
     assert cushioned == apart[2:]

@@ -141,7 +141,8 @@ from dataclasses import dataclass
 import casadi as ca
 
 from malta.model.parameters import si
-from malta.model.plant import Actuator, Plant, Signal
+from malta.model.actuator import Actuator
+from malta.model.plant import Plant, Signal
 from malta.synthesis.requirements import Figure, Requirement
 
 

@@ -349,7 +349,7 @@ def test_what_the_paper_calls_unsuitable_holds_what_it_claims(found: Evidence) -
     assert claims.machine_share(found) == pytest.approx(3.0030, abs=1e-3)
     assert claims.peak_sensitivity(found) == pytest.approx(2.0, abs=1e-3)
     plant = found.model.plant
-    end = malta.verify(malta.linearize(plant, plant.at(z=plant.travel)), found.controller)
+    end = malta.verify(malta.linearize(plant, plant.at(z=plant.stroke.travel)), found.controller)
     assert max(end.peak_sensitivity[s.name] for s in plant.outputs) == pytest.approx(2.242, abs=0.002)
     assert axis_coupling(found) == pytest.approx(0.139, abs=0.001)
     assert noise_forces(found) == pytest.approx((0.5000, 0.8000), rel=1e-3)

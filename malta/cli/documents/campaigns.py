@@ -320,7 +320,7 @@ def _run_part(found: Summary, runs: Runs, row: int) -> RunPart:
 
     plant, batch = found.plan.plant, runs.batch
     outputs = [identifier(signal.name, signal.unit) for signal in plant.outputs]
-    contacts = distinct(map(as_key, plant.contacts))
+    contacts = distinct(map(as_key, plant.contacts.names))
     return RunPart(
         run=int(runs.index[row]),
         end=verdicts(plant)[int(batch.verdict[row])],

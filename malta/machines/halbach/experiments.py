@@ -239,8 +239,8 @@ def ramp_reference(plant: Plant, distance: float, speed: float, start: float) ->
 
     Raises InputError for a distance that is longer than twice the travel.
     """
-    if not abs(distance) / 2 <= plant.travel:
-        found, most = f"{distance:g} m", f"at most {2 * plant.travel:g} m, the travel to both sides"
+    if not abs(distance) / 2 <= plant.stroke.travel:
+        found, most = (f"{distance:g} m", f"at most {2 * plant.stroke.travel:g} m, the travel to both sides")
         raise InputError("halbach", "ramp: distance", found, most)
 
     def at(t: FloatArray) -> Motion:

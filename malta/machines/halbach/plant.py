@@ -35,8 +35,12 @@ from malta.machines.halbach.electronics import (
     phase_currents,
 )
 from malta.machines.halbach.parameters import Parameters as Parameters
+from malta.model.actuator import Actuator
+from malta.model.contacts import Contacts
 from malta.model.equations import Body, Resultant
-from malta.model.plant import Actuator, Plant, Signal
+from malta.model.plant import Plant, Signal
+from malta.model.sensors import Sensors
+from malta.model.stroke import Stroke
 
 POSITION = Signal("x", "m")
 FORCE = Signal("F_x", "N")
@@ -52,16 +56,11 @@ def plant(par: Parameters) -> Plant:
         inputs=(FORCE,),
         outputs=(POSITION,),
         disturbances=(FORCE,),
-        uncontrolled=(),
         f=lambda x, u, w: motion(par, x, u[0], w[0]),
         h=lambda x, _: x[0],
         load=lambda _: ca.DM.zeros(1),
         position_of=lambda p: p,
         preload=lambda _: ca.DM.zeros(1),
-        currents=lambda y, v: phase_currents(par, y[0], v[0], par.F_z),
-        forces=lambda x, i: forces(par, x[0], i)[0],
-        limited=lambda i: i / ca.fmax(1, ca.mmax(ca.fabs(i)) / par.I_adc),  # their sum stays zero
-        tabulated=False,
         actuator=Actuator(
             coils=COILS,
             force_limit=(par.F_max,),
@@ -75,23 +74,21 @@ def plant(par: Parameters) -> Plant:
             sample_time=1 / par.f_pwm,
             loop_delay=current_delay(par, MEAN_OF),
             dead_time=(par.latency + 0.5) * par.T_laser,
+            currents=lambda y, v: phase_currents(par, y[0], v[0], par.F_z),
+            forces=lambda x, i: forces(par, x[0], i)[0],
+            limited=lambda i: i / ca.fmax(1, ca.mmax(ca.fabs(i)) / par.I_adc),  # their sum stays zero
+            electronics=partial(electronics, par),
         ),
-        windings=None,
-        electronics=partial(electronics, par),
-        contacts=("left the travel",),
-        contact=lambda x: ca.fabs(x[0]) / par.travel,
-        cushioned=(False,),
-        bearing=lambda _: ca.DM.zeros(1),
-        sense=lambda x, errors: x[0] + errors[0],
-        sensor_errors=(Signal("offset_x", "m"),),  # of the Park angle: k times this
-        noise=(par.n_laser / math.sqrt(3),),
-        uniform=True,
-        resolution=(par.dx,),
+        contacts=Contacts(("left the travel",), lambda x: ca.fabs(x[0]) / par.travel),
+        sensors=Sensors(
+            sense=lambda x, errors: x[0] + errors[0],
+            errors=(Signal("offset_x", "m"),),  # of the Park angle: k times this
+            noise=(par.n_laser / math.sqrt(3),),
+            uniform=True,
+            resolution=(par.dx,),
+        ),
         inertia=(par.m,),
-        mass=par.m,
-        thrust="F_x",
-        stroke="x",
-        travel=par.travel,
+        stroke=Stroke("x", thrust="F_x", travel=par.travel, mass=par.m),
         variant=plant,
         bodies=partial(_bodies, par),
     )

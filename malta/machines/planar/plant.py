@@ -29,8 +29,12 @@ from malta.machines.planar.commutation import (
 )
 from malta.machines.planar.field import CoilModel, centre_of_force, shape_of, simulation_model
 from malta.machines.planar.parameters import Parameters as Parameters
+from malta.model.actuator import Actuator
+from malta.model.contacts import Contacts
 from malta.model.equations import Body, Resultant, acceleration, principal_angles, rotate, rotation
-from malta.model.plant import Actuator, Plant, Signal, trace
+from malta.model.plant import Plant, Signal, trace
+from malta.model.sensors import Sensors
+from malta.model.stroke import Stroke
 
 POSITIONS = tuple(Signal(n, "m") for n in "xyz") + tuple(Signal(n, "rad") for n in ("phi", "theta", "psi"))
 RATES = tuple(Signal(f"{s.name}_dot", f"{s.unit}/s") for s in POSITIONS)
@@ -57,16 +61,11 @@ def plant(par: Parameters) -> Plant:
         inputs=WRENCH,
         outputs=POSITIONS,
         disturbances=WRENCH,
-        uncontrolled=(),
         f=trace("f", [x, u, w], partial(motion, par)),
         h=lambda x, _: x[:6],
         load=lambda _: load(par),
         position_of=lambda y: y,
         preload=lambda _: -load(par),
-        currents=current_law(par, numbers=numbers),
-        forces=lambda x, i: forces_function(shape_of(par))(x, i, factors_of(par)),
-        limited=lambda i: limit_currents(par, i),
-        tabulated=par.cells > 0,
         actuator=Actuator(
             coils=CURRENTS,
             force_limit=(par.F_max, par.F_max, par.F_max, par.T_max, par.T_max, par.T_max),
@@ -80,23 +79,19 @@ def plant(par: Parameters) -> Plant:
             sample_time=par.T_s,
             loop_delay=0.0,
             dead_time=par.T_d,
+            currents=current_law(par, numbers=numbers),
+            forces=lambda x, i: forces_function(shape_of(par))(x, i, factors_of(par)),
+            limited=lambda i: limit_currents(par, i),
+            tabulated=par.cells > 0,
         ),
-        windings=None,
-        electronics=None,
-        contacts=CONTACTS,
-        contact=lambda x: contact(par, x),
-        cushioned=(False, False, False),
-        bearing=lambda _: ca.DM.zeros(6),
-        sense=lambda x, errors: x[:6] + errors,
-        sensor_errors=SENSOR_ERRORS,
-        noise=(par.s_p, par.s_p, par.s_p, par.s_a, par.s_a, par.s_a),
-        uniform=False,
-        resolution=(0.0,) * 6,
+        contacts=Contacts(CONTACTS, lambda x: contact(par, x)),
+        sensors=Sensors(
+            sense=lambda x, errors: x[:6] + errors,
+            errors=SENSOR_ERRORS,
+            noise=(par.s_p, par.s_p, par.s_p, par.s_a, par.s_a, par.s_a),
+        ),
         inertia=(par.m, par.m, par.m, par.I_x, par.I_y, par.I_z),
-        mass=par.m,
-        thrust="F_y",
-        stroke="y",
-        travel=par.xy_max,
+        stroke=Stroke("y", thrust="F_y", travel=par.xy_max, mass=par.m),
         variant=plant,
         bodies=partial(_bodies, par),
     )

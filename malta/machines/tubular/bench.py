@@ -227,7 +227,7 @@ def _judge_lift(controller: Controller, log: Log) -> list[Finding]:
     return [
         Finding(
             "off its place after the lift-off",
-            Estimate(float(np.abs(y).max()), plant.resolution[0], "m"),
+            Estimate(float(np.abs(y).max()), plant.sensors.resolution[0], "m"),
             0,
             LIFTED,
         )
@@ -263,7 +263,7 @@ def _judge_slow(controller: Controller, log: Log) -> list[Finding]:
 def _record_drop(bench: Bench) -> Log:
     """From the centre without current; the log ends before the touchdown."""
     scenario = Scenario("drop", 0.05, references.hold, cold=True, open_loop=True)
-    log = fly(_unheld(bench), scenario, ends=tuple(bench.truth.contacts))
+    log = fly(_unheld(bench), scenario, ends=tuple(bench.truth.contacts.names))
     par: Any = bench.truth.parameters
     fallen = np.flatnonzero(np.abs(log.columns["y"][:, :4]).max(axis=1) > 0.9 * par.r_max)
     if not len(fallen):

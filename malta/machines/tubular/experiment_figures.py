@@ -66,7 +66,7 @@ def commissioning_figure(e: Experiment, _: Published | None = None) -> Figure:
     draw_bound(height, -clearance(plant) * 1e6, "touchdown bearing", where="below left")
     finish_axes(height, "", "height [µm]")
     finish_axes(error, "", "off its reference, radially [µm]")
-    finish_axes(stroke, "", f"{plant.stroke} [mm]")
+    finish_axes(stroke, "", f"{plant.stroke.name} [mm]")
     radial = [k for k in range(len(plant.inputs)) if k != plant.thrust_input]
     forces = dict(zip((plant.thrust_input, *radial), (thrust, *np.ravel(others)), strict=True))
     for k, axes in forces.items():  # each in a panel of its own: noise hides the others
@@ -232,7 +232,7 @@ def recording_figure(e: Experiment, _: Published | None = None) -> Figure:
     """v0(z) of the thrust and the differences of all forces; axial errors of strokes with own and recorded v0."""
     found = "no v0 recorded"
     if e.merits:
-        thrust = next(merit for merit in e.merits if merit.label.endswith(e.run.plant.thrust))
+        thrust = next(merit for merit in e.merits if merit.label.endswith(e.run.plant.stroke.thrust))
         found = f"{thrust.label}: {thrust.phrase()}; {e.merits[-1].label}: {e.merits[-1].phrase()}"
     figure = new_page(runs_of(e), "v0(z) recorded by a slow stroke", found, hspace=0.34, top=0.83, left=0.1)
     (table, difference), (own, recorded) = figure.subplots(2, 2)
@@ -267,11 +267,13 @@ def _draw_tables(table: Axes, difference: Axes, e: Experiment) -> None:
     if "v0 " in e.curves:
         off = (e.curves["v0 "] - np.array([ff.at(float(at)) for at in z])) * 1e3
         bearings = np.delete(off, axis, axis=1)
-        draw_line(difference, z * 1e3, off[:, axis], label=plant.thrust, **STYLES[0] | {"linewidth": 0.9})
+        draw_line(
+            difference, z * 1e3, off[:, axis], label=plant.stroke.thrust, **STYLES[0] | {"linewidth": 0.9}
+        )
         count = f"{bearings.shape[1]} bearing forces, least to largest"
         difference.fill_between(z * 1e3, *_extremes(bearings), color="#e0a08c", linewidth=0, label=count)
-    finish_axes(table, f"{plant.stroke} [mm]", f"v0 of {plant.thrust} [N]")
-    finish_axes(difference, f"{plant.stroke} [mm]", "recorded less own v0 [mN]", legend=2)
+    finish_axes(table, f"{plant.stroke.name} [mm]", f"v0 of {plant.stroke.thrust} [N]")
+    finish_axes(difference, f"{plant.stroke.name} [mm]", "recorded less own v0 [mN]", legend=2)
 
 
 def _extremes(values: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -117,7 +117,10 @@ def hold_figure(e: Experiment, published: Published | None = None) -> Figure:
     run, axis = e.run, e.run.plant.stroke_output
     names = [s.name for s in run.plant.outputs]
     y, p = run.y[-RESTING:] * 1e6, run.p[-RESTING:] * 1e6
-    bins = [1e6 * (r or s / 3) or 1.0 for r, s in zip(run.plant.resolution, run.plant.noise, strict=True)]
+    bins = [
+        1e6 * (r or s / 3) or 1.0
+        for r, s in zip(run.plant.sensors.resolution, run.plant.sensors.noise, strict=True)
+    ]
     rms, widest = np.sqrt((p**2).mean(axis=0)), np.abs(y).max(axis=0)
     radial = [k for k in range(len(names)) if k != axis]
     figure = new_page(
@@ -234,7 +237,7 @@ def payload_figure(e: Experiment, published: Published | None = None) -> Figure:
     sag.set_xlim(-20, (begin - picked) * 1e3)
     for axes in (axial, radial):
         axes.set_xlim(0, (e.run.scenario.duration - begin) * 1e3)
-    masses = [(run.scenario.changes[0][1]["m"] - plant.mass) * 1e3 for run in runs]
+    masses = [(run.scenario.changes[0][1]["m"] - plant.stroke.mass) * 1e3 for run in runs]
     for case, mass, style in zip(e.cases, masses, cycle((*STYLES, *MORE))):
         run, y = case.run, case.run.p[:, lowest] * 1e6
         last = int(np.searchsorted(run.t, begin))
@@ -325,7 +328,7 @@ def disturbance_figure(e: Experiment, _: Published | None = None) -> Figure:
         mark_end(axes, run, ms, deflection)
     finish_axes(compliance, "frequency [Hz]", "x1 over F_x [µm/N]", legend=2)
     finish_axes(radial, "time [ms]", f"{plant.outputs[0].name} [µm]", legend=3)
-    finish_axes(axial, "time [ms]", f"{plant.stroke} [mm]", legend=2)
+    finish_axes(axial, "time [ms]", f"{plant.stroke.name} [mm]", legend=2)
     finish_axes(vibration, "time [ms]", f"{plant.outputs[1].name} [µm]", legend=1)
     return figure
 

@@ -25,6 +25,8 @@ from malta.machines.tubular.drive import (
     potential,
 )
 from malta.machines.tubular.parameters import Parameters as Parameters
+from malta.model.actuator import Actuator
+from malta.model.contacts import Contacts
 from malta.model.equations import (
     EXACT,
     SMALL_ANGLE,
@@ -37,8 +39,9 @@ from malta.model.equations import (
     rotate,
     rotation,
 )
-from malta.model.plant import Actuator, Plant, Signal, trace
-from malta.model.signals import late_sensors
+from malta.model.plant import Plant, Signal, trace
+from malta.model.sensors import Sensors
+from malta.model.stroke import Stroke
 
 # The mover's centre of gravity off its axis, by c = (c_x, c_y, 0) in frame R.
 #
@@ -100,28 +103,23 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
         load=lambda x: load(par, x, trig),
         position_of=lambda p: position_of(par, p),
         preload=lambda _: ca.DM.zeros(5),
-        currents=lambda _, v: v / ca.vertcat(*constants),
-        forces=lambda _, i: ca.vertcat(*constants) * i,
-        limited=lambda i: ca.fmax(ca.fmin(i, par.I_max), -par.I_max),
-        tabulated=False,
         actuator=_actuator(par, constants),
-        windings=drive(par),
-        electronics=None,
-        contacts=("touchdown at sensor plane 1", "touchdown at sensor plane 2", "axial end stop"),
-        contact=lambda x: contact(par, x, trig),
-        cushioned=(True, True, False),
-        bearing=trace("bearing", [x], lambda x: touchdown_bearing(par, x, trig)),
-        sense=lambda x, errors: sensed(par, x, errors, trig),
-        sensor_errors=SENSOR_ERRORS,
-        sensors=late_sensors((*[par.tau_s] * 4, 0.0), par.T_s),
-        travel=par.z_max,
-        noise=(*(par.s_r * n for n in (par.n_x1, par.n_y1, par.n_x2, par.n_y2)), par.s_z),
-        uniform=False,
-        resolution=(par.dp, par.dp, par.dp, par.dp, 0.0),
+        contacts=Contacts(
+            names=("touchdown at sensor plane 1", "touchdown at sensor plane 2", "axial end stop"),
+            contact=lambda x: contact(par, x, trig),
+            cushioned=(True, True, False),
+            bearing=trace("bearing", [x], lambda x: touchdown_bearing(par, x, trig)),
+        ),
+        sensors=Sensors(
+            sense=lambda x, errors: sensed(par, x, errors, trig),
+            errors=SENSOR_ERRORS,
+            lag=(*[par.tau_s] * 4, 0.0),
+            dead_time=par.T_s,
+            noise=(*(par.s_r * n for n in (par.n_x1, par.n_y1, par.n_x2, par.n_y2)), par.s_z),
+            resolution=(par.dp, par.dp, par.dp, par.dp, 0.0),
+        ),
+        stroke=Stroke("z", thrust="f_D", travel=par.z_max, mass=par.m),
         inertia=(0.0, 0.0, 0.0, 0.0, par.m),
-        mass=par.m,
-        thrust="f_D",
-        stroke="z",
         bodies=partial(_bodies, par),
         variant=partial(plant, small_angle=small_angle),
     )
@@ -145,7 +143,7 @@ def _bodies(par: Parameters) -> tuple[Body, ...]:
 
 
 def _actuator(par: Parameters, constants: tuple[float, ...]) -> Actuator:
-    """The current loops and their limits; `constants` are N/A of each input."""
+    """The current loops, their limits and the windings; `constants` are N/A of each input."""
     return Actuator(
         coils=COILS,
         force_limit=tuple(par.I_max * constant for constant in constants),
@@ -159,6 +157,7 @@ def _actuator(par: Parameters, constants: tuple[float, ...]) -> Actuator:
         sample_time=par.T_cc,
         loop_delay=par.T_d,
         dead_time=par.T_d,
+        windings=drive(par),
     )
 
 

@@ -131,7 +131,7 @@ def run_figure(e: Experiment, _: Published | None = None) -> Figure:
             for unit in dict.fromkeys(s.unit for s in run.plant.inputs)
         ),
         partial(_draw_errors, run=run, group=stroke, unit=_stroke_unit(run)),
-        partial(_draw_clearances if run.plant.contacts else _draw_currents, run=run),
+        partial(_draw_clearances if run.plant.contacts.names else _draw_currents, run=run),
     ]
     furthest = [(group.name, _largest_error(run, group), group.fine) for group in others]
     furthest.append((stroke.name, _largest_error(run, stroke), _stroke_unit(run)))
@@ -189,7 +189,7 @@ def _draw_forces(axes: Axes, x: str, run: Trajectory, unit: str) -> None:
 
 def _draw_clearances(axes: Axes, x: str, run: Trajectory) -> None:
     """Shares of the clearances that are used up, on a logarithmic axis."""
-    names = [name.removeprefix("touchdown at sensor ") for name in run.plant.contacts]
+    names = [name.removeprefix("touchdown at sensor ") for name in run.plant.contacts.names]
     ways = dict(zip(names, np.maximum(run.contact.T * 100, 1e-3), strict=True))
     columns = draw_group(axes, run.t * 1e3, ways)
     axes.set_yscale("log")

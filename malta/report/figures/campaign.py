@@ -153,7 +153,7 @@ def _nearness(summary: Summary, runs: Runs) -> tuple[FloatArray, str]:
     if contact.shape[1]:
         beyond = contact.max(axis=0) - np.median(contact, axis=0)
         k = int(beyond.argmax())
-        name = plant.contacts[k].removeprefix("touchdown at ")
+        name = plant.contacts.names[k].removeprefix("touchdown at ")
         return 100 * contact[:, k], f"clearance used up, {name} [%]"
     group = lateral_outputs(plant)[0]
     worst = runs.batch.deviation[:, group.columns].max(axis=1) * in_unit(1.0, group.fine)
@@ -227,7 +227,7 @@ def _draw_errors(axes: Axes, summary: Summary, runs: Runs) -> None:
     key = bounds_of(plan).get(across.unit)
     if published is not None and key is not None:
         bounds["published bound"] = published_in_unit(published, key, across.fine)
-    if plant.contacts and completed.all():  # what the runs are ranked by
+    if plant.contacts.names and completed.all():  # what the runs are ranked by
         values, label = 100 * closeness(summary, runs), "clearance used up beyond median [%]"
         unit, bounds = "%", {}
     most = float(values.max(initial=0.0))
@@ -463,7 +463,7 @@ def _draw_bands(axes: Axes, plan: Plan, name: str, counts: Any) -> None:
     total = counts.sum(axis=0)
     base = np.zeros(len(total))
     by_way = dict(zip(ways_to_end(plan), counts, strict=True))
-    for label, style in (dict(FINE) | dict(zip(plan.plant.contacts, cycle(TOUCHES)))).items():
+    for label, style in (dict(FINE) | dict(zip(plan.plant.contacts.names, cycle(TOUCHES)))).items():
         if not by_way[label].any():
             continue
         share = 100 * by_way[label] / np.maximum(total, 1)

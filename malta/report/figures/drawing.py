@@ -406,7 +406,7 @@ def clearance(plant: Plant) -> float:
     ]
 
     def share(**moved: float) -> FloatArray:
-        return np.array(ca.evalf(plant.contact(ca.SX(ca.DM(plant.at(**moved).x))))).ravel()
+        return np.array(ca.evalf(plant.contacts.contact(ca.SX(ca.DM(plant.at(**moved).x))))).ravel()
 
     nearer = [share(**{name: side * way}) - share() for name in across for side in (1, -1)]
     most = max((float(used.max(initial=0.0)) for used in nearer), default=0.0)

@@ -427,7 +427,7 @@ def summary_sentences(a: Analysis) -> list[str]:
     if parts:
         sentences.append(f"It {_list_in_words(parts)}.")
     if plant.has_stroke:
-        sentences.append(f"The travel of {plant.stroke} is ±{in_unit(plant.travel, 'mm'):g} mm.")
+        sentences.append(f"The travel of {plant.stroke.name} is ±{in_unit(plant.stroke.travel, 'mm'):g} mm.")
     spec = a.subject.written_from
     if spec is not None and spec.summary:
         sentences.insert(0, f"{spec.summary.rstrip('.')}.")

@@ -228,7 +228,7 @@ def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shar
         digests=np.empty((groups, 0, LANES)),
     )
     ff = controller.feedforward
-    shared = Shared(inputs.given, feedforward_table(ff.z_grid, ff.v0), count, plant.uniform)
+    shared = Shared(inputs.given, feedforward_table(ff.z_grid, ff.v0), count, plant.sensors.uniform)
     return inputs, shared, lanes, parts
 
 
@@ -358,7 +358,7 @@ def is_compiled(plant: Plant, controller: Controller, scenario: Scenario) -> boo
 def functions_text(plant: Plant, controller: Controller, scenario: Scenario) -> str:
     """The functions that `simulate_many` runs as text: in C, or as CasADi stores those that have no form in C."""
     shape = shape_of(plant, controller, setup_of(plant, controller, scenario))
-    if not plant_of(controller.parameters).tabulated:
+    if not plant_of(controller.parameters).actuator.tabulated:
         return engine_text(shape, digest_function(shape), cruise_functions(shape))
     period = period_of(plant, controller, shape.setup, numbers_of(plant, controller, 1), constant=True)
     return "\n".join(f.serialize() for f in (period.sense, period.decide, period.substep))
@@ -431,7 +431,7 @@ def _own_numbers(plant: Plant, values: Mapping[str, ca.DM], variation: Variation
             replace(plant.parameters, **{name: float(extreme)})
         if f"machine.{name}" in place:  # else every run has the default
             own[place[f"machine.{name}"]] = column
-    names = [signal.name for signal in plant.sensor_errors]
+    names = [signal.name for signal in plant.sensors.errors]
     for name, column in sensor_errors.items():
         column = np.asarray(column, dtype=float)
         if not np.isfinite(column).all():

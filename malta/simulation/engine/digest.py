@@ -76,7 +76,7 @@ class Batch:
 
 def verdicts(plant: Plant) -> tuple[str, ...]:
     """Names of the verdicts that a run may end with; the first is that of success."""
-    return ("completed", "diverged", "not lifted", *plant.contacts)
+    return ("completed", "diverged", "not lifted", *plant.contacts.names)
 
 
 def digest_sizes(plant: Plant) -> dict[str, int]:
@@ -96,7 +96,7 @@ def digest_sizes(plant: Plant) -> dict[str, int]:
         "squares": p,
         "force": m,
         "limited": m,
-        "contact": len(plant.contacts),
+        "contact": len(plant.contacts.names),
         "resting": 1,  # 1 where the mover rests on its touchdown bearings at the start
         "touching": 1,  # 1 where it touches them at the end
         "touched": 1,  # sample at which it first touched them, -1 before
@@ -140,13 +140,13 @@ def digest_function(shape: Any) -> ca.Function:
         "samples": kept["samples"] + alive,
         "culprit": ca.if_else(
             ca.logic_and(ca.logic_and(alive, kept["culprit"] < 0), used >= 1),
-            _index_of_largest(row["contact"]) if shape.plant.contacts else -1,
+            _index_of_largest(row["contact"]) if shape.plant.contacts.names else -1,
             kept["culprit"],
         ),
     }
     if shape.setup.bearing:
         touching = used >= 1
-        ends = [row["contact"][i] for i, held in enumerate(shape.plant.cushioned) if not held]
+        ends = [row["contact"][i] for i, held in enumerate(shape.plant.contacts.cushioned) if not held]
         after["alive"] = ca.logic_and(alive, _largest_share(ca.vertcat(*ends)) < 1)
         first = kept["samples"] == 0
         after["resting"] = ca.if_else(first, touching, kept["resting"])

@@ -298,7 +298,7 @@ def engine_of(
                 lib.run, p, flatten(values), substeps, table, ending_columns(plant, c, setup)
             )
         if choice == "compiled":
-            if plant_of(c.parameters).tabulated:
+            if plant_of(c.parameters).actuator.tabulated:
                 raise InputError(
                     "simulate", "engine", "a controller that looks up a table", "virtual machine"
                 )
@@ -342,7 +342,7 @@ def library_of(
     digest : the function that updates a run's digest; for several lanes
     cruise : see digest.cruise_functions
     """
-    if plant_of(shape.controller.parameters).tabulated:
+    if plant_of(shape.controller.parameters).actuator.tabulated:
         return None
     lib = library(engine_text(shape, digest, cruise), lanes)
     return None if lib is None else (lib, compiled_period(shape))

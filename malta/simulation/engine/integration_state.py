@@ -258,7 +258,7 @@ def with_working_state(p: Period, plant: Plant, c: Controller, s: Setup) -> Peri
     loop, signals = Loop(plant, c, s, g), signals_of(layout_of(plant, c, s), ca.SX)
     machine, given = signals.machine, ca.vertcat(*signals.given.values())
     x, i, h = machine["x"], machine["i_coil"], g["substep"]
-    rate = ca.cse(ca.densify(motion(loop, signals, x, plant.forces(x, i))))
+    rate = ca.cse(ca.densify(motion(loop, signals, x, plant.actuator.forces(x, i))))
     parts, names, slope = linear_parts(rate, i, theta)
     if parts.numel() > i.numel():
         parts, names, slope = i, i, rate

@@ -156,11 +156,11 @@ def jump(plant: Plant, output: int, size: float, at: float) -> Reference:
 def default_step(plant: Plant, output: int) -> float:
     """A tenth of the clearance of an output, SI; without contacts, ten times the sensor's noise."""
     y = np.zeros(len(plant.outputs))
-    probe = max(10 * plant.noise[output], SIZE)
+    probe = max(10 * plant.sensors.noise[output], SIZE)
     y[output] = probe
-    if plant.contacts:
+    if plant.contacts.names:
         x = placed(plant, ca.DM(plant.position_of(ca.DM(y))))
-        used = float(np.max(np.array(ca.DM(plant.contact(x)))))
+        used = float(np.max(np.array(ca.DM(plant.contacts.contact(x)))))
         if used > 0:
             return probe * CLEARANCE / used
     return probe
@@ -484,7 +484,8 @@ def held_payload(plant: Plant) -> float:
     """Find the mass, kg, at which a force reaches its limit at rest in the middle or at an end of the travel."""
     par: Any = plant.parameters
     limits = np.array(plant.actuator.force_limit)
-    places = [{plant.stroke: share * plant.travel} for share in PLACES_OF_REST] if plant.has_stroke else [{}]
+    stroke = plant.stroke
+    places = [{stroke.name: share * stroke.travel} for share in PLACES_OF_REST] if plant.has_stroke else [{}]
 
     def share_used(extra: float) -> float:
         heavier = plant.variant(replace(par, m=par.m + extra))

@@ -181,7 +181,7 @@ def fastest_stroke(
     ends = np.array([z_ends, rest, i_ends, actuator.R * i_ends])
     # First guess of T: bang-bang at a current that the voltage allows, plus terms of inductance and induced voltage.
     i_typical = i_max * u_max / (u_max + actuator.R * i_max)
-    T = 2 * math.sqrt(abs(distance) * plant.mass / (k * i_typical))
+    T = 2 * math.sqrt(abs(distance) * plant.stroke.mass / (k * i_typical))
     T += (4 * actuator.L * i_typical + emf_constant * abs(distance)) / u_max
     scale = np.array([abs(distance), 2 * abs(distance) / T, i_max, u_max])
     s: FloatArray = np.linspace(0, 1, intervals + 1)
@@ -219,7 +219,7 @@ def sigmoid_at_peak_current(
 
     # Without a load, |z''| peaks at d (2 ln 9 / rise)^2 / (6 sqrt 3). The load moves the rise between two bounds.
     held, k = _holding_current(plant, distance), plant.actuator.force_constant[plant.thrust_input]
-    inertia = plant.mass * abs(distance) * (2 * math.log(9)) ** 2 / (6 * math.sqrt(3) * k)
+    inertia = plant.stroke.mass * abs(distance) * (2 * math.log(9)) ** 2 / (6 * math.sqrt(3) * k)
     quickest, slowest = math.sqrt(inertia / (i_max + held)), math.sqrt(inertia / (i_max - held))
     from scipy.optimize import brentq  # here: it takes long to load
 
@@ -318,8 +318,8 @@ def _limits(
     plant: Plant, distance: float, emf_constant: float, voltage_share: float, current_share: float
 ) -> tuple[float, float]:
     """i_max (A) and u_max (V). InputError for arguments out of range, or limits that cannot hold the load."""
-    if not 0 < abs(distance) <= 2 * plant.travel:
-        expected = f"one other than 0 m within the travel of +-{plant.travel} m"
+    if not 0 < abs(distance) <= 2 * plant.stroke.travel:
+        expected = f"one other than 0 m within the travel of +-{plant.stroke.travel} m"
         raise InputError("stroke", "distance", f"{distance} m", expected)
     if not 0 <= emf_constant < math.inf:
         raise InputError("stroke", "emf_constant", f"{emf_constant} V s/m", "a finite number, 0 or more")
@@ -349,14 +349,15 @@ def _axis(plant: Plant) -> ca.Function:
     F = u[plant.thrust_input]
     others = ca.vertcat(*(u[j] for j in range(u.numel()) if j != plant.thrust_input))
     if ca.depends_on(acceleration, others):
-        raise InputError(plant.name, plant.stroke, "an axis that other inputs push", f"{plant.thrust} alone")
+        found, expected = "an axis that other inputs push", f"{plant.stroke.thrust} alone"
+        raise InputError(plant.name, plant.stroke.name, found, expected)
     return ca.Function("axis", [z, v, F], [acceleration])
 
 
 def _current(plant: Plant, z: FloatArray, v: FloatArray, a: FloatArray) -> FloatArray:
     """i (A) that accelerates the mover by `a`: z'' is affine in the thrust, with the slope 1 / m."""
     free = np.array(_axis(plant)(z[None], v[None], 0.0)).ravel()
-    return np.asarray(plant.mass * (a - free) / plant.actuator.force_constant[plant.thrust_input])
+    return np.asarray(plant.stroke.mass * (a - free) / plant.actuator.force_constant[plant.thrust_input])
 
 
 def _holding_current(plant: Plant, distance: float) -> float:

@@ -58,7 +58,7 @@ def commissioning(
     The exported C of controller and supervisor fly it, and a C compiler has to be there.
     """
     _require_own_engine("commissioning", options)
-    own = {"start": rest_on_bearing(plant) | {plant.stroke: 0.0}, "cold": True, "bearing": True}
+    own = {"start": rest_on_bearing(plant) | {plant.stroke.name: 0.0}, "cold": True, "bearing": True}
     reference = partial(references.stroke, start=-distance / 2, end=distance / 2, rise=rise, centre=STROKE)
     scenario = scenario_of("commissioning", END, reference, own | options)
     flights: list[Flown] = []
@@ -143,7 +143,7 @@ def _require_own_engine(name: str, options: Mapping[str, Any]) -> None:
 
 def _judged(run: Trajectory, flown: Flown, *, from_rest: bool) -> Trajectory:
     """The run with the verdict of a supervised flight: slow contact in a lift-off or at a landing's end is none."""
-    if run.verdict.name in ("interrupted", "diverged", run.plant.contacts[-1]):
+    if run.verdict.name in ("interrupted", "diverged", run.plant.contacts.names[-1]):
         return run
     states = flown.states(run.t)
     if from_rest and not (states == NUMBERS["OPERATE"]).any():
@@ -155,8 +155,8 @@ def _judged(run: Trajectory, flown: Flown, *, from_rest: bool) -> Trajectory:
     if not len(hard) or not flying.any():
         return replace(run, verdict=Verdict("completed", run.scenario.duration))
     k = hard[0]
-    shares = run.contact[k, : len(run.plant.contacts)]
-    return replace(run, verdict=Verdict(run.plant.contacts[int(shares.argmax())], float(run.t[k])))
+    shares = run.contact[k, : len(run.plant.contacts.names)]
+    return replace(run, verdict=Verdict(run.plant.contacts.names[int(shares.argmax())], float(run.t[k])))
 
 
 def _commissioning_merits(run: Trajectory, flown: Flown) -> tuple[Merit, ...]:

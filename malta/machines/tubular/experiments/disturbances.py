@@ -66,13 +66,15 @@ def disturbance_cases(plant: Plant, _: Controller, **options: Any) -> list[Plann
     names = [s.name for s in plant.disturbances]
     outputs = [s.name for s in plant.outputs]
     wanted: list[PlannedRun] = []
-    for name, size, seen in (("F_x", 1.0, "x1"), ("F_z", 1.0, plant.stroke), ("T_y", 0.05, "x1")):
+    for name, size, seen in (("F_x", 1.0, "x1"), ("F_z", 1.0, plant.stroke.name), ("T_y", 0.05, "x1")):
         push = partial(step_wrench, column=names.index(name), size=size, at=0.02, width=len(names))
         scenario = scenario_of("disturbance", 0.4, references.hold, QUIET | {"disturbance": push} | options)
         unit = plant.disturbances[names.index(name)].unit
         merits = partial(_step_merits, output=outputs.index(seen))
         wanted.append(PlannedRun(f"step of {size:g} {unit} {name}", scenario, merits))
-    shake = partial(sine_wrench, column=names.index("F_y"), size=plant.mass, frequency=50.0, width=len(names))
+    shake = partial(
+        sine_wrench, column=names.index("F_y"), size=plant.stroke.mass, frequency=50.0, width=len(names)
+    )
     vibration = scenario_of("vibration", 0.3, references.hold, QUIET | {"disturbance": shake} | options)
     shaken = partial(_sine_merits, output=outputs.index("y1"), frequency=50.0)
     wanted.append(PlannedRun("housing shaken by 1 m/s2 at 50 Hz along y", vibration, shaken))
@@ -132,7 +134,7 @@ def carrier(
     acceleration = carrier_acceleration(t, carried, within)
     found = (
         Merit("largest acceleration of the carrier", float(np.abs(acceleration).max()), "m/s^2"),
-        Merit("largest inertial force", float(plant.mass * np.abs(acceleration).max()), "N"),
+        Merit("largest inertial force", float(plant.stroke.mass * np.abs(acceleration).max()), "N"),
     )
     curves = {"t": t, "acceleration": acceleration}
     return Experiment("carrier", "Does it ride along?", cases, found, curves, interrupted=cut)
@@ -168,7 +170,7 @@ def inertial_wrench(
     """The wrench on the mover as seen from the carrier, or a share of it, at the times t."""
     wrench = np.zeros((len(t), len(plant.disturbances)))
     column = [s.name for s in plant.disturbances].index("F_x")
-    wrench[:, column] = -share * plant.mass * carrier_acceleration(t, carried, within)
+    wrench[:, column] = -share * plant.stroke.mass * carrier_acceleration(t, carried, within)
     return wrench
 
 

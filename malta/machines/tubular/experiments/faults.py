@@ -149,7 +149,7 @@ def contacts_of(run: Trajectory, since: float = 0.0) -> tuple[NDArray[np.intp], 
     Every contact counts, also after a bounce, but that at the start; its speed is that of the sensor planes over the
     three samples before.
     """
-    touching = np.atleast_1d((run.contact[:, np.array(run.plant.cushioned)] >= 1).any(axis=1))
+    touching = np.atleast_1d((run.contact[:, np.array(run.plant.contacts.cushioned)] >= 1).any(axis=1))
     met = np.flatnonzero(touching[1:] & ~touching[:-1]) + 1
     met = met[run.t[met] >= since]
     others = [i for i in range(run.p.shape[1]) if i != run.plant.stroke_output]
@@ -381,7 +381,7 @@ def _scenario(plant: Plant, phase: Phase, faults: tuple[Fault, ...], options: Ma
     own: dict[str, Any] = {"bearing": True, "fidelity": "phase", "faults": faults} | dict(options)
     reference: Any = references.hold
     if phase == "lift":
-        own |= {"start": rest_on_bearing(plant) | {plant.stroke: 0.0}, "cold": True}
+        own |= {"start": rest_on_bearing(plant) | {plant.stroke.name: 0.0}, "cold": True}
     if phase == "stroke":
         reference = partial(
             references.stroke, start=-DISTANCE / 2, end=DISTANCE / 2, rise=RISE, centre=STROKE_CENTRE

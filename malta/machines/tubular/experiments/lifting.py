@@ -85,14 +85,18 @@ def rest_on_bearing(plant: Plant) -> dict[str, float]:
     free = plant.states[downward].name
     x = ca.SX.sym("x", len(names))
     force = ca.Function(
-        "force", [x], [plant.f(x, ca.SX.zeros(len(plant.inputs)), plant.load(x) + plant.bearing(x))]
+        "force", [x], [plant.f(x, ca.SX.zeros(len(plant.inputs)), plant.load(x) + plant.contacts.bearing(x))]
     )
 
     def net(depth: float) -> float:
         return float(force(plant.at(**{free: -depth}).x)[len(names) // 2 + downward])
 
     edge = brentq(
-        lambda depth: float(ca.evalf(plant.contact(ca.SX(ca.DM(plant.at(**{free: -depth}).x))))[0]) - 1, 0, 1
+        lambda depth: (
+            float(ca.evalf(plant.contacts.contact(ca.SX(ca.DM(plant.at(**{free: -depth}).x))))[0]) - 1
+        ),
+        0,
+        1,
     )
     return {free: -float(brentq(net, edge, 1.5 * edge, xtol=1e-15))}
 
@@ -146,7 +150,7 @@ def payload(
     reference = partial(delayed_stroke, wait=WAIT)
     wanted = []
     for extra in masses:
-        own: dict[str, Any] = {"changes": ((PICKED, {"m": plant.mass + extra}),), "bearing": True}
+        own: dict[str, Any] = {"changes": ((PICKED, {"m": plant.stroke.mass + extra}),), "bearing": True}
         own |= {"anticipated": partial(payload_wrench, plant=plant, extra=extra)} if known else {}
         scenario = scenario_of("payload", WAIT + 0.15, reference, own | options)
         wanted.append(PlannedRun(f"{extra * 1e3:.0f} g", scenario, _payload_merits))
@@ -297,7 +301,7 @@ def _bounds(plant: Plant) -> dict[tuple[str, str], FloatArray]:
 def _clearances(plant: Plant) -> dict[str, FloatArray]:
     """Corners of the clearance of touchdown bearings and travel in each plane of the maps, 4 x 2."""
     par: Any = plant.parameters
-    r, tilt, z = par.r_max, par.r_max / par.l_S, plant.travel
+    r, tilt, z = par.r_max, par.r_max / par.l_S, plant.stroke.travel
     diamond = np.array([(r, 0.0), (0.0, tilt), (-r, 0.0), (0.0, -tilt)])
     box = np.array([(z, r), (-z, r), (-z, -r), (z, -r)])
     return {f"clearance {' '.join(plane)}": box if "z" in plane else diamond for plane in PLANES}
@@ -309,7 +313,7 @@ def _maps(
     """Whether the mover returns, on a grid in each plane, and the grids' axes."""
     widest = {plane: BEYOND * np.abs(b).max(axis=0) for plane, b in bounds.items()}
     reach_x = widest[PLANES[0]][0]
-    widest[PLANES[2]] = np.array([0.99 * free.plant.travel, reach_x])
+    widest[PLANES[2]] = np.array([0.99 * free.plant.stroke.travel, reach_x])
     axes = {
         f"axis {' '.join(plane)} {name}": np.linspace(-half, half, points)
         for plane, halves in widest.items()
@@ -351,7 +355,7 @@ def _starts_inside(plant: Plant) -> dict[str, FloatArray]:
     u = np.asarray(qmc.Sobol(5, rng=0).random_base2(round(math.log2(RANDOM))))
     radius, angle = 0.99 * par.r_max * np.sqrt(u[:, :2]), 2 * math.pi * u[:, 2:4]
     (x1, x2), (y1, y2) = (radius * np.cos(angle)).T, (radius * np.sin(angle)).T
-    p = ca.DM(np.vstack([x1, y1, x2, y2, 0.99 * plant.travel * (2 * u[:, 4] - 1)]))
+    p = ca.DM(np.vstack([x1, y1, x2, y2, 0.99 * plant.stroke.travel * (2 * u[:, 4] - 1)]))
     names = [s.name for s in plant.states[:5]]
     symbol = ca.SX.sym("p", 5)
     position = ca.Function("position", [symbol], [plant.position_of(symbol)]).map(RANDOM)

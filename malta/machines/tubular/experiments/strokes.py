@@ -255,8 +255,8 @@ def force_log(run: Trajectory) -> ForceLog:
 def forces_of(log: Log, plant: Plant) -> ForceLog:
     """Positions and commanded forces of a log. Raises InputError for a missing column, and for a missing reading."""
     names = [s.name for s in plant.inputs]
-    z, v = log.table("y", [plant.stroke]), log.table("v", names)
-    for name, column in zip([plant.stroke, *names], np.hstack([z, v]).T, strict=True):
+    z, v = log.table("y", [plant.stroke.name]), log.table("v", names)
+    for name, column in zip([plant.stroke.name, *names], np.hstack([z, v]).T, strict=True):
         missing = np.flatnonzero(~np.isfinite(column))
         if len(missing):
             found = f"no finite number in row {missing[0] + 1}"
@@ -277,7 +277,7 @@ def slow_stroke(plant: Plant, way: float) -> Reference:
 
     The stroke begins and ends at -SWEPT of the travel; the other outputs stay at zero.
     """
-    reach, axis = SWEPT * plant.travel, plant.stroke_output
+    reach, axis = SWEPT * plant.stroke.travel, plant.stroke_output
 
     def at(t: FloatArray) -> Motion:
         motion = [np.zeros((len(t), len(plant.outputs))) for _ in range(3)]
@@ -297,20 +297,20 @@ def record(log: ForceLog, plant: Plant) -> Recorded:
 
         recorded = record(forces_of(malta.identification.read_log("stand.csv"), plant), plant)
     """
-    reach = COVERED * plant.travel
+    reach = COVERED * plant.stroke.travel
     low, high = float(log.z.min()), float(log.z.max())
     if low > -reach or high < reach:
         found = f"positions from {low * 1e3:.4g} to {high * 1e3:.4g} mm"
         raise InputError(
-            log.source, plant.stroke, found, f"the travel, -{reach * 1e3:.4g} to {reach * 1e3:.4g} mm"
+            log.source, plant.stroke.name, found, f"the travel, -{reach * 1e3:.4g} to {reach * 1e3:.4g} mm"
         )
     half = max(V0_STEPS, math.ceil(reach / V0_STEP))
     z_grid = np.linspace(-reach, reach, 2 * half + 1)
     means = _average(log)
     _require_slow(means, plant)
-    rising = _rising(means.z, TURN * plant.travel)
+    rising = _rising(means.z, TURN * plant.stroke.travel)
     there, back = (
-        _fit(means._replace(z=means.z[chosen], v=means.v[chosen]), z_grid, plant.stroke, way)
+        _fit(means._replace(z=means.z[chosen], v=means.v[chosen]), z_grid, plant.stroke.name, way)
         for chosen, way in ((rising, "there"), (~rising, "back"))
     )
     return Recorded(z_grid, (there + back) / 2, (there - back) / 2)
@@ -355,14 +355,14 @@ def _require_slow(log: ForceLog, plant: Plant) -> None:
 
     The speed is the mean one in each of PLACES parts of the travel, so that noise does not show.
     """
-    edges = np.linspace(-COVERED * plant.travel, COVERED * plant.travel, PLACES + 1)
+    edges = np.linspace(-COVERED * plant.stroke.travel, COVERED * plant.stroke.travel, PLACES + 1)
     middle, speed = (log.z[1:] + log.z[:-1]) / 2, np.abs(np.diff(log.z) / np.diff(log.t))
     place = np.digitize(middle, edges)
     mean = np.array([speed[place == k].mean() for k in range(1, PLACES + 1) if (place == k).any()])
-    force = plant.mass / 2 * np.abs(np.diff(mean**2)).max(initial=0.0) / (edges[1] - edges[0])
+    force = plant.stroke.mass / 2 * np.abs(np.diff(mean**2)).max(initial=0.0) / (edges[1] - edges[0])
     if force > INERTIA:
         found = f"a stroke that accelerates the mover by {force:.3g} N"
-        raise InputError(log.source, plant.stroke, found, f"a slow one: at most {INERTIA:g} N")
+        raise InputError(log.source, plant.stroke.name, found, f"a slow one: at most {INERTIA:g} N")
 
 
 def _fit(log: ForceLog, z_grid: FloatArray, stroke: str, way: str) -> FloatArray:
@@ -516,10 +516,10 @@ def _differences(recorded: Recorded, controller: Controller, plant: Plant) -> tu
     at = float(recorded.z_grid[int(off[:, plant.thrust_input].argmax())])
     merits.append(
         Merit(
-            f"that of {plant.thrust} at {plant.stroke}",
+            f"that of {plant.stroke.thrust} at {plant.stroke.name}",
             at,
             "mm",
-            key=f"recorded_minus_own_v0_{plant.thrust}_at",
+            key=f"recorded_minus_own_v0_{plant.stroke.thrust}_at",
         )
     )
     apart = float(np.abs(recorded.apart).max())

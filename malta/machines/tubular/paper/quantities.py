@@ -203,7 +203,7 @@ def pole_change(e: Evidence) -> float:
     """Relative change of the fastest open-loop pole from the middle to the end of the travel."""
     plant = e.model.plant
     middle, end = (
-        np.linalg.eigvals(linearize(plant, plant.at(z=z)).A).real.max() for z in (0.0, plant.travel)
+        np.linalg.eigvals(linearize(plant, plant.at(z=z)).A).real.max() for z in (0.0, plant.stroke.travel)
     )
     return float(end / middle - 1)
 
@@ -223,7 +223,7 @@ def is_solved_for_ratio(e: Evidence) -> bool:
     plant = e.model.plant
     solved = calibrate(linearize(plant, plant.at()), e.spec.weights, IMPLIED_RATIO).q_base
     half = len(solved) // 2
-    radial = [k for k, s in enumerate(plant.design_states[:half]) if s.name != plant.stroke]
+    radial = [k for k, s in enumerate(plant.design_states[:half]) if s.name != plant.stroke.name]
     return bool(np.allclose(e.spec.weights.q_base[radial], solved[radial], rtol=1e-4))
 
 
@@ -381,7 +381,7 @@ def axis_coupling(e: Evidence) -> float:
     Accelerations C B of the linear model, without attraction: both are the larger, the faster the motion.
     """
     plant, worst = e.model.plant, 0.0
-    for z in np.linspace(-plant.travel, plant.travel, PLACES):
+    for z in np.linspace(-plant.stroke.travel, plant.stroke.travel, PLACES):
         model = linearize(plant, plant.at(z=float(z)))
         half = len(model.A) // 2
         moved = np.abs(model.C[:, :half] @ model.force_map)
