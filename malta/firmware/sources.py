@@ -32,7 +32,7 @@ from malta.firmware.period_functions import table_size
 from malta.firmware.program import TYPES, Precision, Program, build_program, lower
 from malta.firmware.signals import Field, Target, place_of_readings
 from malta.firmware.step import programs_of
-from malta.firmware.supervisor import JUMP, MOST_RATE, bounds_of, reading_deviations, reference_limits
+from malta.firmware.supervisor import JUMP, MOST_RATE, bounds_of, reference_limits
 from malta.model.plant import Signal, placed
 from malta.simulation.period import state_reference
 
@@ -378,7 +378,7 @@ SHORTEST_RISE = 20  # samples
 def stand_in_context(t: Target, name: str) -> dict[str, Any]:
     """What stand_in.c is filled with. name : the controller's"""
     found: dict[str, Any] = {
-        "noise": c_numbers(reading_deviations(t.believed), t.precision),
+        "noise": c_numbers(t.believed.sensors.deviations, t.precision),
         "noise_step": c_number(2.0**-15, t.precision),
     }
     if (reached := readings_at_rest(t)) is not None:

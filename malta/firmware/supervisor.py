@@ -310,7 +310,7 @@ def bounds_of(t: Target) -> Bounds:
         bounds_of(Target(malta.gains.read("design/gains/robust.json"))).jump
     """
     c, plant = t.controller, t.believed
-    sigma = reading_deviations(plant)
+    sigma = plant.sensors.deviations
     touch, acceleration = touch_bounds(plant), accelerations(c)
     speed = np.sqrt(4 * acceleration * touch)
     known = np.where(sigma > 0, sigma, np.inf)
@@ -417,13 +417,6 @@ def absent_monitors(t: Target) -> dict[str, str]:
         (unlimited, "forces have no limits", ("HELPLESS", "SATURATION")),
     )
     return {key: reason for absent, reason, keys in listed if absent for key in keys}
-
-
-def reading_deviations(plant: Plant) -> FloatArray:
-    """Standard deviations of readings: noise, and steps of the resolution as even noise, q / sqrt(12)."""
-    return np.asarray(
-        np.hypot(np.array(plant.sensors.noise), np.array(plant.sensors.resolution) / math.sqrt(12))
-    )
 
 
 def repetition_probabilities(plant: Plant) -> list[float]:

@@ -490,9 +490,8 @@ def _record_stroke(bench: Bench) -> Log:
 
 def _largest_error(plant: Plant, log: Log) -> float:
     """Of the stroke, m."""
-    return float(
-        np.abs(log.table("y", [plant.stroke.name]) - log.table("reference", [plant.stroke.name])).max()
-    )
+    name = [plant.stroke.name]
+    return float(np.abs(log.table("y", name) - log.table("reference", name)).max())
 
 
 def judge_stroke(controller: Controller, log: Log) -> list[Finding]:

@@ -291,8 +291,7 @@ def _bent(model: ResponseModel, signal: Multisine, found: Spectra, periods: int)
 
 def sensor_noise(plant: Plant) -> FloatArray:
     """The standard deviation of each sensor's noise and steps, SI."""
-    noise, steps = plant.sensors.noise, np.array(plant.sensors.resolution)
-    return np.asarray(np.maximum(np.hypot(noise, steps / np.sqrt(12)), QUIET))
+    return np.asarray(np.maximum(plant.sensors.deviations, QUIET))
 
 
 def _peaks(signal: Multisine, spectrum: ComplexArray) -> FloatArray:

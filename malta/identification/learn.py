@@ -123,12 +123,7 @@ def learn_v0(controller: Controller, log: Log) -> LearnedV0:
     c = normal @ (at.T @ missing - plant.stroke.mass * bent.T @ z)
     inside = (table.z_grid >= z_ref.min()) & (table.z_grid <= z_ref.max())
     places = phi(np.clip(table.z_grid, z_ref.min(), z_ref.max()))
-    noise = float(
-        np.hypot(
-            plant.sensors.noise[plant.stroke_output],
-            plant.sensors.resolution[plant.stroke_output] / np.sqrt(12),
-        )
-    )
+    noise = float(plant.sensors.deviations[plant.stroke_output])
     scatter = plant.stroke.mass * noise * np.linalg.norm(places @ normal @ bent.T, axis=1)
     v0 = table.v0.copy()
     v0[:, k] += places @ c

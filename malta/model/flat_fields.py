@@ -28,11 +28,6 @@ def refuse_flat(given: Mapping[str, Any], where: str = "Plant") -> None:
     """Raise InputError unless the fields of groups stand in their groups; the sentence spells these groups.
 
     given : arguments of a plant by name
-
-    >>> refuse_flat({"contacts": ("stop",), "contact": abs, "noise": (1e-6,)}, "ball")
-    Traceback (most recent call last):
-    malta.errors.InputError: ball: contacts, contact, noise: found at the machine itself, expected \
-contacts=Contacts(names=..., contact=...), sensors=Sensors(noise=...)
     """
     flat, groups = [], dict[str, list[str]]()
     for name, value in given.items():

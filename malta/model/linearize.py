@@ -294,6 +294,5 @@ def is_commutated(plant: Plant) -> bool:
     """Whether a machine's currents depend on the measured position, so that holding them changes the loop."""
     kind = ca.MX if plant.actuator.tabulated else ca.SX
     y, v = kind.sym("y", len(plant.outputs)), kind.sym("v", len(plant.inputs))
-    return bool(
-        ca.which_depends(plant.actuator.currents(y, v), y, 1, True) != [False] * len(plant.actuator.coils)
-    )
+    i = plant.actuator.currents(y, v)
+    return bool(ca.which_depends(i, y, 1, True) != [False] * len(plant.actuator.coils))

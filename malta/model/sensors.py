@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.matrices import system_matrix
 from malta.model.signals import DEFAULT, CasadiFn, Signal
@@ -67,6 +69,11 @@ class Sensors:
     def late(self) -> bool:
         """Whether a sensor has a lag or a dead time."""
         return bool(self.lagging or self.dead_time)
+
+    @property
+    def deviations(self) -> FloatArray:
+        """Standard deviations of readings: noise, and steps of the resolution as even noise, q / sqrt(12)."""
+        return np.asarray(np.hypot(np.array(self.noise), np.array(self.resolution) / np.sqrt(12)))
 
 
 MOST_DELAY = 100  # samples: each one has states of its own in the loop and in what is compiled

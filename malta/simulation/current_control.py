@@ -132,11 +132,8 @@ def control_currents(
         i_axes=read,
     )
     note("current_errors", "epsilon = commanded less measured currents of the axes", epsilon=error)
-    Q = (
-        believed.drive.turned(believed.actuator.forces(estimate, current))
-        if s.turning
-        else ca.SX.eye(len(drive.axes))
-    )
+    forces = believed.actuator.forces
+    Q = believed.drive.turned(forces(estimate, current)) if s.turning else ca.SX.eye(len(drive.axes))
     waiting = controller["u_limited"]
     step = g["Ki_current"] * g["control_time"] * (1 - waiting) * (Q @ error)
     integral = add(controller["u_integral"], step)

@@ -117,11 +117,8 @@ def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
     if s.outside:
         given |= {"xi_hat": n}
     row = {"x": len(plant.states), "p": p, "y": p, "xi_hat": n, "v": m, "force": m, "saturated": m}
-    row |= {
-        "contact": len(plant.contacts.names),
-        "current": coils,
-        "met": 1 + (len(fast.flags) if fast else 0),
-    }
+    met = 1 + (len(fast.flags) if fast else 0)
+    row |= {"contact": len(plant.contacts.names), "current": coils, "met": met}
     if driven:
         row |= {"i": axes, "u": axes, "link": 1}
     if s.fidelity == "phase":
@@ -144,9 +141,8 @@ def places_of(sizes: Mapping[str, int], begin: int = 0) -> dict[str, slice]:
 def ending_columns(plant: Plant, c: Controller, s: Setup) -> tuple[int, ...]:
     """The columns of a row whose contacts end a run; a contact that a touchdown bearing cushions ends none."""
     first = columns_of_row(plant, c, s)["contact"].start
-    return tuple(
-        first + i for i, cushioned in enumerate(plant.contacts.cushioned) if not (s.bearing and cushioned)
-    )
+    cushioned = plant.contacts.cushioned
+    return tuple(first + i for i, soft in enumerate(cushioned) if not (s.bearing and soft))
 
 
 def numbers_of(

@@ -58,8 +58,6 @@ def plant(par: Parameters) -> Plant:
         disturbances=(FORCE,),
         f=lambda x, u, w: motion(par, x, u[0], w[0]),
         h=lambda x, _: x[0],
-        load=lambda _: ca.DM.zeros(1),
-        position_of=lambda p: p,
         preload=lambda _: ca.DM.zeros(1),
         actuator=Actuator(
             coils=COILS,

@@ -117,10 +117,8 @@ def hold_figure(e: Experiment, published: Published | None = None) -> Figure:
     run, axis = e.run, e.run.plant.stroke_output
     names = [s.name for s in run.plant.outputs]
     y, p = run.y[-RESTING:] * 1e6, run.p[-RESTING:] * 1e6
-    bins = [
-        1e6 * (r or s / 3) or 1.0
-        for r, s in zip(run.plant.sensors.resolution, run.plant.sensors.noise, strict=True)
-    ]
+    sensors = run.plant.sensors
+    bins = [1e6 * (r or s / 3) or 1.0 for r, s in zip(sensors.resolution, sensors.noise, strict=True)]
     rms, widest = np.sqrt((p**2).mean(axis=0)), np.abs(y).max(axis=0)
     radial = [k for k in range(len(names)) if k != axis]
     figure = new_page(

@@ -91,13 +91,10 @@ def rest_on_bearing(plant: Plant) -> dict[str, float]:
     def net(depth: float) -> float:
         return float(force(plant.at(**{free: -depth}).x)[len(names) // 2 + downward])
 
-    edge = brentq(
-        lambda depth: (
-            float(ca.evalf(plant.contacts.contact(ca.SX(ca.DM(plant.at(**{free: -depth}).x))))[0]) - 1
-        ),
-        0,
-        1,
-    )
+    def beyond(depth: float) -> float:
+        return float(ca.evalf(plant.contacts.contact(ca.SX(ca.DM(plant.at(**{free: -depth}).x))))[0]) - 1
+
+    edge = brentq(beyond, 0, 1)
     return {free: -float(brentq(net, edge, 1.5 * edge, xtol=1e-15))}
 
 
