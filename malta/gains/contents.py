@@ -18,6 +18,7 @@ from malta.model.linear import LinearSystem, linear_machine
 from malta.model.machines import machine
 from malta.model.parameters import later_parameters, units_of
 from malta.model.plant import Parameters, Plant, Signal, outputs_at
+from malta.model.signals import Coordinates
 from malta.synthesis.controller import (
     Commutation,
     Controller,
@@ -31,7 +32,6 @@ from malta.synthesis.controller import (
     stored_forces,
 )
 from malta.synthesis.schedule import SCHEDULED, Schedule
-from malta.synthesis.spec import Coordinates
 
 # The table of a machine from plain matrices in a gain file, from and to its parameters.
 

@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, StrictInt, StrictStr
 
+from malta.model.signals import Coordinates
 from malta.synthesis.controller import Tracks
-from malta.synthesis.spec import Coordinates
 from malta.tables import Finite, Positive, Quantity, Record, entry
 
 Vector = list[Finite]

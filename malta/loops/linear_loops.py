@@ -24,7 +24,7 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.linear.conversion import from_control
-from malta.linear.interconnection import gain
+from malta.linear.interconnection import append, connect, gain
 from malta.linear.matrices import system_matrix
 from malta.linear.sampling import eigenvalues
 from malta.linear.system import System, balanced_units
@@ -198,34 +198,22 @@ class LinearLoop:
 
         Raises CheckError for a loop without a solution, 1 + L = 0 at infinite frequency.
         """
-        (A, B_all, C_all, D_all), (F_A, F_B, F_C, F_D) = self.plant, self.law
-        p, u = len(self.outputs), len(F_C)
+        (F_A, F_B, F_C, F_D), (R_s, R_v), p = self.law, self.command, len(self.outputs)
         if factors is not None and at == "sensors":
             F_B, F_D = F_B * factors, F_D * factors
         elif factors is not None:
-            rows = np.append(factors, np.ones(u - len(factors)))[:, None]
+            rows = np.append(factors, np.ones(len(F_C) - len(factors)))[:, None]
             F_C, F_D = rows * F_C, rows * F_D
-        B, B_w, C, D, D_w = B_all[:, :u], B_all[:, u:], C_all[:p], D_all[:p, :u], D_all[:p, u:]
+        law = System(F_A, np.hstack([F_B, R_s]), F_C, np.hstack([F_D, R_v]))
+        (out, into), u = self.plant.D.shape, len(F_C)
+        M = np.zeros((into + p + R_v.shape[1], out + u))  # of v, w, y, r by the outputs and v
+        M[:u, out:], M[into : into + p, :p] = np.eye(u), np.eye(p)
+        outside = [*range(into + p, len(M)), *range(u, into)]
         try:
-            W = np.linalg.inv(np.eye(p) - D @ F_D)
-        except np.linalg.LinAlgError as error:
+            both = append(self.plant, law)
+            return connect(both, M, np.eye(len(M))[:, outside], np.eye(out, out + u)[-p:])
+        except InputError as error:
             raise CheckError(f"{self.name}: 1 + L is singular at infinite frequency") from error
-        R_s, R_v = self.command
-        y = np.hstack([W @ C, W @ D @ F_C]), np.hstack([W @ D @ R_v, W @ D_w])  # of (x, s), of (r, w)
-        v = F_D @ y[0], F_D @ y[1] + np.hstack([R_v, np.zeros((u, B_w.shape[1]))])
-        v[0][:, len(A) :] += F_C
-        whole = np.vstack([B @ v[0], F_B @ y[0]])
-        whole[: len(A), : len(A)] += A
-        whole[len(A) :, len(A) :] += F_A
-        driven = np.vstack([B @ v[1], F_B @ y[1]])
-        driven[: len(A), R_v.shape[1] :] += B_w
-        driven[len(A) :, : R_v.shape[1]] += R_s
-        true, through = C_all[-p:], D_all[-p:]
-        out = through[:, :u] @ v[0]
-        out[:, : len(A)] += true
-        direct = through[:, :u] @ v[1]
-        direct[:, R_v.shape[1] :] += through[:, u:]
-        return System(whole, driven, out, direct)
 
     def poles_of(self, A: FloatArray) -> ComplexArray:
         """Eigenvalues in rad/s; of sampled systems ln(z) / T, without the poles of pure delay."""

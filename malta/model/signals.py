@@ -7,8 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+Coordinates = Literal[
+    "signals", "positions"
+]  # of integrals and process noise: of the outputs, or of the positions
 CasadiFn = Callable[..., Any]  # takes and returns casadi SX, MX or DM
 DEFAULT: Any = None  # stands for a function that follows from the other fields
 EXACT = 1e-9  # of the limit of a command

@@ -184,8 +184,10 @@ def write_certificate(
 ) -> Path:
     """Write the certificate of a margin.
 
+    path : of the file
     places : its loops, one, or one for each place at which it holds
     ranges, over : the box and the intervals that do not grow, as for `robust_margin`
+    margin : from `malta.robust_margin` of these loops
     origin : the machine and the law, from `malta.gains.certified.origin_of`; None: matrices of no machine
 
     Returns the path. `malta check`, or the folder malta/checker wherever it lies, proves the claim again.
@@ -193,10 +195,10 @@ def write_certificate(
     Raises InputError for loops that certificates do not cover, CheckError when nothing is proven.
 
     >>> import malta
-    >>> motor, F = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0}), [[0.5]]
-    >>> margin = malta.robust_margin(motor, F, {"k": 0.1})  # lost at k = 2
-    >>> path = malta.proof.write_certificate("build/motor.json", [(motor, F)], {"k": 0.1}, None, margin)
-    >>> path.name
+    >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
+    >>> box, loops = {"k": 0.1}, [(motor, [[0.5]])]  # lost at k = 2
+    >>> margin = malta.robust_margin(*loops[0], box)
+    >>> malta.proof.write_certificate("build/motor.json", loops, box, None, margin).name
     'motor.json'
     """
     content = certificate_of(places, ranges, over, margin, origin)

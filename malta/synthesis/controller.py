@@ -58,11 +58,11 @@ from malta.display import display
 from malta.errors import InputError
 from malta.model.equations import note
 from malta.model.plant import Parameters, Plant, Signal, outputs_at
+from malta.model.signals import Coordinates
 from malta.synthesis.schedule import SCHEDULED, Schedule, interpolate
 
 if TYPE_CHECKING:
     from malta.synthesis.filters import Gains
-    from malta.synthesis.spec import Coordinates
 
 
 Tracks = Literal["states", "errors"]

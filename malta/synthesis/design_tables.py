@@ -10,9 +10,10 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, create_model
 
 from malta.errors import InputError
+from malta.model.signals import Coordinates
 from malta.synthesis.recovery import RecoveryTable
 from malta.synthesis.requirements import Requirement
-from malta.synthesis.spec import Coordinates, Discretization, PidAxes, Place
+from malta.synthesis.spec import Discretization, PidAxes, Place
 from malta.tables import Finite, Positive, Quantity, Record, entry, validate
 
 

@@ -23,9 +23,10 @@ from malta.errors import InputError
 from malta.linear.matrices import system_matrix
 from malta.linear.sampling import add_lags, delay_inputs, sample, sample_noise
 from malta.linear.system import System
+from malta.model.signals import Coordinates
 from malta.processes import on_one_thread
 from malta.synthesis.riccati import Solver, care, dare
-from malta.synthesis.spec import Coordinates, Weights
+from malta.synthesis.spec import Weights
 
 # The design model between samples: currents that are held, forces behind the lag of the current loops.
 

@@ -23,6 +23,7 @@ from malta.errors import InputError, require_known
 from malta.model.data import plant_of
 from malta.model.parameters import box_words, fingerprint, replace_fields
 from malta.model.plant import Parameters, Plant, Signal
+from malta.model.signals import Coordinates
 from malta.units import to_si
 
 if TYPE_CHECKING:
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 Discretization = Literal["backward-euler", "zoh", "sampled-data"]
 # What integrals are taken of and process noise acts on: errors of outputs and forces of inputs, or errors of positions
 # and their accelerations.
-Coordinates = Literal["signals", "positions"]
 PidAxes = Literal["decentralized", "centre-of-gravity"]
 Place = Literal["measured", "predicted"]
 Law = Literal["LQG", "PID", "structure"]

@@ -133,6 +133,8 @@ def test_several_signals() -> None:
     assert read(full).poles.tolist() == pytest.approx([1.0, 1.0])
     hidden = control.tf([[[1, -1], [0]], [[0], [1]]], [[np.polymul(one, [1, 2]), [1]], [[1], [1, 3]]])
     assert sorted(read(hidden).poles.real.tolist()) == pytest.approx([-3.0, -2.0, 1.0])
+    beside = control.tf([[[1, -1], [0]], [[0], [1]]], [[np.polymul(one, [1, 2]), [1]], [[1], one]])
+    assert sorted(read(beside).poles.real.tolist()) == pytest.approx([-2.0, 1.0, 1.0])  # of two entries
 
 
 def test_sample_times() -> None:

@@ -150,6 +150,8 @@ def test_zeros_of_a_system_that_is_not_square() -> None:
     A = np.diag([-1.0, -2.0, -3.0])
     seen = System(A, np.array([[1.0], [1.0], [0.0]]), np.array([[1.0, 0, 0], [0, 1, 0]]), np.zeros((2, 1)))
     np.testing.assert_allclose(seen.zeros, [-3.0], atol=1e-12)  # the state that no input moves
+    driven = System(A.T, seen.C.T, seen.B.T, seen.D.T)
+    np.testing.assert_allclose(driven.zeros, [-3.0], atol=1e-12)
     assert not len(gain(np.ones((2, 1))).zeros)
 
 
