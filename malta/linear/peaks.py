@@ -25,7 +25,7 @@ from malta.linear.matrices import system_matrix
 from malta.linear.sampling import eigenvalues
 from malta.linear.system import System
 
-RISE = 1e-8  # relative, above the largest gain that was found, at which a search ends
+RISE = 1e-7  # relative, above the largest gain that was found, at which a search ends
 JOINS = 1e-15  # of the largest entries of its row and column: smaller ones are rounding
 NEAR_AXIS = 1e-4  # |Re| of an eigenvalue over its size, up to which it may lie on the imaginary axis
 SAME = 1e-10  # relative: eigenvalues of that distance are one, of jw and of -jw
