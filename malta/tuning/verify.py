@@ -1,4 +1,4 @@
-"""`malta.verify`, in its order: what is linear, the proven margin, stage by stage if asked, requirements of the design."""
+"""`malta.verify`, in its order: what is linear, the proven margin, stage by stage if asked, the requirements."""
 
 from __future__ import annotations
 
