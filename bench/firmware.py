@@ -28,7 +28,7 @@ from malta.firmware.signals import Target
 from malta.firmware.sources import sources
 from malta.firmware.step import look_up, programs_of, started_state, step_function
 from malta.firmware.vectors import record_vectors
-from malta.synthesis.controller import commanded, estimated, gains_of
+from malta.synthesis.controller import command_forces, estimate_states, gains_of
 
 ROOT = Path(__file__).parents[1]
 HERE, A9, M4F = PROCESSORS
@@ -67,8 +67,8 @@ def law_function(t: Target, kind: Any, gains: Mapping[str, Any]) -> ca.Function:
     a = {name: kind.sym(name, size) for name, size in sizes.items()}
     y = ca.SX.sym("y", sizes["y"])
     positions = ca.Function("positions", [y], [ca.densify(plant.position_of(y))])
-    xi_hat = estimated(gains, a["xi_pred"], a["y"])
-    following, saturated, v = commanded(gains, xi_hat, a["e"], a["xi_ref"], a["v_ff"], a["v0"])
+    xi_hat = estimate_states(gains, a["xi_pred"], a["y"])
+    following, saturated, v = command_forces(gains, xi_hat, a["e"], a["xi_ref"], a["v_ff"], a["v0"])
     results = {
         "q": positions(a["y"]),
         "xi_hat": xi_hat,

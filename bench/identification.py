@@ -22,7 +22,7 @@ import malta
 from malta.identification import log_of, prediction
 from malta.identification.identify import identify
 from malta.identification.response import ResponseModel
-from malta.identification.spectra import noise_of, readings, residuals_of, spectrum_of, straightened, whole
+from malta.identification.spectra import noise_of, readings, residuals_of, spectrum_of, straighten, whole
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
@@ -55,11 +55,11 @@ def squares(controller: Controller, log: Log) -> FloatArray:
     spectrum = spectrum_of(log, y, i)
     mean = spectrum.outputs[0].real, spectrum.currents[0].real
     model = ResponseModel(plant, NAMES, tuple(log.names("i")), *mean, log.sample_time)
-    plain = straightened(model, spectrum, model.start)
+    plain = straighten(model, spectrum, model.start)
     noise = noise_of(model, plain, model.start, residuals_of(model, plain, model.start).between)
     linear = prediction._filter(model, model.start, noise, len(y) * model.sample_time)
     search = prediction._Search(
-        model, linear, i, prediction.next_rows(i), y, np.ones_like(y), prediction.NORMAL
+        model, linear, i, prediction.next_rows(i), y, np.ones_like(y), prediction.FREEDOM
     )
     n, half = len(linear.A), len(linear.A) // 2
     first = np.concatenate([np.zeros(half), np.array(model.place[list(plant.controlled)])])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.special import erf
 
-from malta.machines.halbach.electronics import MEAN_OF, current_loop
+from malta.machines.halbach.electronics import MEAN_SAMPLES, current_loop
 from malta.machines.halbach.plant import Parameters
 from malta.simulation.readings import keys, normals
 
@@ -96,7 +96,7 @@ def run(c: Controller, wanted: Sequence[Any], laser: Sequence[float], noise: Seq
     par = c.parameters
     assert isinstance(par, Parameters)
     A, k, R, L, V_dc, h = par.A, par.k, par.R, par.L, par.V_dc, 1 / par.f_pwm
-    loops, code_step = current_loop(par, MEAN_OF), 2 * par.I_adc / par.codes
+    loops, code_step = current_loop(par, MEAN_SAMPLES), 2 * par.I_adc / par.codes
     duty_step = 1 / par.counts
 
     def park(cosine: float, sine: float, phases: Vector) -> tuple[float, float]:
@@ -144,7 +144,7 @@ def run(c: Controller, wanted: Sequence[Any], laser: Sequence[float], noise: Seq
     i = unpark(cosine, sine, 0.0, par.F_z / A)
     u_d, u_q = park(cosine, sine, [R * j for j in i])
     duty, _ = modulated(unpark(cosine, sine, u_d, u_q))
-    rings = [[sampled(j)] * MEAN_OF for j in i[:2]]
+    rings = [[sampled(j)] * MEAN_SAMPLES for j in i[:2]]
     sums = [sum(ring) for ring in rings]
     period = 0
     for n, (asked, error) in enumerate(zip(wanted, laser, strict=True)):
@@ -154,12 +154,12 @@ def run(c: Controller, wanted: Sequence[Any], laser: Sequence[float], noise: Seq
         cosine, sine = math.cos(k * y), math.sin(k * y)
         until = _periods(n + 1, c)
         while period < until:
-            oldest = period % MEAN_OF
+            oldest = period % MEAN_SAMPLES
             for ring, (j, jitter) in enumerate(zip(i[:2], noise[period], strict=True)):
                 code = sampled(j + par.s_adc * jitter)
                 sums[ring] += code - rings[ring][oldest]
                 rings[ring][oldest] = code
-            a, b = (total / MEAN_OF * code_step - par.I_adc for total in sums)
+            a, b = (total / MEAN_SAMPLES * code_step - par.I_adc for total in sums)
             d, q = park(cosine, sine, [a, b, -a - b])
             e_d, e_q = F / A - d, par.F_z / A - q
             wanted_V = unpark(cosine, sine, u_d + loops.Kp * e_d, u_q + loops.Kp * e_q)

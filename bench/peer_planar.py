@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from malta.machines.planar.field import Table
+from malta.machines.planar.field import FieldTable
 from malta.machines.planar.plant import Parameters
 
 if TYPE_CHECKING:
@@ -22,7 +22,9 @@ def coils(par: Parameters) -> FloatArray:
     return np.array([[a * par.coil_pitch, b * par.coil_pitch, par.r_z] for a in steps for b in steps])
 
 
-def currents(par: Parameters, table: Table, arms: FloatArray, p: FloatArray, W: FloatArray) -> FloatArray:
+def currents(
+    par: Parameters, table: FieldTable, arms: FloatArray, p: FloatArray, W: FloatArray
+) -> FloatArray:
     """(25)-(29), (31)-(35): i = K(p)^+ W with the weights of (27) mended."""
     n = len(table.nodes) - 1
     decay = math.exp(-math.pi / table.tau_n * (p[2] - table.z))

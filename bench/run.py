@@ -349,7 +349,7 @@ def decoupling(runs: int) -> list[Result]:
     own, plain, *compiled_times = medians(by_malta, by_hand, *ours.values(), runs=runs, what="planar")
     own, plain = own / few, plain / few
     seconds = dict(zip(ours, (taken / calls for taken in compiled_times), strict=True))
-    printed = malta.model.published(ROOT / "data" / "planar.toml")
+    printed = malta.model.read_published(ROOT / "data" / "planar.toml")
     loop = published_value(printed, "real_time.mean")
     numpy_loop = "numpy, a loop and pinv"
     return [

@@ -75,6 +75,8 @@ _NOW_OF = {
 _OLD = {
     **{name: f"malta.{package}.{name}" for package, names in _NOW_OF.items() for name in names.split()},
     "LateSensors": "malta.model.Sensors",
+    "published": "malta.model.read_published",
+    "replayed": "malta.simulation.replay_run",
     "Margins": "malta.margins.LoopReport",
     "Robustness": "malta.margins.LoopReport",
 }

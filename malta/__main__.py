@@ -7,7 +7,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-INTERRUPTED = 130  # exit code
+INTERRUPT_EXIT_CODE = 130  # exit code
 HELP = Path(__file__).parent / "cli" / "help.txt"  # of `malta --help --help`, which makes it anew
 COLUMNS = 80  # from which it is the same on every terminal
 
@@ -31,7 +31,7 @@ def main() -> None:
             _leave()
         raise
     except SystemExit as ended:
-        if ended.code == INTERRUPTED:
+        if ended.code == INTERRUPT_EXIT_CODE:
             _leave()
         raise
     finally:
@@ -53,7 +53,7 @@ def _leave() -> None:
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError, AttributeError):
             stream.flush()
-    os._exit(INTERRUPTED)
+    os._exit(INTERRUPT_EXIT_CODE)
 
 
 if __name__ == "__main__":

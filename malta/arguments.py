@@ -11,14 +11,14 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import InputError
 
-LARGEST = 1e150  # size of a parameter at most, so that squares of its multiples do not overflow
-LONG = 60  # characters of a value that a message shows
+MAX_SIZE = 1e150  # size of a parameter at most, so that squares of its multiples do not overflow
+MAX_VALUE_LENGTH = 60  # characters of a value that a message shows
 
 
 def describe(value: Any) -> str:
     """A value as a message shows it: its text when that is short, else its type."""
     text = repr(value) if isinstance(value, complex | float | int | str | tuple | list | dict) else ""
-    if text and len(text) <= LONG:
+    if text and len(text) <= MAX_VALUE_LENGTH:
         return text
     return "None" if value is None else f"a value of type {type(value).__name__}"
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 DIGITS = 4  # of a bound that is no share
 PLACES = 2  # behind the point of a share in percent
-EXACT = Context(prec=700)  # holds the product of any two numbers
+EXACT_CONTEXT = Context(prec=700)  # holds the product of any two numbers
 
 
 class Bound(NamedTuple):
@@ -33,14 +33,14 @@ class Bound(NamedTuple):
         """It as a share, times a factor: `99.62 %`; unit: "" for a column that is headed with it."""
         if word := self._word:
             return word
-        return str(self._rounded(self._times(100 * factor), -PLACES)) + unit
+        return str(self._round(self._times(100 * factor), -PLACES)) + unit
 
     def text(self, digits: int = DIGITS, factor: float = 1.0) -> str:
         """It with so many digits, in a unit that has `factor` to one of SI."""
         if word := self._word:
             return word
         number = self._times(factor)
-        return f"{float(self._rounded(number, number.adjusted() + 1 - digits)):.{digits}g}"
+        return f"{float(self._round(number, number.adjusted() + 1 - digits)):.{digits}g}"
 
     @property
     def _word(self) -> str:
@@ -50,10 +50,10 @@ class Bound(NamedTuple):
 
     def _times(self, factor: float) -> Decimal:
         """The shortest decimals that read back as the value, 0.9962 for 0.9962, times a factor without rounding."""
-        return EXACT.multiply(Decimal(repr(float(self.value or 0.0))), Decimal(repr(float(factor))))
+        return EXACT_CONTEXT.multiply(Decimal(repr(float(self.value or 0.0))), Decimal(repr(float(factor))))
 
-    def _rounded(self, number: Decimal, power: int) -> Decimal:
-        return number.quantize(Decimal(1).scaleb(power), self.rounding, EXACT)
+    def _round(self, number: Decimal, power: int) -> Decimal:
+        return number.quantize(Decimal(1).scaleb(power), self.rounding, EXACT_CONTEXT)
 
 
 def at_least(value: float | None) -> Bound:

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 LINES = 10  # of text, the title's included
 COLUMNS = 80
-FEW = 6  # numbers that stand in a row each
+ROW_LENGTH = 6  # numbers that stand in a row each
 PREFIXES = {-4: "p", -3: "n", -2: "u", -1: "m", 0: "", 1: "k", 2: "M", 3: "G"}
-PREFIXED = ("m", "rad", "s", "N", "A", "V", "W", "Hz", "N m")
+PREFIXED_UNITS = ("m", "rad", "s", "N", "A", "V", "W", "Hz", "N m")
 
 
 class Curves(NamedTuple):
@@ -118,14 +118,16 @@ def _brief(value: Any) -> str:
     if isinstance(value, str | int | Path) or value is None:
         return str(value)
     if hasattr(value, "tolist") and hasattr(value, "shape"):
-        if value.ndim == 1 and value.size <= FEW:
+        if value.ndim == 1 and value.size <= ROW_LENGTH:
             return ", ".join(map(_brief, value.tolist())) or "none"
         ends = f", {value.min():.4g} to {value.max():.4g}" if value.size and value.dtype.kind in "fiu" else ""
         return " x ".join(map(str, value.shape)) + ends
     if isinstance(value, Mapping):
-        return (", ".join(value) or "none") if len(value) <= FEW else f"{len(value)} entries"
+        return (", ".join(value) or "none") if len(value) <= ROW_LENGTH else f"{len(value)} entries"
     if isinstance(value, tuple | list) and not hasattr(value, "_fields"):
-        plain = len(value) <= FEW and all(isinstance(entry, float | int | str | complex) for entry in value)
+        plain = len(value) <= ROW_LENGTH and all(
+            isinstance(entry, float | int | str | complex) for entry in value
+        )
         return (", ".join(map(_brief, value)) or "none") if plain else f"{len(value)} entries"
     return str(getattr(value, "name", "") or type(value).__name__)
 
@@ -137,7 +139,7 @@ def quantity(value: float, unit: str) -> str:
     ('13.4 um', '0.36 kg', '2')
     """
     prefix = ""
-    if unit in PREFIXED and math.isfinite(value) and value:
+    if unit in PREFIXED_UNITS and math.isfinite(value) and value:
         power = math.floor((math.log10(abs(value)) + 1e-9) / 3)
         if power in PREFIXES and (unit != "rad" or power < 0):
             value, prefix = value / 1000.0**power, PREFIXES[power]

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-LONGEST = 300  # characters of a sentence
+MAX_SENTENCE_LENGTH = 300  # characters of a sentence
 MOST_OF_FILE, MOST_OF_FIELD = 150, 60  # characters of it that name the file and the field
 
 
@@ -16,7 +16,7 @@ def on_one_line(text: str) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
 
 
-def shorten(text: str, most: int = LONGEST, *, head: float = 0.75) -> str:
+def shorten(text: str, most: int = MAX_SENTENCE_LENGTH, *, head: float = 0.75) -> str:
     """A text in one line of at most `most` characters; dots stand for what is left out behind a share `head` of them.
 
     >>> shorten("expected one of m K_A K_B K_D l_B", 25)
@@ -57,7 +57,7 @@ class InputError(ValueError):
         file = shorten(self.where, MOST_OF_FILE, head=0.25)
         subject = ": ".join(filter(None, (file, shorten(field, MOST_OF_FIELD))))
         hint = _suggestion(field, found, list(among) or _names_in(expected))
-        room = LONGEST - len(f"{subject}: found , expected {hint}")
+        room = MAX_SENTENCE_LENGTH - len(f"{subject}: found , expected {hint}")
         whole = len(on_one_line(expected))
         self.found = shorten(found, max(room // 2, room - whole))
         self.expected = shorten(expected, room - len(self.found))

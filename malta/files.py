@@ -97,8 +97,8 @@ def _usual_handler() -> Handler | None:
 
 PACKAGE = Path(__file__).resolve().parent
 FOLDERS = ("data", "design", "notebooks", "examples")  # that come with malta
-LARGEST = 100_000_000  # bytes of a file to read
-MANY = 1000  # entries of a folder that a missing file's name is compared with
+MAX_FILE_BYTES = 100_000_000  # bytes of a file to read
+MAX_COMPARED_NAMES = 1000  # entries of a folder that a missing file's name is compared with
 _Content = TypeVar("_Content", str, bytes)
 
 
@@ -108,19 +108,19 @@ def shipped_path(*parts: str) -> Path:
     An installed package holds data/, design/, notebooks/ and examples/ in its folder `shipped`, which may lie in a zip;
     in a checkout they stand beside the package.
     """
-    inside = _unpacked() if PACKAGE.parent.is_file() else PACKAGE / "shipped"
+    inside = _unpack() if PACKAGE.parent.is_file() else PACKAGE / "shipped"
     return (inside if inside.is_dir() else PACKAGE.parent).joinpath(*parts)
 
 
-def packaged(name: str) -> bytes:
-    """A file beside the modules, as `packaged("report/page/style.css")`: of a folder or of a zip."""
+def read_packaged(name: str) -> bytes:
+    """A file beside the modules, as `read_packaged("report/page/style.css")`: of a folder or of a zip."""
     from importlib.resources import files
 
     return files("malta").joinpath(name).read_bytes()
 
 
 @cache
-def _unpacked() -> Path:
+def _unpack() -> Path:
     """What comes with malta, from the zip that the package lies in, as files of this process."""
     import zipfile
 
@@ -201,7 +201,7 @@ def replace_files(contents: Mapping[Path, bytes]) -> None:
                     file.flush()
                     os.fsync(file.fileno())
             except (OSError, ValueError) as error:
-                raise _refused(path, error) from error
+                raise _refusal(path, error) from error
         before = {path: path.read_bytes() if path.exists() else None for _, path in staged}
         with put_off_interrupts():
             _rename(staged, before)
@@ -223,7 +223,7 @@ def _rename(staged: list[tuple[Path, Path]], before: Mapping[Path, bytes | None]
             for other in replaced:
                 old = before[other]
                 other.unlink() if old is None else other.write_bytes(old)
-            raise _refused(path, error) from error
+            raise _refusal(path, error) from error
         replaced.append(path)
     for noted in _notes:
         noted.extend(replaced)
@@ -301,7 +301,7 @@ def scratch_folder() -> Iterator[Path]:
         with tempfile.TemporaryDirectory() as folder:
             yield Path(folder)
     except OSError as error:
-        raise _refused(Path(tempfile.gettempdir()), error) from error
+        raise _refusal(Path(tempfile.gettempdir()), error) from error
 
 
 def _obstacle(path: Path) -> str:
@@ -323,13 +323,13 @@ def read_file(
 ) -> _Content:
     """What `read` makes of a file; InputError when it is missing or unreadable. `kind` as "TOML file".
 
-    Pipes and devices, which may never end, are refused, and so are files of more than `largest` bytes; None: LARGEST.
+    Pipes and devices, which may never end, are refused, and so are files of more than `largest` bytes (MAX_FILE_BYTES).
     """
     try:
         status = path.stat()
         if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
             raise InputError(path, "", "a pipe or a device", f"a {kind}")
-        size, most = status.st_size, LARGEST if largest is None else largest
+        size, most = status.st_size, MAX_FILE_BYTES if largest is None else largest
         if size > most and stat.S_ISREG(status.st_mode):
             raise InputError(path, "", f"{size} bytes", f"a {kind} of at most {most}")
         return read(path)
@@ -357,7 +357,7 @@ def _most_like(path: Path) -> Path | None:
     from difflib import get_close_matches  # where something is wrong already
 
     try:
-        names = [entry.name for entry in islice(path.parent.iterdir(), MANY)]
+        names = [entry.name for entry in islice(path.parent.iterdir(), MAX_COMPARED_NAMES)]
     except (OSError, ValueError):
         return None
     for some in ([name for name in names if Path(name).suffix == path.suffix], names):
@@ -367,7 +367,7 @@ def _most_like(path: Path) -> Path | None:
     return None
 
 
-def _refused(path: Path, error: OSError | ValueError) -> InputError:
+def _refusal(path: Path, error: OSError | ValueError) -> InputError:
     reason = getattr(error, "strerror", None) or str(error)
     blamed = getattr(error, "filename", None)
     if blamed and Path(blamed) in path.parents:

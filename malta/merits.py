@@ -17,7 +17,7 @@ from malta.units import distinct, identifier, in_unit
 
 Better = Literal["high", "low", ""]  # "": neither
 Scope = Literal["loop", "box", "machine"]  # what two designs share where a comparison makes sense
-PLAIN = (1e-2, 1e6)  # sizes of numbers that are written without a power of ten
+PLAIN_SIZES = (1e-2, 1e6)  # sizes of numbers that are written without a power of ten
 ROOTS = {"m s^0.5": (1e6, "um s^0.5"), "rad s^0.5": (1e6, "urad s^0.5")}  # no products of whole powers
 
 
@@ -167,7 +167,7 @@ def four_digits(value: float) -> str:
     ('0.5000', '4.7e-07')
     """
     rounded = float(f"{value:.4g}")
-    return number(rounded) if PLAIN[0] <= abs(value) < PLAIN[1] or not value else f"{rounded:g}"
+    return number(rounded) if PLAIN_SIZES[0] <= abs(value) < PLAIN_SIZES[1] or not value else f"{rounded:g}"
 
 
 def find_best(figures: Sequence[Merit | None]) -> tuple[bool, ...]:
@@ -200,7 +200,9 @@ def by_identifier(figures: Iterable[Merit]) -> dict[str, Merit]:
     return dict(zip(distinct(one.identifier for one in listed), listed, strict=True))
 
 
-def reported(label: str, unit: str, relation: str = "about", *, better: Better = "low", key: str = "") -> Any:
+def merit_field(
+    label: str, unit: str, relation: str = "about", *, better: Better = "low", key: str = ""
+) -> Any:
     """Declare a field of a result that is a figure of merit, SI, or a mapping of such by signal.
 
     label : its words; "{}" in it is the name of the signal
@@ -223,10 +225,10 @@ def reported_merits(record: Any) -> dict[str, Merit]:
     >>> [str(one) for one in reported_merits(Stroke(0.0158, {"x1": 3e-6})).values()]
     ['rise, 10-90 % 15.8 ms', 'deviation x1 3 um']
     """
-    return dict(_reported(record))
+    return dict(_merits_of(record))
 
 
-def _reported(record: Any) -> Iterator[tuple[str, Merit]]:
+def _merits_of(record: Any) -> Iterator[tuple[str, Merit]]:
     for one in fields(record):
         merit, value = one.metadata.get("merit"), getattr(record, one.name)
         if merit is None:

@@ -17,7 +17,7 @@ from malta.errors import InputError
 from malta.files import read_file
 
 _Model = TypeVar("_Model", bound=BaseModel)
-DEEPEST = 30  # tables and lists in others; files of malta have 6 at most
+MAX_DEPTH = 30  # tables and lists in others; files of malta have 6 at most
 Finite = Annotated[float, Checked(strict=True, allow_inf_nan=False)]
 Positive = Annotated[Finite, Checked(gt=0)]
 
@@ -64,11 +64,11 @@ def load_toml(path: str | Path) -> dict[str, Any]:
 
 
 def require_shallow(content: object, where: str | Path) -> None:
-    """Raise InputError for tables and lists in more than DEEPEST others: what is done to each takes the stack."""
+    """Raise InputError for tables and lists in more than MAX_DEPTH others: what is done to each takes the stack."""
     level, depth = [content], 0
     while level:
-        if depth > DEEPEST:
-            raise InputError(where, "", f"tables in more than {DEEPEST} others", "the tables of its format")
+        if depth > MAX_DEPTH:
+            raise InputError(where, "", f"tables in more than {MAX_DEPTH} others", "the tables of its format")
         inner = (x.values() if isinstance(x, dict) else x for x in level if isinstance(x, dict | list))
         level, depth = [value for values in inner for value in values], depth + 1
 
@@ -143,7 +143,7 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 # Sources: PKWARE, APPNOTE.TXT (.zip); NumPy Enhancement Proposal 1 (.npy).
 
 
-MANY = 2000  # members; a gain file has about 60
+MAX_MEMBERS = 2000  # members; a gain file has about 60
 ENTRY = b"PK\x01\x02"  # opens the entry of a member in the table of an archive
 SUFFIX = ".npy"
 KINDS = "biufcU"  # of arrays: truth values, numbers, text
@@ -172,8 +172,8 @@ def read_npz(data: bytes) -> dict[str, Any]:
 def _arrays(data: bytes) -> dict[str, Any]:
     if not zipfile.is_zipfile(io.BytesIO(data)):
         raise ValueError("no archive: damage, a pickle or a file of another kind")
-    if data.count(ENTRY) > MANY:  # before zipfile makes a record of each
-        raise ValueError(f"an archive of more than {MANY} members")
+    if data.count(ENTRY) > MAX_MEMBERS:  # before zipfile makes a record of each
+        raise ValueError(f"an archive of more than {MAX_MEMBERS} members")
     arrays: dict[str, Any] = {}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = archive.infolist()

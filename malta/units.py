@@ -55,18 +55,18 @@ def _units() -> Any:
 
 # pint evaluates numbers and powers of powers, so that a short text could keep it busy for ever. It gets products of
 # names and 1 with powers of one digit, in few parentheses: "kg m^2", "N m / (rad/s)", "1/s".
-LONGEST = 200  # characters
-DEEPEST = 3  # parentheses in parentheses
-HUGE = 1e100  # of SI units
+MAX_UNIT_LENGTH = 200  # characters
+MAX_NESTING = 3  # parentheses in parentheses
+MAX_FACTOR = 1e100  # of SI units
 _FACTOR = r"(?:[^\W\d_]{1,30}|1|%)(?:\s*(?:\^|\*\*)\s*-?[1-9])?"
 _PRODUCT = rf"\s*{_FACTOR}(?:(?:\s*[*/]\s*|\s+){_FACTOR})*\s*"
 
 
 def _is_unit(text: str) -> bool:
     """Whether a text has the form of a unit, whatever its names mean; no text at all is the unit of a plain number."""
-    if len(text) > LONGEST:
+    if len(text) > MAX_UNIT_LENGTH:
         return False
-    for _ in range(DEEPEST):
+    for _ in range(MAX_NESTING):
         text = re.sub(rf"\({_PRODUCT}\)", "group", text)
     return not text.strip() or re.fullmatch(_PRODUCT, text) is not None
 
@@ -94,7 +94,7 @@ _SYMBOLS: dict[str, _Symbol] = {
     "ohm": (_KILO, (1, 2, -3, -2)),
     "F": (((1e3, -1),), (-1, -2, 4, 2)),
 }
-_WHOLE: dict[str, _Symbol] = {  # names without a prefix
+_UNPREFIXED_SYMBOLS: dict[str, _Symbol] = {  # names without a prefix
     "1": ((), ()),
     "%": (((0.01, 1),), ()),
     "percent": (((0.01, 1),), ()),
@@ -104,9 +104,9 @@ _WHOLE: dict[str, _Symbol] = {  # names without a prefix
 _TOKEN = r"[()/*]|[^\W\d_]+(?:\^-?\d)?|\S"
 
 
-def _known(name: str) -> _Symbol | None:
+def _find_symbol(name: str) -> _Symbol | None:
     """A symbol of the tables, with its prefix as the first scale; None for any other name."""
-    found = _SYMBOLS.get(name) or _WHOLE.get(name)
+    found = _SYMBOLS.get(name) or _UNPREFIXED_SYMBOLS.get(name)
     if found is None and name[:1] in _PREFIXES and name[1:] in _SYMBOLS:
         scales, powers = _SYMBOLS[name[1:]]
         return ((_PREFIXES[name[0]], 1), *scales), powers
@@ -127,13 +127,13 @@ def _plain_root_units(unit: str) -> tuple[float, dict[str, int]] | None:
             group, sign = (1, 1) if token == ")" else (group, -1 if token == "/" else 1)
         else:
             name, _, power = token.partition("^")
-            if _known(name) is None:
+            if _find_symbol(name) is None:
                 return None
             exponents[name] = exponents.get(name, 0) + group * sign * int(power or 1)
             sign = 1
     factor, root = 1.0, dict.fromkeys(_ROOTS, 0)
     for name, exponent in exponents.items():
-        scales, powers = _known(name) or ((), ())
+        scales, powers = _find_symbol(name) or ((), ())
         for scale, power in scales if exponent else ():
             factor *= scale ** (power * exponent)
         for base, power in zip(_ROOTS, powers, strict=False):
@@ -148,7 +148,7 @@ def _root_units(unit: str) -> tuple[float, dict[str, int]]:
         raise ValueError("a text that is no product of units")
     found = _plain_root_units(unit)
     factor, root = _pint_root_units(unit) if found is None else found
-    if not 1 / HUGE < factor < HUGE:
+    if not 1 / MAX_FACTOR < factor < MAX_FACTOR:
         raise ValueError("a unit beyond all measure")
     return factor, root
 
@@ -158,11 +158,11 @@ def _pint_root_units(unit: str) -> tuple[float, dict[str, int]]:
     return float(factor), dict(root._units)
 
 
-def _quoted(unit: str) -> str:
+def _quote(unit: str) -> str:
     return repr(unit if len(unit) <= 40 else f"{unit[:37]}...")
 
 
-WHOLE = ("min", "minute")  # which nobody writes with a prefix
+NO_PREFIX = ("min", "minute")  # which nobody writes with a prefix
 
 
 def units_like(unit: str, si_unit: str) -> list[str]:
@@ -174,9 +174,9 @@ def units_like(unit: str, si_unit: str) -> list[str]:
     for names in ([column[0] for column in columns], [column[min(2, len(column) - 1)] for column in columns]):
         prefixes = ["", *(name[:-1] for name in names if name.endswith("-"))]
         known += [
-            p + name for name in names if name.isalpha() for p in prefixes if not p or name not in WHOLE
+            p + name for name in names if name.isalpha() for p in prefixes if not p or name not in NO_PREFIX
         ]
-    for token in set(re.findall(r"[^\W\d_]+", unit[:LONGEST])):
+    for token in set(re.findall(r"[^\W\d_]+", unit[:MAX_UNIT_LENGTH])):
         near = get_close_matches(token, known, n=20, cutoff=0.4)
         others += [re.sub(rf"(?<![^\W\d_]){token}(?![^\W\d_])", name, unit) for name in near]
     return [other for other in others if is_unit_of(other, si_unit)]
@@ -205,10 +205,10 @@ def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -
     try:
         factor, found_root = _root_units(unit)
     except Exception as error:  # pint raises many kinds, tokenizer errors among them
-        raise InputError(where, f"{name}.unit", _quoted(unit), expected, units_like(unit, si_unit)) from error
+        raise InputError(where, f"{name}.unit", _quote(unit), expected, units_like(unit, si_unit)) from error
     si_factor, si_root = _root_units(si_unit)
     if found_root != si_root:
-        raise InputError(where, f"{name}.unit", _quoted(unit), expected, units_like(unit, si_unit))
+        raise InputError(where, f"{name}.unit", _quote(unit), expected, units_like(unit, si_unit))
     ratio: float = factor / si_factor
     whole = round(1 / ratio) if ratio < 1 else 0
     # Dividing by a power of ten is exact where multiplying is not: 50 us is 5e-05, not 4.9999...e-05.
@@ -239,7 +239,7 @@ def unit_factor(unit: str, name: str) -> float:
         factor, root = _root_units("" if unit == "1" else unit)
         return float(factor / 1000.0 ** float(root.get("gram", 0)))  # the root of mass is the gram
     except Exception as error:  # pint raises many kinds, tokenizer errors among them
-        raise InputError("data", name, _quoted(unit), "a unit") from error
+        raise InputError("data", name, _quote(unit), "a unit") from error
 
 
 @cache
@@ -260,7 +260,7 @@ def base_exponents(unit: str) -> Mapping[str, int]:
 
 
 # Units that are not a prefix before an SI unit, in SI; shares are numbers: 0.01 is 1 %.
-_OTHERS = {
+_OTHER_UNITS = {
     "": "", "1": "", "percent": "share", "%": "share", "g": "kg", "kg": "kg", "deg": "rad", "degree": "rad",
     "turn": "rad", "revolution": "rad", "rpm": "rad_per_s", "min": "s", "minute": "s", "inch": "m", "in": "m",
 }  # fmt: skip
@@ -275,8 +275,8 @@ def unit_suffix(unit: str) -> str:
     >>> [unit_suffix(unit) for unit in ("ms", "um/N", "m/s^2", "N m", "percent", "1")]
     ['s', 'm_per_N', 'm_per_s2', 'N_m', 'share', '']
     """
-    if unit in _OTHERS:
-        return _OTHERS[unit]
+    if unit in _OTHER_UNITS:
+        return _OTHER_UNITS[unit]
     parts = re.findall(r"[^\W\d]+|\d+|/|-", unit)
     words = ["per" if part == "/" else _in_si(part) for part in parts]
     return re.sub(r"_(?=\d)|(?<=_)_", "", "_".join(word for word in words if word))
@@ -286,8 +286,8 @@ def _in_si(name: str) -> str:
     """A unit without its prefix."""
     if name in _SI or name.isdigit():
         return name
-    if name in _OTHERS:
-        return _OTHERS[name]
+    if name in _OTHER_UNITS:
+        return _OTHER_UNITS[name]
     return name[1:] if name[:1] in _PREFIX_LETTERS and name[1:] in _SI else name
 
 

@@ -20,11 +20,11 @@ from malta.errors import InputError
 
 WORK = 120.0  # units that a search may take
 MOST_CELLS = 300_000
-AGAIN = 2.0  # times the work of the last round, where the clock alone ends a search
+GROWTH = 2.0  # times the work of the last round, where the clock alone ends a search
 TICKS = 1e9  # of a unit: sums of whole ticks do not depend on their order
-ENDLESS = 1e18  # ticks
-LEAST = 0.05  # of the work done, that another round has
-MORE = "may decide it"  # ends the reason of a search that ended with its work or its time
+ENDLESS_TICKS = 1e18  # ticks
+MIN_ROUND_WORK = 0.05  # of the work done, that another round has
+MORE_WORK = "may decide it"  # ends the reason of a search that ended with its work or its time
 
 Answer = TypeVar("Answer")
 
@@ -102,12 +102,12 @@ _meter: ContextVar[Meter | None] = ContextVar("meter", default=None)
 
 
 @contextmanager
-def metered(work: float, seconds: float | None = None) -> Iterator[Meter]:
+def count_work(work: float, seconds: float | None = None) -> Iterator[Meter]:
     """Count the work of the block from zero, whatever was done before; its sum counts outside.
 
     The block may take what a block around it leaves, of its work and of its time.
     """
-    outer, end = _meter.get(), min(work * TICKS, ENDLESS)
+    outer, end = _meter.get(), min(work * TICKS, ENDLESS_TICKS)
     deadline = math.inf if seconds is None else time.monotonic() + seconds
     if outer is not None:
         end, deadline = min(end, max(outer.left, 0.0)), min(deadline, outer.deadline)
@@ -138,14 +138,14 @@ def in_rounds(
     goes_on = (budget.work or budget.time) is not None if budget.patient is None else budget.patient
     while True:
         seconds = None if budget.time is None else max(last - time.monotonic(), 0.0)
-        with metered(work, seconds) as meter:
+        with count_work(work, seconds) as meter:
             found = ask(meter.end / TICKS, patient)
         best = found if best is None or rank(found) >= rank(best) else best
         total += meter.work
-        work = AGAIN * work if budget.work is None else budget.work - total
+        work = GROWTH * work if budget.work is None else budget.work - total
         left = work if outer is None else min(work, outer.left / TICKS)
         done = rank(best) == math.inf or (patient and not meter.is_used)
-        if done or meter.stopped or not goes_on or left < LEAST * total:
+        if done or meter.stopped or not goes_on or left < MIN_ROUND_WORK * total:
             return best, Ended(total, meter.is_used, meter.stopped)
         patient = True
 
@@ -159,28 +159,28 @@ class Ended(NamedTuple):
 
     def explain(self, reason: str) -> str:
         """The reason why an answer is open, with what ended the search and the work to go on with."""
-        if not reason or reason.endswith(MORE) or not (self.stopped or self.is_used):
+        if not reason or reason.endswith(MORE_WORK) or not (self.stopped or self.is_used):
             return reason
         by = "the clock ended the search" if self.stopped else "the search ended"
-        return f"{reason}; {by} after {self.work:.3g} units of work, {AGAIN * self.work:.3g} {MORE}"
+        return f"{reason}; {by} after {self.work:.3g} units of work, {GROWTH * self.work:.3g} {MORE_WORK}"
 
 
 @contextmanager
 def work_limit(end: float) -> Iterator[None]:
-    """Within the block the work is up at `end`, as counted by `spent`, if it is not up before."""
+    """Within the block the work is up at `end`, as counted by `work_done`, if it is not up before."""
     own = _meter.get()
     if own is None:
-        with metered(end), work_limit(end):
+        with count_work(end), work_limit(end):
             yield
         return
-    before, own.limit = own.limit, min(end * TICKS, ENDLESS, own.limit)
+    before, own.limit = own.limit, min(end * TICKS, ENDLESS_TICKS, own.limit)
     try:
         yield
     finally:
         own.limit = before
 
 
-def spent() -> float:
+def work_done() -> float:
     """The work of the question so far."""
     own = _meter.get()
     return 0.0 if own is None else own.work
@@ -231,13 +231,13 @@ def check_clock() -> None:
             raise WorkUp
 
 
-def remembered(
+def remember(
     known: MutableMapping[Any, tuple[Answer, Sequence[float]]], key: Any, made: Callable[[], Answer]
 ) -> Answer:
     """The result of steps that are done once; they count each time, so that no answer depends on earlier ones."""
     if key not in known:
         own = _meter.get()
-        with metered(math.inf) if own is None else nullcontext(own) as meter:
+        with count_work(math.inf) if own is None else nullcontext(own) as meter:
             begun = len(meter.prices)
             known[key] = made(), tuple(meter.prices[begun:])
         return known[key][0]

@@ -45,7 +45,7 @@ print(model.sys.poles().real.round(2))
 # ## Check: Table I, to every printed digit
 
 # %%
-table = malta.model.published("data/tubular.toml")["table_I"]["poles"]
+table = malta.model.read_published("data/tubular.toml")["table_I"]["poles"]
 expected = np.sort([sign * pole for pole in table.values() for sign in (-1, 1)])
 assert np.abs(np.sort(model.sys.poles().real) - expected).max() < 0.005
 

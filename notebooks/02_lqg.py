@@ -32,7 +32,7 @@ Path("build").mkdir(exist_ok=True)
 
 # %%
 specs = {name: malta.read_design(f"design/{name}.toml") for name in ("table2", "calibrated")}
-published = malta.model.published("data/tubular.toml")
+published = malta.model.read_published("data/tubular.toml")
 for spec in specs.values():
     print(f"{spec.name}: {spec.summary}; {spec.discretization}")
 

@@ -28,7 +28,7 @@ Path("build").mkdir(exist_ok=True)
 # %%
 NAMES = ("table2", "calibrated", "robust")
 controllers = {name: malta.gains.read(f"design/gains/{name}.json") for name in NAMES}
-published = malta.model.published("data/tubular.toml")
+published = malta.model.read_published("data/tubular.toml")
 plants = {name: malta.plant_of(c.parameters) for name, c in controllers.items()}
 
 # %% [markdown]

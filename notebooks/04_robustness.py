@@ -144,7 +144,7 @@ plan = malta.campaigns.Plan(
 )
 folder = f"build/04_campaign_{plan.identity[:8]}"
 campaign = malta.campaign(plan, folder)
-display(malta.report.campaign(campaign, folder, malta.model.published("data/tubular.toml")))
+display(malta.report.campaign(campaign, folder, malta.model.read_published("data/tubular.toml")))
 assert campaign.completed.all()
 
 # %% [markdown]

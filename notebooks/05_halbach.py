@@ -30,7 +30,7 @@ Path("build").mkdir(exist_ok=True)
 
 # %%
 par = malta.read("data/halbach.toml")
-published = malta.model.published("data/halbach.toml")
+published = malta.model.read_published("data/halbach.toml")
 print(f"A = {par.A} N/A, k = {par.k} rad/m, m = {par.m} kg, b = {par.b} N s/m, F_z = {par.F_z} N")
 
 # %% [markdown]

@@ -31,7 +31,7 @@ Path("build").mkdir(exist_ok=True)
 # %%
 par = malta.read("data/planar.toml")
 assert isinstance(par, planar.Parameters)
-published = malta.model.published("data/planar.toml")
+published = malta.model.read_published("data/planar.toml")
 print(f"pole pitch {par.tau_n * 1e3:g} mm, coil pitch {par.coil_pitch / par.tau_n:.4g} pole pitches")
 
 # %% [markdown]
@@ -104,7 +104,8 @@ assert np.abs(K @ i - W).max() < 1e-11 * np.abs(W).max()
 
 ratios = np.arange(44, 66) / 12  # of the coil pitch to the pole pitch
 conditions = [
-    commutation.conditioning(replace(par, coil_pitch=ratio * par.tau_n), exact, 6).max() for ratio in ratios
+    commutation.condition_numbers(replace(par, coil_pitch=ratio * par.tau_n), exact, 6).max()
+    for ratio in ratios
 ]
 assert np.isinf(conditions[ratios.tolist().index(4.0)])
 assert commutation.check_pitch(par, exact) < 2.6
@@ -117,7 +118,7 @@ left.annotate("ours, 16/3", (5.31, 2e3), rotation=90, ha="right", fontsize=8, co
 left.set(xlabel="coil pitch [pole pitches]", ylabel="worst condition of K(p), singular: 1e4 [1]")
 steps = np.arange(24) * 2 * par.tau_n / 24 * 1e3
 drawn = right.pcolormesh(
-    steps, steps, commutation.conditioning(par, exact, 24).T, cmap="Greys", shading="nearest"
+    steps, steps, commutation.condition_numbers(par, exact, 24).T, cmap="Greys", shading="nearest"
 )
 figure.colorbar(drawn, ax=right, label="condition of K(p) [1]")
 right.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")

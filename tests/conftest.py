@@ -28,7 +28,7 @@ from malta.files import replace_files
 from malta.firmware import cost
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.machines.tubular import plant as tubular
-from malta.model.data import published as read_published
+from malta.model.data import read_published
 from malta.proof import robust
 from malta.proof.blocks import gain
 from malta.proof.problem import OfLoop, OfSeveral, Problem
@@ -213,7 +213,7 @@ def _loop(system: UncertainSystem, law: Any) -> Any:
     return system.names, system.nominal, matrices, system.limits, system.sample_time, vars(law)
 
 
-def _question(problem: Problem, box: Box, effort: robust.Effort) -> bytes | None:
+def _question(problem: Problem, box: Box, effort: robust.ProofEffort) -> bytes | None:
     """All that a margin depends on; None of polynomials."""
     loops = []
     for one in problem.problems if isinstance(problem, OfSeveral) else (problem,):
@@ -228,7 +228,7 @@ def _remembering(answers: Answers) -> Iterator[None]:
     """Questions that are answered already are not searched again."""
     searched, largest = robust.margin_of, gain.worst_case_gain
 
-    def margin_of(problem: Problem, box: Box, effort: robust.Effort) -> malta.proof.Margin:
+    def margin_of(problem: Problem, box: Box, effort: robust.ProofEffort) -> malta.proof.Margin:
         question = _question(problem, box, effort)
         if question is None:
             return searched(problem, box, effort)
@@ -265,9 +265,9 @@ def _counted_once(_answers: Answers) -> Iterator[None]:
     """Reports of exports count a text's instructions once: compilers of three processors take seconds for it."""
     count = cost.cost_on
 
-    def cost_on(p: cost.Processor, *of: Any) -> cost.Cost | None:
+    def cost_on(p: cost.Processor, *of: Any) -> cost.ProcessorCost | None:
         tools = [shutil.which(p.prefix + tool) for tool in ("gcc", "size", "objdump")]
-        found: cost.Cost | None = _answers.of(
+        found: cost.ProcessorCost | None = _answers.of(
             pickle.dumps((p, tools, of)), lambda: count(p, *of), lambda _: True
         )
         return found

@@ -28,7 +28,7 @@ from malta.cli.main import app as program
 from malta.files import json_text
 from malta.schemas.files import change_nodes, without_null
 from malta.synthesis.design_tables import specification_record
-from malta.synthesis.requirements import GENERIC, requirements_for
+from malta.synthesis.requirements import GENERIC_REQUIREMENTS, requirements_for
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -150,7 +150,7 @@ class Requirements(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """Write a table of them, as of other entries."""
-        wanted = {requirement.name: requirement for requirement in GENERIC}
+        wanted = {requirement.name: requirement for requirement in GENERIC_REQUIREMENTS}
         if self.arguments:
             known = requirements_for(malta.plant_of(malta.read(self.arguments[0])))
             wanted = {name: one for name, one in known.items() if wanted.get(name) is not one}

@@ -13,7 +13,7 @@ import numpy as np
 
 from malta.simulation import references
 from malta.simulation.experiments import (
-    QUIET,
+    NO_NOISE,
     Experiment,
     Merit,
     PlannedRun,
@@ -48,7 +48,7 @@ def unbalance(
     flights = []
     for speed, expected in zip(speeds, linear, strict=True):
         machine = analysis.at_speed(plant, speed)
-        given = {"fidelity": "force", "disturbance": partial(rotating, machine)} | QUIET | options
+        given = {"fidelity": "force", "disturbance": partial(rotating, machine)} | NO_NOISE | options
         duration = SETTLING + 2 * math.pi * TURNS / speed
         scenario = scenario_of("unbalance", duration, references.hold, given)
         merits = partial(_merits, speed=speed, expected=expected)

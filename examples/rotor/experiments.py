@@ -23,7 +23,7 @@ from malta.model.linearize import linearize
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
-    QUIET,
+    NO_NOISE,
     Experiment,
     Merit,
     PlannedRun,
@@ -77,7 +77,7 @@ def at_speed(plant: Plant, speed: float) -> Plant:
 
 def _turning(machine: Plant, speed: float, expected: FloatArray, options: Mapping[str, Any]) -> PlannedRun:
     duration = max(2 * SETTLING, SETTLING + 4 * 2 * math.pi / speed)
-    given = FORCES | QUIET | {"disturbance": partial(rotating, machine)} | dict(options)
+    given = FORCES | NO_NOISE | {"disturbance": partial(rotating, machine)} | dict(options)
     scenario = scenario_of("unbalance", duration, references.hold, given)
     return PlannedRun(
         f"{speed:g} rad/s", scenario, partial(_unbalance_merits, speed=speed, expected=expected)

@@ -12,11 +12,11 @@ from functools import cached_property
 from typing import Any
 
 from malta.app.files import fingerprint
-from malta.app.picture import PARTS, Problem, View, add_part, eigenvalue_margin, opening
+from malta.app.picture import PARTS, PictureSubject, View, add_part, eigenvalue_margin, first_picture
 from malta.model.plant import Parameters
 
-SLOW = 0.07  # s of processor time, beyond which no answer is taken by a further part
-FADING = 0.9  # of what a part took, at each answer that goes without it: a busy computer is so no longer
+LONGEST_ANSWER_TIME = 0.07  # s of processor time, beyond which no answer is taken by a further part
+TIME_DECAY = 0.9  # of what a part took, at each answer that goes without it: a busy computer is so no longer
 MARGIN = "margin"
 
 
@@ -24,7 +24,7 @@ MARGIN = "margin"
 class Answer:
     """A picture that may lack parts, `missing`; the eigenvalue margin is None where it is left out."""
 
-    problem: Problem
+    problem: PictureSubject
     view: View
     new: bool  # whether the machine is another than that of the answer before
     document: dict[str, Any] = field(default_factory=dict)
@@ -45,22 +45,22 @@ class Answers:
         self._takes = dict[tuple[str, bool], float]()  # s of processor time of a part, new machine or not
         self._traced: Parameters | None = None  # of the machine of the last answer
 
-    def begin(self, problem: Problem, view: View, began: float) -> Answer:
+    def begin(self, problem: PictureSubject, view: View, began: float) -> Answer:
         """What a picture opens with, and its parts while there is time; all of them of an unstable loop.
 
         began : of time.thread_time
         """
         machine = problem.plant.parameters
-        found = Answer(problem, view, machine != self._traced, opening(problem) | {MARGIN: None})
+        found = Answer(problem, view, machine != self._traced, first_picture(problem) | {MARGIN: None})
         for name in (*PARTS, MARGIN):
             takes = 0.0 if self._traced is None else self._takes.get((name, found.new), 0.0)
-            late = found.document["stable"] and time.thread_time() - began + takes > SLOW
+            late = found.document["stable"] and time.thread_time() - began + takes > LONGEST_ANSWER_TIME
             if found.missing or late:
                 found.missing.append(name)
             else:
                 self._add(found, name)
             if found.missing == [name]:
-                self._takes[name, found.new] = FADING * takes
+                self._takes[name, found.new] = TIME_DECAY * takes
         self._traced = machine
         return found
 
@@ -69,7 +69,7 @@ class Answers:
         asked, rest = [*found.missing], {}
         found.missing.clear()
         for name in asked:
-            if name == MARGIN and self._takes.get((name, found.new), 0.0) > SLOW:
+            if name == MARGIN and self._takes.get((name, found.new), 0.0) > LONGEST_ANSWER_TIME:
                 found.missing.append(name)
                 continue
             self._add(found, name)

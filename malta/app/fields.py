@@ -19,8 +19,8 @@ from malta.units import to_si
 
 MACHINE = "machine."  # begins keys of machine parameters; those of the design file are its own
 DECADES = 2.0  # of a slider, either way of the file's number
-HUGE = 1e300  # what no number of a design comes near
-NARROW = 4.0  # factor, either way, of a machine's parameters and of the sample time
+LIMIT = 1e300  # what no number of a design comes near
+SPAN = 4.0  # factor, either way, of a machine's parameters and of the sample time
 
 Kind = Literal["log", "linear", "integer", "switch", "choice", "number"]
 TITLES = {
@@ -43,7 +43,7 @@ TITLES = {
 
 
 @dataclass(frozen=True)
-class Field:
+class PageField:
     """One number, switch or choice, as the page shows it.
 
     key : of the entry, as "bases.state.x" or "machine.m"
@@ -81,7 +81,7 @@ class Files(Protocol):
     def machine_entry(self, name: str) -> dict[str, Any] | None: ...
 
 
-def fields_of(files: Files) -> tuple[Field, ...]:
+def fields_of(files: Files) -> tuple[PageField, ...]:
     """All fields of a design, in the order of its file; the machine's parameters come last."""
     law = tuple(_law_fields(files))
     return (
@@ -92,7 +92,7 @@ def fields_of(files: Files) -> tuple[Field, ...]:
     )
 
 
-def _law_fields(files: Files) -> Iterator[Field]:
+def _law_fields(files: Files) -> Iterator[PageField]:
     """Weights, bases, noise, the gains of a PID, and the numbers of elements."""
     variables = {entry: v for v in files.spec.search for entry in v.entries}
     for table in ("weights", "bases", "noise", "pid", "structure"):
@@ -110,7 +110,7 @@ def _law_fields(files: Files) -> Iterator[Field]:
                     if unit:
                         scale = to_si(1.0, variable.unit, si, "", key) / to_si(1.0, unit, si, "", key)
                     low, high = min(value, variable.low * scale), max(value, variable.high * scale)
-                yield Field(
+                yield PageField(
                     key, TITLES.get(path, path), name, value, unit, kind, low, high,
                     zero=path.startswith("weights"),
                     tuning="" if variable is None else variable.name,
@@ -119,7 +119,7 @@ def _law_fields(files: Files) -> Iterator[Field]:
                 )  # fmt: skip
 
 
-def _with_sliders(law: tuple[Field, ...], files: Files) -> tuple[Field, ...]:
+def _with_sliders(law: tuple[PageField, ...], files: Files) -> tuple[PageField, ...]:
     """The fields of a law whose file has no [search], with a slider for what most often moves: equal numbers together.
 
     Of an LQG these are the bases of weighted states and integrals, or the weights where bases stand as "SI", and the
@@ -129,7 +129,7 @@ def _with_sliders(law: tuple[Field, ...], files: Files) -> tuple[Field, ...]:
     plain = {
         f"bases.{part}" for part in ("state", "integral") if files.content.get("bases", {}).get(part) == "SI"
     }
-    together: dict[tuple[str, str, object], list[Field]] = {}
+    together: dict[tuple[str, str, object], list[PageField]] = {}
     for f in law:
         table, _, name = f.key.rpartition(".")
         part = table.rpartition(".")[2]
@@ -138,7 +138,7 @@ def _with_sliders(law: tuple[Field, ...], files: Files) -> tuple[Field, ...]:
             moves = table.startswith("weights" if f"bases.{part}" in plain else "bases")
         if moves and f.kind == "log" and f.value:
             together.setdefault((table, f.unit, f.value), []).append(f)
-    named: dict[str, Field] = {}
+    named: dict[str, PageField] = {}
     for members in together.values():
         names = " ".join(f.label for f in members)
         for f in members:
@@ -166,21 +166,21 @@ def _range(value: float, *, zero: bool, share: bool) -> tuple[float, float, Kind
         return value / 10**DECADES, value * 10**DECADES, "log"
     if value == 0 and zero:
         return 1e-3, 1e3, "log"
-    return (0.0, 0.0, "number") if value == 0 else (-NARROW * abs(value), NARROW * abs(value), "linear")
+    return (0.0, 0.0, "number") if value == 0 else (-SPAN * abs(value), SPAN * abs(value), "linear")
 
 
-def _sampling_fields(files: Files) -> Iterator[Field]:
+def _sampling_fields(files: Files) -> Iterator[PageField]:
     """Sample time, delay, and the switches of the design model."""
     content, group, lqg = files.content, "Sampling", files.spec.kind == "LQG"
     time = content["sample_time"]
-    low, high = time["value"] / NARROW, time["value"] * NARROW
-    yield Field("sample_time", group, "sample time", time["value"], time["unit"], "log", low, high)
+    low, high = time["value"] / SPAN, time["value"] * SPAN
+    yield PageField("sample_time", group, "sample time", time["value"], time["unit"], "log", low, high)
     defaults = {name: f.default for name, f in DesignFile.model_fields.items()}
     if lqg:
         delay = float(content.get("delay", 0))
-        yield Field("delay", group, "delay in the design model", delay, "samples", "integer", 0, 10)
+        yield PageField("delay", group, "delay in the design model", delay, "samples", "integer", 0, 10)
         choices = get_args(Discretization)
-        yield Field(
+        yield PageField(
             "discretization",
             group,
             "discretization",
@@ -197,32 +197,32 @@ def _sampling_fields(files: Files) -> Iterator[Field]:
     if not files.spec.plant.second_order:
         del switches["position_feedforward"]
     for key, label in switches.items():
-        yield Field(key, group, label, bool(content.get(key, defaults[key])), kind="switch")
+        yield PageField(key, group, label, bool(content.get(key, defaults[key])), kind="switch")
     if is_commutated(files.spec.plant):
         place = content.get("commutation", defaults["commutation"])
-        yield Field(
+        yield PageField(
             "commutation", group, "place of commutation", place, kind="choice", choices=get_args(Place)
         )
 
 
-def _place_fields(files: Files) -> Iterator[Field]:
+def _place_fields(files: Files) -> Iterator[PageField]:
     """The operating point and the box of the uncertainty."""
     plant, content = files.spec.plant, files.content
     for name, q in content["operating_point"].items():
         reach = 2 * abs(q["value"]) or 1.0
         if name == plant.stroke.name:
             reach = plant.stroke.travel / to_si(1.0, q["unit"], "m", "", name)
-        yield Field(
+        yield PageField(
             f"operating_point.{name}", "Operating point", name, q["value"], q["unit"], "linear", -reach, reach
         )
     for name, share in content["uncertainty"].items():
         note = f"share of {name}, either way, at a margin of 100 %"
-        yield Field(
+        yield PageField(
             f"uncertainty.{name}", "Uncertainty box", f"{name} ±", share, "", "log", 0.005, 0.9, note=note
         )
 
 
-def _machine_fields(files: Files) -> Iterator[Field]:
+def _machine_fields(files: Files) -> Iterator[PageField]:
     """The parameters of the machine in the units of its data file, with their sources as notes."""
     par = files.spec.parameters
     for f in fields(par):
@@ -233,7 +233,7 @@ def _machine_fields(files: Files) -> Iterator[Field]:
         value = entry["value"] if entry else getattr(par, f.name)
         scale = to_si(1.0, unit, si, files.spec.machine_file, f.name)
         low, high, kind = _machine_range(value, f.metadata, scale)
-        yield Field(
+        yield PageField(
             MACHINE + f.name,
             "Machine",
             f.name,
@@ -250,7 +250,7 @@ def _machine_range(value: float, declared: Mapping[str, Any], scale: float) -> t
     """A slider within the limits of a parameter; a whole number that shapes the model, and 0, have none."""
     if declared.get("shapes") or value == 0:
         return 0.0, 0.0, "number"
-    low, high = sorted((value / NARROW, value * NARROW)) if value > 0 else (NARROW * value, -NARROW * value)
+    low, high = sorted((value / SPAN, value * SPAN)) if value > 0 else (SPAN * value, -SPAN * value)
     least = declared.get("at_least") if declared.get("above") is None else declared.get("above")
     below = declared.get("below")
     low = low if least is None else max(low, least / scale)
@@ -258,7 +258,7 @@ def _machine_range(value: float, declared: Mapping[str, Any], scale: float) -> t
     return (low, high, "log") if value > 0 and low > 0 else (low, high, "linear")
 
 
-def check_value(field: Field, value: object, where: str) -> float | int | bool | str:
+def check_value(field: PageField, value: object, where: str) -> float | int | bool | str:
     """Return a value that a client sent for a field. Raises InputError for another kind of value."""
     if field.kind == "switch" and isinstance(value, bool):
         return value
@@ -276,4 +276,4 @@ def check_value(field: Field, value: object, where: str) -> float | int | bool |
 
 def is_number(value: object) -> TypeGuard[int | float]:
     """Whether a value is a number that a float can hold."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and -HUGE < value < HUGE
+    return isinstance(value, int | float) and not isinstance(value, bool) and -LIMIT < value < LIMIT

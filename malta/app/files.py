@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import tomlkit
 
-from malta.app.fields import MACHINE, Field, check_value, fields_of
+from malta.app.fields import MACHINE, PageField, check_value, fields_of
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, replace_files
 from malta.gains import SUFFIXES
@@ -78,7 +78,7 @@ class DesignFiles:
         return resolve_published(self.raw, self.path)
 
     @cached_property
-    def fields(self) -> dict[str, Field]:
+    def fields(self) -> dict[str, PageField]:
         """What can be edited, by key."""
         return {f.key: f for f in fields_of(self)}
 
@@ -199,7 +199,7 @@ def set_entry(content: Any, key: str, value: Value, files: DesignFiles) -> None:
 
 
 NAME = r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}"  # of a design, as design files have it
-LONGEST = 600  # s, of `malta design`
+DESIGN_TIMEOUT = 600  # s, of `malta design`
 
 
 class TakenError(Exception):
@@ -364,11 +364,11 @@ def save_gains(design: Path, root: Path, machine: Path | None, *, replace: bool)
     own = environment(**({"MALTA_MACHINE": str(machine.resolve())} if machine else {}))
     try:
         done = subprocess.run(
-            command, cwd=root, env=own, capture_output=True, text=True, timeout=LONGEST, check=False
+            command, cwd=root, env=own, capture_output=True, text=True, timeout=DESIGN_TIMEOUT, check=False
         )
     except subprocess.TimeoutExpired as error:
         raise CheckError(
-            f"malta design took more than {LONGEST:g} s and was ended; old gain files stand"
+            f"malta design took more than {DESIGN_TIMEOUT:g} s and was ended; old gain files stand"
         ) from error
     if done.returncode:
         said = done.stderr.strip().splitlines() or [f"malta design ended with code {done.returncode}"]

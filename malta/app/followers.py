@@ -122,7 +122,7 @@ def _start() -> subprocess.Popen[str]:
     )
 
 
-DOES = {
+FOLLOWER_TEXTS = {
     "prove": "proves the margin",
     "map": "draws the margin map",
     "tune": "tunes",
@@ -133,7 +133,7 @@ DOES = {
 
 def _obituary(asked: Mapping[str, Any], reason: str, *, again: bool) -> dict[str, Any]:
     """What is heard of a process that ended at a document. again : it was started again and asked once more"""
-    does = DOES.get(asked["task"], "simulates and judges the requirements")
+    does = FOLLOWER_TEXTS.get(asked["task"], "simulates and judges the requirements")
     sentence = f"the process that {does} ended by itself ({reason})"
     mark = {"version": asked["version"], "serial": asked["serial"]}
     if again:

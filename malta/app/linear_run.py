@@ -24,7 +24,7 @@ from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario
 from malta.synthesis.controller import Controller
 
-LONGEST = 20_000  # samples
+MAX_SAMPLES = 20_000  # samples
 
 
 class LinearRun(NamedTuple):
@@ -41,12 +41,12 @@ def linear_run(loop: SampledLoop, controller: Controller, scenario: Scenario) ->
 
     loop : `malta.loop(machine, controller).sampled`
 
-    Raises InputError for more than LONGEST samples.
+    Raises InputError for more than MAX_SAMPLES samples.
     """
     c, law, plant = controller, loop.control, plant_of(controller.parameters)
     samples = max(1, round(scenario.duration / c.sample_time))
-    if samples > LONGEST:
-        raise InputError(scenario.where, "duration", f"{samples} samples", f"at most {LONGEST}")
+    if samples > MAX_SAMPLES:
+        raise InputError(scenario.where, "duration", f"{samples} samples", f"at most {MAX_SAMPLES}")
     t = np.arange(samples) * c.sample_time
     motion = motion_of(scenario, plant, c, t)
     here = outputs_at(plant, plant.point(c.operating_point[0]).x)

@@ -81,7 +81,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class PictureSubject:
     """A design that has been synthesized, and the machine that it runs on."""
 
     spec: Spec
@@ -105,13 +105,13 @@ class Problem:
         return loop_curves(self.loop)
 
 
-def solve(edited: Edited) -> Problem:
+def solve(edited: Edited) -> PictureSubject:
     """Synthesize the controller of an edited design. Raises InputError and CheckError as `synthesize`."""
     spec = edited.spec
     at = tuple(spec.operating_point.items())
     controller = synthesize(spec, _design_model(spec.plant, at), solver="scipy")
     plant = _machine(edited)
-    return Problem(spec, plant, _design_model(plant, at), controller)
+    return PictureSubject(spec, plant, _design_model(plant, at), controller)
 
 
 def _machine(edited: Edited) -> Plant:
@@ -126,21 +126,21 @@ def _design_model(plant: Plant, at: tuple[tuple[str, float], ...]) -> LinearMode
     return linearize(plant, plant.at(**dict(at)))
 
 
-def picture(problem: Problem, view: View, *, margin: bool = True) -> dict[str, Any]:
+def picture(problem: PictureSubject, view: View, *, margin: bool = True) -> dict[str, Any]:
     """Compute the document that the page draws: what it opens with, and its PARTS.
 
     margin : whether the eigenvalue margin is asked for
 
     Raises CheckError where no input holds the machine.
     """
-    document = opening(problem)
+    document = first_picture(problem)
     for name in PARTS:
         add_part(document, name, problem, view)
     return document | {"margin": eigenvalue_margin(problem) if margin else None}
 
 
 @np.errstate(all="ignore")  # an unstable loop runs away
-def opening(problem: Problem) -> dict[str, Any]:
+def first_picture(problem: PictureSubject) -> dict[str, Any]:
     """Stability, poles, and the figures that need no curve. Raises CheckError where no input holds the machine."""
     stage = problem.report.stages[-1]
     figures = _figures(problem, None)
@@ -149,7 +149,7 @@ def opening(problem: Problem) -> dict[str, Any]:
     }  # fmt: skip
 
 
-Part = Callable[[Problem, View, Mapping[str, Any]], Any]
+Part = Callable[[PictureSubject, View, Mapping[str, Any]], Any]
 # Of a picture, in the order in which they are computed, each from what is known before.
 PARTS: Mapping[str, Part] = {
     "frequency": lambda problem, _view, _known: _frequency(problem.curves),
@@ -160,12 +160,12 @@ PARTS: Mapping[str, Part] = {
 
 
 @np.errstate(all="ignore")
-def add_part(document: dict[str, Any], name: str, problem: Problem, view: View) -> None:
+def add_part(document: dict[str, Any], name: str, problem: PictureSubject, view: View) -> None:
     """Add one of PARTS to a document that has what comes before it."""
     document[name] = PARTS[name](problem, view, document)
 
 
-def _poles(problem: Problem) -> dict[str, list[list[float]]]:
+def _poles(problem: PictureSubject) -> dict[str, list[list[float]]]:
     """The poles of the continuous machine, of regulator, filter and closed loop, rad/s, as rows [re, im]."""
     poles = problem.report.poles.pairs
     sets = {
@@ -203,7 +203,7 @@ def crossovers(curves: LoopCurves) -> list[tuple[float, float] | None]:
     return [c and (c.frequency, float(np.angle(c.value) + math.pi) % (2 * math.pi)) for c in last]
 
 
-def run_document(problem: Problem, view: View) -> dict[str, Any] | None:
+def run_document(problem: PictureSubject, view: View) -> dict[str, Any] | None:
     """The chosen run on the linear loop; None where the machine has no such run, or it is too long."""
     try:
         name, planned = planned_run(problem.plant, problem.controller, view.run)
@@ -220,7 +220,7 @@ def curves(name: str, t: FloatArray, reference: FloatArray, p: FloatArray, v: Fl
     return {"name": name, "t": round_values(t[::step]), "reference": rows[0], "p": rows[1], "v": rows[2]}
 
 
-def _load(problem: Problem, view: View) -> dict[str, Any] | None:
+def _load(problem: PictureSubject, view: View) -> dict[str, Any] | None:
     """The outputs under a unit of one disturbance, until little of it is left; None without disturbances."""
     names = [s.name for s in problem.plant.disturbances]
     if not names or not problem.report.stable:
@@ -239,19 +239,21 @@ def _load(problem: Problem, view: View) -> dict[str, Any] | None:
     }
 
 
-def _answer(problem: Problem, view: View) -> tuple[StepResponse, int]:
+def _answer(problem: PictureSubject, view: View) -> tuple[StepResponse, int]:
     """The answer of the loop to a unit of the chosen load, and which that is."""
     names = [s.name for s in problem.plant.disturbances]
     k = names.index(view.load) if view.load in names else 0
     return problem.loop.sampled.answer(k), k
 
 
-def largest_moved(problem: Problem, view: View) -> FloatArray | None:
+def largest_moved(problem: PictureSubject, view: View) -> FloatArray | None:
     """How far the chosen load moves each output at most; None without loads from outside."""
     return _answer(problem, view)[0].largest[:, 0] if problem.plant.disturbances else None
 
 
-def eigenvalue_margin(problem: Problem, first: tuple[int, float] | None = None) -> dict[str, Any] | None:
+def eigenvalue_margin(
+    problem: PictureSubject, first: tuple[int, float] | None = None
+) -> dict[str, Any] | None:
     """The eigenvalue margin, an upper bound; None without an uncertainty, or where the model is none of parameters.
 
     first : the ray of the last eigenvalue margin, and that margin
@@ -279,7 +281,7 @@ def margin_document(bound: RayBound) -> dict[str, Any]:
     }
 
 
-def map_document(problem: Problem, names: tuple[str, str], lost: float) -> dict[str, Any]:
+def map_document(problem: PictureSubject, names: tuple[str, str], lost: float) -> dict[str, Any]:
     """The plane of two uncertain parameters: where eigenvalues are unstable on a grid, which proves nothing.
 
     The other uncertain parameters are anywhere in the box, as in the proof.
@@ -308,7 +310,7 @@ def map_document(problem: Problem, names: tuple[str, str], lost: float) -> dict[
     }  # fmt: skip
 
 
-def poles_document(problem: Problem, at: Mapping[str, float]) -> dict[str, Any]:
+def poles_document(problem: PictureSubject, at: Mapping[str, float]) -> dict[str, Any]:
     """Poles of the closed loop at a point of the map, rad/s: of the worst machine that the point stands for.
 
     at : values of x and of y
@@ -336,7 +338,7 @@ def poles_document(problem: Problem, at: Mapping[str, float]) -> dict[str, Any]:
 # run and the load that are drawn. Numbers are SI but for angles.
 
 
-SHORT = {
+SHORT_LABELS = {
     "peak_sensitivity": "peak |S|",
     f"bandwidth_{BANDWIDTH}": "bandwidth, T",
     "bandwidth_crossover_max": "crossover, L",
@@ -346,7 +348,7 @@ SHORT = {
 SIDES = {"high": 1, "low": -1, "": 0}  # of the better values
 
 
-def _figures(problem: Problem, known: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+def _figures(problem: PictureSubject, known: Mapping[str, Any] | None) -> list[dict[str, Any]]:
     """The figures of the picture: numbers without a value are null.
 
     known : with the run and the load; None: the figures that need no curve
@@ -357,7 +359,7 @@ def _figures(problem: Problem, known: Mapping[str, Any] | None) -> list[dict[str
         merits = [*_loop_merits(problem, curves=known is not None), *over_time, *merits]
     return [
         {
-            "label": SHORT.get(one.key, one.label),
+            "label": SHORT_LABELS.get(one.key, one.label),
             "value": in_unit(one.value, one.unit) if math.isfinite(one.value) else None,
             "unit": one.unit,
             "frequency": one.is_frequency,
@@ -368,7 +370,7 @@ def _figures(problem: Problem, known: Mapping[str, Any] | None) -> list[dict[str
     ]
 
 
-def _loop_merits(problem: Problem, *, curves: bool) -> list[Merit]:
+def _loop_merits(problem: PictureSubject, *, curves: bool) -> list[Merit]:
     """Of the machine's loop: sensitivity, bandwidths, margins of the channels where there are curves, noise."""
     found = problem.report.quick_figures
     known = {one.key: one for one in found}
@@ -384,7 +386,7 @@ def _loop_merits(problem: Problem, *, curves: bool) -> list[Merit]:
     ]
 
 
-def _channel_margins(problem: Problem) -> tuple[Merit, Merit]:
+def _channel_margins(problem: PictureSubject) -> tuple[Merit, Merit]:
     """The smallest phase margin and delay margin of the sensors."""
     turns = [phase_and_delay(crossings) for crossings in problem.curves.crossings]
     names = [s.name for s in problem.curves.channels()]
@@ -398,7 +400,7 @@ def _channel_margins(problem: Problem) -> tuple[Merit, Merit]:
 
 
 def _time_merits(
-    problem: Problem, run: Mapping[str, Any] | None, load: Mapping[str, Any] | None
+    problem: PictureSubject, run: Mapping[str, Any] | None, load: Mapping[str, Any] | None
 ) -> list[Merit]:
     """The largest errors of the run, and what the load moves, on the linear loop."""
     outputs, merits = problem.plant.outputs, []

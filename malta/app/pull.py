@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from malta.app.fields import Field
+from malta.app.fields import PageField
 from malta.app.files import DesignFiles, Edit, Value
-from malta.app.picture import Problem, View, crossovers, largest_moved, run_document, solve
+from malta.app.picture import PictureSubject, View, crossovers, largest_moved, run_document, solve
 from malta.errors import CheckError, InputError
 
 KINDS = {
@@ -33,7 +33,7 @@ KINDS = {
 NUDGE = 0.08  # of a logarithm: the step by which numbers are compared
 LEAST_SLOPE = 0.02  # of logarithms, below which a number does not move a figure
 TRIALS = 8  # of one pull, after the numbers were compared
-CLOSE = 5e-3  # of a figure that was asked for
+GOAL_TOLERANCE = 5e-3  # of a figure that was asked for
 
 
 class Handle(NamedTuple):
@@ -53,12 +53,12 @@ class Pull:
     handle: Handle
 
     @property
-    def numbers(self) -> list[Field]:
+    def numbers(self) -> list[PageField]:
         """The numbers that may change: one field for each slider of the first group that has ends."""
         named = {f.tuning: f for f in self.files.fields.values() if f.tuning}
         return [f for f in named.values() if f.kind == "log" and self.value_of(f) > 0]
 
-    def value_of(self, field: Field) -> float:
+    def value_of(self, field: PageField) -> float:
         """The value that the design has."""
         return float(self.edit.values.get(field.key, field.value))
 
@@ -84,7 +84,7 @@ class Pull:
         return tuple(math.log(max(one, 1e-300)) for one in found)
 
 
-def figures_of(problem: Problem, view: View, handle: Handle) -> tuple[float, ...]:
+def figures_of(problem: PictureSubject, view: View, handle: Handle) -> tuple[float, ...]:
     """The figure at a handle of a stable design, SI; of a phase margin the crossover beside it.
 
     Raises InputError for a handle that the design does not have.
@@ -181,7 +181,7 @@ def pull_to(pull: Pull, asked: float, slopes: Mapping[str, tuple[float, ...]]) -
     values = pull.values(dict(zip(chosen, u.tolist(), strict=True)))
     return {
         "values": values, "asked": asked, "found": math.exp(logarithm),
-        "reached": abs(logarithm - math.log(asked)) <= 4 * CLOSE,
+        "reached": abs(logarithm - math.log(asked)) <= 4 * GOAL_TOLERANCE,
         "numbers": [f.tuning for f in fields], "at_end": at_end,
         "what": f"{words} of {pull.handle.signal}",
     }  # fmt: skip
@@ -202,7 +202,7 @@ def _solve(look: Look, start: Any, asked: float, J: Any, ends: Any) -> tuple[Any
     target = np.array([asked, *first[1:]])
     radius = 1.0
     for _ in range(TRIALS):
-        if abs(at - target).max() <= CLOSE:
+        if abs(at - target).max() <= GOAL_TOLERANCE:
             break
         step = np.linalg.lstsq(J, target - at, rcond=1e-3)[0]
         step *= min(1.0, radius / max(float(np.abs(step).max()), 1e-300))

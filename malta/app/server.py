@@ -19,12 +19,12 @@ from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from malta.app.session import Document, Session
 from malta.errors import InputError
-from malta.files import locate, packaged
+from malta.files import locate, read_packaged
 from malta.synthesis.spec import Spec
 
 ADDRESS = "127.0.0.1"
-LARGEST = 1_000_000  # bytes of a document
-IDLE = 60  # s, until a connection that says nothing is closed
+MAX_DOCUMENT_BYTES = 1_000_000  # bytes of a document
+IDLE_TIMEOUT = 60  # s, until a connection that says nothing is closed
 PAGES = {
     "/": ("index.html", "text/html"),
     "/app.css": ("app.css", "text/css"),
@@ -77,7 +77,7 @@ class _Handler(BaseHTTPRequestHandler):
     server: Server
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "malta", ""
-    timeout = IDLE
+    timeout = IDLE_TIMEOUT
 
     def do_GET(self) -> None:
         """A file of the page; the page itself only with the token."""
@@ -94,7 +94,7 @@ class _Handler(BaseHTTPRequestHandler):
             )
             return
         name, kind = PAGES[address.path]
-        self._send(HTTPStatus.OK, kind, packaged(f"app/static/{name}"))
+        self._send(HTTPStatus.OK, kind, read_packaged(f"app/static/{name}"))
 
     def do_POST(self) -> None:
         """A document of the page."""
@@ -113,8 +113,8 @@ class _Handler(BaseHTTPRequestHandler):
         if not (length.isascii() and length.isdigit()):
             self._refuse(HTTPStatus.LENGTH_REQUIRED, "no length")
             return
-        if len(length) > len(str(LARGEST)) or int(length) > LARGEST:
-            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {LARGEST} bytes")
+        if len(length) > len(str(MAX_DOCUMENT_BYTES)) or int(length) > MAX_DOCUMENT_BYTES:
+            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {MAX_DOCUMENT_BYTES} bytes")
             return
         try:
             body = json.loads(self.rfile.read(int(length)))
@@ -217,7 +217,7 @@ def _widget_class() -> Any:
         """A design under edit; `session` answers its messages."""
 
         _esm = script()
-        _css = packaged("app/static/app.css").decode()
+        _css = read_packaged("app/static/app.css").decode()
         height = traitlets.Int(HEIGHT).tag(sync=True)
 
         def __init__(self, path: Path, folder: Path, height: int) -> None:
@@ -246,6 +246,6 @@ def _widget_class() -> Any:
 
 def script() -> str:
     """The modules of the page as one module of JavaScript, without their imports of each other."""
-    parts = [packaged(f"app/static/{name}.js").decode() for name in SCRIPTS]
+    parts = [read_packaged(f"app/static/{name}.js").decode() for name in SCRIPTS]
     plain = [re.sub(r"^import .*\n", "", part, flags=re.MULTILINE) for part in parts]
     return "\n".join(re.sub(r"^export (?!default)", "", part, flags=re.MULTILINE) for part in plain)

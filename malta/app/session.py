@@ -36,9 +36,9 @@ from malta.synthesis.requirements import requirements_for
 from malta.synthesis.spec import Spec
 from malta.tuning.search import base_of
 
-QUIET = 0.25  # s, after the last move until its proof begins
+PAUSE_BEFORE_PROOF = 0.25  # s, after the last move until its proof begins
 LONGEST_WAIT = 20.0  # s, of a question for news
-KEPT = 1000  # news of one version
+KEPT_NEWS = 1000  # news of one version
 
 Document = dict[str, Any]
 
@@ -374,7 +374,7 @@ class Session:
             if self._timer is not None:
                 self._timer.cancel()
             self._due |= tasks
-            self._timer = threading.Timer(QUIET, ask)
+            self._timer = threading.Timer(PAUSE_BEFORE_PROOF, ask)
             self._timer.daemon = True
             self._timer.start()
 
@@ -405,7 +405,7 @@ class Session:
             if reply["version"] not in (None, self._version):
                 return
             self._count += 1
-            self._news = [*self._news, (self._count, reply)][-KEPT:]
+            self._news = [*self._news, (self._count, reply)][-KEPT_NEWS:]
             self._state.notify_all()
         if self._hear is not None:
             self._hear(reply)

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple, TextIO
 from malta.app.files import DesignFiles, Edited, fingerprint, open_design
 from malta.app.followers import describe_error, failed_document
 from malta.app.picture import (
-    Problem,
+    PictureSubject,
     View,
     curves,
     map_document,
@@ -42,23 +42,23 @@ from malta.proof.loss import ray_bound
 from malta.simulation.simulate import simulate
 from malta.synthesis.requirements import judge_figure, proven_margin, ratio_of, requirements_for
 from malta.synthesis.spec import Spec, Variable
-from malta.tuning.pid import LEAST, ROOM, STEEP, load_error, name_of, search_gains
+from malta.tuning.pid import BOUND_COST, MIN_BOUND_RATIO, ROOM, load_error, name_of, search_gains
 from malta.tuning.search import Effort, Journal, Progress, Trial, apply_trial, at_least_of, base_of
 from malta.tuning.tune import cluster_search, clusters_of, frugal_trials, search_weights
 from malta.tuning.verify import SynthesizedDesign, outcomes_of
-from malta.work import metered
+from malta.work import count_work
 
 # Trials for each number, of one search after the other: the page's own, then better ones.
 POLISH = (0, 1, 2, 4, 8, 16, 40)
 LEAST_GAIN = 1e-3  # of the logarithm that a search makes small, from one candidate to the next
-ALONG = 4  # trials for each number, of a point of the front
-EASED = (1.4, 1.2, 1.1, 1.0, 0.9, 0.8, 0.7)  # of the peak sensitivity that a PID may have, along its front
+TRIALS_ALONG_FRONT = 4  # trials for each number, of a point of the front
+PEAKS_ASKED = (1.4, 1.2, 1.1, 1.0, 0.9, 0.8, 0.7)  # of the peak sensitivity of PIDs along the front
 SLACK = 0.005  # of a requirement, beyond which a point of the front misses it
 PRICES = ("command noise", "moved by")  # of a margin, named as figures of the picture: of an LQG, of a PID
 POINT_WORK = 20.0  # of the proof of a point of the front
 
 
-class Search(NamedTuple):
+class TuningRequest(NamedTuple):
     """What a search begins with, and what it reports to."""
 
     files: DesignFiles
@@ -86,7 +86,7 @@ def searched_spec(files: DesignFiles, edited: Edited) -> Spec:
     return replace(spec, search=variables)
 
 
-def candidates(search: Search) -> Iterator[dict[str, Any]]:
+def candidates(search: TuningRequest) -> Iterator[dict[str, Any]]:
     """Designs that come nearer to [specification], from the design of the page on, each better than the one before.
 
     Raises InputError as `malta.tune`.
@@ -110,7 +110,7 @@ def candidates(search: Search) -> Iterator[dict[str, Any]]:
         best = badness if best is None else min(best, badness)
 
 
-def front(search: Search) -> Iterator[dict[str, Any]]:
+def front(search: TuningRequest) -> Iterator[dict[str, Any]]:
     """Designs of least noise for margins about the one that is asked for; of a PID, of least errors under loads.
 
     Raises InputError as `malta.tune`, and for a design that asks for neither.
@@ -135,7 +135,7 @@ def front(search: Search) -> Iterator[dict[str, Any]]:
         seen.add(trial.values)
         design = apply_trial(spec, trial)
         problem = solve(Edited(design, search.edited.truth))
-        with metered(POINT_WORK):
+        with count_work(POINT_WORK):
             margin = travel_margin(
                 problem.plant,
                 problem.controller,
@@ -153,25 +153,25 @@ def front(search: Search) -> Iterator[dict[str, Any]]:
         yield _document(search, spec, trial, problem) | found | misses
 
 
-def _trials_of_lqg(spec: Spec, search: Search) -> Iterator[Trial]:
+def _trials_of_lqg(spec: Spec, search: TuningRequest) -> Iterator[Trial]:
     """The least noise of the inputs for shares of the margin that is asked for, upwards from the smallest."""
     journal = Journal(None, "", restart=False)
     journal.expect(1, search.progress)
     found = (cluster_search(spec, cluster, spec.delay, journal) for cluster in clusters_of(spec))
-    yield from frugal_trials(spec, [(one, one.start) for one in found], "force", ALONG)
+    yield from frugal_trials(spec, [(one, one.start) for one in found], "force", TRIALS_ALONG_FRONT)
 
 
-def _trials_of_pid(spec: Spec, search: Search) -> Iterator[Trial]:
+def _trials_of_pid(spec: Spec, search: TuningRequest) -> Iterator[Trial]:
     """The smallest errors under loads for multiples of the peak sensitivity that is asked for."""
     journal, asked = Journal(None, "", restart=False), spec.specification
-    for share in EASED:
+    for share in PEAKS_ASKED:
         bound = {"peak_sensitivity": 1 + share * (asked["peak_sensitivity"] - 1)}
         eased = replace(spec, specification={**asked, **bound})
-        yield search_gains(eased, journal, Effort(0, ALONG, 0), search.progress)[0]
+        yield search_gains(eased, journal, Effort(0, TRIALS_ALONG_FRONT, 0), search.progress)[0]
 
 
 def nearest_limit(spec: Spec, trial: Trial, free: Collection[str] = ()) -> tuple[str, float]:
-    """The requirement that a trial's figures are nearest to, or furthest beyond, and the ratio; ("", LEAST) for none.
+    """The requirement that a trial is nearest to, or furthest beyond, and the ratio; else "", MIN_BOUND_RATIO.
 
     free : requirements that do not count
     """
@@ -185,7 +185,7 @@ def nearest_limit(spec: Spec, trial: Trial, free: Collection[str] = ()) -> tuple
             ratio = ratio_of(bound, value, at_least=base_of(name) in at_least)
             found[base_of(name)] = max(found.get(base_of(name), 0.0), ratio)
     worst = max(found, key=found.__getitem__, default="")
-    return worst, found.get(worst, LEAST)
+    return worst, found.get(worst, MIN_BOUND_RATIO)
 
 
 def _badness(spec: Spec, trial: Trial) -> float:
@@ -193,10 +193,10 @@ def _badness(spec: Spec, trial: Trial) -> float:
     beyond = math.log(nearest_limit(spec, trial)[1]) if trial.figures else math.inf
     if spec.pid is None or not trial.figures:
         return beyond
-    return math.log(load_error(trial.figures)) + STEEP * max(beyond - 2 * ROOM, 0.0)
+    return math.log(load_error(trial.figures)) + BOUND_COST * max(beyond - 2 * ROOM, 0.0)
 
 
-def _document(search: Search, spec: Spec, trial: Trial, problem: Problem) -> dict[str, Any]:
+def _document(search: TuningRequest, spec: Spec, trial: Trial, problem: PictureSubject) -> dict[str, Any]:
     """A design that was found: its numbers in the units of the file, and its picture."""
     fields, values = search.files.fields, dict[str, float]()
     for variable, value in zip(spec.search, trial.values, strict=True):
@@ -218,7 +218,9 @@ class SupersededError(Exception):
     """A newer design is waiting."""
 
 
-def replies(problem: Problem, truth: Edited, message: Message, newer: Newer) -> Iterator[dict[str, Any]]:
+def replies(
+    problem: PictureSubject, truth: Edited, message: Message, newer: Newer
+) -> Iterator[dict[str, Any]]:
     """What follows a design, one document after the other: message["task"] is "check", "prove" or "map"."""
     if message["task"] == "prove":
         yield from _proof(problem, newer)
@@ -234,7 +236,7 @@ def replies(problem: Problem, truth: Edited, message: Message, newer: Newer) -> 
     yield from _requirements(problem, truth)
 
 
-def _simulate(problem: Problem, view: View) -> dict[str, Any]:
+def _simulate(problem: PictureSubject, view: View) -> dict[str, Any]:
     """The chosen run by the nonlinear simulation."""
     try:
         name, planned = planned_run(problem.plant, problem.controller, view.run)
@@ -246,7 +248,7 @@ def _simulate(problem: Problem, view: View) -> dict[str, Any]:
     return {"kind": "run", "engine": run.engine, "label": planned.label} | found | verdict
 
 
-def _requirements(problem: Problem, edited: Edited) -> Iterator[dict[str, Any]]:
+def _requirements(problem: PictureSubject, edited: Edited) -> Iterator[dict[str, Any]]:
     """The outcome of each requirement but the margin, on the machine that the design runs on."""
     asked = {name: bound for name, bound in problem.spec.specification.items() if name != "margin"}
     spec = replace(problem.spec, specification=asked, parameters=edited.truth)
@@ -267,7 +269,7 @@ def outcome_document(outcomes: list[Outcome]) -> dict[str, Any]:
     return {"holds": holds, "found": found, "how": how}
 
 
-def _proof(problem: Problem, newer: Newer) -> Iterator[dict[str, Any]]:
+def _proof(problem: PictureSubject, newer: Newer) -> Iterator[dict[str, Any]]:
     """The margin over the travel with its proof."""
     box = problem.spec.uncertainty
     if not box:
@@ -304,7 +306,7 @@ def _end_if(newer: Newer) -> Callable[..., None]:
 
 def _explore(opened: DesignFiles, edited: Edited, message: Message, newer: Newer) -> Iterator[dict[str, Any]]:
     """Designs that a search comes by, each with its number; the last document says that it ended."""
-    search = Search(opened, edited, View(message["run"], message["load"]), _end_if(newer))
+    search = TuningRequest(opened, edited, View(message["run"], message["load"]), _end_if(newer))
     count = 0
     for count, found in enumerate(TASKS[message["task"]](search), 1):
         yield {"kind": "candidate", "of": message["task"], "number": count} | found

@@ -15,18 +15,18 @@ from threading import Thread
 from typing import Any
 
 from malta.campaigns.plan import Plan
-from malta.campaigns.store import Block, fly
+from malta.campaigns.store import RunBlock, fly
 from malta.errors import InputError
 from malta.files import version
 from malta.model.machines import load_sources, sources_of
 
 ANSWER = 3.0  # s, within which a scheduler answers
-AHEAD = 4  # blocks under way for each thread of the workers
+BLOCKS_AHEAD = 4  # blocks under way for each thread of the workers
 WAIT = 30.0  # s without any worker, after which the campaign stops
 
 
 @dataclass(frozen=True)
-class _Task:
+class _PlanTask:
     """A plan as it is sent to a worker, which keeps the first copy.
 
     The text of the machine's modules is sent along for a machine of the user's own, of which the worker has no file.
@@ -39,7 +39,7 @@ class _Task:
     plan: bytes = field(compare=False)  # pickled: a worker loads the machine before it reads the plan
 
 
-def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[int, Block]]:
+def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[int, RunBlock]]:
     """(first run, block) as workers finish them; the block of a worker that dies goes to another worker.
 
     left : first run -> number of runs
@@ -65,12 +65,12 @@ def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[
 
 def collect_blocks(
     dask: Any, client: Any, address: str, plan: Plan, left: Mapping[int, int]
-) -> Iterator[tuple[int, Block]]:
+) -> Iterator[tuple[int, RunBlock]]:
     task = task_of(plan, version())
     parts, alone = deque(left.items()), 0.0  # s
     waiting: dict[Any, int] = {}
     while waiting or parts:
-        room = AHEAD * max(_threads(client), 1) - len(waiting)
+        room = BLOCKS_AHEAD * max(_threads(client), 1) - len(waiting)
         try:
             # Few at a time: a block that is done stays in the memory of its worker until it is fetched.
             for part in [parts.popleft() for _ in range(min(len(parts), room))]:
@@ -84,18 +84,18 @@ def collect_blocks(
             continue
         except Exception as error:  # the scheduler is gone, and with it the blocks that were under way
             raise InputError(
-                "--cluster", address, f"the connection lost ({type(error).__name__})", AGAIN
+                "--cluster", address, f"the connection lost ({type(error).__name__})", RESUME_HINT
             ) from error
         for future in done:
             yield waiting.pop(future), block_of(address, future)
 
 
-def task_of(plan: Plan, malta: str) -> _Task:
+def task_of(plan: Plan, malta: str) -> _PlanTask:
     name = plan.plant.name
-    return _Task(plan.identity, malta, name, sources_of(name), pickle.dumps(plan))
+    return _PlanTask(plan.identity, malta, name, sources_of(name), pickle.dumps(plan))
 
 
-AGAIN = "the same command once more: it goes on with what is left"
+RESUME_HINT = "the same command once more: it goes on with what is left"
 
 
 @contextmanager
@@ -130,18 +130,18 @@ def require_malta(client: Any, expected: str) -> None:
 def _ask_all(client: Any, question: Callable[[str], Any], name: str) -> dict[str, Any]:
     """The answers of the scheduler and of all workers, or their exceptions."""
     answers: dict[str, Any] = {}
-    with suppress(*LOST):
+    with suppress(*CONNECTION_ERRORS):
         found = client.run(question, name, on_error="return")
         answers |= {f"the worker {k}": v for k, v in found.items()}
     try:
-        with suppress(*LOST):
+        with suppress(*CONNECTION_ERRORS):
             answers["the scheduler"] = client.run_on_scheduler(question, name)
     except ImportError as error:
         answers["the scheduler"] = error
     return answers
 
 
-LOST = (OSError, TimeoutError)  # connections of Dask end with them
+CONNECTION_ERRORS = (OSError, TimeoutError)  # connections of Dask end with them
 
 
 def _connect(dask: Any, address: str) -> Any:
@@ -174,15 +174,15 @@ def _threads(client: Any) -> int:
         return 0
 
 
-def block_of(address: str, future: Any) -> Block:
+def block_of(address: str, future: Any) -> RunBlock:
     if future.status != "finished":
         error = future.exception() if future.status == "error" else None
         found = "the connection lost" if error is None else f"a worker that fails ({_describe(error)})"
-        raise InputError("--cluster", address, found, AGAIN)
+        raise InputError("--cluster", address, found, RESUME_HINT)
     found = future.result()
     if isinstance(found, tuple) and len(found) == 4 and all(isinstance(part, str) for part in found):
         raise InputError(*found)
-    block: Block = found
+    block: RunBlock = found
     return block
 
 
@@ -190,7 +190,7 @@ def _describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
-def simulate_at_worker(task: _Task, first: int, count: int) -> Block | tuple[str, str, str, str]:
+def simulate_at_worker(task: _PlanTask, first: int, count: int) -> RunBlock | tuple[str, str, str, str]:
     """Simulate a block on a worker: the block, or the arguments of an InputError, which does not pickle."""
     here = version()
     if here != task.version:
@@ -205,7 +205,7 @@ def simulate_at_worker(task: _Task, first: int, count: int) -> Block | tuple[str
 
 
 @lru_cache(maxsize=4)
-def unpickle_plan(task: _Task) -> Plan:
+def unpickle_plan(task: _PlanTask) -> Plan:
     """The plan of a task, unpickled once: results for its machines and its scenario are cached by the object's id."""
     if task.sources:
         load_sources(task.machine, task.sources)

@@ -21,7 +21,7 @@ from malta.arrays import FloatArray
 from malta.campaigns.plan import Plan, machines_at, planned_run, varied_names
 from malta.campaigns.result import Campaign, Finding, figures_of, specified_bounds
 from malta.campaigns.store import simulate_machines
-from malta.campaigns.summary import UNBOUNDED, Bounds
+from malta.campaigns.summary import NO_BOUNDS, RunLimits
 from malta.display import display
 from malta.errors import InputError
 from malta.model.machines import outputs_of
@@ -29,7 +29,7 @@ from malta.simulation.engine.digest import Batch
 from malta.units import in_unit
 
 EVENTS = ("touchdown", "published", "specification")  # limits without a bound of the user's own
-BELOW = float(np.nextafter(1, 0))  # the largest severity of a run within its limit
+MAX_SEVERITY_WITHIN = float(np.nextafter(1, 0))  # the largest severity of a run within its limit
 
 
 @display
@@ -48,7 +48,7 @@ class Limit:
         return slug(self.name)
 
 
-def limit_of(plan: Plan, name: str, bound: float | None = None, bounds: Bounds = UNBOUNDED) -> Limit:
+def limit_of(plan: Plan, name: str, bound: float | None = None, bounds: RunLimits = NO_BOUNDS) -> Limit:
     """Make the limit that a run of a plan must not exceed, from its name.
 
     A run of severity 1 or more exceeds the limit, and so does every run that was not completed.
@@ -77,7 +77,7 @@ def limit_of(plan: Plan, name: str, bound: float | None = None, bounds: Bounds =
     if key in EVENTS:
         if bound is not None:
             raise InputError("campaign", f"limit {key}", f"a bound of {bound:g}", "no bound")
-        measure = {"touchdown": _touchdown, "published": _published, "specification": _specification}[key]
+        measure = {"touchdown": _touchdown, "published": _severity, "specification": _specification}[key]
         texts = {
             "touchdown": ("touchdown", "without touchdown"),
             "published": ("a run outside the published bounds", "within the published bounds"),
@@ -123,7 +123,7 @@ def middle_run(plan: Plan) -> Batch:
     return simulate_machines(plan, machines, replace(planned_run(plan).scenario, noise=0.0))
 
 
-def _touchdown(plan: Plan, _: Bounds) -> Callable[[Batch], FloatArray]:
+def _touchdown(plan: Plan, _: RunLimits) -> Callable[[Batch], FloatArray]:
     """Each contact's share of the clearance, 0 at that of the machine in the middle, so that contacts compare."""
     middle = middle_run(plan)
     if not plan.plant.contacts.names:
@@ -144,7 +144,7 @@ def _touchdown(plan: Plan, _: Bounds) -> Callable[[Batch], FloatArray]:
     return severity
 
 
-def _published(plan: Plan, bounds: Bounds) -> Callable[[Batch], FloatArray]:
+def _severity(plan: Plan, bounds: RunLimits) -> Callable[[Batch], FloatArray]:
     def bounded(batch: Batch) -> list[Finding]:
         listed = figures_of(_campaign(plan, batch), bounds.published)
         return [f for f in listed if f.bounded]
@@ -158,7 +158,7 @@ def _published(plan: Plan, bounds: Bounds) -> Callable[[Batch], FloatArray]:
     )
 
 
-def _specification(plan: Plan, bounds: Bounds) -> Callable[[Batch], FloatArray]:
+def _specification(plan: Plan, bounds: RunLimits) -> Callable[[Batch], FloatArray]:
     own = {} if bounds.spec is None else specified_bounds(plan, bounds.spec)
     if not own:
         expected = "a design with bounds on this scenario"
@@ -176,7 +176,9 @@ def _specification(plan: Plan, bounds: Bounds) -> Callable[[Batch], FloatArray]:
 
 def _ratio(values: FloatArray, bound: float, batch: Batch) -> FloatArray:
     """values / bound, below 1 exactly where the bound is kept; infinite for a run without the value."""
-    ratio = np.where(values > bound, np.maximum(values / bound, 1.0), np.minimum(values / bound, BELOW))
+    ratio = np.where(
+        values > bound, np.maximum(values / bound, 1.0), np.minimum(values / bound, MAX_SEVERITY_WITHIN)
+    )
     return _with_failures(np.where(np.isnan(values), np.inf, ratio), batch)
 
 

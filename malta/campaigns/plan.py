@@ -327,8 +327,8 @@ def _check_counts(plan: Plan) -> None:
         value = getattr(plan, name)
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
             raise InputError("campaign", name, repr(value), f"a whole number of at least {least}")
-    if plan.samples > MOST:
-        raise InputError("campaign", "samples", str(plan.samples), f"at most {MOST}")
+    if plan.samples > MAX_RUNS:
+        raise InputError("campaign", "samples", str(plan.samples), f"at most {MAX_RUNS}")
     if plan.law not in get_args(Law):
         raise InputError("campaign", "controller", repr(plan.law), "one of " + ", ".join(get_args(Law)))
     if plan.sampler not in SAMPLERS:
@@ -340,7 +340,7 @@ def _check_counts(plan: Plan) -> None:
             )
 
 
-MOST = 1_000_000_000  # runs: below 2**30, so that a place in a stratum of the design has some bits too
+MAX_RUNS = 1_000_000_000  # runs: below 2**30, so that a place in a stratum of the design has some bits too
 
 
 def _check_spread(plan: Plan, units: Mapping[str, str]) -> None:

@@ -78,22 +78,22 @@ from malta.tables import read_npz
 SHARE = 10  # one run in SHARE passes a level
 LEVELS = 10  # at most: probabilities down to 1e-10
 REPETITIONS = 4
-FEWEST = 500  # runs in a level of a repetition: with 100, probabilities of 1e-5 were too large by a half
-APART = 2**40  # indices of noise from one repetition to the next
+MIN_LEVEL_RUNS = 500  # of a repetition: with 100, probabilities of 1e-5 were too large by a half
+NOISE_STRIDE = 2**40  # indices of noise from one repetition to the next
 ACCEPTANCE = 0.44  # of the steps, Papaioannou et al. 2015
 FIRST_STEP = 0.6  # size of the first step, in standard deviations
 
 
-class Runs(NamedTuple):
+class LevelRuns(NamedTuple):
     """Runs of one level, a row for each."""
 
     u: FloatArray  # runs x dimensions, standard normal
     noise: NDArray[np.int64]  # runs x parts, index of the run whose noise the part has
     severity: FloatArray  # 1 or more: failed
 
-    def chosen(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Runs:
+    def choose(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> LevelRuns:
         """Some of the runs."""
-        return Runs(self.u[rows], self.noise[rows], self.severity[rows])
+        return LevelRuns(self.u[rows], self.noise[rows], self.severity[rows])
 
 
 class Level(NamedTuple):
@@ -110,7 +110,7 @@ class Subset:
 
     levels: tuple[Level, ...]
     simulated: int  # runs
-    failures: Runs  # that the last level has; empty where no run failed
+    failures: LevelRuns  # that the last level has; empty where no run failed
     worst: float  # largest severity below failure; NaN where every run failed
     samples: int  # runs in a level
 
@@ -126,7 +126,7 @@ class Subset:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class RareEventEstimate:
     """The probability that independent repetitions of a subset simulation agree on."""
 
     repetitions: tuple[Subset, ...]
@@ -162,10 +162,10 @@ class Estimate:
         return sum(one.simulated for one in self.repetitions)
 
     @property
-    def failures(self) -> Runs:
+    def failures(self) -> LevelRuns:
         """The failures of all repetitions."""
         found = [one.failures for one in self.repetitions]
-        return Runs(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+        return LevelRuns(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
 
     @property
     def worst(self) -> float:
@@ -206,20 +206,22 @@ def repeated_subset_simulation(
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
     keep: Callable[[int, Callable[[], Subset]], Subset] | None = None,
-) -> Estimate:
+) -> RareEventEstimate:
     """The probability that a severity is 1 or more, by REPETITIONS of `subset_simulation`.
 
     samples : runs in a level of all repetitions together, in multiples of SHARE * REPETITIONS
     keep : (repetition, function that simulates it) -> repetition; for who has some already
 
-    Raises InputError for fewer than FEWEST runs in a level of a repetition, and as `subset_simulation` does.
+    Raises InputError for fewer than MIN_LEVEL_RUNS runs in a level of a repetition, and as `subset_simulation` does.
 
         found = repeated_subset_simulation(lambda u, noise: u[:, 0] / 5.2, 1, samples=8000)
         print(found.probability, found.interval())  # 1e-7
     """
     each = samples // REPETITIONS
-    if each < FEWEST:
-        expected = f"at least {REPETITIONS * FEWEST}: {REPETITIONS} repetitions of {FEWEST} in each level"
+    if each < MIN_LEVEL_RUNS:
+        expected = (
+            f"at least {REPETITIONS * MIN_LEVEL_RUNS}: {REPETITIONS} times {MIN_LEVEL_RUNS} in each level"
+        )
         raise InputError("rare event", "samples", str(samples), expected)
     found: list[Subset] = []
 
@@ -235,12 +237,12 @@ def repeated_subset_simulation(
             parts,
             samples=each,
             seed=(seed, k),
-            first=k * APART,
+            first=k * NOISE_STRIDE,
             progress=report,
         )
         found.append(simulate() if keep is None else keep(k, simulate))
         report(0.0)
-    return Estimate(tuple(found))
+    return RareEventEstimate(tuple(found))
 
 
 def subset_simulation(
@@ -269,7 +271,7 @@ def subset_simulation(
         rng.standard_normal((size, dimensions)),
         np.repeat(first + np.arange(size)[:, None], parts, axis=1),
     )
-    runs = Runs(u, noise, severity(u, noise))
+    runs = LevelRuns(u, noise, severity(u, noise))
     stride, levels = _Stride(FIRST_STEP, math.nan, size), list[Level]()
     start = float(np.median(runs.severity))
     while True:
@@ -282,9 +284,9 @@ def subset_simulation(
             progress(min(1.0, max(0.0, (threshold - start) / (1 - start))) if start < 1 else 1.0)
         if threshold >= 1:
             break
-        runs, stride = _climb(severity, runs.chosen(passed), threshold, stride, rng, chains, first)
+        runs, stride = _climb(severity, runs.choose(passed), threshold, stride, rng, chains, first)
     below = runs.severity[runs.severity < 1]
-    failures = runs.chosen(runs.severity >= 1)
+    failures = runs.choose(runs.severity >= 1)
     return Subset(tuple(levels), stride.drawn, failures, float(below.max()) if below.size else math.nan, size)
 
 
@@ -296,7 +298,7 @@ class _Stride(NamedTuple):
     drawn: int  # runs simulated so far
 
 
-def _threshold(runs: Runs, chains: int, *, last: bool) -> float:
+def _threshold(runs: LevelRuns, chains: int, *, last: bool) -> float:
     """The severity that `chains` runs reach; 1 where more fail, or where no further level is allowed.
 
     Where many runs have the same severity, as 0 of something that seldom occurs, it is the next larger one.
@@ -317,18 +319,18 @@ def _threshold(runs: Runs, chains: int, *, last: bool) -> float:
 
 def _climb(
     severity: Severity,
-    seeds: Runs,
+    seeds: LevelRuns,
     threshold: float,
     stride: _Stride,
     rng: np.random.Generator,
     chains: int,
     first: int,
-) -> tuple[Runs, _Stride]:
+) -> tuple[LevelRuns, _Stride]:
     """As many runs as before from the next level, by chains that begin with runs which passed it, and the next stride.
 
     The runs are in order of the steps, in each step in order of the chains.
     """
-    state = seeds.chosen(np.resize(rng.permutation(len(seeds.severity)), chains))
+    state = seeds.choose(np.resize(rng.permutation(len(seeds.severity)), chains))
     spread, states, rates = state.u.std(axis=0), [state], []
     length, drawn = stride.size, stride.drawn
     for step in range(1, SHARE):
@@ -339,7 +341,7 @@ def _climb(
         proposed = severity(u, noise)
         drawn += chains
         kept = proposed >= threshold
-        state = Runs(
+        state = LevelRuns(
             np.where(kept[:, None], u, state.u),
             np.where(kept[:, None], noise, state.noise),
             np.where(kept, proposed, state.severity),
@@ -348,7 +350,7 @@ def _climb(
         rates.append(float(kept.mean()))
         length *= math.exp((rates[-1] - ACCEPTANCE) / math.sqrt(step))
     u, noise, severities = (np.concatenate(column) for column in zip(*states, strict=True))
-    return Runs(u, noise, severities), _Stride(length, float(np.mean(rates)), drawn)
+    return LevelRuns(u, noise, severities), _Stride(length, float(np.mean(rates)), drawn)
 
 
 PARTS = 100  # of a run, whose noise changes independently
@@ -373,7 +375,7 @@ class RareEvent:
 
     plan: Plan
     limit: Limit
-    found: Estimate
+    found: RareEventEstimate
     design_point: DesignPoint | None  # None where no run failed
 
     @property
@@ -490,7 +492,7 @@ def _read_repetition(path: Path, plan: Plan, limit: Limit, repetition: int) -> S
             return None
         levels = tuple(Level(*map(float, row)) for row in arrays["levels"])
         simulated, samples = map(int, arrays["counts"])
-        failures = Runs(*(arrays[name] for name in Runs._fields))
+        failures = LevelRuns(*(arrays[name] for name in LevelRuns._fields))
     except (ValueError, KeyError, TypeError):
         return None
     return Subset(levels, simulated, failures, float(arrays["worst"]), samples)
@@ -501,11 +503,11 @@ def _simulate(plan: Plan, u: FloatArray, noise: NDArray[np.int64], workers: int 
     return simulate_machines(plan, machines_in_box(plan, ndtr(u)), noise=noise, workers=workers)
 
 
-def _design_point(plan: Plan, failures: Runs) -> DesignPoint | None:
+def _design_point(plan: Plan, failures: LevelRuns) -> DesignPoint | None:
     if not len(failures.severity):
         return None
     far = np.sqrt((failures.u**2).sum(axis=1))
-    nearest = failures.chosen(np.array([far.argmin()]))
+    nearest = failures.choose(np.array([far.argmin()]))
     machines = machines_in_box(plan, ndtr(nearest.u))
     batch = simulate_machines(plan, machines, noise=nearest.noise)
     return DesignPoint(

@@ -14,7 +14,7 @@ from scipy.stats import binomtest
 
 from malta.arrays import FloatArray, readonly
 from malta.campaigns.plan import Plan, half_width, varied_names
-from malta.campaigns.store import Block, figure_shapes
+from malta.campaigns.store import RunBlock, figure_shapes
 from malta.display import Description, display
 from malta.merits import Merit
 from malta.model.data import published_value
@@ -94,7 +94,7 @@ class Campaign:
         return Description(f"{title}: {len(self.index)} of {self.plan.samples} machines", rows)
 
 
-def gather(plan: Plan, done: Mapping[int, Block]) -> Campaign:
+def gather(plan: Plan, done: Mapping[int, RunBlock]) -> Campaign:
     """The campaign of the blocks that are done, by their first runs, in order of the runs."""
     order = sorted(done)
     blocks = [done[first] for first in order]

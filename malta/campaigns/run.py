@@ -24,7 +24,7 @@ from malta.campaigns.plan import PRECISIONS, Machines, Plan, draw_machines, plan
 from malta.campaigns.result import Campaign, gather
 from malta.campaigns.store import (
     MANIFEST,
-    Block,
+    RunBlock,
     block_name,
     encode_block,
     fly,
@@ -34,15 +34,15 @@ from malta.campaigns.store import (
     read_manifest,
     read_plan,
 )
-from malta.campaigns.summary import UNBOUNDED, Bounds, Summary, join, summary_of
+from malta.campaigns.summary import NO_BOUNDS, RunLimits, Summary, join, summary_of
 from malta.errors import InputError
 from malta.files import file_exists, replace_files, watch_interrupts
 from malta.firmware.flight import engine_of_c
 from malta.simulation.engine import compiled
-from malta.simulation.engine.batch import record_run, replayed
+from malta.simulation.engine.batch import record_run, replay_run
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import Experiment, Progress
-from malta.simulation.experiments.catalogue import main_job, settling, single_run
+from malta.simulation.experiments.catalogue import main_job, settling_option, single_run
 from malta.simulation.simulate import EngineOf
 from malta.synthesis.controller import Controller
 from malta.synthesis.spec import Spec
@@ -54,7 +54,7 @@ FILES = 256  # blocks that a campaign has before they grow
 IN_MEMORY = 10_000_000  # runs whose figures `campaign` returns: 3 GB
 
 
-class Session(NamedTuple):
+class RunExecution(NamedTuple):
     """How the runs that are missing are simulated."""
 
     workers: int | None = None  # threads on this machine; None: one for each core
@@ -70,10 +70,10 @@ class Ending(NamedTuple):
     damaged: tuple[Path, ...]  # files of blocks that could not be read; their runs were simulated again
 
 
-class Blocks(Protocol):
+class BlockSink(Protocol):
     """What takes the blocks of a campaign, by their first runs, and knows which ones it has: a dict, or a sum."""
 
-    def __setitem__(self, first: int, block: Block, /) -> None: ...
+    def __setitem__(self, first: int, block: RunBlock, /) -> None: ...
 
     def __contains__(self, first: object, /) -> bool: ...
 
@@ -117,8 +117,8 @@ def campaign(
     if plan.samples > IN_MEMORY:
         expected = f"at most {IN_MEMORY} in memory; malta.campaigns.summarize needs none for its runs"
         raise InputError("campaign", "samples", str(plan.samples), expected)
-    done: dict[int, Block] = {}
-    session = Session(workers, cluster, block, progress)
+    done: dict[int, RunBlock] = {}
+    session = RunExecution(workers, cluster, block, progress)
     with campaign_folder(plan, folder, session) as (place, size):
         ending = run_blocks(plan, place, size, session, done)
     return replace(gather(plan, done), **ending._asdict(), folder=place)
@@ -126,7 +126,7 @@ def campaign(
 
 @contextmanager
 def campaign_folder(
-    plan: Plan, folder: str | Path | None, session: Session, gains: Path | None = None
+    plan: Plan, folder: str | Path | None, session: RunExecution, gains: Path | None = None
 ) -> Iterator[tuple[Path | None, int]]:
     """The folder of a campaign, with its manifest, and the number of runs in a block.
 
@@ -149,7 +149,7 @@ def campaign_folder(
         raise
 
 
-def run_blocks(plan: Plan, place: Path | None, size: int, session: Session, done: Blocks) -> Ending:
+def run_blocks(plan: Plan, place: Path | None, size: int, session: RunExecution, done: BlockSink) -> Ending:
     """Put all blocks of a plan into `done`: those that a folder has, then those that are missing, as they are flown.
 
     A block is forgotten here once `done` has it and the folder too.
@@ -196,7 +196,7 @@ def parts_of(plan: Plan, size: int) -> dict[int, int]:
     return {first: min(size, plan.samples - first) for first in range(0, plan.samples, size)}
 
 
-def block_size(plan: Plan, session: Session) -> int:
+def block_size(plan: Plan, session: RunExecution) -> int:
     """Runs in a block: BLOCK, doubled up to LARGE_BLOCK where a campaign would have more than FILES blocks.
 
     Raises InputError for workers beside a cluster, and for numbers out of range.
@@ -215,8 +215,8 @@ def block_size(plan: Plan, session: Session) -> int:
 
 
 def _fly_blocks(
-    plan: Plan, left: Mapping[int, int], session: Session, report: Progress
-) -> Iterator[tuple[int, Block]]:
+    plan: Plan, left: Mapping[int, int], session: RunExecution, report: Progress
+) -> Iterator[tuple[int, RunBlock]]:
     """(first run, block) for every block that is left, as soon as it is done.
 
     left : first run -> number of runs
@@ -271,7 +271,7 @@ def replay_machine(
     """
     planned = planned_run(plan)
     changes, errors = machines.changes, machines.sensor_errors
-    plant, scenario = replayed(plan.plant, planned.scenario, changes, index, first, errors)
+    plant, scenario = replay_run(plan.plant, planned.scenario, changes, index, first, errors)
     if noise is not None:
         scenario = replace(scenario, run=tuple(noise[index - first].tolist()))
     own = planned._replace(scenario=scenario)
@@ -318,7 +318,7 @@ def main_campaign(
 def main_plan(controller: Controller, spec: Spec, machines: int = MACHINES, *, settle: bool = True) -> Plan:
     """The plan of `main_campaign`."""
     job = main_job(spec.plant)
-    options = settling(job, spec.plant) if settle else {}
+    options = settling_option(job, spec.plant) if settle else {}
     return Plan(controller, job, dict(spec.uncertainty), samples=machines, options=options)
 
 
@@ -328,12 +328,12 @@ def main_plan(controller: Controller, spec: Spec, machines: int = MACHINES, *, s
 class Sum:
     """The summary of the blocks so far, and which ones they are."""
 
-    def __init__(self, plan: Plan, size: int, bounds: Bounds) -> None:
+    def __init__(self, plan: Plan, size: int, bounds: RunLimits) -> None:
         self.size = size  # runs in a block
         # One pair, so that Ctrl-C between two statements leaves no block that is counted and not noted.
         self.state = summary_of(gather(plan, {}), bounds), 0  # a bit for each block
 
-    def __setitem__(self, first: int, block: Block) -> None:
+    def __setitem__(self, first: int, block: RunBlock) -> None:
         summary, noted = self.state
         own = summary_of(gather(summary.plan, {first: block}), summary.bounds)
         self.state = join(summary, own), noted | 1 << first // self.size
@@ -345,7 +345,7 @@ class Sum:
 def summarize(
     plan: Plan,
     folder: str | Path | None = None,
-    bounds: Bounds = UNBOUNDED,
+    bounds: RunLimits = NO_BOUNDS,
     *,
     workers: int | None = None,
     cluster: str | None = None,
@@ -378,7 +378,7 @@ def summarize(
     >>> f"{rate.passed} of {rate.runs}; with 95 % confidence above {rate.low:.2f}"
     '16 of 16; with 95 % confidence above 0.79'
     """
-    session = Session(workers, cluster, block, progress)
+    session = RunExecution(workers, cluster, block, progress)
     with campaign_folder(plan, folder, session) as (place, size):
         found = Sum(plan, size, bounds)
         ending = run_blocks(plan, place, size, session, found)
@@ -388,8 +388,8 @@ def summarize(
 # The status of a campaign: which of its blocks a folder has, also while another process adds some.
 
 
-RECENT = 50  # blocks whose times tell the pace
-QUIET = 30.0  # s without a new block, after which nobody seems to simulate any
+PACE_BLOCKS = 50  # blocks whose times tell the pace
+STALL_TIME = 30.0  # s without a new block, after which nobody seems to simulate any
 PATIENCE = 5.0  # paces without a new block, likewise
 
 
@@ -411,7 +411,7 @@ class Status:
         return (
             self.blocks < self.of
             and self.age is not None
-            and self.age < max(QUIET, PATIENCE * (self.pace or 0))
+            and self.age < max(STALL_TIME, PATIENCE * (self.pace or 0))
         )
 
     @property
@@ -421,7 +421,10 @@ class Status:
 
 
 def status(
-    folder: str | Path, controller: Controller, bounds: Bounds = UNBOUNDED, progress: Progress | None = None
+    folder: str | Path,
+    controller: Controller,
+    bounds: RunLimits = NO_BOUNDS,
+    progress: Progress | None = None,
 ) -> Status:
     """The status of the campaign in a folder. Every block is read and its seal checked; nothing is written.
 
@@ -447,7 +450,7 @@ def status(
         if progress is not None:
             progress((first + parts[first]) / plan.samples)
     times.sort()
-    gaps = np.diff(times[-RECENT - 1 :])
+    gaps = np.diff(times[-PACE_BLOCKS - 1 :])
     return Status(
         len(times),
         len(parts),

@@ -41,7 +41,7 @@ from malta.firmware.flight import engine_of_c
 from malta.model.parameters import fingerprint
 from malta.simulation.engine.batch import is_compiled, simulate_many
 from malta.simulation.engine.compiled import MOST_LANES
-from malta.simulation.engine.digest import LARGEST_FIGURE, Batch, verdicts
+from malta.simulation.engine.digest import MAX_FIGURE, Batch, verdicts
 from malta.simulation.experiments import Progress
 from malta.simulation.scenario import Scenario
 from malta.synthesis.controller import Controller
@@ -50,7 +50,7 @@ from malta.tables import read_npz
 # A block: some consecutive runs of a plan, simulated together.
 
 
-class Block(NamedTuple):
+class RunBlock(NamedTuple):
     """The runs of a block, a row for each."""
 
     values: FloatArray  # runs x names, SI: drawn parameters and errors of the sensors
@@ -85,7 +85,7 @@ def simulate_machines(
 
 def fly(
     plan: Plan, first: int, count: int, workers: int | None = None, progress: Progress | None = None
-) -> Block:
+) -> RunBlock:
     """Simulate the `count` runs of a plan from run `first` on.
 
     first : a multiple of MOST_LANES, so that a run has the same place in its group of machines in every block
@@ -93,7 +93,7 @@ def fly(
     """
     machines = draw_machines(plan, first, count)
     batch = simulate_machines(plan, machines, first=first, workers=workers, progress=progress)
-    return Block(machines.values, batch, _engine_name(plan))
+    return RunBlock(machines.values, batch, _engine_name(plan))
 
 
 def _engine_name(plan: Plan) -> str:
@@ -221,7 +221,7 @@ def read_plan(folder: str | Path, controller: Controller) -> Plan:
 
 def read_blocks(
     place: Path, plan: Plan, parts: Mapping[int, int]
-) -> Iterator[tuple[int, Path, Block | None]]:
+) -> Iterator[tuple[int, Path, RunBlock | None]]:
     """(first run, file, block) for each of the blocks `parts`, first run -> number of runs, that a folder has.
 
     None stands for the block of a damaged file.
@@ -261,7 +261,7 @@ def shorten(value: Any) -> str:
     return text if len(text) <= 40 else text[:12] + "..."
 
 
-def encode_block(block: Block, plan: Plan, first: int) -> bytes:
+def encode_block(block: RunBlock, plan: Plan, first: int) -> bytes:
     """The block that begins with run `first` as an .npz archive, with the identity of its plan and its seal."""
     buffer = io.BytesIO()
     arrays: dict[str, Any] = {
@@ -283,7 +283,7 @@ def seal(arrays: Mapping[str, Any], first: int) -> str:
     return marks.hexdigest()
 
 
-def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
+def read_block(path: Path, plan: Plan, first: int, count: int) -> RunBlock | None:
     """The block of `count` runs from `first` on; None for a damaged file.
 
     Raises InputError for a block of another campaign.
@@ -309,7 +309,7 @@ def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
         and np.array_equal(values, machines.values)
         and _are_possible(columns, plan, count)
     )
-    return Block(values, Batch(**columns), kind) if whole else None
+    return RunBlock(values, Batch(**columns), kind) if whole else None
 
 
 ENGINES = ("compiled", "virtual machine", "exported C, double", "exported C, float")
@@ -332,16 +332,16 @@ def _are_possible(columns: Mapping[str, Any], plan: Plan, count: int) -> bool:
     ]
     # Figures of a run that diverged may be infinite or NaN, and rise and overshoot of a run that ended early are NaN.
     positive = [not (columns[name] < 0).any() for name in ("deviation", "rms", "force", "rise", "overshoot")]
-    finite = [(np.abs(columns[name][completed == 1]) < LARGEST_FIGURE).all() for name in FINITE]
+    finite = [(np.abs(columns[name][completed == 1]) < MAX_FIGURE).all() for name in FINITE_COLUMNS]
     finite += [
-        not (np.isfinite(columns[name]) & (columns[name] >= LARGEST_FIGURE)).any()
+        not (np.isfinite(columns[name]) & (columns[name] >= MAX_FIGURE)).any()
         for name in ("rise", "overshoot")
     ]
     codes = (verdict == np.floor(verdict)).all() and np.array_equal(completed, verdict == 0)
     return all(inside) and all(positive) and all(finite) and bool(codes)
 
 
-FINITE = ("deviation", "rms", "force", "contact", "last")  # where a run was completed
+FINITE_COLUMNS = ("deviation", "rms", "force", "contact", "last")  # where a run was completed
 
 
 def figure_shapes(plan: Plan) -> dict[str, tuple[int, ...]]:

@@ -37,9 +37,9 @@ from malta.model.parameters import differences
 from malta.simulation.experiments import Progress, progress_of_part
 
 NOISE = "noise"  # the name of its factor
-LEAST = 16  # points of each of the two samples
+MIN_POINTS = 16  # points of each of the two samples
 RESAMPLES = 100
-NORMAL = 1.96  # standard deviations of a 95 % interval, either way
+INTERVAL_DEVIATIONS = 1.96  # standard deviations of a 95 % interval, either way
 DRAWS = 2**40  # of the noise, among which its factor chooses
 
 
@@ -119,8 +119,8 @@ def sensitivity(
     noisy = planned_run(plan).scenario.noise > 0
     factors = (*names, *([NOISE] if noisy else []))
     size = 2 ** int(math.log2(max(plan.samples / (len(factors) + 2), 1)))
-    if size < LEAST:
-        expected = f"at least {LEAST * (len(factors) + 2)} for {len(factors)} factors"
+    if size < MIN_POINTS:
+        expected = f"at least {MIN_POINTS * (len(factors) + 2)} for {len(factors)} factors"
         raise InputError("campaign", "samples", str(plan.samples), expected)
     points = sobol_points(len(factors), size, plan.seed)
     machines = machines_in_box(plan, points[:, : len(names)])
@@ -160,7 +160,7 @@ def indices_of(values: FloatArray, size: int, seed: int) -> tuple[Index, ...]:
             func={"f_A": A[rows], "f_B": B[rows], "f_AB": np.array([one[rows] for one in mixed])}, n=size
         )
     first, total = (np.reshape(x, (RESAMPLES + 1, -1)) for x in (found.first_order, found.total_order))
-    half = [NORMAL * np.nanstd(x[1:], axis=0, ddof=1) for x in (first, total)]
+    half = [INTERVAL_DEVIATIONS * np.nanstd(x[1:], axis=0, ddof=1) for x in (first, total)]
     return tuple(Index(*map(float, row)) for row in zip(first[0], half[0], total[0], half[1], strict=True))
 
 
@@ -191,8 +191,8 @@ def sensitivity_document(found: Sensitivity) -> dict[str, Any]:
 # reported.
 
 
-WIDEST = 16.0  # multiples of today's spread that are tried, at most
-FARTHEST = 0.95  # relative spread, at most: parameters stay above 0
+MAX_SPREAD_FACTOR = 16.0  # multiples of today's spread that are tried, at most
+MAX_RELATIVE_SPREAD = 0.95  # relative spread, at most: parameters stay above 0
 SPREADS = 6  # that are tried up to the widest
 HALVINGS = 7  # of the bracket around the answer
 CHUNK = 1024  # runs, after which a yield may be known to be lost
@@ -201,14 +201,14 @@ CHUNK = 1024  # runs, after which a yield may be known to be lost
 class Spread(NamedTuple):
     """The largest spread of one parameter, the others at their own, or of all together."""
 
-    name: str  # of the parameter; ALL
+    name: str  # of the parameter; ALL_PARAMETERS
     factor: float  # in multiples of today's spread; 0 where the yield is lost even without any
     within: Rate | None  # the yield at that spread; None where it is lost without any
     widest: float  # factor that was tried, at most
     monotone: bool  # no wider spread that was tried keeps the yield again
 
 
-ALL = "all together"
+ALL_PARAMETERS = "all together"
 
 
 @display
@@ -267,7 +267,7 @@ def tolerances(
     names, columns = varied_names(plan), varying_columns(plan)
     if not columns:
         raise InputError("campaign", "spread", "nothing that varies", "parameters that vary")
-    searches = {names[k]: [k] for k in columns} | ({ALL: columns} if len(columns) > 1 else {})
+    searches = {names[k]: [k] for k in columns} | ({ALL_PARAMETERS: columns} if len(columns) > 1 else {})
     today = _yield(plan, limit, np.ones(len(names)), 0.0, workers)
     assert today is not None
     found: list[Spread] = []
@@ -289,7 +289,7 @@ def tolerances(
 def _widest(plan: Plan, name: str) -> float:
     """The largest factor on a spread that is tried."""
     relative = name in plan.spread and name not in differences(plan.parameters)
-    return FARTHEST / plan.spread[name] if relative else WIDEST
+    return MAX_RELATIVE_SPREAD / plan.spread[name] if relative else MAX_SPREAD_FACTOR
 
 
 def largest_spread(
@@ -339,7 +339,7 @@ def _yield(plan: Plan, limit: Limit, widths: FloatArray, wanted: float, workers:
 
 
 def spread_of(found: Tolerances, spread: Spread) -> float:
-    """The largest spread itself: a share, or SI for differences and errors of sensors; NaN for ALL."""
+    """The largest spread itself: a share, or SI for differences and errors of sensors; NaN for ALL_PARAMETERS."""
     own = {**found.plan.spread, **found.plan.sensor_spread}
     return spread.factor * own[spread.name] if spread.name in own else math.nan
 

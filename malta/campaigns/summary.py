@@ -2,7 +2,7 @@
 
     block -> summary_of -> join -> Summary
 
-Numbers of runs add, distributions are sketches, sums of values are exact fractions, and of the worst runs KEPT stay.
+Numbers of runs add, distributions are sketches, sums of values are exact fractions, and KEPT_RUNS worst runs stay.
 Therefore blocks may be joined in any order: the summary is the same to the bit.
 """
 
@@ -34,16 +34,16 @@ from malta.campaigns.result import (
 )
 from malta.display import Description, display
 from malta.merits import Merit, figure
-from malta.simulation.engine.digest import LARGEST_FIGURE, Batch, verdicts
+from malta.simulation.engine.digest import MAX_FIGURE, Batch, verdicts
 from malta.synthesis.spec import Spec
 from malta.units import in_unit
 
 # Sketches: the distribution of a figure over any number of runs, in memory that does not grow with them.
 #
-# Up to EXACT values a sketch keeps all. Beyond them it counts: a bucket has the numbers that agree in sign, exponent
-# and the first BITS bits of the mantissa, so a bucket is at most 2**-BITS of its numbers wide, and its middle is
-# within ACCURACY = 2**-(BITS + 1) of each of them. Counts of two sketches add, and the number of values alone decides
-# whether they are counted: what is merged in whatever order is the same to the bit.
+# Up to MAX_EXACT_VALUES values a sketch keeps all. Beyond them it counts: a bucket has the numbers that agree in
+# sign, exponent and the first BITS bits of the mantissa, so a bucket is at most 2**-BITS of its numbers wide, and its
+# middle is within ACCURACY = 2**-(BITS + 1) of each of them. Counts of two sketches add, and the number of values
+# alone decides whether they are counted: what is merged in whatever order is the same to the bit.
 #
 #     values of a block -> sketch_of -> merge -> quantiles, histogram
 #
@@ -52,7 +52,7 @@ from malta.units import in_unit
 # rounded.
 
 
-EXACT = 100_000  # values that a sketch keeps as they are
+MAX_EXACT_VALUES = 100_000  # values that a sketch keeps as they are
 BITS = 13  # of the mantissa that name a bucket; a power of two of values takes 2**BITS counts, 64 KB
 ACCURACY = 2.0 ** -(BITS + 1)  # relative, of a quantile of counted values
 
@@ -64,13 +64,13 @@ class Sketch:
     count: int = 0
     smallest: float = math.inf
     largest: float = -math.inf
-    values: tuple[FloatArray, ...] = ()  # all of them, in any order, while they are at most EXACT
+    values: tuple[FloatArray, ...] = ()  # all of them, in any order, while they are at most MAX_EXACT_VALUES
     counts: Mapping[int, NDArray[np.int64]] = field(default_factory=dict)  # (sign, exponent) -> counts
 
     @property
     def exact(self) -> bool:
         """Whether quantiles are those of the values; else they are within ACCURACY of them."""
-        return self.count <= EXACT
+        return self.count <= MAX_EXACT_VALUES
 
 
 def sketch_of(values: FloatArray) -> Sketch:
@@ -168,18 +168,18 @@ def _buckets(sketch: Sketch) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]
     return np.clip(low, *bounds), np.clip(high, *bounds), counts
 
 
-KEPT = 1000  # of the worst runs, by each measure of badness
-WITHIN, LIMITED = "within the published bounds", "completed, commands limited"
+KEPT_RUNS = 1000  # of the worst runs, by each measure of badness
+WITHIN_BOUNDS_TEXT, LIMITED_TEXT = "within the published bounds", "completed, commands limited"
 
 
-class Bounds(NamedTuple):
+class RunLimits(NamedTuple):
     """What bounds the runs of a campaign, beside the scenario itself."""
 
     published: Mapping[str, Any] | None = None  # figures of the machine's paper
     spec: Spec | None = None  # whose [specification] counts
 
 
-UNBOUNDED = Bounds()
+NO_BOUNDS = RunLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +262,7 @@ class Summary:
     """
 
     plan: Plan
-    bounds: Bounds
+    bounds: RunLimits
     runs: int
     verdicts: NDArray[np.int64]
     within: int | None
@@ -332,7 +332,7 @@ class Summary:
         return Description(f"{title}: {self.runs} of {self.plan.samples} machines", tuple(rows))
 
 
-def summary_of(found: Campaign, bounds: Bounds = UNBOUNDED) -> Summary:
+def summary_of(found: Campaign, bounds: RunLimits = NO_BOUNDS) -> Summary:
     """The summary of a campaign whose runs are in memory, or of one block of it.
 
     found = malta.campaign(plan)
@@ -357,7 +357,7 @@ def summary_of(found: Campaign, bounds: Bounds = UNBOUNDED) -> Summary:
     )
 
 
-def as_summary(found: Campaign | Summary, bounds: Bounds) -> Summary:
+def as_summary(found: Campaign | Summary, bounds: RunLimits) -> Summary:
     """A summary, which has its own bounds, or that of a campaign in memory."""
     return found if isinstance(found, Summary) else summary_of(found, bounds)
 
@@ -403,7 +403,7 @@ def _join_merits(one: Distribution, other: Distribution) -> Distribution:
 def ways_to_end(plan: Plan) -> tuple[str, ...]:
     """Names of the ways in which a run may end, the best first: verdicts, with success in three grades."""
     names = verdicts(plan.plant)
-    return (WITHIN, LIMITED, *names)
+    return (WITHIN_BOUNDS_TEXT, LIMITED_TEXT, *names)
 
 
 def bin_edges(plan: Plan, name: str) -> FloatArray:
@@ -431,7 +431,7 @@ def _bands(found: Campaign, within: NDArray[np.bool_] | None) -> NDArray[np.int6
 
 
 def worst_runs(summary: Summary, count: int) -> Runs:
-    """The worst runs, the worst first, at most KEPT: those that ended early, then those closest to a contact.
+    """The worst runs, the worst first, at most KEPT_RUNS: those that ended early, then those closest to a contact.
 
     Closeness is relative to the median of the completed runs, because the scenario itself may come near an end stop.
     """
@@ -439,15 +439,15 @@ def worst_runs(summary: Summary, count: int) -> Runs:
     completed = runs.batch.completed == 1
     closest = -closeness(summary, runs)
     order = np.lexsort((runs.index, np.where(completed, closest, runs.batch.duration), completed))
-    return runs.take(order[: min(count, KEPT)])
+    return runs.take(order[: min(count, KEPT_RUNS)])
 
 
 def closeness(summary: Summary, runs: Runs) -> FloatArray:
     """How much more of its clearance each run uses up than the median of the completed runs, at its worst contact."""
     medians = [m.percentiles([50])[0] for m in summary.listed if m.kind == CLEARANCE]
-    contact = np.nan_to_num(runs.batch.contact, posinf=LARGEST_FIGURE, neginf=-LARGEST_FIGURE)
+    contact = np.nan_to_num(runs.batch.contact, posinf=MAX_FIGURE, neginf=-MAX_FIGURE)
     # a run that diverged may have any
-    away = np.clip(contact, -LARGEST_FIGURE, LARGEST_FIGURE) - np.array(medians)
+    away = np.clip(contact, -MAX_FIGURE, MAX_FIGURE) - np.array(medians)
     return np.asarray(away.max(axis=1) if away.shape[1] else np.zeros(len(runs.index)))
 
 
@@ -458,19 +458,19 @@ def worst_of(found: Campaign, count: int) -> list[int]:
 
 
 def _keep(runs: Runs) -> Runs:
-    """The runs of which the worst may be: the first KEPT that ended early, and the closest to each contact.
+    """The runs of which the worst may be: the first KEPT_RUNS that ended early, and the closest to each contact.
 
-    A run among the KEPT worst is among the KEPT closest to that contact to which it is closest relative to the median:
-    every run before it there is worse.
+    A run among the KEPT_RUNS worst is among the KEPT_RUNS closest to that contact to which it is closest relative to
+    the median: every run before it there is worse.
     """
-    if len(runs.index) <= KEPT:
+    if len(runs.index) <= KEPT_RUNS:
         return runs
     completed = runs.batch.completed == 1
     measures = [np.where(completed, np.inf, runs.batch.duration)]
     measures += [np.where(completed, -column, np.inf) for column in runs.batch.contact.T]
     if not runs.batch.contact.shape[1]:
         measures.append(np.where(completed, 0.0, np.inf))
-    rows = [np.lexsort((runs.index, measure))[:KEPT] for measure in measures]
+    rows = [np.lexsort((runs.index, measure))[:KEPT_RUNS] for measure in measures]
     return runs.take(np.unique(np.concatenate(rows)))
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 
-from .check import Verdict, check
-from .file import Claim, Unreadable, double
+from .check import CertificateVerdict, check
+from .file import StabilityClaim, Unreadable, double
 
 
 def main(arguments: list[str]) -> int:
@@ -23,7 +23,7 @@ def main(arguments: list[str]) -> int:
     return 0 if found.ok else 1
 
 
-def _lines(found: Verdict) -> list[str]:
+def _lines(found: CertificateVerdict) -> list[str]:
     """The claim with its box, the groups, the verdict."""
     box = [
         f"{p.name} in [{double(p.interval[0])!r}, {double(p.interval[1])!r}] {p.unit or ''}".rstrip()
@@ -33,7 +33,7 @@ def _lines(found: Verdict) -> list[str]:
     return [_subject(found.stated), *box, *found.groups, f"stable in {found.claim!r} of the box: {verdict}"]
 
 
-def _subject(claim: Claim) -> str:
+def _subject(claim: StabilityClaim) -> str:
     """Whose loops these are said to be."""
     origin, T = claim.origin, claim.sample_time
     whose = "matrices of no machine" if origin is None else f"{origin.machine}, law {origin.law}"

@@ -25,8 +25,8 @@ from typing import Any
 
 from flint import acb, arb, arb_mat, arb_poly, ctx, fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 
-from .file import Axis, Claim, Document, Part, double, inside, read
-from .loop import Polynomial, Refused, split
+from .file import AxisEnclosure, Document, StabilityClaim, StatedPart, double, inside, read
+from .loop import CheckedPolynomial, Refused, split
 
 BITS = 256  # of the coefficients; cells need fewer
 CELL_BITS = 160
@@ -36,7 +36,7 @@ Box = Sequence[tuple[Any, Any]]
 
 
 @dataclass(frozen=True)
-class Verdict:
+class CertificateVerdict:
     """What a certificate claims, and whether it holds.
 
     ok : whether it does
@@ -51,13 +51,13 @@ class Verdict:
     claim: float
     groups: tuple[str, ...]
     failures: tuple[str, ...]
-    stated: Claim
+    stated: StabilityClaim
     compared: bool
 
 
 def check(
     path: str | Path, seconds: float = 600.0, compare: Callable[[Document], str] | None = None
-) -> Verdict:
+) -> CertificateVerdict:
     """Whether a certificate holds.
 
     path : of the certificate
@@ -73,7 +73,7 @@ def check(
         refused = compare(document)
     lines, failures = ([], [refused]) if refused else _proofs(document, time.monotonic() + seconds)
     claim, compared = double(document.claim.lower), compare is not None and not refused
-    return Verdict(not failures, claim, tuple(lines), tuple(failures), document.claim, compared)
+    return CertificateVerdict(not failures, claim, tuple(lines), tuple(failures), document.claim, compared)
 
 
 def _contradiction(document: Document) -> str:
@@ -108,14 +108,14 @@ def _proofs(document: Document, until: float) -> tuple[list[str], list[str]]:
     return lines, failures
 
 
-def proven(claim: Claim, f: Polynomial, until: float) -> str:
+def proven(claim: StabilityClaim, f: CheckedPolynomial, until: float) -> str:
     """One line of what was shown. Raises Refused."""
     group, parameters, unit = f.group, claim.parameters, (fmpq(0), fmpq(1))
     ctx.prec = 2 * BITS
     nominal = [1 / p.nominal if inv else p.nominal for p, inv in zip(parameters, group.inverted, strict=True)]
     if not stable(f.at([arb(x) for x in nominal])):
         raise Refused("the nominal loop is not shown to be stable")
-    if not tiled([part.box for part in group.parts], [p.sides(claim.lower) for p in parameters], until):
+    if not tiles_box([part.box for part in group.parts], [p.sides(claim.lower) for p in parameters], until):
         raise Refused("the parts of the box leave a gap")
     for k, part in enumerate(group.parts):
         ends = [max((c.high for c in part.cells if c.branch == branch), default=fmpq(0)) for branch in (0, 1)]
@@ -123,7 +123,7 @@ def proven(claim: Claim, f: Polynomial, until: float) -> str:
             raise Refused("frequencies between the two branches are missing")
         for branch in (0, 1):
             cells = [((c.low, c.high), *c.box) for c in part.cells if c.branch == branch]
-            if not tiled(cells, [(fmpq(0), ends[branch]), *([unit] * len(part.box))], until):
+            if not tiles_box(cells, [(fmpq(0), ends[branch]), *([unit] * len(part.box))], until):
                 raise Refused(f"the cells of part {k + 1} leave a gap")
         if any(a <= 0 <= b for (a, b), inv in zip(part.box, group.inverted, strict=True) if inv):
             raise Refused("a parameter that divides reaches zero")
@@ -133,8 +133,8 @@ def proven(claim: Claim, f: Polynomial, until: float) -> str:
         over = balls(box)
         if not all(abs(r.at(over)) > 0 for r in f.leading):
             raise Refused("E is not shown to be invertible")
-        values, left = interpolated(f, box, part.axes, until)
-        excluded(*bernstein(values, left, part.axes), f.moved(over), part, until)
+        values, left = interpolate(f, box, part.axes, until)
+        check_exclusion(*bernstein(values, left, part.axes), f.dust_bounds(over), part, until)
     count = sum(len(part.cells) for part in group.parts)
     return f"{len(group.states)} + {len(group.own)} states, {count} cells, all above zero"
 
@@ -154,7 +154,7 @@ def stable(a: list[Any]) -> bool:
     return bool(sign * one[0] > 0)
 
 
-def tiled(cells: Sequence[Any], whole: Box, until: float = math.inf) -> bool:
+def tiles_box(cells: Sequence[Any], whole: Box, until: float = math.inf) -> bool:
     """Whether boxes cover a box: within it they do not overlap, and their volumes add up to its volume."""
     wide = [i for i, (a, b) in enumerate(whole) if a < b]
     own = [[(max(a, c), min(b, d)) for (a, b), (c, d) in zip(cell, whole, strict=True)] for cell in cells]
@@ -174,8 +174,8 @@ def tiled(cells: Sequence[Any], whole: Box, until: float = math.inf) -> bool:
     return bool(sum(volumes[:-1], fmpq(0)) == volumes[-1])
 
 
-def interpolated(
-    f: Polynomial, box: Box, axes: Sequence[Axis], until: float = math.inf
+def interpolate(
+    f: CheckedPolynomial, box: Box, axes: Sequence[AxisEnclosure], until: float = math.inf
 ) -> tuple[list[Any], list[Any]]:
     """a_0, a_1, ... in products of Chebyshev polynomials T_k(1 - 2 u), and bounds of what is left out of each.
 
@@ -208,7 +208,7 @@ def interpolated(
     return values, left
 
 
-def within(f: Polynomial, box: Box, i: int, rho: Any) -> list[Any]:
+def within(f: CheckedPolynomial, box: Box, i: int, rho: Any) -> list[Any]:
     """Bounds of |a_k| with v_i in the rectangle about Bernstein's ellipse rho."""
     v = balls(box)
     half, middle = arb((box[i][1] - box[i][0]) / 2), arb((box[i][0] + box[i][1]) / 2)
@@ -222,7 +222,9 @@ def within(f: Polynomial, box: Box, i: int, rho: Any) -> list[Any]:
         ctx.prec = BITS
 
 
-def bernstein(values: list[Any], left: list[Any], axes: Sequence[Axis]) -> tuple[list[Any], tuple[int, ...]]:
+def bernstein(
+    values: list[Any], left: list[Any], axes: Sequence[AxisEnclosure]
+) -> tuple[list[Any], tuple[int, ...]]:
     """Bernstein coefficients of the degrees that are kept; the other terms, |T_k| <= 1, join what is left out."""
     shape, kept, rest = [axis.degree + 1 for axis in axes], [], list(left)
     new = tuple(axis.kept + 1 for axis in axes)
@@ -250,7 +252,9 @@ def along(values: list[Any], n: int, after: int, matrix: Any) -> list[Any]:
     return [made[(i * before + b) * after + a] for b in range(before) for i in range(m) for a in range(after)]
 
 
-def excluded(values: list[Any], shape: tuple[int, ...], b: list[Any], part: Part, until: float) -> None:
+def check_exclusion(
+    values: list[Any], shape: tuple[int, ...], b: list[Any], part: StatedPart, until: float
+) -> None:
     """Re(conj(c) a(jw; p)) > |c| b(w) on each cell. Raises Refused.
 
     A polynomial lies between its Bernstein coefficients; those over a part of an interval are values of its blossom.

@@ -16,9 +16,9 @@ from typing import Any
 from flint import fmpq
 
 FORMAT, VERSION = "malta margin certificate", 2
-LARGEST = 4_000_000  # bytes of a certificate
+MAX_BYTES = 4_000_000  # bytes of a certificate
 STAGES = ("lag", "pi")  # of current loops: first-order lags, or the sampled PI controllers of the gain file
-LONG = 100  # characters of a name
+MAX_NAME_LENGTH = 100  # characters of a name
 ARITY = {
     "assign": 1, "neg": 1, "sq": 1, "twice": 1, "inv": 1, "constpow": 1,
     "add": 2, "sub": 2, "mul": 2, "div": 2, "input": 0, "const": 0,
@@ -35,7 +35,7 @@ class Unreadable(ValueError):
 
 
 @dataclass(frozen=True)
-class Parameter:
+class StatedParameter:
     """p in [nominal - t down + over[0], nominal + t up + over[1]], SI; `over` does not grow with the margin t."""
 
     name: str
@@ -52,7 +52,7 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Origin:
+class StatedOrigin:
     """The machine and the law that the loops are said to be of."""
 
     machine: str
@@ -63,7 +63,7 @@ class Origin:
 
 
 @dataclass(frozen=True)
-class Places:
+class StatedPlaces:
     """Where each loop stands along the travel, which is no parameter then."""
 
     name: str
@@ -72,18 +72,18 @@ class Places:
 
 
 @dataclass(frozen=True)
-class Claim:
+class StabilityClaim:
     """Every loop is stable for all p in the sides at `lower`."""
 
     lower: Any
-    origin: Origin | None  # None: of matrices alone
+    origin: StatedOrigin | None  # None: of matrices alone
     sample_time: Any  # s; None: continuous
-    places: Places | None  # None: all loops are of the whole travel, or of no travel
-    parameters: tuple[Parameter, ...]
+    places: StatedPlaces | None  # None: all loops are of the whole travel, or of no travel
+    parameters: tuple[StatedParameter, ...]
 
 
 @dataclass(frozen=True)
-class Cell:
+class StatedCell:
     """Where Re(conj(re + j im) a) > 0 is claimed: x in [low, high], v in its shares of the part's box.
 
     Branch 0: s = j x 2^scale; branch 1: s = j 2^scale / x.
@@ -98,7 +98,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Axis:
+class AxisEnclosure:
     """How a part is enclosed along one parameter: degree of interpolation, ellipse it is bounded in, degree kept."""
 
     degree: int
@@ -107,23 +107,23 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class Part:
+class StatedPart:
     """A part of the box of p, and its cells."""
 
-    axes: tuple[Axis, ...]
+    axes: tuple[AxisEnclosure, ...]
     box: tuple[tuple[Any, Any], ...]
     scale: int
-    cells: tuple[Cell, ...]
+    cells: tuple[StatedCell, ...]
 
 
 @dataclass(frozen=True)
-class Group:
+class StatedGroup:
     """States of the system and of the compensator; parameters whose v is 1 / p."""
 
     states: tuple[int, ...]
     own: tuple[int, ...]
     inverted: tuple[bool, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[StatedPart, ...]
 
     def members(self, n: int) -> tuple[int, ...]:
         """Numbers of the states, those of the compensator after the system's n."""
@@ -131,7 +131,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Loop:
+class StatedLoop:
     """E x' = A x + B u (x+ where discrete), y = C x, u = F y after hold, delay (samples) and lag (rad/s)."""
 
     states: int
@@ -143,7 +143,7 @@ class Loop:
     delay: int
     lag: Any
     units: tuple[int, ...]  # log2 of sizes of the states, in which small couplings are bounded
-    groups: tuple[Group, ...]
+    groups: tuple[StatedGroup, ...]
 
     @property
     def held(self) -> bool:
@@ -155,13 +155,13 @@ class Loop:
 class Document:
     """What is claimed, and of which loops; sha256: what the file says and what it is."""
 
-    claim: Claim
-    loops: tuple[Loop, ...]
+    claim: StabilityClaim
+    loops: tuple[StatedLoop, ...]
     sealed: bool
 
 
 @dataclass(frozen=True)
-class Field:
+class DocumentValue:
     """A value of the file and its place, which every complaint names."""
 
     file: Path
@@ -171,25 +171,25 @@ class Field:
     def wrong(self, expected: str) -> Unreadable:
         return Unreadable(self.file, self.name, repr(self.value)[:60], expected)
 
-    def __getitem__(self, key: str) -> Field:
+    def __getitem__(self, key: str) -> DocumentValue:
         if not isinstance(self.value, dict):
             raise self.wrong(f"a table with {key}")
         if key not in self.value:
             raise Unreadable(self.file, f"{self.name}.{key}".lstrip("."), "nothing", "a value")
-        return Field(self.file, f"{self.name}.{key}".lstrip("."), self.value[key])
+        return DocumentValue(self.file, f"{self.name}.{key}".lstrip("."), self.value[key])
 
-    def items(self, least: int, most: int | None = None) -> list[Field]:
+    def items(self, least: int, most: int | None = None) -> list[DocumentValue]:
         most = least if most is None else most
         if not isinstance(self.value, list) or not least <= len(self.value) <= most:
             raise self.wrong(f"a list of {least} to {most} items")
-        return [Field(self.file, f"{self.name}[{k}]", x) for k, x in enumerate(self.value)]
+        return [DocumentValue(self.file, f"{self.name}[{k}]", x) for k, x in enumerate(self.value)]
 
     def whole(self, low: int, high: int) -> int:
         if type(self.value) is not int or not low <= self.value <= high:
             raise self.wrong(f"a whole number from {low} to {high}")
         return self.value
 
-    def text(self, longest: int = LONG) -> str:
+    def text(self, longest: int = MAX_NAME_LENGTH) -> str:
         """A name that a terminal can print."""
         found = self.value
         if not (isinstance(found, str) and len(found) <= longest and found.isprintable()):
@@ -228,7 +228,7 @@ class Field:
         return tuple(x.whole(0, count - 1) for x in self.items(0, max(count, 1)))
 
 
-def parameter(f: Field, known: bool) -> Parameter:
+def parameter(f: DocumentValue, known: bool) -> StatedParameter:
     """A parameter of the box; `known`: of a machine, which gives it a unit."""
     over = f["over"].pair()
     if not over[0] <= 0 <= over[1]:
@@ -237,10 +237,10 @@ def parameter(f: Field, known: bool) -> Parameter:
         raise f["unit"].wrong("null without a machine")
     unit = f["unit"].text() if known else None
     grows = (f["down"].number(0), f["up"].number(0))
-    return Parameter(f["name"].text(), unit, f["nominal"].number(), *grows, over, f["interval"].pair())
+    return StatedParameter(f["name"].text(), unit, f["nominal"].number(), *grows, over, f["interval"].pair())
 
 
-def claim(f: Field, loops: int) -> Claim:
+def claim(f: DocumentValue, loops: int) -> StabilityClaim:
     """What the certificate claims of so many loops."""
     machine, law, stage = f["machine"], f["law"], f["current_loops"]
     origin = None
@@ -250,20 +250,20 @@ def claim(f: Field, loops: int) -> Claim:
         seal = law["sha256"].text(64)
         if len(seal) != 64 or set(seal) - set("0123456789abcdef"):
             raise law["sha256"].wrong("64 hexadecimal digits")
-        origin = Origin(
+        origin = StatedOrigin(
             machine["name"].text(), machine["preset"].text(), law["name"].text(), seal, stage.value
         )
     T, where, places = f["sample_time"], f["places"], None
     if where.value is not None:
         at = tuple(x.number() for x in where["at"].items(loops))
-        places = Places(where["name"].text(), where["unit"].text(), at)
+        places = StatedPlaces(where["name"].text(), where["unit"].text(), at)
     elif origin is not None and loops > 1:
         raise where.wrong(f"the places of {loops} loops along the travel")
     parameters = tuple(parameter(x, origin is not None) for x in f["parameters"].items(1, 20))
     if len({p.name for p in parameters}) < len(parameters):
         raise f["parameters"].wrong("each parameter once")
     time = None if T.value is None else T.number(1e-90)
-    return Claim(f["lower"].number(1e-9, 10_000), origin, time, places, parameters)
+    return StabilityClaim(f["lower"].number(1e-9, 10_000), origin, time, places, parameters)
 
 
 def double(x: Any) -> float:
@@ -281,7 +281,7 @@ def inside(low: Any, high: Any) -> tuple[float, float]:
     return first, last
 
 
-def step(f: Field, k: int, inputs: int) -> tuple[str, int, tuple[int, ...], Any]:
+def step(f: DocumentValue, k: int, inputs: int) -> tuple[str, int, tuple[int, ...], Any]:
     """The k-th step: what is done, which input, on which steps before it, with which number."""
     name, target, on, number = f.items(4)
     operands, value = on.indices(k), number.number()
@@ -292,7 +292,7 @@ def step(f: Field, k: int, inputs: int) -> tuple[str, int, tuple[int, ...], Any]
     return name.value, target.whole(0, inputs - 1 if name.value == "input" else 0), operands, value
 
 
-def entries(f: Field, rows: int, columns: int, steps: int) -> tuple[tuple[int, int, int], ...]:
+def entries(f: DocumentValue, rows: int, columns: int, steps: int) -> tuple[tuple[int, int, int], ...]:
     found = {}
     for row in f.items(0, rows * columns):
         i, j, which = row.items(3)
@@ -300,7 +300,7 @@ def entries(f: Field, rows: int, columns: int, steps: int) -> tuple[tuple[int, i
     return tuple((*at, which) for at, which in found.items())
 
 
-def loop(f: Field, inputs: int) -> Loop:
+def loop(f: DocumentValue, inputs: int) -> StatedLoop:
     n, m, p = (x.whole(1, 60) for x in f["shape"].items(3))
     steps = tuple(step(x, k, inputs) for k, x in enumerate(f["steps"].items(0, 20_000)))
     shapes = {"A": (n, n), "B": (n, m), "C": (p, n)} | ({"E": (n, n)} if "E" in f.value else {})
@@ -316,31 +316,33 @@ def loop(f: Field, inputs: int) -> Loop:
         raise f["discrete"].wrong("false, or a sample time and no lag")
     groups = tuple(group(g, n, k, inputs) for g in f["groups"].items(0, n + k))
     units = tuple(x.whole(-300, 300) for x in f["units"].items(n + k))
-    return Loop(
+    return StatedLoop(
         n, steps, tuple(matrices),
         tuple(law[key].matrix(*at) for key, at in (("A", (k, k)), ("B", (k, p)), ("C", (m, k)), ("D", (m, p)))),
         T, discrete, f["delay"].whole(0, 20 if T is not None else 0), lag, units, groups,
     )  # fmt: skip
 
 
-def group(f: Field, n: int, k: int, inputs: int) -> Group:
+def group(f: DocumentValue, n: int, k: int, inputs: int) -> StatedGroup:
     inverted = tuple(x.truth() for x in f["inverted"].items(inputs))
     parts = tuple(part(x, inputs) for x in f["parts"].items(0, 256))
-    return Group(f["states"].indices(n), f["own"].indices(k), inverted, parts)
+    return StatedGroup(f["states"].indices(n), f["own"].indices(k), inverted, parts)
 
 
-def part(f: Field, inputs: int) -> Part:
+def part(f: DocumentValue, inputs: int) -> StatedPart:
     cells = []
     for row in f["cells"].items(1, 20_000):
         branch, low, high, shares, re, im = row.items(6)
-        ends = Field(f.file, row.name, [low.value, high.value]).pair(0)
+        ends = DocumentValue(f.file, row.name, [low.value, high.value]).pair(0)
         box = tuple(x.pair(0, 1) for x in shares.items(inputs))
-        cells.append(Cell(branch.whole(0, 1), *ends, box, re.number(), im.number()))
+        cells.append(StatedCell(branch.whole(0, 1), *ends, box, re.number(), im.number()))
     axes = []
     for x in f["axes"].items(inputs):
         degree, rho, kept = x.items(3)
-        axes.append(Axis(degree.whole(0, 24), rho.number(1.001, 1e30), kept.whole(0, degree.whole(0, 24))))
-    return Part(
+        axes.append(
+            AxisEnclosure(degree.whole(0, 24), rho.number(1.001, 1e30), kept.whole(0, degree.whole(0, 24)))
+        )
+    return StatedPart(
         tuple(axes),
         tuple(x.pair() for x in f["box"].items(inputs)),
         f["scale"].whole(-300, 300),
@@ -360,8 +362,8 @@ def content_of(path: Path) -> dict[str, Any]:
         if not (path.is_file() or path.is_dir()) and path.exists():
             raise Unreadable(path, "", "a pipe or a device", "a certificate")
         size = path.stat().st_size
-        if size > LARGEST:
-            raise Unreadable(path, "", f"{size} bytes", f"a certificate of at most {LARGEST}")
+        if size > MAX_BYTES:
+            raise Unreadable(path, "", f"{size} bytes", f"a certificate of at most {MAX_BYTES}")
         content = json.loads(path.read_bytes().decode())
     except Unreadable:
         raise
@@ -369,7 +371,7 @@ def content_of(path: Path) -> dict[str, Any]:
         raise Unreadable(path, "", error.strerror or "an unreadable file", "a certificate") from error
     except (ValueError, RecursionError) as error:
         raise Unreadable(path, "", f"no JSON ({str(error)[:80]})", "a certificate") from error
-    f = Field(path, "", content)
+    f = DocumentValue(path, "", content)
     if f["format"].value != FORMAT or f["version"].value != VERSION:
         raise f["version"].wrong(f"{FORMAT}, version {VERSION}")
     assert isinstance(content, dict)
@@ -379,7 +381,7 @@ def content_of(path: Path) -> dict[str, Any]:
 def read(path: Path) -> Document:
     """A certificate. Raises Unreadable for files that cannot be read, and fields that are missing or wrong."""
     content = content_of(path)
-    f = Field(path, "", content)
+    f = DocumentValue(path, "", content)
     several = f["loops"].items(1, 20)
     made = claim(f["claim"], len(several))
     loops = tuple(loop(x, len(made.parameters)) for x in several)

@@ -19,7 +19,7 @@ from typing import Any
 
 from flint import Ordering, acb, arb, arb_mat, arb_poly, fmpq_mpoly_ctx
 
-from .file import Group, Loop
+from .file import StatedGroup, StatedLoop
 
 MOST_TERMS = 2000  # of an expression
 SIDES = {"A": (0, 0), "K": (0, 0), "F": (0, 1), "H": (1, 0), "L": (1, 1)}  # rows, columns: 0 of x, 1 of xi
@@ -32,7 +32,7 @@ class Refused(Exception):
     """Why a certificate does not hold."""
 
 
-class Ratio:
+class CheckedRatio:
     """num / den, polynomials of v in lowest terms."""
 
     def __init__(self, num: Any, den: Any) -> None:
@@ -42,22 +42,22 @@ class Ratio:
         if len(terms) > MOST_TERMS or max(c.height_bits() for c in terms) > 50_000:
             raise Refused("expressions that are too long")
 
-    def __add__(self, other: Ratio) -> Ratio:
-        return Ratio(self.num * other.den + other.num * self.den, self.den * other.den)
+    def __add__(self, other: CheckedRatio) -> CheckedRatio:
+        return CheckedRatio(self.num * other.den + other.num * self.den, self.den * other.den)
 
-    def __neg__(self) -> Ratio:
-        return Ratio(-self.num, self.den)
+    def __neg__(self) -> CheckedRatio:
+        return CheckedRatio(-self.num, self.den)
 
-    def __mul__(self, other: Ratio) -> Ratio:
-        return Ratio(self.num * other.num, self.den * other.den)
+    def __mul__(self, other: CheckedRatio) -> CheckedRatio:
+        return CheckedRatio(self.num * other.num, self.den * other.den)
 
-    def __truediv__(self, other: Ratio) -> Ratio:
+    def __truediv__(self, other: CheckedRatio) -> CheckedRatio:
         if other.num.is_zero():
             raise Refused("a division by zero")
-        return Ratio(self.num * other.den, self.den * other.num)
+        return CheckedRatio(self.num * other.den, self.den * other.num)
 
-    def __pow__(self, power: int) -> Ratio:
-        whole = Ratio(self.num ** abs(power), self.den ** abs(power))
+    def __pow__(self, power: int) -> CheckedRatio:
+        whole = CheckedRatio(self.num ** abs(power), self.den ** abs(power))
         return whole if power >= 0 else whole / (whole * whole)
 
     @cached_property
@@ -89,16 +89,16 @@ STEPS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def expressions(loop: Loop, inverted: Sequence[bool], until: float) -> dict[str, Table]:
+def expressions(loop: StatedLoop, inverted: Sequence[bool], until: float) -> dict[str, Table]:
     """A, K, F, H and L as rational functions of v: the program run on them, and products with the compensator's."""
     context = fmpq_mpoly_ctx.get([f"v{i}" for i in range(len(inverted))], Ordering.lex)
     unit = context.constant(1)
-    cells: list[Ratio] = []
+    cells: list[CheckedRatio] = []
     for name, target, on, value in loop.steps:
         if time.monotonic() > until:
             raise Refused("time is up")
         if name in ("input", "const"):
-            v = Ratio(context.gens()[target] if name == "input" else context.constant(value), unit)
+            v = CheckedRatio(context.gens()[target] if name == "input" else context.constant(value), unit)
             cells.append(v**-1 if name == "input" and inverted[target] else v)
         else:
             operands = [cells[i] for i in on]
@@ -107,7 +107,7 @@ def expressions(loop: Loop, inverted: Sequence[bool], until: float) -> dict[str,
     A, B = ({(i, j): r / E[i, i] if E else r for (i, j), r in m.items()} for m in (A, B))
     a, b, c, d = (
         {
-            (i, j): Ratio(context.constant(x), unit)
+            (i, j): CheckedRatio(context.constant(x), unit)
             for i, row in enumerate(m)
             for j, x in enumerate(row)
             if x != 0
@@ -128,12 +128,12 @@ def times(one: Table, two: Table) -> Table:
     return {at: r for at, r in found.items() if not r.num.is_zero()}
 
 
-def split(loop: Loop, until: float = math.inf) -> list[Polynomial]:
+def split(loop: StatedLoop, until: float = math.inf) -> list[CheckedPolynomial]:
     """The characteristic polynomial of each group, in its own v.
 
     Where couplings only lead from groups to later ones, the loop's pencil is block triangular: its determinant is the
-    product of the groups'. Where some lead back, all between groups are dust (`Polynomial.moved`), which holds cannot
-    have within their exponential. Raises Refused.
+    product of the groups'. Where some lead back, all between groups are dust (`CheckedPolynomial.moved`), which holds
+    cannot have within their exponential. Raises Refused.
     """
     n, whole = loop.states, {g.inverted: expressions(loop, g.inverted, until) for g in loop.groups}
     place = {i: k for k, group in enumerate(loop.groups) for i in group.members(n)}
@@ -155,15 +155,20 @@ def split(loop: Loop, until: float = math.inf) -> list[Polynomial]:
         if back and loop.held and any(name == "A" for name, *_ in dust):
             raise Refused("groups that act on one another between samples")
         leading = [whole[group.inverted]["E"][i, i] for i in group.states if loop.entries[3]]
-        found.append(Polynomial(loop, group, inside, dust if back else [], leading))
+        found.append(CheckedPolynomial(loop, group, inside, dust if back else [], leading))
     return found
 
 
-class Polynomial:
+class CheckedPolynomial:
     """a_0 ... a_N of det P at balls of v, and bounds over complex balls."""
 
     def __init__(
-        self, loop: Loop, group: Group, inside: dict[str, Table], dust: list[Any], leading: list[Ratio]
+        self,
+        loop: StatedLoop,
+        group: StatedGroup,
+        inside: dict[str, Table],
+        dust: list[Any],
+        leading: list[CheckedRatio],
     ) -> None:
         self.loop, self.group, self.leading = loop, group, leading
         forces = [(i, r) for name in "KF" for (i, _), r in inside[name].items()]
@@ -171,7 +176,7 @@ class Polynomial:
         q: dict[int, Any] = {}
         for i, r in sorted(forces, key=lambda force: force[0]):
             q[i] = r.den if i not in q else q[i] * r.den / q[i].gcd(r.den)
-        self.q = {i: Ratio(x, x * 0 + 1) for i, x in q.items()}
+        self.q = {i: CheckedRatio(x, x * 0 + 1) for i, x in q.items()}
         row = {i: k for k, i in enumerate(q)}
         self.tables = inside | {
             name: {(row[i], j): self.q[i] * r for (i, j), r in inside[name].items()} for name in "KF"
@@ -198,20 +203,20 @@ class Polynomial:
     def at(self, v: Sequence[Any]) -> list[Any]:
         """Coefficients at real balls: of the closed loop, without f."""
         (t, q), (w, r, k) = self.values(v), self.shape
-        phi, gamma = (matrix(x) for x in self._driven(t["A"], bounds=False))
+        phi, gamma = (matrix(x) for x in self._windings(t["A"], bounds=False))
         K, F = ({(i, j): x / q[i] for (i, j), x in t[name].items()} for name in "KF")
         inner, outer = phi + gamma * matrix(dense(r, w, K), w), gamma * matrix(dense(r, k, F), k)
         closed = matrix(blocks([inner.tolist(), outer.tolist()], [dense(k, w, t["H"]), self._law(t["L"])]))
         a = [x * math.prod(q, start=arb(1)) for x in closed.charpoly().coeffs()]
         a += [arb(0)] * (w + k + 1 - len(a))
-        return a if self.loop.sample_time is None else mapped(a, [1, -1])
+        return a if self.loop.sample_time is None else map_to_disc(a, [1, -1])
 
     def bounds(self, v: Sequence[Any]) -> list[Any]:
         """At least |a_k| for all complex v in balls."""
         a = determinant_bounds(*self.sizes(v))
-        return a if self.loop.sample_time is None else mapped(a, [1, 1])
+        return a if self.loop.sample_time is None else map_to_disc(a, [1, 1])
 
-    def moved(self, v: Sequence[Any]) -> list[Any]:
+    def dust_bounds(self, v: Sequence[Any]) -> list[Any]:
         """Coefficients of b such that dust e leaves the loop's pencil regular where |a(jw)| > b(w) in each group.
 
         P + e is regular where in some units d of the states the row sums of |P^-1 e| are below one. By Cramer's rule
@@ -227,13 +232,13 @@ class Polynomial:
         if not all(x.is_finite() for x in e):
             raise Refused("a division by what may be zero")
         b = determinant_bounds(m, dynamic, e, self.units)
-        return b if self.loop.sample_time is None else mapped(b, [1, 1], [1, 0, 1])
+        return b if self.loop.sample_time is None else map_to_disc(b, [1, 1], [1, 0, 1])
 
     def sizes(self, v: Sequence[Any]) -> tuple[Rows, list[bool]]:
         """Bounds of the entries of P, and in which rows g stands."""
         (t, q), (w, r, k) = self.values(v), self.shape
         m = blocks(
-            [*self._driven(t["A"], bounds=True), dense(w, k)],
+            [*self._windings(t["A"], bounds=True), dense(w, k)],
             [dense(r, w, t["K"]), dense(r, r, {(i, i): x for i, x in enumerate(q)}), dense(r, k, t["F"])],
             [dense(k, w, t["H"]), dense(k, r), self._law(t["L"])],
         )
@@ -243,7 +248,7 @@ class Polynomial:
         k, one = self.shape[2], int(self.loop.sample_time is not None)
         return [[x - one * (i == j) for j, x in enumerate(row)] for i, row in enumerate(dense(k, k, L))]
 
-    def _driven(self, table: Table, *, bounds: bool) -> tuple[Rows, Rows]:
+    def _windings(self, table: Table, *, bounds: bool) -> tuple[Rows, Rows]:
         """Phi and Gamma: of x, then a lag of each force, then forces under way, of which the latest enters last."""
         loop, n, r = self.loop, len(self.group.states), len(self.q)
         a, b = dense(n, n, table), dense(n, r, {(i, k): arb(1) for k, i in enumerate(self.q)})
@@ -316,7 +321,7 @@ def height(x: Any) -> float:
 # polynomials and determinants
 
 
-def mapped(a: list[Any], one: list[int], square: list[int] | None = None) -> list[Any]:
+def map_to_disc(a: list[Any], one: list[int], square: list[int] | None = None) -> list[Any]:
     """(1 - v)^N a(g) for g = z - 1 = 2 v / (1 - v), where `one` is 1 - v.
 
     With 1 + v in its place: bounds of these coefficients. With 1 + v^2 for its square: of |(1 - v)^N a|, v on the axis.
@@ -353,7 +358,7 @@ def determinant_bounds(
             for j, x in enumerate(row)
             if x > 0 or (i == j and dynamic[i])
         ]
-        d = balanced(n, [(i, j, max(height(x), -250.0)) for i, j, x in full], d)
+        d = balance_units(n, [(i, j, max(height(x), -250.0)) for i, j, x in full], d)
         own, lines = [round(x) for x in d], [arb(0)] * n
         for i, j, x in full:
             lines[i] += (x * arb(2) ** (own[j] - own[i])) ** 2
@@ -366,7 +371,7 @@ def determinant_bounds(
     return best
 
 
-def balanced(n: int, heights: list[tuple[int, int, float]], d: list[float]) -> list[float]:
+def balance_units(n: int, heights: list[tuple[int, int, float]], d: list[float]) -> list[float]:
     """log2 of units in which the product of the rows' lengths is small: Sinkhorn's iteration, from d."""
     for _ in range(6):
         rows, columns = [0.0] * n, [0.0] * n

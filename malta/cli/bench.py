@@ -26,12 +26,12 @@ from malta.cli.options import (
     read_uncertainty,
     require_suffixes,
 )
-from malta.cli.output import make_console, print_document, print_note, print_text, print_written, working
+from malta.cli.output import make_console, print_document, print_note, print_text, print_written, progress_on
 from malta.errors import CheckError, InputError
 from malta.files import PICTURES, replace_files
 
 if TYPE_CHECKING:
-    from malta.identification.commission import Commissioning, Step
+    from malta.identification.commission import Check, Commissioning
     from malta.identification.measure import Measurement
     from malta.synthesis.controller import Controller
 
@@ -107,8 +107,8 @@ def measure(
         return
     if not logs:
         raise InputError("malta measure", "LOG", "none", "a log, or --plan")
-    with working(f"measuring from {', '.join(map(str, logs))}"):
-        found = _measured(gains, controller, logs, uncertain, identified)
+    with progress_on(f"measuring from {', '.join(map(str, logs))}"):
+        found = _measure(gains, controller, logs, uncertain, identified)
     files = []
     if out is not None:
         from malta.report.figures import measured_figure, save
@@ -130,7 +130,7 @@ def _require_no(given: Any, what: str) -> None:
         raise InputError("malta measure", "", what, "one of them")
 
 
-def _measured(
+def _measure(
     gains: Path,
     controller: Controller,
     logs: list[Path],
@@ -290,7 +290,7 @@ def commission(
         raise CheckError(f"step {last.name} failed: {last.refusal or bad}")
 
 
-def _print_plan(steps: tuple[Step, ...]) -> None:
+def _print_plan(steps: tuple[Check, ...]) -> None:
     """The checklist, as it stands before the first step."""
     from malta.report.tables.experiments import checklist_table
 

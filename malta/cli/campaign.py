@@ -49,8 +49,8 @@ if TYPE_CHECKING:
     from malta.campaigns.limits import Limit
     from malta.campaigns.plan import Law, Plan, Sampler
     from malta.campaigns.run import Status
-    from malta.campaigns.summary import Bounds, Summary
-    from malta.cli.documents.loops import Part
+    from malta.campaigns.summary import RunLimits, Summary
+    from malta.cli.documents.loops import DocumentPart
     from malta.simulation.experiments import Progress
 
 
@@ -86,7 +86,7 @@ def show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: S
     """Print the status of the campaign in a folder. Raises InputError for options that the campaign decides."""
     from malta.campaigns.run import status as status_of
     from malta.campaigns.store import noted_gains
-    from malta.campaigns.summary import Bounds
+    from malta.campaigns.summary import RunLimits
     from malta.model.data import plant_of, published_figures
 
     sources = {param: ctx.get_parameter_source(str(param.name)) for param in ctx.command.params}
@@ -101,7 +101,7 @@ def show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: S
     gains = noted_gains(folder) if gains is None else gains
     controller = read_controller(gains, options.machine)
     published = published_figures(plant_of(controller.parameters).name)
-    bounds = Bounds(published, find_design(gains, controller, options.design))
+    bounds = RunLimits(published, find_design(gains, controller, options.design))
     with progress_bar("status") as progress:
         found = status_of(folder, controller, bounds, progress)
     if options.as_json:
@@ -150,7 +150,7 @@ class Setting(NamedTuple):
 
     gains: Path
     plan: Plan
-    bounds: Bounds
+    bounds: RunLimits
     folder: Path
     workers: int | None
     as_json: bool
@@ -181,10 +181,10 @@ def choose_study(name: str | None, limit: str | None, keep: str | None, cluster:
     return Study(name, limit or "touchdown", wanted)
 
 
-class Outcome(NamedTuple):
+class StudyOutcome(NamedTuple):
     """What a study leaves behind."""
 
-    document: Part
+    document: DocumentPart
     files: list[Path]
     parts: list[Any]  # tables and lines for the console
     note: str  # "": none
@@ -193,7 +193,7 @@ class Outcome(NamedTuple):
 def run_study(study: Study, setting: Setting) -> None:
     """Run a study, write it into the campaign's folder and print it; exit with code 130 after Ctrl-C."""
     from malta.campaigns.plan import planned_run
-    from malta.campaigns.run import Session, campaign_folder
+    from malta.campaigns.run import RunExecution, campaign_folder
     from malta.report.tables.campaign import box_text, run_text
     from malta.simulation.engine.batch import is_compiled
 
@@ -201,7 +201,7 @@ def run_study(study: Study, setting: Setting) -> None:
         _print_limits(setting.plan)
         raise typer.Exit
     limit = read_limit(study.limit, setting.plan, setting.bounds)
-    what, session = f"{setting.plan.scenario}, {study.name}", Session(setting.workers)
+    what, session = f"{setting.plan.scenario}, {study.name}", RunExecution(setting.workers)
     folder = campaign_folder(setting.plan, setting.folder, session, setting.gains)
     with folder, progress_bar(what, insists=False) as bar:
         progress = limit_time(bar, what, agreed=setting.yes)
@@ -227,7 +227,7 @@ def run_study(study: Study, setting: Setting) -> None:
         print_note(NO_COMPILER)
 
 
-def _rare(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> Outcome:
+def _rare(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> StudyOutcome:
     """The probability of exceeding a limit."""
     from malta.campaigns.rare import event_name, rare_event, write_event
     from malta.cli.documents.campaigns import RareOutput, rare_fields
@@ -243,10 +243,10 @@ def _rare(limit: Limit, _: float, setting: Setting, progress: Progress | None) -
         place = f"{setting.folder}:{event_name(limit)}"
         parts.append(f"the design point again: malta simulate {setting.gains} --replay {place}")
     document = RareOutput(**_head(setting, files), **rare_fields(event))
-    return Outcome(document, files, parts, rare_event_sentence(event))
+    return StudyOutcome(document, files, parts, rare_event_sentence(event))
 
 
-def _sobol(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> Outcome:
+def _sobol(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> StudyOutcome:
     """Which parameter costs yield."""
     from malta.campaigns.studies import sensitivity, sensitivity_document
     from malta.cli.documents.campaigns import SobolOutput, sobol_fields
@@ -259,10 +259,10 @@ def _sobol(limit: Limit, _: float, setting: Setting, progress: Progress | None) 
         files.append(setting.folder / f"sobol_{limit.slug}.png")
         sensitivity_figure(found, files[-1])
     output = SobolOutput(**_head(setting, files), **sobol_fields(found))
-    return Outcome(output, files, [sensitivity_tables(found)], sensitivity_sentence(found))
+    return StudyOutcome(output, files, [sensitivity_tables(found)], sensitivity_sentence(found))
 
 
-def _tolerance(limit: Limit, wanted: float, setting: Setting, progress: Progress | None) -> Outcome:
+def _tolerance(limit: Limit, wanted: float, setting: Setting, progress: Progress | None) -> StudyOutcome:
     """The largest spreads that keep a yield."""
     from malta.campaigns.studies import tolerance_document, tolerances
     from malta.cli.documents.campaigns import ToleranceOutput, tolerance_fields
@@ -271,7 +271,7 @@ def _tolerance(limit: Limit, wanted: float, setting: Setting, progress: Progress
     found = tolerances(setting.plan, limit, wanted, workers=setting.workers, progress=progress)
     files = [_write(setting, f"tolerance_{limit.slug}.json", tolerance_document(found))]
     output = ToleranceOutput(**_head(setting, files), **tolerance_fields(found))
-    return Outcome(output, files, [spreads_table(found)], tolerance_sentence(found))
+    return StudyOutcome(output, files, [spreads_table(found)], tolerance_sentence(found))
 
 
 def _head(setting: Setting, files: list[Path]) -> dict[str, Any]:
@@ -290,7 +290,7 @@ def _write(setting: Setting, name: str, document: dict[str, Any]) -> Path:
     return path
 
 
-def read_limit(text: str, plan: Plan, bounds: Bounds) -> Limit:
+def read_limit(text: str, plan: Plan, bounds: RunLimits) -> Limit:
     """Read a limit: "touchdown", "published", "specification", or a merit with its bound, as "deviation-y1=20um".
 
     A bound without a unit is in SI. Raises InputError for any other text.
@@ -443,10 +443,10 @@ def campaign(
     if gains is None:
         raise InputError("campaign", "GAINS", "nothing", "a gain file, or --status FOLDER")
     from malta.campaigns.plan import Plan
-    from malta.campaigns.run import Session, campaign_folder, summarize
-    from malta.campaigns.summary import Bounds
+    from malta.campaigns.run import RunExecution, campaign_folder, summarize
+    from malta.campaigns.summary import RunLimits
     from malta.model.data import plant_of, published_figures
-    from malta.simulation.experiments.catalogue import main_job, settling
+    from malta.simulation.experiments.catalogue import main_job, settling_option
 
     controller = read_controller(gains, machine)
     parameters = change_machine(controller.parameters, change)
@@ -459,7 +459,7 @@ def campaign(
     asked = choose_study(study, limit, keep, cluster)
     options = {"noise": 1.0} | read_options(option, scenario, plant)
     if study != "rare":
-        options = settling(scenario, plant) | options
+        options = settling_option(scenario, plant) | options
     plan = Plan(
         controller,
         scenario,
@@ -473,12 +473,12 @@ def campaign(
         options,
         cast("Law", law),
     )
-    bounds = Bounds(published, find_design(gains, controller, design))
+    bounds = RunLimits(published, find_design(gains, controller, design))
     folder = out or Path("build") / "campaigns" / f"{controller.name}_{scenario}_{plan.identity[:8]}"
     if asked is not None:
         run_study(asked, Setting(gains, plan, bounds, folder, workers, as_json, yes))
         return
-    session = Session(workers, cluster)
+    session = RunExecution(workers, cluster)
     with campaign_folder(plan, folder, session, gains), progress_bar(scenario, insists=False) as bar:
         progress = limit_time(bar, f"{scenario}, {samples} runs", agreed=yes)
         result = summarize(plan, folder, bounds, workers=workers, cluster=cluster, progress=progress)

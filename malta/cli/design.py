@@ -26,7 +26,7 @@ from malta.cli.output import (
     print_error,
     print_written,
     progress_bar,
-    working,
+    progress_on,
 )
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, replace_files, shipped_path
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from malta.synthesis.filter_check import FilterCheck
     from malta.synthesis.spec import Pid, Spec
     from malta.tuning.search import Effort
-    from malta.tuning.tune import Tuned
+    from malta.tuning.tune import TuningResult
 
 
 def design(
@@ -77,7 +77,7 @@ def design(
     chosen = design_files("design", files)
     for n, file in enumerate(chosen):
         try:
-            with working(
+            with progress_on(
                 f"designing {file}" + (f" ({n + 1} of {len(chosen)})" if len(chosen) > 1 else "")
             ) as work:
                 made = _run_design(file, change, out or gains_folder(file), figures, sources, work.note)
@@ -229,7 +229,7 @@ def _simulate_gain_file(
 
 
 EXAMPLE = "ball"  # the folder of examples/ that a new machine begins as
-NEXT = """
+NEXT_STEPS = """
 Try it, from the folder {name}/:
     malta design
     malta verify design/gains/{name}.json --machine {name}.py
@@ -280,7 +280,7 @@ def new(
     )
     console = make_console()
     print_written(console, renamed)
-    console.print(NEXT.format(name=name), soft_wrap=True)  # commands stay whole, to be copied
+    console.print(NEXT_STEPS.format(name=name), soft_wrap=True)  # commands stay whole, to be copied
 
 
 def _is_source(path: Path) -> bool:
@@ -379,7 +379,7 @@ def _tune_structure(spec: Spec, target: Path, *, as_json: bool) -> None:
     from malta.structured.design import structured_text, tune_design
     from malta.tuning.verify import judge
 
-    with working(f"tuning {spec.name}") as work:
+    with progress_on(f"tuning {spec.name}") as work:
         found = tune_design(spec, note=work.note)
         replace_files({target: structured_text(found.spec, target).encode()})
         work.note("requirements")
@@ -403,7 +403,7 @@ def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:
     from malta import report
     from malta.tuning.verify import judge
 
-    with working(f"judging {spec.name}"):
+    with progress_on(f"judging {spec.name}"):
         requirements = judge(spec)
     if as_json:
         from malta.cli.documents.loops import RequirementPart
@@ -416,7 +416,7 @@ def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:
     _require_all(requirements, file)
 
 
-def _search(spec: Spec, journal: Path, effort: Effort, *, restart: bool) -> Tuned:
+def _search(spec: Spec, journal: Path, effort: Effort, *, restart: bool) -> TuningResult:
     """Search the numbers behind a progress bar; Ctrl-C names the journal of the trials and ends with code 130."""
     from malta.tuning.tune import tune as search
 
@@ -427,7 +427,7 @@ def _search(spec: Spec, journal: Path, effort: Effort, *, restart: bool) -> Tune
             raise interruption(f"the same command goes on from {journal}") from None
 
 
-def _write(spec: Spec, tuned: Tuned, target: Path) -> list[Path]:
+def _write(spec: Spec, tuned: TuningResult, target: Path) -> list[Path]:
     """Write the design file that was found; beside it the Pareto front where there is one."""
     from malta import report
     from malta.tuning.tune import design_text
@@ -443,7 +443,7 @@ def _write(spec: Spec, tuned: Tuned, target: Path) -> list[Path]:
     return [*files, picture]
 
 
-def _print_tables(tuned: Tuned, files: Sequence[Path]) -> None:
+def _print_tables(tuned: TuningResult, files: Sequence[Path]) -> None:
     """Print the Pareto front where there is one, the requirements, and the files."""
     from malta import report
 

@@ -16,7 +16,7 @@ from malta.cli.output import (
     print_note,
     print_written,
     progress_bar,
-    working,
+    progress_on,
 )
 from malta.errors import InputError
 from malta.units import to_si
@@ -107,7 +107,7 @@ def export(
     if to == "fmu":
         own = part or "controller"
         file = out or Path("build") / f"{controller.name}_{own}.fmu"
-        with working("exporting"):
+        with progress_on("exporting"):
             chosen["platforms"] = None if platforms is None else platforms.replace(" ", "").split(",")
             note = export_fmu(gains, file, part=cast("Any", own), fmi=fmi or 2, **chosen)
         if note:
@@ -121,7 +121,7 @@ def export(
                 "proving the margin with other gains, minutes for some designs; --no-proof leaves it out"
             )
         folder = out or Path("build") / f"{controller.name}_c"
-        with working("exporting"):
+        with progress_on("exporting"):
             files = export_c(
                 gains,
                 folder,

@@ -23,7 +23,14 @@ from malta.cli.options import (
     require_suffixes,
     verify_and_write,
 )
-from malta.cli.output import make_console, print_document, print_text, print_written, progress_bar, working
+from malta.cli.output import (
+    make_console,
+    print_document,
+    print_text,
+    print_written,
+    progress_bar,
+    progress_on,
+)
 from malta.errors import CheckError, InputError
 from malta.files import PICTURES, replace_files
 
@@ -106,7 +113,7 @@ def identify(
         )
     if loaded is not None and robust:
         raise InputError("--robust", "", "two logs", "one log: two are estimated at the lines alone")
-    with working(f"identifying from {log}"):
+    with progress_on(f"identifying from {log}"):
         read = read_log(log, (*GROUPS, "u") if drive else GROUPS)
         windings = identify_windings(controller, read) if drive else None
         if loaded is not None:
@@ -510,10 +517,10 @@ def _learn_strokes(
     from malta.report.tables.experiments import strokes_table
 
     plant = plant_of(change_machine(controller.parameters, change))
-    with working(f"{strokes} strokes"):
+    with progress_on(f"{strokes} strokes"):
         found = learn_strokes(plant, controller, strokes=strokes)
     box = read_uncertainty(gains, uncertain, controller.parameters)
-    with working("proving that errors shrink"):
+    with progress_on("proving that errors shrink"):
         shrinks = contraction(controller, box) if box else None
     files = _write_taught(
         found.controller, controller, gains, out, "no --out: the force constant is not learned"
@@ -572,7 +579,7 @@ def replay(gains: GainFile, log: LogFile, machine: MachineFile = None, as_json: 
     from malta.report.tables.experiments import replay_table
 
     controller = read_controller(gains, machine)
-    with working(f"replaying {log}"):
+    with progress_on(f"replaying {log}"):
         exact = replay_dump(controller, log) if log.suffix == ".dump" else None
     if exact is not None and not as_json:
         count = f"{exact.same} of {exact.samples} samples"
@@ -581,7 +588,7 @@ def replay(gains: GainFile, log: LogFile, machine: MachineFile = None, as_json: 
         raise CheckError(
             f"{log}: from {exact.first:.6g} s on the exported C commands other bits: another export flew"
         )
-    with working(f"replaying {log}"):
+    with progress_on(f"replaying {log}"):
         found = replay_law(controller, read_log(log), same=None if exact is None else True)
     if as_json:
         from malta.cli.documents.others import replay_output

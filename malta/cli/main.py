@@ -34,7 +34,7 @@ from malta.files import is_interrupt, noting_files, version
 # The class of all commands: help in panels, and the options of the version before, which say what replaces them.
 
 
-REST = "Options"  # the last panel of a help, of options without one
+LAST_PANEL = "Options"  # the last panel of a help, of options without one
 UNITS = {  # options that `--option NAME=VALUE` takes now, and the unit that their numbers had
     "distance": "mm", "rise": "ms", "profile": "", "during": "", "fidelity": "", "noise": "", "estimator": "",
     "feedforward": "", "bearing_axes": "", "delay": "", "substeps": "",
@@ -50,7 +50,7 @@ STUDIES = {
 KINDS = {"integer": "N", "integer range": "N", "text": "WORD"}  # of a value without a name
 
 
-class Command(TyperCommand):
+class PanelCommand(TyperCommand):
     """A command whose help has a panel for each group of options."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -71,12 +71,12 @@ class Command(TyperCommand):
             if record is not None and param.param_type_name == "argument":
                 record = _name_of(param), record[1]
             if record is not None:
-                own = getattr(param, "rich_help_panel", None) or REST
+                own = getattr(param, "rich_help_panel", None) or LAST_PANEL
                 panels.setdefault("Arguments" if param.param_type_name == "argument" else own, []).append(
                     record
                 )
-        rest = panels.pop(REST, [])
-        for heading, rows in [*panels.items(), (REST, rest)]:
+        rest = panels.pop(LAST_PANEL, [])
+        for heading, rows in [*panels.items(), (LAST_PANEL, rest)]:
             if rows:
                 with formatter.section(heading):
                     formatter.write_dl(rows)
@@ -140,7 +140,7 @@ class Commands(Mapping[str, Any]):
         """The command of a name. Raises KeyError for an unknown one."""
         if name not in self._made:
             alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-            alone.command(cls=Command)(self._functions[name])
+            alone.command(cls=PanelCommand)(self._functions[name])
             self._made[name] = get_command(alone)
         return self._made[name]
 

@@ -33,7 +33,7 @@ class GeneralOption(NamedTuple):
 
 
 # Fields of Scenario; each may be given as `--option NAME=VALUE`.
-GENERAL: Mapping[str, GeneralOption] = {
+SCENARIO_FIELDS: Mapping[str, GeneralOption] = {
     "fidelity": GeneralOption(
         "", "force, dq (PI loops on the windings) or phase; the scenario's own without it"
     ),
@@ -176,7 +176,11 @@ def read_options(texts: list[str] | None, scenario: str, plant: Plant) -> dict[s
         name, value = _split(text)
         if not (name and value):
             raise InputError("--option", "", repr(text), "NAME=VALUE")
-        default = GENERAL[name].default if name in GENERAL else option_of(scenario, plant, name, GENERAL)
+        default = (
+            SCENARIO_FIELDS[name].default
+            if name in SCENARIO_FIELDS
+            else option_of(scenario, plant, name, SCENARIO_FIELDS)
+        )
         _require_once("--option", name, value, merged)
         merged[name] = _read_like(default, value, units.get(name, "1"), name)
     return merged
@@ -370,7 +374,7 @@ MachineFile = Annotated[
 # What commands read before they begin: design files, the changed machine, published figures, scenarios.
 
 
-LONGEST_NAME = 48  # letters of the changes in the name of a design; more are shortened to a number
+MAX_NAME_LENGTH = 48  # letters of the changes in the name of a design; more are shortened to a number
 
 
 def design_files(
@@ -504,7 +508,7 @@ def name_of_changes(changes: list[str]) -> str:
     words = re.sub(r"(?<!\d)\.(?=\d)", "0.", " ".join(changes)).replace("%", "percent")
     words = re.sub(r"[\u00b5\u03bc]", "u", words)  # micro
     words = re.sub(r"[^A-Za-z0-9-]+", "_", words).strip("_")
-    return words if len(words) <= LONGEST_NAME else hashlib.sha256(words.encode()).hexdigest()[:8]
+    return words if len(words) <= MAX_NAME_LENGTH else hashlib.sha256(words.encode()).hexdigest()[:8]
 
 
 def change_machine(parameters: Parameters, changes: list[str] | None) -> Parameters:
@@ -537,5 +541,5 @@ def print_scenarios(plant: Plant, *, campaigns: bool = False) -> None:
     console = make_console()
     console.print(report.scenarios_table(plant, series_of(plant) if campaigns else None))
     console.print("Every scenario takes, as --option NAME=VALUE:")
-    for name, option in GENERAL.items():
+    for name, option in SCENARIO_FIELDS.items():
         console.print(f"  {name:12}  {option.meaning}", highlight=False)

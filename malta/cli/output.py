@@ -23,21 +23,21 @@ from malta.files import is_interrupt, json_text, press_again, watch_interrupts
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from malta.cli.documents.loops import Part
+    from malta.cli.documents.loops import DocumentPart
 
 
 # How long work may take that nobody agreed to: it is refused as soon as its own progress tells that it is longer.
 
 
-LONGEST = 600.0  # s, without --yes
-ENOUGH = 5.0  # s, between the two reports that an estimate is made of
-SURE = 60.0  # s, from the first report to the last estimate: who has waited longer is not refused
+UNCONFIRMED_TIME = 600.0  # s, without --yes
+ESTIMATE_INTERVAL = 5.0  # s, between the two reports that an estimate is made of
+ESTIMATE_PERIOD = 60.0  # s, from the first report to the last estimate: who has waited longer is not refused
 
 
 def limit_time(
     show: Callable[[float], None] | None, what: str, *, agreed: bool, times: float = 1.0
 ) -> Callable[[float], None] | None:
-    """The function that takes the share done, 0 to 1, shows it, and refuses work that takes more than LONGEST.
+    """The function that takes the share done, 0 to 1, shows it, and refuses work that takes more than UNCONFIRMED_TIME.
 
     what : the work, for the sentence;  agreed : whether the user said --yes: nothing is refused
     times : the work that follows, as a multiple of the one that reports
@@ -60,12 +60,12 @@ def limit_time(
         if begun is None:
             begun, looked = now, (now, share)
         since, done = now - looked[0], share - looked[1]
-        if since < ENOUGH or done <= 0 or now - begun > SURE:
+        if since < ESTIMATE_INTERVAL or done <= 0 or now - begun > ESTIMATE_PERIOD:
             return
         looked = now, share
         total = times * (now - begun + (1 - share) * since / done)
-        if total > LONGEST:
-            found, most = f"about {duration_text(total)} of work", duration_text(LONGEST)
+        if total > UNCONFIRMED_TIME:
+            found, most = f"about {duration_text(total)} of work", duration_text(UNCONFIRMED_TIME)
             raise InputError(what, "", found, f"at most {most}, or --yes")
 
     return report
@@ -80,11 +80,11 @@ def duration_text(seconds: float) -> str:
 
 
 WIDTH = 100  # columns of tables on wide terminals, and in files and pipes where COLUMNS says nothing else
-NARROWEST = 20  # columns; COLUMNS below is no width
+MIN_WIDTH = 20  # columns; COLUMNS below is no width
 PATIENCE = 2.0  # s, from the begin of work to the first line about it
 INTERVAL = 2.0  # s, between the first lines
 NO_COMPILER = "no C compiler: simulated on CasADi's virtual machine, some hundred times slower"
-DROPPED = 2.0  # s after Ctrl-C; work that goes on has not heard of it
+INTERRUPT_TIME = 2.0  # s after Ctrl-C; work that goes on has not heard of it
 LINES = 10.0  # s, between later lines
 
 
@@ -100,7 +100,7 @@ def make_console() -> Console:
         console.width = min(console.width, WIDTH)
     else:
         columns = os.environ.get("COLUMNS", "")
-        console.width = max(int(columns), NARROWEST) if re.fullmatch(r"0*[1-9]\d{0,3}", columns) else WIDTH
+        console.width = max(int(columns), MIN_WIDTH) if re.fullmatch(r"0*[1-9]\d{0,3}", columns) else WIDTH
     return console
 
 
@@ -130,7 +130,7 @@ def print_written(console: Console, files: Iterable[Path]) -> None:
         console.print(f"wrote {file}", soft_wrap=True)
 
 
-def print_document(document: Part) -> None:
+def print_document(document: DocumentPart) -> None:
     """Print one JSON document, its schema and version first; numbers that are not finite become null."""
     content = document.model_dump(by_alias=True)
     head = {key: content.pop(key) for key in ("schema", "version")}
@@ -160,12 +160,12 @@ def print_error(error: InputError | CheckError, file: Path | None = None) -> int
     return 1 if failed else 2
 
 
-class Work:
+class WorkProgress:
     """Work that takes a while, and what is known of how far it is.
 
     Whoever works reports; a thread speaks where no report comes. Lines on standard error begin after PATIENCE and
     become rarer, up to one in LINES. Libraries may drop the KeyboardInterrupt of Ctrl-C: where the work goes on
-    DROPPED seconds after it, the thread presses again.
+    INTERRUPT_TIME seconds after it, the thread presses again.
 
     insists : whether it does; not for work that ends by itself after Ctrl-C, with what it has
     """
@@ -207,17 +207,17 @@ class Work:
         """Print lines as they become due, and press Ctrl-C again where it was dropped, until the work has ended."""
         while not self.ended.wait(min(max(self.due - time.monotonic(), 0.05), 0.25)):
             self.speak()
-            if self.insists and self.pressed and time.monotonic() > self.pressed[-1] + DROPPED:
+            if self.insists and self.pressed and time.monotonic() > self.pressed[-1] + INTERRUPT_TIME:
                 press_again()
 
 
 @contextmanager
-def working(what: str, *, insists: bool = True) -> Iterator[Work]:
+def progress_on(what: str, *, insists: bool = True) -> Iterator[WorkProgress]:
     """Say how far work is on standard error: a bar on a terminal, elsewhere lines. `insists` as of Work.
 
     Example: `with working("claims") as work: work.report(0.5)`
     """
-    work = Work(what, insists=insists)
+    work = WorkProgress(what, insists=insists)
     thread = Thread(target=work.attend, daemon=True)
     with watch_interrupts() as work.pressed, _draw_bar(work) if sys.stderr.isatty() else nullcontext():
         thread.start()
@@ -229,7 +229,7 @@ def working(what: str, *, insists: bool = True) -> Iterator[Work]:
 
 
 @contextmanager
-def _draw_bar(work: Work) -> Iterator[None]:
+def _draw_bar(work: WorkProgress) -> Iterator[None]:
     """Draw a bar for work on a terminal: it pulses until the first report, then has the time left."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -254,7 +254,7 @@ def _draw_bar(work: Work) -> Iterator[None]:
 @contextmanager
 def progress_bar(what: str, *, insists: bool = True) -> Iterator[Callable[[float], None]]:
     """Say how far work is; yields the function that takes the share done, 0 to 1. `insists` as of Work."""
-    with working(what, insists=insists) as work:
+    with progress_on(what, insists=insists) as work:
         yield work.report
 
 
@@ -265,7 +265,7 @@ def margin_progress(what: str) -> Iterator[tuple[Callable[[float], None], Callab
     Yields the functions that take the share done and the bounds. Ctrl-C prints the last bounds and ends with exit
     code 130.
     """
-    with working(what) as work:
+    with progress_on(what) as work:
         try:
             yield work.report, work.bound
         except (KeyboardInterrupt, RuntimeError, SystemError) as error:

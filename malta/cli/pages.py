@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from malta.report.ledger import Ledger
     from malta.synthesis.spec import Spec
 
-FIRST = "design"  # the folder whose first design opens where none is named
+FIRST_FOLDER = "design"  # the folder whose first design opens where none is named
 
 
 def app(
@@ -93,9 +93,9 @@ def _design_file(named: Path | None) -> Path:
                 named, "", "a gain file", "the design file that it was made of, as design/NAME.toml"
             )
         return locate(named)
-    found = sorted(Path(FIRST).glob("*.toml"))
+    found = sorted(Path(FIRST_FOLDER).glob("*.toml"))
     if not found:
-        raise InputError("app", "", "no design file", f"its name, or a folder {FIRST}/ with some")
+        raise InputError("app", "", "no design file", f"its name, or a folder {FIRST_FOLDER}/ with some")
     return found[0]
 
 
@@ -256,14 +256,16 @@ def _compute_each(groups: Sequence[Sequence[Spec]], progress: Callable[[float], 
 
     A campaign or an experiment that is cut short hands over what it has, of which a paper's figures cannot be made.
     """
-    from malta.model.data import published
+    from malta.model.data import read_published
     from malta.report.ledger import ledger
     from malta.simulation.experiments import progress_of_part
 
     with watch_interrupts() as pressed:
         try:
             found = [
-                ledger(group, published(group[0].machine_file), progress_of_part(progress, n, len(groups)))
+                ledger(
+                    group, read_published(group[0].machine_file), progress_of_part(progress, n, len(groups))
+                )
                 for n, group in enumerate(groups)
             ]
         except Exception:

@@ -154,10 +154,10 @@ def campaigns_of(
     if not folders and not kept:
         return []
     from malta.campaigns.run import status
-    from malta.campaigns.summary import Bounds
+    from malta.campaigns.summary import RunLimits
     from malta.model.data import plant_of, published_figures
 
-    bounds = Bounds(published_figures(plant_of(controller.parameters).name), spec)
+    bounds = RunLimits(published_figures(plant_of(controller.parameters).name), spec)
     found = []
     for folder in folders or kept:
         try:
@@ -190,7 +190,7 @@ SUFFIXES = (".png", ".svg", ".pdf")
 Machines = Mapping[str, tuple["Plant", "Controller"]]  # by the names of their loops
 
 
-class Picture(NamedTuple):
+class NamedFigure(NamedTuple):
     """A figure with the name that its file gets: NAME_KIND."""
 
     name: str
@@ -445,7 +445,7 @@ def _draw(
     planes: Sequence[RootLocus | MarginMap],
     *,
     named: bool,
-) -> list[Picture]:
+) -> list[NamedFigure]:
     """The pictures of all kinds; a root locus and a margin map are drawn of each loop.
 
     named : whether the user named the channels
@@ -474,17 +474,18 @@ def _draw(
         if kind == LOCUS:
             loci = [found for found in planes if not isinstance(found, MarginMap)]
             pictures += [
-                Picture(f"{found.name}_{LOCUS}", plots.root_locus(found, loops[found.name])) for found in loci
+                NamedFigure(f"{found.name}_{LOCUS}", plots.root_locus(found, loops[found.name]))
+                for found in loci
             ]
         elif kind == MAP:
             maps = [found for found in planes if isinstance(found, MarginMap)]
-            pictures += [Picture(f"{found.name}_{MAP}", plots.margin_map(found)) for found in maps]
+            pictures += [NamedFigure(f"{found.name}_{MAP}", plots.margin_map(found)) for found in maps]
         else:
-            pictures.append(Picture(f"{first}_{kind}", draw[kind]()))
+            pictures.append(NamedFigure(f"{first}_{kind}", draw[kind]()))
     return pictures
 
 
-def _save(pictures: Sequence[Picture], out: Path | None, *, dark: bool) -> list[Path]:
+def _save(pictures: Sequence[NamedFigure], out: Path | None, *, dark: bool) -> list[Path]:
     """Write the pictures to the file that was named, or to a folder as NAME_KIND.png, all or none."""
     from malta.report import encode_figure
 

@@ -40,7 +40,7 @@ from malta.errors import CheckError, InputError
 from malta.files import require_suffix
 
 if TYPE_CHECKING:
-    from malta.firmware.flight import Difference
+    from malta.firmware.flight import SignalDifference
     from malta.firmware.program import Precision
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
@@ -62,7 +62,7 @@ def require_controller(name: str, engine: str) -> None:
 
 def compare_flights(
     fly: Callable[[Any], Experiment], flown: Experiment
-) -> dict[str, dict[Precision, list[Difference]]]:
+) -> dict[str, dict[Precision, list[SignalDifference]]]:
     """The differences of the C's flights to those of the simulation's law, by case and precision.
 
     fly : makes the experiment with an engine; flown : that of the C in double precision
@@ -70,13 +70,13 @@ def compare_flights(
     from malta.firmware.flight import differences, engine_of_c
 
     own, single = fly("auto"), fly(engine_of_c("float"))
-    found: dict[str, dict[Precision, list[Difference]]] = {}
+    found: dict[str, dict[Precision, list[SignalDifference]]] = {}
     for case, c, f in zip(own.cases, flown.cases, single.cases, strict=True):
         found[case.label] = {"double": differences(case.run, c.run), "float": differences(case.run, f.run)}
     return found
 
 
-def comparison_table(title: str, found: dict[Precision, list[Difference]]) -> Any:
+def comparison_table(title: str, found: dict[Precision, list[SignalDifference]]) -> Any:
     """A table of the largest difference of each signal, as a share of its range."""
     from malta.report.tables import add_row, new_table
 
@@ -92,10 +92,10 @@ def titles(labels: Sequence[str]) -> list[str]:
     return [text if len(labels) == 1 else f"{text}: {label}" for label in labels]
 
 
-LONGEST_NUMBER = 20  # digits of a run; Python refuses thousands of them
+MAX_RUN_DIGITS = 20  # digits of a run; Python refuses thousands of them
 
 
-class Simulation(NamedTuple):
+class SimulatedScenario(NamedTuple):
     """A simulated scenario."""
 
     scenario: str
@@ -193,10 +193,10 @@ def simulate(
         # With substeps a second run, with twice as many, follows for the estimate of the error.
         progress = limit_time(bar, chosen, agreed=yes, times=times)
 
-        def fly(engine: Any) -> Simulation:
+        def fly(engine: Any) -> SimulatedScenario:
             if replay is None:
                 result = experiment(chosen, plant, controller, progress=progress, engine=engine, **options)
-                return Simulation(chosen, result, f"{controller.name}_{chosen}")
+                return SimulatedScenario(chosen, result, f"{controller.name}_{chosen}")
             given = {"--option": option, "--sensor": sensor, "--scenario": scenario, "--set": change}
             others = [name for name, value in given.items() if value]
             others += [] if seed is None else ["--seed"]
@@ -247,7 +247,7 @@ def _replay(
     others: Sequence[str],
     engine: Any,
     progress: Callable[[float], None] | None,
-) -> Simulation:
+) -> SimulatedScenario:
     """Simulate one run of a campaign, `FOLDER:RUN`, or the design point of a rare event, `FOLDER:rare_LIMIT`, again.
 
     Raises InputError for another form, and for `others`, the names of options that the campaign decides.
@@ -258,7 +258,7 @@ def _replay(
 
     folder, _, run = text.rpartition(":")
     event = run.startswith("rare_") and Path(run).name == run
-    if not folder or not ((run.isdecimal() and len(run) <= LONGEST_NUMBER) or event):
+    if not folder or not ((run.isdecimal() and len(run) <= MAX_RUN_DIGITS) or event):
         expected = "FOLDER:RUN, as build/campaigns/mine:17 or build/campaigns/mine:rare_touchdown"
         raise InputError("--replay", "", repr(text), expected)
     if others:
@@ -271,10 +271,10 @@ def _replay(
         result, name = replay_design_point(plan, point, engine=engine, progress=progress), run
     else:
         result, name = simulate_run(plan, int(run), engine=engine, progress=progress), f"run_{int(run)}"
-    return Simulation(plan.scenario, result, f"{controller.name}_{plan.scenario}_{name}")
+    return SimulatedScenario(plan.scenario, result, f"{controller.name}_{plan.scenario}_{name}")
 
 
-def _save(simulation: Simulation, folder: Path, published: Mapping[str, Any] | None) -> list[Path]:
+def _save(simulation: SimulatedScenario, folder: Path, published: Mapping[str, Any] | None) -> list[Path]:
     """Write the time series of every run, and the figure."""
     from malta import report
     from malta.simulation.trajectory import save as save_series
@@ -287,7 +287,7 @@ def _save(simulation: Simulation, folder: Path, published: Mapping[str, Any] | N
     return [*series, picture]
 
 
-def _save_gains(simulation: Simulation, gains: Path, folder: Path) -> list[Path]:
+def _save_gains(simulation: SimulatedScenario, gains: Path, folder: Path) -> list[Path]:
     """Verify the controller that an experiment has found, and write it."""
     controller = simulation.experiment.controller
     return [] if controller is None else verify_and_write(controller, gains, folder)
@@ -300,7 +300,7 @@ def _slug(label: str) -> str:
 
 def _print_tables(
     gains: Path,
-    simulation: Simulation,
+    simulation: SimulatedScenario,
     changes: Sequence[str],
     published: Mapping[str, Any] | None,
     *,
@@ -322,7 +322,7 @@ def _print_tables(
         print_text(console, f"integration error, estimated: {integration_error(run):.1g} {units}")
 
 
-def _conclude(gains: Path, simulation: Simulation, engine: str) -> None:
+def _conclude(gains: Path, simulation: SimulatedScenario, engine: str) -> None:
     """Note a missing compiler; exit with code 130 after Ctrl-C, raise CheckError when a run ended early."""
     from malta.model.data import plant_of
 

@@ -29,13 +29,13 @@ from malta.cli.output import (
     print_note,
     print_text,
     print_written,
-    working,
+    progress_on,
 )
 from malta.errors import CheckError, InputError, shorten
 
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
-    from malta.checker.check import Verdict
+    from malta.checker.check import CertificateVerdict
     from malta.cli.documents.others import CheckOutput
     from malta.identification.data_file import IdentifiedData
     from malta.loops.windings import CurrentLoops
@@ -242,7 +242,7 @@ def check(
     """
     from malta.gains.certified import check as check_certificate
 
-    with working(f"checking {file}"):
+    with progress_on(f"checking {file}"):
         box = None if gains is None else _box_of(gains, uncertain, machine)
         if gains is None and uncertain:
             raise InputError("--uncertain", "", "no gain file", "--gains GAINS, whose uncertainty it is")
@@ -260,7 +260,7 @@ def _box_of(gains: Path, uncertain: list[str] | None, machine: Path | None) -> d
     return read_uncertainty(gains, uncertain, controller.parameters) if uncertain else None
 
 
-def _print(file: Path, gains: Path | None, verdict: Verdict) -> None:
+def _print(file: Path, gains: Path | None, verdict: CertificateVerdict) -> None:
     """Print what is claimed, of what and where, and whether it holds."""
     from malta.report.tables import COLOURS
     from malta.report.tables.design import claim_share, claim_table, claim_text
@@ -283,7 +283,7 @@ def _print(file: Path, gains: Path | None, verdict: Verdict) -> None:
         print_note(shorten(f"{file}: {line}"))
 
 
-def _document(file: Path, verdict: Verdict) -> CheckOutput:
+def _document(file: Path, verdict: CertificateVerdict) -> CheckOutput:
     """The JSON document of a check."""
     from malta.cli.documents.others import CheckOutput, certified_part
 

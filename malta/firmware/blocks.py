@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 
 from malta.firmware.program import (
-    Block,
+    NamedEquation,
     Precision,
     Program,
     build_program,
@@ -24,9 +24,9 @@ from malta.firmware.program import (
 )
 from malta.model.equations import Equation
 
-LONGEST = 140  # operations of a function, with results that it only copies
-FEWEST, SMALLEST = 4, 8  # copies of a loop, and operations of each, for which it is worth it
-LEAVES = ("INPUT", "CONST")
+MAX_OPERATIONS = 140  # operations of a function, with results that it only copies
+MIN_COPIES, MIN_COPY_OPERATIONS = 4, 8  # copies of a loop, and operations of each, for which it is worth it
+LEAF_OPERATIONS = ("INPUT", "CONST")
 
 
 class Staged(NamedTuple):
@@ -34,7 +34,7 @@ class Staged(NamedTuple):
 
     plain: ca.Function  # with its own results alone
     whole: ca.Function
-    blocks: tuple[Block, ...]
+    blocks: tuple[NamedEquation, ...]
 
 
 Entry = tuple[str, int]  # of a vector
@@ -47,10 +47,10 @@ class Copy(NamedTuple):
     outputs: tuple[tuple[int, int, int], ...]  # result, entry, operation
 
 
-class Stage(NamedTuple):
+class BlockStage(NamedTuple):
     """A block, or a part of a long one, in a program."""
 
-    block: Block
+    block: NamedEquation
     part: int  # from 1; 0: the whole block
     operations: tuple[int, ...]  # that it computes, in order; of copies the first one's
     outputs: tuple[tuple[int, int, int], ...]  # result, entry, operation; of copies the first one's
@@ -68,7 +68,7 @@ def staged_function(
     that only bears an argument's name has its block's before it. The first note of a name counts. Raises KeyError for a
     result that no note names.
     """
-    blocks: list[Block] = []
+    blocks: list[NamedEquation] = []
     between: dict[str, Any] = {}
     known: set[str] = set()
     for block, text, values, times in equations:
@@ -78,7 +78,7 @@ def staged_function(
         known |= set(names)
         between |= {key: value for key, value in names.items() if key not in results}
         if names:
-            blocks.append(Block(block, text, tuple(names), times))
+            blocks.append(NamedEquation(block, text, tuple(names), times))
     if set(results) - known:
         raise KeyError(f"{name}: no equation gives {', '.join(sorted(set(results) - known))}")
     given = {key: ca.densify(ca.vec(ca.SX(value))) for key, value in {**results, **between}.items()}
@@ -103,17 +103,17 @@ def staged_program(s: Staged, precision: Precision) -> Program:
     return without_unused(whole._replace(blocks=blocks))
 
 
-def stages(p: Program) -> list[Stage]:
+def stages(p: Program) -> list[BlockStage]:
     """The blocks of a program in order, long ones in parts, those of equal computations as loops."""
     known = named_inputs(p)
-    found: list[Stage] = []
+    found: list[BlockStage] = []
     names = p.names
     for block in p.blocks:
         outputs = [o for result in block.results for o in p.outputs if names[o[0]] == result]
         loops = _loops(p, block, outputs, known)
         found += loops or _parts(p, block, _order(p, [k for *_, k in outputs], known), outputs)
         for i, j, k in outputs:
-            if p.operations[k].op not in LEAVES:
+            if p.operations[k].op not in LEAF_OPERATIONS:
                 known.setdefault(k, (names[i], j))
     return found
 
@@ -125,7 +125,7 @@ def named_inputs(p: Program) -> dict[int, Entry]:
     }
 
 
-def unrolled(p: Program) -> Program:
+def unroll(p: Program) -> Program:
     """The same program without loops."""
     return p._replace(blocks=tuple(block._replace(times=1) for block in p.blocks))
 
@@ -137,11 +137,11 @@ def _order(p: Program, wanted: Sequence[int], known: Container[int]) -> list[int
         waiting = [last]
         while waiting:
             k = waiting[-1]
-            if k in order or k in known or p.operations[k].op in LEAVES:
+            if k in order or k in known or p.operations[k].op in LEAF_OPERATIONS:
                 waiting.pop()
                 continue
             missing = [a for a in p.operations[k].operands if not (a in order or a in known)]
-            missing = [a for a in missing if p.operations[a].op not in LEAVES]
+            missing = [a for a in missing if p.operations[a].op not in LEAF_OPERATIONS]
             waiting += reversed(missing)
             if not missing:
                 order[k] = None
@@ -149,13 +149,13 @@ def _order(p: Program, wanted: Sequence[int], known: Container[int]) -> list[int
 
 
 def _loops(
-    p: Program, block: Block, outputs: list[tuple[int, int, int]], known: Mapping[int, Entry]
-) -> list[Stage]:
+    p: Program, block: NamedEquation, outputs: list[tuple[int, int, int]], known: Mapping[int, Entry]
+) -> list[BlockStage]:
     """A block of several equal computations as loops, one for each form that they have; none where it is not worth it.
 
     CasADi writes c x - c y as c (x - y), so that copies for equal numbers may have another form than others.
     """
-    if block.times < FEWEST or any(result.endswith("_next") for result in block.results):
+    if block.times < MIN_COPIES or any(result.endswith("_next") for result in block.results):
         return []
     sizes = dict((*p.results, *p.between))
     copies: list[list[tuple[int, int, int]]] = [[] for _ in range(block.times)]
@@ -171,15 +171,15 @@ def _loops(
         forms.setdefault(_form(p, copy, {**known, **{k: ("", -k - 1) for k in common}}, begins), []).append(
             copy
         )
-    loops = [of for of in forms.values() if len(of) >= FEWEST]
-    rest = [copy for of in forms.values() if len(of) < FEWEST for copy in of]
+    loops = [of for of in forms.values() if len(of) >= MIN_COPIES]
+    rest = [copy for of in forms.values() if len(of) < MIN_COPIES for copy in of]
     left = [o for copy in rest for o in copy.outputs]
     flat = list(_parts(p, block, _order(p, [k for *_, k in left], known), left)) if left else []
     each = sum(map(len, orders))
     written = len(common) + sum(len(of[0].operations) for of in loops) + sum(len(s.operations) for s in flat)
-    if written * 2 > each or each < SMALLEST * block.times or (common and len(loops) > 1):
+    if written * 2 > each or each < MIN_COPY_OPERATIONS * block.times or (common and len(loops) > 1):
         return []
-    found = [Stage(block, 0, *of[0], copies=tuple(of), common=tuple(common)) for of in loops] + flat
+    found = [BlockStage(block, 0, *of[0], copies=tuple(of), common=tuple(common)) for of in loops] + flat
     return [stage._replace(part=n if len(found) > 1 else 0) for n, stage in enumerate(found, 1)]
 
 
@@ -201,15 +201,15 @@ def _form(p: Program, copy: Copy, known: Mapping[int, Entry], begins: Mapping[in
 
 
 def _parts(
-    p: Program, block: Block, order: list[int], outputs: list[tuple[int, int, int]]
-) -> Iterator[Stage]:
-    """A block, in parts of LONGEST lines at most."""
+    p: Program, block: NamedEquation, order: list[int], outputs: list[tuple[int, int, int]]
+) -> Iterator[BlockStage]:
+    """A block, in parts of MAX_OPERATIONS lines at most."""
     results = {k for *_, k in outputs}
     copies = len(outputs) - len(results & set(order))
-    crossing = _crossing(p, order, results)
+    crossing = _count_crossings(p, order, results)
     edges = [0]
-    while len(order) + copies - edges[-1] > LONGEST and edges[-1] + LONGEST // 2 < len(order):
-        ends = range(edges[-1] + LONGEST // 2, min(edges[-1] + LONGEST, len(order) - 1) + 1)
+    while len(order) + copies - edges[-1] > MAX_OPERATIONS and edges[-1] + MAX_OPERATIONS // 2 < len(order):
+        ends = range(edges[-1] + MAX_OPERATIONS // 2, min(edges[-1] + MAX_OPERATIONS, len(order) - 1) + 1)
         edges.append(min(ends, key=lambda at: (crossing[at], -at)))
     edges.append(len(order))
     part_of = {k: n for n, (a, b) in enumerate(pairwise(edges)) for k in order[a:b]}
@@ -219,7 +219,7 @@ def _parts(
         own = tuple(order[a:b])
         mine = tuple(o for o in outputs if part_of.get(o[2], last) == n)
         handed = tuple(k for k in own if taken.get(k, 0) >= b and k not in results)
-        yield Stage(block, n + 1 if last else 0, own, mine, handed)
+        yield BlockStage(block, n + 1 if last else 0, own, mine, handed)
 
 
 def _last_use(p: Program, order: list[int]) -> dict[int, int]:
@@ -227,7 +227,7 @@ def _last_use(p: Program, order: list[int]) -> dict[int, int]:
     return {a: at for at, k in enumerate(order) for a in p.operations[k].operands}
 
 
-def _crossing(p: Program, order: list[int], results: set[int]) -> list[int]:
+def _count_crossings(p: Program, order: list[int], results: set[int]) -> list[int]:
     """Of each place in the order: how many values without a name are taken behind it."""
     change = [0] * (len(order) + 1)
     taken = _last_use(p, order)

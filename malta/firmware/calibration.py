@@ -19,24 +19,27 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.firmware.ctext import c_number, c_numbers
-from malta.firmware.signals import Field, Target
+from malta.firmware.signals import CField, Target
 from malta.firmware.supervisor import Monitor, monitors_of, reference_limits
 from malta.model.plant import Signal
 from malta.synthesis.controller import gains_of
 from malta.units import unit_factor
 
 SCATTER = 0.1  # share of each gain by which it may differ, either way
-SAME = {"double": 1e-9, "float": 1e-6}  # of a gain, by which entries with one factor may differ: rounding
-LEAST = 0.01  # share of a limit or of a reference that is left at least
+TOLERANCES = {
+    "double": 1e-9,
+    "float": 1e-6,
+}  # of a gain: rounding by which entries with one factor may differ
+MIN_LIMIT_SHARE = 0.01  # share of a limit or of a reference that is left at least
 FNV_START, FNV_FACTOR = 0x811C9DC5, 0x01000193
 GAINS = ("K", "Ki", "L")
 LAW = (*GAINS, "force_limit", "current_limit", "Kp", "Ki_current")  # of what a step computes with
 
 
-class Parameter(NamedTuple):
+class RecordMember(NamedTuple):
     """A member of the record with its numbers and the range of each."""
 
-    field: Field
+    field: CField
     values: FloatArray
     least: FloatArray
     most: FloatArray
@@ -44,7 +47,7 @@ class Parameter(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def parameters_of(t: Target) -> tuple[Parameter, ...]:
+def parameters_of(t: Target) -> tuple[RecordMember, ...]:
     """The real members of the record, in its order; none of a target that is not tunable.
 
     parameters_of(Target(controller, tunable=True))[0].field.name
@@ -68,7 +71,7 @@ def axes_of_rows(t: Target, name: str) -> list[int]:
     return [axis[row] for row, yes in zip(rows, is_tunable(gain), strict=True) if yes]
 
 
-def law_fields(t: Target) -> list[Field]:
+def law_fields(t: Target) -> list[CField]:
     """The members with which a step computes; none of a target that is not tunable."""
     return [p.field for p in parameters_of(t) if p.field.name in LAW]
 
@@ -109,7 +112,7 @@ def is_tunable(gain: ca.DM) -> list[bool]:
     return [abs(value) != 1 for value in gain.nonzeros()]
 
 
-def _law_parameters(t: Target) -> list[Parameter]:
+def _law_parameters(t: Target) -> list[RecordMember]:
     c = t.controller
     gains, proven = gains_of(c), proven_share(t)
     share, others = (SCATTER, SCATTER) if proven is None else (proven, 0.0)
@@ -121,15 +124,15 @@ def _law_parameters(t: Target) -> list[Parameter]:
         _gain("L", gains["L"], c.states, c.measurements, "gain of the filter", others),
     ]
     if np.isfinite(c.limits.force).all():
-        found.append(_shrinking("force_limit", c.forces, "limit of a force", c.limits.force))
+        found.append(_shrinking_member("force_limit", c.forces, "limit of a force", c.limits.force))
     coils = t.believed.actuator.coils
     limits = np.broadcast_to(c.limits.current, len(coils))
     if np.isfinite(limits).all():
-        found.append(_shrinking("current_limit", coils, "limit of a current", limits))
+        found.append(_shrinking_member("current_limit", coils, "limit of a current", limits))
     if t.driven and c.current_loop is not None:
         loop = c.current_loop
-        found.append(_scattered("Kp", (Signal("", "V/A"),), "of the current loops", [loop.Kp], others))
-        step = _scattered(
+        found.append(_scattered_member("Kp", (Signal("", "V/A"),), "of the current loops", [loop.Kp], others))
+        step = _scattered_member(
             "Ki_current",
             (Signal("", "V/A"),),
             "integral gain of the current loops, times the sample time",
@@ -149,7 +152,7 @@ def _gain(
     share: float,
     *,
     over: str = "",
-) -> Parameter:
+) -> RecordMember:
     """The entries of a gain that may be tuned, column by column."""
     kept = is_tunable(matrix)
     places = [
@@ -159,7 +162,7 @@ def _gain(
         Signal(f"{rows[i].name} {columns[j].name}", _quotient(rows[i].unit, columns[j].unit + over))
         for i, j in places
     )
-    return _scattered(name, signals, meaning, np.array(matrix.nonzeros())[kept], share)
+    return _scattered_member(name, signals, meaning, np.array(matrix.nonzeros())[kept], share)
 
 
 def _quotient(unit: str, by: str) -> str:
@@ -172,23 +175,25 @@ def _quotient(unit: str, by: str) -> str:
     return "1" if unit == by else text
 
 
-def _scattered(name: str, signals: tuple[Signal, ...], meaning: str, values: Any, share: float) -> Parameter:
+def _scattered_member(
+    name: str, signals: tuple[Signal, ...], meaning: str, values: Any, share: float
+) -> RecordMember:
     numbers = np.asarray(values, dtype=float)
     around = share * np.abs(numbers)
-    return Parameter(Field(name, signals, meaning), numbers, numbers - around, numbers + around)
+    return RecordMember(CField(name, signals, meaning), numbers, numbers - around, numbers + around)
 
 
-def _shrinking(name: str, signals: tuple[Signal, ...], meaning: str, values: Any) -> Parameter:
+def _shrinking_member(name: str, signals: tuple[Signal, ...], meaning: str, values: Any) -> RecordMember:
     numbers = np.asarray(values, dtype=float)
-    return Parameter(Field(name, signals, meaning), numbers, LEAST * numbers, numbers)
+    return RecordMember(CField(name, signals, meaning), numbers, MIN_LIMIT_SHARE * numbers, numbers)
 
 
-def _reference_parameters(t: Target) -> list[Parameter]:
+def _reference_parameters(t: Target) -> list[RecordMember]:
     """The limits of references."""
     outputs = t.controller.measurements
     per = {"position": "", "speed": "/s", "acceleration": "/s^2"}
     return [
-        _shrinking(
+        _shrinking_member(
             name,
             tuple(Signal(s.name, f"{s.unit}{per[name]}") for s in outputs),
             f"limit of references: {name}",
@@ -198,12 +203,14 @@ def _reference_parameters(t: Target) -> list[Parameter]:
     ]
 
 
-def _thresholds(t: Target) -> Parameter:
+def _thresholds(t: Target) -> RecordMember:
     """The thresholds of the monitors, a number for each row of their table."""
     rows = monitors_of(t)
     values = np.array([row.threshold for row in rows])
     signals = tuple(Signal(title, "1") for title in monitor_titles(rows))
-    return Parameter(Field("threshold", signals, "of a monitor's level"), values, np.zeros(len(rows)), values)
+    return RecordMember(
+        CField("threshold", signals, "of a monitor's level"), values, np.zeros(len(rows)), values
+    )
 
 
 def monitor_titles(rows: tuple[Monitor, ...]) -> list[str]:
@@ -237,7 +244,7 @@ def parameter_context(t: Target) -> dict[str, Any]:
         text = c_numbers(values, t.precision)
         return textwrap.fill(text, 110, subsequent_indent="    ")
 
-    def inside(p: Parameter) -> Any:
+    def inside(p: RecordMember) -> Any:
         """The range, of which rounding takes nothing."""
         kept = p.values.astype(real)
         return np.minimum(p.least.astype(real), kept), np.maximum(p.most.astype(real), kept)
@@ -301,6 +308,6 @@ def _factors(t: Target) -> dict[str, Any]:
         ],
         "first_entries": ", ".join(str(axes["K"].index(k)) for k in range(count)),
         "axis_count": count,
-        "same": c_number(SAME[t.precision], t.precision),
+        "same": c_number(TOLERANCES[t.precision], t.precision),
         "nought": c_number(0.0, t.precision),
     }

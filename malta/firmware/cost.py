@@ -32,7 +32,7 @@ from malta.simulation import references
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller
-from malta.synthesis.schedule import SCHEDULED
+from malta.synthesis.schedule import SCHEDULED_MATRICES
 
 if TYPE_CHECKING:
     from malta.proof.margin import Margin
@@ -47,12 +47,12 @@ if TYPE_CHECKING:
 
 
 # Functions stay functions, and a switch stays branches, so that lines and branches are those of the text.
-APART = ("-g", "-fno-inline", "-fno-partial-inlining", "-fno-ipa-cp", "-fno-ipa-sra", "-fno-jump-tables")
+CC_FLAGS = ("-g", "-fno-inline", "-fno-partial-inlining", "-fno-ipa-cp", "-fno-ipa-sra", "-fno-jump-tables")
 LISTING = ("-d", "-l", "-r", "--no-show-raw-insn")  # of objdump
-_ENDS = re.compile(r"^(?:ret|retq|bx\s+lr|(?:pop|ldmia(?:\.w)?)\b.*\bpc\b.*)")
-_LEAVES = re.compile(r"^(?:b|b\.n|b\.w|jmp|jmpq)\s")
-_CALLS = re.compile(r"^(?:bl|blx|call|callq)\s")
-_BRANCHES = re.compile(r"^(?:b[a-z]{2}(?:\.[nw])?|b|b\.n|b\.w|cbn?z|j[a-z]+)\s")
+_RETURN_LINE = re.compile(r"^(?:ret|retq|bx\s+lr|(?:pop|ldmia(?:\.w)?)\b.*\bpc\b.*)")
+_JUMP_LINE = re.compile(r"^(?:b|b\.n|b\.w|jmp|jmpq)\s")
+_CALL_LINE = re.compile(r"^(?:bl|blx|call|callq)\s")
+_BRANCH_LINE = re.compile(r"^(?:b[a-z]{2}(?:\.[nw])?|b|b\.n|b\.w|cbn?z|j[a-z]+)\s")
 
 
 class Instruction(NamedTuple):
@@ -116,12 +116,12 @@ def _functions_of(listing: str, passes: list[int]) -> dict[str, list[Instruction
         elif place := re.match(r"^\S*\.c:(\d+)", line):
             weight = passes[int(place[1]) - 1]
         elif relocation := re.match(r"^\s+[0-9a-f]+: R_\S*(?:CALL|JUMP|PLT|PC32)\S*\s+(\w+)", line):
-            if code and (_CALLS.match(code[-1].text) or _LEAVES.match(code[-1].text)):
+            if code and (_CALL_LINE.match(code[-1].text) or _JUMP_LINE.match(code[-1].text)):
                 code[-1] = code[-1]._replace(symbol=relocation[1])
         elif one := re.match(r"^\s+([0-9a-f]+):\s+([a-z].*)", line):
             text = one[2].strip()
             target = re.search(r"<(\w+)>", text)  # a function's beginning
-            calls = target and target[1] != name and (_CALLS.match(text) or _LEAVES.match(text))
+            calls = target and target[1] != name and (_CALL_LINE.match(text) or _JUMP_LINE.match(text))
             code.append(Instruction(int(one[1], 16), text, weight, target[1] if target and calls else ""))
     return found
 
@@ -131,9 +131,9 @@ def _longest(code: list[Instruction], costs: list[int]) -> int:
     places = {i.address: k for k, i in enumerate(code)}
     after: dict[int, list[int]] = {}
     for k, i in enumerate(code):
-        onward = [] if _ENDS.match(i.text) or _LEAVES.match(i.text) else [k + 1]
+        onward = [] if _RETURN_LINE.match(i.text) or _JUMP_LINE.match(i.text) else [k + 1]
         goal = re.search(r"\b([0-9a-f]+) <", i.text)
-        if goal and _BRANCHES.match(i.text) and not i.symbol and int(goal[1], 16) in places:
+        if goal and _BRANCH_LINE.match(i.text) and not i.symbol and int(goal[1], 16) in places:
             onward.append(places[int(goal[1], 16)])
         after[k] = [j for j in onward if j < len(code)]
     return _way(after, costs, set(after), 0) if code else 0
@@ -168,7 +168,7 @@ def _way(after: Mapping[int, list[int]], costs: list[int], nodes: set[int], star
 # What single precision does to a controller: its coefficients, its margin, and the noise of its rounding.
 
 
-ROUNDED = 200  # samples over which the noise of rounding is measured
+ROUNDING_SAMPLES = 200  # samples over which the noise of rounding is measured
 
 
 class RoundingNoise(NamedTuple):
@@ -178,11 +178,11 @@ class RoundingNoise(NamedTuple):
     sensors: FloatArray
 
 
-def rounded(c: Controller) -> Controller:
+def round_gains(c: Controller) -> Controller:
     """The controller with the coefficients that single precision holds."""
 
     def in_single(record: Any) -> dict[str, Any]:
-        return {name: getattr(record, name).astype(np.float32).astype(float) for name in SCHEDULED}
+        return {name: getattr(record, name).astype(np.float32).astype(float) for name in SCHEDULED_MATRICES}
 
     if c.schedule is None:
         return replace(c, **in_single(c))
@@ -196,7 +196,7 @@ def rounded_margin(c: Controller, uncertainty: dict[str, float]) -> Margin | Non
 
     if not uncertainty:
         return None
-    return travel_margin(plant_of(c.parameters), rounded(c), uncertainty)
+    return travel_margin(plant_of(c.parameters), round_gains(c), uncertainty)
 
 
 def rounding_noise(t: Target) -> RoundingNoise:
@@ -205,7 +205,7 @@ def rounding_noise(t: Target) -> RoundingNoise:
     Both precisions take the readings of one flight; what their forces differ by is the rounding.
     """
     c, plant = t.controller, t.believed
-    lasts = ROUNDED * c.sample_time
+    lasts = ROUNDING_SAMPLES * c.sample_time
     fidelity: Any = t.fidelity if t.driven else "force"
     run = simulate(plant, c, Scenario("hold", lasts, references.hold, noise=1.0, fidelity=fidelity))
     read = readings_of(t, run)
@@ -264,7 +264,7 @@ PROCESSORS = (
 )
 
 
-class Cost(NamedTuple):
+class ProcessorCost(NamedTuple):
     """Of a controller on one processor."""
 
     processor: str
@@ -285,7 +285,7 @@ def operations(t: Target) -> dict[str, int]:
     return {kind: sum(count[op] for op in ops) for kind, ops in KINDS.items()}
 
 
-def costs(t: Target) -> list[Cost]:
+def costs(t: Target) -> list[ProcessorCost]:
     """The costs on every processor whose compiler is installed."""
     name = c_name(t.controller.name)
     own = supervisor_sources(t, name)
@@ -294,7 +294,9 @@ def costs(t: Target) -> list[Cost]:
     return [cost for cost in found if cost is not None]
 
 
-def cost_on(p: Processor, files: Mapping[str, str], straight: Mapping[str, str], name: str) -> Cost | None:
+def cost_on(
+    p: Processor, files: Mapping[str, str], straight: Mapping[str, str], name: str
+) -> ProcessorCost | None:
     """The cost on one processor; None without its compiler. straight : the same controller, its loops written out"""
     if any(shutil.which(p.prefix + tool) is None for tool in ("gcc", "size", "objdump")):
         return None
@@ -302,16 +304,16 @@ def cost_on(p: Processor, files: Mapping[str, str], straight: Mapping[str, str],
     counted = "straight" if straight != files else name
     state = f'#include "{name}.h"\nconst char state_bytes[sizeof({name}_state)] = {{0}};\n'
     more = {f"{counted}.c": straight[f"{name}.c"], "state.c": state}
-    with _written({**files, **more}) as folder:
+    with _write_folder({**files, **more}) as folder:
         for file in dict.fromkeys((name, counted, "state")):
-            if _compiled(p, folder, file, "-fstack-usage") is None:
+            if _compile(p, folder, file, "-fstack-usage") is None:
                 return None
         sizes, (bytes_of_state, *_) = (
             (_run([f"{p.prefix}size", f"{of}.o"], folder) or "").splitlines()[-1].split()
             for of in (name, "state")
         )
         listing = _run([f"{p.prefix}objdump", "-d", "--no-show-raw-insn", f"{counted}.o"], folder) or ""
-        apart = {f"{of}.c": _listing(p, folder, of) for of in (name, f"{name}_supervisor")}
+        apart = {f"{of}.c": _disassemble(p, folder, of) for of in (name, f"{name}_supervisor")}
         stacks = _stacks((folder / f"{name}.su").read_text(encoding="utf-8"))
     supervised = 0
     if None not in apart.values():
@@ -325,7 +327,7 @@ def cost_on(p: Processor, files: Mapping[str, str], straight: Mapping[str, str],
         if function.split(".")[0] in own or function.startswith(blocks)
         for instruction in instructions
     ]
-    return Cost(
+    return ProcessorCost(
         p.name,
         int(sizes[0]),
         int(sizes[1]) + int(sizes[2]),
@@ -338,7 +340,7 @@ def cost_on(p: Processor, files: Mapping[str, str], straight: Mapping[str, str],
 
 
 @contextmanager
-def _written(files: Mapping[str, str]) -> Iterator[Path]:
+def _write_folder(files: Mapping[str, str]) -> Iterator[Path]:
     """A folder with these files."""
     with scratch_folder() as folder:
         for file, text in files.items():
@@ -346,18 +348,18 @@ def _written(files: Mapping[str, str]) -> Iterator[Path]:
         yield folder
 
 
-def _compiled(p: Processor, folder: Path, name: str, *options: str) -> str | None:
+def _compile(p: Processor, folder: Path, name: str, *options: str) -> str | None:
     """Compile NAME.c to NAME.o; None where that fails."""
     return _run([f"{p.prefix}gcc", *FLAGS, *options, *p.options, "-c", f"{name}.c"], folder)
 
 
-def _listing(p: Processor, folder: Path, name: str) -> str | None:
+def _disassemble(p: Processor, folder: Path, name: str) -> str | None:
     """The instructions of NAME.c with its lines, each function apart; None where a tool fails."""
-    done = _compiled(p, folder, name, *APART, "-o", f"{name}.apart")
+    done = _compile(p, folder, name, *CC_FLAGS, "-o", f"{name}.apart")
     return None if done is None else _run([f"{p.prefix}objdump", *LISTING, f"{name}.apart"], folder)
 
 
-SELDOM = ("begin_block", "stop_after", "count_down")  # of a ring: at a block's begin, at a trigger, after
+RARE_STEPS = ("begin_block", "stop_after", "count_down")  # of a ring: at a block's begin, at a trigger, after
 
 
 class LogCost(NamedTuple):
@@ -374,12 +376,12 @@ def log_costs(t: Target) -> list[LogCost]:
     files = sources(t, "", name) | ring_sources(t, "", name)
     file, found = f"{name}_log.c", []
     for p in PROCESSORS:
-        with _written(files) as folder:
-            listing = _listing(p, folder, f"{name}_log")
+        with _write_folder(files) as folder:
+            listing = _disassemble(p, folder, f"{name}_log")
         if listing is not None:
             own = [f"{name}_log_sample", f"{name}_log_keep"]
             most = sum(1 + longest_path({file: listing}, files, part) for part in own)  # 1: the call
-            seldom = sum(longest_path({file: listing}, files, part) for part in SELDOM)
+            seldom = sum(longest_path({file: listing}, files, part) for part in RARE_STEPS)
             found.append(LogCost(p.name, most - seldom, most))
     return found
 

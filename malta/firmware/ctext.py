@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
-from malta.firmware.blocks import LEAVES, Entry, Stage, named_inputs, stages
+from malta.firmware.blocks import LEAF_OPERATIONS, BlockStage, Entry, named_inputs, stages
 from malta.firmware.program import TRUTHS, Operation, Precision, Program
 
 _FORMS = {
@@ -72,7 +72,7 @@ def signature(p: Program, prefix: str) -> str:
     """The declaration of a program's function, without its end."""
     takes = [f"const {prefix}_real {name}[{size}]" for name, size in p.arguments if size]
     gives = [f"{prefix}_real {name}[{size}]" for name, size in p.results if size]
-    return _wrapped(f"void {prefix}_{p.name}({', '.join([*takes, *gives])})")
+    return _wrap(f"void {prefix}_{p.name}({', '.join([*takes, *gives])})")
 
 
 def function_text(p: Program, prefix: str, precision: Precision, *, static: bool = False) -> str:
@@ -124,25 +124,25 @@ def operand_text(
     zero, one = c_number(0.0, precision), c_number(1.0, precision)
     if p.operations[k].op == "CONST" and k not in names:
         number = c_number(p.operations[k].value, precision)
-        return f"({number} != {zero})" if condition else _bracketed(number)
+        return f"({number} != {zero})" if condition else _bracket(number)
     name = names[k]
     if p.operations[k].op in TRUTHS and not name.endswith("]"):
         return name if condition else f"({name} ? {one} : {zero})"
     return f"({name} != {zero})" if condition else name
 
 
-def _bracketed(number: str) -> str:
+def _bracket(number: str) -> str:
     return f"({number})" if number.startswith("-") else number
 
 
 # Programs in blocks as C99: a static function for each block, with its equation, and one that calls them in order.
 
 
-APART = "_APART"  # ends the name of the macro that keeps a long loop a function of its own, see apart.c
-LONG = 40  # operations of such a loop; shorter ones take fewer registers than their call
+APART_SUFFIX = "_APART"  # of the macro that keeps a long loop a function of its own, see apart.c
+MIN_APART_OPERATIONS = 40  # operations of such a loop; shorter ones take fewer registers than their call
 
 
-class Place(NamedTuple):
+class VectorPlace(NamedTuple):
     """Where a vector is: a parameter of C functions, and how the vector is reached from it."""
 
     parameter: str
@@ -150,14 +150,14 @@ class Place(NamedTuple):
     access: str
 
 
-def array_place(name: str, size: int, prefix: str) -> Place:
+def array_place(name: str, size: int, prefix: str) -> VectorPlace:
     """A vector that is a parameter itself."""
-    return Place(name, f"{prefix}_real {name}[{size}]", name)
+    return VectorPlace(name, f"{prefix}_real {name}[{size}]", name)
 
 
-def member_place(record: str, variable: str, name: str) -> Place:
+def member_place(record: str, variable: str, name: str) -> VectorPlace:
     """A vector in a record. name : with a dot where it is in a record of the record"""
-    return Place(variable, f"{record} *{variable}", f"{variable}->{name}")
+    return VectorPlace(variable, f"{record} *{variable}", f"{variable}->{name}")
 
 
 @dataclass
@@ -174,8 +174,8 @@ class _Writer(NamedTuple):
     """A program with the places of its vectors, those between its blocks among them."""
 
     p: Program
-    stages: list[Stage]
-    places: dict[str, Place]
+    stages: list[BlockStage]
+    places: dict[str, VectorPlace]
     between: dict[str, int]  # vectors that only blocks see, with their sizes
     late: dict[str, str]  # results whose old values later blocks take, and where they go at the end
     prefix: str
@@ -190,7 +190,7 @@ class _Writer(NamedTuple):
 
 
 def blocks_text(
-    p: Program, places: Mapping[str, Place], prefix: str, precision: Precision, *, static: bool
+    p: Program, places: Mapping[str, VectorPlace], prefix: str, precision: Precision, *, static: bool
 ) -> str:
     """The C of a program in blocks. A result may be where an argument is: it takes its place when no block reads it.
 
@@ -221,28 +221,28 @@ def blocks_text(
     return "\n".join([*_record(w), *functions, head, *lines, *unused, *calls, *ends, "}", ""])
 
 
-def blocks_signature(p: Program, places: Mapping[str, Place], prefix: str) -> str:
+def blocks_signature(p: Program, places: Mapping[str, VectorPlace], prefix: str) -> str:
     """The declaration of a program's function with these places, without its end."""
     written = {places[name].parameter for name, size in p.results if size}
     declared = [
         place.declared if place.parameter in written else f"const {place.declared}"
         for place in _own_parameters(p, places)
     ]
-    return _wrapped(f"void {prefix}_{p.name}({', '.join(declared)})")
+    return _wrap(f"void {prefix}_{p.name}({', '.join(declared)})")
 
 
-def blocks_call(p: Program, places: Mapping[str, Place], prefix: str) -> str:
+def blocks_call(p: Program, places: Mapping[str, VectorPlace], prefix: str) -> str:
     """The call of a program's function by the names of its own parameters."""
     return f"{prefix}_{p.name}({', '.join(place.parameter for place in _own_parameters(p, places))})"
 
 
-def _own_parameters(p: Program, places: Mapping[str, Place]) -> list[Place]:
+def _own_parameters(p: Program, places: Mapping[str, VectorPlace]) -> list[VectorPlace]:
     """A place in each parameter of a program's function, in order."""
     own = [places[name] for name, size in (*p.arguments, *p.results) if size]
     return list({place.parameter: place for place in own}.values())
 
 
-def _writer(p: Program, places: Mapping[str, Place], prefix: str, precision: Precision) -> _Writer:
+def _writer(p: Program, places: Mapping[str, VectorPlace], prefix: str, precision: Precision) -> _Writer:
     found = stages(p)
     given = {p.names[i] for i, *_ in p.outputs}
     between = {name: size for name, size in p.between if name in given}
@@ -257,7 +257,7 @@ def _writer(p: Program, places: Mapping[str, Place], prefix: str, precision: Pre
     return _Writer(p, found, dict(places) | own, between, late, prefix, precision)
 
 
-def _read_later(p: Program, found: list[Stage], places: Mapping[str, Place]) -> list[str]:
+def _read_later(p: Program, found: list[BlockStage], places: Mapping[str, VectorPlace]) -> list[str]:
     """The results that take the place of an argument which a later block still reads."""
     last: dict[str, int] = {}  # by place: the last stage that reads an argument there
     first: dict[str, int] = {}  # by result: the first stage that writes it
@@ -273,7 +273,7 @@ def _read_later(p: Program, found: list[Stage], places: Mapping[str, Place]) -> 
     return [name for name, n in first.items() if last.get(places[name].access, -1) > n]
 
 
-def _body(w: _Writer, stage: Stage, known: dict[int, Entry]) -> _Body:
+def _body(w: _Writer, stage: BlockStage, known: dict[int, Entry]) -> _Body:
     """The statements of a stage; what it gives is known from here on."""
     p, body = w.p, _Body()
     targets = _targets(w, stage)
@@ -323,7 +323,7 @@ class _Copies:
     numbers : columns of constants; steps : by how much places in vectors are further, as columns too
     """
 
-    def __init__(self, w: _Writer, stage: Stage, known: Mapping[int, Entry]) -> None:
+    def __init__(self, w: _Writer, stage: BlockStage, known: Mapping[int, Entry]) -> None:
         self.w, self.stage, self.known = w, stage, known
         self.numbers: list[tuple[float, ...]] = []
         self.steps: list[tuple[int, ...]] = []
@@ -379,7 +379,7 @@ def _table(head: str, rows: list[list[str]]) -> list[str]:
     return [f"  static const {head}[{len(rows)}][{len(rows[0])}] = {{", wrapped, "  };"]
 
 
-def _loop_body(w: _Writer, stage: Stage, known: dict[int, Entry]) -> _Body:
+def _loop_body(w: _Writer, stage: BlockStage, known: dict[int, Entry]) -> _Body:
     """The statements of a loop over equal computations."""
     p, body, tables = w.p, _Body(), _Copies(w, stage, known)
     first, names, inner = stage.copies[0], dict[int, str](), list[str]()
@@ -396,7 +396,7 @@ def _loop_body(w: _Writer, stage: Stage, known: dict[int, Entry]) -> _Body:
         own = dict(names)
         for m, a in enumerate(p.operations[k].operands):
             if a not in names:
-                own |= _differing(
+                own |= _name_differences(
                     tables, a, [p.operations[c.operations[n]].operands[m] for c in stage.copies], body
                 )
         value = value_text(p, k, own, w.prefix, w.precision)
@@ -412,13 +412,15 @@ def _loop_body(w: _Writer, stage: Stage, known: dict[int, Entry]) -> _Body:
     for n, (*_, k) in enumerate(first.outputs):
         if k not in first.operations:
             given = (
-                names if k in names else _differing(tables, k, [c.outputs[n][2] for c in stage.copies], body)
+                names
+                if k in names
+                else _name_differences(tables, k, [c.outputs[n][2] for c in stage.copies], body)
             )
             body.last.append(f"    {ends[n]} = {operand_text(p, k, given, w.precision)};")
     for copy in stage.copies:
         body.given |= {p.names[i] for i, *_ in copy.outputs}
         for i, j, k in copy.outputs:
-            if p.operations[k].op not in LEAVES:
+            if p.operations[k].op not in LEAF_OPERATIONS:
                 known.setdefault(k, (p.names[i], j))
     heads, begin = tables.lines()
     count = len(stage.copies)
@@ -428,7 +430,7 @@ def _loop_body(w: _Writer, stage: Stage, known: dict[int, Entry]) -> _Body:
 
 
 def _common_lines(
-    w: _Writer, stage: Stage, known: Mapping[int, Entry], names: dict[int, str], body: _Body
+    w: _Writer, stage: BlockStage, known: Mapping[int, Entry], names: dict[int, str], body: _Body
 ) -> list[str]:
     """What all copies of a loop take, before it."""
     lines = []
@@ -441,7 +443,7 @@ def _common_lines(
     return lines
 
 
-def _differing(tables: _Copies, a: int, of: Sequence[int], body: _Body) -> dict[int, str]:
+def _name_differences(tables: _Copies, a: int, of: Sequence[int], body: _Body) -> dict[int, str]:
     """The name of an operand that is no operation of the loop; none for a number that is the same in all copies."""
     if a in tables.known:
         entries = [tables.known[k] for k in of]
@@ -451,7 +453,7 @@ def _differing(tables: _Copies, a: int, of: Sequence[int], body: _Body) -> dict[
     return {} if number is None else {a: number}
 
 
-def _targets(w: _Writer, stage: Stage) -> dict[int, list[Entry]]:
+def _targets(w: _Writer, stage: BlockStage) -> dict[int, list[Entry]]:
     """Where the values of operations go."""
     targets: dict[int, list[Entry]] = {}
     for i, j, k in stage.outputs:
@@ -482,30 +484,34 @@ def _parameters(w: _Writer, vectors: Iterable[str]) -> list[str]:
     return [v for v in dict.fromkeys(w.places[name].parameter for name in order) if v in wanted]
 
 
-def _stage_name(w: _Writer, stage: Stage) -> str:
+def _stage_name(w: _Writer, stage: BlockStage) -> str:
     return f"{w.name}_{stage.block.name}{f'_{stage.part}' if stage.part else ''}"
 
 
-def _stage_function(w: _Writer, stage: Stage, body: _Body) -> str:
+def _stage_function(w: _Writer, stage: BlockStage, body: _Body) -> str:
     written = {w.places[name].parameter for name in body.given}
     declared = {place.parameter: place.declared for place in w.places.values()}
     takes = [
         declared[v] if v in written else f"const {declared[v]}"
         for v in _parameters(w, body.taken | body.given)
     ]
-    apart = f"{w.prefix.upper()}{APART} " if stage.copies and len(stage.operations) > LONG else ""
-    head = _wrapped(f"static {apart}void {_stage_name(w, stage)}({', '.join(takes)})")
+    apart = (
+        f"{w.prefix.upper()}{APART_SUFFIX} "
+        if stage.copies and len(stage.operations) > MIN_APART_OPERATIONS
+        else ""
+    )
+    head = _wrap(f"static {apart}void {_stage_name(w, stage)}({', '.join(takes)})")
     return "\n".join([_comment(stage), f"{head} {{", *body.lines, *body.last, "}", ""])
 
 
-def _stage_call(w: _Writer, stage: Stage, body: _Body) -> str:
+def _stage_call(w: _Writer, stage: BlockStage, body: _Body) -> str:
     given = ["&mid" if v == "mid" else v for v in _parameters(w, body.taken | body.given)]
     return f"  {_stage_name(w, stage)}({', '.join(given)});"
 
 
-def _comment(stage: Stage) -> str:
+def _comment(stage: BlockStage) -> str:
     part = f" (part {stage.part})" if stage.part else ""
-    return _wrapped(f"/* {stage.block.equation}{part} */", "   ")
+    return _wrap(f"/* {stage.block.equation}{part} */", "   ")
 
 
 def _record(w: _Writer) -> list[str]:
@@ -522,5 +528,5 @@ def _record(w: _Writer) -> list[str]:
     ]
 
 
-def _wrapped(text: str, indent: str = "    ") -> str:
+def _wrap(text: str, indent: str = "    ") -> str:
     return "\n".join(textwrap.wrap(text, 118, subsequent_indent=indent, break_long_words=False))

@@ -16,8 +16,8 @@ from malta.files import file_exists, locate, replace_files
 from malta.firmware.calibration import (
     FNV_FACTOR,
     FNV_START,
-    LEAST,
-    Parameter,
+    MIN_LIMIT_SHARE,
+    RecordMember,
     counts_of,
     gain_lines,
     monitor_titles,
@@ -26,12 +26,12 @@ from malta.firmware.calibration import (
 from malta.firmware.cost import (
     CLOCK,
     PROCESSORS,
-    ROUNDED,
-    Cost,
+    ROUNDING_SAMPLES,
+    ProcessorCost,
     costs,
     log_costs,
     operations,
-    rounded,
+    round_gains,
     rounded_margin,
     rounding_noise,
     smallest_error,
@@ -40,7 +40,7 @@ from malta.firmware.ctext import c_name, c_number
 from malta.firmware.fmu import Part, build_fmu
 from malta.firmware.period_functions import LINK_RANGE
 from malta.firmware.program import Precision
-from malta.firmware.signals import Field, Target, fidelity_of, reading_ranges
+from malta.firmware.signals import CField, Target, fidelity_of, reading_ranges
 from malta.firmware.sources import (
     RISES,
     comment,
@@ -69,11 +69,11 @@ from malta.synthesis.controller import Controller
 # numbers.
 
 
-WIDE = 1e12  # of a measurement without a limit
-WHOLE = 4  # bytes of an int32_t
+UNLIMITED_READING = 1e12  # of a measurement without a limit
+INT_BYTES = 4  # bytes of an int32_t
 
 
-class Entry(NamedTuple):
+class MemoryEntry(NamedTuple):
     """A number in the target's memory."""
 
     name: str
@@ -104,15 +104,15 @@ def a2l_text(t: Target, name: str) -> str:
                 {"name": title, "unit": unit, "factor": repr(factor)}
                 for (unit, factor), title in methods.items()
             ],
-            "characteristics": [_shown(e, methods) for e in entries],
-            "measurements": [_shown(e, methods) for e in measured],
+            "characteristics": [_show_entry(e, methods) for e in entries],
+            "measurements": [_show_entry(e, methods) for e in measured],
             "states": list(enumerate(STATES)),
             "monitors": [(-1, "NONE"), *enumerate(MONITORS)],
         },
     )
 
 
-def _shown(e: Entry, methods: dict[tuple[str, float], str]) -> dict[str, Any]:
+def _show_entry(e: MemoryEntry, methods: dict[tuple[str, float], str]) -> dict[str, Any]:
     return e._asdict() | {
         "meaning": comment(e.meaning).replace('"', "'"),
         "method": e.table or methods[e.unit, e.factor],
@@ -121,7 +121,7 @@ def _shown(e: Entry, methods: dict[tuple[str, float], str]) -> dict[str, Any]:
     }
 
 
-def _labels(field: Field) -> list[str]:
+def _labels(field: CField) -> list[str]:
     """A name for each number of a field, which is a C identifier."""
     if field.size == 1 and not field.signals[0].name:
         return [field.name]
@@ -131,7 +131,7 @@ def _labels(field: Field) -> list[str]:
     return labels
 
 
-def _parameters(t: Target, name: str) -> Iterator[Entry]:
+def _parameters(t: Target, name: str) -> Iterator[MemoryEntry]:
     """The record of parameters, in its order."""
     symbol, at = f"{name}_default_parameters", 0
     for p in parameters_of(t):
@@ -139,17 +139,17 @@ def _parameters(t: Target, name: str) -> Iterator[Entry]:
         ranges = np.stack([p.least, p.most]) * factor
         for label, signal, low, high in zip(_labels(p.field), p.field.signals, *ranges, strict=True):
             unit = own or ("" if signal.unit in ("SI", "1") else signal.unit)
-            yield Entry(label, p.field.meaning, unit, factor, low, high, symbol, at)
+            yield MemoryEntry(label, p.field.meaning, unit, factor, low, high, symbol, at)
             at += t.real_bytes
     for title, most in zip(monitor_titles(monitors_of(t)), counts_of(t), strict=True):
         words = "samples in a row until a monitor acts"
-        yield Entry(f"samples.{c_name(title)}", words, "", 1.0, 1, most, symbol, at, "LONG")
-        at += WHOLE
+        yield MemoryEntry(f"samples.{c_name(title)}", words, "", 1.0, 1, most, symbol, at, "LONG")
+        at += INT_BYTES
     words = f"FNV-1a, from 0x{FNV_START:08x}, over the bytes of the record before it"
-    yield Entry("checksum", words, "", 1.0, 0, 2**32 - 1, symbol, at, "ULONG")
+    yield MemoryEntry("checksum", words, "", 1.0, 0, 2**32 - 1, symbol, at, "ULONG")
 
 
-def _outputs(t: Target) -> Iterator[Entry]:
+def _outputs(t: Target) -> Iterator[MemoryEntry]:
     """What a step commands and estimates."""
     c, at = t.controller, 0
     most = {
@@ -158,24 +158,24 @@ def _outputs(t: Target) -> Iterator[Entry]:
         "current": np.broadcast_to(c.limits.current, len(t.believed.actuator.coils)),
     }
     for field in t.output_fields:
-        limits = np.minimum(most.get(field.name, np.full(field.size, WIDE)), WIDE)
+        limits = np.minimum(most.get(field.name, np.full(field.size, UNLIMITED_READING)), UNLIMITED_READING)
         for label, signal, limit in zip(_labels(field), field.signals, limits, strict=True):
             unit = "" if signal.unit in ("SI", "1") else signal.unit
             is_share = field.name in ("refused", "saturated", "met")
             low, high = (0.0, 1.0) if is_share else (-limit, limit)
-            yield Entry(label, field.meaning, unit, 1.0, low, high, "out", at)
+            yield MemoryEntry(label, field.meaning, unit, 1.0, low, high, "out", at)
             at += t.real_bytes
 
 
-def _supervision() -> Iterator[Entry]:
+def _supervision() -> Iterator[MemoryEntry]:
     """What a supervisor says; its record begins with its times."""
-    at = WHOLE * len(TIMES)
+    at = INT_BYTES * len(TIMES)
     tables = {"state": "state_names", "enable": "", "monitor": "monitor_names", "reaction": ""}
     for k, (key, table) in enumerate(tables.items()):
         low, high = (-1, len(MONITORS)) if key == "monitor" else (0, len(STATES))
         words = "of the supervisor"
-        yield Entry(
-            f"supervisor.{key}", words, "", 1.0, low, high, "supervisor", at + WHOLE * k, "LONG", table
+        yield MemoryEntry(
+            f"supervisor.{key}", words, "", 1.0, low, high, "supervisor", at + INT_BYTES * k, "LONG", table
         )
 
 
@@ -255,13 +255,13 @@ def _test_context(t: Target) -> dict[str, Any]:
         "fnv_factor": FNV_FACTOR,
         "reference_all": t.reference_fields,
         "input_all": t.input_fields,
-        "output_all": _filled(t.output_fields),
-        "state_all": _filled(t.state_fields),
+        "output_all": _fill(t.output_fields),
+        "state_all": _fill(t.state_fields),
         "vectors": [_vector_text(v, t.precision) for v in vectors],
     }
 
 
-def _filled(fields: list[Field]) -> list[Field]:
+def _fill(fields: list[CField]) -> list[CField]:
     return [field for field in fields if field.size]
 
 
@@ -301,7 +301,7 @@ def _number(value: Any, precision: Precision) -> str:
 # covered.
 
 
-class Deviation(NamedTuple):
+class Waiver(NamedTuple):
     """A rule that files deviate from."""
 
     rule: str
@@ -310,12 +310,12 @@ class Deviation(NamedTuple):
 
 
 DEVIATIONS = (
-    Deviation("2.5", ".h", "macros of the interface are for the caller: a program need not use all of them"),
-    Deviation("8.7", "_supervisor.c", "the caller too uses the table of monitors and the initialization"),
-    Deviation("21.6", "_test.c", "the test prints its verdict; the controller has no output of its own"),
-    Deviation("21.6", "_pil.c", "a PC has its port in the standard streams; a target defines NAME_PIL_PORT"),
-    Deviation("21.15", "_pil.c", "memcpy between numbers and words: the line carries bits"),
-    Deviation(
+    Waiver("2.5", ".h", "macros of the interface are for the caller: a program need not use all of them"),
+    Waiver("8.7", "_supervisor.c", "the caller too uses the table of monitors and the initialization"),
+    Waiver("21.6", "_test.c", "the test prints its verdict; the controller has no output of its own"),
+    Waiver("21.6", "_pil.c", "a PC has its port in the standard streams; a target defines NAME_PIL_PORT"),
+    Waiver("21.15", "_pil.c", "memcpy between numbers and words: the line carries bits"),
+    Waiver(
         "21.15",
         "_test.c",
         "memcpy of numbers into words and records: the test compares bits, and calls pieces with records",
@@ -371,7 +371,7 @@ def report_text(
             "missing": f"Not found here, so not counted: {', '.join(missing)}." if missing else "",
             "rounding_text": _rounding_text(t),
             "noise": _noise_rows(t),
-            "rounding_samples": ROUNDED,
+            "rounding_samples": ROUNDING_SAMPLES,
             "deviations": DEVIATIONS,
             "margin_text": _margin_text(t, uncertainty, proof=proof),
             "link_range": f"{LINK_RANGE[0]:g} to {LINK_RANGE[1]:g} times its nominal value",
@@ -390,10 +390,10 @@ def report_text(
     )
 
 
-def _tunable_context(t: Target, found: list[Cost]) -> dict[str, Any]:
+def _tunable_context(t: Target, found: list[ProcessorCost]) -> dict[str, Any]:
     """The section about parameters that the target may change."""
     plain = {c.processor: c for c in costs(replace(t, tunable=False))}
-    limit = f"{100 * LEAST:g} % of the design's to all of it"
+    limit = f"{100 * MIN_LIMIT_SHARE:g} % of the design's to all of it"
     words = dict.fromkeys(("force_limit", "current_limit", *ReferenceLimits._fields), limit)
     words["threshold"] = "0 to those of the table of monitors"
     return {
@@ -406,7 +406,7 @@ def _tunable_context(t: Target, found: list[Cost]) -> dict[str, Any]:
     }
 
 
-def _log_context(t: Target, found: list[Cost]) -> dict[str, Any]:
+def _log_context(t: Target, found: list[ProcessorCost]) -> dict[str, Any]:
     """The section about the ring buffer."""
     plain = {c.processor: c.instructions for c in found}
     return {
@@ -416,7 +416,7 @@ def _log_context(t: Target, found: list[Cost]) -> dict[str, Any]:
     }
 
 
-def _scatter(p: Parameter) -> str:
+def _scatter(p: RecordMember) -> str:
     """By how much a gain may differ."""
     share = float(np.max(p.most - p.values) / np.max(np.abs(p.values)))
     return f"{100 * share:.3g} % either way" if share else "that of the design"
@@ -476,7 +476,7 @@ def _margin_text(t: Target, uncertainty: dict[str, float], *, proof: bool) -> st
     )
 
 
-FASTEST = 1e12  # Hz, of a clock
+MAX_CLOCK_RATE = 1e12  # Hz, of a clock
 Until = Literal["currents", "duty-cycles"]
 
 
@@ -518,7 +518,7 @@ def export_c(
     """
     path = locate(gains)
     if clock is not None:
-        positive("export", "clock", clock, below=FASTEST)
+        positive("export", "clock", clock, below=MAX_CLOCK_RATE)
     target = replace(_target(read(path), precision, until), tunable=tunable, excited=excitation)
     if log is not None:
         target = replace(target, logged=positive("export", "log", log))
@@ -529,7 +529,7 @@ def export_c(
     if tunable and proof:
         from malta.margins.tuned_gains import gain_box  # flint, which no other export needs
 
-        held = rounded(target.controller) if precision == "float" else target.controller
+        held = round_gains(target.controller) if precision == "float" else target.controller
         target = replace(target, gains=gain_box(target.believed, held, uncertainty))
     texts = folder_files(target, content.sha256, uncertainty, proof=proof, clock=clock)
     files = {folder / name: text.encode() for name, text in sorted(texts.items())}

@@ -20,7 +20,7 @@ from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.firmware.ctext import c_name
 from malta.firmware.program import Precision
-from malta.firmware.signals import Field, Target
+from malta.firmware.signals import CField, Target
 from malta.firmware.sources import sources
 from malta.model.plant import Plant
 from malta.simulation.engine.compiled import library
@@ -45,7 +45,7 @@ from malta.synthesis.controller import Controller
 
 
 REALS: dict[Precision, Any] = {"double": ctypes.c_double, "float": ctypes.c_float}
-EXTRA = ("_parameters.c",)  # of a controller that is tunable
+TUNABLES = ("_parameters.c",)  # of a controller that is tunable
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
 
 
@@ -67,11 +67,11 @@ def compile_controller(t: Target) -> Native:
     name = c_name(t.controller.name)
     files = sources(t, "", name)
     lib = compile_files(
-        [files[f"{name}{end}"] for end in (".h", ".c", "_parts.c", *EXTRA) if f"{name}{end}" in files]
+        [files[f"{name}{end}"] for end in (".h", ".c", "_parts.c", *TUNABLES) if f"{name}{end}" in files]
     )
     real = REALS[t.precision]
 
-    def record(title: str, fields: list[Field], more: tuple[tuple[str, Any], ...] = ()) -> Any:
+    def record(title: str, fields: list[CField], more: tuple[tuple[str, Any], ...] = ()) -> Any:
         return record_type(title, (*((f.name, real * f.size) for f in fields if f.size), *more))
 
     Reference = record("Reference", t.reference_fields)
@@ -206,7 +206,7 @@ def _engine(
     ) -> tuple[FloatArray, FloatArray]:
         part = slice(first, first + len(given))
         beside = np.hstack([inputs.motion.ddp[part], forces[part]])
-        flight = _Flight(native, state, step, sizes, machine, setup)
+        flight = _ControllerFlight(native, state, step, sizes, machine, setup)
         return _fly(flight, first, begin, given, noise, fast, beside, substeps)
 
     return Engine(f"exported C, {precision}", run)
@@ -268,7 +268,7 @@ def _motion(p: Period, count: int) -> ca.Function:
     return ca.Function("motion", [machine, held, given, ca.vec(jitter)], [ca.densify(after)])
 
 
-_REPLACED = ("xi_hat", "v", "saturated", "current", "met", "command")
+_REPLACED_SERIES = ("xi_hat", "v", "saturated", "current", "met", "command")
 
 
 def _record(plant: Plant, c: Controller, setup: Setup, p: Period) -> ca.Function:
@@ -327,7 +327,7 @@ def _first_state(native: Native, sizes: Layout, ready: Prepared) -> Any:
     return state
 
 
-class _Flight(NamedTuple):
+class _ControllerFlight(NamedTuple):
     """A controller on its way with a machine."""
 
     native: Native
@@ -339,7 +339,7 @@ class _Flight(NamedTuple):
 
 
 def _fly(
-    f: _Flight,
+    f: _ControllerFlight,
     first: int,
     begin: FloatArray,
     given: FloatArray,
@@ -353,10 +353,10 @@ def _fly(
     held_state = np.array(begin, dtype=float)
     states = np.empty((len(given), len(held_state)))
     reads = np.empty((len(given), f.machine.sense.size1_out(0)))
-    entries = {name: view(outputs, name) for name in _REPLACED if hasattr(outputs, name)}
+    entries = {name: view(outputs, name) for name in _REPLACED_SERIES if hasattr(outputs, name)}
     if f.setup.fidelity == "force":
         entries["command"] = entries["current"]
-    commands = np.empty((len(given), sum(entries[name].size for name in _REPLACED)))
+    commands = np.empty((len(given), sum(entries[name].size for name in _REPLACED_SERIES)))
     places = places_of({**f.sizes.machine, **f.sizes.controller})
     around = places_of(f.sizes.given)
     machine = slice(0, sum(f.sizes.machine.values()))
@@ -382,7 +382,7 @@ def _fly(
         if f.setup.faulty:
             held_state[places["y_last"]] = read[: f.sizes.row["y"]]
         command = held_state[places["command"]] if missed else np.array(entries["command"], dtype=float)
-        commands[k] = np.concatenate([entries[name] for name in _REPLACED])
+        commands[k] = np.concatenate([entries[name] for name in _REPLACED_SERIES])
         commands[k, commands.shape[1] - len(command) :] = command
         queue = np.concatenate([held_state[places["under_way"]], command])
         held_state[places["under_way"]] = queue[len(command) :]
@@ -405,7 +405,7 @@ def call_valid(inputs: Any) -> None:
 
 
 def _put(
-    f: _Flight,
+    f: _ControllerFlight,
     inputs: Any,
     state: FloatArray,
     row: FloatArray,
@@ -434,7 +434,7 @@ def _put(
 
 
 @dataclass(frozen=True)
-class Difference:
+class SignalDifference:
     """How far a signal of two runs is apart at most, and the range of the signal."""
 
     name: str
@@ -449,12 +449,12 @@ class Difference:
 
 def differences(
     run: Trajectory, other: Trajectory, names: Sequence[str] = SERIES_COMPARED
-) -> list[Difference]:
+) -> list[SignalDifference]:
     """The largest differences of two runs' signals, over the samples that both have."""
     samples = min(len(run.t), len(other.t))
     found = []
     for name in names:
         one, two = getattr(run, name)[:samples], getattr(other, name)[:samples]
         if one.size:
-            found.append(Difference(name, float(np.abs(one - two).max()), float(np.abs(one).max())))
+            found.append(SignalDifference(name, float(np.abs(one - two).max()), float(np.abs(one).max())))
     return found

@@ -31,12 +31,12 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError, on_one_line
-from malta.files import packaged, version
+from malta.files import read_packaged, version
 from malta.firmware.calibration import parameters_of
 from malta.firmware.ctext import c_name, c_number
 from malta.firmware.flight import FLAGS
 from malta.firmware.machine import (
-    Machine,
+    FirmwareMachine,
     command_field,
     machine_functions,
     machine_sources,
@@ -46,7 +46,7 @@ from malta.firmware.machine import (
     state_field,
     wrench_fields,
 )
-from malta.firmware.signals import Field, Target
+from malta.firmware.signals import CField, Target
 from malta.firmware.sources import comment, head_context, render, sources
 from malta.firmware.supervisor import STATES
 from malta.firmware.supervisor_text import request_members, supervisor_sources
@@ -59,19 +59,21 @@ from malta.units import base_exponents, unit_factor
 Part = Literal["controller", "supervised", "machine", "loop"]
 PARTS: tuple[Part, ...] = get_args(Part)
 SWITCH = (0.0, 1.0)  # least and most of what is on or off
-COLD = Field("cold", (Signal("", "1"),), "1: starts without current, 0: with the currents that hold it")
-NOISE = Field("noise", (Signal("", "1"),), "of the sensors, in multiples of the machine's own")
-SEED = Field("seed", (Signal("", "1"),), "whole number, of the noise: that of simulations with this seed")
-FLYING = Field(
+COLD_FIELD = CField(
+    "cold", (Signal("", "1"),), "1: starts without current, 0: with the currents that hold it"
+)
+NOISE = CField("noise", (Signal("", "1"),), "of the sensors, in multiples of the machine's own")
+SEED = CField("seed", (Signal("", "1"),), "whole number, of the noise: that of simulations with this seed")
+FLYING_FIELD = CField(
     "flying", (Signal("", "1"),), "1: the machine flies at its reference at the start, 0: it rests"
 )
-LATE = Field("late", (Signal("", "1"),), "1: commands act a delay later, 0: at once")
-LARGEST = 1e30  # of a parameter without a limit
+LATE_FIELD = CField("late", (Signal("", "1"),), "1: commands act a delay later, 0: at once")
+UNLIMITED_PARAMETER = 1e30  # of a parameter without a limit
 MOST_NOISE, MOST_SEED = 1e6, 2.0**53
 _WORDS = ("valid ", "refused ", "limited ")  # before the names of signals that belong to others
 
 
-class Variable(NamedTuple):
+class FmuVariable(NamedTuple):
     """A variable of a unit; its place among the others is its value reference."""
 
     name: str
@@ -100,10 +102,10 @@ class Variable(NamedTuple):
         return letters.get(self.causality, "o")
 
 
-class Group(NamedTuple):
+class VariableGroup(NamedTuple):
     """A field as variables."""
 
-    field: Field
+    field: CField
     causality: str
     variability: str
     start: Any = None  # numbers, or one for all
@@ -116,10 +118,10 @@ class Unit(NamedTuple):
 
     target: Target
     part: Part
-    variables: tuple[Variable, ...]
+    variables: tuple[FmuVariable, ...]
     at: dict[str, int]  # value reference of each group's first variable
     name: str
-    machine: Machine | None  # None for a controller alone
+    machine: FirmwareMachine | None  # None for a controller alone
 
     @property
     def has_controller(self) -> bool:
@@ -134,11 +136,11 @@ def unit_of(t: Target, part: Part) -> Unit:
     """A unit and its variables. Raises InputError for an unknown part."""
     if part not in PARTS:
         raise InputError("export", "part", repr(part), "one of " + ", ".join(PARTS))
-    m = Machine(t) if part in ("machine", "loop") and not t.look_ups else None
+    m = FirmwareMachine(t) if part in ("machine", "loop") and not t.look_ups else None
     if part in ("machine", "loop") and m is None:
         found = f"a {t.believed.name} whose currents come from a table"
         raise InputError("export", part, found, "the controller alone, or a coil model without a table")
-    variables = [Variable("time", "independent", "continuous", "s", None, "simulation time", 0)]
+    variables = [FmuVariable("time", "independent", "continuous", "s", None, "simulation time", 0)]
     at: dict[str, int] = {}
     for group in _groups(t, part, m):
         at[group.field.name] = len(variables)
@@ -147,7 +149,7 @@ def unit_of(t: Target, part: Part) -> Unit:
         for signal, label, *known in zip(group.field.signals, _labels(group.field), *numbers, strict=True):
             start, least, most = (None if v is None else float(v) for v in known)
             variables.append(
-                Variable(
+                FmuVariable(
                     label,
                     group.causality,
                     group.variability,
@@ -162,81 +164,83 @@ def unit_of(t: Target, part: Part) -> Unit:
     return Unit(t, part, tuple(variables), at, c_name(t.controller.name), m)
 
 
-def _groups(t: Target, part: Part, m: Machine | None) -> Iterator[Group]:
+def _groups(t: Target, part: Part, m: FirmwareMachine | None) -> Iterator[VariableGroup]:
     """The fields of a part in the order of their value references: inputs, parameters, outputs, what is inside."""
     if part != "machine":
         for f in t.reference_fields:
-            yield Group(f._replace(name=f"{f.name}_ref"), "input", "continuous", 0.0)
+            yield VariableGroup(f._replace(name=f"{f.name}_ref"), "input", "continuous", 0.0)
     if part == "supervised":
-        yield Group(request_field(), "input", "discrete", 0.0)
+        yield VariableGroup(request_field(), "input", "discrete", 0.0)
     if m is None:
         for f in t.input_fields:
             valid = f.name.endswith("_valid")
             start = 1.0 if valid else t.believed.drive.link_voltage if f.name == "link" else 0.0
-            yield Group(f, "input", "discrete" if valid else "continuous", start)
+            yield VariableGroup(f, "input", "discrete" if valid else "continuous", start)
     elif part == "machine":
-        yield Group(command_field(t), "input", "discrete", _command_at_rest(m))
+        yield VariableGroup(command_field(t), "input", "discrete", _command_at_rest(m))
     for f in wrench_fields(m) if m is not None else []:
-        yield Group(f, "input", "continuous", 0.0)
+        yield VariableGroup(f, "input", "continuous", 0.0)
     if part == "supervised":
-        yield Group(FLYING, "parameter", "fixed", 0.0, *SWITCH)
-        rest = Field("rest", t.controller.measurements, "readings of the machine where it lands, if it flies")
-        yield Group(rest, "parameter", "fixed", 0.0)
+        yield VariableGroup(FLYING_FIELD, "parameter", "fixed", 0.0, *SWITCH)
+        rest = CField(
+            "rest", t.controller.measurements, "readings of the machine where it lands, if it flies"
+        )
+        yield VariableGroup(rest, "parameter", "fixed", 0.0)
     if m is not None:
         yield from _machine_parameters(m, part)
     for p in parameters_of(t):
-        yield Group(p.field, "parameter", "tunable", p.values, p.least, p.most)
+        yield VariableGroup(p.field, "parameter", "tunable", p.values, p.least, p.most)
     if part != "machine":
         for f in t.output_fields:
-            yield Group(f, "output", "discrete")
+            yield VariableGroup(f, "output", "discrete")
     if part == "supervised":
-        yield Group(supervision_field(), "output", "discrete")
+        yield VariableGroup(supervision_field(), "output", "discrete")
     for f in reading_fields(m) if m is not None else []:
-        yield Group(f, "local" if f.name == "x" else "output", "continuous")
+        yield VariableGroup(f, "local" if f.name == "x" else "output", "continuous")
 
 
-def _machine_parameters(m: Machine, part: Part) -> Iterator[Group]:
+def _machine_parameters(m: FirmwareMachine, part: Part) -> Iterator[VariableGroup]:
     """How a machine starts, with what noise, and what it is."""
     if part == "machine":
-        yield Group(state_field(m, "x_start", "at the start"), "parameter", "fixed", _at_rest(m))
-        yield Group(COLD, "parameter", "fixed", 0.0, *SWITCH)
+        yield VariableGroup(state_field(m, "x_start", "at the start"), "parameter", "fixed", _at_rest(m))
+        yield VariableGroup(COLD_FIELD, "parameter", "fixed", 0.0, *SWITCH)
         if m.setup.delay:
-            yield Group(LATE, "parameter", "fixed", 1.0, *SWITCH)
+            yield VariableGroup(LATE_FIELD, "parameter", "fixed", 1.0, *SWITCH)
     else:
         meaning = "at the start, beyond what the reference gives"
-        yield Group(state_field(m, "offset", meaning), "parameter", "fixed", 0.0)
+        yield VariableGroup(state_field(m, "offset", meaning), "parameter", "fixed", 0.0)
     if noise_channels(m):
-        yield Group(NOISE, "parameter", "tunable", 0.0, 0.0, MOST_NOISE)
-        yield Group(SEED, "parameter", "fixed", 0.0, 0.0, MOST_SEED)
+        yield VariableGroup(NOISE, "parameter", "tunable", 0.0, 0.0, MOST_NOISE)
+        yield VariableGroup(SEED, "parameter", "fixed", 0.0, 0.0, MOST_SEED)
     values = [getattr(m.plant.parameters, name) for name in m.parameters]
     least, most = zip(*(_range(m, name) for name in m.parameters), strict=True)
-    yield Group(parameter_field(m), "parameter", "tunable", values, least, most)
+    yield VariableGroup(parameter_field(m), "parameter", "tunable", values, least, most)
 
 
-def _range(m: Machine, name: str) -> tuple[float, float]:
+def _range(m: FirmwareMachine, name: str) -> tuple[float, float]:
     """The least and the largest value of a parameter that its record accepts."""
     known = next(f.metadata for f in fields(m.plant.parameters) if f.name == name)
     above, least, below = (known[key] for key in ("above", "at_least", "below"))
     if above is not None:
         least = np.finfo(float).tiny if above == 0 else np.nextafter(above, np.inf)
-    most = LARGEST if below is None else np.nextafter(below, -np.inf)
-    return float(-LARGEST if least is None else least), float(most)
+    most = UNLIMITED_PARAMETER if below is None else np.nextafter(below, -np.inf)
+    return float(-UNLIMITED_PARAMETER if least is None else least), float(most)
 
 
-def request_field() -> Field:
+def request_field() -> CField:
     """What a supervisor is asked for, beside its reference."""
     members = [member for member in request_members() if member.kind == "int32_t"]
-    return Field("request", tuple(Signal(member.name, "1") for member in members), "request")
+    return CField("request", tuple(Signal(member.name, "1") for member in members), "request")
 
 
-def supervision_field() -> Field:
+def supervision_field() -> CField:
     """What a supervisor says."""
     words = ", ".join(f"{k} {state.lower()}" for k, state in enumerate(STATES))
     names = ("state", "enable", "monitor", "reaction")
-    return Field("supervisor", tuple(Signal(name, "1") for name in names), f"states: {words}")
+    return CField("supervisor", tuple(Signal(name, "1") for name in names), f"states: {words}")
 
 
-def _labels(field: Field) -> list[str]:
+def _labels(field: CField) -> list[str]:
     """The names of a field's variables, as `y.z`; numbers as `y[1]` where names of signals do not serve."""
     if field.size == 1 and not field.signals[0].name:
         return [field.name]
@@ -251,14 +255,14 @@ def _labels(field: Field) -> list[str]:
     return [f"{field.name}.{label}" for label in labels]
 
 
-def _at_rest(m: Machine) -> list[float]:
+def _at_rest(m: FirmwareMachine) -> list[float]:
     """The states that a reference of zero gives."""
     place = machine_functions(m)["place"]
     zeros = [ca.DM.zeros(place.size1_in(k)) for k in range(place.n_in())]
     return [float(v) for v in np.array(place(*zeros)).ravel()]
 
 
-def _command_at_rest(m: Machine) -> list[float]:
+def _command_at_rest(m: FirmwareMachine) -> list[float]:
     """The commands that hold the machine there."""
     plant, c = m.plant, m.target.controller
     x = ca.DM(_at_rest(m))
@@ -289,7 +293,7 @@ def _library_context(u: Unit, token: str) -> dict[str, Any]:
     starts = [c_number(v.start or 0.0, "double") for v in u.variables]
     inputs = [f for f in t.input_fields if f.size]
 
-    def places(fields: list[Field], suffix: str = "") -> list[dict[str, Any]]:
+    def places(fields: list[CField], suffix: str = "") -> list[dict[str, Any]]:
         return [
             {"field": f.name, "at": u.at.get(f.name + suffix, 0), "size": f.size, "name": f.name}
             for f in fields
@@ -339,7 +343,7 @@ def _library_context(u: Unit, token: str) -> dict[str, Any]:
 
 
 PATIENCE = 1800.0  # s; zig builds the C library of a system at its first use, that of Windows in minutes
-ALL = "all"
+ALL_PLATFORMS = "all"
 OWN_FLAGS = (*FLAGS, "-fvisibility=hidden", "-fno-sanitize=undefined", "-g0", "-s")
 FAT_MAGIC, FAT_ALIGNMENT = 0xCAFEBABE, 14  # of Mach-O files of several processors; pages of 2^14 bytes
 DARWIN_CPUS = {"x86_64": (0x01000007, 3), "aarch64": (0x0100000C, 0)}
@@ -377,9 +381,11 @@ def platforms_named(names: Sequence[str]) -> tuple[Platform, ...]:
     """
     known = {name: p for p in PLATFORMS for name in (p.name, p.second)}
     for name in names:
-        if name not in (ALL, *known):
-            raise InputError("export", "platforms", repr(name), f"{ALL}, or some of {', '.join(known)}")
-    chosen = PLATFORMS if ALL in names else [known[name] for name in names]
+        if name not in (ALL_PLATFORMS, *known):
+            raise InputError(
+                "export", "platforms", repr(name), f"{ALL_PLATFORMS}, or some of {', '.join(known)}"
+            )
+    chosen = PLATFORMS if ALL_PLATFORMS in names else [known[name] for name in names]
     return tuple(p for p in PLATFORMS if p in chosen)
 
 
@@ -430,7 +436,7 @@ WITHOUT_COMPILER = (
     "without a binary, because no C compiler works here: the importing tool has to compile the sources"
 )
 DATE = (1980, 1, 1, 0, 0, 0)  # of all members
-STOP = 0.1  # s, of the default experiment
+STOP_TIME = 0.1  # s, of the default experiment
 TOKEN = "@token@"  # in place of the token while it is computed
 
 
@@ -471,7 +477,7 @@ def build_fmu(
         return Fmu(_archive(members | cross_compile(own, chosen, identifier_of(unit), fmi)), "")
     binary = shared_library(own, (*FLAGS, "-fvisibility=hidden"))
     if binary is not None:
-        members[f"binaries/{platform_of(fmi)}/{identifier_of(unit)}{_ending()}"] = binary
+        members[f"binaries/{platform_of(fmi)}/{identifier_of(unit)}{_library_suffix()}"] = binary
     return Fmu(_archive(members), "" if binary is not None else WITHOUT_COMPILER)
 
 
@@ -489,7 +495,7 @@ def platform_of(fmi: int) -> str:
     return f"{ARCHITECTURES.get(machine, machine)}-{system}"
 
 
-def _ending() -> str:
+def _library_suffix() -> str:
     return ".dylib" if sys.platform == "darwin" else ".so"
 
 
@@ -500,7 +506,7 @@ def _texts(u: Unit, sha256: str, fmi: int) -> dict[str, str]:
     context |= {"files": sorted(name for name in own if name.endswith(".c"))}
     texts = {f"sources/{name}": text for name, text in own.items()}
     for name in HEADERS[fmi]:
-        texts[f"sources/{name}"] = packaged(f"firmware/templates/fmi/{name}").decode()
+        texts[f"sources/{name}"] = read_packaged(f"firmware/templates/fmi/{name}").decode()
     if fmi == 3:
         texts["sources/buildDescription.xml"] = render("fmu_build.xml", context)
     texts["documentation/index.html"] = render("fmu_index.html", context)
@@ -524,7 +530,7 @@ def _context(u: Unit, sha256: str) -> dict[str, Any]:
         "part": u.part,
         "identifier": identifier_of(u),
         "sample_time": repr(c.sample_time),
-        "stop": repr(max(STOP, 10 * c.sample_time)),
+        "stop": repr(max(STOP_TIME, 10 * c.sample_time)),
         "variables": u.variables,
         "units": _units(u),
     }

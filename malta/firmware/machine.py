@@ -24,7 +24,7 @@ import numpy as np
 from malta.firmware.ctext import c_number, c_numbers, function_text, signature
 from malta.firmware.period_functions import named_function, symbols
 from malta.firmware.program import Program, build_program, lower
-from malta.firmware.signals import Field, Target
+from malta.firmware.signals import CField, Target
 from malta.firmware.sources import call_text, comment, head_context, number_rows, render, root_context
 from malta.model.parameters import acting_names, twins_of, units_of
 from malta.model.plant import Plant, Signal, symbolic
@@ -42,13 +42,13 @@ from malta.simulation.period import Period, initial_state, period_of, state_refe
 from malta.simulation.readings import COSINE, LOGARITHM, SINE
 from malta.simulation.scenario import Scenario, Simulation, simulation_of, substeps_of
 
-TINY = 1e-6  # share of a substep that rounding may add, see engines.substeps_until
+SUBSTEP_ROUNDING = 1e-6  # share of a substep that rounding may add, see engines.substeps_until
 WAVES = {"logarithm": LOGARITHM, "cosine": COSINE, "sine": SINE}  # polynomials of the noise
-OWN = ("begin", "substep", "read")  # functions that only the machine's text calls
+OWN_FUNCTIONS = ("begin", "substep", "read")  # functions that only the machine's text calls
 
 
 @dataclass(frozen=True, eq=False)
-class Machine:
+class FirmwareMachine:
     """The machine that a gain file knows, under the commands of its exported controller; a Target refuses tables."""
 
     target: Target
@@ -131,76 +131,81 @@ class Machine:
     @cached_property
     def parameters(self) -> tuple[str, ...]:
         """The parameters that its start, its motion or its readings depend on."""
-        results = [e for _, _, found in _varying(self) for e in found.values()]
+        results = [e for _, _, found in _varying_functions(self) for e in found.values()]
         depends = ca.which_depends(ca.vertcat(*results), ca.vertcat(*self.symbols.values()))
         return tuple(name for name, acts in zip(self.symbols, depends, strict=True) if acts)
 
 
-def command_field(t: Target) -> Field:
+def command_field(t: Target) -> CField:
     """What the controller commands and the machine takes: duty cycles, shares, set points, or currents of coils."""
     fields = {f.name: f for f in t.output_fields}
     return fields.get("command", fields["current"])
 
 
-def wrench_fields(m: Machine) -> list[Field]:
+def wrench_fields(m: FirmwareMachine) -> list[CField]:
     """Forces and torques from outside; none for a machine without disturbances."""
-    return [Field("w", m.plant.disturbances, "from outside")] if m.plant.disturbances else []
+    return [CField("w", m.plant.disturbances, "from outside")] if m.plant.disturbances else []
 
 
-def noise_channels(m: Machine) -> int:
+def noise_channels(m: FirmwareMachine) -> int:
     """Normal numbers of a sample; none for sensors with uniform noise, which a master adds to the readings."""
     return 0 if m.plant.sensors.uniform else len(m.plant.outputs) + read_currents(m.plant, m.setup)
 
 
-def state_field(m: Machine, name: str, meaning: str) -> Field:
-    return Field(name, m.plant.states, meaning)
+def state_field(m: FirmwareMachine, name: str, meaning: str) -> CField:
+    return CField(name, m.plant.states, meaning)
 
 
-def parameter_field(m: Machine) -> Field:
+def parameter_field(m: FirmwareMachine) -> CField:
     """The parameters that a co-simulation may change."""
     units = units_of(m.plant.parameters)
     signals = tuple(Signal(name, units[name]) for name in m.parameters)
-    return Field("machine", signals, "parameter of the machine")
+    return CField("machine", signals, "parameter of the machine")
 
 
-def reading_fields(m: Machine) -> list[Field]:
+def reading_fields(m: FirmwareMachine) -> list[CField]:
     """What is known of the machine at a sample; the last field is its whole state of motion."""
     plant = m.plant
-    fields = [Field("p", plant.outputs, "true outputs"), Field("y", plant.outputs, "readings of the sensors")]
+    fields = [
+        CField("p", plant.outputs, "true outputs"),
+        CField("y", plant.outputs, "readings of the sensors"),
+    ]
     if m.target.driven:
         fields += [
-            Field("i", m.target.current_readings, "currents as they are read"),
-            Field("link", (Signal("V_link", "V"),), "voltage of the DC link"),
+            CField("i", m.target.current_readings, "currents as they are read"),
+            CField("link", (Signal("V_link", "V"),), "voltage of the DC link"),
         ]
     else:
-        fields.append(Field("i_coil", plant.actuator.coils, "currents of the coils"))
+        fields.append(CField("i_coil", plant.actuator.coils, "currents of the coils"))
     contacts = tuple(Signal(name, "1") for name in plant.contacts.names)
     return [
         *fields,
-        Field("force", plant.inputs, "forces that act"),
-        Field("contact", contacts, "used share of each clearance, 1 at contact"),
+        CField("force", plant.inputs, "forces that act"),
+        CField("contact", contacts, "used share of each clearance, 1 at contact"),
         state_field(m, "x", "state of motion"),
     ]
 
 
-def machine_functions(m: Machine) -> dict[str, ca.Function]:
+def machine_functions(m: FirmwareMachine) -> dict[str, ca.Function]:
     """The functions above by name, before they are lowered."""
     par = ca.vertcat(*(m.symbols[name] for name in m.parameters))
-    varying = [named_function(name, given | {"par": par}, found) for name, given, found in _varying(m)]
+    varying = [
+        named_function(name, given | {"par": par}, found) for name, given, found in _varying_functions(m)
+    ]
     return {f.name(): f for f in [_place(m), *varying, _shift(m)]}
 
 
-def _varying(m: Machine) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
+def _varying_functions(m: FirmwareMachine) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
     """Name, arguments and results of the functions that depend on the machine's parameters."""
     return [("begin", *_begin(m)), ("substep", *_substep(m)), ("read", *_read(m))]
 
 
-def machine_programs(m: Machine) -> dict[str, Program]:
+def machine_programs(m: FirmwareMachine) -> dict[str, Program]:
     """The programs of the functions, by name."""
     return {name: build_program(lower(f, "double")) for name, f in machine_functions(m).items()}
 
 
-def _place(m: Machine) -> ca.Function:
+def _place(m: FirmwareMachine) -> ca.Function:
     plant = m.plant
     p, dp = (ca.SX.sym(name, len(plant.outputs)) for name in ("p_ref", "dp_ref"))
     offset = ca.SX.sym("offset", len(plant.states))
@@ -211,7 +216,7 @@ def _place(m: Machine) -> ca.Function:
     return named_function("place", {"p_ref": p, "dp_ref": dp, "offset": offset}, {"x": x})
 
 
-def _begin(m: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
+def _begin(m: FirmwareMachine) -> tuple[dict[str, Any], dict[str, Any]]:
     plant, c = m.variable, m.target.controller
     x, v0, cold = ca.SX.sym("x", len(plant.states)), ca.SX.sym("v0", len(c.forces)), ca.SX.sym("cold")
     current = (1 - cold) * m.plant.actuator.currents(plant.h(x, 0), v0)
@@ -224,7 +229,7 @@ def _begin(m: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
     }
 
 
-def _substep(m: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
+def _substep(m: FirmwareMachine) -> tuple[dict[str, Any], dict[str, Any]]:
     p = m.period
     state, command = ca.SX.sym("state", m.state_size), ca.SX.sym("command", p.substep.size1_in(1))
     given = {name: ca.SX.zeros(size) for name, size in m.sizes.given.items()}
@@ -234,7 +239,7 @@ def _substep(m: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
     return {"state": state, "command": command, **wrench}, {"state_next": after}
 
 
-def _read(m: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
+def _read(m: FirmwareMachine) -> tuple[dict[str, Any], dict[str, Any]]:
     p, plant, sizes = m.period, m.plant, m.sizes
     state, outputs = ca.SX.sym("state", m.state_size), len(plant.outputs)
     normals = ca.SX.sym("normals", noise_channels(m))
@@ -257,7 +262,7 @@ def _read(m: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
     return {"state": state, "normals": normals}, {f.name: read[f.name] for f in reading_fields(m)}
 
 
-def _shift(m: Machine) -> ca.Function:
+def _shift(m: FirmwareMachine) -> ca.Function:
     """As inputs.initial_values: forces that are under way come from currents commutated for the place of the mover."""
     c, plant = m.target.controller, m.plant
     xi_pred, offset = ca.SX.sym("xi_pred", len(c.states)), ca.SX.sym("offset", len(plant.states))
@@ -278,14 +283,14 @@ def _split(vector: Any, sizes: Mapping[str, int]) -> dict[str, Any]:
     return {name: vector[place, 0] for name, place in places_of(sizes).items()}
 
 
-def machine_sources(m: Machine, name: str, functions: tuple[str, ...]) -> dict[str, str]:
+def machine_sources(m: FirmwareMachine, name: str, functions: tuple[str, ...]) -> dict[str, str]:
     """<name>.h and <name>.c with these of the functions. name : a C identifier"""
     programs = machine_programs(m)
     context = _context(m, {key: programs[key] for key in functions}, name)
     return {f"{name}.{end}": render(f"fmu_machine.{end}", context) for end in ("h", "c")}
 
 
-def _context(m: Machine, programs: Mapping[str, Program], name: str) -> dict[str, Any]:
+def _context(m: FirmwareMachine, programs: Mapping[str, Program], name: str) -> dict[str, Any]:
     plant, c = m.plant, m.target.controller
 
     command = command_field(m.target)
@@ -307,7 +312,7 @@ def _context(m: Machine, programs: Mapping[str, Program], name: str) -> dict[str
         "machine": comment(plant.name),
         "period": f"{c.sample_time * 1e6:g} us",
         "substeps": c_number(m.substeps, "double"),
-        "tiny": c_number(TINY, "double"),
+        "tiny": c_number(SUBSTEP_ROUNDING, "double"),
         "state": m.state_size,
         "states": len(plant.states),
         "held": command.size,
@@ -323,9 +328,9 @@ def _context(m: Machine, programs: Mapping[str, Program], name: str) -> dict[str
         "v0_rows": number_rows(ff.v0, len(c.forces), "double"),
         "reads": [f for f in reading_fields(m) if f.size],
         "functions": "\n".join(
-            function_text(p, name, "double", static=key in OWN) for key, p in programs.items()
+            function_text(p, name, "double", static=key in OWN_FUNCTIONS) for key, p in programs.items()
         ),
-        "declarations": [signature(p, name) for key, p in programs.items() if key not in OWN],
+        "declarations": [signature(p, name) for key, p in programs.items() if key not in OWN_FUNCTIONS],
         "call_begin": call_text(programs["begin"], name, places | {"x": "x"}),
         "call_substep": call_text(programs["substep"], name, places),
         "call_read": call_text(programs["read"], name, places),

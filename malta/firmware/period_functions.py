@@ -20,16 +20,16 @@ from malta.arrays import FloatArray
 from malta.firmware.blocks import Staged, staged_function
 from malta.firmware.calibration import law_arguments, law_symbols
 from malta.firmware.program import as_written
-from malta.firmware.signals import Field, Target, reading_ranges
+from malta.firmware.signals import CField, Target, reading_ranges
 from malta.model.equations import note, recorded_equations, recorded_look_ups
-from malta.model.plant import placed
+from malta.model.plant import place_states
 from malta.simulation.current_control import control_currents
-from malta.simulation.layout import Loop, Signals, electronics_of, numbers_of
+from malta.simulation.layout import LoopPlan, Symbols, electronics_of, numbers_of
 from malta.simulation.period import law_reference, limited_currents, state_reference
 from malta.synthesis.controller import (
-    commanded,
-    estimated,
-    filtered,
+    command_forces,
+    estimate_states,
+    filter_reading,
     freeze_moving,
     frozen_axes,
     look_ahead,
@@ -37,11 +37,11 @@ from malta.synthesis.controller import (
 )
 from malta.synthesis.schedule import interpolate
 
-FAR = 1e3  # times the reach of a reading: what a filter may expect in its place, which supervisors call astray before
+ASTRAY_FACTOR = 1e3  # times the reach of a reading: supervisors call a filter astray long before
 LINK_RANGE = (0.05, 4.0)  # readings of the link's voltage that are believed, in multiples of the nominal one
 
 
-def symbols(fields: Sequence[Field]) -> dict[str, Any]:
+def symbols(fields: Sequence[CField]) -> dict[str, Any]:
     """Symbols of fields by name."""
     return {field.name: ca.SX.sym(field.name, field.size) for field in fields}
 
@@ -63,7 +63,7 @@ def sense(t: Target) -> Staged:
 
     A reading is refused that its sensor calls invalid, that is no number, or beyond all that the machine can reach; the
     filter then goes on by its model. Comparisons with a NaN are false, so no reading poisons the state. What the filter
-    expects is bounded by FAR times that reach: an unstable model that goes on alone would leave all numbers behind.
+    expects is bounded by ASTRAY_FACTOR times that reach: an unstable model alone would leave all numbers behind.
     """
     c = t.controller
     a = symbols(
@@ -74,7 +74,7 @@ def sense(t: Target) -> Staged:
         ]
     )
     reach = reading_ranges(t.believed)
-    most = ca.DM(FAR * reach)
+    most = ca.DM(ASTRAY_FACTOR * reach)
     with recorded_equations() as equations:
         expected = interpolate(numbers(t), c.schedule, a["p"])["Cd"] @ a["xi_pred"]
         if c.tracks == "errors":
@@ -82,7 +82,9 @@ def sense(t: Target) -> Staged:
         bounded = ca.fmax(ca.fmin(expected, most), -most)
         used, refused = gate(a["y"], a["y_valid"], reach, bounded)
         instead = "Cd xi_pred" if c.tracks == "states" else "p"
-        meaning = f"y_used = y where it may be used, else {instead} within +-{FAR:g} r; refused: not used"
+        meaning = (
+            f"y_used = y where it may be used, else {instead} within +-{ASTRAY_FACTOR:g} r; refused: not used"
+        )
         note("gate", meaning, y_used=used, refused=refused)
         results = {"y_used": used, "refused": refused}
         if t.look_ups:
@@ -154,11 +156,11 @@ def _decided_forces(
     xi_ref = law_reference(c, plant, g, {"p_ref": p, "dp_ref": dp, "v_past": v_past})
     note("law_reference", "xi_ref = (q*, dq* + rate dp, memory of forces under way)", xi_ref=xi_ref)
     if t.excited:  # after v_past: the filter knows these forces, the reference does not
-        v_ff = _excited(t, v_ff, reference["excitation"])
-    xi_hat = estimated(g, state["xi_pred"], filtered(c.tracks, y, p), None, sums.add_to_states)
+        v_ff = _add_excitation(t, v_ff, reference["excitation"])
+    xi_hat = estimate_states(g, state["xi_pred"], filter_reading(c.tracks, y, p), None, sums.add_to_states)
     frozen = freeze_moving(g, state["frozen"], dp)
     e = sum_errors(g, state["e"], frozen, y, p, sums.add_to_errors)
-    xi_pred, saturated, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
+    xi_pred, saturated, v = command_forces(g, xi_hat, e, xi_ref, v_ff, v0)
     xi_pred, place = look_ahead(g, sums.predict(xi_pred, xi_hat), y, dp)
     ahead = "" if c.commutation is None else " + Bd lead pull dp"
     note("predict", f"xi_pred = Ad xi_hat + Bd (v - v0){ahead}", xi_pred=xi_pred, **sums.rest("xi_rest"))
@@ -172,7 +174,7 @@ def _decided_forces(
     return after, {"xi_hat": xi_hat, "v": v, "saturated": saturated}, place
 
 
-def _excited(t: Target, v_ff: Any, excitation: Any) -> Any:
+def _add_excitation(t: Target, v_ff: Any, excitation: Any) -> Any:
     """The forces that are fed forward with an excitation; what is no number or beyond a limit is none."""
     most = ca.DM(np.array(t.controller.limits.force))
     used = ca.if_else(ca.fabs(excitation) <= most, excitation, 0)
@@ -351,7 +353,12 @@ def drive_currents(
     if t.tunable:
         g = g | {"control_time": ca.SX(1)}
     command, after, _ = control_currents(
-        Loop(plant, c, t.setup, g), Signals(machine, loops, {}), current, known, None, sums.add_to_voltages
+        LoopPlan(plant, c, t.setup, g),
+        Symbols(machine, loops, {}),
+        current,
+        known,
+        None,
+        sums.add_to_voltages,
     )
     return command, after | {"i_last": i, "link_last": V}
 
@@ -389,7 +396,7 @@ def _state_on_reference(t: Target, reference: dict[str, Any], v0: Any) -> dict[s
         state["xi_pred"] = ca.vertcat(state_reference(plant)(p, dp), v_past)
         note("expect", "xi_pred = (q*, dq*, memory of forces under way)", xi_pred=state["xi_pred"])
     if t.driven:
-        drive, x = plant.drive, placed(plant, state_reference(plant)(p, dp))
+        drive, x = plant.drive, place_states(plant, state_reference(plant)(p, dp))
         i = drive.command(plant.actuator.currents(p, v0))
         state["u_integral"] = plant.actuator.R * i
         note("hold_currents", "u_integral = R i_axes of the currents for v0", u_integral=state["u_integral"])

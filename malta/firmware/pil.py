@@ -38,7 +38,7 @@ from malta.simulation.layout import Fidelity
 
 
 termios: Any = import_module("termios") if find_spec("termios") else None  # of POSIX systems
-BROKEN: tuple[type[Exception], ...] = (OSError,) if termios is None else (OSError, termios.error)
+PORT_ERRORS: tuple[type[Exception], ...] = (OSError,) if termios is None else (OSError, termios.error)
 START = b"\xa5\x5a"
 ANSWER, GARBLED = 128, 255  # added to the kind of a request; the kind that answers a garbled one
 TRIES = 4  # of each request
@@ -113,7 +113,7 @@ def serial_port(name: str, baud: int) -> Iterator[Port]:
             yield Posix(number)
         finally:
             os.close(number)
-    except BROKEN as error:  # those of pyserial are an OSError
+    except PORT_ERRORS as error:  # those of pyserial are an OSError
         found = getattr(error, "strerror", None) or str(error.args[-1] if error.args else error)
         raise InputError(
             name, "", found, "a serial port, as /dev/ttyUSB0, that no other program uses"
@@ -159,7 +159,7 @@ def frame_bytes(f: Frame) -> bytes:
     return START + body + struct.pack("<I", zlib.crc32(body))
 
 
-class Line:
+class SerialLine:
     """Requests and their answers over a port.
 
     seconds : to wait for an answer; repeated : how often a request was sent again
@@ -229,7 +229,7 @@ def next_frame(data: bytes, at: int) -> tuple[Frame | None, int]:
 
 
 BAUD, SECONDS = 115200, 2.0
-LONGEST = 600.0  # s to wait for an answer
+MAX_ANSWER_TIME = 600.0  # s to wait for an answer
 PROTOCOL = 1
 HELLO, BEGIN, STEP = 1, 2, 3  # requests
 HEAD = "<BBBBHH64s"  # of the answer to HELLO
@@ -327,10 +327,10 @@ def replay_on_target(
     No such file or directory
     """
     path = locate(gains)
-    positive("replay", "seconds", seconds, below=LONGEST)
+    positive("replay", "seconds", seconds, below=MAX_ANSWER_TIME)
     sha256 = content_of(path)[0].sha256
     with serial_port(port, baud) as opened:
-        line = Line(opened, port, seconds)
+        line = SerialLine(opened, port, seconds)
         t = _target_of(line, path, sha256)
         vectors = record_vectors(t)
         begin, counts, found = time.perf_counter(), 0, []
@@ -342,7 +342,7 @@ def replay_on_target(
         return Replay(t.precision, tuple(found), time.perf_counter() - begin, line.repeated, counts)
 
 
-def _target_of(line: Line, path: Path, sha256: str) -> Target:
+def _target_of(line: SerialLine, path: Path, sha256: str) -> Target:
     """The export that a target runs. Raises InputError where it is not that of the gain file."""
     answer = line.ask(HELLO, b"")
     if len(answer) != struct.calcsize(HEAD) or answer[0] != PROTOCOL:
@@ -367,7 +367,7 @@ def _target_of(line: Line, path: Path, sha256: str) -> Target:
 
 
 def _replay(
-    line: Line, t: Target, v: Vector, tell: Callable[[float], None] | None
+    line: SerialLine, t: Target, v: Vector, tell: Callable[[float], None] | None
 ) -> tuple[ReplayedVector, int]:
     """What the target makes of a vector, and the counts of its slowest step."""
     real, order = t.real, ORDERS[t.precision]

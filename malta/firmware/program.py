@@ -58,34 +58,34 @@ class Elementary:
     exponentials: tuple[float, ...]  # (e^r - 1 - r) / r^2 in powers of r, |r| up to ln(2) / 2
     arctangents: tuple[float, ...]  # (atan(r) / r - 1) / r^2 in powers of r^2, |r| up to tan(pi/8)
 
-    def rounded(self, x: Any) -> Any:
+    def round_to_even(self, x: Any) -> Any:
         """The nearest whole number; halves go to the even one."""
         return (x + self.shift) - self.shift
 
     def floor(self, x: Any) -> Any:
         """The largest whole number that is not above x."""
-        n = self.rounded(x)
+        n = self.round_to_even(x)
         return ca.if_else(x < n, n - 1, n)
 
     def sine(self, x: Any) -> Any:
         """sin(x) = (-1)^n sin(x - n pi) with the nearest n."""
-        return self._wave(x, self.rounded(x * (1 / math.pi)), 0.0)
+        return self._wave(x, self.round_to_even(x * (1 / math.pi)), 0.0)
 
     def cosine(self, x: Any) -> Any:
         """cos(x) = sin(x + pi/2) = (-1)^n sin(x - (n - 1/2) pi)."""
-        return self._wave(x, self.rounded(x * (1 / math.pi) + 0.5), 0.5)
+        return self._wave(x, self.round_to_even(x * (1 / math.pi) + 0.5), 0.5)
 
     def _wave(self, x: Any, n: Any, half: float) -> Any:
         turns = n - half if half else n
         r = reduce(lambda rest, part: rest - turns * part, self.pi, x)
-        odd = n * 0.5 - self.rounded(n * 0.5)  # -1/2 or 1/2 for odd n, else 0
+        odd = n * 0.5 - self.round_to_even(n * 0.5)  # -1/2 or 1/2 for odd n, else 0
         t = r * r
         return (r + r * (t * polynomial(self.sines, t))) * (1 - 8 * (odd * odd))
 
     def exponential(self, x: Any) -> Any:
         """e^x = 2^n e^(x - n ln 2) with the nearest n; x is taken within the domain."""
         x = ca.fmax(ca.fmin(x, EDGE), -EDGE)
-        n = self.rounded(x * (1 / math.log(2)))
+        n = self.round_to_even(x * (1 / math.log(2)))
         r = reduce(lambda rest, part: rest - n * part, self.ln2, x)
         return (1 + (r + r * r * polynomial(self.exponentials, r))) * _power_of_two(n)
 
@@ -119,7 +119,7 @@ def _power_of_two(n: Any) -> Any:
     return factor
 
 
-ELEMENTARY: dict[Precision, Elementary] = {
+ELEMENTARY_FUNCTIONS: dict[Precision, Elementary] = {
     "double": Elementary(
         shift=1.5 * 2**52,
         pi=(3.1415926534682512, 1.2154201012607932e-10, 4.044532497591901e-21),
@@ -158,7 +158,7 @@ ELEMENTARY: dict[Precision, Elementary] = {
 
 
 NAMES = {getattr(ca, name): name.removeprefix("OP_") for name in dir(ca) if name.startswith("OP_")}
-_SHIFTS_WORTH = 3  # sines and cosines of one angle plus constants, from which on two of them serve for all
+_MIN_SHIFTS = 3  # sines and cosines of one angle plus constants, from which on two of them serve for all
 
 
 class _Angle(NamedTuple):
@@ -178,7 +178,7 @@ def lower(f: ca.Function, precision: Precision) -> ca.Function:
     with as_written():
         arguments = [ca.SX.sym(f.name_in(i), f.size1_in(i)) for i in range(f.n_in())]
         results = [[ca.SX(0)] * f.size1_out(i) for i in range(f.n_out())]
-        waves = _Waves(f, ELEMENTARY[precision])
+        waves = _Waves(f, ELEMENTARY_FUNCTIONS[precision])
         work: dict[int, Any] = {}
         for k in range(f.n_instructions()):
             op, reads, writes = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
@@ -191,7 +191,7 @@ def lower(f: ca.Function, precision: Precision) -> ca.Function:
             elif NAMES[op] in ("SIN", "COS"):
                 work[writes[0]] = waves.value(k, NAMES[op], work[reads[0]])
             else:
-                work[writes[0]] = _form_of(f, k, ELEMENTARY[precision])(*(work[r] for r in reads))
+                work[writes[0]] = _form_of(f, k, ELEMENTARY_FUNCTIONS[precision])(*(work[r] for r in reads))
             waves.note(k, work[writes[0]] if op != ca.OP_OUTPUT else None)
         found = [ca.densify(ca.vertcat(*column)) for column in results]
         return ca.Function(f.name(), arguments, ca.cse(found), f.name_in(), f.name_out())
@@ -200,7 +200,7 @@ def lower(f: ca.Function, precision: Precision) -> ca.Function:
 def _form_of(f: ca.Function, k: int, own: Elementary) -> Callable[..., Any]:
     """How an instruction is computed by basic operations."""
     name = NAMES[f.instruction_id(k)]
-    if name in _KEPT:
+    if name in _KEPT_OPERATIONS:
         operation = f.instruction_id(k)
         return lambda *a: ca.SX.binary(operation, *a) if len(a) == 2 else ca.SX.unary(operation, *a)
     forms: dict[str, Callable[..., Any]] = {
@@ -227,7 +227,7 @@ def _form_of(f: ca.Function, k: int, own: Elementary) -> Callable[..., Any]:
     return forms[name]
 
 
-_KEPT = (
+_KEPT_OPERATIONS = (
     *("ADD", "SUB", "MUL", "DIV", "NEG", "FABS", "SQRT", "FMIN", "FMAX"),
     *("LT", "LE", "EQ", "NE", "NOT", "AND", "OR", "IF_ELSE_ZERO"),
 )
@@ -284,7 +284,7 @@ class _Waves:
     def value(self, k: int, name: str, x: Any) -> Any:
         """The sine or cosine x of instruction k."""
         base, shift = self.angles[k]
-        if self.uses[base] < _SHIFTS_WORTH:
+        if self.uses[base] < _MIN_SHIFTS:
             return self.own.sine(x) if name == "SIN" else self.own.cosine(x)
         if base not in self.pairs:
             self.pairs[base] = self.own.sine(self.values[base]), self.own.cosine(self.values[base])
@@ -309,7 +309,7 @@ class Operation(NamedTuple):
     place: tuple[int, int] = (0, 0)  # of an INPUT: argument, entry
 
 
-class Block(NamedTuple):
+class NamedEquation(NamedTuple):
     """An equation and the names of what it gives."""
 
     name: str
@@ -327,7 +327,7 @@ class Program(NamedTuple):
     operations: tuple[Operation, ...]
     outputs: tuple[tuple[int, int, int], ...]  # result, or behind them one of `between`; entry, operation
     between: tuple[tuple[str, int], ...] = ()  # what blocks hand on: names and sizes
-    blocks: tuple[Block, ...] = ()  # in which it is computed, if any
+    blocks: tuple[NamedEquation, ...] = ()  # in which it is computed, if any
 
     @property
     def names(self) -> list[str]:

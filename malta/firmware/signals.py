@@ -16,7 +16,7 @@ from malta.errors import InputError
 from malta.firmware.program import TYPES, Precision
 from malta.model.data import plant_of
 from malta.model.equations import LookUp, recorded_look_ups
-from malta.model.plant import Plant, Signal, placed
+from malta.model.plant import Plant, Signal, place_states
 from malta.simulation.layout import Fidelity, Setup, electronics_of, fidelities
 from malta.synthesis.controller import Controller
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from malta.margins.tuned_gains import GainBox
 
 
-SLOW = 0.1  # share that a state changes by in a sample without anything added, at most: it is then a sum
-UNBOUNDED = 1e6  # of its unit, an output's range where none is known: beyond, single precision has no room
+SUM_SHARE = 0.1  # share that a state changes by in a sample without anything added, at most: it is then a sum
+UNLIMITED_RANGE = 1e6  # of an output without a known range: beyond, single precision has no room
 
 
-class Field(NamedTuple):
+class CField(NamedTuple):
     """A vector of named numbers."""
 
     name: str
@@ -107,7 +107,7 @@ class Target:
         """The states that sum up what is added to them: observed disturbances, and slow states of a law of errors."""
         Ad, Bd = self.controller.Ad, self.controller.Bd
         if self.controller.tracks == "errors":
-            return tuple(k for k in range(len(Ad)) if abs(Ad[k, k] - 1) < SLOW)
+            return tuple(k for k in range(len(Ad)) if abs(Ad[k, k] - 1) < SUM_SHARE)
         unit = np.eye(len(Ad))
         return tuple(k for k in range(len(Ad)) if (Ad[k] == unit[k]).all() and not Bd[k].any())
 
@@ -127,19 +127,19 @@ class Target:
         return self.precision == "float"
 
     @cached_property
-    def state_fields(self) -> list[Field]:
+    def state_fields(self) -> list[CField]:
         """What the controller remembers from one sample to the next."""
         c, m = self.controller, self.controller.forces
         errors = tuple(Signal(f"sum of {s.name}* - {s.name}", f"{s.unit} s") for s in c.measurements)
         fields = [
-            Field("xi_pred", c.states, "what the filter expects of the states at the next sample"),
-            Field("e", errors, "sums of the errors p* - y"),
-            Field("frozen", signals_after("waits ", c.measurements, "1"), "1 where the sum of errors waits"),
+            CField("xi_pred", c.states, "what the filter expects of the states at the next sample"),
+            CField("e", errors, "sums of the errors p* - y"),
+            CField("frozen", signals_after("waits ", c.measurements, "1"), "1 where the sum of errors waits"),
         ]
         if self.compensated:
-            fields.append(Field("e_rest", errors, "what rounding took from the sums of errors"))
+            fields.append(CField("e_rest", errors, "what rounding took from the sums of errors"))
             if self.summing_states:
-                fields.append(Field("xi_rest", c.states, "the same, of states that sum up"))
+                fields.append(CField("xi_rest", c.states, "the same, of states that sum up"))
         if c.tracks == "states" and (c.lagging or c.delay):
             ages = range(c.delay, 0, -1)
             stored = [Signal(f"{s.name}*[k-{age}]", s.unit) for age in ages for s in m]
@@ -148,76 +148,78 @@ class Target:
                 [Signal(f"{s.name}_ff[k-{age}]", s.unit) for age in ages for s in m] if c.lagging else []
             )
             fields.append(
-                Field("memory", (*lag, *stored, *forward), "references of forces that are under way")
+                CField("memory", (*lag, *stored, *forward), "references of forces that are under way")
             )
         if self.driven:
             drive = self.believed.drive
             volts = tuple(Signal(s.name.replace("i_", "u_"), "V") for s in drive.axes)
-            fields.append(Field("u_integral", volts, "integrals of the current loops"))
+            fields.append(CField("u_integral", volts, "integrals of the current loops"))
             fields.append(
-                Field(
+                CField(
                     "u_limited",
                     signals_after("limited ", drive.axes, "1"),
                     "1 where a half-bridge was at its limit",
                 )
             )
             if self.compensated:
-                fields.append(Field("u_rest", volts, "what rounding took from the integrals"))
-            fields.append(Field("i_last", self.current_readings, "the last valid readings of currents"))
-            fields.append(Field("link_last", (Signal("V_link", "V"),), "the last valid reading of the link"))
+                fields.append(CField("u_rest", volts, "what rounding took from the integrals"))
+            fields.append(CField("i_last", self.current_readings, "the last valid readings of currents"))
+            fields.append(CField("link_last", (Signal("V_link", "V"),), "the last valid reading of the link"))
         return fields
 
     @cached_property
-    def reference_fields(self) -> list[Field]:
+    def reference_fields(self) -> list[CField]:
         """The reference of a sample."""
         outputs = self.controller.measurements
         return [
-            Field("p", signals_after("", outputs, "", "*"), "reference"),
-            Field("dp", tuple(Signal(f"{s.name}*'", f"{s.unit}/s") for s in outputs), "its rate"),
-            Field("ddp", tuple(Signal(f"{s.name}*''", f"{s.unit}/s^2") for s in outputs), "its acceleration"),
+            CField("p", signals_after("", outputs, "", "*"), "reference"),
+            CField("dp", tuple(Signal(f"{s.name}*'", f"{s.unit}/s") for s in outputs), "its rate"),
+            CField(
+                "ddp", tuple(Signal(f"{s.name}*''", f"{s.unit}/s^2") for s in outputs), "its acceleration"
+            ),
         ]
 
     @cached_property
-    def input_fields(self) -> list[Field]:
+    def input_fields(self) -> list[CField]:
         """What is read at a sample."""
         outputs = self.controller.measurements
         fields = [
-            Field("y", outputs, "measured outputs"),
-            Field("y_valid", signals_after("valid ", outputs, "1"), "1 where a reading may be used, else 0"),
+            CField("y", outputs, "measured outputs"),
+            CField("y_valid", signals_after("valid ", outputs, "1"), "1 where a reading may be used, else 0"),
         ]
         if self.driven:
             fields += [
-                Field("i", self.current_readings, "measured currents"),
-                Field(
+                CField("i", self.current_readings, "measured currents"),
+                CField(
                     "i_valid",
                     signals_after("valid ", self.current_readings, "1"),
                     "1 where a reading may be used, else 0",
                 ),
-                Field("link", (Signal("V_link", "V"),), "measured voltage of the DC link"),
+                CField("link", (Signal("V_link", "V"),), "measured voltage of the DC link"),
             ]
         if self.excited:
             meaning = "forces beside those of the law, which the filter knows as sent"
-            fields.append(Field("excitation", signals_after("exc ", self.controller.forces, ""), meaning))
+            fields.append(CField("excitation", signals_after("exc ", self.controller.forces, ""), meaning))
         return fields
 
     @cached_property
-    def output_fields(self) -> list[Field]:
+    def output_fields(self) -> list[CField]:
         """What is commanded at a sample, and what else a supervisor or a log wants of it."""
         c, plant = self.controller, self.believed
         outputs = c.measurements
         fields = [
-            Field("y_used", outputs, "readings, or what the filter expected in place of refused ones"),
-            Field("refused", signals_after("refused ", outputs, "1"), "1 where a reading was refused"),
-            Field("xi_hat", c.states, "estimated states"),
-            Field("v", c.forces, "commanded forces, within their limits"),
-            Field("saturated", signals_after("limited ", c.forces, "1"), "1 where a force is at its limit"),
-            Field("current", plant.actuator.coils, "commanded currents"),
-            Field("met", (Signal("current limit", "1"),), "1 where a current is at its limit"),
+            CField("y_used", outputs, "readings, or what the filter expected in place of refused ones"),
+            CField("refused", signals_after("refused ", outputs, "1"), "1 where a reading was refused"),
+            CField("xi_hat", c.states, "estimated states"),
+            CField("v", c.forces, "commanded forces, within their limits"),
+            CField("saturated", signals_after("limited ", c.forces, "1"), "1 where a force is at its limit"),
+            CField("current", plant.actuator.coils, "commanded currents"),
+            CField("met", (Signal("current limit", "1"),), "1 where a current is at its limit"),
         ]
         if self.has_set_points:
             electronics = electronics_of(plant, self.setup)
             points = () if electronics is None else electronics.set_points
-            fields.append(Field("command", points, "set points of the electronics"))
+            fields.append(CField("command", points, "set points of the electronics"))
         elif self.driven:
             phases = plant.drive.phases if self.fidelity == "phase" else plant.drive.axes
             sign = "d_" if self.fidelity == "phase" else "m_"
@@ -227,7 +229,7 @@ class Target:
                 else "voltages of the axes as shares of the link's"
             )
             fields.append(
-                Field("command", tuple(Signal(s.name.replace("i_", sign), "1") for s in phases), meaning)
+                CField("command", tuple(Signal(s.name.replace("i_", sign), "1") for s in phases), meaning)
             )
         return fields
 
@@ -249,7 +251,7 @@ def signals_after(before: str, signals: tuple[Signal, ...], unit: str, after: st
 
 def place_of_readings(plant: Plant, y: Any) -> Any:
     """The states of a machine at rest that is read as y, as an expression."""
-    return placed(plant, ca.SX(plant.position_of(y)))
+    return place_states(plant, ca.SX(plant.position_of(y)))
 
 
 def used_clearances(plant: Plant) -> Callable[[int, float], FloatArray]:
@@ -260,7 +262,7 @@ def used_clearances(plant: Plant) -> Callable[[int, float], FloatArray]:
     def share_used(k: int, reading: float) -> FloatArray:
         p = np.zeros(len(plant.outputs))
         p[k] = reading
-        state = placed(plant, ca.DM(plant.position_of(ca.DM(p))))
+        state = place_states(plant, ca.DM(plant.position_of(ca.DM(p))))
         return np.array(contact(state)).ravel()[: len(plant.contacts.names)]
 
     return share_used
@@ -270,11 +272,11 @@ def used_clearances(plant: Plant) -> Callable[[int, float], FloatArray]:
 def reading_ranges(plant: Plant) -> FloatArray:
     """The largest reading of each output that a machine can give, either way: twice where it touches, or its travel.
 
-    Of an output that meets nothing: 1 m, or 1 of its unit; UNBOUNDED for a machine that has no contacts at all, as a
+    Of an output that meets nothing: 1 m, or 1 of its unit; UNLIMITED_RANGE for a machine without contacts, as a
     motor that turns. Beyond, a reading is refused.
     """
     share_used, sizes = used_clearances(plant), 10.0 ** np.arange(-7, 0.01, 0.05)
-    ranges, nowhere = [], 1.0 if plant.contacts.names else UNBOUNDED
+    ranges, nowhere = [], 1.0 if plant.contacts.names else UNLIMITED_RANGE
     for k, _ in enumerate(plant.outputs):
         reach = next((size for size in sizes if share_used(k, size).max(initial=0.0) >= 1), math.inf)
         if plant.has_stroke and k == plant.stroke_output and plant.stroke.travel:

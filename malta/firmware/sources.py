@@ -13,11 +13,11 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.files import version
-from malta.firmware.blocks import unrolled
+from malta.firmware.blocks import unroll
 from malta.firmware.calibration import counts_of, gain_lines, law_fields, parameter_context, parameters_of
 from malta.firmware.ctext import (
-    APART,
-    Place,
+    APART_SUFFIX,
+    VectorPlace,
     array_place,
     blocks_call,
     blocks_signature,
@@ -30,19 +30,19 @@ from malta.firmware.ctext import (
 )
 from malta.firmware.period_functions import table_size
 from malta.firmware.program import TYPES, Precision, Program, build_program, lower
-from malta.firmware.signals import Field, Target, place_of_readings
+from malta.firmware.signals import CField, Target, place_of_readings
 from malta.firmware.step import programs_of
 from malta.firmware.supervisor import JUMP, MOST_RATE, bounds_of, reference_limits
-from malta.model.plant import Signal, placed
+from malta.model.plant import Signal, place_states
 from malta.simulation.period import state_reference
 
 if TYPE_CHECKING:
     import jinja2
 
 MOST_POINTS = 65_535  # of a table of v0(z)
-FUSED = ("sense", "decide", "state_at")  # functions that a step consists of; the others are its pieces
+FUSION = ("sense", "decide", "state_at")  # functions that a step consists of; the others are its pieces
 MOST_PARAMETERS = 6  # of a function
-LONGEST_RISE = 1000.0  # s, of a stroke
+MAX_RISE = 1000.0  # s, of a stroke
 RISES = 6.0  # times its rise that a stroke lasts: a logistic one is then within 2e-6 of its ends
 MOST_SAMPLES = 1e9  # of a stroke: twice their number is an int32_t
 DIVISOR, DIVIDENDS = 7.0, (9.0, 13.0, 18.0)  # of quotients that a reciprocal rounds otherwise
@@ -61,7 +61,7 @@ def sources(t: Target, sha256: str, name: str = "", *, loops: bool = True) -> di
     name = name or c_name(t.controller.name)
     programs = programs_of(t)
     if not loops:
-        programs = {key: unrolled(p) for key, p in programs.items()}
+        programs = {key: unroll(p) for key, p in programs.items()}
     context = template_context(t, programs, name, sha256)
     return {
         f"{name}.h": render("controller.h", context),
@@ -128,13 +128,13 @@ def head_context(t: Target, name: str) -> dict[str, str]:
 
 def _function_context(t: Target, programs: Mapping[str, Program], name: str) -> dict[str, Any]:
     """The functions, the calls of those that a step consists of, and the root that they need."""
-    others = {key: p for key, p in programs.items() if key not in FUSED}
+    others = {key: p for key, p in programs.items() if key not in FUSION}
     fused_root, parts_root = (
-        any(o.op == "SQRT" for key in keys for o in programs[key].operations) for keys in (FUSED, others)
+        any(o.op == "SQRT" for key in keys for o in programs[key].operations) for keys in (FUSION, others)
     )
     fused = step_places(t, name)
     pieces = {key: piece_places(p, name) for key, p in others.items()}
-    texts = {key: blocks_text(programs[key], fused, name, t.precision, static=True) for key in FUSED}
+    texts = {key: blocks_text(programs[key], fused, name, t.precision, static=True) for key in FUSION}
     functions = "\n".join(
         blocks_text(p, pieces[key], name, t.precision, static=False) for key, p in others.items()
     )
@@ -143,15 +143,15 @@ def _function_context(t: Target, programs: Mapping[str, Program], name: str) -> 
         "functions": functions,
         "piece_records": [record for p in others.values() for record in piece_records(p)],
         "declarations": [blocks_signature(p, pieces[key], name) for key, p in others.items()],
-        "loops": any(APART in text for text in texts.values()),
-        "parts_loops": APART in functions,
+        "loops": any(APART_SUFFIX in text for text in texts.values()),
+        "parts_loops": APART_SUFFIX in functions,
         "root": fused_root,
         "parts_root": parts_root,
-        **{f"call_{key}": blocks_call(programs[key], fused, name) for key in FUSED},
+        **{f"call_{key}": blocks_call(programs[key], fused, name) for key in FUSION},
     }
 
 
-def step_places(t: Target, name: str) -> dict[str, Place]:
+def step_places(t: Target, name: str) -> dict[str, VectorPlace]:
     """Where the vectors of a step are: in the records of the header; v0 and the table's values are the step's own."""
     state, given, out = f"{name}_state", f"{name}_inputs", f"{name}_outputs"
     places = {f.name: member_place(state, "s", f.name) for f in t.state_fields}
@@ -164,7 +164,7 @@ def step_places(t: Target, name: str) -> dict[str, Place]:
     return places | {key: array_place(key, size, name) for key, size in sizes.items()}
 
 
-def piece_places(p: Program, name: str) -> dict[str, Place]:
+def piece_places(p: Program, name: str) -> dict[str, VectorPlace]:
     """Where the vectors of a piece are: parameters, or members of two records where these would be too many."""
     if not piece_records(p):
         return {key: array_place(key, size, name) for key, size in (*p.arguments, *p.results)}
@@ -189,7 +189,7 @@ def _limit_context(t: Target) -> dict[str, Any]:
     """What references, tables and strokes may be."""
     plant = t.believed
     stroke = plant.has_stroke and plant.stroke.travel > 0
-    longest = min(LONGEST_RISE, MOST_SAMPLES * t.controller.sample_time / RISES)
+    longest = min(MAX_RISE, MOST_SAMPLES * t.controller.sample_time / RISES)
     return {
         "limit_lines": _limit_lines(t),
         "force_limits": c_numbers(_finite(t.controller.limits.force), t.precision),
@@ -294,7 +294,7 @@ def _records(t: Target, n: str) -> list[dict[str, Any]]:
         beside.insert(3, f"const {n}_parameters *parameters;")
     commanded = "What is commanded at a sample, and what else a log or a supervisor wants."
     remembered = "What the controller remembers from one sample to the next."
-    found: list[tuple[str, str, list[Field], list[str]]] = [
+    found: list[tuple[str, str, list[CField], list[str]]] = [
         *([_parameter_record(t)] if t.tunable else []),
         ("reference", "The reference of a sample.", t.reference_fields, []),
         ("state", remembered, t.state_fields, beside),
@@ -311,12 +311,12 @@ def _records(t: Target, n: str) -> list[dict[str, Any]]:
         ]
         found.append(("stroke", "A stroke that is under way.", [], whole))
     return [
-        {"name": key, "meaning": meaning, "more": more, "fields": [_shown(f) for f in fields if f.size]}
+        {"name": key, "meaning": meaning, "more": more, "fields": [_show_field(f) for f in fields if f.size]}
         for key, meaning, fields, more in found
     ]
 
 
-def _parameter_record(t: Target) -> tuple[str, str, list[Field], list[str]]:
+def _parameter_record(t: Target) -> tuple[str, str, list[CField], list[str]]:
     """The record of what a target may change."""
     whole = [
         f"int32_t samples[{len(counts_of(t))}]; /* in a row until a monitor acts */",
@@ -325,7 +325,7 @@ def _parameter_record(t: Target) -> tuple[str, str, list[Field], list[str]]:
     return "parameters", "What the target may change.", [p.field for p in parameters_of(t)], whole
 
 
-def _shown(field: Field) -> dict[str, Any]:
+def _show_field(field: CField) -> dict[str, Any]:
     """A field with lines that name its signals, as long as lines may be."""
     lines, line = [], ""
     for text in (comment(f"{s.name} [{s.unit}]") for s in field.signals):
@@ -372,7 +372,7 @@ def call_text(p: Program, prefix: str, places: Mapping[str, str]) -> str:
 UNEVEN_SHARE = 1e-3  # of the bound of the currents of a star: noise of a current sensor
 ROOM = 2.0  # by which an example's stroke stays below the limits of references
 QUINTIC_SPEED, QUINTIC_ACCELERATION = 1.3, 4.0  # largest, of a quintic: way / rise, way / rise^2, 10 to 90 %
-SHORTEST_RISE = 20  # samples
+MIN_RISE_SAMPLES = 20  # samples
 
 
 def stand_in_context(t: Target, name: str) -> dict[str, Any]:
@@ -399,7 +399,7 @@ def readings_at_rest(t: Target) -> FloatArray | None:
     if len(plant.outputs) <= len(plant.inputs):
         return None
     p = ca.SX.sym("p", len(plant.outputs))
-    x = placed(plant, state_reference(plant)(p, 0 * p))
+    x = place_states(plant, state_reference(plant)(p, 0 * p))
     slope = ca.Function("slope", [p], [ca.densify(ca.jacobian(plant.h(x, 0), p))])
     return np.array(slope(np.zeros(len(plant.outputs))))
 
@@ -423,7 +423,7 @@ def example_stroke(t: Target) -> tuple[float, float]:
     way = min(t.believed.stroke.travel / 10, limits.position[k] / ROOM)
     speed, acceleration = limits.speed[k] / ROOM, limits.acceleration[k] / ROOM
     by_acceleration = float(np.sqrt(QUINTIC_ACCELERATION * way / acceleration))
-    rise = max(SHORTEST_RISE * Ts, QUINTIC_SPEED * way / speed, by_acceleration, 0.02)
+    rise = max(MIN_RISE_SAMPLES * Ts, QUINTIC_SPEED * way / speed, by_acceleration, 0.02)
     if t.controller.tracks == "states":
         sigma = float(bounds_of(t).sigma[k])
         way = min(way, JUMP / ROOM * sigma * rise / (QUINTIC_SPEED * Ts))
@@ -440,9 +440,9 @@ MAGIC = b"MALTALOG"
 LAYOUT = 1  # version of the record
 ORDER = 0x01020304
 SHARE = 8  # blocks that hold the samples that are asked for; one more is being written
-LARGEST = 2_000_000_000  # bytes of a ring
+MAX_RING_BYTES = 2_000_000_000  # bytes of a ring
 CAUSES = ("RUNS", "CALL", "FAULT", "THRESHOLD")
-FLOWN = Field("flown", (Signal("flown", "1"),), "1 where the law ran")
+FLOWN_FIELD = CField("flown", (Signal("flown", "1"),), "1 where the law ran")
 MEMBERS = (
     ("period", "samples of a period of the excitation; 0: none, or the caller does not say"),
     ("watched", "output whose used reading is a trigger beyond `threshold`; -1: none"),
@@ -457,12 +457,12 @@ MEMBERS = (
 HEAD = 8 + 4 * (3 + len(MEMBERS))  # bytes before the text
 
 
-class Ring(NamedTuple):
+class RingLayout(NamedTuple):
     """The size of a ring: samples of a block, numbers of a sample and of a state, the lines that describe them."""
 
     block: int
-    sample: tuple[tuple[str, Field], ...]  # "in.y" and so on
-    state: tuple[Field, ...]
+    sample: tuple[tuple[str, CField], ...]  # "in.y" and so on
+    state: tuple[CField, ...]
     text: tuple[str, ...]
     real_bytes: int
 
@@ -496,7 +496,7 @@ class Ring(NamedTuple):
         return HEAD + self.text_bytes + self.real_bytes * reals
 
 
-def ring_of(t: Target, sha256: str) -> Ring:
+def ring_of(t: Target, sha256: str) -> RingLayout:
     """The ring of an export. Raises InputError for a time that no memory holds.
 
     ring_of(Target(controller, logged=0.1), sha256).memory
@@ -504,10 +504,10 @@ def ring_of(t: Target, sha256: str) -> Ring:
     c = t.controller
     parts = {"reference": t.reference_fields, "in": t.input_fields, "out": t.output_fields}
     sample = tuple((f"{part}.{f.name}", f) for part, fields in parts.items() for f in fields if f.size)
-    sample += (("flown", FLOWN),)
+    sample += (("flown", FLOWN_FIELD),)
     state = tuple(f for f in t.state_fields if f.size)
     # Of a huge time the block is not computed: its memory is refused.
-    block = math.ceil(min(t.logged / c.sample_time, LARGEST) / SHARE - 1e-9)
+    block = math.ceil(min(t.logged / c.sample_time, MAX_RING_BYTES) / SHARE - 1e-9)
     head = {
         "machine": t.believed.name,
         "controller": c.name,
@@ -524,14 +524,14 @@ def ring_of(t: Target, sha256: str) -> Ring:
     lines += [[name, *_headings(f)] for name, f in sample]
     lines += [[f"state.{f.name}", *_headings(f)] for f in state]
     text = tuple("\t".join(comment(word).replace('"', "'") for word in line) for line in lines)
-    ring = Ring(block, sample, state, text, t.real_bytes)
-    if ring.memory > LARGEST:
+    ring = RingLayout(block, sample, state, text, t.real_bytes)
+    if ring.memory > MAX_RING_BYTES:
         found = f"{t.logged:g} s of {ring.numbers * ring.real_bytes} bytes a sample"
-        raise InputError("export", "log", found, f"at most {LARGEST:.0e} bytes in all")
+        raise InputError("export", "log", found, f"at most {MAX_RING_BYTES:.0e} bytes in all")
     return ring
 
 
-def _headings(field: Field) -> list[str]:
+def _headings(field: CField) -> list[str]:
     return [f"{s.name} [{s.unit}]" for s in field.signals]
 
 

@@ -27,12 +27,18 @@ from malta.firmware.period_functions import (
     table_size,
 )
 from malta.firmware.program import Program, evaluate
-from malta.firmware.signals import Field, Target
+from malta.firmware.signals import CField, Target
 from malta.model.equations import interpolate, note, recorded_equations
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.period import state_reference
-from malta.synthesis.controller import commanded, estimated, filtered, freeze_moving, sum_errors
+from malta.synthesis.controller import (
+    command_forces,
+    estimate_states,
+    filter_reading,
+    freeze_moving,
+    sum_errors,
+)
 
 # The pieces of a control period that are usable alone, and all functions of an export together.
 #
@@ -82,11 +88,11 @@ def _law_pieces(t: Target) -> list[Staged]:
         }
 
     def law(xi_hat: Any, e: Any, xi_ref: Any, v_ff: Any, v0: Any, **_: Any) -> dict[str, Any]:
-        following, saturated, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
+        following, saturated, v = command_forces(g, xi_hat, e, xi_ref, v_ff, v0)
         return {"v": v, "saturated": saturated, "xi_pred_next": following}
 
     return [
-        _piece("calibrate", some("raw", "gain", "offset"), _calibrated, "y = gain raw + offset"),
+        _piece("calibrate", some("raw", "gain", "offset"), _calibrate, "y = gain raw + offset"),
         _piece(
             "positions", some("y"), lambda y: {"q": plant.position_of(y)}, "q: the place at which y is read"
         ),
@@ -100,7 +106,9 @@ def _law_pieces(t: Target) -> list[Staged]:
         _piece(
             "filter",
             some("xi_pred", "y", "p") | law_arguments(t, "L"),
-            lambda xi_pred, y, p, **_: {"xi_hat": estimated(g, xi_pred, filtered(c.tracks, y, p))},
+            lambda xi_pred, y, p, **_: {
+                "xi_hat": estimate_states(g, xi_pred, filter_reading(c.tracks, y, p))
+            },
             f"xi_hat = xi_pred + L ({'y - p' if c.tracks == 'errors' else 'y'} - Cd xi_pred)",
         ),
         _piece(
@@ -118,7 +126,7 @@ def _law_pieces(t: Target) -> list[Staged]:
     ]
 
 
-def _calibrated(raw: Any, gain: Any, offset: Any) -> dict[str, Any]:
+def _calibrate(raw: Any, gain: Any, offset: Any) -> dict[str, Any]:
     return {"y": gain * raw + offset}
 
 
@@ -145,8 +153,8 @@ def _current_pieces(t: Target) -> list[Staged]:
 def _current_control(t: Target, current: Any) -> Staged:
     """The PI current loops alone; `states` are those of the machine's design model, estimated or of the readings."""
     names = ("u_integral", "u_limited", "i_last", "link_last", "u_rest")
-    state = symbols(_chosen(t.state_fields, names))
-    read = symbols(_chosen(t.input_fields, ("i", "i_valid", "link")))
+    state = symbols(_choose_fields(t.state_fields, names))
+    read = symbols(_choose_fields(t.input_fields, ("i", "i_valid", "link")))
     known = ca.SX.sym("states", len(t.controller.A))
 
     def control(**_: Any) -> dict[str, Any]:
@@ -158,7 +166,7 @@ def _current_control(t: Target, current: Any) -> Staged:
     return _piece("current_control", {"current": current, "states": known, **state, **read, **own}, control)
 
 
-def _chosen(fields: Sequence[Field], names: Sequence[str]) -> list[Field]:
+def _choose_fields(fields: Sequence[CField], names: Sequence[str]) -> list[CField]:
     """The fields of these names."""
     return [field for field in fields if field.name in names]
 

@@ -27,7 +27,7 @@ from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.firmware.signals import Target, place_of_readings, reading_ranges, used_clearances
 from malta.linear.sampling import eigenvalues, sample
-from malta.model.plant import Plant, placed
+from malta.model.plant import Plant, place_states
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import noise_input
 from malta.synthesis.riccati import dare
@@ -39,7 +39,7 @@ TRUST, TRUST_KEPT = 2e-6, 5e-5
 PLACES = 9  # along the stroke, for which there are such gains
 
 
-class Gains(NamedTuple):
+class ReducedFilterGains(NamedTuple):
     """Gains L of filters that do without one sensor each, at places along the stroke."""
 
     places: FloatArray  # g, of the stroke; one of 0 for a machine without a stroke
@@ -47,7 +47,7 @@ class Gains(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def gains_without(t: Target) -> Gains:
+def gains_without(t: Target) -> ReducedFilterGains:
     """Gains of Kalman filters that do without one sensor, for the prediction of prediction_correction at each place.
 
     The process noise is TRUST, or TRUST_KEPT, of the gain file's. Where the other sensors cannot see the disturbances
@@ -60,7 +60,7 @@ def gains_without(t: Target) -> Gains:
         places = np.linspace(-plant.stroke.travel, plant.stroke.travel, PLACES)
     plain = c.tracks == "states" and c.schedule is None
     if c.noise is None or c.cost is None or not plain or len(c.measurements) < 2:
-        return Gains(places, {})
+        return ReducedFilterGains(places, {})
     W, V = _process_noise(c), c.noise.sensor
     xi = ca.SX.sym("xi", len(c.states))
     derivatives = ca.Function(
@@ -89,7 +89,7 @@ def gains_without(t: Target) -> Gains:
             if len(stable) == len(models):
                 found[k] = np.array(stable)
                 break
-    return Gains(places, found)
+    return ReducedFilterGains(places, found)
 
 
 def _process_noise(c: Controller) -> FloatArray:
@@ -144,7 +144,7 @@ def expected_readings(t: Target) -> ca.Function:
     """
     c, plant = t.controller, t.believed
     xi = ca.SX.sym("xi_pred", len(c.states))
-    x = placed(plant, xi[: len(plant.controlled)])
+    x = place_states(plant, xi[: len(plant.controlled)])
     y = ca.densify(plant.h(x, ca.SX.zeros(len(plant.inputs))))
     return ca.Function("expected", [xi], [y], ["xi_pred"], ["y"])
 
@@ -159,7 +159,7 @@ def prediction_correction(t: Target) -> ca.Function:
     c, plant = t.controller, t.believed
     xi = ca.SX.sym("xi_hat", len(c.states))
     n, m = len(c.A), len(c.forces)
-    x = placed(plant, xi[: len(plant.controlled)])
+    x = place_states(plant, xi[: len(plant.controlled)])
     u = xi[n : n + m] if c.lagging + c.delay else ca.SX.zeros(m)
     held, outside = ca.DM(plant.at().u), ca.SX.zeros(len(plant.disturbances))
     rate = plant.f(x, held + u, outside) - plant.f(
@@ -186,9 +186,9 @@ STATES: dict[State, str] = {
     "FAULT": "bridges at zero voltage, until acknowledged",
 }
 REACTIONS: tuple[Reaction, ...] = ("NONE", "IGNORE", "HOLD", "LAND", "FAULT")
-FLYING: tuple[State, ...] = ("LIFT", "SETTLE", "OPERATE", "HOLD", "LANDING")
-READY: tuple[State, ...] = ("SETTLE", "OPERATE", "HOLD")
-AWAKE: tuple[State, ...] = ("OFFSETS", "SENSORS", *FLYING)
+IN_FLIGHT: tuple[State, ...] = ("LIFT", "SETTLE", "OPERATE", "HOLD", "LANDING")
+IN_OPERATION: tuple[State, ...] = ("SETTLE", "OPERATE", "HOLD")
+IN_USE: tuple[State, ...] = ("OFFSETS", "SENSORS", *IN_FLIGHT)
 TRANSITIONS: tuple[tuple[State, str, State], ...] = (
     ("OFF", "START", "OFFSETS"),
     ("OFFSETS", "DONE", "SENSORS"),
@@ -199,9 +199,9 @@ TRANSITIONS: tuple[tuple[State, str, State], ...] = (
     ("SETTLE", "DONE", "OPERATE"),
     ("OPERATE", "HOLD", "HOLD"),
     ("HOLD", "DONE", "OPERATE"),
-    *((state, "LAND", "LANDING") for state in FLYING if state != "LANDING"),
+    *((state, "LAND", "LANDING") for state in IN_FLIGHT if state != "LANDING"),
     ("LANDING", "DONE", "OFF"),
-    *((state, "FAULT", "FAULT") for state in AWAKE),
+    *((state, "FAULT", "FAULT") for state in IN_USE),
     ("FAULT", "ACKNOWLEDGE", "OFF"),
 )
 
@@ -228,29 +228,29 @@ TOUCH = 0.7  # share of a clearance: two outputs at it are not beyond the cleara
 JUMP = 8.0  # standard deviations of readings that a jump, an innovation or a returning reading may have
 # A reading that repeats so often while the reference of a lift or a landing goes so many of its standard deviations is
 # stuck: within the time that noise allows, a law that follows such a reading throws the machine against its bearing.
-REPEATS, UNMOVED = 12, 16.0
+REPEATS, UNMOVED_DEVIATIONS = 12, 16.0
 FALSE_ALARM = 1e-15  # probability at a sample that working sensors repeat a value as long as a stuck one
-DISTURBED = 0.05  # share of the largest acceleration by which a machine may leave what the filter expects
+DISTURBANCE_SHARE = 0.05  # of the largest acceleration: a machine may leave the filter's prediction by it
 # Share of the largest acceleration with which references stop. Twice as much takes the voltage that the bearings need
 # when the link sags by 90 %, and ends in a touchdown.
-STOPPING = 0.1
-BRIDGED = 10  # samples for which a sensor is ignored before the reference stops
-SETTLED = 12.0  # standard deviations of readings that errors may have
-SAGGING = 0.3  # share of the link's voltage that is missing
+STOPPING_SHARE = 0.1
+BRIDGED_SAMPLES = 10  # samples for which a sensor is ignored before the reference stops
+SETTLED_DEVIATIONS = 12.0  # standard deviations of readings that errors may have
+SAG_SHARE = 0.3  # share of the link's voltage that is missing
 OFFSET = 0.02  # largest offset of a current sensor as a share of the current limit
 OVERVOLTAGE = 0.2  # share of the link's voltage that is too much
 LOST_CURRENT = 5  # samples without a reading of a current: a loop that acts on an old one drives it away
-UNEVEN = 0.04  # share of the current limit that the currents of a star may add up to, offsets of its sensors included
+IMBALANCE_SHARE = 0.04  # of the current limit: the sum of a star's currents, with its sensors' offsets
 # Shares of the current limit, on average over MEAN samples: by the first a current may miss its command, else it lands
-# after MISSING samples; by the second it may exceed it, else it is off at once. What stays below its command pushes no
+# after MISSES samples; by the second it may exceed it, else it is off at once. What stays below its command pushes no
 # harder than was meant, and a landing with it is slower than a fall.
 ASTRAY_CURRENT, LOST_CONTROL = 0.1, 0.6
 MEAN = 32.0
-MISSING = 100
-FROZEN = 20  # samples in which no current of a star changes although the commands do
-LATE = (0.2, 0.5)  # share of samples with a missed step before them, averaged over MEMORY samples: hold, land
-KEPT = 0.1  # share of a way to a touchdown or of a travel that references leave free
-OVER = 1.2  # a current is too large, as a multiple of what the limits of the axes can add up to
+MISSES = 100
+FREEZE = 20  # samples in which no current of a star changes although the commands do
+LATENESS = (0.2, 0.5)  # share of missed steps, averaged over MEMORY samples: hold, land
+RESERVED_SHARE = 0.1  # share of a way to a touchdown or of a travel that references leave free
+OVERCURRENT_FACTOR = 1.2  # a current is too large, as a multiple of what the limits of the axes can add up to
 
 
 class Times(NamedTuple):
@@ -280,7 +280,7 @@ class Monitor(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
+class MonitorLimits:
     """Limits of the p outputs, of currents and of times, from the gain file and its machine; inf: none."""
 
     touch: FloatArray  # p, of readings: near a touchdown or the end of the travel
@@ -301,7 +301,7 @@ class Bounds:
 
 
 @lru_cache(maxsize=16)
-def bounds_of(t: Target) -> Bounds:
+def bounds_of(t: Target) -> MonitorLimits:
     """The limits of a target's supervisor.
 
     Speeds: from rest through twice the way to a touchdown with the largest acceleration, v = sqrt(4 a d). A reading
@@ -315,77 +315,83 @@ def bounds_of(t: Target) -> Bounds:
     speed = np.sqrt(4 * acceleration * touch)
     known = np.where(sigma > 0, sigma, np.inf)
     quiet = np.where(np.isfinite(touch), 0.01 * touch, np.minimum(reading_ranges(plant), 1.0) / 100)
-    stopping = np.where(np.isfinite(acceleration), STOPPING * acceleration, np.inf)
+    stopping = np.where(np.isfinite(acceleration), STOPPING_SHARE * acceleration, np.inf)
     stuck = tuple(_repetitions([p]) for p in repetition_probabilities(plant))
-    return Bounds(
+    return MonitorLimits(
         touch=touch,
         range=reading_ranges(plant),
         jump=speed * c.sample_time + math.sqrt(2) * JUMP * sigma,
         sigma=known,
-        settled=np.where(sigma > 0, SETTLED * sigma, quiet),
-        drift=np.where(np.isfinite(acceleration), DISTURBED / 2 * acceleration * c.sample_time**2, np.inf),
+        settled=np.where(sigma > 0, SETTLED_DEVIATIONS * sigma, quiet),
+        drift=np.where(
+            np.isfinite(acceleration), DISTURBANCE_SHARE / 2 * acceleration * c.sample_time**2, np.inf
+        ),
         stopping=stopping,
-        unmoved=np.where(np.array(stuck) < LONG, UNMOVED * known, np.inf),
+        unmoved=np.where(np.array(stuck) < ENDLESS_SAMPLES, UNMOVED_DEVIATIONS * known, np.inf),
         stuck=stuck,
         stale=_repetitions(repetition_probabilities(plant)),
         unbelieved=_samples_without_reading(c),
-        current=OVER * largest_reading(t),
+        current=OVERCURRENT_FACTOR * largest_reading(t),
         offset=OFFSET * float(np.max(c.limits.current)) if t.driven else math.inf,
         deviation=ASTRAY_CURRENT * float(np.max(c.limits.current)) if t.driven else math.inf,
-        uneven=UNEVEN * float(np.max(c.limits.current)) if t.driven else math.inf,
+        uneven=IMBALANCE_SHARE * float(np.max(c.limits.current)) if t.driven else math.inf,
     )
 
 
 def monitors_of(t: Target) -> tuple[Monitor, ...]:
     """The table of monitors: those that make sense for a target's machine, in the order in which they are counted."""
     b = bounds_of(t)
-    checked: tuple[State, ...] = ("SENSORS", *FLYING)
+    checked: tuple[State, ...] = ("SENSORS", *IN_FLIGHT)
     moving: tuple[State, ...] = ("OPERATE", "HOLD")
     ground: tuple[State, ...] = ("OFFSETS", "SENSORS")
     off = LOST_CONTROL / ASTRAY_CURRENT * b.deviation
     # Without a filter that does without the sensor, a fall is softer than a landing by prediction alone.
     without: Reaction = "LAND" if gains_without(t).L else "FAULT"
     listed = [
-        Monitor("TOUCH", "reading over the bound of a touchdown", 1.0, 5, "LAND", READY),
+        Monitor("TOUCH", "reading over the bound of a touchdown", 1.0, 5, "LAND", IN_OPERATION),
         Monitor("RANGE", "reading over what can be read", 1.0, 1, "IGNORE", checked),
-        Monitor("RATE", "jump of a reading over what the machine can do", 1.0, 1, "IGNORE", FLYING),
+        Monitor("RATE", "jump of a reading over what the machine can do", 1.0, 1, "IGNORE", IN_FLIGHT),
         Monitor("INNOVATION", "|y - h(xi_pred)| over sigma", JUMP, 20, "HOLD", moving),
         Monitor("INNOVATION", "|y - h(xi_pred)| over sigma", JUMP, 400, "LAND", moving),
         Monitor("STUCK", "repetitions over what noise or motion allow", 1.0, 1, "IGNORE", checked),
         Monitor("STALE", "repetitions of all sensors at once", b.stale - 0.5, 1, "IGNORE", checked),
         Monitor("NAN", "no number, or called invalid", 0.5, 1, "IGNORE", checked),
-        Monitor("UNBELIEVED", "a sensor is ignored", 0.5, BRIDGED, "HOLD", moving),
-        Monitor("UNBELIEVED", "a sensor is ignored", 0.5, b.unbelieved, without, FLYING),
-        Monitor("BLIND", "all sensors are ignored", 0.5, b.unbelieved, "FAULT", FLYING),
-        Monitor("ASTRAY", "expected reading where none can be, or no reference is", 1.0, 5, "FAULT", FLYING),
-        Monitor("HELPLESS", "a force at its limit, a sensor ignored", 0.5, 10, "FAULT", FLYING),
+        Monitor("UNBELIEVED", "a sensor is ignored", 0.5, BRIDGED_SAMPLES, "HOLD", moving),
+        Monitor("UNBELIEVED", "a sensor is ignored", 0.5, b.unbelieved, without, IN_FLIGHT),
+        Monitor("BLIND", "all sensors are ignored", 0.5, b.unbelieved, "FAULT", IN_FLIGHT),
+        Monitor(
+            "ASTRAY", "expected reading where none can be, or no reference is", 1.0, 5, "FAULT", IN_FLIGHT
+        ),
+        Monitor("HELPLESS", "a force at its limit, a sensor ignored", 0.5, 10, "FAULT", IN_FLIGHT),
         Monitor("MISSED", "missed steps before this one", 2.5, 1, "HOLD", moving),
-        Monitor("MISSED", "missed steps before this one", b.unbelieved + 0.5, 1, "LAND", FLYING),
-        Monitor("OVERRUN", "share of samples after a missed step", LATE[0], 1, "HOLD", moving),
-        Monitor("OVERRUN", "share of samples after a missed step", LATE[1], 1, "LAND", FLYING),
-        Monitor("STOP", "the request to stop", 0.5, 1, "FAULT", AWAKE),
-        Monitor("STO", "safe torque off is active", 0.5, 1, "FAULT", AWAKE),
-        Monitor("CURRENT", "largest reading of a current, A", b.current, 3, "FAULT", AWAKE),
+        Monitor("MISSED", "missed steps before this one", b.unbelieved + 0.5, 1, "LAND", IN_FLIGHT),
+        Monitor("OVERRUN", "share of samples after a missed step", LATENESS[0], 1, "HOLD", moving),
+        Monitor("OVERRUN", "share of samples after a missed step", LATENESS[1], 1, "LAND", IN_FLIGHT),
+        Monitor("STOP", "the request to stop", 0.5, 1, "FAULT", IN_USE),
+        Monitor("STO", "safe torque off is active", 0.5, 1, "FAULT", IN_USE),
+        Monitor("CURRENT", "largest reading of a current, A", b.current, 3, "FAULT", IN_USE),
         Monitor("OFFSET", "largest offset of a current sensor, A", b.offset, 1, "FAULT", ("OFFSETS",)),
-        Monitor("CURRENT_LOST", "a current without a reading", 0.5, LOST_CURRENT, "FAULT", AWAKE),
+        Monitor("CURRENT_LOST", "a current without a reading", 0.5, LOST_CURRENT, "FAULT", IN_USE),
         Monitor("CURRENT_INFERRED", "currents known by their stars", 0.5, LOST_CURRENT, "FAULT", ground),
-        Monitor("CURRENT_INFERRED", "currents known by their stars", 0.5, LOST_CURRENT, "LAND", FLYING),
+        Monitor("CURRENT_INFERRED", "currents known by their stars", 0.5, LOST_CURRENT, "LAND", IN_FLIGHT),
         Monitor(
             "CURRENT_SUM", "currents of a star together, A", b.uneven, LOST_CURRENT, "FAULT", ("SENSORS",)
         ),
-        Monitor("CURRENT_SUM", "currents of a star together, A", b.uneven, LOST_CURRENT, "LAND", FLYING),
-        Monitor("CURRENT_FROZEN", "samples without change, commands move", FROZEN - 0.5, 1, "FAULT", FLYING),
+        Monitor("CURRENT_SUM", "currents of a star together, A", b.uneven, LOST_CURRENT, "LAND", IN_FLIGHT),
         Monitor(
-            "CURRENT_ERROR", "mean of a current off its command, A", b.deviation, MISSING, "LAND", FLYING
+            "CURRENT_FROZEN", "samples without change, commands move", FREEZE - 0.5, 1, "FAULT", IN_FLIGHT
+        ),
+        Monitor(
+            "CURRENT_ERROR", "mean of a current off its command, A", b.deviation, MISSES, "LAND", IN_FLIGHT
         ),
         Monitor("CURRENT_EXCESS", "mean of a current beyond its command, A", off, 1, "FAULT", checked),
-        Monitor("OVERVOLTAGE", "surplus share of the link voltage", OVERVOLTAGE, 3, "FAULT", AWAKE),
-        Monitor("LINK", "missing share of the link voltage", SAGGING, 3, "FAULT", ("OFFSETS", "SENSORS")),
-        Monitor("LINK", "missing share of the link voltage", SAGGING, 3, "LAND", ("LIFT",)),
-        Monitor("LINK", "missing share of the link voltage", SAGGING, 3, "HOLD", moving),
-        Monitor("LINK", "missing share of the link voltage", SAGGING, 2000, "LAND", READY),
+        Monitor("OVERVOLTAGE", "surplus share of the link voltage", OVERVOLTAGE, 3, "FAULT", IN_USE),
+        Monitor("LINK", "missing share of the link voltage", SAG_SHARE, 3, "FAULT", ("OFFSETS", "SENSORS")),
+        Monitor("LINK", "missing share of the link voltage", SAG_SHARE, 3, "LAND", ("LIFT",)),
+        Monitor("LINK", "missing share of the link voltage", SAG_SHARE, 3, "HOLD", moving),
+        Monitor("LINK", "missing share of the link voltage", SAG_SHARE, 2000, "LAND", IN_OPERATION),
         Monitor("SATURATION", "a force is at its limit", 0.5, 200, "HOLD", moving),
-        Monitor("SATURATION", "a force is at its limit", 0.5, 1000, "LAND", READY),
+        Monitor("SATURATION", "a force is at its limit", 0.5, 1000, "LAND", IN_OPERATION),
         Monitor("REFERENCE", "a request that is no number or out of reach", 0.5, 1, "HOLD", moving),
         Monitor("UNSETTLED", "samples without settling", 20.0 * TIMES.settle, 1, "LAND", ("SETTLE",)),
         Monitor("UNREADY", "samples without good readings", 8.0 * TIMES.check, 1, "FAULT", ("SENSORS",)),
@@ -402,8 +408,8 @@ def absent_monitors(t: Target) -> dict[str, str]:
         (not np.isfinite(b.touch).any(), "nothing is met", ("TOUCH",)),
         (not np.isfinite(b.jump).any(), "no speed is too large", ("RATE",)),
         (not np.isfinite(b.sigma).any(), "no noise of the sensors is known", ("INNOVATION",)),
-        (min(b.stuck) >= LONG, "readings of a sensor that works repeat", ("STUCK",)),
-        (b.stale >= LONG, "readings of sensors that work repeat", ("STALE",)),
+        (min(b.stuck) >= ENDLESS_SAMPLES, "readings of a sensor that works repeat", ("STUCK",)),
+        (b.stale >= ENDLESS_SAMPLES, "readings of sensors that work repeat", ("STALE",)),
         (
             not t.driven,
             "the drive has the current loops",
@@ -432,13 +438,13 @@ def repetition_probabilities(plant: Plant) -> list[float]:
     return found
 
 
-LONG = 1_000_000_000  # samples: never
+ENDLESS_SAMPLES = 1_000_000_000  # samples: never
 
 
 def _repetitions(probabilities: list[float]) -> int:
     """Repetitions that are less likely than FALSE_ALARM for sensors that repeat with these probabilities."""
     together = sum(math.log(p) for p in probabilities)
-    return LONG if together > -1e-6 else max(2, math.ceil(math.log(FALSE_ALARM) / together))
+    return ENDLESS_SAMPLES if together > -1e-6 else max(2, math.ceil(math.log(FALSE_ALARM) / together))
 
 
 def touch_bounds(plant: Plant) -> FloatArray:
@@ -512,13 +518,13 @@ class ReferenceLimits(NamedTuple):
 def reference_limits(t: Target) -> ReferenceLimits:
     """The limits of references: of the design file, or by default those of the machine.
 
-    Positions: KEPT less than the way to a touchdown or the travel; what meets nothing has the range of its readings.
+    Positions: RESERVED_SHARE less than the way to a touchdown or the travel; else the range of its readings.
     Accelerations: all that the forces can do. Speeds: from rest through twice the way with that, v = sqrt(4 a d).
 
     Raises InputError for a position beyond the way to a touchdown, the travel, or what can be read.
     """
     touch, most = touch_bounds(t.believed), accelerations(t.controller)
-    position = np.where(np.isfinite(touch), (1 - KEPT) * touch, reading_ranges(t.believed))
+    position = np.where(np.isfinite(touch), (1 - RESERVED_SHARE) * touch, reading_ranges(t.believed))
     acceleration = np.minimum(most, MOST_RATE)
     speed = np.minimum(np.sqrt(4 * acceleration * position), MOST_RATE)
     limits = ReferenceLimits(position, speed, acceleration)

@@ -20,8 +20,8 @@ from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.firmware.ctext import c_number, function_text
 from malta.firmware.flight import (
-    EXTRA,
     REALS,
+    TUNABLES,
     Native,
     Step,
     call_valid,
@@ -35,15 +35,15 @@ from malta.firmware.program import Precision, Program, build_program, lower
 from malta.firmware.signals import Target
 from malta.firmware.sources import arithmetic_context, head_context, render, sources
 from malta.firmware.supervisor import (
-    FLYING,
+    ENDLESS_SAMPLES,
+    IN_FLIGHT,
     JUMP,
-    LONG,
     MEAN,
     MONITORS,
     MOST_RATE,
     REACTIONS,
     REPEATS,
-    SAGGING,
+    SAG_SHARE,
     STATES,
     TIMES,
     TRANSITIONS,
@@ -64,10 +64,10 @@ from malta.simulation.engine.engines import Engine
 from malta.simulation.layout import electronics_of
 from malta.simulation.simulate import Prepared
 
-SHORTEST = 20.0  # samples in which a reference stops at least
-QUICK = 40.0  # samples in which an acceleration fades that the next state does not have
+MIN_STOP_SAMPLES = 20.0  # samples in which a reference stops at least
+FADE_SAMPLES = 40.0  # samples in which an acceleration fades that the next state does not have
 MEMORY = 64.0  # samples over which the noise of readings is averaged
-PASSING = 0.2  # largest (1 - u)^3 (u + 3 u^2): how far a reference of rate 1 goes on in the time 1
+MAX_OVERSHOOT = 0.2  # largest (1 - u)^3 (u + 3 u^2): how far a reference of rate 1 goes on in the time 1
 MOST_MISSED = 1_000_000  # steps that count as missed
 
 
@@ -220,7 +220,7 @@ def _context(t: Target, name: str) -> dict[str, Any]:
         "stroke_output": plant.stroke_output if plant.has_stroke else -1,
         "except_stroke": f" && (k != {plant.stroke_output})" if plant.has_stroke else "",
         "only_stroke": plant.has_stroke and len(c.measurements) == 1,
-        "longest": LONG,
+        "longest": ENDLESS_SAMPLES,
         "arithmetic": arithmetic_context(t.precision),
         "most_missed": MOST_MISSED,
         **_bounds(t),
@@ -299,11 +299,11 @@ _NUMBERS = {
     "mean_jump": 2 / math.sqrt(math.pi),
     "memory": 1 / MEMORY,
     "mean_share": 1 / MEAN,
-    "shortest": SHORTEST,
-    "quick": QUICK,
-    "passing": PASSING,
+    "shortest": MIN_STOP_SAMPLES,
+    "quick": FADE_SAMPLES,
+    "passing": MAX_OVERSHOOT,
     "most_rate": MOST_RATE,
-    "sagging": SAGGING,
+    "sagging": SAG_SHARE,
     "rounding": 1e-5,  # of a limit, by which references of two samples may differ beyond it
     "fade_rate": 3.95,  # at least the largest second derivative of (1 - u)^3 (u + 3 u^2)
     "fade_speed": 15 / 8 / 0.75,
@@ -372,7 +372,7 @@ def compile_supervised(t: Target) -> Supervised:
     """The C of controller and supervisor, compiled. Raises InputError without a C compiler."""
     own = compile_controller(t)
     files = sources(t, "", own.name) | supervisor_sources(t, own.name)
-    order = (".h", "_supervisor.h", ".c", "_parts.c", *EXTRA, "_supervisor.c")
+    order = (".h", "_supervisor.h", ".c", "_parts.c", *TUNABLES, "_supervisor.c")
     lib = compile_files([files[f"{own.name}{end}"] for end in order if f"{own.name}{end}" in files])
     kinds: dict[str, Any] = {
         "int32_t": ctypes.c_int32,
@@ -510,7 +510,7 @@ def unsupervised_engine(
     def stepped(native: Native, state: Any) -> Step:
         Ts = native.target.controller.sample_time
         step, start = (getattr(native.lib, f"{native.name}_{key}") for key in ("step", "start"))
-        flying = [NUMBERS[key] for key in FLYING]
+        flying = [NUMBERS[key] for key in IN_FLIGHT]
         was_on = healthy.state[0] in flying
         index = {round(t / Ts): k for k, t in enumerate(healthy.t)}
 

@@ -20,12 +20,12 @@ from malta.firmware.calibration import FNV_FACTOR, FNV_START
 from malta.firmware.ctext import c_number, c_numbers
 from malta.firmware.program import Program, evaluate
 from malta.firmware.signals import Target, reading_ranges
-from malta.firmware.sources import FUSED, call_text, piece_records, readings_at_rest
+from malta.firmware.sources import FUSION, call_text, piece_records, readings_at_rest
 from malta.firmware.step import first_state, programs_of, started_state, step_function, zero_reference
 from malta.firmware.supervisor import (
-    AWAKE,
+    ENDLESS_SAMPLES,
+    IN_USE,
     JUMP,
-    LONG,
     MONITORS,
     REACTIONS,
     STATES,
@@ -67,10 +67,10 @@ def record_vectors(t: Target) -> list[Vector]:
     lifted = {name: value.copy() for name, value in rest.items()}
     lifted["y"] += 0.4 * reach * np.exp(-np.arange(SAMPLES) / 12.0)[:, None]
     return [
-        _answered(t, "stroke", moving, warm=True),
-        _answered(t, "saturation", far, warm=True),
-        _answered(t, "invalid", _damage(t, rest), warm=True),
-        _answered(t, "lift_off", lifted, warm=False),
+        _answer(t, "stroke", moving, warm=True),
+        _answer(t, "saturation", far, warm=True),
+        _answer(t, "invalid", _damage(t, rest), warm=True),
+        _answer(t, "lift_off", lifted, warm=False),
     ]
 
 
@@ -126,7 +126,7 @@ def _damage(t: Target, flight: dict[str, FloatArray]) -> dict[str, FloatArray]:
     return found
 
 
-def _answered(t: Target, name: str, flight: dict[str, FloatArray], *, warm: bool) -> Vector:
+def _answer(t: Target, name: str, flight: dict[str, FloatArray], *, warm: bool) -> Vector:
     """A vector with the controller's answers."""
     real, step = t.real, step_function(t)
     order = [*(f.name for f in t.reference_fields), *(f.name for f in t.input_fields)]
@@ -162,7 +162,7 @@ def checksum(values: Any, begin: int = FNV_START) -> int:
 # act by a fault, in each state in which it counts; templates/calls.c calls the other functions of the header.
 
 
-LONGEST_TRIAL = 600  # samples until a row acts, the middle of long times left out
+MAX_TRIAL_SAMPLES = 600  # samples until a row acts, the middle of long times left out
 PIECE_SCALE = 2.0**-25  # of drawn whole numbers up to 2^15: 1e-3
 PIECE_TIME = 0.02  # s, of a rise, and m, of a pole
 STROKE_SAMPLES = 20.0  # of a rise
@@ -203,12 +203,12 @@ def trial_context(t: Target, name: str) -> dict[str, Any]:
         "observed": c.observed,
         "tracks_errors": c.tracks == "errors",
         "over": _faults(t, per_unit),
-        "moved": _moved(t),
+        "moved": _motion_near_end(t),
         "seen": ", ".join(map(str, seen)),
         "stuck": ", ".join(map(str, b.stuck)),
         "stale": b.stale,
-        "longest": LONG,
-        "longest_trial": LONGEST_TRIAL,
+        "longest": ENDLESS_SAMPLES,
+        "longest_trial": MAX_TRIAL_SAMPLES,
         "sensors": ", ".join(f"{_sensors(row, t)}u" for row in monitors_of(t)),
         "out_of_reach": ", ".join(f"{_unreached_states(row, t)}u" for row in monitors_of(t)),
         "unreached": _unreached_lines(t),
@@ -281,7 +281,7 @@ def _sensors(row: Monitor, t: Target) -> int:
         "TOUCH": np.isfinite(b.touch),
         "RATE": np.isfinite(b.jump),
         "INNOVATION": np.isfinite(b.sigma),
-        "STUCK": np.array(b.stuck) < LONG,
+        "STUCK": np.array(b.stuck) < ENDLESS_SAMPLES,
     }
     mask = able.get(row.key, np.ones(len(b.range), dtype=bool))
     return sum(1 << k for k, yes in enumerate(mask) if yes)
@@ -304,7 +304,7 @@ def _unreached_lines(t: Target) -> list[str]:
     return lines + [f"without {cell}: {reason}" for cell, reason in cells]
 
 
-def _moved(t: Target) -> dict[str, Any]:
+def _motion_near_end(t: Target) -> dict[str, Any]:
     """A motion near the end of an output's way: where, how fast, and the end."""
     limits, b = reference_limits(t), bounds_of(t)
     k = t.believed.stroke_output if t.believed.has_stroke else 0
@@ -330,7 +330,7 @@ def _strokes(t: Target) -> dict[str, Any]:
 
 def _pieces(t: Target, name: str) -> dict[str, Any]:
     """Calls of the pieces with drawn numbers, and checksums of what their expressions give."""
-    programs = {key: p for key, p in programs_of(t).items() if key not in FUSED}
+    programs = {key: p for key, p in programs_of(t).items() if key not in FUSION}
     given = max(_size(p.arguments) for p in programs.values())
     found = max(_size(p.results) for p in programs.values())
     draws, pieces, sums = _Draws(t), [], []
@@ -399,10 +399,10 @@ def _size(sizes: Sequence[tuple[str, int]]) -> int:
 
 
 GROUND: tuple[State, ...] = ("OFFSETS", "SENSORS")
-OTHERS = {key: tuple(state for state in AWAKE if state != key) for key in AWAKE}
+OTHER_STATES = {key: tuple(state for state in IN_USE if state != key) for key in IN_USE}
 
 # (monitors, states, why they cannot hurt or do not count there); OFF and FAULT have their gates off
-UNWATCHED: tuple[tuple[tuple[str, ...], tuple[State, ...], str], ...] = (
+UNWATCHED_STATES: tuple[tuple[tuple[str, ...], tuple[State, ...], str], ...] = (
     (("TOUCH",), GROUND, "the machine rests on its bearing"),
     (("TOUCH",), ("LIFT", "LANDING"), "the machine leaves its bearing, or goes to it"),
     (("RANGE", "STUCK", "STALE", "NAN"), ("OFFSETS",), "positions are not used yet"),
@@ -413,14 +413,14 @@ UNWATCHED: tuple[tuple[tuple[str, ...], tuple[State, ...], str], ...] = (
     (("SATURATION",), ("LIFT",), "lift-off ends after its time, and SETTLE watches"),
     (("SATURATION", "LINK"), ("LANDING",), "it lands already; HELPLESS watches"),
     (("MISSED", "OVERRUN"), GROUND, "nothing moves"),
-    (("OFFSET",), OTHERS["OFFSETS"], "offsets are known, and subtracted"),
+    (("OFFSET",), OTHER_STATES["OFFSETS"], "offsets are known, and subtracted"),
     (("CURRENT_SUM", "CURRENT_EXCESS"), ("OFFSETS",), "offsets are not known; OFFSET and CURRENT watch"),
     (("CURRENT_ERROR",), GROUND, "nothing is commanded; OFFSET, CURRENT and CURRENT_EXCESS watch"),
     (("CURRENT_FROZEN",), GROUND, "nothing is commanded"),
     (("REFERENCE",), (*GROUND, "LIFT", "LANDING"), "requests are not followed"),
     (("REFERENCE",), ("SETTLE",), "it waits until the request is within its limits"),
-    (("UNSETTLED",), OTHERS["SETTLE"], "nothing is waited for"),
-    (("UNREADY",), OTHERS["SENSORS"], "nothing is waited for"),
+    (("UNSETTLED",), OTHER_STATES["SETTLE"], "nothing is waited for"),
+    (("UNREADY",), OTHER_STATES["SENSORS"], "nothing is waited for"),
 )
 
 
@@ -436,9 +436,9 @@ def watch_table(t: Target) -> dict[str, dict[State, str]]:
             cells[state] = ", ".join(filter(None, [cells[state], row.reaction.lower()]))
     for key, cells in table.items():
         for state in STATES:
-            if state not in AWAKE:
+            if state not in IN_USE:
                 cells[state] = "(gates are off)"
-        for keys, states, reason in UNWATCHED:
+        for keys, states, reason in UNWATCHED_STATES:
             for state in states if key in keys else ():
                 cells[state] = cells[state] or f"({reason})"
     return table
@@ -448,12 +448,12 @@ def watch_lines(t: Target) -> list[str]:
     """The table in Markdown: monitors down, the states that are not off across; reasons are numbered below it."""
     reasons: list[str] = []
     lines = [
-        "| monitor | " + " | ".join(state.lower() for state in AWAKE) + " |",
-        "|---" * (1 + len(AWAKE)) + "|",
+        "| monitor | " + " | ".join(state.lower() for state in IN_USE) + " |",
+        "|---" * (1 + len(IN_USE)) + "|",
     ]
     for key, cells in watch_table(t).items():
         shown = []
-        for state in AWAKE:
+        for state in IN_USE:
             text = cells[state]
             if text.startswith("("):
                 if text not in reasons:

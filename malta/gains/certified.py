@@ -16,22 +16,31 @@ from typing import Any, cast
 import numpy as np
 
 from malta.bound import at_least
-from malta.checker.check import Verdict, check as prove_again
-from malta.checker.file import LONG, Claim, Document, Loop, Origin as Named, Parameter, Places, double
+from malta.checker.check import CertificateVerdict, check as prove_again
+from malta.checker.file import (
+    MAX_NAME_LENGTH,
+    Document,
+    StabilityClaim,
+    StatedLoop,
+    StatedOrigin as Named,
+    StatedParameter,
+    StatedPlaces,
+    double,
+)
 from malta.errors import CheckError, InputError, shorten
 from malta.files import locate
 from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import content_sha256
-from malta.gains.file import APART, content_of, read
+from malta.gains.file import UNCOMPARED_TABLES, content_of, read
 from malta.linear.expressions import NotAnalytic, exact
-from malta.loops.sampled_loops import LAST
+from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.windings import CurrentLoops, chosen_loops
 from malta.margins.travel import ENDS, extent_of, travel_loops
 from malta.model.data import plant_of, published_figures
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
 from malta.proof.box import box_of, sides_of
-from malta.proof.certificate import Origin, loops_of, refused_as_input
+from malta.proof.certificate import LoopOrigin, loops_of, refused_as_input
 from malta.proof.margin import Ranges
 from malta.synthesis.controller import Controller
 
@@ -41,7 +50,7 @@ def check(
     gains: str | Path | None = None,
     seconds: float = 600.0,
     uncertain: Mapping[str, float | tuple[float, float]] | None = None,
-) -> Verdict:
+) -> CertificateVerdict:
     """Whether a certificate holds; with `gains`, whether what it claims is of that gain file and its box.
 
     path : of the certificate
@@ -61,7 +70,7 @@ def check(
 
 def origin_of(
     gains: str | Path, plant: Plant, controller: Controller, current_loops: CurrentLoops, loops: int
-) -> Origin:
+) -> LoopOrigin:
     """The machine and the law that a certificate names.
 
     gains : the file of the controller
@@ -76,15 +85,15 @@ def origin_of(
             gains, "schedule", "a scheduled law", "a law of one set of matrices for a certificate"
         )
     content = content_of(locate(Path(gains)))[1]
-    law = {key: value for key, value in content.items() if key not in APART}
+    law = {key: value for key, value in content.items() if key not in UNCOMPARED_TABLES}
     stage = chosen_loops(plant, controller, current_loops)
     machine, preset, design = (
-        shorten(text, LONG) for text in (plant.name, plant.parameters.preset, controller.name)
+        shorten(text, MAX_NAME_LENGTH) for text in (plant.name, plant.parameters.preset, controller.name)
     )
     named = Named(machine, preset, design, content_sha256(law), stage)
     units = units_of(plant.parameters) | ({plant.stroke.name: "m"} if plant.has_stroke else {})
     at = tuple(exact(share * plant.stroke.travel) for share in ENDS)
-    return Origin(named, units, Places(plant.stroke.name, "m", at) if loops > 1 else None)
+    return LoopOrigin(named, units, StatedPlaces(plant.stroke.name, "m", at) if loops > 1 else None)
 
 
 def disagreement(
@@ -109,7 +118,7 @@ def disagreement(
     if claim.origin is None:
         return f"it is of matrices alone and names no machine, expected that of {gains}"
     stage = cast("CurrentLoops", claim.origin.current_loops)
-    own = origin_of(path, plant, controller, LAST, len(document.loops))
+    own = origin_of(path, plant, controller, LAST_STAGE, len(document.loops))
     return (
         _of_another(claim, own, controller, str(gains))
         or _of_other_values(claim, plant, own.units, str(gains))
@@ -118,7 +127,7 @@ def disagreement(
     )
 
 
-def _of_another(claim: Claim, own: Origin, controller: Controller, gains: str) -> str:
+def _of_another(claim: StabilityClaim, own: LoopOrigin, controller: Controller, gains: str) -> str:
     """Whether machine, law, stage, sample time or places are those of the gain file."""
     assert claim.origin is not None
     found, wanted = claim.origin, own.named
@@ -140,13 +149,13 @@ def _time_text(T: Any) -> str:
     return "none" if T is None else f"{double(T)!r} s"
 
 
-def _places_text(places: Places | None) -> str:
+def _places_text(places: StatedPlaces | None) -> str:
     if places is None:
         return "none"
     return f"{places.name} = {', '.join(repr(double(x)) for x in places.at)} {places.unit}"
 
 
-def _of_other_values(claim: Claim, plant: Plant, units: Mapping[str, str], gains: str) -> str:
+def _of_other_values(claim: StabilityClaim, plant: Plant, units: Mapping[str, str], gains: str) -> str:
     """Whether each parameter is one of the machine, in its unit and about its value."""
     for p in claim.parameters:
         if p.name not in units or (p.name == plant.stroke.name and claim.places is not None):
@@ -159,13 +168,13 @@ def _of_other_values(claim: Claim, plant: Plant, units: Mapping[str, str], gains
     return ""
 
 
-def _less(claim: Claim, plant: Plant, ranges: Ranges, own: Origin, gains: str) -> str:
+def _less(claim: StabilityClaim, plant: Plant, ranges: Ranges, own: LoopOrigin, gains: str) -> str:
     """Whether the box at `lower` covers the uncertainty that many times, and the travel."""
     names = tuple(name for name in units_of(plant.parameters))
     extent = extent_of(plant, ranges)
     nominal = np.array([_nominal(plant, name) for name in names])
     box_of(names, nominal, (), ranges, extent.over, caller="check")  # which says what is wrong with a range
-    given: dict[str, Parameter] = {p.name: p for p in claim.parameters}
+    given: dict[str, StatedParameter] = {p.name: p for p in claim.parameters}
     intervals = dict(extent.over) if own.places else extent.intervals
     for name, value in (*ranges.items(), *intervals.items()):
         low, high = sides_of(_nominal(plant, name), value)
@@ -185,7 +194,7 @@ def _less(claim: Claim, plant: Plant, ranges: Ranges, own: Origin, gains: str) -
     return ""
 
 
-def _ends(low: Any, high: Any, own: Origin, name: str) -> str:
+def _ends(low: Any, high: Any, own: LoopOrigin, name: str) -> str:
     return f"{double(low):.7g} to {double(high):.7g} {own.units[name]}".removesuffix(" 1")
 
 
@@ -208,7 +217,7 @@ def _of_other_loops(
     return "" if found == tuple(_bare(loop) for loop in wanted) else f"the loops are not those of {gains}"
 
 
-def _bare(loop: Loop) -> Loop:
+def _bare(loop: StatedLoop) -> StatedLoop:
     """A loop without what is chosen for its proof."""
     return replace(loop, units=(), groups=())
 

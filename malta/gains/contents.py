@@ -31,13 +31,13 @@ from malta.synthesis.controller import (
     lagging_forces,
     stored_forces,
 )
-from malta.synthesis.schedule import SCHEDULED, Schedule
+from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule
 
 # The table of a machine from plain matrices in a gain file, from and to its parameters.
 
 
-SAME = 1e-9  # of the largest entry: matrices that are the same but for rounding
-LINEAR = "linear"  # the name of all such machines; their own names are their presets
+MATRIX_TOLERANCE = 1e-9  # of the largest entry: matrices that are the same but for rounding
+LINEAR_MACHINE_NAME = "linear"  # the name of all such machines; their own names are their presets
 
 
 def signal_tables(record: Any, *keys: str) -> dict[str, Any]:
@@ -76,8 +76,10 @@ def _finite_or_none(x: float) -> float | None:
 
 def linear_parameters(plant: PlantTable, given: LinearTable, path: str | Path) -> Parameters:
     """The parameters of a machine from plain matrices."""
-    if plant.name != LINEAR:
-        raise InputError(path, "plant.linear", f"matrices of a {plant.name}", f"those of {LINEAR!r}")
+    if plant.name != LINEAR_MACHINE_NAME:
+        raise InputError(
+            path, "plant.linear", f"matrices of a {plant.name}", f"those of {LINEAR_MACHINE_NAME!r}"
+        )
     require_plain_name(plant.preset, path, "plant.preset")
     parameters, terms = plant.parameters or {}, given.terms or {}
     for key, q in parameters.items():
@@ -218,13 +220,13 @@ def _schedule(file: GainFile, arrays: Arrays, layout: _Layout, path: str | Path)
     names = [s.name for s in plant.outputs]
     require_known([file.schedule.variable], names, path, "schedule.variable")
     output, places = names.index(file.schedule.variable), given["places"]
-    stacked = {key: given[key].reshape(len(places), -1, given[key].shape[1]) for key in SCHEDULED}
+    stacked = {key: given[key].reshape(len(places), -1, given[key].shape[1]) for key in SCHEDULED_MATRICES}
     with relocate_errors(path, "schedule.places"):
         made = Schedule(file.schedule.variable, output, places, **stacked)
     x = plant.point(arrays["operating_point"]["x"]).x
     here = made.at(float(outputs_at(plant, x)[output]))
     for key, M in (arrays["model"] | arrays["gains"]).items():
-        if key in here and not np.abs(M - here[key]).max() <= SAME * np.abs(M).max(initial=0.0):
+        if key in here and not np.abs(M - here[key]).max() <= MATRIX_TOLERANCE * np.abs(M).max(initial=0.0):
             raise InputError(
                 path, f"schedule.{key}", "other numbers at the operating point", "those beside it"
             )
@@ -265,7 +267,7 @@ def _layout(file: GainFile, par: Parameters, path: str | Path) -> _Layout:
     ):
         if found != wanted:
             raise InputError(path, f"signals.{key}", _names(found), f"{_names(wanted)} of the {plant.name}")
-    observed = () if errors else _observed(file, states, forces, len(mechanical), path)
+    observed = () if errors else _observed_signals(file, states, forces, len(mechanical), path)
     correlated = len((file.noise and file.noise.correlation) or ())
     coordinates: Coordinates = file.law.coordinates if file.law else "signals"
     if coordinates == "positions" or correlated:
@@ -335,7 +337,7 @@ def _check_values(arrays: Mapping[str, Mapping[str, FloatArray]], path: str | Pa
         )
 
 
-def _observed(
+def _observed_signals(
     file: GainFile, states: tuple[Signal, ...], forces: tuple[Signal, ...], n0: int, path: str | Path
 ) -> tuple[Signal, ...]:
     """The disturbances among the states, after stored forces. Raises InputError for other states."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.files import read_file
-from malta.synthesis.schedule import SCHEDULED
+from malta.synthesis.schedule import SCHEDULED_MATRICES
 from malta.tables import read_npz, require_shallow
 
 # A strict reader of MAT-files, level 5: the elements that gain files are made of, and no others.
@@ -32,16 +32,16 @@ from malta.tables import read_npz, require_shallow
 #               char     one element of text;                         number one element of integers or floats
 #
 # Every size is compared with the bytes that are left before anything is read, so no file makes this reader crash, run
-# on, or take more memory than a small multiple of the file, or of LARGEST where it is compressed. Source: MathWorks,
-# MAT-File Format (R2019b), chapter 1.
+# on, or take more memory than a small multiple of the file, or of MAX_DECOMPRESSED_BYTES where it is compressed.
+# Source: MathWorks, MAT-File Format (R2019b), chapter 1.
 
 
 HEADER = 128  # bytes
 LITTLE_ENDIAN = b"\x00\x01IM"  # version 1.0 and the mark of the byte order, at the end of the header
-LARGEST = 16_000_000  # bytes of all compressed elements after decompression
-DEEPEST = 16  # structs in structs
+MAX_DECOMPRESSED_BYTES = 16_000_000  # bytes of all compressed elements after decompression
+MAX_STRUCT_DEPTH = 16  # structs in structs
 
-INT8, INT32, UINT32, MATRIX, COMPRESSED = 1, 5, 6, 14, 15
+INT8, INT32, UINT32, MATRIX, COMPRESSED_ELEMENT = 1, 5, 6, 14, 15
 NUMBERS = {
     1: "<i1",
     2: "<u1",
@@ -68,9 +68,9 @@ def read_mat(data: bytes) -> dict[str, Any]:
     if data[HEADER - len(LITTLE_ENDIAN) : HEADER] != LITTLE_ENDIAN:
         raise ValueError("its header is none of a little-endian MAT-file of level 5")
     found: dict[str, Any] = {}
-    room = LARGEST
+    room = MAX_DECOMPRESSED_BYTES
     for kind, content in _elements(memoryview(data)[HEADER:]):
-        if kind == COMPRESSED:
+        if kind == COMPRESSED_ELEMENT:
             kind, content = _decompress(content, room)
             room -= len(content)  # never 0, which zlib takes for no limit: the tag is not counted
         if kind != MATRIX:
@@ -93,7 +93,7 @@ def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
         if kind >> 16:  # type, size and content in 8 bytes
             kind, size = kind & 0xFFFF, kind >> 16
             begin, padded = at + 4, 4
-        elif kind == COMPRESSED:  # without padding
+        elif kind == COMPRESSED_ELEMENT:  # without padding
             padded = size
         if size > padded or padded > len(data) - begin:
             raise ValueError(f"an element of {size} bytes where {len(data) - begin} are left")
@@ -109,7 +109,9 @@ def _decompress(content: memoryview, room: int) -> tuple[int, memoryview]:
     except zlib.error as error:
         raise ValueError(f"a compressed element that is damaged: {error}") from error
     if not unpacker.eof or unpacker.unused_data:
-        raise ValueError(f"a compressed element that is damaged, or of more than {LARGEST} bytes")
+        raise ValueError(
+            f"a compressed element that is damaged, or of more than {MAX_DECOMPRESSED_BYTES} bytes"
+        )
     parts = _elements(memoryview(plain))
     found = next(parts, None)
     if found is None or next(parts, None) is not None:
@@ -121,8 +123,8 @@ def _matrix(content: memoryview, depth: int) -> tuple[str, Any]:
     """Name and value of a matrix; no bytes at all are an empty one."""
     if not content:
         return "", np.zeros((0, 0))
-    if depth > DEEPEST:
-        raise ValueError(f"more than {DEEPEST} structs in structs")
+    if depth > MAX_STRUCT_DEPTH:
+        raise ValueError(f"more than {MAX_STRUCT_DEPTH} structs in structs")
     parts = _elements(content)
     flags = np.frombuffer(_content(parts, UINT32, "flags", 8), "<u4")
     kind = int(flags[0]) & 0xFF
@@ -226,7 +228,7 @@ def _numbers(parts: Iterator[tuple[int, memoryview]], rows: int, columns: int, w
 
 MAT_HEADER = 116  # bytes of descriptive text that open a MAT-file
 MATRICES = (
-    *(f"schedule.{name}" for name in SCHEDULED),
+    *(f"schedule.{name}" for name in SCHEDULED_MATRICES),
     "model.",
     "gains.",
     "feedforward.v0",
@@ -285,10 +287,10 @@ def content_sha256(content: Mapping[str, Any]) -> str:
 
 def _to_json(content: Mapping[str, Any]) -> bytes:
     text = json.dumps(content, indent=1, allow_nan=False)
-    return _INNERMOST.sub(_on_one_line, text).encode() + b"\n"
+    return _INNERMOST_LIST.sub(_on_one_line, text).encode() + b"\n"
 
 
-_INNERMOST = re.compile(r"([\[{])\s*([^][{}]*?)\s*([\]}])")
+_INNERMOST_LIST = re.compile(r"([\[{])\s*([^][{}]*?)\s*([\]}])")
 
 
 def _on_one_line(innermost: re.Match[str]) -> str:

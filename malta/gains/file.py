@@ -41,7 +41,7 @@ import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.files import locate, replace_files, require_plain_name, version
-from malta.gains.contents import LINEAR, build_controller, linear_table, signal_tables
+from malta.gains.contents import LINEAR_MACHINE_NAME, build_controller, linear_table, signal_tables
 from malta.gains.encodings import SUFFIXES as SUFFIXES, content_sha256, decode, encode
 from malta.gains.schema import GainFile
 from malta.loops.own_model import unstable_gain
@@ -49,7 +49,7 @@ from malta.model.data import plant_of
 from malta.model.linear import is_linear
 from malta.model.parameters import units_of, values_of
 from malta.synthesis.controller import Controller
-from malta.synthesis.schedule import SCHEDULED, Schedule
+from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule
 from malta.tables import validate
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def document(controller: Controller, margins: LoopReport) -> dict[str, Any]:
         "version": 2 if extended else 1,
         "design": {"name": c.name, "spec_sha256": c.spec_sha256},
         "plant": {
-            "name": LINEAR if linear else plant_of(c.parameters).name,
+            "name": LINEAR_MACHINE_NAME if linear else plant_of(c.parameters).name,
             "preset": c.parameters.preset,
             "parameters": {k: {"value": v, "unit": units[k]} for k, v in values_of(c.parameters).items()},
             **({"linear": linear_table(c.parameters)} if linear else {}),
@@ -138,7 +138,7 @@ def _table(record: Any, *keys: str, later: tuple[str, ...] = ()) -> dict[str, An
 
 def _schedule_table(schedule: Schedule) -> dict[str, Any]:
     """A schedule: the matrices of one place below those of another."""
-    stacked = {name: np.vstack([*getattr(schedule, name)]) for name in SCHEDULED}
+    stacked = {name: np.vstack([*getattr(schedule, name)]) for name in SCHEDULED_MATRICES}
     return {"variable": schedule.variable, "places": schedule.places, **stacked}
 
 
@@ -282,10 +282,14 @@ def _plain(value: Any) -> Any:
 # its provenance, is left as it is.
 
 
-CLOSE = 1e-9  # of the largest number in the same array
-CLOSE_VERIFIED = 1e-6  # of poles and bandwidths, which magnify what moves a matrix
-NARROWER = 1.01  # largest ratio by which the new bounds of a margin may be tighter
-APART = {"provenance", "sha256", "verification"}  # tables that are not compared with CLOSE
+AGREEMENT_TOLERANCE = 1e-9  # of the largest number in the same array
+VERIFICATION_TOLERANCE = 1e-6  # of poles and bandwidths, which magnify what moves a matrix
+MAX_TIGHTENING = 1.01  # largest ratio by which the new bounds of a margin may be tighter
+UNCOMPARED_TABLES = {
+    "provenance",
+    "sha256",
+    "verification",
+}  # tables that are not compared with AGREEMENT_TOLERANCE
 
 
 def agrees(controller: Controller, margins: LoopReport, *paths: str | Path) -> bool:
@@ -320,14 +324,14 @@ def agrees(controller: Controller, margins: LoopReport, *paths: str | Path) -> b
 def _agree(wanted: Mapping[str, Any], found: dict[str, Any]) -> bool:
     """Whether two documents hold the same controller and margins that do not contradict each other."""
     if set(wanted) != set(found) or not all(
-        _close(wanted[key], found[key], CLOSE) for key in set(wanted) - APART
+        _close(wanted[key], found[key], AGREEMENT_TOLERANCE) for key in set(wanted) - UNCOMPARED_TABLES
     ):
         return False
     verified, before = (dict(content["verification"]) for content in (wanted, found))
     robust, earlier = verified.pop("robust"), before.pop("robust")
     poles, others = verified.pop("poles"), before.pop("poles")
     return (
-        _close(verified, before, CLOSE_VERIFIED)
+        _close(verified, before, VERIFICATION_TOLERANCE)
         and all(_same_poles(poles[name], others[name]) for name in poles)
         and _hardly_narrower(robust, earlier)
     )
@@ -338,7 +342,7 @@ def _same_poles(one: Any, two: Any) -> bool:
     if not one or not two or len(one) != len(two):
         return bool(one == two)
     first, second = (np.array(rows)[:, 0] + 1j * np.abs(np.array(rows)[:, 1]) for rows in (one, two))
-    room, left = CLOSE_VERIFIED * np.abs(first).max(), second.tolist()
+    room, left = VERIFICATION_TOLERANCE * np.abs(first).max(), second.tolist()
     for pole in first.tolist():  # each takes the nearest that is left
         nearest = min(left, key=lambda other: abs(other - pole))
         if abs(nearest - pole) > room:
@@ -348,14 +352,14 @@ def _same_poles(one: Any, two: Any) -> bool:
 
 
 def _hardly_narrower(now: Mapping[str, Any] | None, before: Mapping[str, Any] | None) -> bool:
-    """Whether the bounds of a margin agree with earlier ones and are at most NARROWER times as tight."""
+    """Whether the bounds of a margin agree with earlier ones and are at most MAX_TIGHTENING times as tight."""
     if now is None or before is None or now["uncertainty"] != before["uncertainty"]:
         return now == before
     lower, upper = _bounds(now)
     lowest, highest = _bounds(before)
-    room = 1 + CLOSE_VERIFIED
+    room = 1 + VERIFICATION_TOLERANCE
     agree = lower <= highest * room and lowest <= upper * room
-    return agree and lower <= lowest * NARROWER and upper >= highest / NARROWER
+    return agree and lower <= lowest * MAX_TIGHTENING and upper >= highest / MAX_TIGHTENING
 
 
 def _bounds(robust: Mapping[str, Any]) -> tuple[float, float]:

@@ -28,24 +28,26 @@ def _rows(value: Any) -> Any:
     return value
 
 
-class Signal(Record):
+class SignalRow(Record):
     """A signal of the machine or of the controller."""
 
     name: StrictStr = entry("name of the signal")
     unit: StrictStr = entry("its SI unit")
 
 
-class Columns(Record):
+class SignalColumns(Record):
     """Signals as .npz and .mat hold them: two lists of equal length."""
 
     name: list[StrictStr] = entry("names of the signals")
     unit: list[StrictStr] = entry("their SI units")
 
 
-Signals = Annotated[list[Signal], BeforeValidator(_rows, json_schema_input_type=list[Signal] | Columns)]
+Signals = Annotated[
+    list[SignalRow], BeforeValidator(_rows, json_schema_input_type=list[SignalRow] | SignalColumns)
+]
 
 
-class Design(Record):
+class DesignTable(Record):
     """The design file that the gains come from."""
 
     name: StrictStr = entry("name of the design, a plain file name")
@@ -120,7 +122,7 @@ class Law(Record):
     )
 
 
-class OperatingPoint(Record):
+class OperatingPointTable(Record):
     """Where the machine was linearized."""
 
     x: Vector = entry("mechanical states, SI", shape="n0")
@@ -138,7 +140,7 @@ class SignalTable(Record):
     measurements: Signals = entry("measured positions", shape="p")
 
 
-class Model(Record):
+class ModelTable(Record):
     """The design model."""
 
     A: Matrix = entry("continuous, mechanical states", shape="n0 x n0")
@@ -149,7 +151,7 @@ class Model(Record):
     Cd: Matrix = entry("sampled", shape="p x n")
 
 
-class Gains(Record):
+class GainsTable(Record):
     """The gains of the control law."""
 
     K: Matrix = entry("of the states", shape="m x n")
@@ -157,7 +159,7 @@ class Gains(Record):
     L: Matrix = entry("of the filter, filter form", shape="n x p")
 
 
-class Schedule(Record):
+class ScheduledLawTable(Record):
     """The matrices of a scheduled law at places of an output, those of one place below those of another; version 2."""
 
     variable: StrictStr = entry("output whose reference chooses the matrices, linear between places")
@@ -170,7 +172,7 @@ class Schedule(Record):
     L: Matrix = entry("as in gains", shape="g n x p")
 
 
-class Cost(Record):
+class RegulatorCostTable(Record):
     """Diagonals of Q, R and Q_i, which the regulator minimizes, SI."""
 
     state: Vector = entry("of the mechanical states, at least 0", shape="n0")
@@ -178,7 +180,7 @@ class Cost(Record):
     integral: Vector = entry("of the integrals of errors, at least 0", shape="p, or n0/2 in positions")
 
 
-class Noise(Record):
+class FilterNoiseTable(Record):
     """Variances that the filter was designed for, of one sample."""
 
     process: Vector = entry(
@@ -194,7 +196,7 @@ class Noise(Record):
     )
 
 
-class Feedforward(Record):
+class FeedforwardTable(Record):
     """What is added to the forces for a reference."""
 
     inertia: Vector = entry("mass or moment of inertia of each force", "kg, kg m^2", shape="m")
@@ -207,7 +209,7 @@ class Feedforward(Record):
     )
 
 
-class CurrentLoop(Record):
+class CurrentLoopTable(Record):
     """PI controllers of the currents."""
 
     Kp: Positive = entry("proportional gain", "V/A")
@@ -215,14 +217,14 @@ class CurrentLoop(Record):
     sample_time: Positive = entry("sample time of the loop", "s")
 
 
-class Commutation(Record):
+class CommutationTable(Record):
     """Currents that are commutated for where the machine will be; version 2."""
 
     lead: Positive = entry("time ahead: currents are for y + lead p*'", "s")
     pull: Matrix = entry("change of the forces with the position at constant currents", "N/m", shape="m x p")
 
 
-class Limits(Record):
+class LimitsTable(Record):
     """Largest values, either way."""
 
     current: Vector | None = entry("of each coil; null: no limit", "A", shape="c")
@@ -230,7 +232,7 @@ class Limits(Record):
     force: Vector | None = entry("of each force, which bounds v0 too; null: no limit", "N, N m", shape="m")
 
 
-class Poles(Record):
+class PolesTable(Record):
     """Poles as rows [real part, imaginary part]."""
 
     open_loop: Matrix = entry("of the machine", "rad/s")
@@ -251,7 +253,7 @@ class Robust(Record):
 class Verification(Record):
     """What `malta verify` found when the file was written."""
 
-    poles: Poles = entry("poles")
+    poles: PolesTable = entry("poles")
     bandwidth: dict[StrictStr, Finite] = entry("bandwidth by its definition", "rad/s")
     peak_sensitivity: dict[StrictStr, Finite] = entry("largest |S| by measurement", "1")
     robust: Robust | None = entry("robust margin; null: none was asked for")
@@ -273,24 +275,26 @@ class GainFile(Record):
 
     schema_: Literal["malta-gains"] = entry("kind of the file", alias="schema")
     version: StrictInt = entry("1; 2 of a file with a table law")
-    design: Design = entry("the design file that the gains come from")
+    design: DesignTable = entry("the design file that the gains come from")
     plant: PlantTable = entry("the machine that the gains are for")
-    operating_point: OperatingPoint = entry("where the machine was linearized")
+    operating_point: OperatingPointTable = entry("where the machine was linearized")
     sample_time: Positive = entry("control period", "s")
     law: Law | None = entry("what the control law takes; version 2", default=None)
     signals: SignalTable = entry("names and units, in the order of the matrices")
-    model: Model = entry("the design model")
-    gains: Gains = entry("the gains of the control law")
-    cost: Cost | None = entry("weights of the regulator; null of a PID")
-    noise: Noise | None = entry("variances of the filter; null of a PID")
-    feedforward: Feedforward = entry("what is added to the forces for a reference")
-    current_loop: CurrentLoop | None = entry("PI controllers of the currents; null: currents follow at once")
-    commutation: Commutation | None = entry("commutation ahead; version 2", default=None)
-    schedule: Schedule | None = entry(
+    model: ModelTable = entry("the design model")
+    gains: GainsTable = entry("the gains of the control law")
+    cost: RegulatorCostTable | None = entry("weights of the regulator; null of a PID")
+    noise: FilterNoiseTable | None = entry("variances of the filter; null of a PID")
+    feedforward: FeedforwardTable = entry("what is added to the forces for a reference")
+    current_loop: CurrentLoopTable | None = entry(
+        "PI controllers of the currents; null: currents follow at once"
+    )
+    commutation: CommutationTable | None = entry("commutation ahead; version 2", default=None)
+    schedule: ScheduledLawTable | None = entry(
         "matrices at places of an output; model and gains are those at the operating point; version 2",
         default=None,
     )
-    limits: Limits = entry("largest values, either way")
+    limits: LimitsTable = entry("largest values, either way")
     verification: Verification = entry("poles, bandwidth, peaks and margin")
     provenance: Provenance = entry("versions of what computed the gains")
     sha256: StrictStr = entry("sha256 of the rest as compact JSON with sorted keys")

@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from malta.identification.log import Log
 
 BATCHES = 20
-FEWEST = 10  # samples of a batch
+MIN_BATCH_SAMPLES = 10  # samples of a batch
 GAP = np.pi / 2  # largest stretch of a ring without readings, rad
 STEP = 1e-5  # m or rad: for the slope of the forces that hold a machine
 TURN = 0.8  # of a period, that a run along a wave takes at least
 
 
-class Estimate(NamedTuple):
+class Interval95(NamedTuple):
     """A figure with its 95 % interval.
 
     value : SI
@@ -47,7 +47,7 @@ class Estimate(NamedTuple):
         return f"{self.value:.5g} +- {self.half:.2g}{'' if self.unit == '1' else f' {self.unit}'}"
 
 
-def at_rest(log: Log, group: str = "y", *, still: bool = False) -> dict[str, tuple[Estimate, Estimate]]:
+def at_rest(log: Log, group: str = "y", *, still: bool = False) -> dict[str, tuple[Interval95, Interval95]]:
     """The mean and the standard deviation of each signal of a log at rest.
 
     The deviation is that of successive readings, sigma^2 = mean of (y_k+1 - y_k)^2 / 2, so that a mover which still
@@ -76,19 +76,21 @@ def at_rest(log: Log, group: str = "y", *, still: bool = False) -> dict[str, tup
     found = {}
     for signal, values in zip(log.signals[group], log.columns[group].T, strict=True):
         parts = _batches(values, log.source)
-        mean = Estimate(float(values.mean()), _half(parts.mean(axis=1)), signal.unit)
+        mean = Interval95(float(values.mean()), _half(parts.mean(axis=1)), signal.unit)
         variance = parts.var(axis=1, ddof=1) if still else (np.diff(parts, axis=1) ** 2).mean(axis=1) / 2
         deviation = float(np.sqrt(variance.mean()))
         spread = _half(variance) / max(2 * deviation, 1e-300)
-        found[signal.name] = (mean, Estimate(deviation, spread, signal.unit))
+        found[signal.name] = (mean, Interval95(deviation, spread, signal.unit))
     return found
 
 
 def _batches(values: FloatArray, source: str) -> FloatArray:
     """The values in BATCHES rows. Raises CheckError for too few, and for missing ones."""
     each = len(values) // BATCHES
-    if each < FEWEST:
-        raise CheckError(f"{source}: {len(values)} samples, at least {BATCHES * FEWEST} are needed")
+    if each < MIN_BATCH_SAMPLES:
+        raise CheckError(
+            f"{source}: {len(values)} samples, at least {BATCHES * MIN_BATCH_SAMPLES} are needed"
+        )
     if not np.isfinite(values).all():
         raise CheckError(f"{source}: samples are missing")
     return np.asarray(values[: BATCHES * each].reshape(BATCHES, each))
@@ -126,20 +128,20 @@ def _fit_ellipse(
     return found.x, fit_clustered(np.asarray(found.jac), np.asarray(found.fun))
 
 
-class Ring(NamedTuple):
+class RingCalibration(NamedTuple):
     """Errors of two sensors across each other, from a run along a ring: y = o + (1 + E) p, E symmetric.
 
     A turn of both sensors about the axis shows on no ring; so cross talk is its symmetric part.
     """
 
-    gain_x: Estimate  # of E
-    gain_y: Estimate
-    cross: Estimate
-    offset_x: Estimate
-    offset_y: Estimate
+    gain_x: Interval95  # of E
+    gain_y: Interval95
+    cross: Interval95
+    offset_x: Interval95
+    offset_y: Interval95
 
 
-def ring(log: Log, pair: Sequence[str], radius: float) -> Ring:
+def ring(log: Log, pair: Sequence[str], radius: float) -> RingCalibration:
     """Calibrate two sensors from a run in which the mover rolls along a ring of a known radius.
 
     log : of the run; the pace does not matter
@@ -165,17 +167,17 @@ def ring(log: Log, pair: Sequence[str], radius: float) -> Ring:
 
     theta, half = _fit_ellipse(y, shape, start)
     ends = zip(theta - [0, 0, 1, 1, 0], half, ("m", "m", "1", "1", "1"), strict=True)
-    o_x, o_y, g_x, g_y, c = (Estimate(float(a), float(b), unit) for a, b, unit in ends)
-    return Ring(g_x, g_y, c, o_x, o_y)
+    o_x, o_y, g_x, g_y, c = (Interval95(float(a), float(b), unit) for a, b, unit in ends)
+    return RingCalibration(g_x, g_y, c, o_x, o_y)
 
 
 class Quadrature(NamedTuple):
     """Errors of two signals a quarter of a period apart: c = c_0 + A cos t, s = s_0 + (1 + a) A sin(t + phi)."""
 
-    amplitude: Estimate  # a
-    phase: Estimate  # phi, rad
-    offset_cosine: Estimate  # c_0 / A
-    offset_sine: Estimate
+    amplitude: Interval95  # a
+    phase: Interval95  # phi, rad
+    offset_cosine: Interval95  # c_0 / A
+    offset_sine: Interval95
 
 
 def quadrature(cosine: FloatArray, sine: FloatArray) -> Quadrature:
@@ -209,14 +211,14 @@ def quadrature(cosine: FloatArray, sine: FloatArray) -> Quadrature:
     theta, half = _fit_ellipse(points, shape, start)
     A = float(theta[2])
     return Quadrature(
-        Estimate(float(theta[3]) / A - 1, float(np.hypot(half[3], half[2] * theta[3] / A)) / A),
-        Estimate(float(theta[4]), float(half[4]), "rad"),
-        Estimate(float(theta[0]) / A, float(half[0]) / A),
-        Estimate(float(theta[1]) / A, float(half[1]) / A),
+        Interval95(float(theta[3]) / A - 1, float(np.hypot(half[3], half[2] * theta[3] / A)) / A),
+        Interval95(float(theta[4]), float(half[4]), "rad"),
+        Interval95(float(theta[0]) / A, float(half[0]) / A),
+        Interval95(float(theta[1]) / A, float(half[1]) / A),
     )
 
 
-def slope(log: Log, current: tuple[str, str], output: str, *, free: bool = False) -> Estimate:
+def slope(log: Log, current: tuple[str, str], output: str, *, free: bool = False) -> Interval95:
     """How an output follows a current or a command: its sign is the polarity of the coils.
 
     y = c + k u in each batch where the mover rests against something, as the ring along which a force turns; pulses or
@@ -241,7 +243,7 @@ def slope(log: Log, current: tuple[str, str], output: str, *, free: bool = False
         raise CheckError(f"{log.source}: {name} has no pulses throughout")
     parts = (u * y).sum(axis=1) / power
     above = f"{_unit(log, 'y', output)}/s^2" if free else _unit(log, "y", output)
-    return Estimate(float(parts.mean()), _half(parts), f"{above}/{_unit(log, group, name)}")
+    return Interval95(float(parts.mean()), _half(parts), f"{above}/{_unit(log, group, name)}")
 
 
 def _unit(log: Log, group: str, name: str) -> str:
@@ -251,8 +253,8 @@ def _unit(log: Log, group: str, name: str) -> str:
 class Centre(NamedTuple):
     """Where the magnets of a machine pull to no side, as its sensors read it, and how hard they pull beside it."""
 
-    centre: dict[str, Estimate]  # by output, SI
-    stiffness: Estimate  # over that of the machine in the gain file, with its force constants
+    centre: dict[str, Interval95]  # by output, SI
+    stiffness: Interval95  # over that of the machine in the gain file, with its force constants
 
 
 def magnetic_centre(log: Log, plant: Plant) -> Centre:
@@ -289,9 +291,9 @@ def magnetic_centre(log: Log, plant: Plant) -> Centre:
     spread = np.hypot(half[1:] / k, centre * half[0] / k)
     names, units = [plant.outputs[j].name for j in outputs], [plant.outputs[j].unit for j in outputs]
     found = {
-        n: Estimate(float(a), float(b), u) for n, a, b, u in zip(names, centre, spread, units, strict=True)
+        n: Interval95(float(a), float(b), u) for n, a, b, u in zip(names, centre, spread, units, strict=True)
     }
-    return Centre(found, Estimate(k, float(half[0])))
+    return Centre(found, Interval95(k, float(half[0])))
 
 
 def _batches_of(values: FloatArray, each: int) -> FloatArray:
@@ -314,7 +316,7 @@ def _holding_forces(plant: Plant) -> tuple[FloatArray, FloatArray]:
     return forces(zero), np.column_stack([(forces(zero + h) - forces(zero - h)) / (2 * STEP) for h in steps])
 
 
-def unstable_pole(log: Log, output: str) -> Estimate:
+def unstable_pole(log: Log, output: str) -> Interval95:
     """The pole of a free fall from rest, rad/s: y = a + b cosh(s t) + c sinh(s t), which is that of K / m.
 
     log : of a fall without current, from its begin until just before the touchdown
@@ -335,10 +337,10 @@ def unstable_pole(log: Log, output: str) -> Estimate:
     start = np.array([s, y[0], (y[-1] - y[0]) / np.cosh(3.0), 0.0])
     found = least_squares(curve, start, x_scale=[s, span, span, span], xtol=1e-14)
     half = fit_clustered(np.asarray(found.jac), np.asarray(found.fun))
-    return Estimate(float(found.x[0]), float(half[0]), "rad/s")
+    return Interval95(float(found.x[0]), float(half[0]), "rad/s")
 
 
-def wave(log: Log, plant: Plant, period: float) -> tuple[Estimate, Estimate]:
+def wave(log: Log, plant: Plant, period: float) -> tuple[Interval95, Interval95]:
     """Amplitude and phase of a force along the stroke that the thrust holds: -f = A sin(2 pi z / period + phi).
 
     log : of a slow stroke over a period, as of the record of v0(z)
@@ -359,4 +361,4 @@ def wave(log: Log, plant: Plant, period: float) -> tuple[Estimate, Estimate]:
     size = float(np.hypot(theta[0], theta[1]))
     spread = float(np.hypot(theta[0] * half[0], theta[1] * half[1])) / size
     across = float(np.hypot(theta[1] * half[0], theta[0] * half[1])) / size**2
-    return Estimate(size, spread, "N"), Estimate(float(np.arctan2(theta[1], theta[0])), across, "rad")
+    return Interval95(size, spread, "N"), Interval95(float(np.arctan2(theta[1], theta[0])), across, "rad")

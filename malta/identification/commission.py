@@ -22,7 +22,7 @@ from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, json_text, read_file, replace_files
 from malta.gains.file import content_of
-from malta.identification.calibration import Estimate, at_rest
+from malta.identification.calibration import Interval95, at_rest
 from malta.identification.excite import cut_loop, output_bands
 from malta.identification.learn import FACTORS, learn, own_stroke
 from malta.identification.log import Log, log_of
@@ -42,24 +42,24 @@ from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller
 
 JOURNAL = "journal.json"
-LARGEST = 10_000_000  # bytes of a journal
+MAX_JOURNAL_BYTES = 10_000_000  # bytes of a journal
 VERSION = 1
 ENDS = ("completed", "not lifted")  # of flights in which nothing went wrong
-NOISY = 1.5  # times the noise and steps of a sensor that the gain file believes
-STILL = 2000  # samples of a rest: noise is told to 4 %
+MAX_NOISE_RATIO = 1.5  # times the noise and steps of a sensor that the gain file believes
+REST_SAMPLES = 2000  # samples of a rest: noise is told to 4 %
 ERROR = 0.1  # of the travel: the largest error of a stroke
 DRIVE = (0.7, 1.3)  # of R and L: copper that is 75 K warmer has 1.3 times the resistance
 CURRENT_MARGIN = 0.5  # rad, least phase margin of the current loops
-LEAST_DISK = 0.2  # disk margin of all sensors
+MIN_DISK_MARGIN = 0.2  # disk margin of all sensors
 SLACK = 1.2  # times what a design promises, where that is less than what a new machine is asked for
-WORST = 3.0  # largest |S|: the end of zone A of ISO 14839-3, which a new machine is asked for
+MAX_PEAK = 3.0  # largest |S|: the end of zone A of ISO 14839-3, which a new machine is asked for
 
 
-class Finding(NamedTuple):
+class StepFinding(NamedTuple):
     """A figure of a step with its interval, and the limits between which all of it has to be, SI."""
 
     name: str
-    found: Estimate
+    found: Interval95
     low: float = -math.inf
     high: float = math.inf
 
@@ -80,7 +80,7 @@ class Bench(NamedTuple):
     seed: int
 
 
-class Step(NamedTuple):
+class Check(NamedTuple):
     """A line of the checklist.
 
     name : of one word
@@ -96,18 +96,18 @@ class Step(NamedTuple):
     needs: str
     aborts: str
     record: Callable[[Bench], Log]
-    judge: Callable[[Controller, Log], Sequence[Finding]]
+    judge: Callable[[Controller, Log], Sequence[StepFinding]]
 
 
 @dataclass(frozen=True)
-class Entry:
+class JournalEntry:
     """What a step found: its log with its sha256, findings, and why it was refused; "": it was judged."""
 
     name: str
     question: str
     log: str
     sha256: str
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[StepFinding, ...] = ()
     refusal: str = ""
 
     @property
@@ -134,7 +134,7 @@ class Commissioning:
     sha256: str
     machine: str
     bench: str
-    entries: tuple[Entry, ...]
+    entries: tuple[JournalEntry, ...]
     steps: tuple[str, ...]
     kept: tuple[str, ...] = field(default=(), compare=False)
 
@@ -181,7 +181,7 @@ class Commissioning:
         return Description(f"Commissioning of a {self.machine}", rows)
 
 
-def _finding_table(one: Finding) -> dict[str, Any]:
+def _finding_table(one: StepFinding) -> dict[str, Any]:
     value, half, unit = one.found
     return {"name": one.name, "value": value, "half": half, "unit": unit, "low": one.low, "high": one.high}
 
@@ -194,7 +194,7 @@ def commission(
     truth: Plant | None = None,
     errors: Mapping[str, float] | None = None,
     logs: str | Path | None = None,
-    steps: Sequence[Step] | None = None,
+    steps: Sequence[Check] | None = None,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Commissioning:
@@ -224,7 +224,7 @@ def commission(
     list_of = tuple(steps if steps is not None else steps_of(plant, box))
     bench = Bench(controller, truth or plant, dict(errors or {}), seed)
     simulated = "" if logs else _digest_of(bench)
-    entries: list[Entry] = []
+    entries: list[JournalEntry] = []
     kept: list[str] = []
     done = Commissioning(str(path), digest, plant.name, simulated, (), tuple(step.name for step in list_of))
     before = {} if logs else _entries_before(folder, done)
@@ -233,7 +233,7 @@ def commission(
         if entry is None:
             if progress is not None:
                 progress(step.name)
-            entry = _gone(step, bench, folder, None if logs is None else Path(logs))
+            entry = _take_step(step, bench, folder, None if logs is None else Path(logs))
         else:
             kept.append(step.name)
         entries.append(entry)
@@ -245,14 +245,14 @@ def commission(
     return done
 
 
-def steps_of(plant: Plant, box: Mapping[str, float]) -> tuple[Step, ...]:
+def steps_of(plant: Plant, box: Mapping[str, float]) -> tuple[Check, ...]:
     """The checklist of a machine, its own or else the general one; box: share by which each parameter may differ."""
-    own: Callable[[Mapping[str, float]], tuple[Step, ...]] | None
+    own: Callable[[Mapping[str, float]], tuple[Check, ...]] | None
     own = attribute_of(plant, "experiments", "commissioning_steps")
     return general_steps(plant, box) if own is None else own(box)
 
 
-def _gone(step: Step, bench: Bench, folder: Path, logs: Path | None) -> Entry:
+def _take_step(step: Check, bench: Bench, folder: Path, logs: Path | None) -> JournalEntry:
     """Record or read the log of a step, and judge it."""
     try:
         if logs is None:
@@ -261,15 +261,17 @@ def _gone(step: Step, bench: Bench, folder: Path, logs: Path | None) -> Entry:
             found = [logs / f"{step.name}{suffix}" for suffix in (".npz", ".csv", ".mat")]
             path = next((file for file in found if file.exists()), found[0])
             if not path.exists():
-                return Entry(step.name, step.question, str(path), "", (), f"waits for {path}: {step.needs}")
+                return JournalEntry(
+                    step.name, step.question, str(path), "", (), f"waits for {path}: {step.needs}"
+                )
         log = read_log(path)
     except CheckError as error:
-        return Entry(step.name, step.question, "", "", (), str(error))
+        return JournalEntry(step.name, step.question, "", "", (), str(error))
     try:
         findings = tuple(step.judge(bench.controller, log))
     except CheckError as error:
-        return Entry(step.name, step.question, str(path), log.sha256, (), str(error))
-    return Entry(step.name, step.question, str(path), log.sha256, findings)
+        return JournalEntry(step.name, step.question, str(path), log.sha256, (), str(error))
+    return JournalEntry(step.name, step.question, str(path), log.sha256, findings)
 
 
 def _digest(path: Path) -> str:
@@ -282,7 +284,7 @@ def _digest_of(bench: Bench) -> str:
     return sha256(text.encode()).hexdigest()
 
 
-def _entries_before(folder: Path, now: Commissioning) -> dict[str, Entry]:
+def _entries_before(folder: Path, now: Commissioning) -> dict[str, JournalEntry]:
     """The entries of a journal that passed with these gains on this bench, and whose logs are as they were.
 
     Raises InputError for a file that holds no journal, or a journal with another signature.
@@ -306,14 +308,14 @@ def _entries_before(folder: Path, now: Commissioning) -> dict[str, Entry]:
 def read_journal(path: Path) -> tuple[Commissioning, str]:
     """A journal and the signature that stands in it. Raises InputError for a file of another kind."""
     try:
-        content = json.loads(read_file(path, "journal", Path.read_bytes, LARGEST))
+        content = json.loads(read_file(path, "journal", Path.read_bytes, MAX_JOURNAL_BYTES))
         entries = []
         for e in content["entries"]:
             findings = tuple(_finding_of(one) for one in e["findings"])
             name, question, log, digest, refusal = (
                 str(e[key]) for key in ("step", "question", "log", "sha256", "refusal")
             )
-            entries.append(Entry(name, question, log, digest, findings, refusal))
+            entries.append(JournalEntry(name, question, log, digest, findings, refusal))
         gains, digest, machine, bench = (str(content[key]) for key in ("gains", "sha256", "machine", "bench"))
         if content["version"] != VERSION:
             raise InputError(path, "version", str(content["version"]), str(VERSION))
@@ -327,12 +329,12 @@ def read_journal(path: Path) -> tuple[Commissioning, str]:
         ) from error
 
 
-def _finding_of(table: Mapping[str, Any]) -> Finding:
+def _finding_of(table: Mapping[str, Any]) -> StepFinding:
     ends = {"low": -math.inf, "high": math.inf} | {
         k: float(table[k]) for k in ("low", "high") if table[k] is not None
     }
     value, half = (math.nan if table[k] is None else float(table[k]) for k in ("value", "half"))
-    return Finding(str(table["name"]), Estimate(value, half, str(table["unit"])), **ends)
+    return StepFinding(str(table["name"]), Interval95(value, half, str(table["unit"])), **ends)
 
 
 def fly(bench: Bench, scenario: Scenario, *, ends: Iterable[str] = ENDS) -> Log:
@@ -346,9 +348,9 @@ def fly(bench: Bench, scenario: Scenario, *, ends: Iterable[str] = ENDS) -> Log:
     return log_of(run)
 
 
-def general_steps(plant: Plant, box: Mapping[str, float]) -> tuple[Step, ...]:
+def general_steps(plant: Plant, box: Mapping[str, float]) -> tuple[Check, ...]:
     """The checklist of any machine that levitates: rest in flight, the loop, and a stroke where it has one."""
-    noise = Step(
+    noise = Check(
         "still", "Do the sensors read as quietly as the filter believes?", "the mover held at its place",
         "touchdown", _record_still, judge_noise,
     )  # fmt: skip
@@ -361,25 +363,25 @@ def record_noise(bench: Bench) -> Log:
     return dc_log(bench.truth, bench.controller.name, bench.controller.sample_time, seed=bench.seed)
 
 
-def noise_step(record: Callable[[Bench], Log] = record_noise) -> Step:
+def noise_step(record: Callable[[Bench], Log] = record_noise) -> Check:
     """The step that measures the noise of the current sensors, and what it makes of the forces."""
-    return Step(
+    return Check(
         "noise", "What noise do the currents make of the forces?", "mover out or clamped, 1 A dc in each phase",
         "a current above 2 A", record, judge_currents,
     )  # fmt: skip
 
 
-def judge_currents(controller: Controller, log: Log) -> list[Finding]:
+def judge_currents(controller: Controller, log: Log) -> list[StepFinding]:
     """The noise of each force by that of the measured currents.
 
     Of a log without currents, the process noise that the filter was designed for stands, and is named so.
     """
     found = process_noise(plant_of(controller.parameters), log)
     if found:
-        return [Finding(f"noise of {name}", e) for name, e in found.items()]
+        return [StepFinding(f"noise of {name}", e) for name, e in found.items()]
     own = 0.0 if controller.noise is None else float(np.sqrt(controller.noise.process.max()))
     what = "no current sensors: the largest process noise that the gain file has"
-    return [Finding(what, Estimate(own, 0.0))]
+    return [StepFinding(what, Interval95(own, 0.0))]
 
 
 def noise_of_design(done: Commissioning, controller: Controller) -> str:
@@ -395,47 +397,49 @@ def noise_of_design(done: Commissioning, controller: Controller) -> str:
 
 def _record_still(bench: Bench) -> Log:
     """So many samples that noise is told to a few percent, and ten turns of what the slowest loop follows."""
-    Ts, band = bench.controller.sample_time, output_bands(_believed(bench.controller))
-    return fly(bench, Scenario("still", max(STILL * Ts, 10 / float(band.min())), references.hold))
+    Ts, band = bench.controller.sample_time, output_bands(_own_loop(bench.controller))
+    return fly(bench, Scenario("still", max(REST_SAMPLES * Ts, 10 / float(band.min())), references.hold))
 
 
-def stroke_step() -> Step:
+def stroke_step() -> Check:
     """The step that flies a stroke, and learns from it."""
-    return Step(
+    return Check(
         "stroke", "Does it follow a stroke, and with which thrust?", "the travel free, |S| as predicted",
         "touchdown, end stop, current limit", _record_stroke, judge_stroke,
     )  # fmt: skip
 
 
-def judge_noise(controller: Controller, log: Log) -> list[Finding]:
+def judge_noise(controller: Controller, log: Log) -> list[StepFinding]:
     """The noise of each position sensor beside what the gain file's machine has."""
     plant = plant_of(controller.parameters)
     found = at_rest(log)
     return [
-        Finding(f"noise of {s.name}", found[s.name][1], 0.0, NOISY * math.hypot(noise, step) + 1e-12)
+        StepFinding(
+            f"noise of {s.name}", found[s.name][1], 0.0, MAX_NOISE_RATIO * math.hypot(noise, step) + 1e-12
+        )
         for s, noise, step in zip(plant.outputs, plant.sensors.noise, plant.sensors.resolution, strict=True)
     ]
 
 
-def loop_step(box: Mapping[str, float], **options: Any) -> Step:
+def loop_step(box: Mapping[str, float], **options: Any) -> Check:
     """The step that measures the loop; `options` are those of `malta.excite`."""
-    return Step(
+    return Check(
         "loop", "Is the loop as predicted, and in zone A?", "the mover in flight, the excitation in the law",
         "touchdown, a force at its limit", partial(_record_loop, options), partial(judge_loop, box=box),
     )  # fmt: skip
 
 
-def _believed(controller: Controller) -> Loop:
+def _own_loop(controller: Controller) -> Loop:
     """The loop of the gain file's own machine."""
     return loop(plant_of(controller.parameters), controller)
 
 
 def _record_loop(options: Mapping[str, Any], bench: Bench) -> Log:
-    plan = plan_measurement(_believed(bench.controller), **options).excitations[0]
+    plan = plan_measurement(_own_loop(bench.controller), **options).excitations[0]
     return fly(bench, Scenario.excited(plan.signal, plan.duration))
 
 
-def judge_loop(controller: Controller, log: Log, box: Mapping[str, float]) -> list[Finding]:
+def judge_loop(controller: Controller, log: Log, box: Mapping[str, float]) -> list[StepFinding]:
     """The largest |S| of each sensor and the disk margin.
 
     box : parameters that are uncertain, each with its share; without any, |S| is compared with no prediction
@@ -451,15 +455,15 @@ def judge_loop(controller: Controller, log: Log, box: Mapping[str, float]) -> li
     peaks = []
     for k, (name, (value, high, _)) in enumerate(found.peaks.items()):
         own = float(found.S.high[:, k].max())
-        what, most = ("", WORST) if own < WORST else (f", {own:.3g} by design", SLACK * own)
-        peaks.append(Finding(f"largest |S| of {name}{what}", Estimate(value, high - value), 0.0, most))
-    (disk, low), own = found.disks[-1], float(disk_sizes(cut_loop(_believed(controller), found.w).S).min())
-    what, least = ("", LEAST_DISK) if own > SLACK * LEAST_DISK else (f", {own:.3g} by design", 0.0)
-    margin = Finding(f"disk margin of all sensors{what}", Estimate(disk.size, disk.size - low), least)
+        what, most = ("", MAX_PEAK) if own < MAX_PEAK else (f", {own:.3g} by design", SLACK * own)
+        peaks.append(StepFinding(f"largest |S| of {name}{what}", Interval95(value, high - value), 0.0, most))
+    (disk, low), own = found.disks[-1], float(disk_sizes(cut_loop(_own_loop(controller), found.w).S).min())
+    what, least = ("", MIN_DISK_MARGIN) if own > SLACK * MIN_DISK_MARGIN else (f", {own:.3g} by design", 0.0)
+    margin = StepFinding(f"disk margin of all sensors{what}", Interval95(disk.size, disk.size - low), least)
     return [*peaks, margin, *judge_drive(controller, log)]
 
 
-def judge_drive(controller: Controller, log: Log) -> list[Finding]:
+def judge_drive(controller: Controller, log: Log) -> list[StepFinding]:
     """R and L of the windings over those of the gain file, the dead time, and the phase margin of the current loops.
 
     None of a machine without windings, and where the log has no voltages.
@@ -472,14 +476,14 @@ def judge_drive(controller: Controller, log: Log) -> list[Finding]:
     half = controller.sample_time / 2
     return [
         *(
-            Finding(
-                f"{name} of the drive over the gain file's", Estimate(e.value / own, e.half / own), *DRIVE
+            StepFinding(
+                f"{name} of the drive over the gain file's", Interval95(e.value / own, e.half / own), *DRIVE
             )
             for name, e, own in shares
         ),
-        Finding("dead time of the drive", found.dead_time, dead_time - half, dead_time + half),
-        Finding(
-            "phase margin of the current loops", Estimate(found.phase_margin, 0.0, "rad"), CURRENT_MARGIN
+        StepFinding("dead time of the drive", found.dead_time, dead_time - half, dead_time + half),
+        StepFinding(
+            "phase margin of the current loops", Interval95(found.phase_margin, 0.0, "rad"), CURRENT_MARGIN
         ),
     ]
 
@@ -494,7 +498,7 @@ def _largest_error(plant: Plant, log: Log) -> float:
     return float(np.abs(log.table("y", name) - log.table("reference", name)).max())
 
 
-def judge_stroke(controller: Controller, log: Log) -> list[Finding]:
+def judge_stroke(controller: Controller, log: Log) -> list[StepFinding]:
     """The largest error along the stroke, and the thrust that it took over what the law expects."""
     plant = plant_of(controller.parameters)
     error, most, what = _largest_error(plant, log), ERROR * plant.stroke.travel, ""
@@ -505,10 +509,10 @@ def judge_stroke(controller: Controller, log: Log) -> list[Finding]:
     noise = float(plant.sensors.noise[plant.stroke_output])
     taught = learn(controller, log)
     return [
-        Finding(f"largest axial error{what}", Estimate(error, 2 * noise, "m"), 0, most),
-        Finding(
+        StepFinding(f"largest axial error{what}", Interval95(error, 2 * noise, "m"), 0, most),
+        StepFinding(
             f"thrust over that of {taught.parameter or 'the law, as no parameter scales it alone'}",
-            Estimate(taught.factor, 1.96 * taught.deviation),
+            Interval95(taught.factor, 1.96 * taught.deviation),
             *FACTORS,
         ),
     ]

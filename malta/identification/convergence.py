@@ -49,11 +49,11 @@ from malta.proof.groups import loop_of
 from malta.synthesis.controller import Controller
 
 TOLERANCE = 1e-2  # relative distance between the proven bound and the largest value found
-ALIKE = 1e-6  # by which V T_0 may miss z^-r B
-ON_CIRCLE = 1e-9  # by which a zero of T_0 has to be off the circle
+MODEL_TOLERANCE = 1e-6  # by which V T_0 may miss z^-r B
+CIRCLE_DISTANCE = 1e-9  # by which a zero of T_0 has to be off the circle
 
 
-class Axis(NamedTuple):
+class StrokeLoop(NamedTuple):
     """The states through which one sum of errors moves the stroke, as a loop of their own."""
 
     system: UncertainSystem
@@ -112,10 +112,10 @@ def contraction(controller: Controller, box: Mapping[str, float], *, time: float
     inverse = _inverse(axis)
     if inverse is None:
         return _unproven("the stroke's response has no inverse")
-    missed = _missed(axis, *inverse)
-    if missed is None or not missed < ALIKE:
+    missed = _bound_of_miss(axis, *inverse)
+    if missed is None or not missed < MODEL_TOLERANCE:
         return _unproven("the inverse of the stroke's response is not proven to be near enough")
-    system, law = _learning(axis, *inverse, FORCE)
+    system, law = _learning_loop(axis, *inverse, FORCE)
     channel = (law.C.shape[0] - 1, law.B.shape[1] - 1)
     entries = _as_entries(system, law, box)
     system, ranges = (system, dict(box)) if entries is None else entries
@@ -179,7 +179,7 @@ def _unproven(reason: str) -> Gain:
     return Gain(math.nan, None, math.nan, {}, 0, 0.0, reason)
 
 
-def _axis(system: UncertainSystem, law: Compensator, stroke: int) -> Axis:
+def _axis(system: UncertainSystem, law: Compensator, stroke: int) -> StrokeLoop:
     """The loop of the states between a sum of errors and the stroke. Raises InputError for a law without sums."""
     program = loop_of(system, law).program
     A, B, C = (np.zeros(shape, dtype=bool) for shape in program.shapes[:3])
@@ -194,7 +194,7 @@ def _axis(system: UncertainSystem, law: Compensator, stroke: int) -> Axis:
     flow[u:y, n:u], flow[u:y, y:], flow[y:, :n] = law.C != 0, law.D != 0, C
     sums = range(k - law.integrals, k)
     for i in sums:
-        keep = _reached(flow, n + i) & _reached(flow.T, y + stroke)
+        keep = _reachable(flow, n + i) & _reachable(flow.T, y + stroke)
         if keep[y + stroke] and keep[n + i]:
             break
     else:
@@ -211,10 +211,10 @@ def _axis(system: UncertainSystem, law: Compensator, stroke: int) -> Axis:
         law, A=law.A[np.ix_(own, own)], B=law.B[np.ix_(own, outs)], C=law.C[np.ix_(ins, own)],
         D=law.D[np.ix_(ins, outs)], integrals=int((own >= k - law.integrals).sum()),
     )  # fmt: skip
-    return Axis(small, of_axis, int(np.searchsorted(own, i)), int(np.searchsorted(outs, stroke)))
+    return StrokeLoop(small, of_axis, int(np.searchsorted(own, i)), int(np.searchsorted(outs, stroke)))
 
 
-def _reached(flow: NDArray[np.bool_], start: int) -> NDArray[np.bool_]:
+def _reachable(flow: NDArray[np.bool_], start: int) -> NDArray[np.bool_]:
     """Whether a signal reaches each of the others."""
     found = np.zeros(len(flow), dtype=bool)
     found[start] = True
@@ -223,15 +223,15 @@ def _reached(flow: NDArray[np.bool_], start: int) -> NDArray[np.bool_]:
     return found
 
 
-def _missed(axis: Axis, inverse: System, passed: System) -> float | None:
+def _bound_of_miss(axis: StrokeLoop, inverse: System, passed: System) -> float | None:
     """A proven bound of |z^-r B - V T_0| over all frequencies; None where nothing is proven."""
-    system, law = _learning(axis, inverse, passed, 1.0)
+    system, law = _learning_loop(axis, inverse, passed, 1.0)
     channel = (law.C.shape[0] - 1, law.B.shape[1] - 1)
     own = {name: (x, x) for name, x in zip(system.names, system.nominal.tolist(), strict=True)}
     return worst_case_gain(system, law, own, of="effort", channel=channel, tolerance=TOLERANCE).upper
 
 
-def _inverse(axis: Axis) -> tuple[System, System] | None:
+def _inverse(axis: StrokeLoop) -> tuple[System, System] | None:
     """V and z^-r B, in floating point; None where there is no V."""
     of = axis.response
     n, r, answer = len(of.A), 1, of.B
@@ -240,7 +240,7 @@ def _inverse(axis: Axis) -> tuple[System, System] | None:
     zeros, poles = 1 + replace(of, A=of.A - np.eye(n)).zeros, np.linalg.eigvals(of.A).astype(complex)
     zeros = zeros[np.argsort(np.abs(zeros))[: n - r]]
     outside = np.abs(zeros) > 1
-    if len(zeros) < n - r or (np.abs(np.abs(zeros) - 1) < ON_CIRCLE).any():
+    if len(zeros) < n - r or (np.abs(np.abs(zeros) - 1) < CIRCLE_DISTANCE).any():
         return None
     far, at = zeros[outside].conj(), np.exp(1j * np.array([0.01, 0.02]) * np.pi)
     scale = (
@@ -272,7 +272,9 @@ def _filter(zeros: ComplexArray, poles: ComplexArray, gain: float) -> System:
     return found
 
 
-def _learning(axis: Axis, V: System, passed: System, share: float) -> tuple[UncertainSystem, Compensator]:
+def _learning_loop(
+    axis: StrokeLoop, V: System, passed: System, share: float
+) -> tuple[UncertainSystem, Compensator]:
     """The axis with one more reading w and one more command e_out = (z^-r B - share T V) w, both last."""
     system, c = axis.system, axis.law
     n, (m, q), more = len(c.A), c.D.shape, len(V.A) + len(passed.A)

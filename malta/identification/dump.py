@@ -23,13 +23,23 @@ from malta.errors import InputError
 from malta.files import read_file
 from malta.firmware.flight import compile_controller, new_state
 from malta.firmware.signals import Target
-from malta.firmware.sources import CAUSES, HEAD, LARGEST, LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
+from malta.firmware.sources import (
+    CAUSES,
+    HEAD,
+    LAYOUT,
+    MAGIC,
+    MAX_RING_BYTES,
+    MEMBERS,
+    ORDER,
+    RingLayout,
+    ring_of,
+)
 from malta.synthesis.controller import Controller
 
 WORDS = ("machine", "controller", "gains", "sample_time", "precision", "fidelity")
 COUNTS = ("excited", "tunable", "block", "blocks")
 PARTS = ("reference.", "in.", "out.", "flown")
-COMPARED = ("out.v", "out.command")
+COMPARED_COLUMNS = ("out.v", "out.command")
 MOST_TEXT = 10_000_000  # bytes that name signals
 
 
@@ -59,7 +69,7 @@ def read_dump(content: bytes, path: Path) -> Dump:
         raise InputError(path, "version", str(version), f"{LAYOUT}, of this version of malta")
     if not 0 < text_bytes <= MOST_TEXT:
         raise InputError(path, "text_bytes", str(text_bytes), f"1 to {MOST_TEXT}")
-    words, headings, real, at = _described(content, text_bytes, path)
+    words, headings, real, at = _read_description(content, text_bytes, path)
     of = np.dtype(f"{ends[0]}f{real}")
     sample = np.dtype([(n, of, (len(h),)) for n, h in headings.items() if n.startswith(PARTS)])
     kept = sum(len(h) for n, h in headings.items() if n.startswith("state."))
@@ -81,7 +91,7 @@ def read_dump(content: bytes, path: Path) -> Dump:
     )  # fmt: skip
 
 
-def _described(
+def _read_description(
     content: bytes, count: int, path: Path
 ) -> tuple[dict[str, str], dict[str, list[str]], int, int]:
     """What the text of a dump says: words, headings by vector, bytes of a number, and where the text ends."""
@@ -220,18 +230,18 @@ def replay_dump(controller: Controller, path: str | Path) -> ExactReplay:
     'ExactReplay'
     """
     path = Path(path)
-    dump = read_dump(read_file(path, "dump", Path.read_bytes, LARGEST), path)
+    dump = read_dump(read_file(path, "dump", Path.read_bytes, MAX_RING_BYTES), path)
     words, Ts = dump.words, controller.sample_time
     marks: dict[str, Any] = {name: words[name] == "1" for name in ("excited", "tunable")}
     t = Target(
         controller, cast("Any", words["precision"]), cast("Any", words["fidelity"]), **marks, logged=Ts
     )
     _require_same_fields(ring_of(t, ""), dump, path)
-    out, known, restarts = _recomputed(t, dump)
+    out, known, restarts = _recompute(t, dump)
     if not known.any():
         raise InputError(path, "flown", "no sample of a law whose state is known", "one at least")
     alike = np.ones(len(out), dtype=bool)
-    for name in (name for name in COMPARED if name in dump.headings):
+    for name in (name for name in COMPARED_COLUMNS if name in dump.headings):
         alike &= (_bits(out[name]) == _bits(dump.rows[name])).all(axis=1)
     off = np.abs(out["out.v"][known].astype(float) - dump.rows["out.v"][known]).max(axis=0)
     difference = dict(zip([s.name for s in controller.forces], off.tolist(), strict=True))
@@ -246,7 +256,7 @@ def _bits(table: Any) -> Any:
     return table.view(f"u{table.dtype.itemsize}")
 
 
-def _require_same_fields(ring: Ring, dump: Dump, path: Path) -> None:
+def _require_same_fields(ring: RingLayout, dump: Dump, path: Path) -> None:
     """Raise InputError where a dump has other vectors than the export of the gain file."""
     own = {line.split("\t")[0]: line.split("\t")[1:] for line in ring.text}
     for name, headings in dump.headings.items():
@@ -256,7 +266,7 @@ def _require_same_fields(ring: Ring, dump: Dump, path: Path) -> None:
             raise InputError(path, name, found, f"those of the gain file's export: {expected}")
 
 
-def _recomputed(t: Target, dump: Dump) -> tuple[Any, Any, int]:
+def _recompute(t: Target, dump: Dump) -> tuple[Any, Any, int]:
     """What the C commands at each sample, as a structured array; where its state is known; how often it was set."""
     native = compile_controller(t)
     step, state = getattr(native.lib, f"{native.name}_step"), new_state(native)

@@ -28,20 +28,23 @@ from malta.simulation.inputs import Multisine, interleaved_multisine
 if TYPE_CHECKING:
     from malta.loops.loop import Loop
 
-HIGHEST = 400.0  # Hz: the highest line, where the loop's band and the samples allow it
-ABOVE = (0.8, 10.0)  # times the band of the fastest output, between which the highest line is
-SAMPLED = 0.25  # of the sampling rate, above which no line is: motion between samples is as good as seen
+HIGHEST_LINE = 400.0  # Hz: the highest line, where the loop's band and the samples allow it
+BAND_FACTORS = (0.8, 10.0)  # times the band of the fastest output, between which the highest line is
+RATE_SHARE = 0.25  # of the sampling rate, above which no line is: motion between samples is as good as seen
 DECADES = 200.0  # times the lowest line: the highest one
 TURNS = 2.0  # of the lowest line in a period
 LINES = 12  # of each input
 PERIODS = 10
-LOWEST, GRID = 1e-5, 500  # of the Nyquist frequency, and points from there on, by which a band is found
+MIN_SHARE, GRID = 1e-5, 500  # of the Nyquist frequency, and points from there on, by which a band is found
 SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
-QUIET = 1e-9  # m or rad: noise of a sensor that has none
-LONGEST = 5e7  # samples of a flight
-WIDE, FAR = 2.0, 5.0  # times the largest motion, deviations of the noise: beyond both another machine flies
+NOISE_FLOOR = 1e-9  # m or rad: noise of a sensor that has none
+MAX_SAMPLES = 5e7  # samples of a flight
+MAX_MOTION, MAX_DEVIATION = (
+    2.0,
+    5.0,
+)  # times the largest motion, deviations of noise: beyond both another machine flies
 CURRENT = 0.1  # of the current limit: the amplitude where none is given
-BENT = 100.0  # deviations of the noise at the lines, as what curvature adds is computed to a percent of it
+CURVATURE_DEVIATIONS = 100.0  # of the noise at the lines: what curvature adds is computed to a percent
 COMMAND = 0.5  # of the force limits, which commands keep within there, with the forces that hold the machine
 
 
@@ -158,7 +161,7 @@ def excite(
     axis = unit.axis.astype(int)
     if by_default:
         current = CURRENT * plant.actuator.current_limit
-        room = COMMAND * limit - np.minimum(np.abs(np.asarray(_held(loop).v)), COMMAND / 2 * limit)
+        room = COMMAND * limit - np.minimum(np.abs(np.asarray(_rest_point(loop).v)), COMMAND / 2 * limit)
         limits = [(found.v / room, 1.0)]
     sizes = ((found.i, current), (found.y, motion))
     limits += [(part, most) for part, most in sizes if most is not None and np.isfinite(most)]
@@ -169,7 +172,9 @@ def excite(
         raise InputError("excite", "force", "none, and a machine without limits", expected)
     for spectrum, most in limits:
         share = share * min(1.0, most / _together(unit, spectrum * share[axis][:, None]).max())
-    while by_default and _bent(model, unit, found.times(share[axis]), periods) > BENT:
+    while (
+        by_default and _curvature_share(model, unit, found.times(share[axis]), periods) > CURVATURE_DEVIATIONS
+    ):
         share = 0.8 * share
     signal = replace(unit, amplitude=unit.amplitude * share[axis])
     return _plan(loop, model, signal, periods, found.times(share[axis]), named=bool(parameters))
@@ -225,14 +230,18 @@ def default_band(loop: Loop) -> tuple[float, float]:
     0.023 to 4.55 Hz
     """
     bands = output_bands(loop)
-    high = min(max(HIGHEST, ABOVE[0] * bands.max()), ABOVE[1] * bands.max(), SAMPLED / loop.sample_time)
+    high = min(
+        max(HIGHEST_LINE, BAND_FACTORS[0] * bands.max()),
+        BAND_FACTORS[1] * bands.max(),
+        RATE_SHARE / loop.sample_time,
+    )
     return float(min(high / DECADES, bands.min() / 2)), float(high)
 
 
 def output_bands(loop: Loop) -> FloatArray:
     """By output: the highest frequency at which |T| = 0.7, the others closed, Hz; the lowest that is looked at where it
     never is."""
-    w = np.geomspace(LOWEST, 1.0, GRID) * np.pi / loop.sample_time
+    w = np.geomspace(MIN_SHARE, 1.0, GRID) * np.pi / loop.sample_time
     S = cut_loop(loop, w).S
     wide = np.abs(1 - np.einsum("kpp->kp", S)) >= np.sqrt(0.5)
     last = np.where(wide.any(axis=0), len(w) - 1 - wide[::-1].argmax(axis=0), 0)
@@ -241,7 +250,7 @@ def output_bands(loop: Loop) -> FloatArray:
 
 def model_at(loop: Loop, names: Sequence[str]) -> ResponseModel:
     """The response of a loop's machine where it is held."""
-    plant, point = loop.plant, _held(loop)
+    plant, point = loop.plant, _rest_point(loop)
     y = outputs_at(plant, point.x)
     coils = ca.DM(plant.actuator.currents(ca.DM(y), ca.DM(point.v)))
     i = np.array(
@@ -278,7 +287,7 @@ def predicted_spectra(loop: Loop, model: ResponseModel, signal: Multisine) -> Sp
     return Spectra(Y, np.einsum("kmp,kp->km", np.linalg.pinv(G), Y), V)
 
 
-def _bent(model: ResponseModel, signal: Multisine, found: Spectra, periods: int) -> float:
+def _curvature_share(model: ResponseModel, signal: Multisine, found: Spectra, periods: int) -> float:
     """What the machine's curvature adds at the lines over the noise there of so many periods: of the worst output."""
     lines = signal.lines.astype(int)
     whole = np.zeros((2 * lines[-1] + 1, found.y.shape[1] + found.i.shape[1]), dtype=complex)
@@ -291,7 +300,7 @@ def _bent(model: ResponseModel, signal: Multisine, found: Spectra, periods: int)
 
 def sensor_noise(plant: Plant) -> FloatArray:
     """The standard deviation of each sensor's noise and steps, SI."""
-    return np.asarray(np.maximum(plant.sensors.deviations, QUIET))
+    return np.asarray(np.maximum(plant.sensors.deviations, NOISE_FLOOR))
 
 
 def _peaks(signal: Multisine, spectrum: ComplexArray) -> FloatArray:
@@ -322,7 +331,7 @@ def _plan(
     F = information(slopes, found.i / 2, variance)
     chosen = list(range(len(model.names))) if named else well_found(F, model.names, SHARE / 1.96)
     sigma = deviations(F[np.ix_(chosen, chosen)])
-    most = (_together(signal, found.v) + np.abs(np.asarray(_held(loop).v))) / np.array(
+    most = (_together(signal, found.v) + np.abs(np.asarray(_rest_point(loop).v))) / np.array(
         plant.actuator.force_limit
     )
     outputs, inputs = [s.name for s in plant.outputs], [s.name for s in plant.inputs]
@@ -330,14 +339,14 @@ def _plan(
         signal,
         periods,
         motion=dict(zip(outputs, motion.tolist(), strict=True)),
-        window=dict(zip(outputs, (WIDE * motion + FAR * noise).tolist(), strict=True)),
+        window=dict(zip(outputs, (MAX_MOTION * motion + MAX_DEVIATION * noise).tolist(), strict=True)),
         current=dict(zip(model.currents, _together(signal, found.i).tolist(), strict=True)),
         command=dict(zip(inputs, most.tolist(), strict=True)),
         accuracy={model.names[k]: 1.96 * float(s) for k, s in zip(chosen, sigma, strict=True)},
     )
 
 
-def _held(loop: Loop) -> OperatingPoint:
+def _rest_point(loop: Loop) -> OperatingPoint:
     """The machine at rest where the loop is."""
     return trim(loop.plant, **{name: value for name, value in loop.at.items() if value})
 
@@ -362,9 +371,9 @@ def _require(
 def _require_length(loop: Loop, period: float, periods: int) -> None:
     """Raise InputError for a flight that is too long, and a period that is no whole number of samples."""
     whole = period / loop.sample_time
-    if (periods + 1) * whole > LONGEST:
+    if (periods + 1) * whole > MAX_SAMPLES:
         raise InputError(
-            "excite", "periods", f"{(periods + 1) * whole:.3g} samples of all", f"at most {LONGEST:g}"
+            "excite", "periods", f"{(periods + 1) * whole:.3g} samples of all", f"at most {MAX_SAMPLES:g}"
         )
     if abs(whole - round(whole)) > 1e-6:
         raise InputError("excite", "period", f"{whole:g} samples", "a whole number of samples")

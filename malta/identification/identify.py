@@ -20,7 +20,7 @@ from malta.identification.prediction import Predicted, predict
 from malta.identification.response import (
     STEP,
     ResponseModel,
-    acting,
+    acting_parameters,
     axes_of,
     candidates,
     deviations,
@@ -46,7 +46,7 @@ from malta.identification.spectra import (
     residuals_of,
     sentence_of,
     spectrum_of,
-    straightened,
+    straighten,
     weights_of,
     white_residuals,
     whiteness_of,
@@ -61,15 +61,15 @@ IntArray = NDArray[np.integer[Any]]
 
 GROUPS = ("y", "v", "i", "excitation")  # of a log, which are used
 SHARE = 0.5  # of its value: a parameter that is found worse is not asked for by itself
-LOST = 1.0  # of its value: a combination of parameters that is found worse is not found
-LIKELY = 1e-6  # probability below which chi2 refuses the model
+LOST_SHARE = 1.0  # of its value: a combination of parameters that is found worse is not found
+MIN_PROBABILITY = 1e-6  # probability below which chi2 refuses the model
 SLACK = 1.1  # factor of chi2: the noise's covariance is estimated too
-WHITE = 5.0  # standard deviations of the correlation between neighbouring lines
-STRAIGHTENED = 12  # estimates at most, each with the curvature and the weights of the one before
-SETTLED = 0.01  # standard deviations: what moves by less is settled
-DIFFERENT = 3.0  # standard deviations between the estimates at the lines and in time
-COMPUTED = 3e-5  # of a value: to which estimates on a right model are computed
-QUIET = 4.0  # power at the lines over the noise, of the output that moves most: below, nothing was excited
+MAX_LINE_CORRELATION = 5.0  # standard deviations of the correlation between neighbouring lines
+MAX_STRAIGHTENINGS = 12  # estimates at most, each with the curvature and the weights of the one before
+SETTLED_STEP = 0.01  # standard deviations: what moves by less is settled
+MAX_ESTIMATE_DISTANCE = 3.0  # standard deviations between the estimates at the lines and in time
+ESTIMATE_ACCURACY = 3e-5  # of a value: to which estimates on a right model are computed
+MIN_LINE_POWER = 4.0  # over the noise, of the output that moves most: below, nothing was excited
 
 
 @display
@@ -160,7 +160,7 @@ class Identified:
         if self.in_time is None:
             return {}
         variance = np.maximum(np.diag(self.covariance), np.diag(self.in_time.covariance))
-        off = (self.in_time.values - self.values) / np.sqrt(variance + (COMPUTED * self.values) ** 2)
+        off = (self.in_time.values - self.values) / np.sqrt(variance + (ESTIMATE_ACCURACY * self.values) ** 2)
         return dict(zip(self.names, off.tolist(), strict=True))
 
     @property
@@ -172,18 +172,18 @@ class Identified:
                 f"chi2 / dof is {self.chi2:.3g}, at most {self.limit:.3g} is noise: the machine's model does not "
                 f"explain the log, {worst} least ({self.by_output[worst]:.3g}){sentence_of(self.explained)}"
             )
-        if abs(self.whiteness) > WHITE:
+        if abs(self.whiteness) > MAX_LINE_CORRELATION:
             return (
                 f"residuals of neighbouring lines are correlated by {self.whiteness:.1f} standard deviations, at "
-                f"most {WHITE:g} is noise: the machine's model lacks something"
+                f"most {MAX_LINE_CORRELATION:g} is noise: the machine's model lacks something"
             )
         if self.differences and self.in_time is not None:
             name, off = max(self.differences.items(), key=lambda item: abs(item[1]))
             k = self.names.index(name)
-            if abs(off) > DIFFERENT:
+            if abs(off) > MAX_ESTIMATE_DISTANCE:
                 return (
                     f"{name} is {self.values[k]:.5g} at the lines and {self.in_time.values[k]:.5g} in time, "
-                    f"{abs(off):.1f} standard deviations apart, at most {DIFFERENT:g} is noise: the machine's model "
+                    f"{abs(off):.1f} standard deviations apart, at most {MAX_ESTIMATE_DISTANCE:g} is noise: the model "
                     "lacks something"
                 )
         return ""
@@ -263,20 +263,20 @@ def identify(
     y, i = readings(log, robust=robust), whole(log, "i")
     names = require_parameters(plant, parameters) or candidates(plant)
     names = tuple(name for name in names if name not in (known or {}))
-    records, dropped = _chosen([_record(plant, names, log, y, i)], log.source, named=bool(parameters))
+    records, dropped = _choose([_record(plant, names, log, y, i)], log.source, named=bool(parameters))
     model, spectrum, _ = records[0]
     found = _estimate_straightened(records, log, dropped)
     filled = robust or bool(np.isnan(y).any())
     wanted = filled or (in_time and not found.refusal)
     if not wanted or plant.sensors.late or not plant.second_order:
         return found
-    predicted = _predicted(model, spectrum, found, i, y, robust=robust)
+    predicted = _estimate_in_time(model, spectrum, found, i, y, robust=robust)
     if filled:  # once more, with predictions in their place
         spectrum = spectrum_of(log, predicted.readings, i)
         found = _estimate_straightened([records[0]._replace(spectrum=spectrum)], log, dropped)
         told = float(np.isfinite(y).mean())  # what was filled in tells nothing
         found = replace(found, covariance=found.covariance / told)
-        predicted = _predicted(model, spectrum, found, i, y, robust=robust)
+        predicted = _estimate_in_time(model, spectrum, found, i, y, robust=robust)
     return replace(found, in_time=predicted)
 
 
@@ -325,7 +325,7 @@ def weigh(
         records.append(_record(machine, names, flown, readings(flown, robust=False), whole(flown, "i")))
     records[1] = records[1]._replace(added=added)
     source = f"{log.source} and {loaded.source}"
-    records, dropped = _chosen(records, source, named=bool(parameters))
+    records, dropped = _choose(records, source, named=bool(parameters))
     return _estimate_straightened(records, log, dropped)
 
 
@@ -352,14 +352,14 @@ def _record(plant: Plant, names: tuple[str, ...], log: Log, y: FloatArray, i: Fl
     return _Record(model, s)
 
 
-def _chosen(records: list[_Record], source: str, *, named: bool) -> tuple[list[_Record], dict[str, float]]:
+def _choose(records: list[_Record], source: str, *, named: bool) -> tuple[list[_Record], dict[str, float]]:
     """The records with the parameters that are told, and the deviations of those that are not, as shares.
 
     Where they were named, all have to be told; else those that are not are left out.
     """
     model, dropped = records[0].model, {}
     told = [
-        _information(r.model, straightened(r.model, r.spectrum, r.model.start), model.scale) for r in records
+        _information(r.model, straighten(r.model, r.spectrum, r.model.start), model.scale) for r in records
     ]
     F = np.sum(told, axis=0)
     if not named:
@@ -377,22 +377,22 @@ def _chosen(records: list[_Record], source: str, *, named: bool) -> tuple[list[_
 def _estimate_straightened(records: Sequence[_Record], log: Log, dropped: Mapping[str, float]) -> Identified:
     """The estimate at the lines, with the machine's curvature at what was found, until that moves no more."""
     theta = records[0].model.start
-    for _ in range(STRAIGHTENED):
-        straight = [r._replace(spectrum=straightened(r.model, r.spectrum, r.at(theta))) for r in records]
+    for _ in range(MAX_STRAIGHTENINGS):
+        straight = [r._replace(spectrum=straighten(r.model, r.spectrum, r.at(theta))) for r in records]
         found = _search(straight, theta)
         _require_told(straight, found)
         moved = np.abs(found.theta - theta) / np.sqrt(np.diag(found.covariance))
         theta = found.theta
-        if (moved < SETTLED).all():
+        if (moved < SETTLED_STEP).all():
             break
     return _estimate(straight, log, dropped, found)
 
 
-def _predicted(
+def _estimate_in_time(
     model: ResponseModel, s: Spectrum, found: Identified, i: FloatArray, y: FloatArray, *, robust: bool
 ) -> Predicted:
     """The estimate in time, from that at the lines on."""
-    plain = straightened(model, s, found.values)
+    plain = straighten(model, s, found.values)
     noise = noise_of(model, plain, found.values, residuals_of(model, plain, found.values).between)
     return predict(model, found.values, noise, i, y, source=s.source, robust=robust)
 
@@ -425,7 +425,7 @@ def _information(model: ResponseModel, s: Spectrum, scale: FloatArray) -> FloatA
     C, _ = windowed_covariances(residuals_of(model, s, model.start).between)
     variance = np.einsum("kpp->kp", C).real
     power = (np.abs(s.outputs[s.lines]) ** 2 / variance).max(axis=1)
-    if np.median(power) < QUIET:
+    if np.median(power) < MIN_LINE_POWER:
         raise CheckError(
             f"{s.source}: the excitation does not rise above the noise: at half of the lines the outputs move by "
             f"less than {np.sqrt(np.median(power)):.2g} standard deviations"
@@ -442,7 +442,7 @@ def _require_identifiable(model: ResponseModel, F: FloatArray, source: str) -> N
     if blind:
         raise CheckError(f"{source}: {' '.join(blind)} do not act on the response at all")
     values, vectors = np.linalg.eigh(F)
-    if values[0] > 1 / LOST**2 and values[0] > 1e-12 * values[-1]:
+    if values[0] > 1 / LOST_SHARE**2 and values[0] > 1e-12 * values[-1]:
         return
     along = vectors[:, 0] / vectors[np.abs(vectors[:, 0]).argmax(), 0]
     parts = [(n, a) for n, a in zip(model.names, along, strict=True) if abs(a) > 0.02]
@@ -454,14 +454,14 @@ def _require_identifiable(model: ResponseModel, F: FloatArray, source: str) -> N
         names = " ".join(name for name, _ in parts)
         raise CheckError(
             f"{source}: only ratios of {names} are identifiable: all of them larger by one factor make the same "
-            f"response. Name one as known, as --known {one}={_starting(model, one):g}"
+            f"response. Name one as known, as --known {one}={_starting_value(model, one):g}"
         )
     raise CheckError(
         f"{source}: these parameters are not identifiable together: {text} make the same response. Name one as known"
     )
 
 
-def _starting(model: ResponseModel, name: str) -> float:
+def _starting_value(model: ResponseModel, name: str) -> float:
     return float(model.start[model.names.index(name)])
 
 
@@ -513,14 +513,14 @@ def _estimate(records: Sequence[_Record], log: Log, dropped: Mapping[str, float]
     model, s, _ = records[0]
     outputs = (np.abs(np.concatenate(white)) ** 2).mean(axis=0).tolist()
     par, plant = model.plant.parameters, model.plant
-    others = replace(model, names=tuple(n for n in acting(plant) if n not in model.names))
+    others = replace(model, names=tuple(n for n in acting_parameters(plant) if n not in model.names))
     slopes = others.slopes(others.start, s.rate * s.lines)
     held = {n: float(getattr(par, n)) for n, slope in zip(others.names, slopes, strict=True) if slope.any()}
     try:
         most_likely = plant_with(plant, dict(zip(model.names, theta.tolist(), strict=True)))
     except InputError as error:
         raise CheckError(f"{s.source}: what explains the log best is no machine ({error})") from error
-    limit = float(SLACK * 2 * gammainccinv(dof / 2, LIKELY) / dof)
+    limit = float(SLACK * 2 * gammainccinv(dof / 2, MIN_PROBABILITY) / dof)
     parts = [(r.model, r.spectrum, r.at(theta)) for r in records]
     return Identified(
         log=log,
@@ -545,7 +545,7 @@ def _require_told(records: Sequence[_Record], found: Found) -> None:
     """Raise CheckError for a parameter that is not told: as a mass is not, where two logs are alike."""
     model, added = records[0].model, records[-1].added
     sigma = np.sqrt(np.diag(found.covariance)) / np.maximum(np.abs(found.theta), model.scale)
-    lost = {n: one for n, one in zip(model.names, sigma.tolist(), strict=True) if not one < LOST}
+    lost = {n: one for n, one in zip(model.names, sigma.tolist(), strict=True) if not one < LOST_SHARE}
     if lost:
         name = next((n for n in added if n in lost), max(lost, key=lambda n: lost[n]))
         source = " and ".join(r.spectrum.source for r in records)

@@ -27,8 +27,8 @@ from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import V0_STEPS
 
-SLOW = 0.02  # of the thrust's limit, that the inertia may take
-SHORTEST = 2.0  # spacings of the spline's knots, that a stroke has to cover
+INERTIA_SHARE = 0.02  # of the thrust's limit, that the inertia may take
+MIN_KNOT_SPACINGS = 2.0  # spacings of the spline's knots, that a stroke has to cover
 DEGREE = 5  # of the splines in z: four derivatives are smooth
 
 
@@ -111,10 +111,10 @@ def learn_v0(controller: Controller, log: Log) -> LearnedV0:
     way = reference_spline(log, [stroke], controller.sample_time)
     z_ref, speed, slope = (way(t, order)[:, 0] for order in range(3))
     inertia = plant.stroke.mass * float(np.abs(slope).max())
-    if inertia > SLOW * controller.limits.force[k]:
+    if inertia > INERTIA_SHARE * controller.limits.force[k]:
         found = f"a stroke that accelerates the mover by {inertia:.3g} N"
         raise InputError(
-            log.source, f"ref.{stroke}", found, f"at most {SLOW * controller.limits.force[k]:.3g} N"
+            log.source, f"ref.{stroke}", found, f"at most {INERTIA_SHARE * controller.limits.force[k]:.3g} N"
         )
     phi = _splines(float(z_ref.min()), float(z_ref.max()), plant.stroke.travel / V0_STEPS, log.source)
     at, bent = phi(z_ref), phi(z_ref, 2) * speed[:, None] ** 2 + phi(z_ref, 1) * slope[:, None]
@@ -133,15 +133,15 @@ def learn_v0(controller: Controller, log: Log) -> LearnedV0:
 
 def _splines(low: float, high: float, step: float, source: str) -> BSpline:
     """Splines in z with knots about a step apart, m. Raises InputError for a stroke that is too short."""
-    if high - low < SHORTEST * step:
+    if high - low < MIN_KNOT_SPACINGS * step:
         found = f"a stroke of {1e3 * (high - low):.3g} mm"
-        raise InputError(source, "reference", found, f"at least {1e3 * SHORTEST * step:.3g} mm")
+        raise InputError(source, "reference", found, f"at least {1e3 * MIN_KNOT_SPACINGS * step:.3g} mm")
     inner = np.linspace(low, high, round((high - low) / step) + 1)
     knots = np.concatenate([[low] * DEGREE, inner, [high] * DEGREE])
     return BSpline(knots, np.eye(len(knots) - DEGREE - 1), DEGREE)
 
 
-SMALLEST = 0.05  # of the thrust's limit, that a stroke has to take
+MIN_THRUST_SHARE = 0.05  # of the thrust's limit, that a stroke has to take
 FACTORS = (0.5, 2.0)  # of the thrust, beyond which something else is wrong
 
 
@@ -286,7 +286,7 @@ def _thrust_factor(controller: Controller, believed: Plant, log: Log) -> tuple[f
     t = Ts * np.arange(len(z_ref))
     a = reference_spline(log, [stroke], Ts)(t, 2)[:, 0]
     largest = float(np.abs(a).max())
-    if believed.stroke.mass * largest < SMALLEST * controller.limits.force[thrust]:
+    if believed.stroke.mass * largest < MIN_THRUST_SHARE * controller.limits.force[thrust]:
         found = f"{largest:.3g} m/s2 at most in ref.{stroke}"
         raise InputError(log.source, "reference", found, "a stroke that takes 5 % of the thrust's limit")
     # By parts: a_ref and its slope vanish at both ends of a stroke.

@@ -16,7 +16,7 @@ from malta.errors import CheckError, InputError
 from malta.model.plant import Plant, Signal
 from malta.simulation.current_control import reading_errors
 from malta.simulation.inputs import Multisine, initial_values
-from malta.simulation.layout import Loop
+from malta.simulation.layout import LoopPlan
 from malta.simulation.simulate import prepare
 from malta.simulation.trajectory import Trajectory
 
@@ -141,11 +141,11 @@ class Survey:
         )
 
 
-STUCK = 0.02  # of a log, for which a sensor may read the same
-FEWEST = 200  # samples of a reading that is called stuck
+STUCK_SHARE = 0.02  # of a log, for which a sensor may read the same
+MIN_STUCK_SAMPLES = 200  # samples of a reading that is called stuck
 PILE = 0.002  # of a log at an end of a sensor's range
-STEEP = 4.0  # times as many readings at the end as beside it
-SOME = 5  # different readings, without which a sensor has no range
+PILE_RATIO = 4.0  # times as many readings at the end as beside it
+MIN_DIFFERENT_READINGS = 5  # different readings, without which a sensor has no range
 
 
 def survey(log: Log) -> Survey:
@@ -164,8 +164,8 @@ def survey(log: Log) -> Survey:
     near = steps[steps < 1.5 * log.sample_time]
     stuck, clipped = {}, {}
     for signal, values in zip(log.signals.get("y", ()), log.columns["y"].T, strict=True):
-        longest, piled = _longest_run(values), _piled(values)
-        if longest >= max(FEWEST, STUCK * len(values)):
+        longest, piled = _longest_run(values), _count_piled(values)
+        if longest >= max(MIN_STUCK_SAMPLES, STUCK_SHARE * len(values)):
             stuck[signal.name] = longest
         elif piled:
             clipped[signal.name] = piled
@@ -187,13 +187,13 @@ def _longest_run(values: FloatArray) -> int:
     return int(np.diff(np.concatenate([[-1], changes, [len(values) - 1]])).max(initial=0))
 
 
-def _piled(values: FloatArray) -> int:
+def _count_piled(values: FloatArray) -> int:
     """The number of samples at an end of the range where many more pile up than beside it; 0: none do."""
     levels, count = np.unique(values[np.isfinite(values)], return_counts=True)
-    if len(levels) < SOME:
+    if len(levels) < MIN_DIFFERENT_READINGS:
         return 0
     ends = ((count[0], count[1]), (count[-1], count[-2]))
-    return int(sum(end for end, next_ in ends if end > max(PILE * len(values), STEEP * next_)))
+    return int(sum(end for end, next_ in ends if end > max(PILE * len(values), PILE_RATIO * next_)))
 
 
 def log_of(run: Trajectory) -> Log:
@@ -246,7 +246,7 @@ def _read_currents(run: Trajectory) -> FloatArray:
     x, i = ca.SX.sym("x", run.x.shape[1]), ca.SX.sym("i", run.i.shape[1])
     phases = ca.SX.sym("i_phase", run.i_phase.shape[1])
     noise = ca.SX.sym("noise", len(plant.drive.phases))
-    loop = Loop(plant, c, setup, {})
+    loop = LoopPlan(plant, c, setup, {})
     errors = reading_errors(loop, {"x": x, "i": i, "i_phase": phases}, noise)
     read = ca.Function("read", [x, i, phases, noise], [i + plant.drive.to_axes(x) @ errors])
     k = len(run.t)

@@ -19,7 +19,7 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.files import packaged, read_file, replace_files, require_suffix
+from malta.files import read_file, read_packaged, replace_files, require_suffix
 from malta.gains.encodings import read_mat
 from malta.identification.dump import decode_dump
 from malta.identification.log import GROUPS, Log
@@ -30,8 +30,8 @@ from malta.tables import read_npz
 from malta.units import is_unit_of, to_si
 
 VERSION = 1
-LARGEST = 2_000_000_000  # bytes of a log
-MOST = 1e30  # SI: no reading is beyond it, and squares and sums of those within are numbers
+MAX_LOG_BYTES = 2_000_000_000  # bytes of a log
+MAX_READING = 1e30  # SI: no reading is beyond it, and squares and sums of those within are numbers
 SUFFIXES = (".csv", ".npz", ".mat", ".parquet")
 TEXTS = ("machine", "controller")  # of a file's head; sample_time and period are numbers, s
 
@@ -127,7 +127,7 @@ def _from_parquet(content: bytes, path: Path) -> Decoded:
     head = {name: text[0] for name, text in words.items() if text}
     if not columns:
         raise InputError(path, "", "no columns", "t [s], x1 [m], ...")
-    return _tabulated(head, [name.strip() for name in read.column_names], columns, path)
+    return _tables_of(head, [name.strip() for name in read.column_names], columns, path)
 
 
 def _to_csv(log: Log) -> bytes:
@@ -195,7 +195,7 @@ def read_log(path: str | Path, groups: Collection[str] = tuple(GROUPS)) -> Log:
     """
     path = Path(path)
     suffix = require_suffix(path, *SUFFIXES, ".dump").suffix.lower()
-    content = read_file(path, "log", Path.read_bytes, LARGEST)
+    content = read_file(path, "log", Path.read_bytes, MAX_LOG_BYTES)
     decoders: dict[str, Callable[[bytes, Path], Decoded]]
     decoders = {
         ".csv": partial(_from_csv, groups=groups),
@@ -204,7 +204,7 @@ def read_log(path: str | Path, groups: Collection[str] = tuple(GROUPS)) -> Log:
         ".dump": decode_dump,
     }
     head, t, tables, headings = decoders.get(suffix, _from_parquet)(content, path)
-    if len(t) < 2 or not ((np.diff(t) > 0).all() and np.abs(t).max() < MOST):
+    if len(t) < 2 or not ((np.diff(t) > 0).all() and np.abs(t).max() < MAX_READING):
         raise InputError(path, "t", "times that do not rise", "the times of the samples, in order")
     columns, signals = {}, {}
     for group in [name for name in tables if name in groups]:
@@ -224,7 +224,7 @@ def _seconds(head: Mapping[str, Any], name: str, path: Path) -> float:
         seconds = float(found)
     except (TypeError, ValueError):
         seconds = math.nan
-    if not 0 <= seconds < MOST:
+    if not 0 <= seconds < MAX_READING:
         raise InputError(path, name, repr(found), "a number of seconds")
     return seconds
 
@@ -255,7 +255,7 @@ def _from_csv(content: bytes, path: Path, groups: Collection[str]) -> Decoded:
         raise InputError(path, "", "headings alone", "a line of numbers for each sample")
     if len(columns) != len(used):
         raise InputError(path, "", f"{len(columns)} cells in a line", f"{len(names)}, as headings")
-    return _tabulated(head, [names[k] for k in used], columns, path)
+    return _tables_of(head, [names[k] for k in used], columns, path)
 
 
 def _csv_head(content: bytes) -> tuple[dict[str, Any], list[str], int]:
@@ -276,7 +276,7 @@ def _fast_columns(content: bytes, begin: int, count: int, used: list[int]) -> li
 
     None without a compiler, and for what that does not take: numpy reads it, or says what is wrong.
     """
-    read = library(packaged("identification/cells.c").decode(), 1, flags=SAMPLE_LOOP_FLAGS)
+    read = library(read_packaged("identification/cells.c").decode(), 1, flags=SAMPLE_LOOP_FLAGS)
     if read is None:
         return None
     wanted = np.isin(np.arange(count), used).astype(np.uint8)
@@ -312,7 +312,7 @@ def _columns(content: bytes, begin: int, count: int, used: list[int]) -> list[Fl
     return list(table.T)
 
 
-def _tabulated(head: dict[str, Any], names: list[str], columns: list[FloatArray], path: Path) -> Decoded:
+def _tables_of(head: dict[str, Any], names: list[str], columns: list[FloatArray], path: Path) -> Decoded:
     """The tables of a file that is one table, whose first column is t."""
     _require_times(names, path)
     places: dict[str, list[int]] = {}
@@ -370,8 +370,8 @@ def _in_si(table: FloatArray, headings: list[str], path: Path) -> tuple[FloatArr
     if any(factor != 1 for factor in factors):
         table = table * factors
     ends = np.fmin.reduce(table, axis=None, initial=0), np.fmax.reduce(table, axis=None, initial=0)
-    if max(map(abs, ends)) >= MOST:
-        row, column = np.argwhere(np.abs(table) >= MOST)[0]
+    if max(map(abs, ends)) >= MAX_READING:
+        row, column = np.argwhere(np.abs(table) >= MAX_READING)[0]
         found = f"{table[row, column]:g} in sample {row + 1}"
         raise InputError(path, headings[column], found, "a reading, or nothing where it is missing")
     table.flags.writeable = False  # so that a log takes it as it is

@@ -22,9 +22,16 @@ from scipy.stats import norm
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Curves, Description, display
 from malta.errors import InputError
-from malta.identification.excite import LONGEST, Cut, ExcitationPlan, cut_loop, excite, sensor_noise
+from malta.identification.excite import MAX_SAMPLES, Cut, ExcitationPlan, cut_loop, excite, sensor_noise
 from malta.identification.log import Log
-from malta.identification.spectra import FEWEST, SIGMA, Columns, Line, columns_of, lines_of
+from malta.identification.spectra import (
+    MIN_PERIODS,
+    SIGMA,
+    ResponseColumns,
+    SpectralLine,
+    columns_of,
+    lines_of,
+)
 from malta.loops.classical import Disk, disk_sizes
 from malta.loops.loop import Loop, loop
 from malta.margins.loop_report import zone
@@ -32,10 +39,10 @@ from malta.model.data import plant_of
 from malta.model.parameters import box_words, units_of
 from malta.synthesis.controller import Controller
 
-SAME_LAW = 0.02  # of a command at the lines, by which the law of the gain file may miss it
+LAW_TOLERANCE = 0.02  # of a command at the lines, by which the law of the gain file may miss it
 SAMPLES = 32  # machines at random in the box, beside its corners
-NARROW = 0.03  # of its width, by which a sampled tube may be too narrow on either side
-NEAR = 0.02  # of a predicted magnitude without a tube, by which a linear loop may miss the machine
+MAX_TUBE_ERROR = 0.03  # of its width, by which a sampled tube may be too narrow on either side
+MAX_MODEL_ERROR = 0.02  # of a predicted magnitude without a tube, by which a linear loop may miss the machine
 CORNERS = 6  # parameters of which all corners are taken
 
 
@@ -67,7 +74,7 @@ class Curve(NamedTuple):
     def outside(self, factor: float) -> FloatArray:
         """By how many bands the magnitude is outside of the tube, above 0 where it is; `factor` deviations a band."""
         width = self.high - self.low
-        room = np.where(width > 0, NARROW * width, NEAR * self.high)
+        room = np.where(width > 0, MAX_TUBE_ERROR * width, MAX_MODEL_ERROR * self.high)
         off = np.maximum(self.low - self.size, self.size - self.high) - room
         return np.asarray(off / np.maximum(factor * self.deviation, 1e-300) - 1)
 
@@ -143,7 +150,7 @@ class Measurement:
     @property
     def refusal(self) -> str:
         """Why the machine is not as predicted: another law, or |S| or |T| outside of the tube; "": it is."""
-        if self.law > SAME_LAW:
+        if self.law > LAW_TOLERANCE:
             return (
                 f"another law flew, or at its limits: commands at the lines miss those of the gain file by "
                 f"{100 * self.law:.2g} %"
@@ -315,24 +322,24 @@ def plan_measurement(
     """
     if width is not None and not (np.isfinite(width) and width > 0):
         raise InputError("measure", "width", f"{width:g}", "a share above 0")
-    found = _expected(loop, separate=separate, **options)
+    found = _plan_flights(loop, separate=separate, **options)
     if width is None:
         return found
     while True:
         first = found.excitations[0]
-        periods = max(FEWEST, int(np.ceil(min(first.periods * (found.worst / width) ** 2, 1e12))))
+        periods = max(MIN_PERIODS, int(np.ceil(min(first.periods * (found.worst / width) ** 2, 1e12))))
         samples = periods * first.signal.period / loop.sample_time
-        if samples > LONGEST:
+        if samples > MAX_SAMPLES:
             raise InputError(
-                "measure", "width", f"{samples:.3g} samples for it", f"at most {LONGEST:g}: excite more"
+                "measure", "width", f"{samples:.3g} samples for it", f"at most {MAX_SAMPLES:g}: excite more"
             )
         # Where no size is given, curvature is kept beside the noise: a longer flight is excited less.
-        found = _expected(loop, separate=separate, **options | {"periods": periods})
+        found = _plan_flights(loop, separate=separate, **options | {"periods": periods})
         if found.worst <= width * (1 + 1e-9):
             return found
 
 
-def _expected(loop: Loop, *, separate: bool, **options: Any) -> MeasurementPlan:
+def _plan_flights(loop: Loop, *, separate: bool, **options: Any) -> MeasurementPlan:
     """The flights of these options, and what they will tell."""
     plant = loop.plant
     shifts = range(len(plant.inputs) if separate else 1)
@@ -351,7 +358,9 @@ def _expected(loop: Loop, *, separate: bool, **options: Any) -> MeasurementPlan:
         y = np.einsum("kpm,km->kp", G, d)
         moved[plan.signal.axis.astype(int), k] = np.abs(y) ** 2
         nothing = np.zeros(0, dtype=complex)
-        lines += [Line(at, *one) for at, *one in zip(w.tolist(), d, y, [nothing] * len(w), C, strict=True)]
+        lines += [
+            SpectralLine(at, *one) for at, *one in zip(w.tolist(), d, y, [nothing] * len(w), C, strict=True)
+        ]
     curve = _curves(columns_of(lines, w, G), cut, [cut])[0][0]
     coherence, sensors = {}, tuple(s.name for s in plant.outputs)
     for i, name in enumerate(sensors):
@@ -386,7 +395,7 @@ def machines_of(
     return found
 
 
-def _curves(columns: Columns, cut: Cut, machines: Sequence[Cut]) -> tuple[list[Curve], FloatArray]:
+def _curves(columns: ResponseColumns, cut: Cut, machines: Sequence[Cut]) -> tuple[list[Curve], FloatArray]:
     """S, T and L of each sensor, S P, and sigma_max(S): measured, predicted, and their tube; and deviations of S.
 
     Those are of a part of each entry of S, k x p x p.
@@ -404,19 +413,19 @@ def _curves(columns: Columns, cut: Cut, machines: Sequence[Cut]) -> tuple[list[C
     found = (s, 1 - s, 1 / s - 1, columns.G @ into, sigma[:, :1].astype(complex))
     deviations = (dev_s, dev_s, dev_s / np.abs(s) ** 2, dev_c, dev_top[:, None])
     curves = []
-    tubes = zip(*(_predicted(one) for one in machines), strict=True)
+    tubes = zip(*(_predict_responses(one) for one in machines), strict=True)
     for value, deviation, same in zip(found, deviations, tubes, strict=True):
         sizes = np.abs(np.array(same))
         curves.append(Curve(value, deviation, same[0], sizes.min(axis=0), sizes.max(axis=0)))
     return curves, dev
 
 
-def sensitivity_of(columns: Columns, cut: Cut) -> ComplexArray:
+def sensitivity_of(columns: ResponseColumns, cut: Cut) -> ComplexArray:
     """S = I + G F_d^-1 F as measured, k x p x p."""
     return np.asarray(np.eye(columns.G.shape[1]) + columns.G @ np.linalg.solve(cut.F_d, cut.F))
 
 
-def _predicted(cut: Cut) -> tuple[ComplexArray, ...]:
+def _predict_responses(cut: Cut) -> tuple[ComplexArray, ...]:
     """S, T and L of each sensor, S P, and sigma_max(S), of a loop."""
     S = cut.S
     s = np.einsum("kpp->kp", S)
@@ -438,7 +447,7 @@ def _disks(
     return tuple(found)
 
 
-def _law_misses(lines: Sequence[Line], cut: Cut, w: FloatArray) -> float:
+def _law_misses(lines: Sequence[SpectralLine], cut: Cut, w: FloatArray) -> float:
     """The rms of V - F Y - F_d D over that of V, of all lines; NaN without commands."""
     if not len(lines[0].v):
         return float("nan")

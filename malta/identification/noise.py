@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray
-from malta.identification.calibration import Estimate, at_rest
+from malta.identification.calibration import Interval95, at_rest
 from malta.identification.log import Log, require_currents
 from malta.identification.response import axes_of
 from malta.model.equilibrium import trim
@@ -23,7 +23,7 @@ from malta.model.plant import Plant, outputs_at
 SAMPLES = 20_000  # of a simulated log: they tell a standard deviation to 1 %
 
 
-def process_noise(plant: Plant, log: Log) -> dict[str, Estimate]:
+def process_noise(plant: Plant, log: Log) -> dict[str, Interval95]:
     """The standard deviation of the force of each input that noise of the measured currents makes in a sample.
 
         f_k = J i_k  with  J = df / di,     of phases  J = df / di_axes T(x)^+
@@ -91,16 +91,16 @@ def dc_log(plant: Plant, controller: str, sample_time: float, *, seed: int) -> L
     return Log("run noise", plant.name, controller, sample_time, 0.0, t, columns, signals)
 
 
-def noise_table(process: Mapping[str, Estimate], sensor: Mapping[str, Estimate], sources: str) -> str:
+def noise_table(process: Mapping[str, Interval95], sensor: Mapping[str, Interval95], sources: str) -> str:
     """The [noise] of a design file, as standard deviations of one sample.
 
     process : by input, as of `process_noise`
     sensor : by output, as of `malta.identification.calibration.at_rest`
     sources : the logs, for the comment
 
-    >>> from malta.identification.calibration import Estimate
+    >>> from malta.identification.calibration import Interval95
     >>> from malta.identification.noise import noise_table
-    >>> print(noise_table({"F": Estimate(0.05, 0.0, "N")}, {"x": Estimate(4e-7, 0.0, "m")}, "day"), end="")
+    >>> print(noise_table({"F": Interval95(0.05, 0.0, "N")}, {"x": Interval95(4e-7, 0.0, "m")}, "day"), end="")
     [noise]                              # of one sample: standard deviations, measured: day
     process = { F = { value = 0.05, unit = "N" } }
     sensor = { x = { value = 4e-07, unit = "m" } }

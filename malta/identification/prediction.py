@@ -35,17 +35,19 @@ from malta.synthesis.riccati import dare
 
 BLOCK = 1000  # samples that are summed up together
 PASSES = 8  # of the filter over the log, at most
-SETTLED = 0.05  # standard deviations: steps of all parameters that are smaller end the search
-FAR = 1.0  # standard deviations: after a larger step slopes are computed anew
-NORMAL = 1e12  # degrees of freedom with which Student's distribution is the normal one
+SETTLED_STEP = 0.05  # standard deviations: steps of all parameters that are smaller end the search
+LARGE_STEP = 1.0  # standard deviations: after a larger step slopes are computed anew
+FREEDOM = 1e12  # degrees of freedom with which Student's distribution is the normal one
 STUDENT = 4.0  # degrees of freedom against outliers
 SPAN = 7  # readings: a reading's neighbours
 SPIKE = 20.0  # times the usual distance from the median of the neighbours
 OUTLIER = 6.0  # standard deviations
-SLOWEST = 20.0  # over the record's length, rad/s: with which the filter forgets the process noise at least
+FORGETTING_RATE = (
+    20.0  # over the record's length, rad/s: the filter forgets the process noise at least so fast
+)
 STEP = 0.2  # over the fastest pole: about a step of the integration
 MOST_STEPS = 32  # of a sample
-EVEN = 1e-3  # of a sample, over the time constant of a current: what lags by less goes evenly
+MAX_LAG_SHARE = 1e-3  # of a sample, over the time constant of a current: what lags by less goes evenly
 BINS = 400  # between the lines, from which the process noise is found
 
 
@@ -71,7 +73,7 @@ class Predicted:
     readings: FloatArray
 
 
-class Noise(NamedTuple):
+class NoiseModel(NamedTuple):
     """Variances of a sample: of the sensors by output, and of accelerations by position."""
 
     sensors: FloatArray
@@ -80,7 +82,7 @@ class Noise(NamedTuple):
 
 def noise_between_lines(
     model: ResponseModel, theta: FloatArray, w: FloatArray, e: ComplexArray, N: int
-) -> Noise:
+) -> NoiseModel:
     """The noise of sensors and process from e = Y - G I at bins between the lines.
 
     The covariance at a bin is R + H(w) Q H(w)^H, with the response H from accelerations to outputs; R and Q are
@@ -116,7 +118,7 @@ def noise_between_lines(
     bounds = [(-6.0, 2.0)] * p + [(-16.0, 4.0)] * n
     start = np.concatenate([np.zeros(p), np.full(n, -6.0)])
     found = np.exp(minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds).x)
-    return Noise(N * size * found[:p], N * found[p:] / strength)
+    return NoiseModel(N * size * found[:p], N * found[p:] / strength)
 
 
 def _from_accelerations(model: ResponseModel, theta: FloatArray, w: FloatArray) -> ComplexArray:
@@ -127,7 +129,9 @@ def _from_accelerations(model: ResponseModel, theta: FloatArray, w: FloatArray) 
     return np.asarray(C @ np.linalg.solve(1j * w[:, None, None] * np.eye(2 * n) - A, push))
 
 
-def noise_covariances(model: ResponseModel, theta: FloatArray, noise: Noise, w: FloatArray) -> ComplexArray:
+def noise_covariances(
+    model: ResponseModel, theta: FloatArray, noise: NoiseModel, w: FloatArray
+) -> ComplexArray:
     """The covariance R + H(w) Q H(w)^H of a noise at each bin, bins x p x p, but for a factor.
 
     w : bins, rad/s
@@ -136,7 +140,7 @@ def noise_covariances(model: ResponseModel, theta: FloatArray, noise: Noise, w: 
     return np.asarray(np.diag(noise.sensors) + (H * noise.process) @ H.conj().transpose(0, 2, 1))
 
 
-class _Linear(NamedTuple):
+class _LinearFilter(NamedTuple):
     """The filter about the place of the log: F ~ A x, y ~ C x, gain K, and s, the size of innovations."""
 
     A: FloatArray
@@ -145,18 +149,18 @@ class _Linear(NamedTuple):
     s: FloatArray
 
 
-def _filter(model: ResponseModel, theta: FloatArray, noise: Noise, length: float) -> _Linear:
+def _filter(model: ResponseModel, theta: FloatArray, noise: NoiseModel, length: float) -> _LinearFilter:
     """The steady filter. Process noise below what lets it forget within the record is raised to that."""
     A, _, C, _ = model.matrices(theta)
     n, Ts = len(A) // 2, model.sample_time
     Ad = expm(A * Ts)
     at_positions = (np.linalg.pinv(C[:, :n]) ** 2) @ noise.sensors
-    least = (SLOWEST / length) ** 4 * at_positions
+    least = (FORGETTING_RATE / length) ** 4 * at_positions
     G = np.vstack([Ts**2 / 2 * np.eye(n), Ts * np.eye(n)])
     Q, R = (G * np.maximum(noise.process, least)) @ G.T, np.diag(noise.sensors)
     P = dare(Ad.T, C.T, Q, R, what="filter of a log").X
     size = C @ P @ C.T + R
-    return _Linear(Ad, C, np.linalg.solve(size, C @ P).T, np.sqrt(np.diag(size)))
+    return _LinearFilter(Ad, C, np.linalg.solve(size, C @ P).T, np.sqrt(np.diag(size)))
 
 
 class _Shape(NamedTuple):
@@ -260,7 +264,7 @@ class _Search(NamedTuple):
     """What the runs of a search share."""
 
     model: ResponseModel
-    linear: _Linear
+    linear: _LinearFilter
     i: FloatArray
     after: FloatArray  # i one sample later
     y: FloatArray  # 0 where missing
@@ -278,7 +282,7 @@ class _Search(NamedTuple):
         return _Shape(model.plant, model.currents, model.sample_time, apart, steps)
 
 
-class _Flight(NamedTuple):
+class _FilterRun(NamedTuple):
     """A run of the filter: innovations and weights, k x p, and states after each correction, k x n."""
 
     e: FloatArray
@@ -299,7 +303,7 @@ def current_shares(rate: float, Ts: float, steps: int) -> FloatArray:
         return np.zeros(3 * steps + 1)
     t = np.arange(steps + 1) / steps
     a = rate * Ts
-    if a < EVEN:
+    if a < MAX_LAG_SHARE:
         f = np.column_stack([t[:-1], (t[:-1] + t[1:]) / 2, t[1:]])
         return np.append(f.ravel(), 0.5)
     h, left = a / steps, 1 - np.exp(-a)
@@ -325,14 +329,14 @@ def _numbers(s: _Search, theta: FloatArray) -> FloatArray:
     return np.array([*value, *error, *shares])
 
 
-def _fly(s: _Search, theta: FloatArray, d: FloatArray, x: FloatArray) -> _Flight:
+def _fly(s: _Search, theta: FloatArray, d: FloatArray, x: FloatArray) -> _FilterRun:
     """Run the filter over the log from the state x."""
     p = s.y.shape[1]
     numbers = np.concatenate([_numbers(s, theta), d, s.linear.K.T.ravel(), s.linear.s, [s.nu]])
     rows = _filter_loop(s.shape)(x, (s.i, s.after, s.y, s.there), numbers)
     if not np.isfinite(rows).all():
         raise FloatingPointError
-    return _Flight(rows[:, :p], rows[:, p : 2 * p], rows[:, 2 * p :])
+    return _FilterRun(rows[:, :p], rows[:, p : 2 * p], rows[:, 2 * p :])
 
 
 class _Modes(NamedTuple):
@@ -375,7 +379,7 @@ def _slopes(s: _Search, modes: _Modes, theta: FloatArray, x: FloatArray) -> Floa
     return loop(np.zeros(2 * count * c), (s.i, s.after, x), numbers).reshape(len(x), -1, c)
 
 
-def _normal(s: _Search, modes: _Modes, flight: _Flight, E: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _normal(s: _Search, modes: _Modes, flight: _FilterRun, E: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Sums of E' w E / s^2 and of E' w e / s^2 over the log, with the slopes of e in parameters, constant accelerations
     and the first state.
 
@@ -423,7 +427,7 @@ def without_spikes(y: FloatArray) -> FloatArray:
 def predict(
     model: ResponseModel,
     theta: FloatArray,
-    noise: Noise,
+    noise: NoiseModel,
     i: FloatArray,
     y: FloatArray,
     *,
@@ -445,7 +449,7 @@ def predict(
     there = np.isfinite(y).astype(float)
     linear = _filter(model, theta, noise, len(y) * model.sample_time)
     s = _Search(
-        model, linear, i, next_rows(i), np.where(there > 0, y, 0.0), there, STUDENT if robust else NORMAL
+        model, linear, i, next_rows(i), np.where(there > 0, y, 0.0), there, STUDENT if robust else FREEDOM
     )
     n, c = len(linear.A), len(theta)
     half, x = n // 2, np.array(model.place[list(model.plant.controlled)])
@@ -458,7 +462,7 @@ def predict(
             raise CheckError(
                 f"{source}: the filter does not follow the log: another machine than the model"
             ) from None
-        if moved > FAR:
+        if moved > LARGE_STEP:
             E = _slopes(s, modes, theta, flight.x)
         N, g = _normal(s, modes, flight, E)
         unit = np.sqrt(np.diag(N))
@@ -467,13 +471,13 @@ def predict(
         covariance = inverse[:c, :c]
         theta, d, x = theta + step[:c], d + step[c : c + half], x + step[c + half :]
         moved = float((np.abs(step[:c]) / np.sqrt(np.diag(covariance))).max())
-        if moved < SETTLED:
+        if moved < SETTLED_STEP:
             break
     return _result(s, theta, covariance, flight, noise)
 
 
 def _result(
-    s: _Search, theta: FloatArray, covariance: FloatArray, flight: _Flight, noise: Noise
+    s: _Search, theta: FloatArray, covariance: FloatArray, flight: _FilterRun, noise: NoiseModel
 ) -> Predicted:
     """The record of a search that ended."""
     size = flight.e / s.linear.s
@@ -483,7 +487,7 @@ def _result(
     predicted = s.y - flight.e
     gone = (s.there == 0) | off
     spread = max(1.0, float(np.nanmean(kept**2)))
-    if s.nu < NORMAL:  # of weights that depend on e: mean score^2 over the squared mean of the score's slope
+    if s.nu < FREEDOM:  # of weights that depend on e: mean score^2 over the squared mean of the score's slope
         w = flight.w
         slope = (w * (1 - 2 * w * size**2 / (s.nu + 1))).sum() / w.sum()
         spread = float((w**2 * size**2).sum() / w.sum() / slope**2)

@@ -14,8 +14,8 @@ from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
 from malta.identification.log import Log, in_order, reference_spline, require_same_law, sample_excitation
-from malta.identification.response import acting
-from malta.identification.spectra import FARTHEST, sentence_of
+from malta.identification.response import acting_parameters
+from malta.identification.spectra import MAX_PARAMETER_CHANGE, sentence_of
 from malta.model.data import plant_of
 from malta.model.parameters import twins_of
 from malta.model.plant import Plant
@@ -28,9 +28,9 @@ from malta.simulation.scenario import Scenario, Simulation, simulation_of
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import (
     Controller,
-    commanded,
-    estimated,
-    filtered,
+    command_forces,
+    estimate_states,
+    filter_reading,
     freeze_moving,
     frozen_axes,
     gains_of,
@@ -39,12 +39,12 @@ from malta.synthesis.controller import (
 )
 from malta.synthesis.schedule import interpolate
 
-SAME = 1e-6  # of a force's limit: commands that differ by less are the same, in files of nine digits too
-SETTLED = 0.5  # of a log, after which the start of the filter is forgotten
+COMMAND_TOLERANCE = 1e-6  # of a force's limit, which files of nine digits keep too
+SETTLED_SHARE = 0.5  # of a log, after which the start of the filter is forgotten
 LAGS = 20  # samples, over which innovations are tested
-LARGER = 1.2  # times the innovations of the gain file's own machine, beyond which the log's are refused
-ALIKE = 0.1  # by which autocorrelations of both may differ, and 6 standard deviations where that is more
-STILL = 0.1  # of what noise makes of an innovation: one that is as near to that without noise has none
+MAX_INNOVATION_RATIO = 1.2  # to the innovations of the gain file's own machine; beyond, a log's are refused
+MAX_CORRELATION_DIFFERENCE = 0.1  # of autocorrelations; 6 standard deviations where that is more
+NOISELESS_SHARE = 0.1  # of what noise adds to an innovation: with less it counts as without noise
 STEP = 0.01  # of a parameter, by which the machine is moved to see what that changes
 SEED = 1  # of the noise of the gain file's own machine: not that of a simulated log
 
@@ -107,10 +107,10 @@ class LawReplay:
     def doubt(self) -> str:
         """What is wrong with the innovations, with numbers; "": nothing."""
         name = max(self.own, key=lambda n: self.rms[n] / self.own[n])
-        if self.rms[name] > LARGER * self.own[name]:
+        if self.rms[name] > MAX_INNOVATION_RATIO * self.own[name]:
             return (
                 f"the innovation of {name} has {self.rms[name]:.3g} rms, {self.rms[name] / self.own[name]:.3g} times "
-                f"that of the gain file's machine, at most {LARGER:g} is noise"
+                f"that of the gain file's machine, at most {MAX_INNOVATION_RATIO:g} is noise"
             )
         name = max(self.unlike, key=lambda n: self.unlike[n])
         if self.unlike[name] > self.allowed:
@@ -166,22 +166,22 @@ def replay_law(controller: Controller, log: Log, *, same: bool | None = None) ->
         raise CheckError(f"{log.source}: samples are missing, and a law cannot run on")
     simulation, inputs = _inputs(controller, log)
     commands, innovation = _run(simulation, inputs, y)
-    half = int(SETTLED * len(y))
+    half = int(SETTLED_SHARE * len(y))
     off = np.abs(commands - v)
     late = innovation[half:]
     names, forces = [s.name for s in plant.outputs], [s.name for s in plant.inputs]
     noise = np.sqrt(np.array(plant.sensors.noise) ** 2 + np.array(plant.sensors.resolution) ** 2 / 12)
     largest = off[half:].max(axis=0)
     if same is None:
-        same = bool((largest <= SAME * controller.limits.force).all())
+        same = bool((largest <= COMMAND_TOLERANCE * controller.limits.force).all())
     rms = np.sqrt((late**2).mean(axis=0))
     twin = _Twin(controller, log, (simulation, inputs)) if same else None
     own = late if twin is None else twin.innovation(plant, noise=1.0)[half:]
     unlike = np.abs(_autocorrelations(late) - _autocorrelations(own)).max(axis=1)
-    allowed = max(ALIKE, 6 * float(np.sqrt(2 / len(late))))
+    allowed = max(MAX_CORRELATION_DIFFERENCE, 6 * float(np.sqrt(2 / len(late))))
     if twin is not None and (unlike > allowed).any():  # or a flight without noise, as simulations have
         still = twin.innovation(plant, noise=0.0)[half:]
-        unlike[(late - still).std(axis=0) <= STILL * own.std(axis=0)] = 0.0
+        unlike[(late - still).std(axis=0) <= NOISELESS_SHARE * own.std(axis=0)] = 0.0
     found = LawReplay(
         commands,
         innovation,
@@ -198,7 +198,7 @@ def replay_law(controller: Controller, log: Log, *, same: bool | None = None) ->
     )
     if twin is None or not found.doubt:
         return found
-    return replace(found, explained=_explained(plant, twin, late, own, noise))
+    return replace(found, explained=_explain(plant, twin, late, own, noise))
 
 
 def whiteness(values: FloatArray) -> float:
@@ -238,7 +238,7 @@ class _Twin:
         return _run(*self.given, run.y)[1]
 
 
-def _explained(
+def _explain(
     plant: Plant, twin: _Twin, late: FloatArray, own: FloatArray, noise: FloatArray
 ) -> dict[str, tuple[float, float]]:
     """By parameter: the change of it that explains most of the innovations, as a share of its value, and how much.
@@ -255,7 +255,7 @@ def _explained(
     beyond = float((off**2).sum() - ((own - still) ** 2 / noise**2).sum())
     found: dict[str, tuple[float, float]] = {}
     alike = twins_of(plant.parameters)
-    for name in acting(plant):
+    for name in acting_parameters(plant):
         value = float(getattr(plant.parameters, name))
         both = dict.fromkeys([name, *(n for n, other in alike.items() if other == name)], (1 + STEP) * value)
         par: Any = plant.parameters
@@ -267,7 +267,7 @@ def _explained(
         power = float((D**2).sum())
         if power > 0 and beyond > 0:
             a = float((off * D).sum()) / power
-            if abs(a) < FARTHEST:
+            if abs(a) < MAX_PARAMETER_CHANGE:
                 found[name] = (a, min(1.0, a**2 * power / beyond))
     return found
 
@@ -328,12 +328,12 @@ def _law_loop(simulation: Simulation) -> Loop:
     g = {name: ca.SX(value) for name, value in (gains_of(c) | {"rate": ca.DM(c.feedforward.rate)}).items()}
     g = dict(interpolate(g, c.schedule, given["p_ref"]))
     xi_pred, e, frozen = state[:n], state[n : n + p], state[n + p :]
-    taken = filtered(c.tracks, y, given["p_ref"])
-    xi_hat = estimated(g, xi_pred, taken)
+    taken = filter_reading(c.tracks, y, given["p_ref"])
+    xi_hat = estimate_states(g, xi_pred, taken)
     still = freeze_moving(g, frozen, given["dp_ref"])
     sums = sum_errors(g, e, still, y, given["p_ref"])
     xi_ref = law_reference(c, plant_of(c.parameters), g, given)
-    after, saturated, v = commanded(g, xi_hat, sums, xi_ref, given["v_ff"], v0)
+    after, saturated, v = command_forces(g, xi_hat, sums, xi_ref, given["v_ff"], v0)
     after, _ = look_ahead(g, after, y, given["dp_ref"])
     innovation = taken - g["Cd"] @ xi_pred
     inputs = ca.vertcat(*given.values(), y, v0)

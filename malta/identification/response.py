@@ -27,8 +27,8 @@ from malta.model.sensors import with_lags
 from malta.simulation.engine.engines import evaluate
 
 STEP = 1e-5  # of a scale: for derivatives by differences
-QUIETER = 0.01  # of the variance of all currents: a direction with less of it is left out
-ALIKE = 1e3  # condition number of eigenvectors, which are too much alike above it
+MIN_VARIANCE_SHARE = 0.01  # of the variance of all currents: a direction with less of it is left out
+MAX_EIGENVECTOR_CONDITION = 1e3  # condition number of eigenvectors, which are too much alike above it
 SCALES = {"1": 0.1, "m": 1e-3, "rad": 0.1, "s": 1e-4}  # of a parameter whose value is 0, SI
 
 
@@ -254,7 +254,7 @@ def points_of_noise(i: FloatArray, periods: int) -> FloatArray:
     parts = i.reshape(periods, -1, i.shape[1])
     off = (parts - parts.mean(axis=0)).reshape(i.shape) * np.sqrt(periods / max(periods - 1, 1))
     values, vectors = np.linalg.eigh(off.T @ off / len(off))
-    loud = values > QUIETER * values.sum()
+    loud = values > MIN_VARIANCE_SHARE * values.sum()
     points = (vectors[:, loud] * np.sqrt(loud.sum() * values[loud])).T
     return np.vstack([points, -points]) if loud.any() else np.zeros((1, i.shape[1]))
 
@@ -275,7 +275,7 @@ def axes_of(plant: Plant) -> tuple[Any, ...]:
 def transfer(A: FloatArray, C: FloatArray, B: FloatArray, z: ComplexArray) -> ComplexArray:
     """C (z - A)^-1 B at many z: by eigenvectors, or where these are nearly alike by a solution for each."""
     values, V = np.linalg.eig(A)
-    if np.linalg.cond(V) > ALIKE:
+    if np.linalg.cond(V) > MAX_EIGENVECTOR_CONDITION:
         return np.asarray(C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B))
     seen, driven = C @ V, np.linalg.solve(V, B.astype(complex))
     outer = seen.T[:, :, None] * driven[:, None, :]
@@ -307,19 +307,19 @@ def require_parameters(plant: Plant, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def acting(plant: Plant) -> tuple[str, ...]:
+def acting_parameters(plant: Plant) -> tuple[str, ...]:
     """The parameters of a machine that are not 0, twins apart."""
     par, twins = plant.parameters, twins_of(plant.parameters)
     return tuple(n for n in symbolic_names(par) if n not in twins and float(getattr(par, n)) != 0)
 
 
 def candidates(plant: Plant) -> tuple[str, ...]:
-    """The parameters that may be asked for where none are named: `acting` without masses, lengths and pure numbers.
+    """The parameters that are asked for where none is named: `acting_parameters` but masses, lengths, pure numbers.
 
     Those are weighed, measured and counted, as turns are; and without one of them only ratios are told.
     """
     units = units_of_model(plant)
-    return tuple(name for name in acting(plant) if units[name] not in ("kg", "m", "1"))
+    return tuple(name for name in acting_parameters(plant) if units[name] not in ("kg", "m", "1"))
 
 
 def information(slopes: ComplexArray, inputs: ComplexArray, variance: FloatArray) -> FloatArray:

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from malta.errors import CheckError
 from malta.firmware.signals import place_of_readings
 from malta.identification.log import Log, in_order, require_same_law
-from malta.identification.prediction import Noise, noise_between_lines, noise_covariances, without_spikes
-from malta.identification.response import STEP, ResponseModel, acting
+from malta.identification.prediction import NoiseModel, noise_between_lines, noise_covariances, without_spikes
+from malta.identification.response import STEP, ResponseModel, acting_parameters
 from malta.model.parameters import twins_of
 
 if TYPE_CHECKING:
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 
 SIGMA = 1.959963984540054  # half of a 95 % interval
 NEIGHBOURS = 16  # bins between lines, nearest to a line, that tell the noise there
-EXCITED = 1e-6  # of the largest line of an excitation: what is above is a line
-FEWEST = 3  # periods
+MIN_LINE_SHARE = 1e-6  # of the largest line of an excitation: what is above is a line
+MIN_PERIODS = 3  # periods
 WINDOW = 3  # lines to either side whose bins are taken together
-WIDER = 2  # times the highest line: up to there motion counts that curvature multiplies
-REPAIRED = 1e-3  # of the currents that may be missing
-FILLED = 0.2  # of the readings that may be missing
-INDEPENDENT = 0.05  # smallest eigenvalue of the correlation of the excited inputs; 1 where none share a line
+MOTION_BAND_FACTOR = 2  # times the highest line: up to there motion counts that curvature multiplies
+MAX_MISSING_CURRENTS = 1e-3  # of the currents that may be missing
+MAX_MISSING_READINGS = 0.2  # of the readings that may be missing
+MIN_CORRELATION_EIGENVALUE = 0.05  # of the excited inputs; 1 where none share a line
 FEEDBACK = 1e-3  # of an excitation: commands that move by less beside it do not depend on readings
 
 
@@ -85,18 +85,20 @@ def whole_periods(log: Log, excitation: FloatArray, samples: int) -> tuple[int, 
     if each < 2:
         raise CheckError(f"{log.source}: a period of {log.period:g} s is shorter than two samples")
     periods = samples // each
-    if periods > FEWEST:
+    if periods > MIN_PERIODS:
         periods -= 1  # the first one, in which the loop settles
-    if periods < FEWEST:
+    if periods < MIN_PERIODS:
         found = f"{samples * log.sample_time:.4g} s are {periods} periods of {log.period:g} s"
-        raise CheckError(f"{log.source}: too short: {found}, at least {FEWEST} and one to settle are needed")
+        raise CheckError(
+            f"{log.source}: too short: {found}, at least {MIN_PERIODS} and one to settle are needed"
+        )
     return each * periods, periods
 
 
 def excited_lines(log: Log, D: ComplexArray, periods: int) -> IntArray:
     """The bins that an excitation D has. Raises CheckError where they are no multiples of 1 / period."""
     size = np.abs(D[1:])
-    lines = 1 + np.flatnonzero((size > EXCITED * size.max()).any(axis=1))
+    lines = 1 + np.flatnonzero((size > MIN_LINE_SHARE * size.max()).any(axis=1))
     if (lines % periods).any():
         raise CheckError(
             f"{log.source}: the excitation has not the period of {log.period:g} s that the log names"
@@ -110,18 +112,18 @@ def require_independent(log: Log, D: ComplexArray) -> None:
     D : lines x inputs, Fourier coefficients of the excitation
     """
     size = np.linalg.norm(D, axis=0)
-    used = np.flatnonzero(size > EXCITED * size.max())
+    used = np.flatnonzero(size > MIN_LINE_SHARE * size.max())
     unit = D[:, used] / size[used]
     R = unit.conj().T @ unit
     least = float(np.linalg.eigvalsh(R)[0])
-    if least < INDEPENDENT:
+    if least < MIN_CORRELATION_EIGENVALUE:
         between = np.abs(R - np.eye(len(used)))
         a, b = np.unravel_index(int(between.argmax()), between.shape)
         one, other = (log.names("excitation")[used[k]] for k in (a, b))
         raise CheckError(
             f"{log.source}: the excitation of the inputs is not independent: their lines collide, and {one} and "
             f"{other} are correlated by {between[a, b]:.3f}; the smallest eigenvalue is {least:.2g}, "
-            f"at least {INDEPENDENT:g} is needed"
+            f"at least {MIN_CORRELATION_EIGENVALUE:g} is needed"
         )
 
 
@@ -190,12 +192,12 @@ def spectrum_of(log: Log, y: FloatArray, i: FloatArray) -> Spectrum:
     )
 
 
-def straightened(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Spectrum:
+def straighten(model: ResponseModel, s: Spectrum, theta: FloatArray) -> Spectrum:
     """The spectrum without what the machine's curvature adds at harmonics; see `ResponseModel.beyond_linear`.
 
     Products of two lines fall on other lines. Without this they were taken for the machine's linear response.
     """
-    last = min(WIDER * int(s.lines[-1]) // s.periods, (len(s.outputs) - 1) // s.periods)
+    last = min(MOTION_BAND_FACTOR * int(s.lines[-1]) // s.periods, (len(s.outputs) - 1) // s.periods)
     places = s.periods * np.arange(last + 1)
     outputs = np.array(s.outputs)
     outputs[places] -= model.beyond_linear(theta, s.outputs[places], s.currents[places], s.rate * s.periods)
@@ -219,7 +221,7 @@ def readings(log: Log, *, robust: bool) -> FloatArray:
     """The measured outputs at even times, NaN where one is missing, or sticks out where outliers are looked for."""
     y = _at_even_times(log, "y")
     missing = float(np.isnan(y).any(axis=1).mean())
-    if missing > FILLED:
+    if missing > MAX_MISSING_READINGS:
         raise CheckError(
             f"{log.source}: {100 * missing:.3g} % of the samples of y are missing, at most 20 % may be"
         )
@@ -232,7 +234,7 @@ def _at_even_times(log: Log, group: str) -> FloatArray:
     k = np.round((log.t - log.t[0]) / log.sample_time).astype(int)
     if k[-1] == log.samples - 1:
         return table
-    if k[-1] > (1 + FILLED) * log.samples:
+    if k[-1] > (1 + MAX_MISSING_READINGS) * log.samples:
         raise CheckError(f"{log.source}: {k[-1] + 1 - log.samples} samples are missing in its gaps")
     whole = np.full((k[-1] + 1, table.shape[1]), np.nan)
     whole[k] = table
@@ -251,7 +253,7 @@ def whole(log: Log, group: str) -> FloatArray:
     """The columns of a group with missing samples between their neighbours. Raises CheckError for many of them."""
     table = _at_even_times(log, group)
     missing = float(np.isnan(table).any(axis=1).mean())
-    if missing > REPAIRED:
+    if missing > MAX_MISSING_CURRENTS:
         raise CheckError(
             f"{log.source}: {100 * missing:.3g} % of the samples of {group} are missing, at most 0.1 % may be"
         )
@@ -290,7 +292,7 @@ def residuals_of(
     return Residuals(lines, between.reshape(*s.between.shape, -1), others)
 
 
-def noise_of(model: ResponseModel, s: Spectrum, theta: FloatArray, between: ComplexArray) -> Noise:
+def noise_of(model: ResponseModel, s: Spectrum, theta: FloatArray, between: ComplexArray) -> NoiseModel:
     """The noise of sensors and process by the residuals between the lines, see `Residuals`."""
     bins, places = np.unique(s.between.ravel(), return_index=True)
     e = between.reshape(-1, between.shape[2])[places]
@@ -346,11 +348,11 @@ def whiteness_of(parts: Sequence[ComplexArray], spectra: Sequence[Spectrum]) -> 
     return total / float(np.sqrt(max(count, 1) / 2))
 
 
-LOUD = 4.0  # power at the lines over the noise, of the output that moves most; less is no excitation
-MISSING = 1e-3  # of the samples that may be missing
+MIN_LINE_POWER = 4.0  # over the noise, of the output that moves most; less is no excitation
+MAX_MISSING_SAMPLES = 1e-3  # of the samples that may be missing
 
 
-class Line(NamedTuple):
+class SpectralLine(NamedTuple):
     """A line of a log: Fourier coefficients, and the covariance of that of y, p x p."""
 
     w: float
@@ -360,7 +362,7 @@ class Line(NamedTuple):
     covariance: ComplexArray
 
 
-def lines_of(log: Log, loop: Loop) -> list[Line]:
+def lines_of(log: Log, loop: Loop) -> list[SpectralLine]:
     """The lines of the last whole periods of a log. Raises CheckError for a log that tells nothing."""
     plant = loop.plant
     require_log(log, plant.name, loop.sample_time)
@@ -376,21 +378,21 @@ def lines_of(log: Log, loop: Loop) -> list[Line]:
         log.table("y", [s.name for s in plant.outputs]),
         commands,
     )
-    D, Y, V = (np.fft.rfft(_filled(table, log)[-N:], axis=0) / N for table in tables)
+    D, Y, V = (np.fft.rfft(_fill(table, log)[-N:], axis=0) / N for table in tables)
     lines = excited_lines(log, D, periods)
     C = _noise(Y, lines, periods)
     power = (np.abs(Y[lines]) ** 2 / np.einsum("kpp->kp", C).real).max(axis=1)
-    if np.median(power) < LOUD:
+    if np.median(power) < MIN_LINE_POWER:
         raise CheckError(f"{log.source}: the excitation does not rise above the noise at half of the lines")
     rate = 2 * np.pi / (N * log.sample_time)
-    return [Line(rate * k, D[k], Y[k], V[k], c) for k, c in zip(lines.tolist(), C, strict=True)]
+    return [SpectralLine(rate * k, D[k], Y[k], V[k], c) for k, c in zip(lines.tolist(), C, strict=True)]
 
 
-def _filled(table: FloatArray, log: Log) -> FloatArray:
+def _fill(table: FloatArray, log: Log) -> FloatArray:
     """A table with missing samples between their neighbours. Raises CheckError for more than a few of them."""
     bad = ~np.isfinite(table)
     missing = int(bad.any(axis=1).sum()) + log.survey.gaps
-    if missing > MISSING * log.samples or log.survey.gaps:
+    if missing > MAX_MISSING_SAMPLES * log.samples or log.survey.gaps:
         raise CheckError(f"{log.source}: {missing} samples are missing, at most 0.1 % may be, and no gaps")
     return between_neighbours(table)
 
@@ -411,14 +413,14 @@ def _noise(Y: ComplexArray, lines: Any, periods: int) -> ComplexArray:
     return np.asarray(C)
 
 
-class Columns(NamedTuple):
+class ResponseColumns(NamedTuple):
     """G at k frequencies, k x p x m, and the covariance of each column, k x m x p x p."""
 
     G: ComplexArray
     covariance: ComplexArray
 
 
-def columns_of(lines: Sequence[Line], w: FloatArray, predicted: ComplexArray) -> Columns:
+def columns_of(lines: Sequence[SpectralLine], w: FloatArray, predicted: ComplexArray) -> ResponseColumns:
     """G at all lines: measured where it is, else interpolated as a difference to the prediction."""
     k, p, m = predicted.shape
     off = np.zeros((k, m, p), dtype=complex)
@@ -427,8 +429,8 @@ def columns_of(lines: Sequence[Line], w: FloatArray, predicted: ComplexArray) ->
     for at, value in enumerate(w):
         here = [line for line in lines if line.w == value]
         D = np.array([line.d for line in here]).T  # m x experiments
-        used = np.flatnonzero((np.abs(D) > EXCITED * np.abs(D).max()).any(axis=1))
-        if np.linalg.matrix_rank(D[used], tol=EXCITED * np.abs(D).max()) < len(used):
+        used = np.flatnonzero((np.abs(D) > MIN_LINE_SHARE * np.abs(D).max()).any(axis=1))
+        if np.linalg.matrix_rank(D[used], tol=MIN_LINE_SHARE * np.abs(D).max()) < len(used):
             found = f"{value / (2 * np.pi):.4g} Hz excites {len(used)} inputs in {len(here)} logs"
             raise CheckError(f"measure: the line at {found}: one input a line, or a log for each input")
         inverse = np.linalg.pinv(D[used])  # experiments x inputs
@@ -441,7 +443,7 @@ def columns_of(lines: Sequence[Line], w: FloatArray, predicted: ComplexArray) ->
             raise CheckError("measure: an input is excited at fewer than two lines")
         scale = predicted[:, :, j][:, np.abs(predicted[:, :, j]).mean(axis=0).argmax()]
         interpolate_columns(np.log(w), known[:, j], scale, off[:, j], C[:, j])
-    return Columns(predicted + off.transpose(0, 2, 1), C)
+    return ResponseColumns(predicted + off.transpose(0, 2, 1), C)
 
 
 def interpolate_columns(
@@ -478,8 +480,8 @@ def interpolate_columns(
     C[lost] += 2 * error[:, :, None] * error[:, None, :]  # either part of a complex number may have it whole
 
 
-FARTHEST = 0.5  # of its value: a parameter that would have to change by more explains nothing
-ALONE = 1e-6  # of a slope: what is left of it beside those of the estimated parameters, if it acts by itself
+MAX_PARAMETER_CHANGE = 0.5  # of its value: a parameter that would have to change by more explains nothing
+MIN_OWN_SLOPE = 1e-6  # of a slope: its part beside those of the estimated parameters
 
 Explained = Mapping[str, tuple[float, float]]
 """By parameter: the change that explains most, as a share of its value or of a sensor's gain, and the share that it
@@ -508,7 +510,7 @@ def explained_at_lines(parts: Sequence[tuple[ResponseModel, Spectrum, FloatArray
     gains = (error.name for error in plant.sensors.errors if error.unit == "1")
     alone = ((twin,) for twin in twins_of(plant.parameters))  # a twin among others would not follow its twin
     found = {}
-    for group in ((*acting(plant), *gains), *alone):
+    for group in ((*acting_parameters(plant), *gains), *alone):
         others = [name for name in group if name not in names]
         if not others:
             continue
@@ -519,8 +521,8 @@ def explained_at_lines(parts: Sequence[tuple[ResponseModel, Spectrum, FloatArray
         beyond = float(r @ r) - (len(r) - len(names)) / 2
         for name, whole in zip(others, J[:, len(names) :].T, strict=True):
             u = whole - Q @ (Q.T @ whole)
-            acts = np.linalg.norm(u) > ALONE * np.linalg.norm(whole)
-            if acts and beyond > 0 and abs(a := -float(u @ r / (u @ u))) < FARTHEST:
+            acts = np.linalg.norm(u) > MIN_OWN_SLOPE * np.linalg.norm(whole)
+            if acts and beyond > 0 and abs(a := -float(u @ r / (u @ u))) < MAX_PARAMETER_CHANGE:
                 found[name] = (a, min(1.0, a**2 * float(u @ u) / beyond))
     return found
 

@@ -46,15 +46,15 @@ from malta.simulation.trajectory import Trajectory, stroke_figures
 from malta.synthesis.controller import Controller
 
 FORCE = 0.8  # of what the model says is missing, that the next stroke is sent at most
-FINE = 4.0  # knots of the force in a period of the highest frequency of the reference
+KNOTS_PER_PERIOD = 4.0  # knots of the force in a period of the highest frequency of the reference
 POWER = 0.999  # of the acceleration of the reference: it is below that frequency
-WEAK = 3e-3  # of the force that moves the stroke most: forces that move it less are no patterns
+MIN_PATTERN_FORCE = 3e-3  # of the force that moves the stroke most: forces that move it less are no patterns
 CHANCE = 2.0  # standard deviations, above which an error is more than noise
 ROUNDS = 4  # strokes of the gain file's own machine, without noise: they leave some 0.2^4 of its error
-TAKEN = 0.25  # of the thrust's limit, by a stroke of a machine without a rise of its own
-ROUGH = 20  # samples of its rise, at least
-LOGISTIC = 2 * math.log(9) / 108**0.25  # s, rise of a logistic move by 1 m with 1 m/s2 at most
-LONGEST = 20_000  # samples of a stroke's log
+DEFAULT_THRUST_SHARE = 0.25  # of the thrust's limit, by a stroke of a machine without a rise of its own
+MIN_RISE_SAMPLES = 20  # samples of its rise, at least
+LOGISTIC_RISE = 2 * math.log(9) / 108**0.25  # s, rise of a logistic move by 1 m with 1 m/s2 at most
+MAX_SAMPLES = 20_000  # samples of a stroke's log
 
 
 def stroke_of(plant: Plant, controller: Controller, distance: float | None = None) -> Scenario:
@@ -79,8 +79,12 @@ def stroke_of(plant: Plant, controller: Controller, distance: float | None = Non
     distance = 2 * plant.stroke.travel / 3 if distance is None else distance
     rise = None
     if attribute_of(plant, "experiments", "RISE") is None:
-        most = TAKEN * controller.limits.force[believed.thrust_input] / believed.stroke.mass
-        rise = max(ROUGH * controller.sample_time, 2 * turn, LOGISTIC * math.sqrt(abs(distance) / most))
+        most = DEFAULT_THRUST_SHARE * controller.limits.force[believed.thrust_input] / believed.stroke.mass
+        rise = max(
+            MIN_RISE_SAMPLES * controller.sample_time,
+            2 * turn,
+            LOGISTIC_RISE * math.sqrt(abs(distance) / most),
+        )
     driven: dict[str, Any] = {} if plant.actuator.windings is not None else {"fidelity": "force"}
     return Scenario.stroke(distance, rise=rise, settle=max(0.3, 10 * turn), **driven)
 
@@ -114,7 +118,7 @@ def thrust_patterns(believed: Loop, reference: FloatArray) -> ThrustPatterns:
     G[1:-1] = cut.G[:, k, believed.plant.thrust_input]
     moved = fftconvolve(B, np.fft.irfft(G, 2 * N)[:N, None], axes=0)[:N]
     U, s, Vt = np.linalg.svd(moved, full_matrices=False)
-    kept = s >= WEAK * s[0]
+    kept = s >= MIN_PATTERN_FORCE * s[0]
     U = U[:, kept]
     power = np.abs(np.pad(cut.S[:, k, k], 1, mode="edge")) ** 2 / N  # of both halves of the circle
     power[[0, -1]] /= 2
@@ -123,12 +127,12 @@ def thrust_patterns(believed: Loop, reference: FloatArray) -> ThrustPatterns:
 
 
 def _splines(Ts: float, reference: FloatArray) -> FloatArray:
-    """Cubic splines whose knots are FINE to a period of the highest frequency of the reference's acceleration."""
+    """Cubic splines, KNOTS_PER_PERIOD to a period of the highest frequency of the reference's acceleration."""
     N = len(reference)
     t, f = Ts * np.arange(N), np.fft.rfftfreq(N, Ts)
     power = np.cumsum(np.abs(np.fft.rfft(make_interp_spline(t, reference, k=5)(t, 2))) ** 2)
     highest = f[int(np.searchsorted(power, POWER * power[-1]))]
-    count = max(8, round(N * Ts * highest * FINE))
+    count = max(8, round(N * Ts * highest * KNOTS_PER_PERIOD))
     knots = np.concatenate([np.zeros(3), np.linspace(0, N * Ts, min(count, N // 4) + 1), np.full(3, N * Ts)])
     return np.asarray(BSpline.design_matrix(t, knots, 3).toarray()[:, 1:-1])
 
@@ -186,8 +190,10 @@ def next_stroke(
     """
     plant = plant_of(controller.parameters)
     require_same_law(log, plant.name, controller.sample_time)
-    if log.samples > LONGEST:
-        raise InputError(log.source, "t", f"{log.samples} samples", f"one stroke, at most {LONGEST} samples")
+    if log.samples > MAX_SAMPLES:
+        raise InputError(
+            log.source, "t", f"{log.samples} samples", f"one stroke, at most {MAX_SAMPLES} samples"
+        )
     reference, y = (log.table(group, [plant.stroke.name])[:, 0] for group in ("reference", "y"))
     if not np.isfinite(y).all() or log.survey.gaps:
         raise CheckError(f"{log.source}: samples are missing")

@@ -23,12 +23,12 @@ from scipy.special import gammainccinv
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display
 from malta.errors import InputError
-from malta.identification.calibration import Estimate
-from malta.identification.identify import LIKELY, SLACK
+from malta.identification.calibration import Interval95
+from malta.identification.identify import MIN_PROBABILITY, SLACK
 from malta.identification.log import Log, require_currents
 from malta.identification.spectra import (
+    MOTION_BAND_FACTOR,
     SIGMA,
-    WIDER,
     Spectrum,
     between_neighbours,
     in_axes,
@@ -38,13 +38,13 @@ from malta.identification.spectra import (
     whole,
 )
 from malta.model.data import plant_of
-from malta.model.plant import Plant, placed
+from malta.model.plant import Plant, place_states
 from malta.simulation.current_control import open_loop_gain
 from malta.simulation.engine.engines import evaluate
 from malta.synthesis.controller import Controller
 
 ROUNDS = 3  # searches, each with the noise that the one before has left between the lines
-LONGEST = 20.0  # samples of dead time
+MAX_DEAD_TIME = 20.0  # samples of dead time
 
 
 @display
@@ -76,9 +76,9 @@ class Windings:
     ('', '1.20')
     """
 
-    R: Estimate
-    L: Estimate
-    dead_time: Estimate
+    R: Interval95
+    L: Interval95
+    dead_time: Interval95
     believed: tuple[float, float, float]
     crossover: float
     phase_margin: float
@@ -97,7 +97,7 @@ class Windings:
         )
 
     @property
-    def estimates(self) -> dict[str, tuple[Estimate, float]]:
+    def estimates(self) -> dict[str, tuple[Interval95, float]]:
         """By name: R, L and the dead time, each with what the gain file has, SI."""
         found = self.R, self.L, self.dead_time
         return dict(zip(("R", "L", "dead time"), zip(found, self.believed, strict=True), strict=True))
@@ -179,7 +179,11 @@ def identify_windings(controller: Controller, log: Log) -> Windings:
     i = whole(log, "i")[:, [log.names("i").index(name) for name in used]]
     y = between_neighbours(readings(log, robust=False))
     s = spectrum_of(log, np.hstack([y, u]), i)
-    signals = s.currents, s.outputs[:, len(plant.outputs) :], *_moved(plant, used, s, i, log.sample_time)
+    signals = (
+        s.currents,
+        s.outputs[:, len(plant.outputs) :],
+        *_induced_spectra(plant, used, s, i, log.sample_time),
+    )
     lines, between = (
         _Axes(log.sample_time, s.rate * bins, *(one[bins] for one in signals))
         for bins in (s.lines, s.between.ravel())
@@ -191,14 +195,16 @@ def identify_windings(controller: Controller, log: Log) -> Windings:
         theta, covariance, chi2, dof = _search(lines, between, theta)
     values = theta * [1, 1, log.sample_time] + [0, 0, log.sample_time / 2]
     half = SIGMA * np.sqrt(np.diag(covariance)) * [1, 1, log.sample_time]
-    R, L, dead_time = map(Estimate, values.tolist(), half.tolist(), ("ohm", "H", "s"))
+    R, L, dead_time = map(Interval95, values.tolist(), half.tolist(), ("ohm", "H", "s"))
     loop = _current_loop(controller, *values.tolist())
     designed = actuator.crossover, actuator.phase_margin
-    limit = float(SLACK * 2 * gammainccinv(dof / 2, LIKELY) / dof)
+    limit = float(SLACK * 2 * gammainccinv(dof / 2, MIN_PROBABILITY) / dof)
     return Windings(R, L, dead_time, believed, *loop, designed, chi2, limit)
 
 
-def _moved(plant: Plant, used: list[str], s: Spectrum, i: FloatArray, Ts: float) -> list[ComplexArray]:
+def _induced_spectra(
+    plant: Plant, used: list[str], s: Spectrum, i: FloatArray, Ts: float
+) -> list[ComplexArray]:
     """The spectra of induced voltages, V, and of the coupling of moving axes, A/s; bins x axes each.
 
     Positions and speeds are those of the readings up to twice the highest line.
@@ -207,13 +213,13 @@ def _moved(plant: Plant, used: list[str], s: Spectrum, i: FloatArray, Ts: float)
     i : samples x axes of the log
     """
     N, count = round(2 * np.pi / (s.rate * Ts)), len(plant.outputs)
-    slow = np.arange(len(s.outputs)) <= WIDER * s.lines[-1]
+    slow = np.arange(len(s.outputs)) <= MOTION_BAND_FACTOR * s.lines[-1]
     w = s.rate * np.arange(len(s.outputs))
     y = np.fft.irfft(s.outputs[:, :count] * slow[:, None] * N, N, axis=0)
     speed = np.fft.irfft(1j * w[:, None] * s.outputs[:, :count] * slow[:, None] * N, N, axis=0)
     read, moving, flowing = (ca.SX.sym("signal", size) for size in (count, count, len(used)))
     axes, q = [axis.name for axis in plant.drive.axes], plant.position_of(read)
-    x = placed(plant, ca.vertcat(q, ca.jtimes(q, read, moving)))
+    x = place_states(plant, ca.vertcat(q, ca.jtimes(q, read, moving)))
     whole_i, places = ca.SX.zeros(len(axes)), [axes.index(name) for name in used]
     whole_i[places] = flowing
     added = plant.drive.emf(x), plant.drive.coupling(x, whole_i)
@@ -230,7 +236,7 @@ def _search(lines: _Axes, between: _Axes, begin: FloatArray) -> tuple[FloatArray
         e = (lines.residuals(x * scale) / np.maximum(noise, 1e-300)).ravel()
         return np.concatenate([e.real, e.imag])
 
-    low, high = np.array([0.01, 0.01, 0.0]), np.array([100.0, 100.0, LONGEST])
+    low, high = np.array([0.01, 0.01, 0.0]), np.array([100.0, 100.0, MAX_DEAD_TIME])
     found = least_squares(residuals, begin / scale, bounds=(low, high), x_scale=[1, 1, 0.1], xtol=1e-12)
     dof = len(found.fun) - 3
     chi2 = float(found.fun @ found.fun) / dof

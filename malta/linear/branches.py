@@ -14,12 +14,14 @@ from typing import Any
 import casadi as ca
 from flint import arb
 
-from malta.linear.expressions import KNOWN, POINTS, Arithmetic, NotAnalytic, Program, program
+from malta.linear.expressions import KNOWN_OPERATIONS, POINTS, Arithmetic, MatrixProgram, NotAnalytic, program
 
-_OTHERS: dict[str, Any] = {name: getattr(ca, name) for name in KNOWN if hasattr(ca, name)}
+_OTHER_SYMBOL_OPERATIONS: dict[str, Any] = {
+    name: getattr(ca, name) for name in KNOWN_OPERATIONS if hasattr(ca, name)
+}
 
 
-SYMBOLS = Arithmetic(ca.SX, {**_OTHERS, "pow": ca.power})
+SYMBOLS = Arithmetic(ca.SX, {**_OTHER_SYMBOL_OPERATIONS, "pow": ca.power})
 
 
 class Interval:
@@ -113,7 +115,7 @@ class _Resolved:
             self.positive.append(k if x > 0 else self.add("neg", 0, (k,), 0.0))
         return 1 if x > 0 else -1
 
-    def resolved(self, name: str, operands: tuple[int, ...]) -> int | None:
+    def resolve(self, name: str, operands: tuple[int, ...]) -> int | None:
         """The step that stands for an operation with branches; None for any other, or where the branch is not known."""
         if name in ("fmax", "fmin", "lt", "le"):
             one, two = operands
@@ -136,7 +138,7 @@ class _Resolved:
         return None
 
 
-def resolve_branches(model: Program, nominal: Sequence[float]) -> tuple[Program, int]:
+def resolve_branches(model: MatrixProgram, nominal: Sequence[float]) -> tuple[MatrixProgram, int]:
     """The program with the branches that are active at nominal parameters, and how many conditions these have.
 
     A last matrix of one column is added: first the conditions, which are above zero where the programs agree, then the
@@ -146,7 +148,7 @@ def resolve_branches(model: Program, nominal: Sequence[float]) -> tuple[Program,
     roots: dict[int, int] = {}
     for name, target, operands, value in model.steps:
         own = tuple(place[k] for k in operands)
-        step = found.resolved(name, own)
+        step = found.resolve(name, own)
         step = found.add(name, target, own, value) if step is None else step
         if name == "sqrt":
             roots[step] = own[0]
@@ -155,7 +157,9 @@ def resolve_branches(model: Program, nominal: Sequence[float]) -> tuple[Program,
     last = [*positive, *roots.values()]
     entries = tuple(tuple((i, j, place[k]) for i, j, k in matrix) for matrix in model.entries)
     column = tuple((i, 0, k) for i, k in enumerate(last))
-    made = Program(tuple(found.steps), (*entries, column), (*model.shapes, (len(last), 1)), model.inputs)
+    made = MatrixProgram(
+        tuple(found.steps), (*entries, column), (*model.shapes, (len(last), 1)), model.inputs
+    )
     return made, len(positive)
 
 

@@ -46,7 +46,7 @@ def exact(x: float) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class Program:
+class MatrixProgram:
     """Matrices of scalar expressions in p: instructions (operation, target, operands, constant) on numbered cells."""
 
     steps: tuple[tuple[str, int, tuple[int, ...], float], ...]
@@ -70,7 +70,7 @@ class Program:
     @cached_property
     def foreign(self) -> tuple[str, ...]:
         """Operations that have no complex extension: if_else, abs, floor, ..."""
-        return tuple(sorted({name for name, *_ in self.steps if name not in KNOWN}))
+        return tuple(sorted({name for name, *_ in self.steps if name not in KNOWN_OPERATIONS}))
 
     @cached_property
     def depends(self) -> tuple[frozenset[int], ...]:
@@ -83,7 +83,7 @@ class Program:
                 on.append(frozenset().union(*(on[k] for k in operands)))
         return tuple(frozenset().union(*(on[k] for _, _, k in entries)) for entries in self.entries)
 
-    def only(self, matrices: tuple[int, ...]) -> Program:
+    def only(self, matrices: tuple[int, ...]) -> MatrixProgram:
         """The program of these matrices alone; the others have no entries."""
         return _only(self, matrices)
 
@@ -112,7 +112,7 @@ class Program:
 
 
 @lru_cache(maxsize=64)
-def _only(program: Program, matrices: tuple[int, ...]) -> Program:
+def _only(program: MatrixProgram, matrices: tuple[int, ...]) -> MatrixProgram:
     needed = {k for n in matrices if n < len(program.entries) for _, _, k in program.entries[n]}
     for k in range(len(program.steps) - 1, -1, -1):
         if k in needed:
@@ -126,7 +126,7 @@ def _only(program: Program, matrices: tuple[int, ...]) -> Program:
         tuple((i, j, new[k]) for i, j, k in own) if n in matrices else ()
         for n, own in enumerate(program.entries)
     )
-    return Program(steps, entries, program.shapes, program.inputs)
+    return MatrixProgram(steps, entries, program.shapes, program.inputs)
 
 
 class Arithmetic:
@@ -197,8 +197,8 @@ _BALLS: dict[str, Callable[..., Any]] = {
 }
 # On the real axis no branch is near.
 _POINTS = _BALLS | {"atan": lambda x: x.atan(), "asin": lambda x: x.asin(), "acos": lambda x: x.acos()}
-KNOWN = frozenset({*FIELD, *_BALLS, "const", "input", "constpow"})
-EXACT = Arithmetic(exact, {})
+KNOWN_OPERATIONS = frozenset({*FIELD, *_BALLS, "const", "input", "constpow"})
+EXACT_ARITHMETIC = Arithmetic(exact, {})
 
 
 def _ball(x: float) -> Any:
@@ -227,7 +227,7 @@ POINTS = _Checked(lambda x: arb(exact(x)), _at_points(_POINTS))
 BALLS = _Checked(_ball, _BALLS)
 
 
-def program(function: ca.Function) -> Program:
+def program(function: ca.Function) -> MatrixProgram:
     """The instructions of a CasADi function p -> matrices.
 
     Raises InputError when the function calls one without scalar instructions, as an interpolation table.
@@ -271,7 +271,7 @@ def program(function: ca.Function) -> Program:
             )
         )
     shapes = tuple(flat.size_out(n) for n in range(flat.n_out()))
-    return Program(tuple(steps), tuple(entries), shapes, flat.size1_in(0))
+    return MatrixProgram(tuple(steps), tuple(entries), shapes, flat.size1_in(0))
 
 
 def _step(

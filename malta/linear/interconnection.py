@@ -21,7 +21,7 @@ from malta.arguments import plural
 from malta.errors import InputError, require_known
 from malta.linear.system import System
 
-LARGEST_LOOP = 4  # signals of an algebraic loop of expressions, whose matrix is inverted by minors
+MAX_LOOP_SIGNALS = 4  # signals of an algebraic loop of expressions, whose matrix is inverted by minors
 
 
 def gain(D: Any) -> System:
@@ -229,9 +229,9 @@ def _inverse(Q: Any, caller: str) -> Any:
             return np.linalg.inv(Q)
         except np.linalg.LinAlgError as error:
             raise unsolvable from error
-    if Q.shape[0] > LARGEST_LOOP:
+    if Q.shape[0] > MAX_LOOP_SIGNALS:
         found = f"an algebraic loop of {Q.shape[0]} signals"
-        raise InputError(caller, "D", found, f"at most {LARGEST_LOOP}, or a system without a direct path")
+        raise InputError(caller, "D", found, f"at most {MAX_LOOP_SIGNALS}, or a system without a direct path")
     if ca.sparsify(ca.simplify(ca.det(Q))).nnz() == 0:
         raise unsolvable
     return ca.inv_minor(Q)

@@ -28,18 +28,18 @@ from malta.linear.system import System
 RISE = 1e-7  # relative, above the largest gain that was found, at which a search ends
 JOINS = 1e-15  # of the largest entries of its row and column: smaller ones are rounding
 NEAR_AXIS = 1e-4  # |Re| of an eigenvalue over its size, up to which it may lie on the imaginary axis
-SAME = 1e-10  # relative: eigenvalues of that distance are one, of jw and of -jw
+EIGENVALUE_DISTANCE = 1e-10  # relative: eigenvalues of that distance are one, of jw and of -jw
 LEVELS = 30  # that are tried at most
 DIRECT = 0.05  # of S: a value at infinite frequency that one may divide by
-GENERIC = 0.7390851332  # of a mean frequency: a place on the axis that is no zero
+GENERIC_PLACE = 0.7390851332  # of a mean frequency: a place on the axis that is no zero
 ASIDE = np.exp(
     np.multiply.outer([-0.3, 0.3], 4.0 ** -np.arange(7)).ravel()
 )  # factors by which a top is looked for
-CLOSE = 1e-6  # of a candidate's frequency: how far from it a root is looked for first
+ROOT_DISTANCE = 1e-6  # of a candidate's frequency: how far from it a root is looked for first
 STEPS = 60  # of a root by bisection and secants at most
 ROOT = 1e-13  # relative width of the interval at which a root is known
-TINY = 1e-300  # a singular value whose logarithm is taken
-NOTHING = 1e-13  # of S - 1/2 and of S: what rounding leaves of a response
+MIN_SINGULAR_VALUE = 1e-300  # a singular value whose logarithm is taken
+RESPONSE_ROUNDING = 1e-13  # of S - 1/2 and of S: what rounding leaves of a response
 
 
 class Peak(NamedTuple):
@@ -84,7 +84,7 @@ def part_of(system: System, rows: Sequence[int], columns: Sequence[int]) -> Syst
     A, B, C, D = system
     n = len(A)
     whole = np.abs(system_matrix(A, B[:, columns], C[rows], D[np.ix_(rows, columns)]))
-    joined = _joined(whole)
+    joined = _joins(whole)
     reached, seen = joined[:n, n:].any(axis=1), joined[n:, :n].any(axis=0)
     for graph, marks in ((joined[:n, :n], reached), (joined[:n, :n].T, seen)):
         for _ in range(n):
@@ -121,7 +121,7 @@ def _on_axis(eigenvalues: ComplexArray) -> FloatArray:
     """The frequencies of those eigenvalues that may lie on the imaginary axis, in order."""
     found = eigenvalues[np.isfinite(eigenvalues)]
     w = np.sort(np.abs(found.imag[np.abs(found.real) <= NEAR_AXIS * np.abs(found)]))
-    return w[np.append(True, np.diff(w) > SAME * w[1:])] if len(w) else w
+    return w[np.append(True, np.diff(w) > EIGENVALUE_DISTANCE * w[1:])] if len(w) else w
 
 
 def level_frequencies(system: System, level: float) -> FloatArray:
@@ -217,7 +217,7 @@ def fall_frequencies(system: System, level: float, asked: Sequence[Fall]) -> lis
 
     def sizes(w: FloatArray) -> FloatArray:
         found = np.linalg.svd(response_at(system, w), compute_uv=False)
-        return np.asarray(np.log(np.maximum(found, TINY) / level))
+        return np.asarray(np.log(np.maximum(found, MIN_SINGULAR_VALUE) / level))
 
     parts = [part_of(system, own, own) for own in joined_channels(system, range(len(system.C)))]
     c = np.sort(np.concatenate([level_frequencies(part, level) for part in parts]))
@@ -242,11 +242,11 @@ def joined_channels(system: System, channels: Sequence[int]) -> list[list[int]]:
     n, c = len(system.A), len(channels)
     square = system.part(channels, channels)
     whole = np.abs(system_matrix(square.A, square.B, square.C, square.D))
-    label = sparse.csgraph.connected_components(_joined(whole), directed=False)[1][n : n + c]
+    label = sparse.csgraph.connected_components(_joins(whole), directed=False)[1][n : n + c]
     return [[channels[i] for i in np.flatnonzero(label == k).tolist()] for k in np.unique(label)]
 
 
-def _joined(sizes: FloatArray) -> NDArray[np.bool_]:
+def _joins(sizes: FloatArray) -> NDArray[np.bool_]:
     """Which entries of a matrix in balanced units are more than rounding beside the largest of row and column."""
     largest = sizes.max(axis=1, initial=0.0)[:, None] * sizes.max(axis=0, initial=0.0)
     return np.asarray(sizes**2 > JOINS**2 * largest)
@@ -269,7 +269,7 @@ def phase_crossings(S: System) -> list[Crossing]:
     return [
         Crossing(w, complex(1 / s.real - 1))
         for w, s in places
-        if abs(s.real) > NOTHING and 1 / s.real - 1 < 0
+        if abs(s.real) > RESPONSE_ROUNDING and 1 / s.real - 1 < 0
     ]
 
 
@@ -298,10 +298,10 @@ def _axis_zeros(S: System, mirrored: float) -> FloatArray:
         return _on_axis(eigenvalues(A - B @ C / D.real))
     sizes = np.abs(np.linalg.eigvals(S.A))
     middle = float(np.exp(np.log(np.maximum(sizes, sizes.max() * 1e-6 + 1e-300)).mean()))
-    places = 1j * middle * GENERIC * np.array([1.0, 7.0, 0.13])
+    places = 1j * middle * GENERIC_PLACE * np.array([1.0, 7.0, 0.13])
     values = D + (C @ np.linalg.solve(places[:, None, None] * np.eye(2 * n) - A, B.astype(complex)))[:, 0, 0]
     k = int(np.abs(values).argmax())
-    if not abs(values[k]) > NOTHING * (1 + np.abs(S.D).max()):
+    if not abs(values[k]) > RESPONSE_ROUNDING * (1 + np.abs(S.D).max()):
         return np.zeros(0)
     N = np.linalg.inv(places[k] * np.eye(2 * n) - A)
     x = np.linalg.eigvals(-N + (N @ B) @ (C @ N) / values[k])
@@ -320,11 +320,11 @@ def _roots(
     if not len(c):
         return []
     middle = np.concatenate([c[:1] / 2, np.sqrt(c[1:] * c[:-1]), 2 * c[-1:]])
-    beside = np.minimum(CLOSE * c, np.minimum(c - middle[:-1], middle[1:] - c) / 2)
+    beside = np.minimum(ROOT_DISTANCE * c, np.minimum(c - middle[:-1], middle[1:] - c) / 2)
     w = np.unique(np.concatenate([middle, c - beside, c + beside]))
     values = response_at(S, w)[:, 0, 0]
     y = measure(values)
-    seen = np.abs(y) > NOTHING * (1 + np.abs(values))
+    seen = np.abs(y) > RESPONSE_ROUNDING * (1 + np.abs(values))
     k = np.flatnonzero((y[1:] * y[:-1] < 0) & (seen[1:] | seen[:-1]))
     if not len(k):
         return []

@@ -16,11 +16,11 @@ from flint import Ordering, acb, fmpq_mpoly_ctx
 
 from malta.arrays import FloatArray
 from malta.linear.branches import resolve_branches
-from malta.linear.expressions import FIELD, NotAnalytic, Program, exact, program
+from malta.linear.expressions import FIELD, MatrixProgram, NotAnalytic, exact, program
 from malta.work import check_clock
 
-LARGEST = 4000  # terms of an expression at most
-LONGEST = 2_000_000  # products of terms that are added at once: more take seconds
+MAX_TERMS = 4000  # terms of an expression at most
+MAX_PRODUCTS = 2_000_000  # products of terms that are added at once: more take seconds
 
 
 class TooLarge(Exception):
@@ -34,7 +34,7 @@ class Ratio:
 
     def __init__(self, num: Any, den: Any = None) -> None:
         self.num, self.den = num, den
-        if len(num) > LARGEST:
+        if len(num) > MAX_TERMS:
             raise TooLarge
         check_clock()
 
@@ -55,7 +55,7 @@ class Ratio:
         return self + (-other)
 
     def __mul__(self, other: Ratio) -> Ratio:
-        if len(self.num) * len(other.num) > LONGEST:
+        if len(self.num) * len(other.num) > MAX_PRODUCTS:
             raise TooLarge
         if self.den is None and other.den is None:
             return Ratio(self.num * other.num)
@@ -105,7 +105,7 @@ class Symbolic:
     context: Any
     inputs: int
     atoms: tuple[int, ...]  # steps of the program that are further variables
-    program: Program
+    program: MatrixProgram
     arguments: tuple[Ratio, ...] = ()  # of each atom, the first
 
     def constant(self, x: float) -> Ratio:
@@ -137,7 +137,7 @@ def value(polynomial: Mapping[Any, Any], p: Sequence[Any]) -> Any:
     return total
 
 
-def symbolic(program: Program) -> Symbolic:
+def symbolic(program: MatrixProgram) -> Symbolic:
     """The matrices of a program as rational functions.
 
     Raises TooLarge for too many terms, and NotAnalytic for a division by an expression that is identically zero.

@@ -47,17 +47,17 @@ def minimal(system: System) -> Minimal:
     ([-1.0], [3.0])
     """
     A, B, C, D = system.balanced
-    V, n = _reached(A, B)
+    V, n = _reachable(A, B)
     uncontrollable = np.linalg.eigvals(V[:, n:].T @ A @ V[:, n:]).astype(complex)
     A, B, C = V[:, :n].T @ A @ V[:, :n], V[:, :n].T @ B, C @ V[:, :n]
-    V, n = _reached(A.T, C.T)
+    V, n = _reachable(A.T, C.T)
     unobservable = np.linalg.eigvals(V[:, n:].T @ A @ V[:, n:]).astype(complex)
     A, B, C = V[:, :n].T @ A @ V[:, :n], V[:, :n].T @ B, C @ V[:, :n]
     found = System(A, B, C, D, None, system.dt, (), system.inputs, system.outputs)
     return Minimal(found, uncontrollable, unobservable)
 
 
-def _reached(A: FloatArray, B: FloatArray) -> tuple[FloatArray, int]:
+def _reachable(A: FloatArray, B: FloatArray) -> tuple[FloatArray, int]:
     """Orthogonal states of which the first n are those that inputs move, and n (a staircase of ranks)."""
     V, found = np.eye(len(A)), 0
     size = max(float(np.linalg.norm(A, 2)) if len(A) else 0.0, 1e-300)

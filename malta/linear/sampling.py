@@ -9,7 +9,7 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError
 from malta.linear.matrices import system_matrix
 
-LARGEST = 1e8  # entry of a matrix whose exponential is taken
+MAX_EXPONENTIAL_ENTRY = 1e8  # entry of a matrix whose exponential is taken
 
 
 def eigenvalues(M: FloatArray) -> ComplexArray:
@@ -78,7 +78,9 @@ def _exponential(M: FloatArray) -> FloatArray:
     """e^M, of a stack of matrices each."""
     with np.errstate(all="ignore"):
         turn = np.ones(M.shape)
-        if not np.abs(M).max(initial=0.0) < LARGEST and np.isfinite(M).all():  # units of states?
+        if (
+            not np.abs(M).max(initial=0.0) < MAX_EXPONENTIAL_ENTRY and np.isfinite(M).all()
+        ):  # units of states?
             if M.ndim > 2:
                 return np.array([_exponential(one) for one in M])
             _, (units, _) = linalg.matrix_balance(M, permute=False, separate=True)
@@ -86,7 +88,7 @@ def _exponential(M: FloatArray) -> FloatArray:
         # e^710 is past the largest float
         E = (
             linalg.expm(M * turn) / turn
-            if np.abs(M * turn).max(initial=0.0) < LARGEST
+            if np.abs(M * turn).max(initial=0.0) < MAX_EXPONENTIAL_ENTRY
             else np.array([np.inf])
         )
     if not np.isfinite(E).all():

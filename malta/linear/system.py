@@ -23,8 +23,8 @@ from malta.errors import CheckError, InputError
 from malta.linear.matrices import system_matrix
 from malta.linear.sampling import delay_inputs, eigenvalues, sample
 
-MANY = 32  # frequencies from which on a Schur form is worth its time
-SLOW = 1e-6  # of the norm of A: frequencies below it, where the Schur form has lost digits of slow poles
+MIN_SCHUR_FREQUENCIES = 32  # frequencies from which on a Schur form is worth its time
+SLOW_FREQUENCY = 1e-6  # of the norm of A: below, the Schur form has lost digits of slow poles
 INFINITE = 1e8  # of the size of the matrices: zeros beyond it are at infinity, to rounding
 RANK = 1e-11  # of the largest singular value: smaller ones count as zero
 
@@ -139,7 +139,7 @@ class System:
 
     def part(self, outputs: Sequence[int | str], inputs: Sequence[int | str]) -> System:
         """The system between some signals, by index or name. Raises InputError for unknown names."""
-        rows, columns = _picked(outputs, self.outputs, "outputs"), _picked(inputs, self.inputs, "inputs")
+        rows, columns = _pick(outputs, self.outputs, "outputs"), _pick(inputs, self.inputs, "inputs")
         return replace(
             self,
             B=self.B[:, columns],
@@ -171,7 +171,7 @@ class System:
 
         Of any number of inputs and outputs (Emami-Naeini and Van Dooren, Automatica 18(4), 1982).
         """
-        A, B, C, D = _without_zeros_at_infinity(*_scaled(*self.balanced))
+        A, B, C, D = _without_zeros_at_infinity(*_scale(*self.balanced))
         A, B, C, D = _without_zeros_at_infinity(A.T, C.T, B.T, D.T)  # of a D that is square and regular now
         n = len(A)
         if not n:
@@ -234,7 +234,7 @@ class System:
         return System(Ad, Bd, C, 0 * D, None, Ts, (), self.inputs, self.outputs)
 
 
-def _picked(wanted: Sequence[int | str], known: tuple[str, ...], field: str) -> list[int]:
+def _pick(wanted: Sequence[int | str], known: tuple[str, ...], field: str) -> list[int]:
     missing = [one for one in wanted if isinstance(one, str) and one not in known]
     if missing:
         raise InputError("System", field, repr(missing[0]), "one of " + " ".join(known))
@@ -250,7 +250,7 @@ def balanced_units(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     return np.asarray(units[:n])
 
 
-def _scaled(
+def _scale(
     A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """The system with inputs and outputs in units in which they are of the size of A: the zeros are the same."""
@@ -268,10 +268,10 @@ def _without_zeros_at_infinity(
     """The system with its zeros at which outputs without D are held at zero: its D has full row rank."""
     size = max(float(np.abs(M).max(initial=0.0)) for M in (A, B, C, D)) or 1.0
     while True:
-        U, rank = _compressed(D, RANK * size)
+        U, rank = _compress(D, RANK * size)
         C, D = U.T @ C, U.T @ D
         free, C, D = C[rank:], C[:rank], D[:rank]
-        V, held = _compressed(free.T, RANK * size)
+        V, held = _compress(free.T, RANK * size)
         if not held:
             return A, B, C, D
         V = np.hstack([V[:, held:], V[:, :held]])  # the states at which these outputs are zero come first
@@ -279,7 +279,7 @@ def _without_zeros_at_infinity(
         A, B, C, D = A[:n, :n], B[:n], np.vstack([C[:, :n], A[n:, :n]]), np.vstack([D, B[n:]])
 
 
-def _compressed(M: FloatArray, least: float) -> tuple[FloatArray, int]:
+def _compress(M: FloatArray, least: float) -> tuple[FloatArray, int]:
     """An orthogonal U with U'M = 0 below the first rows, and their number."""
     if not M.size:
         return np.eye(len(M)), 0
@@ -297,13 +297,13 @@ def _response_of_joined(
     def response(s: ComplexArray) -> ComplexArray:
         solved = np.empty((len(s), len(C), len(used)), dtype=complex)
         fast = np.zeros(len(s), dtype=bool)
-        if len(s) >= MANY:
+        if len(s) >= MIN_SCHUR_FREQUENCIES:
             if not forms:
                 T, Z = linalg.schur(A, output="complex")
                 forms.append((T, Z.conj().T @ B, C @ Z))
-            fast = np.abs(s) > SLOW * np.linalg.norm(A)
+            fast = np.abs(s) > SLOW_FREQUENCY * np.linalg.norm(A)
             fast &= np.abs(s[:, None] - np.diag(forms[0][0])).min(axis=1) > 0
-            solved[fast] = _substituted(s[fast], *forms[0], used)
+            solved[fast] = _substitute(s[fast], *forms[0], used)
         if not fast.all():
             solved[~fast] = C @ _resolvent(s[~fast], A, B[:, used])
         found = np.zeros((len(s), len(C), B.shape[1]), dtype=complex)
@@ -313,7 +313,7 @@ def _response_of_joined(
     return response
 
 
-def _substituted(
+def _substitute(
     s: ComplexArray, T: ComplexArray, B: ComplexArray, C: ComplexArray, used: Any
 ) -> ComplexArray:
     """C (s - T)^-1 B of some inputs, T upper triangular, from its last row upwards, all frequencies at once."""

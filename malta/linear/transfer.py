@@ -25,8 +25,8 @@ from malta.linear.system import System
 
 BITS = 512  # of roots and sections
 ROUNDING = 1e-12  # of a pole: what its growth may be by the rounding of coefficients
-TINY = 1e-300  # stands for zero in ratios
-CLOSE = 1e-6  # relative distance of poles that are the same, to the rounding of coefficients
+ZERO = 1e-300  # stands for zero in ratios
+POLE_DISTANCE = 1e-6  # relative distance of poles that are the same, to the rounding of coefficients
 
 
 def realize(num: Sequence[Sequence[Any]], den: Sequence[Sequence[Any]], dt: float | None = None) -> System:
@@ -49,8 +49,8 @@ def realize(num: Sequence[Sequence[Any]], den: Sequence[Sequence[Any]], dt: floa
         entries = [
             [_polynomials(n, d, dt) for n, d in zip(*row, strict=True)] for row in zip(num, den, strict=True)
         ]
-        by_column = _grouped(entries, columns=True)
-        by_row = _grouped(entries, columns=False)
+        by_column = _group(entries, columns=True)
+        by_row = _group(entries, columns=False)
     found = by_row if len(by_row.A) < len(by_column.A) else by_column
     if len(entries) * len(entries[0]) > 1:
         found = _without_copies(found, entries, dt or 0.0)
@@ -84,7 +84,7 @@ def _exact(x: Any) -> fmpq:
     return fmpq(*float(x).as_integer_ratio())
 
 
-def _grouped(entries: list[list[tuple[Polynomial, Polynomial]]], *, columns: bool) -> System:
+def _group(entries: list[list[tuple[Polynomial, Polynomial]]], *, columns: bool) -> System:
     """The system of all entries; those of one column, or row, with the same poles share their states."""
     p, m = len(entries), len(entries[0])
     lines = [[(i, j) for j in range(m)] for i in range(p)]
@@ -118,7 +118,7 @@ def _without_copies(found: System, entries: list[list[tuple[Polynomial, Polynomi
     """
     every = [entry for row in entries for entry in row]
     with ctx.workprec(BITS):
-        poles = [np.array([_rounded(p) for p in _roots(den)]) for _, den in every]
+        poles = [np.array([_round(p) for p in _roots(den)]) for _, den in every]
         growing = [
             (p, num)
             for (num, _), own in zip(every, poles, strict=True)
@@ -128,7 +128,7 @@ def _without_copies(found: System, entries: list[list[tuple[Polynomial, Polynomi
         hidden = any(_cancels(num, p) for p, num in growing)
 
     def times(of: Any, p: complex) -> int:
-        return int((np.abs(np.asarray(of) - p) <= CLOSE * abs(p)).sum())
+        return int((np.abs(np.asarray(of) - p) <= POLE_DISTANCE * abs(p)).sum())
 
     wanted = [(p, max(times(own, p) for own in poles)) for p, _ in growing]
     if hidden or all(times(found.poles, p) == count for p, count in wanted):
@@ -143,28 +143,28 @@ def _without_copies(found: System, entries: list[list[tuple[Polynomial, Polynomi
 def _cancels(num: Polynomial, p: complex) -> bool:
     """Whether a numerator is zero at a pole, to the rounding of its coefficients."""
     sizes = [float(abs(arb(c))) * abs(p) ** k for k, c in enumerate(num.coeffs())]
-    return abs(_rounded(acb_poly([acb(c) for c in num.coeffs()])(acb(p)))) <= CLOSE * sum(sizes)
+    return abs(_round(acb_poly([acb(c) for c in num.coeffs()])(acb(p)))) <= POLE_DISTANCE * sum(sizes)
 
 
 def _roots(polynomial: Polynomial) -> list[acb]:
     return [root for root, times in polynomial.complex_roots() for _ in range(times)]
 
 
-def _rounded(x: acb) -> complex:
+def _round(x: acb) -> complex:
     """A number as a double one; a part that may be zero is zero."""
     return complex(*(0.0 if part.contains(0) else float(part.mid()) for part in (x.real, x.imag)))
 
 
-def _parted(polynomial: Polynomial) -> tuple[list[list[acb]], list[acb]]:
+def _split_roots(polynomial: Polynomial) -> tuple[list[list[acb]], list[acb]]:
     """Pairs of conjugate roots, and real roots, the largest first."""
-    roots = sorted(_roots(polynomial), key=lambda r: -abs(_rounded(r)))
+    roots = sorted(_roots(polynomial), key=lambda r: -abs(_round(r)))
     return [[r, r.conjugate()] for r in roots if r.imag > 0], [r for r in roots if r.imag == 0]
 
 
 def _sections(num: Polynomial, den: Polynomial) -> System:
     """One transfer function as sections in series, each with zeros near its poles."""
-    pairs, reals = _parted(den)
-    zero_pairs, zeros = _parted(num) if num else ([], [])
+    pairs, reals = _split_roots(den)
+    zero_pairs, zeros = _split_roots(num) if num else ([], [])
     joined = 2 * max(len(zero_pairs) - len(pairs), 0)  # real poles that a pair of zeros needs
     poles = pairs + [reals[k : k + 2] for k in range(0, joined, 2)] + [[p] for p in reals[joined:]]
     taken: list[list[acb]] = [[] for _ in poles]
@@ -174,7 +174,7 @@ def _sections(num: Polynomial, den: Polynomial) -> System:
             near = {(i, k): _apart(left[i], poles[k]) for i in range(len(left)) for k in free}
             i, k = min(near, key=lambda pair: near[pair])
             taken[k] += left.pop(i)
-    order = sorted(range(len(poles)), key=lambda k: -abs(_rounded(poles[k][0])))
+    order = sorted(range(len(poles)), key=lambda k: -abs(_round(poles[k][0])))
     size = num.coeffs()[-1] / den.coeffs()[-1] if num else fmpq(0)
     made = []
     for own, of in ((poles[i], taken[i]) for i in order):
@@ -191,7 +191,7 @@ def _sections(num: Polynomial, den: Polynomial) -> System:
 
 def _apart(zeros: list[acb], poles: list[acb]) -> float:
     """How far a zero is from the nearest pole, in ratios: gains of the sections stay as near 1 as they can."""
-    logs = ([cmath.log(_rounded(x) or TINY) for x in roots] for roots in (zeros[:1], poles))
+    logs = ([cmath.log(_round(x) or ZERO) for x in roots] for roots in (zeros[:1], poles))
     return min(abs(z - p) for z, p in itertools.product(*logs))
 
 
@@ -200,8 +200,8 @@ def _chain(nums: list[Polynomial], den: Polynomial) -> System:
 
     Division by the sections from the last to the first leaves what each output reads of them (Newton's form).
     """
-    pairs, reals = _parted(den)
-    poles = sorted([*pairs, *([p] for p in reals)], key=lambda own: -abs(_rounded(own[0])))
+    pairs, reals = _split_roots(den)
+    poles = sorted([*pairs, *([p] for p in reals)], key=lambda own: -abs(_round(own[0])))
     units = [_unit(own) for own in poles]
     starts = np.cumsum([0, *(len(own) for own in poles)])
     n = int(starts[-1])
@@ -232,7 +232,7 @@ def _chain(nums: list[Polynomial], den: Polynomial) -> System:
 
 def _unit(poles: list[acb]) -> float:
     """A power of two near the size of some poles."""
-    size = abs(_rounded(poles[0]))
+    size = abs(_round(poles[0]))
     return 2.0 ** round(math.log2(size)) if size else 1.0
 
 
@@ -259,6 +259,6 @@ def _section(poles: list[acb], n: list[acb], g: float, direct: float) -> System:
     else:
         A, B = [[acb(p.real), acb(g)], [acb(-(p.imag**2) / g), acb(p.real)]], [0.0, g]
         C = [(n0 + n1 * p.real) / g**2, n1 / g]
-    made = ([[_rounded(x).real for x in row] for row in M] for M in (A, [C]))
+    made = ([[_round(x).real for x in row] for row in M] for M in (A, [C]))
     A_made, C_made = (np.array(M) for M in made)
     return System(A_made, np.array(B)[:, None], C_made, np.array([[direct]]))

@@ -23,7 +23,7 @@ from malta.linear.system import System
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class StateGroup:
     """States of the system and of the compensator that close a loop by themselves.
 
     inputs : the states on which inputs act, when these are fewer than the inputs; else None
@@ -200,7 +200,9 @@ def _close(
     return whole
 
 
-def _poles(system: UncertainSystem, c: Compensator, p: FloatArray, groups: Sequence[Group]) -> ComplexArray:
+def _poles(
+    system: UncertainSystem, c: Compensator, p: FloatArray, groups: Sequence[StateGroup]
+) -> ComplexArray:
     """The poles of the closed loop at k rows of parameters, group by group; of sampled loops (lambda - 1) / T."""
     A, B, C = system.at(p)
     F_A, F_B = difference_form(c)
@@ -221,7 +223,7 @@ def _poles(system: UncertainSystem, c: Compensator, p: FloatArray, groups: Seque
 
 
 def instability(
-    system: UncertainSystem, c: Compensator, p: FloatArray, groups: Sequence[Group] = ()
+    system: UncertainSystem, c: Compensator, p: FloatArray, groups: Sequence[StateGroup] = ()
 ) -> FloatArray:
     """The real part of the worst pole at k rows of parameters, 1/s; of sampled loops ln|lambda| / T.
 
@@ -261,10 +263,10 @@ def worst_frequency(poles: ComplexArray, T: float | None) -> float:
 # Frequency responses of a loop's parts, and the peaks and crossings of what is computed from them.
 
 
-FEW = 32  # frequencies at which a system is solved as a whole
+MAX_DIRECT_FREQUENCIES = 32  # frequencies at which a system is solved as a whole
 
 
-class Responses(NamedTuple):
+class ResponseMatrices(NamedTuple):
     """Frequency responses, one matrix for each frequency."""
 
     G_y: ComplexArray  # k x p x m: commands -> sensors, with lag, hold and delay
@@ -273,7 +275,7 @@ class Responses(NamedTuple):
     F: ComplexArray  # k x m x p: sensors -> commands
 
 
-def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: FloatArray) -> Responses:
+def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: FloatArray) -> ResponseMatrices:
     """The responses of system and compensator at frequencies w, rad/s.
 
     p : one row of parameters, or a row for each frequency
@@ -285,7 +287,7 @@ def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: Float
     s, turned, F = _law(law, np.asarray(w, dtype=float).tobytes())
     m, q = len(law.D), C.shape[1] - len(law.D)
     G = (C @ _resolvent(s, A, B) + D) * turned[:, None, None]
-    return Responses(G[:, :q, :m], G[:, :q, m:], G[:, q:, :m], F)
+    return ResponseMatrices(G[:, :q, :m], G[:, :q, m:], G[:, q:, :m], F)
 
 
 def _resolvent(s: ComplexArray, A: FloatArray, B: FloatArray) -> ComplexArray:
@@ -293,7 +295,7 @@ def _resolvent(s: ComplexArray, A: FloatArray, B: FloatArray) -> ComplexArray:
     n = A.shape[-1]
     found = np.zeros((len(s), n, B.shape[-1]), dtype=complex)
     parts = [np.arange(n)]
-    if len(s) > FEW:
+    if len(s) > MAX_DIRECT_FREQUENCIES:
         count, label = sparse.csgraph.connected_components((A != 0).any(axis=0), directed=False)
         parts = [np.flatnonzero(label == k) for k in range(count)]
     for x in parts:

@@ -35,9 +35,9 @@ from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem, instability, open_systems
 
 ROUNDS = 60  # of the balance of a matrix at most
-BALANCED = 1e-9  # relative difference of norms of rows and columns
+BALANCE_TOLERANCE = 1e-9  # relative difference of norms of rows and columns
 LEVELS = 12  # of a disk of several channels at most
-INSIDE = np.linspace(0.0, 1.0, 9)  # of an interval between two levels
+INNER_POINTS = np.linspace(0.0, 1.0, 9)  # of an interval between two levels
 RISE = 1e-7  # relative, above the smallest disk that was found, at which its search ends
 
 
@@ -245,7 +245,7 @@ def _largest_mu(M: System) -> Peak:
         if not len(ends):
             break
         ends = np.concatenate([ends[:1] / 2, ends, 2 * ends[-1:]])
-        w = (ends[:-1, None] + np.diff(ends)[:, None] * INSIDE).ravel()
+        w = (ends[:-1, None] + np.diff(ends)[:, None] * INNER_POINTS).ravel()
         found = sizes(w)
         if not found.max() > best * (1 + RISE):
             break
@@ -288,7 +288,7 @@ def balance_scales(M: ComplexArray) -> FloatArray:
         both = (rows > 0) & (columns > 0)
         ratio = np.where(both, columns / np.where(both, rows, 1), 1)
         d = d * ratio**0.25
-        if np.abs(ratio - 1).max(initial=0.0) < BALANCED:
+        if np.abs(ratio - 1).max(initial=0.0) < BALANCE_TOLERANCE:
             break
     return np.asarray(d[..., 0])
 
@@ -344,7 +344,7 @@ def gang_of_four(loop: Nominal) -> list[tuple[float, ...]]:
 #                        infinity among them. The nearest below and above 1 bound the stable ones.
 
 
-FARTHEST = 1e6  # factors of gain beyond which a margin counts as infinite
+MAX_GAIN_FACTOR = 1e6  # factors of gain beyond which a margin counts as infinite
 
 
 @dataclass(frozen=True)
@@ -380,8 +380,8 @@ class ChannelMargins:
 def gain_range(crossings: Sequence[Crossing]) -> tuple[tuple[float, float], tuple[float, float]]:
     """The factors about 1 that no crossing lies between, and the frequencies of both bounds."""
     factors = [(-1 / c.value.real, c.frequency) for c in crossings if c.value.real < 0]
-    below = max((f for f in factors if 1 / FARTHEST < f[0] < 1), default=(0.0, math.nan))
-    above = min((f for f in factors if 1 <= f[0] < FARTHEST), default=(math.inf, math.nan))
+    below = max((f for f in factors if 1 / MAX_GAIN_FACTOR < f[0] < 1), default=(0.0, math.nan))
+    above = min((f for f in factors if 1 <= f[0] < MAX_GAIN_FACTOR), default=(math.inf, math.nan))
     return (below[0], above[0]), (below[1], above[1])
 
 

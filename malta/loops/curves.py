@@ -31,17 +31,17 @@ from malta.processes import on_one_thread
 
 BASE = 160  # frequencies of the logarithmic grid
 DECADES = 8.0  # at most
-BEYOND = 30.0  # times the slowest and the fastest pole
+POLE_RANGE_FACTOR = 30.0  # times the slowest and the fastest pole
 TURN = 0.15  # |ln| of the ratio of neighbours, above which an interval is halved
-NARROW = 5e-4  # of the frequency: intervals that are not halved, so that none falls on a pole on the axis
+MIN_INTERVAL = 5e-4  # of the frequency: not halved further, so that none falls on a pole on the axis
 ROUNDS = 3  # of halving
-MOST = 90  # frequencies that a round may add
-AROUND = np.array([-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0])  # half-widths of a resonance
-NARROWEST = 1e-9  # relative half-width of a resonance
-LIGHT = 0.5  # damping below which a pole makes a resonance
-STILL = 1e-7  # of the fastest rate: poles that count as zero
-BELOW = 1e-9  # of the lowest frequency: as far as gain crossings are looked for
-FAR_BELOW = 10  # frequencies from there to the lowest
+MAX_ADDED_FREQUENCIES = 90  # frequencies that a round may add
+RESONANCE_OFFSETS = np.array([-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0])  # half-widths of a resonance
+MIN_WIDTH = 1e-9  # relative half-width of a resonance
+MAX_RESONANT_DAMPING = 0.5  # damping below which a pole makes a resonance
+ZERO_POLE_SHARE = 1e-7  # of the fastest rate: poles that count as zero
+CROSSING_RANGE_SHARE = 1e-9  # of the lowest frequency: as far as gain crossings are looked for
+CROSSING_FREQUENCIES = 10  # frequencies from there to the lowest
 
 
 class Responses(NamedTuple):
@@ -296,8 +296,8 @@ def _refine(loop: LinearLoop) -> LoopCurves:
                 np.mod(values[1:].imag - values[:-1].imag + np.pi, 2 * np.pi) - np.pi
             )
         coarse = np.nan_to_num(step, nan=0.0, posinf=0.0).max(axis=1)
-        coarse[np.diff(found.w) < NARROW * found.w[:-1]] = 0.0
-        widest = np.argsort(-coarse)[:MOST]
+        coarse[np.diff(found.w) < MIN_INTERVAL * found.w[:-1]] = 0.0
+        widest = np.argsort(-coarse)[:MAX_ADDED_FREQUENCIES]
         k = np.sort(widest[coarse[widest] > TURN])
         if not len(k):
             break
@@ -307,7 +307,7 @@ def _refine(loop: LinearLoop) -> LoopCurves:
 
 def _to_crossings(loop: LinearLoop, found: Responses) -> Responses:
     """The same with frequencies to a gain crossing far below, as of a weak integrator beside fast poles."""
-    w = found.w[0] * np.geomspace(BELOW, 1.0, FAR_BELOW)
+    w = found.w[0] * np.geomspace(CROSSING_RANGE_SHARE, 1.0, CROSSING_FREQUENCIES)
     far = respond(loop, w)
     with np.errstate(divide="ignore"):
         size = np.log(np.abs(np.concatenate([far.alone("sensors"), far.alone("forces")], axis=1)))
@@ -327,14 +327,14 @@ def _grid(loop: LinearLoop) -> FloatArray:
     """Frequencies from well below the slowest pole to the Nyquist frequency or well above the fastest pole, rad/s."""
     poles = np.concatenate([loop.poles_of(loop.plant.A), loop.poles_of(loop.law.A), loop.closed_poles])
     sizes = np.abs(poles)
-    known = sizes[sizes > STILL * sizes.max(initial=0.0)]
+    known = sizes[sizes > ZERO_POLE_SHARE * sizes.max(initial=0.0)]
     T = loop.sample_time
-    top = (known.max() * BEYOND if len(known) else 1e2) if T is None else np.pi / T
-    low = min(known.min() / BEYOND if len(known) else top / 1e4, top / 1e3)
+    top = (known.max() * POLE_RANGE_FACTOR if len(known) else 1e2) if T is None else np.pi / T
+    low = min(known.min() / POLE_RANGE_FACTOR if len(known) else top / 1e4, top / 1e3)
     low = max(low, top / 10**DECADES)
-    light = poles[(np.abs(poles.real) < LIGHT * sizes) & (poles.imag > 0)]
-    width = np.maximum(np.abs(light.real) / np.maximum(np.abs(light), 1e-300), NARROWEST)
-    near = (np.abs(light.imag)[:, None] * np.exp(width[:, None] * AROUND)).ravel()
+    light = poles[(np.abs(poles.real) < MAX_RESONANT_DAMPING * sizes) & (poles.imag > 0)]
+    width = np.maximum(np.abs(light.real) / np.maximum(np.abs(light), 1e-300), MIN_WIDTH)
+    near = (np.abs(light.imag)[:, None] * np.exp(width[:, None] * RESONANCE_OFFSETS)).ravel()
     closed = loop.closed_poles.imag
     near = np.concatenate([near, closed[closed > 0]]) if loop.stable else near
     w = np.concatenate([np.geomspace(low, top, BASE), near[(near > low) & (near < top)]])

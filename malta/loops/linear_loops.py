@@ -159,8 +159,8 @@ def loop_systems(plant: Plant | Loop, controller: Controller | None = None) -> L
 CALLER = "loop"
 Place = Literal["sensors", "forces"]
 Names = tuple[str, ...]
-GONE = 1e-6  # |z| of the poles of pure delay
-STILL = 1e-6  # of a pole's frequency: growth that counts as none
+DELAY_POLE_SIZE = 1e-6  # |z| of the poles of pure delay
+NO_GROWTH = 1e-6  # of a pole's frequency: growth that counts as none
 ROUNDING = 1e-14  # of a matrix whose eigenvalues are taken
 
 
@@ -221,7 +221,7 @@ class LinearLoop:
         if T is None:
             return found
         z = 1 + T * found
-        found = found[np.abs(z) > GONE]
+        found = found[np.abs(z) > DELAY_POLE_SIZE]
         return np.asarray(np.log1p(T * found) / T)
 
     @cached_property
@@ -256,7 +256,7 @@ class LinearLoop:
         overlap = np.abs(np.einsum("ij,ij->j", left.conj(), right))  # of unit vectors: 1 / condition
         size = float(np.linalg.norm(A, 2)) + (0.0 if T is None else 1 / T)
         growth = self._growth(found)
-        return int(((growth * overlap > ROUNDING * size) & (growth > STILL * np.abs(found))).sum())
+        return int(((growth * overlap > ROUNDING * size) & (growth > NO_GROWTH * np.abs(found))).sum())
 
     def _growth(self, poles: ComplexArray) -> FloatArray:
         """Re of poles; of eigenvalues in differences (|z|^2 - 1) / 2 T."""

@@ -31,15 +31,17 @@ Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 
 GAIN = "gain"  # the name of the factor of the loop gain
 SAMPLES = 41
-MOST = 121  # samples with those of halved intervals
-MOST_OF_GAIN = 401  # the same, where a sample costs no new model of the machine
-FAR = 0.12  # how far a pole may move from sample to sample, of its distance from zero
-SLOW = 1e-4  # of the fastest rate: poles that may move as far as one of this rate
+MAX_SAMPLES = 121  # samples with those of halved intervals
+MAX_GAIN_SAMPLES = 401  # the same, where a sample costs no new model of the machine
+MAX_POLE_MOVE = 0.12  # how far a pole may move from sample to sample, of its distance from zero
+SLOW_POLE_SHARE = 1e-4  # of the fastest rate: poles that may move as far as one of this rate
 DELAY = 0.02  # |z| of poles that count as pure delay
-NEAR = 1e-4  # of the range: intervals that are not halved
+MIN_INTERVAL = 1e-4  # of the range: intervals that are not halved
 ROUNDING = 1e-13  # of the fastest rate: growth that counts as none
-SAME = 1e-7  # of the fastest rate: imaginary parts below are rounding, as of a real pole that is there twice
-EXACT = 1e-8  # of the range: the accuracy of the values at which stability changes
+REAL_POLE_TOLERANCE = (
+    1e-7  # of the fastest rate: smaller imaginary parts are rounding, as of a double real pole
+)
+CROSSING_ACCURACY = 1e-8  # of the range: the accuracy of the values at which stability changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +95,7 @@ def root_locus(
         raise InputError(
             "root locus", parameter, f"{low:g} to {high:g}", "a range from a lower to a higher value"
         )
-    most = MOST_OF_GAIN if parameter == GAIN else MOST
+    most = MAX_GAIN_SAMPLES if parameter == GAIN else MAX_SAMPLES
     first = _values(low, high, nominal, wide=parameter == GAIN)
     values, found = _follow_branches(_count_calls(matrix, most, progress), first, most, loop.sample_time)
     return RootLocus(
@@ -182,9 +184,9 @@ def _follow_branches(
     while len(known) < most:
         moved = np.abs(np.diff(found, axis=0)) / _sizes(found, T)
         worst = moved.max(axis=1, initial=0.0)
-        worst[np.diff(known) < NEAR * (known[-1] - known[0])] = 0.0
+        worst[np.diff(known) < MIN_INTERVAL * (known[-1] - known[0])] = 0.0
         far = np.argsort(-worst)[: most - len(known)]
-        far = np.sort(far[worst[far] > FAR])
+        far = np.sort(far[worst[far] > MAX_POLE_MOVE])
         if not len(far):
             break
         for k in reversed(far.tolist()):
@@ -199,7 +201,7 @@ def _sizes(found: ComplexArray, T: float | None) -> FloatArray:
     Poles next to pure delay have no size: they may move at will.
     """
     size = np.maximum(np.abs(found[:-1]), np.abs(found[1:]))
-    size = np.maximum(size, SLOW * size.max(initial=1e-300))
+    size = np.maximum(size, SLOW_POLE_SHARE * size.max(initial=1e-300))
     if T is None:
         return np.asarray(size)
     z = np.maximum(np.abs(1 + T * found[:-1]), np.abs(1 + T * found[1:]))
@@ -240,7 +242,7 @@ def _continue_branches(last: ComplexArray, ahead: ComplexArray, found: ComplexAr
 
 def _split_pairs(poles: ComplexArray) -> tuple[Indices, Indices, Indices]:
     """Indices of the upper poles, of their conjugates in the same order, and of the real ones, by rounding."""
-    level = SAME * float(np.abs(poles).max(initial=0.0))
+    level = REAL_POLE_TOLERANCE * float(np.abs(poles).max(initial=0.0))
     upper, lower = np.flatnonzero(poles.imag > level), np.flatnonzero(poles.imag < -level)
     apart = np.abs(poles[upper].conj()[:, None] - poles[lower])
     return upper, lower[optimize.linear_sum_assignment(apart)[1]], np.flatnonzero(np.abs(poles.imag) <= level)
@@ -277,7 +279,7 @@ def stability_changes(
         if worst[k] * worst[k + 1] < 0 and max(abs(worst[k]), abs(worst[k + 1])) > least:
             root: Any = optimize.brentq(
                 lambda value: _growth(matrix(value), T), values[k], values[k + 1],
-                xtol=EXACT * (values[-1] - values[0]),
+                xtol=CROSSING_ACCURACY * (values[-1] - values[0]),
             )  # fmt: skip
             made.append(float(root))
     return tuple(made)

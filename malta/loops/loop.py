@@ -20,7 +20,7 @@ from malta.linear.sampling import eigenvalues
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Classical, Nominal, classical_margins
 from malta.loops.sampled_loops import (
-    LAST,
+    LAST_STAGE,
     SampledLoop,
     continuous_poles,
     disturbance_map,
@@ -67,7 +67,7 @@ class Loop:
     plant: Plant
     controller: Controller
     at: Mapping[str, float] = field(default_factory=dict)
-    current_loops: CurrentLoops = LAST
+    current_loops: CurrentLoops = LAST_STAGE
 
     @cached_property
     def model(self) -> LinearModel:
@@ -197,7 +197,7 @@ def loop(
     /,
     *,
     parameters: Mapping[str, float] | None = None,
-    current_loops: CurrentLoops = LAST,
+    current_loops: CurrentLoops = LAST_STAGE,
     **at: float,
 ) -> Loop:
     """Make the loop of a machine and a controller at an operating point.
@@ -227,13 +227,13 @@ def loop(
     if names != [s.name for s in plant.outputs]:
         raise InputError("loop", "controller", f"one of {' '.join(names)}", f"one of the {plant.name}")
     x = plant.state(at) if at else plant.point(controller.operating_point[0]).x
-    return _remembered(machine, controller, tuple(position_at(plant, x).items()), current_loops)
+    return _cached_loop(machine, controller, tuple(position_at(plant, x).items()), current_loops)
 
 
 def loop_of_model(model: LinearModel, controller: Controller) -> Loop:
     """The loop of a linear model's machine at the model's operating point."""
     at = position_at(model.plant, model.operating_point.x)
-    return _remembered(model.plant, controller, tuple(at.items()))
+    return _cached_loop(model.plant, controller, tuple(at.items()))
 
 
 def loop_along(plant: Plant, controller: Controller, position: float | None = None) -> Loop:
@@ -241,7 +241,7 @@ def loop_along(plant: Plant, controller: Controller, position: float | None = No
     at = position_at(plant, plant.point(controller.operating_point[0]).x)
     if position is not None and plant.has_stroke:
         at[plant.stroke.name] = position
-    return _remembered(plant, controller, tuple(at.items()))
+    return _cached_loop(plant, controller, tuple(at.items()))
 
 
 def loop_from(source: Plant | Loop, controller: Controller | None, position: float | None = None) -> Loop:
@@ -255,10 +255,10 @@ def loop_from(source: Plant | Loop, controller: Controller | None, position: flo
 
 
 @lru_cache(maxsize=32)  # what is asked of a loop is computed once; plants and controllers compare by identity
-def _remembered(
+def _cached_loop(
     plant: Plant,
     controller: Controller,
     at: tuple[tuple[str, float], ...],
-    current_loops: CurrentLoops = LAST,
+    current_loops: CurrentLoops = LAST_STAGE,
 ) -> Loop:
     return Loop(plant, law_at(controller, plant, plant.state(dict(at))), dict(at), current_loops)

@@ -21,8 +21,8 @@ from malta.linear.expressions import NotAnalytic, program
 from malta.linear.rational import Ratio, Symbolic, TooLarge, symbolic as rational_functions
 from malta.linear.systems import from_source
 from malta.linear.uncertain import UncertainSystem
-from malta.loops.windings import Windings, with_windings
-from malta.model.equilibrium import commanded
+from malta.loops.windings import WindingModel, with_windings
+from malta.model.equilibrium import with_command
 from malta.model.linearize import is_commutated, jacobians, linearize
 from malta.model.parameters import shape_parameters, twins_of, units_of
 from malta.model.plant import Plant, position_in, symbolic
@@ -44,13 +44,13 @@ from malta.work import check_clock
 # for a proof: an operation that no enclosure knows keeps every proof away from such a model.
 
 
-LONGEST_FORCES = 5_000  # operations up to which the forces are expanded
+MAX_FORCE_OPERATIONS = 5_000  # operations up to which the forces are expanded
 NEWTON_STEPS = 8
-CLOSE = 1e-6  # of the command, between its formula and the nominal one
-NOT_EXACT = "the command that makes the preload is no formula of the parameters"
+COMMAND_TOLERANCE = 1e-6  # of the command, between its formula and the nominal one
+INEXACT_COMMAND = "the command that makes the preload is no formula of the parameters"
 
 
-class Command(NamedTuple):
+class CommandExpression(NamedTuple):
     """The command as an expression; `why` says why it is not exact, "" where it is."""
 
     v: Any
@@ -62,7 +62,9 @@ def is_affine(made: Any, v: Any) -> bool:
     return not any(ca.which_depends(ca.vec(made), v, 2, False))
 
 
-def command_of(chain: ca.Function, p: Any, acting: Any, nominal: FloatArray, wanted: FloatArray) -> Command:
+def command_of(
+    chain: ca.Function, p: Any, acting: Any, nominal: FloatArray, wanted: FloatArray
+) -> CommandExpression:
     """Find v with chain(p, v) = acting as a function of p.
 
     chain : (p, v) -> inputs that the currents of v make
@@ -72,33 +74,33 @@ def command_of(chain: ca.Function, p: Any, acting: Any, nominal: FloatArray, wan
     """
     q = ca.SX.sym("v", chain.size1_in(1))
     made = chain(p, q)
-    left = _simplified(acting - chain(p, acting), p)
+    left = _simplify(acting - chain(p, acting), p)
     none = ca.SX.zeros(q.numel())
-    for v, rest in ((acting, left), (none, _simplified(acting - chain(p, none), p))):
+    for v, rest in ((acting, left), (none, _simplify(acting - chain(p, none), p))):
         if rest.is_zero() and _is_near(v, p, nominal, wanted):
-            return Command(v)
+            return CommandExpression(v)
     if is_affine(made, q):
         slope, start = ca.substitute([ca.jacobian(made, q), made], [q], [none])
-        return Command(acting + ca.solve(slope, acting - start - slope @ acting))
+        return CommandExpression(acting + ca.solve(slope, acting - start - slope @ acting))
     both = ca.Function("both", [ca.vertcat(p, q)], [ca.densify(made - acting), ca.densify(left)])
-    if both.n_instructions() <= LONGEST_FORCES:
+    if both.n_instructions() <= MAX_FORCE_OPERATIONS:
         try:
             v = _exact_command(rational_functions(program(both)), p, acting, wanted, nominal)
         except (TooLarge, NotAnalytic, ZeroDivisionError):
             v = None
         if v is not None and _is_near(v, p, nominal, wanted):
-            return Command(v)
-    return Command(_newton(chain, p, acting, wanted), NOT_EXACT)
+            return CommandExpression(v)
+    return CommandExpression(_newton(chain, p, acting, wanted), INEXACT_COMMAND)
 
 
-def _simplified(expression: Any, p: Any) -> Any:
+def _simplify(expression: Any, p: Any) -> Any:
     """The expression built again from its common subexpressions, where equal terms cancel."""
     return ca.SX(ca.Function("left", [p], [ca.cse(ca.densify(expression))])(p))
 
 
 def _is_near(v: Any, p: Any, nominal: FloatArray, wanted: FloatArray) -> bool:
     found = np.array(ca.Function("v", [p], [ca.densify(v)])(nominal)).ravel()
-    return bool(np.abs(found - wanted).max() <= CLOSE * np.abs(wanted).max())
+    return bool(np.abs(found - wanted).max() <= COMMAND_TOLERANCE * np.abs(wanted).max())
 
 
 def _newton(chain: ca.Function, p: Any, acting: Any, wanted: FloatArray) -> Any:
@@ -118,9 +120,9 @@ def _exact_command(s: Symbolic, p: Any, acting: Any, wanted: FloatArray, nominal
     equations, left = s.entries
     m, first = len(wanted), p.numel()
     zero = Ratio(s.context.constant(0))
-    if all(_resolved(s, r).is_zero() for r in left.values()):
+    if all(_resolve_roots(s, r).is_zero() for r in left.values()):
         return acting
-    polynomials = [_resolved(s, equations.get((i, 0), zero)).num for i in range(m)]
+    polynomials = [_resolve_roots(s, equations.get((i, 0), zero)).num for i in range(m)]
     if any(any(monomial[s.inputs :]) for n in polynomials for monomial in n.monoms()):
         return None  # a sine, or a root that no square resolves
     powers = [
@@ -172,7 +174,7 @@ def _coefficients(s: Symbolic, polynomial: Any, first: int, m: int) -> dict[tupl
     return {power: Ratio(s.context.from_dict(terms)) for power, terms in parts.items()}
 
 
-def _resolved(s: Symbolic, r: Ratio) -> Ratio:
+def _resolve_roots(s: Symbolic, r: Ratio) -> Ratio:
     """The ratio with squares of roots replaced by what the roots are of."""
     steps = [s.program.steps[step] for step in s.atoms]
     is_root = (name == "sqrt" or (name == "constpow" and power == 0.5) for name, _, _, power in steps)
@@ -180,7 +182,7 @@ def _resolved(s: Symbolic, r: Ratio) -> Ratio:
     return rational.replace_squares(s, r, roots)
 
 
-LONGEST = 20_000  # operations up to which a model is expanded
+MAX_MODEL_OPERATIONS = 20_000  # operations up to which a model is expanded
 
 
 def of_plant(
@@ -192,7 +194,7 @@ def of_plant(
     believed: Plant | None = None,
     held: FloatArray | None = None,
     late: bool = False,
-    windings: Windings | None = None,
+    windings: WindingModel | None = None,
 ) -> UncertainSystem:
     """The design model of a plant at a position, in parameters by name, where its preload acts at every value of them.
 
@@ -239,7 +241,7 @@ def of_plant(
         acting = of(p[own], z, ca.DM.zeros(len(plant.inputs)))[-1]
         q = ca.SX.sym("v", len(plant.inputs))
         chain = ca.Function("chain", [p, q], [of(p[own], z, q)[4]])
-        wanted = commanded(plant, plant.at(**(at or {})), believed).v
+        wanted = with_command(plant, plant.at(**(at or {})), believed).v
         v, why = command_of(chain, p, acting, np.array(nominal, dtype=float), np.asarray(wanted))
         A, B, C, E = of(p[own], z, v)[:4]
         if held is not None:
@@ -303,7 +305,7 @@ def _expanded_matrices(
     own = [i for i in range(k) if fixed or not ca.is_equal(p[i], z)]
     outputs = of(q[own], place, q[k:])
     model = ca.Function("model", [q], list(outputs))
-    if model.n_instructions() > LONGEST:
+    if model.n_instructions() > MAX_MODEL_OPERATIONS:
         return None
     scales = np.concatenate([nominal, np.array(model(np.r_[nominal, np.zeros(m)])[-1]).ravel()])
     try:

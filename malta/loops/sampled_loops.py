@@ -136,10 +136,10 @@ def _integrals_last(law: LinearLaw, count: int) -> LinearLaw | None:
     return law._replace(A=A, B_y=summed(law.B_y), B_r=summed(law.B_r), C=law.C @ T)
 
 
-LAST: CurrentLoops = "pi"  # the last stage: the loop that simulations fly by default
+LAST_STAGE: CurrentLoops = "pi"  # the last stage: the loop that simulations fly by default
 ROUNDING = 1e-9  # of the largest entry
-ABOUT = np.array([-3.0, -1.0, -0.3, 0.0, 0.3, 1.0, 3.0])  # half-widths of a resonance
-DELAYED = 1e-6  # |z| below which a pole is one of pure delay
+RESONANCE_OFFSETS = np.array([-3.0, -1.0, -0.3, 0.0, 0.3, 1.0, 3.0])  # half-widths of a resonance
+DELAY_POLE_SIZE = 1e-6  # |z| below which a pole is one of pure delay
 
 
 @display
@@ -191,7 +191,7 @@ class SampledLoop:
         """Frequencies about those of the closed loop's oscillating poles, rad/s, from below their width to above."""
         z = eigenvalues(self.closed)
         poles = np.log(z[z.imag > 0]) / self.sample_time
-        return np.asarray((poles.imag[:, None] + np.abs(poles.real)[:, None] * ABOUT).ravel())
+        return np.asarray((poles.imag[:, None] + np.abs(poles.real)[:, None] * RESONANCE_OFFSETS).ravel())
 
     @cached_property
     def cut(self) -> Nominal:
@@ -270,7 +270,7 @@ def sampled_loop(
     if feedforward:
         law = with_slope(law, feedforward_slope(model, controller))
     if current_loops == "pi":
-        continuous, Ad, Bd, control = _driven(model, controller, delay, sensors)
+        continuous, Ad, Bd, control = _sample_windings(model, controller, delay, sensors)
         if forces_alone or not len(control.emf[0]):
             Bd, law = (
                 Bd[:, : len(controller.forces)],
@@ -306,7 +306,7 @@ def _between_samples(
 
 
 @lru_cache(maxsize=4)  # a loop has it twice, with and without forecast voltages; records compare by identity
-def _driven(
+def _sample_windings(
     model: LinearModel, controller: Controller, delay: int, sensors: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, CurrentControl]:
     """The machine with its windings between samples; sampled behind its current controllers; and these.
@@ -348,7 +348,7 @@ def _pad(C: FloatArray, n: int) -> FloatArray:
 def machine_loop(
     model: LinearModel,
     controller: Controller,
-    current_loops: CurrentLoops = LAST,
+    current_loops: CurrentLoops = LAST_STAGE,
     *,
     forces_alone: bool = False,
 ) -> SampledLoop:
@@ -406,7 +406,7 @@ def commanded_model(model: LinearModel, controller: Controller) -> LinearModel:
 def machine_law(
     plant: Plant,
     controller: Controller,
-    current_loops: CurrentLoops = LAST,
+    current_loops: CurrentLoops = LAST_STAGE,
     *,
     use: ReadingUse | None = None,
     point: OperatingPoint | None = None,
@@ -436,7 +436,7 @@ def machine_system(
     controller: Controller,
     names: Sequence[str],
     at: Mapping[str, float],
-    current_loops: CurrentLoops = LAST,
+    current_loops: CurrentLoops = LAST_STAGE,
 ) -> tuple[UncertainSystem, Compensator]:
     """The machine at the states `at` in parameters by name, and its control law: the arguments of robust_margin."""
     controller = law_at(controller, plant, plant.at(**at).x)
@@ -476,7 +476,7 @@ def loaded_model(plant: Plant, position: float, others: tuple[tuple[str, float],
 
 
 def loaded_loop(
-    plant: Plant, controller: Controller, at: Mapping[str, float], current_loops: CurrentLoops = LAST
+    plant: Plant, controller: Controller, at: Mapping[str, float], current_loops: CurrentLoops = LAST_STAGE
 ) -> Nominal:
     """The responses of `machine_loop` at the states `at` (SI), from forces to sensors and back.
 
@@ -523,7 +523,7 @@ def feedforward_slope(model: LinearModel, controller: Controller) -> FloatArray:
 
 def continuous_poles(sampled: ComplexArray, Ts: float) -> ComplexArray:
     """Poles in rad/s of a sampled system, ln(lambda) / Ts, in order; poles of pure delay are left out."""
-    return sorted_poles(np.asarray(np.log(sampled[np.abs(sampled) > DELAYED].astype(complex)) / Ts))
+    return sorted_poles(np.asarray(np.log(sampled[np.abs(sampled) > DELAY_POLE_SIZE].astype(complex)) / Ts))
 
 
 def sorted_poles(poles: ComplexArray) -> ComplexArray:

@@ -35,9 +35,9 @@ from malta.model.plant import Plant, position_in
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.recovery import RecoveryBound, StepResponse, step_response
-from malta.synthesis.requirements import Noise
+from malta.synthesis.requirements import NoiseRms
 
-AFTER = (0.1, 0.3)  # s
+RECOVERY_TIMES = (0.1, 0.3)  # s
 SHARE = 0.01  # of the largest deviation
 PLACES = 9  # of the travel, its ends among them
 
@@ -103,7 +103,7 @@ def recovery(
     loads: Mapping[str, Mapping[str, float]] | None = None,
     *,
     position: float | None = None,
-    after: tuple[float, ...] = AFTER,
+    after: tuple[float, ...] = RECOVERY_TIMES,
 ) -> tuple[Recovery, ...]:
     """Answer constant loads from outside with the machine's linear loop.
 
@@ -218,9 +218,9 @@ def _deviations(
 # Answers of any linear loop to steps of its references and of the loads on it, and the figures that are read off.
 
 
-SETTLED = 0.02  # of the final value, or of the largest one where the answer returns to zero
-FAST = 0.05  # of the fastest time constant: a sample of a continuous loop
-GROWN = 1e3  # how far the answer of an unstable loop grows
+SETTLED_SHARE = 0.02  # of the final value, or of the largest one where the answer returns to zero
+SAMPLE_SHARE = 0.05  # of the fastest time constant: a sample of a continuous loop
+MAX_GROWTH = 1e3  # how far the answer of an unstable loop grows
 SAMPLES = 2000  # of the answer of an unstable loop
 
 
@@ -272,7 +272,7 @@ def _sample_system(loop: LinearLoop, system: System, T: float | None) -> tuple[F
     if T is not None:
         return np.eye(len(system.A)) + T * system.A, T * system.B, T
     fastest = float(np.abs(loop.closed_poles).max(initial=0.0)) or 1.0
-    return *sample(system.A, system.B, FAST / fastest), FAST / fastest
+    return *sample(system.A, system.B, SAMPLE_SHARE / fastest), SAMPLE_SHARE / fastest
 
 
 def _respond_for_a_while(
@@ -280,11 +280,11 @@ def _respond_for_a_while(
 ) -> StepResponse:
     """The answer of an unstable loop over a finite time."""
     growth = max(float(loop.closed_poles.real.max()), 1e-3 * float(np.abs(loop.closed_poles).max()))
-    stride = max(1, round(math.log(GROWN) / growth / dt / SAMPLES))
+    stride = max(1, round(math.log(MAX_GROWTH) / growth / dt / SAMPLES))
     n, w = g.shape
     one = system_matrix(M, g, None, np.eye(w))
     step, out = np.linalg.matrix_power(one, stride), np.hstack([system.C, system.D])
-    count = max(2, min(SAMPLES, math.ceil(math.log(GROWN) / growth / dt / stride)))
+    count = max(2, min(SAMPLES, math.ceil(math.log(MAX_GROWTH) / growth / dt / stride)))
     state, found = np.vstack([np.zeros((n, w)), np.eye(w)]), []
     for _ in range(count):
         found.append(out @ state)
@@ -302,7 +302,7 @@ def step_figures(answer: StepResponse, output: int, column: int) -> StepFigures:
     if math.isnan(final):
         return StepFigures(nan, nan, nan, peak, float(t[k]), nan)
     returns = abs(final) < 1e-6 * max(largest, 1e-300)
-    band = SETTLED * (largest if returns else abs(final))
+    band = SETTLED_SHARE * (largest if returns else abs(final))
     outside = np.flatnonzero(np.abs(y - final) > band)
     settling = 0.0 if not len(outside) else _settling_time(t, np.abs(y - final), band, int(outside[-1]))
     if returns:
@@ -351,19 +351,19 @@ def noise_variance(plant: Plant) -> FloatArray:
     return variance
 
 
-def noise_of(loop: SampledLoop, plant: Plant) -> Noise:
+def noise_of(loop: SampledLoop, plant: Plant) -> NoiseRms:
     """Compute the rms of the true outputs and of the commanded forces from the sensors' noise and steps."""
     return _noise_from(loop, noise_variance(plant), len(plant.inputs))
 
 
-def budget_of(loop: SampledLoop, plant: Plant) -> Noise:
+def budget_of(loop: SampledLoop, plant: Plant) -> NoiseRms:
     """Compute which sensors the noise at rest comes from: shares of each variance, p x p of motion, m x p of force.
 
     A row without noise is zero.
     """
     V = noise_variance(plant)
     parts = [_noise_from(loop, V * alone, len(plant.inputs)) for alone in np.eye(len(V))]
-    return Noise(_shares([part.motion for part in parts]), _shares([part.force for part in parts]))
+    return NoiseRms(_shares([part.motion for part in parts]), _shares([part.force for part in parts]))
 
 
 def _shares(sizes: list[FloatArray]) -> FloatArray:
@@ -374,7 +374,7 @@ def _shares(sizes: list[FloatArray]) -> FloatArray:
     return found
 
 
-def _noise_from(loop: SampledLoop, V: FloatArray, m: int) -> Noise:
+def _noise_from(loop: SampledLoop, V: FloatArray, m: int) -> NoiseRms:
     """The noise at rest from sensors of these variances; of m forces, behind which a loop may hand on readings."""
     c = loop.control
     noise = np.vstack([loop.Bd @ c.D_y, c.B_y])
@@ -382,4 +382,4 @@ def _noise_from(loop: SampledLoop, V: FloatArray, m: int) -> Noise:
     command = np.hstack([c.D_y @ loop.Cd, c.C])
     out = np.diag(loop.outputs @ X[:n, :n] @ loop.outputs.T)
     force = np.diag(command @ X @ command.T + c.D_y * V @ c.D_y.T)[:m]
-    return Noise(np.sqrt(out), np.sqrt(force))
+    return NoiseRms(np.sqrt(out), np.sqrt(force))

@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 
 
 CurrentLoops = Literal["lag", "pi"]
-EXACT = 1e-9  # of the largest entry: what a map onto the commanded axes may leave
+AXIS_TOLERANCE = 1e-9  # of the largest entry: what a map onto the commanded axes may leave
 
 
-class Windings(NamedTuple):
+class WindingModel(NamedTuple):
     """The windings of a machine in units of forces."""
 
     R: float  # ohm, R_0
@@ -52,7 +52,7 @@ class CurrentControl(NamedTuple):
     """The current controllers of a gain file and the windings that they see."""
 
     loop: CurrentLoop
-    windings: Windings
+    windings: WindingModel
     emf: tuple[FloatArray, FloatArray]  # M^+ emf(x_hat) of the law's states and of y; without rows: none
 
 
@@ -67,34 +67,34 @@ def chosen_loops(plant: Plant, controller: Controller, current_loops: CurrentLoo
         "pi"
         if current_loops == "pi"
         and not _missing_current_loops(plant, controller)
-        and _driven(plant, controller)
+        and _has_driven_windings(plant, controller)
         else "lag"
     )
 
 
-def _driven(plant: Plant, controller: Controller) -> bool:
+def _has_driven_windings(plant: Plant, controller: Controller) -> bool:
     return plant.actuator.windings is not None and controller.current_loop is not None
 
 
-BRAKING = "the limited speed at which far errors are approached (`braking`)"
+BRAKING_TEXT = "the limited speed at which far errors are approached (`braking`)"
 
 
 def left_out(plant: Plant, controller: Controller, current_loops: CurrentLoops = "pi") -> str:
     """What the machine's loop leaves out; "": nothing that simulations fly by default."""
     found = (
         _missing_current_loops(plant, controller, current_loops),
-        BRAKING if controller.braking.any() else "",
+        BRAKING_TEXT if controller.braking.any() else "",
     )
     return ", and ".join(filter(None, found))
 
 
 def _missing_current_loops(plant: Plant, controller: Controller, current_loops: CurrentLoops = "pi") -> str:
     """What it leaves out of the current loops."""
-    if current_loops == "lag" and _driven(plant, controller):
+    if current_loops == "lag" and _has_driven_windings(plant, controller):
         return "the PI current controllers, for which first-order lags at their crossover stand"
     if plant.actuator.electronics is not None and plant.actuator.windings is None:
         return "the electronics' own current controllers, for which first-order lags at their crossover stand"
-    if _driven(plant, controller) and is_commutated(plant_of(controller.parameters)):
+    if _has_driven_windings(plant, controller) and is_commutated(plant_of(controller.parameters)):
         return "PI current loops of currents that depend on the reading, for which first-order lags stand"
     return ""
 
@@ -106,7 +106,7 @@ def force_modes(believed: Plant) -> FloatArray:
     return linearize(believed, believed.at()).force_map if half == m else np.eye(m)
 
 
-def windings_of(plant: Plant, believed: Plant, point: OperatingPoint, modes: FloatArray) -> Windings:
+def windings_of(plant: Plant, believed: Plant, point: OperatingPoint, modes: FloatArray) -> WindingModel:
     """The windings at an operating point, as the controller's own machine commands them.
 
     Raises CheckError for a drive that induces voltages in axes that no force commands.
@@ -115,19 +115,21 @@ def windings_of(plant: Plant, believed: Plant, point: OperatingPoint, modes: Flo
     into = np.linalg.pinv(M)
     for machine in (plant, believed):
         slope = emf_slope(machine, point.x)
-        if np.abs(slope - M @ into @ slope).max() > EXACT * np.abs(slope).max(initial=0.0):
+        if np.abs(slope - M @ into @ slope).max() > AXIS_TOLERANCE * np.abs(slope).max(initial=0.0):
             raise CheckError(
                 f"{plant.name}: voltages are induced in axes of the drive that no force commands"
             )
-    return Windings(float(plant.actuator.R), modes, modes @ into)
+    return WindingModel(float(plant.actuator.R), modes, modes @ into)
 
 
-def current_control(controller: Controller, windings: Windings, point: OperatingPoint) -> CurrentControl:
+def current_control(controller: Controller, windings: WindingModel, point: OperatingPoint) -> CurrentControl:
     """The current controllers of a gain file at an operating point of the machine."""
     assert controller.current_loop is not None
     believed = plant_of(controller.parameters)
     slope = windings.axes @ emf_slope(believed, point.x)[:, list(believed.controlled)]
-    return CurrentControl(controller.current_loop, windings, _estimated(controller, believed, slope, point.x))
+    return CurrentControl(
+        controller.current_loop, windings, _estimate_slopes(controller, believed, slope, point.x)
+    )
 
 
 @lru_cache(maxsize=16)  # several parts of a loop need it; records compare by identity
@@ -165,7 +167,7 @@ def estimated_rows(slope: FloatArray, L: FloatArray, Cd: FloatArray) -> tuple[Fl
     return slope @ (np.eye(len(L))[:n] - L[:n] @ Cd), slope @ L[:n]
 
 
-def _estimated(
+def _estimate_slopes(
     c: Controller, believed: Plant, slope: FloatArray, x: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """slope x_hat of the law's states and of y."""
@@ -181,7 +183,7 @@ def _estimated(
     return (np.zeros((len(slope), 0)), direct) if direct.any() else (np.zeros((0, 0)), np.zeros((0, 0)))
 
 
-def with_windings(plant: Plant, k: Windings, x: Any, A: Any, B: Any, C: Any) -> tuple[Any, Any, Any]:
+def with_windings(plant: Plant, k: WindingModel, x: Any, A: Any, B: Any, C: Any) -> tuple[Any, Any, Any]:
     """A, B and C (CasADi) with the windings: states (x, phi), inputs w, outputs (y, phi).
 
     plant : the machine, whose parameters may be symbols
@@ -305,7 +307,7 @@ def _before_integrals(n: int, added: int, integrals: int) -> list[int]:
     return [*range(n - integrals), *range(n, n + added), *range(n - integrals, n)]
 
 
-class Link(NamedTuple):
+class DcLink(NamedTuple):
     """The voltage of the link under load, as it answers and acts: deviations about rest."""
 
     rate: float  # 1/s, of V' in V
@@ -314,7 +316,7 @@ class Link(NamedTuple):
     share: FloatArray  # of w in V: u / V at rest, in forces over R_0
 
 
-def link_at_rest(plant: Plant, k: Windings, point: OperatingPoint, M: FloatArray) -> Link | None:
+def link_at_rest(plant: Plant, k: WindingModel, point: OperatingPoint, M: FloatArray) -> DcLink | None:
     """The link of a machine that holds its loads; None where no current flows, and the link has no part in the loop."""
     drive, R = plant.drive, plant.actuator.R
     y = plant.h(ca.DM(point.x), 0)
@@ -328,4 +330,4 @@ def link_at_rest(plant: Plant, k: Windings, point: OperatingPoint, M: FloatArray
     V = (V0 + math.sqrt(V0**2 - 4 * Rs * power)) / 2
     C = drive.link_capacitance
     share = k.axes @ u / (k.R * V)
-    return Link(-1 / (Rs * C), -(weight * u) @ M / (C * V), -(weight * i) @ M * k.R / (C * V), share)
+    return DcLink(-1 / (Rs * C), -(weight * u) @ M / (C * V), -(weight * i) @ M * k.R / (C * V), share)

@@ -13,15 +13,15 @@ import numpy as np
 from malta.bound import at_least, at_most
 from malta.display import Curves, Description, display
 from malta.loops.loop import Loop, loop_of_model
-from malta.loops.sampled_loops import LAST
+from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.time_domain import Recovery, furthest, noise_of, recovery
 from malta.loops.windings import CurrentLoops, left_out
-from malta.margins.travel import NOT_BETWEEN, NOWHERE, Extent
+from malta.margins.travel import NO_EXTENT, NOT_BETWEEN_TEXT, Extent
 from malta.merits import ROOTS, Merit, figure, in_groups
-from malta.model.machines import FINE
+from malta.model.machines import FINE_UNITS
 from malta.model.parameters import box_words
 from malta.proof.margin import NOT_PROVEN, Margin
-from malta.synthesis.requirements import Figure, Noise, Payload, Verdict, judge_figure, ratio_of
+from malta.synthesis.requirements import Figure, NoiseRms, Payload, Verdict, judge_figure, ratio_of
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray
@@ -51,7 +51,7 @@ def zone(peak: float) -> str:
 
 CURVE = 120  # points of a curve in a notebook
 # Kinds that a reader looks for.
-FIRST = ("disk", "delay_margin", "peak_s", "peak_t", "damping", "requirements")
+FIRST_KINDS = ("disk", "delay_margin", "peak_s", "peak_t", "damping", "requirements")
 
 
 @display
@@ -71,7 +71,7 @@ class Poles:
 
 
 @dataclass(frozen=True)
-class Stage:
+class StagePeak:
     """The peak sensitivity and stability of one loop, from the ideal one to the machine's."""
 
     name: str
@@ -85,7 +85,7 @@ class Stage:
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
+class ChainStage:
     """One stage of the chain, with its margin and its peak sensitivity."""
 
     name: str
@@ -96,7 +96,7 @@ class Link:
 
 
 @dataclass(frozen=True)
-class Place:
+class TravelPlace:
     """Figures at a place of the stroke: each is the worse of +position and -position.
 
     A machine without a stroke has its places along the first parameter of `plant.over`, as the speed of a rotor.
@@ -152,7 +152,7 @@ class Outcome(NamedTuple):
         """Factor from SI and unit that readers see: bandwidths in Hz, deviations in um."""
         if self.unit == "rad/s":
             return 1 / (2 * math.pi), "Hz"
-        fine = FINE.get(self.unit)
+        fine = FINE_UNITS.get(self.unit)
         return (1e6, fine) if fine else ROOTS.get(self.unit, (1.0, self.unit))
 
     def text(self, value: float) -> str:
@@ -241,19 +241,19 @@ class LoopReport:
     model: LinearModel
     controller: Controller
     poles: Poles
-    stages: tuple[Stage, ...]
+    stages: tuple[StagePeak, ...]
     bandwidth: Mapping[str, float]
     uncertainty: Mapping[str, float] = field(default_factory=dict)
     robust: Margin | None = None
-    extent: Extent = NOWHERE
-    current_loops: CurrentLoops = LAST
-    chain: tuple[Link, ...] = ()
+    extent: Extent = NO_EXTENT
+    current_loops: CurrentLoops = LAST_STAGE
+    chain: tuple[ChainStage, ...] = ()
     disks: tuple[Disk, ...] = ()
     delay: Mapping[str, float] = field(default_factory=dict)
     gang: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     tolerance: Mapping[str, tuple[Margin, Margin]] = field(default_factory=dict)
     mass: Margin | None = None
-    places: tuple[Place, ...] = ()
+    places: tuple[TravelPlace, ...] = ()
     worst: Mapping[str, Gain] = field(default_factory=dict)
     payload: Payload | None = None
     requirements: tuple[Outcome, ...] = ()
@@ -292,7 +292,7 @@ class LoopReport:
     @property
     def covers_travel(self) -> bool:
         """Whether the margin holds at every position of the travel, and not only at some."""
-        return NOT_BETWEEN not in self.travel.reason
+        return NOT_BETWEEN_TEXT not in self.travel.reason
 
     @property
     def places_covered(self) -> str:
@@ -314,7 +314,7 @@ class LoopReport:
         return recovery(self.loop) if self.stable and self.plant.disturbances else ()
 
     @cached_property
-    def noise(self) -> Noise | None:
+    def noise(self) -> NoiseRms | None:
         """Motion and commands at rest, rms; None for an unstable loop."""
         return noise_of(self.loop.sampled, self.plant) if self.stable else None
 
@@ -356,7 +356,7 @@ class LoopReport:
         at = f"{self.controller.name!r} on {self.plant.name!r}"
         box = box_words(self.uncertainty, self.plant.parameters)
         rows = [("margin", f"{self.robust} of {box}")] if self.robust is not None else []
-        shown = sorted(self.figures[1:], key=lambda one: one.kind not in FIRST)
+        shown = sorted(self.figures[1:], key=lambda one: one.kind not in FIRST_KINDS)
         rows += [(one.heading, one.text) for one in shown]
         rows = [("contents", self.loop.contents), *rows]
         return Description(f"Loop of {at}: {state}", tuple(rows), self._curves)
@@ -433,7 +433,7 @@ def _noise(a: LoopReport) -> Iterator[Merit]:
     if a.noise is None:
         return
     for signal, value in zip(a.plant.outputs, a.noise.motion, strict=True):
-        fine, words = FINE.get(signal.unit, signal.unit), f"motion {signal.name}, rms"
+        fine, words = FINE_UNITS.get(signal.unit, signal.unit), f"motion {signal.name}, rms"
         yield figure("motion", f"motion {signal.name} rms", words, value, fine, signal.name)
     for signal, value in zip(a.plant.inputs, a.noise.force, strict=True):
         words = f"command {signal.name}, rms"
@@ -443,7 +443,7 @@ def _noise(a: LoopReport) -> Iterator[Merit]:
 def _loads(a: LoopReport) -> Iterator[Merit]:
     units = {s.name: s.unit for s in a.plant.disturbances}
     for load, output in furthest(a.recovery):
-        fine, name = FINE.get(output.unit, output.unit), f"load {load.name}"
+        fine, name = FINE_UNITS.get(output.unit, output.unit), f"load {load.name}"
         size = f"1 {units[load.name]} {load.name}".replace("1 1 ", "1 ")
         settled = f"{size}: within 1 % after"
         peak = f"{size}: largest over frequency"
@@ -469,5 +469,5 @@ def _requirements(a: LoopReport) -> Iterator[Merit]:
             name, words = f"{name} {one.how}", f"{words}, {one.how}"
         proven = one.name == "margin"
         kind = "proven" if proven else "at_least" if one.at_least else "at_most"
-        unit = "percent" if proven else FINE.get(one.unit, one.unit)
+        unit = "percent" if proven else FINE_UNITS.get(one.unit, one.unit)
         yield figure(kind, name, words, one.found, unit, bound=one.asked)

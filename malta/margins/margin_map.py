@@ -29,11 +29,11 @@ from malta.processes import on_one_thread
 from malta.proof.margin import Margin
 from malta.synthesis.controller import Controller
 
-GRID, COARSE = 25, 4  # values of each parameter; every so many of them are looked at first
-ABOUT = (0.97, 1.0, 1.01, 1.03)  # of the proven box: values beside those of the grid
+GRID, COARSE_STEP = 25, 4  # values of each parameter; every so many of them are looked at first
+BOX_FACTORS = (0.97, 1.0, 1.01, 1.03)  # of the proven box: values beside those of the grid
 MOST_PLACES = 9  # ends and middle of what does not grow with the margin
 MOST_SIDES = 9  # corners and middle of the box of the parameters that are not drawn
-LEAST, WIDEST, BEYOND = 1.5, 8.0, 1.6  # of the box: the smallest and the largest map; times the lost margin
+MIN_SIZE, MAX_SIZE, LOSS_FACTOR = 1.5, 8.0, 1.6  # of the box: the map; times the lost margin
 ROOM = 1e-3  # of a nominal value, to a limit of its parameter
 EDGE = 1 - 1e-6  # of the multiple of a witness: parameters that reach it
 
@@ -62,7 +62,7 @@ class Plane:
 
         Of the machines of a point those are looked at that are the worst on a coarse grid.
         """
-        some, every = (_points(x[::step], y[::step]) for step in (COARSE, 1))
+        some, every = (_points(x[::step], y[::step]) for step in (COARSE_STEP, 1))
         worst = np.full(len(every), -math.inf)
         for system, law in self.loops:
             ends = self._ends(system)
@@ -191,7 +191,7 @@ def margin_map_of(
     others: Others = "box",
     margin: Margin | None = None,
     proof: bool = True,
-    lost: float = LEAST,
+    lost: float = MIN_SIZE,
 ) -> MarginMap:
     """Map the stability of a machine's loop over two of its parameters.
 
@@ -211,8 +211,8 @@ def margin_map_of(
     if margin is None and proof:
         margin = travel_margin(plant, controller, box)
     if margin is not None:
-        lost = margin.upper if math.isfinite(margin.upper) else LEAST
-    reach = min(max(BEYOND * lost, LEAST), WIDEST)
+        lost = margin.upper if math.isfinite(margin.upper) else MIN_SIZE
+    reach = min(max(LOSS_FACTOR * lost, MIN_SIZE), MAX_SIZE)
     nominal, half = plane.nominal[:2], plane.half[:2]
     low, high = (
         np.maximum(nominal - reach * half, plane.low[:2]),
@@ -256,5 +256,5 @@ def plane_of(
 
 def _values(low: float, high: float, nominal: float, half: float, proven: float) -> FloatArray:
     """Values of one axis: even ones, and some about the edges of the proven box, where the boundary matters."""
-    edges = [nominal + side * share * proven * half for side in (-1, 1) for share in ABOUT]
+    edges = [nominal + side * share * proven * half for side in (-1, 1) for share in BOX_FACTORS]
     return np.unique([*np.linspace(low, high, GRID), *(edge for edge in edges if low < edge < high)])

@@ -34,7 +34,7 @@ from scipy import linalg
 
 from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
-from malta.linear.expressions import BALLS, NotAnalytic, Program, program
+from malta.linear.expressions import BALLS, MatrixProgram, NotAnalytic, program
 from malta.linear.matrices import system_matrix
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.parametric_plants import of_plant
@@ -60,7 +60,7 @@ from malta.synthesis.controller import Controller
 
 CALLER = "rate_of_cells"
 SAMPLE = 4  # parts of a sample in which e^(M s) is enclosed
-FAR = 64  # intervals in which norms over the whole course are taken
+COURSE_INTERVALS = 64  # intervals in which norms over the whole course are taken
 Interval = tuple[float, float]
 
 
@@ -98,7 +98,7 @@ def rate_of_cells(
 class _Cell:
     """M, L and R with their first two derivatives as instructions, within an interval."""
 
-    parts: Program  # of p: M, M', M'', L, L', L'', R, R', R''
+    parts: MatrixProgram  # of p: M, M', M'', L, L', L'', R, R', R''
     low: float
     high: float
     n: int
@@ -121,7 +121,7 @@ class _Cell:
         M, _, _, L, _, _, R, _, _ = self.every(arb(p))
         return add_on_top(L, (M * arb(self.T)).exp() * R, self.n)
 
-    def bent(self, p: Any) -> tuple[Any, Any]:
+    def curvature(self, p: Any) -> tuple[Any, Any]:
         """Phi'' and R over a ball p."""
         M, M1, M2, _, _, L2, R, R1, R2 = self.every(p)
         k = M.nrows()
@@ -166,7 +166,7 @@ class _MovingNorms:
         self.back = self.U.inv()
         self.speed = self.slope = 0.0
         for cell in own:
-            edges = np.linspace(cell.low, cell.high, FAR + 1).tolist()
+            edges = np.linspace(cell.low, cell.high, COURSE_INTERVALS + 1).tolist()
             for a, b in pairwise(edges):
                 whole, first, *_ = cell.every(_between(a, b))
                 self.speed = max(self.speed, spectral(self.back * whole * self.U))
@@ -175,7 +175,7 @@ class _MovingNorms:
     def changes(self, X: Any, back: Any, low: float, high: float) -> Changes:
         """Within an interval, in the units X."""
         cell = next(cell for cell in self.own if cell.low <= low and high <= cell.high)
-        second, R = cell.bent(_between(low, high))
+        second, R = cell.curvature(_between(low, high))
         onto = arb_mat([row[: cell.n] for row in back.tolist()])
         spread = spectral(onto * self.X) * spectral(self.back * R * X)
         return Changes(spread, self._first(cell, (low, high), onto, R * X), spectral(back * second * X))
@@ -244,7 +244,7 @@ def _expressions(
     return ca.Function("parts", [q], ca.cse([ca.SX(x) for x in found])), T, n
 
 
-class Cell(NamedTuple):
+class ScheduleCell(NamedTuple):
     """The loop between two places: its system and law, and the interval of the output, SI."""
 
     system: UncertainSystem
@@ -255,7 +255,7 @@ class Cell(NamedTuple):
 @lru_cache(maxsize=8)  # several margins need the same loops; records compare by identity
 def loops_between_places(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops
-) -> list[Cell] | str:
+) -> list[ScheduleCell] | str:
     """The loops between the places of a controller's schedule, in parameters by name; or why there are none."""
     schedule = controller.schedule
     assert schedule is not None
@@ -270,7 +270,9 @@ def loops_between_places(
         there = plant_along(plant, variable, (a + b) / 2)
         system = of_plant(there, [*names, variable], believed=plant_of(controller.parameters), late=True)
         law, channels = law_between(controller, schedule.at(a), schedule.at(b), delay)
-        found.append(Cell(_with_channels(system, plant.actuator.crossover, (a, b), channels), law, (a, b)))
+        found.append(
+            ScheduleCell(_with_channels(system, plant.actuator.crossover, (a, b), channels), law, (a, b))
+        )
     return found
 
 
@@ -282,10 +284,10 @@ def plant_along(plant: Plant, variable: str, place: float) -> Plant:
         own.__name__, [(variable, float, si(unit, default=place))], bases=(own,), frozen=True, eq=True
     )
     values = {f.name: getattr(plant.parameters, f.name) for f in fields(plant.parameters)}
-    return _moved(plant, variable, record(**values))
+    return _move_plant(plant, variable, record(**values))
 
 
-def _moved(plant: Plant, variable: str, par: Any) -> Plant:
+def _move_plant(plant: Plant, variable: str, par: Any) -> Plant:
     """The machine of these parameters, moved to the place that one of them says."""
     base = plant.variant(par)
     k, n = [s.name for s in base.outputs].index(variable), len(base.states)
@@ -302,7 +304,7 @@ def _moved(plant: Plant, variable: str, par: Any) -> Plant:
     return replace(
         base,
         parameters=par,
-        variant=lambda other: _moved(plant, variable, other),
+        variant=lambda other: _move_plant(plant, variable, other),
         f=lambda x, u, w: base.f(there(x), u, w),
         h=lambda x, u: base.h(there(x), u),
         load=lambda x: base.load(there(x)),

@@ -17,8 +17,8 @@ from malta.errors import InputError
 from malta.linear.expressions import NotAnalytic
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal
-from malta.loops.parametric_plants import LONGEST, model_of
-from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
+from malta.loops.parametric_plants import MAX_MODEL_OPERATIONS, model_of
+from malta.loops.sampled_loops import LAST_STAGE, loaded_loop, machine_law, machine_system
 from malta.loops.windings import CurrentLoops
 from malta.margins.scheduled_loops import loops_between_places
 from malta.model.data import plant_of
@@ -31,7 +31,7 @@ from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.problem import OfSeveral
 from malta.proof.robust import (
     TOLERANCE,
-    Effort,
+    ProofEffort,
     common_margin,
     margin_at,
     margin_of,
@@ -42,7 +42,7 @@ from malta.proof.robust import (
 from malta.proof.weak_coupling import HeldLoop
 from malta.proof.weak_coupling.held_currents import held_machine
 from malta.synthesis.schedule import point_at
-from malta.work import MORE, Budget, WorkUp, in_rounds, metered
+from malta.work import MORE_WORK, Budget, WorkUp, count_work, in_rounds
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -100,7 +100,7 @@ class Extent:
         return " and ".join([*everywhere, *([f"for {self.values}"] if self.over else [])])
 
 
-NOWHERE = Extent()  # a machine without a travel and without intervals of parameters
+NO_EXTENT = Extent()  # a machine without a travel and without intervals of parameters
 
 
 def extent_of(plant: Plant, names: Iterable[str] = (), controller: Controller | None = None) -> Extent:
@@ -129,7 +129,7 @@ class LoopAlong:
     plant: Plant
     controller: Controller
     names: tuple[str, ...]
-    current_loops: CurrentLoops = LAST
+    current_loops: CurrentLoops = LAST_STAGE
 
     @property
     def extent(self) -> Extent:
@@ -212,13 +212,13 @@ def own_position(
     return float(getattr(plant.parameters, extent.course))
 
 
-NOT_BETWEEN = "not between them"  # what a margin of several places says
-LONG = 5000  # operations of matrices that are not enclosed over an interval of positions
+NOT_BETWEEN_TEXT = "not between them"  # what a margin of several places says
+MAX_ENCLOSED_OPERATIONS = 5000  # operations of matrices that are not enclosed over an interval of positions
 PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel, either way
-EACH = 6.0  # work, of the margin at a position for itself
+PLACE_WORK = 6.0  # work, of the margin at a position for itself
 ENDS = (0.0, 1.0)  # of those, where no interval is enclosed
 AXES = 0.6  # of the work, for the proof of each axis alone
-NOT_WRITTEN = f"the clock ended the search before the model was written out, more time {MORE}"
+NOT_WRITTEN_TEXT = f"the clock ended the search before the model was written out, more time {MORE_WORK}"
 
 
 @on_one_thread
@@ -226,7 +226,7 @@ def travel_margin(
     plant: Plant,
     controller: Controller,
     ranges: Ranges,
-    current_loops: CurrentLoops = LAST,
+    current_loops: CurrentLoops = LAST_STAGE,
     names: Sequence[str] = (),
     *,
     time: float | None = None,
@@ -250,7 +250,7 @@ def travel_margin(
     Example: `travel_margin(plant, controller, {"m": 0.2}).lower`
     """
     loop = LoopAlong(plant, controller, tuple(names or ranges), current_loops)
-    effort = Effort(None, time, budget, progress, "travel_margin")
+    effort = ProofEffort(None, time, budget, progress, "travel_margin")
     along = _margin_along if controller.schedule is None else _scheduled_margin
     begun = clock.monotonic()
     found, ended = in_rounds(effort.limits, partial(along, loop, ranges, progress), rank_of)
@@ -267,16 +267,18 @@ def _margin_along(
         if plant.has_stroke and not over:  # places of the travel, and no other interval
             problem = margin_anywhere(loop)
     except WorkUp:
-        return replace(NOT_PROVEN, reason=NOT_WRITTEN)
+        return replace(NOT_PROVEN, reason=NOT_WRITTEN_TEXT)
     if problem is not None:
-        with metered(AXES * work):
-            found = margin_of(problem, _box(along[0][0], ranges), Effort(budget=budget, progress=progress))
+        with count_work(AXES * work):
+            found = margin_of(
+                problem, _box(along[0][0], ranges), ProofEffort(budget=budget, progress=progress)
+            )
         if found.lower is not None:
             return found
     found = common_margin(along, ranges, over, budget=budget, progress=progress)
     if len(along) == 1:
         return found
-    here = f"at {len(along)} places of the travel, {NOT_BETWEEN}"
+    here = f"at {len(along)} places of the travel, {NOT_BETWEEN_TEXT}"
     return replace(found, reason=f"{here}; {found.reason}" if found.reason else here)
 
 
@@ -293,8 +295,8 @@ def _scheduled_margin(
     try:
         cells = loops_between_places(loop.plant, loop.controller, (*ranges, *over), loop.current_loops)
     except WorkUp:
-        cells = NOT_WRITTEN
-    with metered(CELLS * work):
+        cells = NOT_WRITTEN_TEXT
+    with count_work(CELLS * work):
         for cell in [] if isinstance(cells, str) else cells:
             outside = over | {schedule.variable: cell.interval}
             found.append(
@@ -307,7 +309,7 @@ def _scheduled_margin(
     if found and not why:
         return smallest_margin(found)
     margin = common_margin(loop.loops, ranges, over, budget=budget, progress=progress)
-    here = f"at {len(loop.loops)} places of {schedule.variable}, {NOT_BETWEEN}"
+    here = f"at {len(loop.loops)} places of {schedule.variable}, {NOT_BETWEEN_TEXT}"
     return replace(margin, reason="; ".join(filter(None, (here, why or str(cells), margin.reason))))
 
 
@@ -319,7 +321,7 @@ def smallest_margin(margins: Sequence[Margin]) -> Margin:
 
 
 def travel_loops(
-    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST_STAGE
 ) -> tuple[list[tuple[UncertainSystem, Compensator]], dict[str, tuple[float, float]]]:
     """The loops whose common margin travel_margin proves, and the intervals that do not grow with the margin.
 
@@ -340,7 +342,7 @@ def _loops_along(loop: LoopAlong) -> list[tuple[UncertainSystem, Compensator]]:
         at |= off_stroke(plant, plant.point(controller.operating_point[0]).x)
         names = [*loop.names, *extent.intervals]
         whole = machine_system(plant, controller, names, at, loop.current_loops)
-        if not plant.has_stroke or whole[0].matrices.n_instructions() < LONG:
+        if not plant.has_stroke or whole[0].matrices.n_instructions() < MAX_ENCLOSED_OPERATIONS:
             return [whole]
     return [every.at(share * plant.stroke.travel) for share in ENDS]
 
@@ -349,7 +351,7 @@ def _is_long(loop: LoopAlong) -> bool:
     """Whether the model along the travel is too long for an expansion."""
     believed = plant_of(loop.controller.parameters)
     held = is_commutated(believed) and not believed.actuator.tabulated
-    return held and model_of(loop.plant, believed, loop.names).n_instructions() > LONGEST
+    return held and model_of(loop.plant, believed, loop.names).n_instructions() > MAX_MODEL_OPERATIONS
 
 
 @lru_cache(maxsize=8)
@@ -390,14 +392,14 @@ def place_margin(
     controller: Controller,
     ranges: Ranges,
     position: float,
-    current_loops: CurrentLoops = LAST,
+    current_loops: CurrentLoops = LAST_STAGE,
     names: Sequence[str] = (),
     travel: Margin | None = None,
 ) -> Margin:
     """The margin of the machine's loop at a position along its course (`Extent.course`), SI.
 
     The other arguments are those of travel_margin; travel is its answer, where it is known. Without a proof along the
-    travel the search takes EACH at most.
+    travel the search takes PLACE_WORK at most.
     """
     whole = LoopAlong(plant, controller, tuple(names or ranges), current_loops)
     if not plant.has_stroke or controller.schedule is not None:
@@ -407,11 +409,11 @@ def place_margin(
         return margin_at(*whole.loops[0], ranges, there, tolerance=TOLERANCE, wider=travel)
     loop = whole.at(position)
     if (problem := margin_anywhere(whole, position)) is not None:
-        with metered(EACH):
-            found = margin_of(problem, _box(loop[0], ranges), Effort())
+        with count_work(PLACE_WORK):
+            found = margin_of(problem, _box(loop[0], ranges), ProofEffort())
         if found.lower is not None:
             return found
-    with metered(EACH):
+    with count_work(PLACE_WORK):
         return robust_margin(*loop, ranges)
 
 
@@ -420,7 +422,7 @@ def worst_sensitivities(
     plant: Plant,
     controller: Controller,
     ranges: Ranges,
-    current_loops: CurrentLoops = LAST,
+    current_loops: CurrentLoops = LAST_STAGE,
     *,
     at: Literal["sensors", "forces"] = "sensors",
     time: float | None = None,

@@ -21,7 +21,7 @@ import numpy as np
 from malta.linear.matrices import system_matrix
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
-from malta.loops.sampled_loops import LAST
+from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.windings import chosen_loops, current_control, force_modes, windings_of
 from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
@@ -36,8 +36,8 @@ from malta.synthesis.controller import Controller
 from malta.work import Budget
 
 FACTOR = "gain factor"  # the name of the further parameter
-MOST = 0.2  # share by which gains may scatter at most: nothing beyond is looked at
-FAST = 50.0  # a Ts
+MAX_SCATTER = 0.2  # share by which gains may scatter at most: nothing beyond is looked at
+MAX_RATE = 50.0  # a Ts
 WORK = 600.0  # of the search
 TOLERANCE = 0.02  # relative distance between the proven bound and the witness
 
@@ -59,7 +59,7 @@ class GainBox(NamedTuple):
 
 @on_one_thread
 def gain_box(plant: Plant, controller: Controller, uncertainty: Ranges) -> GainBox:
-    """The largest scatter of the gains, at most MOST, within which the loop is proven stable for the whole uncertainty.
+    """The largest scatter of the gains, at most MAX_SCATTER, within which the loop is proven stable over the box.
 
     plant : the machine
     uncertainty : shares of the machine's parameters, as in a design file; all hold at once, anywhere in the travel
@@ -80,14 +80,14 @@ def gain_box(plant: Plant, controller: Controller, uncertainty: Ranges) -> GainB
         if name in uncertainty
     }
     found = robust_margin(
-        system, law, {FACTOR: MOST}, {**over, **box}, tolerance=TOLERANCE, budget=Budget(WORK)
+        system, law, {FACTOR: MAX_SCATTER}, {**over, **box}, tolerance=TOLERANCE, budget=Budget(WORK)
     )
     if found.lower is None:
         return GainBox(None, (), found.reason or "the loop is not stable for the whole uncertainty")
     forces, first = len(controller.forces), system.matrices.size1_out(0) - len(controller.forces)
     split = (tuple(j for j in range(forces) if first + j in g.states) for g in groups(loop_of(system, law)))
     axes = tuple(axis for axis in split if axis)
-    return GainBox(min(found.lower, 1.0) * MOST, axes, searched=found.lower < 1 and not found.reason)
+    return GainBox(min(found.lower, 1.0) * MAX_SCATTER, axes, searched=found.lower < 1 and not found.reason)
 
 
 def _unfit(plant: Plant, c: Controller, uncertainty: Ranges) -> str:
@@ -97,7 +97,7 @@ def _unfit(plant: Plant, c: Controller, uncertainty: Ranges) -> str:
         return "the gain file has no uncertainty"
     if c.tracks != "states":
         return "a law of errors has no gains K and L"
-    if chosen_loops(plant, c, LAST) != "pi" or plant.actuator.delay(c.sample_time) != 1:
+    if chosen_loops(plant, c, LAST_STAGE) != "pi" or plant.actuator.delay(c.sample_time) != 1:
         return "its commands do not act a sample later by PI current loops"
     if is_commutated(believed) or plant.sensors.late:
         return "its currents are held for a reading, or its sensors read late"
@@ -106,7 +106,7 @@ def _unfit(plant: Plant, c: Controller, uncertainty: Ranges) -> str:
     return ""
 
 
-def _opened(c: Controller) -> System:
+def _open_law(c: Controller) -> System:
     """The law with the tuned part of its forces as an input q after y, and an output v_n before the fixed part v_1.
 
     Steps 1 to 6 of synthesis/controller.py, deviations alone: states xi_pred, and e where it is fed back.
@@ -130,7 +130,7 @@ def tuned_loop(plant: Plant, c: Controller, system: UncertainSystem) -> tuple[Un
     m, p, Ts = len(c.forces), len(c.measurements), c.sample_time
     believed = plant_of(c.parameters)
     windings = windings_of(plant, believed, plant.at(), force_modes(believed))
-    k, law = current_control(c, windings, plant.at()), _opened(c)
+    k, law = current_control(c, windings, plant.at()), _open_law(c)
     R, S, n = windings.R, windings.modes, len(law.A)
     slope, gain, one = k.loop.Ki * Ts, k.loop.Kp + k.loop.Ki * Ts, np.eye(m)
     emf = np.zeros((m, n)), np.zeros((m, p))
@@ -152,12 +152,12 @@ def tuned_loop(plant: Plant, c: Controller, system: UncertainSystem) -> tuple[Un
         system_matrix(np.zeros((m, p + m)), gain * S / R, D_n, C_n @ B_q),
         sample_time=Ts,
     )
-    parameters, rate = ca.SX.sym("p", len(system.names) + 1), FAST / Ts
+    parameters, rate = ca.SX.sym("p", len(system.names) + 1), MAX_RATE / Ts
     plain, echo = system.matrices(parameters[:-1]), ca.SX.eye(m)
     echoes = (-rate * echo, rate * echo, parameters[-1] * echo)
     matrices = [ca.sparsify(ca.diagcat(M, own)) for M, own in zip(plain, echoes, strict=True)]
-    # a limit of the factor that is just beyond MOST ends the search there
-    limits = (*system.limits, (1 - 1.01 * MOST, 1 + 1.01 * MOST))
+    # a limit of the factor that is just beyond MAX_SCATTER ends the search there
+    limits = (*system.limits, (1 - 1.01 * MAX_SCATTER, 1 + 1.01 * MAX_SCATTER))
     names, nominal = (*system.names, FACTOR), np.append(system.nominal, 1.0)
     whole = ca.Function("matrices", [parameters], matrices)
     return UncertainSystem(names, nominal, whole, limits, approximate=system.approximate), behind

@@ -33,7 +33,7 @@ from malta.loops.loop import loop_of_model
 from malta.loops.own_model import controller_poles
 from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import (
-    LAST,
+    LAST_STAGE,
     SampledLoop,
     commanded_model,
     continuous_poles,
@@ -42,9 +42,9 @@ from malta.loops.sampled_loops import (
     sorted_poles,
 )
 from malta.loops.windings import CurrentLoops, chosen_loops
-from malta.margins.loop_report import BANDWIDTHS, Link, LoopReport, Place, Poles, Stage
+from malta.margins.loop_report import BANDWIDTHS, ChainStage, LoopReport, Poles, StagePeak, TravelPlace
 from malta.margins.travel import (
-    EACH,
+    PLACE_WORK,
     PLACES,
     LoopAlong,
     extent_of,
@@ -63,7 +63,7 @@ from malta.proof.robust import robust_margin
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import gain_at_rest
 from malta.synthesis.lqg import integrals_of, kalman, lqi, lqr, weights_of
-from malta.work import Budget, metered
+from malta.work import Budget, count_work
 
 
 @on_one_thread
@@ -71,7 +71,7 @@ def linear_report(
     model: LinearModel,
     controller: Controller,
     uncertainty: Mapping[str, float] | None = None,
-    current_loops: CurrentLoops = LAST,
+    current_loops: CurrentLoops = LAST_STAGE,
     *,
     time: float | None = None,
 ) -> LoopReport:
@@ -123,16 +123,16 @@ def machine_report(model: LinearModel, controller: Controller) -> LoopReport:
     )
 
 
-def stage_of(name: str, stage: SampledLoop, sensors: list[str]) -> Stage:
+def stage_of(name: str, stage: SampledLoop, sensors: list[str]) -> StagePeak:
     """The peak sensitivities and the spectral radius of a loop; the peaks of an unstable one are NaN."""
     radius = float(np.abs(eigenvalues(stage.closed)).max())
     if radius >= 1:
-        return Stage(name, dict.fromkeys([*sensors, "sigma_max"], np.nan), np.nan, radius)
+        return StagePeak(name, dict.fromkeys([*sensors, "sigma_max"], np.nan), np.nan, radius)
 
     cut = stage.cut
     peaks = {name: peak_gain(cut.sensitivity(i)).value for i, name in enumerate(sensors)}
     largest = peak_of_channels(cut, cut.sensors)
-    return Stage(name, peaks | {"sigma_max": largest.value}, largest.frequency, radius)
+    return StagePeak(name, peaks | {"sigma_max": largest.value}, largest.frequency, radius)
 
 
 def bandwidths_of(
@@ -177,12 +177,12 @@ def _natural_frequencies(model: LinearModel, controller: Controller) -> dict[str
 # against v0(z), as in verify.py: a cogging that is stiffer than the axial loop shows there.
 
 
-SAMPLED = "sampled"  # with first-order lags
-MACHINE = "machine"  # with PI controllers on the windings: the last stage of a machine that has some
+SAMPLED_STAGE = "sampled"  # with first-order lags
+MACHINE_STAGE = "machine"  # with PI controllers on the windings: the last stage of a machine that has some
 
 
 def compensators(
-    plant: Plant, controller: Controller, current_loops: CurrentLoops = LAST
+    plant: Plant, controller: Controller, current_loops: CurrentLoops = LAST_STAGE
 ) -> dict[str, tuple[Compensator, bool]]:
     """The control laws of the stages by name, each with whether it feeds back the states.
 
@@ -190,9 +190,9 @@ def compensators(
 
     State feedback reads [y, x]; the other laws read y.
     """
-    own = {SAMPLED: (machine_law(plant, controller, "lag"), False)}
+    own = {SAMPLED_STAGE: (machine_law(plant, controller, "lag"), False)}
     if chosen_loops(plant, controller, current_loops) == "pi":
-        own[MACHINE] = machine_law(plant, controller), False
+        own[MACHINE_STAGE] = machine_law(plant, controller), False
     if controller.cost is None:
         return own
     believed, weights = plant_of(controller.parameters), weights_of(controller)
@@ -285,7 +285,7 @@ class _Question:
         known, key = self._travel_margins, (tuple(ranges.items()), brief)
         if key not in known:
             budget = Budget(time=self.time, patient=False if brief else None)
-            with metered(EACH if brief else math.inf):
+            with count_work(PLACE_WORK if brief else math.inf):
                 known[key] = travel_margin(
                     self.plant, self.controller, ranges, self.loop.current_loops, self.loop.names,
                     budget=budget, progress=progress,
@@ -349,7 +349,7 @@ def staged_report(
     )
 
 
-def _links(q: _Question) -> tuple[Link, ...]:
+def _links(q: _Question) -> tuple[ChainStage, ...]:
     """The stages of the chain, each with its margin and its peak sensitivity."""
     at = position_at(q.plant, q.plant.point(q.controller.operating_point[0]).x)
     believed = plant_of(q.controller.parameters)
@@ -357,7 +357,7 @@ def _links(q: _Question) -> tuple[Link, ...]:
     stages = compensators(q.plant, q.controller, q.loop.current_loops)
     last = [*stages][-1]
     for name, (law, states) in stages.items():
-        own = name in (SAMPLED, MACHINE)
+        own = name in (SAMPLED_STAGE, MACHINE_STAGE)
         if own:
             stage = q if name == last else replace(q, loop=replace(q.loop, current_loops="lag"))
             position = own_position(q.plant, q.loop.whole_extent, at, q.controller)
@@ -368,7 +368,7 @@ def _links(q: _Question) -> tuple[Link, ...]:
             margin = robust_margin(system, law, q.uncertainty, time=q.time) if q.proof else NOT_PROVEN
             loop = nominal_loop(system, law)
         where: Literal["forces", "sensors"] = "forces" if states else "sensors"
-        links.append(Link(name, margin, peak_sensitivity(loop, where), where, loaded=own))
+        links.append(ChainStage(name, margin, peak_sensitivity(loop, where), where, loaded=own))
         q.report()
     return tuple(links)
 
@@ -386,10 +386,10 @@ def _tolerances(q: _Question) -> tuple[dict[str, tuple[Margin, Margin]], Margin 
     return tolerance, over({"m": (m, m + 1.0)})
 
 
-def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:
+def _places(q: _Question) -> tuple[tuple[TravelPlace, ...], Classical | None]:
     """The places along the course, and the worst of their classical margins; None where one of them is unstable."""
     sensors = [s.name for s in q.plant.outputs]
-    places: list[Place] = []
+    places: list[TravelPlace] = []
     classical: list[Classical | None] = []
     for positions in q.loop.places:
         proven_at = positions if q.whole else positions[:1]  # else a place takes as long as the whole travel
@@ -400,6 +400,6 @@ def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:
         classical += sides
         worst = worst_of(sides)
         disk, delay = (worst.disks[2].size, min(worst.delay.values())) if worst else (np.nan, np.nan)
-        places.append(Place(positions[0], margin, peak, disk, delay))
+        places.append(TravelPlace(positions[0], margin, peak, disk, delay))
         q.report()
     return tuple(places), worst_of(classical)

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from malta.model.actuator import Actuator as Actuator
     from malta.model.coils import Allocation as Allocation, allocation as allocation
     from malta.model.contacts import Contacts as Contacts
-    from malta.model.data import published as published
+    from malta.model.data import read_published as read_published
     from malta.model.linearize import LinearModel as LinearModel
     from malta.model.parameters import check_parameters as check_parameters, si as si
     from malta.model.plant import OperatingPoint as OperatingPoint, Plant as Plant, Signal as Signal
@@ -21,7 +21,7 @@ _NAMES = {
     "malta.model.actuator": "Actuator",
     "malta.model.coils": "Allocation allocation",
     "malta.model.contacts": "Contacts",
-    "malta.model.data": "published",
+    "malta.model.data": "read_published",
     "malta.model.linearize": "LinearModel",
     "malta.model.parameters": "check_parameters si",
     "malta.model.plant": "OperatingPoint Plant Signal",
@@ -30,4 +30,6 @@ _NAMES = {
     "malta.model.stroke": "Stroke",
     "malta.units": "in_unit",
 }
-__all__, __getattr__, __dir__ = contents(__name__, _NAMES, {"LateSensors": "malta.model.Sensors"})
+__all__, __getattr__, __dir__ = contents(
+    __name__, _NAMES, {"LateSensors": "malta.model.Sensors", "published": "malta.model.read_published"}
+)

@@ -26,7 +26,7 @@ from malta.display import display
 from malta.errors import CheckError, InputError
 
 CALLER = "allocation"
-WORST = 1e8  # condition of T that is taken for full rank, its rows scaled
+MAX_CONDITION = 1e8  # condition of T that is taken for full rank, its rows scaled
 ACCURACY = 1e-7  # of forces that a program found, relative
 
 
@@ -208,7 +208,7 @@ def _require_full_rank(T: FloatArray, lost: list[int]) -> None:
     if (rows == 0).any():
         raise CheckError(f"{CALLER}: {left} do not make force {int(np.argmin(rows)) + 1} at all")
     U, s, _ = np.linalg.svd(T / rows[:, None], full_matrices=True)
-    if T.shape[1] < len(T) or s[-1] * WORST < s[0]:
+    if T.shape[1] < len(T) or s[-1] * MAX_CONDITION < s[0]:
         worst = U[:, -1] / rows
         worst = np.where(
             np.abs(worst) < 1e-9 * np.abs(worst).max(), 0.0, worst / worst[np.abs(worst).argmax()]

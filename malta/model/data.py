@@ -201,7 +201,7 @@ def _plant_of(parameters: Any) -> Plant:
 # The figures that a machine's paper prints, from published.toml files, each with its unit.
 
 
-def published(machine_file: str | Path) -> dict[str, Any]:
+def read_published(machine_file: str | Path) -> dict[str, Any]:
     """Read the figures that a machine's paper prints: published/NAME.toml or published.toml beside its data file.
 
     machine_file : the machine's data file, as data/tubular.toml
@@ -211,7 +211,7 @@ def published(machine_file: str | Path) -> dict[str, Any]:
     Raises InputError when neither file exists.
 
     >>> import malta
-    >>> printed = malta.model.published("data/tubular.toml")
+    >>> printed = malta.model.read_published("data/tubular.toml")
     >>> printed["table_I"]["poles"]["x"], printed["table_I"]["unit"]
     (218.92, 'rad/s')
     """

@@ -54,12 +54,12 @@ def recorded_equations() -> Iterator[list[Equation]]:
     >>> found[0].text
     'y = 2 x'
     """
-    with _collected(_recorded) as found:
+    with _collect(_recorded) as found:
         yield found
 
 
 @contextmanager
-def _collected(variable: ContextVar[list[T] | None]) -> Iterator[list[T]]:
+def _collect(variable: ContextVar[list[T] | None]) -> Iterator[list[T]]:
     """A new list in the variable, until the end of the block."""
     found: list[T] = []
     token = variable.set(found)
@@ -69,7 +69,7 @@ def _collected(variable: ContextVar[list[T] | None]) -> Iterator[list[T]]:
         variable.reset(token)
 
 
-def recording() -> bool:
+def is_recording() -> bool:
     """Whether notes are recorded."""
     return _recorded.get() is not None
 
@@ -103,7 +103,7 @@ _look_ups: ContextVar[list[LookUp] | None] = ContextVar("_look_ups", default=Non
 @contextmanager
 def recorded_look_ups() -> Iterator[list[LookUp]]:
     """Within, SX expressions may read tables; each reading is put into the list."""
-    with _collected(_look_ups) as found:
+    with _collect(_look_ups) as found:
         yield found
 
 
@@ -183,11 +183,11 @@ class Trig(NamedTuple):
     cos: Callable[[Any], Any]
 
 
-EXACT = Trig(ca.sin, ca.cos)
-SMALL_ANGLE = Trig(lambda angle: angle, lambda _: 1)
+EXACT_TRIG = Trig(ca.sin, ca.cos)
+SMALL_ANGLE_TRIG = Trig(lambda angle: angle, lambda _: 1)
 
 
-def rotation(q_r: Any, trig: Trig = EXACT) -> Any:
+def rotation(q_r: Any, trig: Trig = EXACT_TRIG) -> Any:
     """R_RI, 3 x 3, from components in I to components in R."""
     (sa, sb, sg), (ca_, cb, cg) = ([fn(q_r[i]) for i in range(3)] for fn in trig)
     R_x = _matrix([[1, 0, 0], [0, ca_, sa], [0, -sa, ca_]])
@@ -196,7 +196,7 @@ def rotation(q_r: Any, trig: Trig = EXACT) -> Any:
     return R_z @ R_y @ R_x
 
 
-def rate_map(q_r: Any, trig: Trig = EXACT) -> Any:
+def rate_map(q_r: Any, trig: Trig = EXACT_TRIG) -> Any:
     """E, 3 x 3, of eq. (4): omega_R = E(q_r) q_r'."""
     sb, cb, sg, cg = trig.sin(q_r[1]), trig.cos(q_r[1]), trig.sin(q_r[2]), trig.cos(q_r[2])
     return _matrix([[cg * cb, sg, 0], [-sg * cb, cg, 0], [sb, 0, 1]])
@@ -215,17 +215,17 @@ def is_round(inertia: Sequence[Any]) -> bool:
     return bool(ca.is_equal(ca.SX(inertia[0]), ca.SX(inertia[1])))
 
 
-def cardan_rates(q_r: Any, omega: Any, trig: Trig = EXACT) -> Any:
+def cardan_rates(q_r: Any, omega: Any, trig: Trig = EXACT_TRIG) -> Any:
     """q_r' = E(q_r)^-1 omega_R. Singular at beta = +-90 degrees, far beyond any air gap."""
     sb, cb, sg, cg = trig.sin(q_r[1]), trig.cos(q_r[1]), trig.sin(q_r[2]), trig.cos(q_r[2])
-    if trig is SMALL_ANGLE:  # E's own inverse: with these sines and cosines it is not the exact one
+    if trig is SMALL_ANGLE_TRIG:  # E's own inverse: with these sines and cosines it is not the exact one
         return ca.solve(rate_map(q_r, trig), omega)
     dalpha = (cg * omega[0] - sg * omega[1]) / cb
     return ca.vertcat(dalpha, sg * omega[0] + cg * omega[1], omega[2] - sb * dalpha)
 
 
 def acceleration(
-    m: float, inertia: Sequence[float], q_r: Any, dq_r: Any, F_I: Any, T_B: Any, trig: Trig = EXACT
+    m: float, inertia: Sequence[float], q_r: Any, dq_r: Any, F_I: Any, T_B: Any, trig: Trig = EXACT_TRIG
 ) -> tuple[Any, Any]:
     """q_t'' and q_r'' under the force F_I (N) and the torque T_B about the centre of gravity (N m).
 
@@ -233,7 +233,7 @@ def acceleration(
     (Ixx, Iyy, Izz) in kg m2. With Omega the angular velocity of B and omega that of the body, both in B:
     I omega' + Omega x I omega = T_B and omega' = E q_r'' + (d omega / d q_r) q_r'.
     """
-    if is_round(inertia) and trig is EXACT:
+    if is_round(inertia) and trig is EXACT_TRIG:
         return F_I / m, _top_acceleration(inertia, q_r, dq_r, T_B)
     q_B = principal_angles(q_r, inertia)
     omega = rate_map(q_B, trig) @ dq_r
@@ -258,7 +258,7 @@ def _top_acceleration(inertia: Sequence[Any], q_r: Any, dq_r: Any, T_B: Any) -> 
     return ca.vertcat(ddalpha, ddbeta, T_B[2] / inertia[2] - omega_1 * dbeta - sb * ddalpha)
 
 
-def rotate(q_r: Any, a_I: Any, trig: Trig = EXACT) -> Any:
+def rotate(q_r: Any, a_I: Any, trig: Trig = EXACT_TRIG) -> Any:
     """R_RI a_I by one rotation after the other, in fewer operations than by the matrix."""
     (sa, sb, sg), (ca_, cb, cg) = ([fn(q_r[i]) for i in range(3)] for fn in trig)
     x, y, z = a_I[0], ca_ * a_I[1] + sa * a_I[2], ca_ * a_I[2] - sa * a_I[1]

@@ -169,11 +169,11 @@ def _function(recipe: Recipe, families: tuple[_Family, ...], options: tuple[Hash
 
 STEPS = 60
 HALVINGS = 30
-LEAST_DECREASE = 1e-4  # of what a step of its length promises
+MIN_DECREASE = 1e-4  # of what a step of its length promises
 ROUNDING = 1e-14  # of the terms of a residual
 
 
-class Solution(NamedTuple):
+class EquilibriumRows(NamedTuple):
     """Rows of unknowns, and what is left of each row's equations where these are not solved; else zeros."""
 
     values: FloatArray
@@ -182,7 +182,7 @@ class Solution(NamedTuple):
 
 def solve(
     equations: Equations, starts: Sequence[FloatArray], scales: FloatArray, still: float, share: float
-) -> Solution:
+) -> EquilibriumRows:
     """Solve r(v) = 0 in each row, from the first of several starts that leads to a solution.
 
     Each step solves the linearized equations in the least-squares sense, with the smallest change of v / scales, and
@@ -211,7 +211,7 @@ def solve(
         open_rows &= ~solved
         if not open_rows.any():
             break
-    return Solution(values, residual)
+    return EquilibriumRows(values, residual)
 
 
 def _sizes(J: FloatArray, scales: FloatArray) -> FloatArray:
@@ -280,17 +280,17 @@ def _search(
         r_new, J_new = equations(tried)
         with np.errstate(invalid="ignore"):
             after = np.linalg.norm(weights * np.where(np.isfinite(r_new), r_new, np.inf), axis=1)
-            falls = trying & (after < (1 - LEAST_DECREASE * length) * before)
+            falls = trying & (after < (1 - MIN_DECREASE * length) * before)
         v[falls], r[falls], J[falls] = tried[falls], r_new[falls], J_new[falls]
         moved |= falls
         length /= 2
     return v, r, J, moved
 
 
-STILL = 1e-9  # m/s, rad/s, m/s2 or rad/s2: a machine that changes by less is at rest
+MAX_REST_RATE = 1e-9  # m/s, rad/s, m/s2 or rad/s2: a machine that changes by less is at rest
 SHARE = 1e-10  # of the rates that the inputs make: rounding
 LIMIT_ROUNDING = 1e-9  # of a limit
-MANY = 32  # states at rest, from which on a function of the entries that are not zero is worth its trace
+MIN_STATES = 32  # at rest, from which on a function of the entries that are not zero is worth its trace
 STARTS = (1.0, 0.3, 0.1, 0.01)  # of the limits of the commands, from where a balance is searched at last
 
 
@@ -318,17 +318,19 @@ def trim(plant: Plant, /, **positions: float) -> OperatingPoint:
     point = balance(plant, plant.state(positions))
     excess = exceeded_limit(plant, point)
     if excess:
-        raise CheckError(f"{plant.name}: nothing holds {_named(plant, point.x)} within its limits: {excess}")
+        raise CheckError(
+            f"{plant.name}: nothing holds {_name_state(plant, point.x)} within its limits: {excess}"
+        )
     return point
 
 
 def balance(plant: Plant, x: FloatArray) -> OperatingPoint:
     """The operating point at rest under the loads, within the limits or beyond them: see `trim`."""
     u = _hold(plant, x[None, :])[0]
-    return commanded(plant, OperatingPoint(x, u, loaded=True))
+    return with_command(plant, OperatingPoint(x, u, loaded=True))
 
 
-def commanded(plant: Plant, point: OperatingPoint, believed: Plant | None = None) -> OperatingPoint:
+def with_command(plant: Plant, point: OperatingPoint, believed: Plant | None = None) -> OperatingPoint:
     """The operating point with the command v at which its inputs act, and the inputs that v makes.
 
     Solves f(x, forces(x, currents(h(x), v)), w) = f(x, u, w) for v, with the currents of `believed`, but for the
@@ -380,7 +382,7 @@ def holding_commands(plant: Plant, states: FloatArray) -> FloatArray:
     return _commands(plant, None, states, _hold(plant, states), [], loaded=True)[0]
 
 
-def _named(plant: Plant, x: FloatArray) -> str:
+def _name_state(plant: Plant, x: FloatArray) -> str:
     """A state in words: "q = 0.001 m"."""
     entries = [f"{s.name} = {v:.4g} {s.unit}" for s, v in zip(plant.states, x.tolist(), strict=True) if v]
     return f"the state {', '.join(entries)}" if entries else "it at rest at its states' zero"
@@ -410,7 +412,7 @@ def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> Flo
     # A load that is the same along the stroke is balanced once.
     _, first, same = np.unique(states[:, depends.astype(int)], axis=0, return_index=True, return_inverse=True)
     start = np.zeros((len(first), len(plant.inputs)))
-    found = solve(_equations(left, states[first]), [start], _scales(plant), STILL, SHARE)
+    found = solve(_equations(left, states[first]), [start], _scales(plant), MAX_REST_RATE, SHARE)
     _require_solved(plant, found.left, "input", states[first])
     return found.values[same]
 
@@ -438,14 +440,18 @@ def _commands(
 
     before : commands to start from, beside the inputs and shares of the limits
     """
-    made = trace(_made, plant, believed)
+    made = trace(_inputs_of, plant, believed)
     sizes = np.maximum(np.abs(inputs), scales := _scales(plant))
 
     def near(acting: FloatArray) -> Any:
         return np.abs(acting - inputs) <= 1e-12 * sizes
 
     if loaded and not before:
-        here = made if len(states) < MANY else trace(_made, plant, believed, _used(states), _used(inputs))
+        here = (
+            made
+            if len(states) < MIN_STATES
+            else trace(_inputs_of, plant, believed, _used_in(states), _used_in(inputs))
+        )
         if near(here.each(states, inputs)[0].T).all():
             return inputs, inputs  # the currents of a command make just what it commands
     equations = _equations(trace(_effect_missed, plant, believed, loaded), np.hstack([states, inputs]))
@@ -457,18 +463,18 @@ def _commands(
         np.zeros_like(inputs),
         *(s * share * rough for share in STARTS for s in (1.0, -1.0)),
     ]
-    found = solve(equations, starts, scales, STILL, SHARE)
+    found = solve(equations, starts, scales, MAX_REST_RATE, SHARE)
     _require_solved(plant, found.left, "command", states, inputs if not loaded else None)
     acting = made.each(states, found.values)[0].T
     return found.values, np.where(near(acting), inputs, acting)
 
 
-def _used(rows: FloatArray) -> tuple[float, ...]:
+def _used_in(rows: FloatArray) -> tuple[float, ...]:
     """1 for columns that are not zero throughout, 0 for others."""
     return tuple(rows.any(axis=0).astype(float).tolist())
 
 
-def _made(
+def _inputs_of(
     plant: Plant, believed: Plant | None, states: tuple[float, ...] = (), commands: tuple[float, ...] = ()
 ) -> tuple[list[Any], list[Any]]:
     """(x, v) -> inputs that the currents of v make; of the states and the commands alone that are used, if any are."""
@@ -545,8 +551,6 @@ def _require_solved(
         k = int(np.nanargmax(np.abs(rate))) if np.isfinite(rate).any() else 0
         found = f"{plant.states[k].name} changes at {rate[k]:.3g} {plant.states[k].unit}/s"
         if preload is None:
-            raise CheckError(f"{plant.name}: no {what} holds {_named(plant, x)}: {found}")
-        missed = (
-            f"no command makes its `preload` {preload[row].tolist()} at {_named(plant, x)}: {found} otherwise"
-        )
+            raise CheckError(f"{plant.name}: no {what} holds {_name_state(plant, x)}: {found}")
+        missed = f"no command makes its `preload` {preload[row].tolist()} at {_name_state(plant, x)}: {found} otherwise"
         raise CheckError(f"{plant.name}: {missed}")

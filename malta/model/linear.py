@@ -40,7 +40,7 @@ from malta.model.parameters import check_parameters, si, symbolic_names
 from malta.model.plant import Parameters, Plant, Signal
 from malta.model.sensors import Sensors
 
-LONGEST = 4000  # characters of a formula
+MAX_FORMULA_LENGTH = 4000  # characters of a formula
 FUNCTIONS = {
     name: getattr(ca, name)
     for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh")
@@ -57,7 +57,7 @@ _OPERATORS: dict[type[ast.AST], Any] = {
 
 # How tightly a text binds: a sum, a product, a sign, a power, a name.
 SUM, PRODUCT, SIGN, POWER, NAME = range(5)
-_BINARY = {  # operation: sign, how tightly it binds, and its left and right side must bind
+_BINARY_OPERATIONS = {  # operation: sign, how tightly it binds, and its left and right side must bind
     ca.OP_ADD: (" + ", SUM, SUM, PRODUCT),
     ca.OP_SUB: (" - ", SUM, SUM, PRODUCT),
     ca.OP_MUL: (" * ", PRODUCT, PRODUCT, SIGN),
@@ -76,7 +76,7 @@ def formula(expression: Any, p: Any, names: Sequence[str]) -> str:
     expression : casadi.SX, 1 x 1
     p : casadi.SX, the vector of the parameters
 
-    Raises ValueError for operations that formulas do not have, and beyond LONGEST characters.
+    Raises ValueError for operations that formulas do not have, and beyond MAX_FORMULA_LENGTH characters.
 
     >>> k, m = ca.SX.sym("k"), ca.SX.sym("m")
     >>> formula(-2 * k / (m + 1) ** 2, ca.vertcat(k, m), ["k", "m"])
@@ -95,8 +95,8 @@ def formula(expression: Any, p: Any, names: Sequence[str]) -> str:
             cells[out[0]] = _constant(f.instruction_constant(k))
         else:
             cells[out[0]] = _text(code, [cells[i] for i in into])
-        if max(map(len, (text for text, _ in cells.values())), default=0) > LONGEST:
-            raise ValueError(f"an expression of more than {LONGEST} characters")
+        if max(map(len, (text for text, _ in cells.values())), default=0) > MAX_FORMULA_LENGTH:
+            raise ValueError(f"an expression of more than {MAX_FORMULA_LENGTH} characters")
     return found
 
 
@@ -112,8 +112,8 @@ def _text(code: int, sides: list[Text]) -> Text:
         text, binds = sides[k]
         return text if binds >= least else f"({text})"
 
-    if code in _BINARY:
-        sign, binds, left, right = _BINARY[code]
+    if code in _BINARY_OPERATIONS:
+        sign, binds, left, right = _BINARY_OPERATIONS[code]
         return side(0, left) + sign + side(1, right), binds
     if code in _CALLS:
         return f"{_CALLS[code]}({sides[0][0]})", NAME
@@ -137,8 +137,8 @@ def value_of(text: str, values: Mapping[str, Any]) -> Any:
     >>> value_of("-b / J", {"b": 0.1, "J": 2e-3})
     -50.0
     """
-    if len(text) > LONGEST:
-        raise ValueError(f"{len(text)} characters, of at most {LONGEST}")
+    if len(text) > MAX_FORMULA_LENGTH:
+        raise ValueError(f"{len(text)} characters, of at most {MAX_FORMULA_LENGTH}")
     try:
         found = _evaluate(ast.parse(text.strip(), mode="eval").body, values)
     except SyntaxError as error:
@@ -177,7 +177,7 @@ def _evaluate(node: ast.AST, values: Mapping[str, Any]) -> Any:
 Rows = tuple[tuple[float, ...], ...]
 LETTERS = "ABC"
 CALLER = "linear_machine"
-RESERVED = ("system", "preset")  # fields of the parameters beside their own
+RESERVED_FIELDS = ("system", "preset")  # fields of the parameters beside their own
 PLACE = re.compile(r"([ABC])_([1-9]\d{0,3})_([1-9]\d{0,3})")  # an entry of a matrix
 
 
@@ -515,7 +515,7 @@ def _terms(
         if name not in nominal or (name not in terms and not formulas):
             where = "nominal" if name not in nominal else "terms"
             raise InputError(CALLER, f"{where}.{name}", "nothing", "a nominal value and its terms")
-        if not str(name).isidentifier() or keyword.iskeyword(name) or name in RESERVED:
+        if not str(name).isidentifier() or keyword.iskeyword(name) or name in RESERVED_FIELDS:
             raise InputError(CALLER, f"nominal.{name}", "this name", "a name as Python has them")
     found = []
     for name in [one for one in nominal if one in terms]:

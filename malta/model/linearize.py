@@ -20,7 +20,7 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError
 from malta.linear.system import System
-from malta.model.equilibrium import chain, commanded, trace
+from malta.model.equilibrium import chain, trace, with_command
 from malta.model.plant import OperatingPoint, Plant
 from malta.model.signals import InverseCheck, Mismatch
 
@@ -126,7 +126,7 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
         )
     if not np.isfinite(point.x).all() or not np.isfinite(point.u).all():
         raise CheckError(f"{plant.name}: a state or a `preload` is not finite: x = {point.x}, u = {point.u}")
-    point = commanded(plant, point, believed)
+    point = with_command(plant, point, believed)
     derivatives = trace(_derivatives, plant, believed, point.loaded)
     A, B, C, E, _, ratio = derivatives(point.x, point.u, point.v)
     keep = list(plant.controlled)
@@ -198,7 +198,7 @@ def jacobians(
 
 PLACES = 21  # along a state, from one end to the other
 SHARES = (-0.5, -0.1, 0.0, 0.1, 0.5)  # of the limits, commanded beside the preload
-FARTHEST, NEAREST = 1e6, 1e-9  # m or rad: a clearance lies between
+MAX_CLEARANCE, MIN_CLEARANCE = 1e6, 1e-9  # m or rad: a clearance lies between
 
 
 def check_inverse(plant: Plant) -> InverseCheck:
@@ -237,9 +237,9 @@ def _clearance(plant: Plant, index: int, sign: float) -> float:
         there[index] = sign * distance
         return bool(np.max(np.array(share(there))) < 1)
 
-    if is_free(FARTHEST) or not is_free(NEAREST):
+    if is_free(MAX_CLEARANCE) or not is_free(MIN_CLEARANCE):
         return 0.0
-    low, high = NEAREST, FARTHEST
+    low, high = MIN_CLEARANCE, MAX_CLEARANCE
     while high > low * (1 + 1e-6):
         middle = math.sqrt(low * high)
         low, high = (middle, high) if is_free(middle) else (low, middle)

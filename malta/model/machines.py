@@ -74,7 +74,7 @@ def machine(name: str | Path | ModuleType) -> ModuleType:
         return _from_file(Path(name))
     if name in _files:
         return sys.modules[_files[name].module]
-    installed = _installed()
+    installed = _installed_machines()
     if name not in installed:
         known = ", ".join(map(repr, machine_names()))
         raise InputError("machine", "name", repr(name), f"one of {known}, or its file by --machine {name}.py")
@@ -89,7 +89,7 @@ def name_of(module: ModuleType) -> str:
     """The machine's name: of its entry point, or the stem of its file."""
     if module.__name__.startswith(FILES + "."):
         return module.__name__.removeprefix(FILES + ".").split(".")[0].rpartition("_")[0]
-    for name, target in _installed().items():
+    for name, target in _installed_machines().items():
         if target == module.__name__:
             return name
     return module.__name__.rpartition(".")[2]
@@ -117,7 +117,7 @@ def module_of(parameters: Any) -> ModuleType:
 
 def machine_names() -> list[str]:
     """The names of all machines: of installed packages and of files loaded so far."""
-    return sorted({*_installed(), *_files})
+    return sorted({*_installed_machines(), *_files})
 
 
 def file_of(name: str) -> Path | None:
@@ -151,7 +151,7 @@ def load_sources(name: str, sources: Mapping[str, str]) -> ModuleType:
 
 def part_of(part: Part, name: str) -> ModuleType | None:
     """The module of a machine's optional part; None without such a part or machine."""
-    if name not in _files and name not in _installed():
+    if name not in _files and name not in _installed_machines():
         return None
     module = machine(name)
     folder = module.__name__ if hasattr(module, "__path__") else module.__name__.rpartition(".")[0]
@@ -182,7 +182,7 @@ def require_part(part: Part, name: str) -> ModuleType:
 
 
 @cache
-def _installed() -> dict[str, str]:
+def _installed_machines() -> dict[str, str]:
     """The machines of installed packages, malta's own also without its metadata: names and modules."""
     own = {found.name: f"{GROUP}.{found.name}.plant" for found in iter_modules(import_module(GROUP).__path__)}
     return own | {point.name: point.value for point in entry_points(group=GROUP)}
@@ -198,7 +198,7 @@ def _from_file(path: Path) -> ModuleType:
         )
     if not (file_exists(path) and path.is_file()):
         raise InputError(where, "", "no such file", "a Python module with Parameters and plant")
-    if name in _installed():
+    if name in _installed_machines():
         found = f"a machine {name!r}, as an installed package has one"
         raise InputError(where, "", found, "another file name")
     text = read_file(where, "Python module", Path.read_bytes)
@@ -254,11 +254,11 @@ def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {line}{at}"
 
 
-FINE: Mapping[str, str] = {"m": "um", "rad": "urad"}  # units of deviations
+FINE_UNITS: Mapping[str, str] = {"m": "um", "rad": "urad"}  # units of deviations
 KINDS: Mapping[str, str] = {"N": "force", "N m": "torque"}
 
 
-class Group(NamedTuple):
+class SignalGroup(NamedTuple):
     """Signals of one unit that a figure shows together."""
 
     name: str
@@ -268,15 +268,15 @@ class Group(NamedTuple):
     @property
     def fine(self) -> str:
         """The unit of deviations."""
-        return FINE.get(self.unit, self.unit)
+        return FINE_UNITS.get(self.unit, self.unit)
 
 
-def outputs_of(plant: Plant) -> tuple[Group, ...]:
+def outputs_of(plant: Plant) -> tuple[SignalGroup, ...]:
     """The machine's outputs: the stroke, if it has one, then the others by their units."""
     return _groups(plant, plant.outputs, plant.stroke_output if plant.has_stroke else None, "stroke")
 
 
-def inputs_of(plant: Plant) -> tuple[Group, ...]:
+def inputs_of(plant: Plant) -> tuple[SignalGroup, ...]:
     """The machine's inputs: the thrust, if it has a stroke, then the others by their units."""
     return _groups(plant, plant.inputs, plant.thrust_input if plant.has_stroke else None, "thrust")
 
@@ -305,7 +305,7 @@ def _per(unit: str, other: str) -> str:
     return "1" if unit == other else f"{unit}/({other})" if whole else f"{unit}/{other}"
 
 
-def lateral_outputs(plant: Plant) -> tuple[Group, ...]:
+def lateral_outputs(plant: Plant) -> tuple[SignalGroup, ...]:
     """The outputs across the stroke; of a machine with one output this output."""
     found = outputs_of(plant)
     return (found[1:] or found) if plant.has_stroke else found
@@ -317,13 +317,13 @@ def stroke_unit(plant: Plant) -> str:
     return unit
 
 
-def _groups(plant: Plant, signals: Sequence[Signal], first: int | None, role: str) -> tuple[Group, ...]:
+def _groups(plant: Plant, signals: Sequence[Signal], first: int | None, role: str) -> tuple[SignalGroup, ...]:
     words: Mapping[str, str] = attribute_of(plant, "experiments", "WORDS", {})
     found = []
     if first is not None:
-        found.append(Group(words.get(role, signals[first].name), signals[first].unit, (first,)))
+        found.append(SignalGroup(words.get(role, signals[first].name), signals[first].unit, (first,)))
     others = [k for k in range(len(signals)) if k != first]
     for unit in dict.fromkeys(signals[k].unit for k in others):
         columns = tuple(k for k in others if signals[k].unit == unit)
-        found.append(Group(words.get(unit, " ".join(signals[k].name for k in columns)), unit, columns))
+        found.append(SignalGroup(words.get(unit, " ".join(signals[k].name for k in columns)), unit, columns))
     return tuple(found)

@@ -351,7 +351,7 @@ def whole_samples(plant: Plant, Ts: float) -> int:
     return whole
 
 
-def placed(plant: Plant, design: Any) -> Any:
+def place_states(plant: Plant, design: Any) -> Any:
     """All states as an expression: these first ones of the design model, the others zero. design : a CasADi column"""
     x = type(design).zeros(len(plant.states))
     x[list(plant.controlled[: design.numel()])] = design

@@ -14,8 +14,8 @@ Coordinates = Literal[
 ]  # of integrals and process noise: of the outputs, or of the positions
 CasadiFn = Callable[..., Any]  # takes and returns casadi SX, MX or DM
 DEFAULT: Any = None  # stands for a function that follows from the other fields
-EXACT = 1e-9  # of the limit of a command
-SHOWN = 7  # states
+LIMIT_TOLERANCE = 1e-9  # of the limit of a command
+SHOWN_STATES = 7  # states
 
 
 class Signal(NamedTuple):
@@ -66,7 +66,7 @@ class InverseCheck:
     @property
     def exact(self) -> bool:
         """Whether every command was made within rounding."""
-        return all(m.share <= EXACT for m in self.mismatches)
+        return all(m.share <= LIMIT_TOLERANCE for m in self.mismatches)
 
     def __repr__(self) -> str:
         return str(self)
@@ -75,16 +75,16 @@ class InverseCheck:
         word = "is" if self.exact else "is not"
         along = ", ".join(m.state.name for m in self.mismatches)
         lines = [f"{self.machine}: `currents` {word} the inverse of `forces` along {along}"]
-        worst = sorted((m for m in self.mismatches if m.share > EXACT), key=lambda m: -m.share)
-        for m in worst[:SHOWN]:
+        worst = sorted((m for m in self.mismatches if m.share > LIMIT_TOLERANCE), key=lambda m: -m.share)
+        for m in worst[:SHOWN_STATES]:
             s, u = m.state, m.input
             room = f"in {m.low:.4g} .. {m.high:.4g} {s.unit}: at {m.place:.4g}" if m.low < m.high else "= 0:"
             lines.append(
                 f"  {s.name} {room} the currents of {u.name} = "
                 f"{m.command:.4g} {u.unit} make {m.made:.4g} {u.unit}, {100 * m.share:.3g} % of its limit apart"
             )
-        if len(worst) > SHOWN:
-            lines.append(f"  and along {len(worst) - SHOWN} more states, less than these")
+        if len(worst) > SHOWN_STATES:
+            lines.append(f"  and along {len(worst) - SHOWN_STATES} more states, less than these")
         return "\n".join([*lines, f"  {self.undefined}"] if self.undefined else lines)
 
 

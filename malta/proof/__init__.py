@@ -32,7 +32,7 @@ if TYPE_CHECKING:
         series as series,
     )
     from malta.proof.margin import Margin as Margin
-    from malta.proof.rates import RateBound as RateBound, varying as varying
+    from malta.proof.rates import RateBound as RateBound, prove_rate as prove_rate
     from malta.proof.robust import Interrupted as Interrupted, margin_of_polynomial as margin_of_polynomial
     from malta.work import Budget as Budget
 
@@ -43,8 +43,8 @@ _NAMES = {
     "malta.proof.certificate": "write_certificate",
     "malta.proof.connections": "append feedback interconnect parallel random_systems series",
     "malta.proof.margin": "Margin",
-    "malta.proof.rates": "RateBound varying",
+    "malta.proof.rates": "RateBound prove_rate",
     "malta.proof.robust": "Interrupted margin_of_polynomial",
     "malta.work": "Budget",
 }
-__all__, __getattr__, __dir__ = contents(__name__, _NAMES)
+__all__, __getattr__, __dir__ = contents(__name__, _NAMES, {"varying": "malta.proof.prove_rate"})

@@ -15,13 +15,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from malta.arguments import LARGEST, by_name, describe, is_number, is_pair
+from malta.arguments import MAX_SIZE, by_name, describe, is_number, is_pair
 from malta.arrays import FloatArray
 from malta.errors import InputError, require_known
 from malta.linear.branches import INTERVALS, Interval
-from malta.linear.expressions import NotAnalytic, Program, exact, program
+from malta.linear.expressions import MatrixProgram, NotAnalytic, exact, program
 
-FAR = 1e2  # search limit, in multiples of the modelled box
+SEARCH_LIMIT = 1e2  # search limit, in multiples of the modelled box
 EDGE = 1e-4  # relative distance of the search from the limits of parameters
 
 
@@ -47,14 +47,14 @@ class Box:
 
     @property
     def limit(self) -> float:
-        """The largest t that a search tries: close to the limit of a parameter, FAR at most."""
-        return min(self.most * (1 - EDGE), FAR)
+        """The largest t that a search tries: close to the limit of a parameter, SEARCH_LIMIT at most."""
+        return min(self.most * (1 - EDGE), SEARCH_LIMIT)
 
     @property
     def searched(self) -> str:
         """How far a search goes, in words."""
-        if self.most * (1 - EDGE) > FAR:
-            return f"up to t = {FAR:g}"
+        if self.most * (1 - EDGE) > SEARCH_LIMIT:
+            return f"up to t = {SEARCH_LIMIT:g}"
         return f"up to t = {self.most:.4g}, where {self.ends}"
 
     def margin(self, p: FloatArray) -> FloatArray:
@@ -169,8 +169,8 @@ def _checked_sides(caller: str, name: str, value: Any, nominal: float) -> tuple[
     if not low <= nominal <= high:
         wanted = f"a share of 0 or more, or (low, high) about the nominal {nominal:g}"
         raise InputError(caller, name, describe(value), wanted)
-    if max(-low, high) > LARGEST:
-        raise InputError(caller, name, describe(value), f"values between -{LARGEST:g} and {LARGEST:g}")
+    if max(-low, high) > MAX_SIZE:
+        raise InputError(caller, name, describe(value), f"values between -{MAX_SIZE:g} and {MAX_SIZE:g}")
     return low, high
 
 
@@ -179,7 +179,7 @@ def _checked_sides(caller: str, name: str, value: Any, nominal: float) -> tuple[
 
 PARTS = 256  # parts of a box on which conditions are looked at
 BISECTIONS = 30  # of the box in which they hold
-ENDS = "a root or a branch of the model ends"
+DOMAIN_END_TEXT = "a root or a branch of the model ends"
 
 
 def within_branches(box: Box, positive: ca.Function | None) -> Box:
@@ -191,14 +191,14 @@ def within_branches(box: Box, positive: ca.Function | None) -> Box:
     if _hold(conditions, box.sides(high)):
         return box
     if not _hold(conditions, box.sides(0.0)):
-        return replace(box, most=0.0, ends=ENDS)
+        return replace(box, most=0.0, ends=DOMAIN_END_TEXT)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         low, high = (middle, high) if _hold(conditions, box.sides(middle)) else (low, middle)
-    return replace(box, most=low, ends=ENDS)
+    return replace(box, most=low, ends=DOMAIN_END_TEXT)
 
 
-def _hold(conditions: Program, sides: FloatArray) -> bool:
+def _hold(conditions: MatrixProgram, sides: FloatArray) -> bool:
     """Whether the conditions are proven on a box (P x 2), or on all its parts."""
     todo, count = [sides], 0
     while todo:

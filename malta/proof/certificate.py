@@ -19,9 +19,18 @@ from flint import arb, ctx
 from scipy import linalg, sparse
 
 from malta.checker import file as checked_file
-from malta.checker.check import BITS, MOST_NODES, balls, bernstein, interpolated, within
-from malta.checker.file import Loop, double
-from malta.checker.loop import SIDES, Polynomial, Refused, Table, balanced, expressions, height, split
+from malta.checker.check import BITS, MOST_NODES, balls, bernstein, interpolate, within
+from malta.checker.file import StatedLoop, double
+from malta.checker.loop import (
+    SIDES,
+    CheckedPolynomial,
+    Refused,
+    Table,
+    balance_units,
+    expressions,
+    height,
+    split,
+)
 from malta.errors import CheckError, InputError
 from malta.files import replace_files, version
 from malta.linear.expressions import FIELD, exact
@@ -40,10 +49,10 @@ if TYPE_CHECKING:
 # How a certificate splits a loop: groups of states, the sizes in which couplings between these count least, and v.
 
 
-SMALL = 1e-11  # relative, of couplings that may be rounding
+COUPLING_TOLERANCE = 1e-11  # relative, of couplings that may be rounding
 
 
-def groups_of(loop: Loop, t: dict[str, Table], box: Box) -> list[dict[str, Any]]:
+def groups_of(loop: StatedLoop, t: dict[str, Table], box: Box) -> list[dict[str, Any]]:
     """States that act on one another.
 
     A group is only acted on by those before it; or couplings that are rounding are left between groups.
@@ -58,7 +67,7 @@ def groups_of(loop: Loop, t: dict[str, Table], box: Box) -> list[dict[str, Any]]
     _, (scales, _) = linalg.matrix_balance(np.exp2(size), permute=False, separate=True)
     size += np.log2(scales) - np.log2(scales)[:, None]
     level = (size.max(axis=1)[:, None] + size.max(axis=0)[None, :]) / 2
-    large = touch & (size > math.log2(SMALL) + level)
+    large = touch & (size > math.log2(COUPLING_TOLERANCE) + level)
     if loop.held:
         for i, j in t["A"]:
             large[i, j] = True
@@ -67,7 +76,7 @@ def groups_of(loop: Loop, t: dict[str, Table], box: Box) -> list[dict[str, Any]]
     if any(len(set(apart[label == g].tolist())) > 1 for g in range(number)):
         order, label = list(dict.fromkeys(apart.tolist())), apart
     else:
-        order = _ordered(touch, label, number)
+        order = _order_groups(touch, label, number)
     members = [np.flatnonzero(label == g).tolist() for g in order]
     return [
         {
@@ -80,7 +89,7 @@ def groups_of(loop: Loop, t: dict[str, Table], box: Box) -> list[dict[str, Any]]
     ]
 
 
-def units_of(read: Callable[[], Loop], described: dict[str, Any], box: Box) -> list[int]:
+def units_of(read: Callable[[], StatedLoop], described: dict[str, Any], box: Box) -> list[int]:
     """log2 of sizes of the states in which couplings between groups count least."""
     loop = read()
     n, best = loop.states, (math.inf, [0] * (loop.states + len(loop.law[0])))
@@ -106,7 +115,7 @@ def units_of(read: Callable[[], Loop], described: dict[str, Any], box: Box) -> l
     return best[1]
 
 
-def _lengths(f: Polynomial, v: list[Any], share: float) -> list[int]:
+def _lengths(f: CheckedPolynomial, v: list[Any], share: float) -> list[int]:
     """log2 of the states' sizes where |g| has a place among the sizes of the entries."""
     m, dynamic = f.sizes(v)
     known = sorted(height(x) for row in m for x in row if x > 0)
@@ -119,19 +128,20 @@ def _lengths(f: Polynomial, v: list[Any], share: float) -> list[int]:
     ]
     d = [0.0] * len(m)
     for _ in range(8):
-        d = balanced(len(m), logs, d)
+        d = balance_units(len(m), logs, d)
     own = len(f.group.own)
     return [round(x) for x in (*d[: len(f.group.states)], *d[len(d) - own :])]
 
 
-def _ratio(f: Polynomial, v: list[Any]) -> float:
+def _ratio(f: CheckedPolynomial, v: list[Any]) -> float:
     """log2 of how large couplings between groups are beside the coefficients."""
     return max(
-        (height(b) - height(a) for a, b in zip(f.at(v), f.moved(v), strict=False) if b > 0), default=-1000.0
+        (height(b) - height(a) for a, b in zip(f.at(v), f.dust_bounds(v), strict=False) if b > 0),
+        default=-1000.0,
     )
 
 
-def _ordered(touch: Any, label: Any, number: int) -> list[int]:
+def _order_groups(touch: Any, label: Any, number: int) -> list[int]:
     """Strongly connected groups, each acted on by those before it alone."""
     left, order = set(range(number)), []
     while left:
@@ -145,7 +155,7 @@ def _ordered(touch: Any, label: Any, number: int) -> list[int]:
     return order
 
 
-def divides(f: Polynomial, i: int) -> bool:
+def divides(f: CheckedPolynomial, i: int) -> bool:
     """Whether the entries are polynomials of 1 / p_i, as of an inertia; q takes other denominators."""
     found = list(f.tables["A"].values())
     below = [{m[i] for m in r.den.monoms()} for r in found]
@@ -158,7 +168,7 @@ def divides(f: Polynomial, i: int) -> bool:
 SHARES = (0.999, 0.97, 0.9, 0.75, 0.5, 0.25)
 MOST_CELLS = 20_000  # cells of one group at most
 MOST_PARTS = 64
-HIGHEST = 24  # degree of an interpolant along one parameter
+MAX_DEGREE = 24  # degree of an interpolant along one parameter
 TAIL = -26.0  # log2 of what interpolation should leave out, relative to each coefficient
 RADII = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, *(2.0**k for k in (4, 5, 6, 8, 10, 14, 20, 30, 50, 99)))
 
@@ -166,12 +176,12 @@ Places = Sequence[tuple["UncertainSystem", "Compensator"]]
 
 
 @dataclass(frozen=True)
-class Origin:
+class LoopOrigin:
     """The machine and the law that loops are of, as the claim names them."""
 
-    named: checked_file.Origin
+    named: checked_file.StatedOrigin
     units: Mapping[str, str]  # SI, of the parameters and of the travel
-    places: checked_file.Places | None  # of the loops, where they are several
+    places: checked_file.StatedPlaces | None  # of the loops, where they are several
 
 
 def write_certificate(
@@ -180,7 +190,7 @@ def write_certificate(
     ranges: Ranges,
     over: Mapping[str, tuple[float, float]] | None,
     margin: Margin,
-    origin: Origin | None = None,
+    origin: LoopOrigin | None = None,
 ) -> Path:
     """Write the certificate of a margin.
 
@@ -211,7 +221,7 @@ def certificate_of(
     ranges: Ranges,
     over: Mapping[str, tuple[float, float]] | None,
     margin: Margin,
-    origin: Origin | None = None,
+    origin: LoopOrigin | None = None,
 ) -> dict[str, Any]:
     """The certificate of a margin as a JSON document."""
     if margin.lower is None:
@@ -238,7 +248,7 @@ def certificate_of(
     return content | {"sha256": checked_file.digest(content)}
 
 
-def _origin(origin: Origin | None) -> dict[str, Any]:
+def _origin(origin: LoopOrigin | None) -> dict[str, Any]:
     """What a claim says of machine, law, stage and places."""
     if origin is None:
         return dict.fromkeys(("machine", "law", "current_loops", "places"))
@@ -297,7 +307,7 @@ def _prove(places: Places, box: Box, margin: float) -> tuple[float, list[dict[st
     raise last
 
 
-def loops_of(places: Places) -> tuple[Loop, ...]:
+def loops_of(places: Places) -> tuple[StatedLoop, ...]:
     """Loops as a certificate has them, without their groups. Raises InputError for those that it cannot have."""
     found = []
     for system, law in places:
@@ -307,10 +317,10 @@ def loops_of(places: Places) -> tuple[Loop, ...]:
     return tuple(found)
 
 
-def _as_read(described: dict[str, Any], inputs: int) -> Loop:
+def _as_read(described: dict[str, Any], inputs: int) -> StatedLoop:
     """A loop as the checker reads it. Raises InputError for what no certificate may have."""
     with refused_as_input():
-        return checked_file.loop(checked_file.Field(Path("certificate"), "", described), inputs)
+        return checked_file.loop(checked_file.DocumentValue(Path("certificate"), "", described), inputs)
 
 
 @contextmanager
@@ -358,7 +368,7 @@ def _loop(system: UncertainSystem, law: Any, box: Box, lower: float) -> dict[str
     described = _description(loop_of(system, _law(system, law)))
     count, before = len(box.names), ctx.prec
 
-    def read() -> Loop:
+    def read() -> StatedLoop:
         return _as_read(described, count)
 
     try:
@@ -379,7 +389,7 @@ def _loop(system: UncertainSystem, law: Any, box: Box, lower: float) -> dict[str
     return described
 
 
-def _parts(f: Polynomial, box: Box, lower: float) -> list[dict[str, Any]]:
+def _parts(f: CheckedPolynomial, box: Box, lower: float) -> list[dict[str, Any]]:
     """The parts of the box with their cells, cut where it is too wide. Raises InputError, CheckError, Refused."""
     todo = [np.array([(below(low), -below(-high)) for low, high in _ends(box, lower)])]
     moving = len(f.used & set(np.flatnonzero(todo[0][:, 0] < todo[0][:, 1]).tolist()))
@@ -396,7 +406,7 @@ def _parts(f: Polynomial, box: Box, lower: float) -> list[dict[str, Any]]:
         v = [(exact(a), exact(b)) for a, b in sides.tolist()]
         v = [(1 / b, 1 / a) if inv else (a, b) for (a, b), inv in zip(v, f.group.inverted, strict=True)]
         try:
-            proof = _enclosed(f, v, box, lower)
+            proof = _enclose(f, v, box, lower)
         except Refused:
             if len(todo) + len(made) >= MOST_PARTS:
                 raise
@@ -411,14 +421,14 @@ def _parts(f: Polynomial, box: Box, lower: float) -> list[dict[str, Any]]:
     return made
 
 
-def _widest(f: Polynomial, sides: FloatArray) -> int:
+def _widest(f: CheckedPolynomial, sides: FloatArray) -> int:
     """The parameter to cut: the widest beside its middle."""
     width = sides[:, 1] - sides[:, 0]
     share = width / np.maximum(np.abs(sides.sum(axis=1)), width)
     return int(np.argmax([s if i in f.used else -1.0 for i, s in enumerate(share)]))
 
 
-def _enclosed(f: Polynomial, v: list[tuple[Any, Any]], box: Box, lower: float) -> dict[str, Any]:
+def _enclose(f: CheckedPolynomial, v: list[tuple[Any, Any]], box: Box, lower: float) -> dict[str, Any]:
     """The enclosure of one part, and its cells.
 
     Raises Refused when it cannot be enclosed, CheckError when zero is not excluded.
@@ -426,12 +436,12 @@ def _enclosed(f: Polynomial, v: list[tuple[Any, Any]], box: Box, lower: float) -
     ctx.prec = BITS
     size = [height(x) for x in f.at([arb((a + b) / 2) for a, b in v])]
     axes = [_axis(f, v, i, size) for i in range(len(v))]
-    values, left = interpolated(f, v, axes)
+    values, left = interpolate(f, v, axes)
     heights = np.array([height(x) for x in values]).reshape(f.count, *(axis.degree + 1 for axis in axes))
     matters = heights > heights.reshape(f.count, -1).max(axis=1).reshape(-1, *[1] * len(axes)) + TAIL
     kept = [max(np.nonzero(matters)[i + 1].tolist(), default=0) for i in range(len(axes))]
     axes = [replace(axis, kept=k) for axis, k in zip(axes, kept, strict=True)]
-    family = _family(*bernstein(values, left, axes), f.moved(balls(v)))
+    family = _family(*bernstein(values, left, axes), f.dust_bounds(balls(v)))
     return {
         "axes": [[axis.degree, double(axis.rho).hex(), axis.kept] for axis in axes],
         "scale": family.scale,
@@ -439,10 +449,12 @@ def _enclosed(f: Polynomial, v: list[tuple[Any, Any]], box: Box, lower: float) -
     }
 
 
-def _axis(f: Polynomial, v: list[tuple[Any, Any]], i: int, size: list[float]) -> checked_file.Axis:
+def _axis(
+    f: CheckedPolynomial, v: list[tuple[Any, Any]], i: int, size: list[float]
+) -> checked_file.AxisEnclosure:
     """The ellipse along v_i that takes the lowest degree. Raises Refused."""
     if i not in f.used or v[i][0] == v[i][1]:
-        return checked_file.Axis(0, exact(RADII[0]), 0)
+        return checked_file.AxisEnclosure(0, exact(RADII[0]), 0)
     best: tuple[float, int, float] | None = None
     for rho in RADII:
         try:
@@ -451,12 +463,12 @@ def _axis(f: Polynomial, v: list[tuple[Any, Any]], i: int, size: list[float]) ->
             break
         share = max((height(m) - s for m, s in zip(most, size, strict=True) if s > -math.inf), default=0.0)
         rate, start = math.log2(rho), share + 1 - math.log2(rho - 1)
-        degree = min(max(math.ceil((start - TAIL) / rate), 0), HIGHEST)
+        degree = min(max(math.ceil((start - TAIL) / rate), 0), MAX_DEGREE)
         rank = (max(start - degree * rate - TAIL, 0.0), degree, rho)
         best = rank if best is None else min(best, rank)
     if best is None or best[0] > 16:
         raise Refused(f"parameter {i + 1} varies too much for one interpolation")
-    return checked_file.Axis(best[1], exact(best[2]), best[1])
+    return checked_file.AxisEnclosure(best[1], exact(best[2]), best[1])
 
 
 def _cells(
@@ -470,7 +482,7 @@ def _cells(
         if search.count > MOST_CELLS or search.blocked < search.target:
             raise CheckError(f"no certificate: not proven within {search.count} cells")
         search = advance(search)
-    cells, boxes, c = search.excluded(len(v))
+    cells, boxes, c = search.excluded_cells(len(v))
     return [
         [int(branch), a, b, own, z.real, z.imag]
         for (branch, a, b), own, z in zip(cells.tolist(), boxes.tolist(), c.tolist(), strict=True)

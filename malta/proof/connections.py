@@ -148,7 +148,7 @@ def interconnect(
     proven 197.57 %, lost at 197.58 % at 168.5 rad/s
     """
     caller = "interconnect"
-    named = [_named(one, caller) for one in systems]
+    named = [_with_names(one, caller) for one in systems]
     whole = _Connection.of([system for system, _, _ in named], caller)
     parts = [
         replace(part, inputs=tuple(into), outputs=tuple(out))
@@ -157,7 +157,7 @@ def interconnect(
     return whole.system(interconnection.interconnect(parts, _names_of(inputs), _names_of(outputs)))
 
 
-def _named(one: Any, caller: str) -> tuple[Any, list[str], list[str]]:
+def _with_names(one: Any, caller: str) -> tuple[Any, list[str], list[str]]:
     """A system with the names of its inputs and outputs, one for each. Raises InputError."""
     system, *names = one if isinstance(one, tuple) else (one,)
     if not names and hasattr(system, "input_labels"):
@@ -245,7 +245,7 @@ class _Connection:
                 low, high = limits.get(name, (-np.inf, np.inf))
                 limits[name] = max(low, above), min(high, below)
         symbols = {name: ca.SX.sym(name) for name in nominal}
-        times = {_sample_time(one, caller) for one in systems} - {_ANY}
+        times = {_sample_time(one, caller) for one in systems} - {_ANY_SAMPLE_TIME}
         if len(times) > 1:
             found = ", ".join(sorted("continuous" if T is None else f"{T:g} s" for T in times))
             raise InputError(
@@ -277,7 +277,7 @@ class _Connection:
         )
 
 
-_ANY = -1.0  # the sample time of gains, which fit every system
+_ANY_SAMPLE_TIME = -1.0  # the sample time of gains, which fit every system
 
 
 def _sample_time(one: Any, caller: str) -> float | None:
@@ -289,7 +289,7 @@ def _sample_time(one: Any, caller: str) -> float | None:
             raise InputError(caller, "law", found, "one without, and the delay and the lag as systems")
         return one.sample_time
     if not hasattr(one, "dt"):
-        return _ANY
+        return _ANY_SAMPLE_TIME
     if one.dt is True:
         raise InputError(caller, "dt", "True", "0, or a sample time in seconds")
     return float(one.dt) if one.dt else None

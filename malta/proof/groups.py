@@ -19,9 +19,9 @@ from scipy import linalg, sparse
 from malta.arguments import plural
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.linear.expressions import NotAnalytic, Program, exact, program
+from malta.linear.expressions import MatrixProgram, NotAnalytic, exact, program
 from malta.linear.rational import Ratio, Symbolic, TooLarge, symbolic
-from malta.linear.uncertain import Compensator, Group, UncertainSystem
+from malta.linear.uncertain import Compensator, StateGroup, UncertainSystem
 
 A, B, C, D, E = range(5)
 
@@ -32,7 +32,7 @@ class UncertainLoop:
 
     system: UncertainSystem
     law: Compensator
-    program: Program
+    program: MatrixProgram
 
     @property
     def symbolic(self) -> Symbolic | None:
@@ -101,12 +101,12 @@ def loop_of(system: UncertainSystem, law: Compensator) -> UncertainLoop:
 
 
 @lru_cache(maxsize=32)  # laws change, the system stays; records compare by identity
-def _program(system: UncertainSystem) -> Program:
+def _program(system: UncertainSystem) -> MatrixProgram:
     return program(system.matrices)
 
 
 @lru_cache(maxsize=32)
-def _symbolic(program: Program) -> Symbolic | None:
+def _symbolic(program: MatrixProgram) -> Symbolic | None:
     try:
         return symbolic(program)
     except (TooLarge, NotAnalytic):
@@ -114,11 +114,11 @@ def _symbolic(program: Program) -> Symbolic | None:
 
 
 @lru_cache(maxsize=32)  # records compare by identity
-def groups(loop: UncertainLoop) -> list[Group]:
+def groups(loop: UncertainLoop) -> list[StateGroup]:
     """The strongly connected parts of the closed loop: its characteristic polynomial is the product of theirs."""
     law, n = loop.law, loop.states
     if loop.direct:
-        return [Group(tuple(range(n)), tuple(range(len(law.A))), None)]
+        return [StateGroup(tuple(range(n)), tuple(range(len(law.A))), None)]
     s = loop.symbolic
     touch = _coupling_pattern(loop) if s is None else _nonzero_couplings(loop, s)
     if loop.descriptor:
@@ -131,7 +131,7 @@ def groups(loop: UncertainLoop) -> list[Group]:
         mine = np.flatnonzero(label == k).tolist()
         states, own = tuple(i for i in mine if i < n), tuple(i - n for i in mine if i >= n)
         inputs = tuple(i for i in acting if i in states)
-        found.append(Group(states, own, inputs if len(inputs) < loop.program.shapes[B][1] else None))
+        found.append(StateGroup(states, own, inputs if len(inputs) < loop.program.shapes[B][1] else None))
     return found
 
 

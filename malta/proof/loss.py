@@ -20,13 +20,13 @@ from malta.work import is_past
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
     from malta.proof.box import Box
-    from malta.proof.exclusion import Part
+    from malta.proof.exclusion import BoxPart
     from malta.proof.problem import Problem
 
     Loss = tuple[float, float | None, FloatArray | None]  # t, w, p
 
 STEP = 1e-6  # of a range, for slopes of the worst root
-NARROW = 2.0**-40  # of a step of the grid, to which a loss is narrowed down
+LOSS_ACCURACY = 2.0**-40  # of a step of the grid, to which a loss is narrowed down
 ROUNDS = 6  # from corner to corner
 CALL = 2e-4  # work of a call for poles, beside that of each row
 
@@ -181,7 +181,7 @@ def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float, proven:
     low, high = (float(grid[k - 1]) if k else 0.0), float(grid[k])
     if is_past():
         return high
-    return _narrow_loss(lambda t: float(rates(np.array([t]))[0]), low, high, NARROW * (high - low))
+    return _narrow_loss(lambda t: float(rates(np.array([t]))[0]), low, high, LOSS_ACCURACY * (high - low))
 
 
 def _narrow_loss(rate: Callable[[float], float], low: float, high: float, width: float) -> float:
@@ -212,10 +212,10 @@ def _narrow_loss(rate: Callable[[float], float], low: float, high: float, width:
 
 
 RAYS_TO_CORNERS = 5  # parameters up to which every corner has a ray; of more, as many corners are drawn
-FARTHEST = 20.0  # multiples of the box
+MAX_BOX_FACTOR = 20.0  # multiples of the box
 LEVELS = (0.125, 0.25, 0.5, 0.75, 1.0)  # shares of a ray at which a first loss of stability is looked for
-RESOLVED = 2.0**-13  # of a ray, to which a loss of stability is narrowed down
-BESIDE = 0.02  # of the margin of a neighbouring design: how near that of a design is expected
+RAY_RESOLUTION = 2.0**-13  # of a ray, to which a loss of stability is narrowed down
+NEIGHBOUR_DISTANCE = 0.02  # of the margin of a neighbouring design: how near that of a design is expected
 RAY_ROUNDS = 8  # of corrections by other rays
 
 
@@ -308,7 +308,7 @@ def _rays_of(
     with np.errstate(divide="ignore", invalid="ignore"):
         room = np.where(steps > 0, limits[:, 1] - start, np.where(steps < 0, start - limits[:, 0], np.inf))
         reach = np.where(steps == 0, np.inf, room / np.abs(steps)).min(axis=1)
-    return _Rays(loop, start, steps, np.minimum(0.999 * reach, FARTHEST))
+    return _Rays(loop, start, steps, np.minimum(0.999 * reach, MAX_BOX_FACTOR))
 
 
 def _corners(count: int) -> FloatArray:
@@ -327,14 +327,16 @@ def _leave(
     """
     rays, ray = sets[which[0]], which[1]
     end = min(float(rays.end[ray]), unstable_at)
-    about = np.array([near * (1 - BESIDE), near * (1 + BESIDE)])
+    about = np.array([near * (1 - NEIGHBOUR_DISTANCE), near * (1 + NEIGHBOUR_DISTANCE)])
     if about[1] < end and (rays.unstable(about, [ray, ray]) >= 0).tolist() == [False, True]:
         low, high = about.tolist()
     elif rays.unstable(np.array([end]), [ray])[0] < 0:
         return math.inf
     else:
         low, high = 0.0, end
-    return _narrow_loss(lambda t: float(rays.unstable(np.array([t]), [ray])[0]), low, high, RESOLVED * end)
+    return _narrow_loss(
+        lambda t: float(rays.unstable(np.array([t]), [ray])[0]), low, high, RAY_RESOLUTION * end
+    )
 
 
 def _first_level(sets: Sequence[_Rays], owner: Sequence[tuple[int, int]]) -> tuple[float, int | None]:
@@ -360,10 +362,10 @@ def _most_unstable(sets: Sequence[_Rays], owner: Sequence[tuple[int, int]], t: f
 
 
 BISECTIONS = 16  # of the way to a witness
-COARSE = 1e-5  # how far beyond a zero, relative, the poles may become unstable without a bisection
+UNBISECTED_DISTANCE = 1e-5  # relative, beyond a zero: poles that become unstable within it take no bisection
 
 
-def confirm(problem: Problem, box: Box, zero: Zero, part: Part) -> Loss | None:
+def confirm(problem: Problem, box: Box, zero: Zero, part: BoxPart) -> Loss | None:
     """The t, frequency and p just beyond a zero at which the poles are unstable; None where they stay stable."""
     p = part.growth.parameters(zero.u)
     w = problem.physical(zero.frequency(part.family))
@@ -375,7 +377,7 @@ def confirm(problem: Problem, box: Box, zero: Zero, part: Part) -> Loss | None:
                 p = corner_of(problem, box, there)
                 there = box.stretch(p, _first_unstable(problem, box, p, 0.95, 1.0))
                 return float(box.margin(there)), w, there
-            if share > 1 + COARSE:  # a double zero, which is found to the root of rounding
+            if share > 1 + UNBISECTED_DISTANCE:  # a double zero, which is found to the root of rounding
                 share = _first_unstable(problem, box, p, stable, float(share))
                 there = box.stretch(p, share)
             return float(zero.t * share), w, there
@@ -399,7 +401,7 @@ def _is_unstable(problem: Problem, p: FloatArray) -> bool:
         return False
 
 
-def contributions(zero: Zero, part: Part, names: tuple[str, ...]) -> dict[str, float]:
+def contributions(zero: Zero, part: BoxPart, names: tuple[str, ...]) -> dict[str, float]:
     """The share of each parameter in reaching the boundary: d ln(margin) = -sum of share x d ln(range).
 
     Along f(jw, p) = 0 the margin moves by Im(conj(f_w) f_p dp); at the witness all parameters pull the same way.

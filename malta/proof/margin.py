@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 from malta.bound import Bound, at_least, at_most
 from malta.display import Description, display, quantity
-from malta.work import MORE
+from malta.work import MORE_WORK
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
-    from malta.proof.multipliers.structured import Proof
+    from malta.proof.multipliers.structured import MultiplierProof
 
 Ranges = Mapping[str, "float | tuple[float, float] | list[float]"]
 Progress = Callable[[float, float], None]  # called with the lower and upper bound so far
@@ -31,7 +31,9 @@ class Certificate:
     sides: FloatArray  # the part of the box: parameters x 2
     inverted: tuple[bool, ...]  # parameters whose shares are of 1 / p
     scale: int
-    multipliers: Proof | None = None  # what a proof by multipliers is, without cells of the kind above
+    multipliers: MultiplierProof | None = (
+        None  # what a proof by multipliers is, without cells of the kind above
+    )
 
 
 @display
@@ -86,7 +88,7 @@ class Margin:
     @property
     def time_up(self) -> bool:
         """Whether the search ended with its work or its time, before anything was proven: more may prove more."""
-        return self.lower is None and self.reason.endswith(MORE)
+        return self.lower is None and self.reason.endswith(MORE_WORK)
 
     @property
     def exhausted(self) -> bool:

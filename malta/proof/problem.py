@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from flint import acb, arb, arb_mat, fmpq
 
-from malta.linear.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program, exact
+from malta.linear.expressions import BALLS, EXACT_ARITHMETIC, POINTS, MatrixProgram, NotAnalytic, exact
 from malta.linear.rational import Symbolic, TooLarge, over_common_denominator, symbolic
 from malta.linear.uncertain import (
     Compensator,
-    Group,
+    StateGroup,
     UncertainSystem,
     closed_loop as closed_matrices,
     critical_frequency,
@@ -33,7 +33,7 @@ from malta.work import WorkUp
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
     from malta.proof.box import Box
-    from malta.proof.exclusion import Part
+    from malta.proof.exclusion import BoxPart
 
 
 # A polynomial with coefficients in p as a loop in which every parameter enters linearly, for multipliers.
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 # fed back.
 
 
-MOST = 30  # signals z beyond which families are cheaper
+MAX_SIGNALS = 30  # signals z beyond which families are cheaper
 
 Monomial = tuple[int, ...]  # the parameters that are multiplied, in order
 
@@ -53,13 +53,13 @@ Monomial = tuple[int, ...]  # the parameters that are multiplied, in order
 def companion(
     names: tuple[str, ...], a: Sequence[Mapping[Any, Any]], T: float | None
 ) -> UncertainLoop | None:
-    """The loop of a polynomial; None where it takes more than MOST signals.
+    """The loop of a polynomial; None where it takes more than MAX_SIGNALS signals.
 
     a : for each power, the lowest first, the terms of its coefficient: rational numbers by exponents of p
     T : sample time of a polynomial in z; None: in s
     """
     rows = _rows(len(names), a)
-    if len(rows) > MOST + 1:
+    if len(rows) > MAX_SIGNALS + 1:
         return None
     n, made = len(a) - 1, _Steps(len(names))
     place = {monomial: k for k, monomial in enumerate(rows)}  # d first
@@ -86,7 +86,7 @@ def companion(
     none = np.zeros((0, 0))
     law = Compensator(none, np.zeros((0, m)), np.zeros((m, 0)), np.eye(m), sample_time=T)
     system = UncertainSystem(names, np.zeros(len(names)), None, sample_time=T)
-    return UncertainLoop(system, law, Program(tuple(made.steps), entries, shapes, len(names)))
+    return UncertainLoop(system, law, MatrixProgram(tuple(made.steps), entries, shapes, len(names)))
 
 
 def _rows(count: int, a: Sequence[Mapping[Any, Any]]) -> dict[Monomial, dict[Any, Any]]:
@@ -151,9 +151,9 @@ def _exact(x: float, like: Any) -> Any:
 POLES = 6e-7  # work of poles in doubles, times the square of the states
 ROW = 6e-4  # work of a row in balls
 EXACT_STEP = 1e-6  # work of an operation in exact numbers
-STEP, CUBED = 4e-6, 1e-6  # work of an operation of the model in balls, and times the cube of the states
-SHORT = 300  # operations of matrices whose exact expressions take no time
-FEW_ROWS = 2  # of parameters, at which the poles of the whole loop take less time than those of its groups
+STEP, STATES_WORK = 4e-6, 1e-6  # work of an operation of the model in balls, and times the cube of the states
+MAX_QUICK_OPERATIONS = 300  # operations of matrices whose exact expressions take no time
+MAX_WHOLE_ROWS = 2  # of parameters: the poles of the whole loop take less time than those of its groups
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +171,7 @@ class Traits:
     is_cheap: bool = False
     is_held: bool = False
     poles: float = 1e-4
-    enclose: Callable[[Box, float], list[Part]] | None = None
+    enclose: Callable[[Box, float], list[BoxPart]] | None = None
 
     @property
     def is_bounded(self) -> bool:
@@ -217,7 +217,7 @@ class OfLoop:
     @property
     def traits(self) -> Traits:
         size = self.loop.states + len(self.loop.law.A)
-        dear = ROW + STEP * len(self.loop.program.steps) + CUBED * size**3
+        dear = ROW + STEP * len(self.loop.program.steps) + STATES_WORK * size**3
         poles = POLES * size**2 if self._plain else dear
         return Traits(self.loop.system.approximate, is_held=self.loop.sampled, poles=poles)
 
@@ -241,9 +241,9 @@ class OfLoop:
         return found
 
     @cached_property
-    def _groups(self) -> Sequence[Group]:
+    def _groups(self) -> Sequence[StateGroup]:
         """The states that close loops by themselves, where these are found at once; else none."""
-        if len(self.loop.program.steps) > SHORT:
+        if len(self.loop.program.steps) > MAX_QUICK_OPERATIONS:
             return ()
         with suppress(WorkUp):
             return groups(self.loop)
@@ -257,7 +257,7 @@ class OfLoop:
     def _poles(self, p: FloatArray) -> Any:
         """The poles of x' = A x, or of differences x+ - x; empty when the matrices have no value."""
         n, k = self.loop.states, len(self.loop.law.A)
-        whole = Group(tuple(range(n)), tuple(range(k)), None)
+        whole = StateGroup(tuple(range(n)), tuple(range(k)), None)
         try:
             entries = self.loop.program.run([arb(x) for x in p.tolist()], POINTS)
             matrix, _ = closed_loop(driven_group(self.loop, whole, entries, arb_mat))
@@ -271,7 +271,7 @@ class OfLoop:
     def instability(self, rows: FloatArray) -> FloatArray:
         if self._plain:
             with suppress(np.linalg.LinAlgError):  # numbers that overflow at some row: each by itself
-                several = len(np.atleast_2d(rows)) > FEW_ROWS and len(self._groups) > 1
+                several = len(np.atleast_2d(rows)) > MAX_WHOLE_ROWS and len(self._groups) > 1
                 return instability(self.loop.system, self.loop.law, rows, self._groups if several else ())
         worst = []
         for p in np.atleast_2d(rows):
@@ -343,7 +343,7 @@ def physical(x: float, T: float | None) -> float:
 class CoefficientPolynomial:
     """A problem whose polynomial in s (or z) has coefficients, lowest first, that are a program of p."""
 
-    program: Program
+    program: MatrixProgram
     names: tuple[str, ...]
     discrete: bool
 
@@ -404,7 +404,9 @@ class CoefficientPolynomial:
     def values(self, v: Sequence[Any]) -> list[Any]:
         """The coefficients as they are given."""
         rational = self.program.rational
-        (entries,) = self.program.run(v if rational else [arb(x) for x in v], EXACT if rational else POINTS)
+        (entries,) = self.program.run(
+            v if rational else [arb(x) for x in v], EXACT_ARITHMETIC if rational else POINTS
+        )
         a: list[Any] = [fmpq(0) if rational else arb(0)] * self.count
         for i, _, x in entries:
             a[i] = x

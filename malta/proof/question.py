@@ -9,25 +9,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.proof.exclusion.witness import Zero
-from malta.work import is_past, spent
+from malta.work import is_past, work_done
 
 if TYPE_CHECKING:
     from malta.proof.box import Box
-    from malta.proof.exclusion import Part, Search
+    from malta.proof.exclusion import BoxPart, CellSearch
     from malta.proof.exclusion.hurwitz import Signs
     from malta.proof.margin import Progress
     from malta.proof.multipliers.structured import Structured
     from malta.proof.problem import Problem
 
-    Searches = list[tuple[Part, Search]]
+    Searches = list[tuple[BoxPart, CellSearch]]
 
-DEAR = 3.0  # work of families beyond which their boxes grow in small steps
-# of the work for families, by the number of parameters, the last for MANY
+DEAR_WORK = 3.0  # work of families beyond which their boxes grow in small steps
+# of the work for families, by the number of parameters, the last for MIN_MANY_PARAMETERS
 SHARES = (0.6, 0.6, 0.6, 0.6, 0.4, 0.3)
-PATIENT, PATIENT_DEAR = 0.8, 0.1  # of the work, for families of a patient search
-OF_HOLDS = 0.12  # of many parameters under a hold, where each family takes long
-MANY = 5  # parameters from which on multipliers come before many cells
-MANY_OF_POLYNOMIALS = 11  # whose cells are cheap
+PATIENT_SHARE, PATIENT_DEAR_SHARE = 0.8, 0.1  # of the work, for families of a patient search
+HOLD_SHARE = 0.12  # of many parameters under a hold, where each family takes long
+MIN_MANY_PARAMETERS = 5  # parameters from which on multipliers come before many cells
+MIN_MANY_CHEAP_PARAMETERS = 11  # whose cells are cheap
 
 
 @dataclass(eq=False)
@@ -41,7 +41,7 @@ class Standing:
     searches: Searches = field(default_factory=list)
 
     def report(self, lower: float, upper: float) -> None:
-        self.lower, self.upper, self.work = max(self.lower, lower), min(self.upper, upper), spent()
+        self.lower, self.upper, self.work = max(self.lower, lower), min(self.upper, upper), work_done()
         if self.progress is not None:
             self.progress(self.lower, self.upper)
 
@@ -83,20 +83,22 @@ class Question:
     @property
     def is_many(self) -> bool:
         """Whether the parameters are so many that multipliers come before many cells."""
-        return self._count >= (MANY_OF_POLYNOMIALS if self.problem.traits.is_cheap else MANY)
+        return self._count >= (
+            MIN_MANY_CHEAP_PARAMETERS if self.problem.traits.is_cheap else MIN_MANY_PARAMETERS
+        )
 
     @property
     def share(self) -> float:
         """The share of the work that families may take where there are multipliers beside them."""
         if self.patient:
-            return PATIENT
+            return PATIENT_SHARE
         is_dear = self.is_many and self.problem.traits.is_held
-        return OF_HOLDS if is_dear else SHARES[min(self._count, MANY)]
+        return HOLD_SHARE if is_dear else SHARES[min(self._count, MIN_MANY_PARAMETERS)]
 
     @property
     def dear(self) -> float:
         """Work of families beyond which their boxes grow in small steps."""
-        return max(DEAR, PATIENT_DEAR * self.end) if self.patient else DEAR
+        return max(DEAR_WORK, PATIENT_DEAR_SHARE * self.end) if self.patient else DEAR_WORK
 
     def is_late(self) -> bool:
         return is_past(self.end)
@@ -115,13 +117,13 @@ class Findings:
     signs: Signs | None = None
     stands: float = 0.0
     upper: float = math.inf
-    zero: tuple[Zero, Part] | None = None
+    zero: tuple[Zero, BoxPart] | None = None
     reasons: tuple[str, ...] = ()
 
     def because(self, reason: str) -> Findings:
         return replace(self, reasons=(*self.reasons, reason))
 
-    def nearer(self, part: Part, zero: Zero | None) -> Findings:
+    def nearer(self, part: BoxPart, zero: Zero | None) -> Findings:
         """The zero is kept when it is nearer than the nearest so far."""
         if zero is None or not zero.t < self.upper:
             return self

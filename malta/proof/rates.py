@@ -36,12 +36,12 @@ from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.processes import on_one_thread
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.robust import law_of
-from malta.work import is_past, metered, work_limit
+from malta.work import count_work, is_past, work_limit
 
-CALLER = "varying"
+CALLER = "prove_rate"
 BITS = 128
-NEAR = 1e-3  # relative size of what rounding may leave of units
-LEAST = 2.0**-12  # part of the interval that one piece has at least
+UNIT_TOLERANCE = 1e-3  # relative size of what rounding may leave of units
+MIN_PIECE_SHARE = 2.0**-12  # part of the interval that one piece has at least
 SHARES = (0.8, 0.5, 0.2)  # of the slowest decay, which V has at the nodes
 WORK = 60.0  # units of work, of a search
 PIECE = 7e-7  # work of a piece, times the cube of its states
@@ -161,7 +161,7 @@ class _Piece(NamedTuple):
 
 
 @on_one_thread
-def varying(
+def prove_rate(
     system: UncertainSystem,
     compensator: Compensator | Any,
     name: str,
@@ -192,7 +192,7 @@ def varying(
     >>> damped = lambda k: ([[0, 1], [-k, -1]], [[0], [1]], [[1, 0]])
     >>> spring = malta.uncertain(damped, {"k": 2.0})
     >>> law = control.ss([], [], [], [[-1.0]], 0.01)  # u = -y: a stiffness from 2 to 4
-    >>> found = malta.proof.varying(spring, law, "k", (1.0, 3.0))
+    >>> found = malta.proof.prove_rate(spring, law, "k", (1.0, 3.0))
     >>> found.rate > 2.0, found.rate < 3.0  # N/m/s
     (True, True)
     """
@@ -209,7 +209,7 @@ def rate_bound(loop: MovingLoop, name: str, time: float | None) -> RateBound:
     """The bound of a loop over all its cells, in a search of WORK, or of a time (s)."""
     low, high, begun = loop.cells[0].low, loop.cells[-1].high, clock.monotonic()
     work = WORK if time is None else math.inf
-    with precision(BITS), metered(work, time), work_limit(work):
+    with precision(BITS), count_work(work, time), work_limit(work):
         reason = "the loop is unstable at a frozen value"
         for share in SHARES:
             found = _pieces(loop, low, high, share)
@@ -241,7 +241,7 @@ def _loop_of(system: UncertainSystem, law: Compensator, name: str) -> _Loop:
         raise InputError(CALLER, "system", f"an A that is not affine in {name}", "A_0 + p A_1")
     parts = ca.Function("parts", [q], [*made, ca.reshape(slope, made[0].shape)])(0)
     A, B, C, A1 = (np.array(ca.DM(M)) for M in parts)
-    plain = _closed(A, A1, B, C, law)
+    plain = _close_loop(A, A1, B, C, law)
     with np.errstate(all="ignore"):
         _, (t, _) = linalg.matrix_balance(
             middle(plain.at(float(system.nominal[system.names.index(name)]))), permute=False, separate=True
@@ -250,10 +250,10 @@ def _loop_of(system: UncertainSystem, law: Compensator, name: str) -> _Loop:
     x, u, s = t[:n], 2.0 ** np.round(np.log2(t[n:own]).mean()) if own > n else 1.0, t[own:]
     # Powers of two: exact.
     law = replace(law, A=law.A * s / s[:, None], B=law.B / s[:, None], C=law.C * s / u, D=law.D / u)
-    return _closed(A * x / x[:, None], A1 * x / x[:, None], B * u / x[:, None], C * x, law)
+    return _close_loop(A * x / x[:, None], A1 * x / x[:, None], B * u / x[:, None], C * x, law)
 
 
-def _closed(A: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray, law: Compensator) -> _Loop:
+def _close_loop(A: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray, law: Compensator) -> _Loop:
     """States: those of the plant, stored inputs from the oldest, those of the law."""
     (n, m), k, d = B.shape, len(law.A), law.delay
     size, own = n + m * d + k, n + m * d
@@ -367,7 +367,7 @@ def _pieces(loop: MovingLoop, low: float, high: float, share: float) -> tuple[li
         piece = _prove(norms, g, (a, b), node(cell, a), node(cell, b))
         if piece is not None:
             found.append(piece)
-        elif b - a < LEAST * (high - low):
+        elif b - a < MIN_PIECE_SHARE * (high - low):
             return f"no piece was proven at {a:g}"
         else:
             stack += [(cell, (a + b) / 2, b), (cell, a, (a + b) / 2)]
@@ -430,7 +430,7 @@ def _prove(
         return None
     wide = math.sqrt((1 + h * d / 2) / (1 - h * d / 2)) * (1 + 1e-9)  # of norms within the piece
     off = _size(X.transpose() * P * X - ball(np.eye(P.nrows())))
-    if off > NEAR:
+    if off > UNIT_TOLERANCE:
         return None
     near = math.sqrt((1 + off) / (1 - off)) * (1 + 1e-9)  # norms in P over those in X
     try:

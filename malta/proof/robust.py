@@ -26,7 +26,7 @@ from scipy import linalg
 
 from malta.arguments import by_name, describe, interval, is_pair, number, positive
 from malta.errors import InputError
-from malta.linear.expressions import NotAnalytic, Program, exact, program
+from malta.linear.expressions import MatrixProgram, NotAnalytic, exact, program
 from malta.linear.rational import Ratio, Symbolic, product
 from malta.linear.systems import compensator_of, polynomial_of
 from malta.linear.uncertain import Compensator, UncertainSystem
@@ -38,7 +38,7 @@ from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.problem import CoefficientPolynomial, OfLoop, OfSeveral, Problem, is_nominal_stable
 from malta.proof.question import Question, Standing
 from malta.proof.search import search
-from malta.work import AGAIN, MORE, Budget, in_rounds, is_past
+from malta.work import GROWTH, MORE_WORK, Budget, in_rounds, is_past
 
 # A loop in the coordinates in which its parameters act apart: x = S x', exactly, found from how the parameters enter.
 #
@@ -49,32 +49,32 @@ from malta.work import AGAIN, MORE, Budget, in_rounds, is_past
 # All numbers are rationals, so that the loop is the same and only entries that cancel are gone.
 
 
-LARGEST = 16  # states
+MAX_LAURENT_STATES = 16  # states
 ROUNDING = 1e-11  # relative size of what rounding may leave of terms that cancel
-APART = 1e-6  # singular value of independent vectors of size one, at least
-FEWER = 0.8  # share of the terms from which on another basis is worth it
+MIN_SINGULAR = 1e-6  # singular value of independent vectors of size one, at least
+MAX_TERM_SHARE = 0.8  # share of the terms from which on another basis is worth it
 
 
-_KNOWN: WeakKeyDictionary[Program, Program | None] = WeakKeyDictionary()
+_KNOWN_PROGRAMS: WeakKeyDictionary[MatrixProgram, MatrixProgram | None] = WeakKeyDictionary()
 
 
 def in_plain_basis(loop: UncertainLoop) -> UncertainLoop:
     """The loop in the basis in which its matrices have clearly fewer terms; the loop itself when none is found."""
-    if loop.direct or not 1 < loop.states <= LARGEST:
+    if loop.direct or not 1 < loop.states <= MAX_LAURENT_STATES:
         return loop
     s = loop.symbolic
     if s is None or s.atoms:
         return loop
-    if loop.program not in _KNOWN:  # laws change, the system stays
+    if loop.program not in _KNOWN_PROGRAMS:  # laws change, the system stays
         try:
-            _KNOWN[loop.program] = _transformed(loop, s)
+            _KNOWN_PROGRAMS[loop.program] = _transform(loop, s)
         except (ZeroDivisionError, NotAnalytic, np.linalg.LinAlgError):
-            _KNOWN[loop.program] = None
-    found = _KNOWN[loop.program]
+            _KNOWN_PROGRAMS[loop.program] = None
+    found = _KNOWN_PROGRAMS[loop.program]
     return loop if found is None else UncertainLoop(loop.system, loop.law, found)
 
 
-def _transformed(loop: UncertainLoop, s: Symbolic) -> Program | None:
+def _transform(loop: UncertainLoop, s: Symbolic) -> MatrixProgram | None:
     n, E_0 = loop.states, _identity(loop.states)
     nominal = [exact(x) for x in loop.system.nominal.tolist()]
     if loop.descriptor:
@@ -93,7 +93,7 @@ def _transformed(loop: UncertainLoop, s: Symbolic) -> Program | None:
     ]
     if loop.descriptor:
         made += [{}, product(left, product(s.entries[E], right))]
-    if _terms(made, nominal) > FEWER * _terms(s.entries, nominal):
+    if _terms(made, nominal) > MAX_TERM_SHARE * _terms(s.entries, nominal):
         return None
     return _program(made, loop.program)
 
@@ -176,7 +176,7 @@ def _extend(vectors: list[list[Any]], more: list[list[Any]]) -> None:
             continue
         unit = [c / size for c in x]
         values = np.array([[float(arb(c)) for c in y] for y in (*vectors, unit)])
-        if np.linalg.svd(values, compute_uv=False)[-1] > APART and len(values) <= values.shape[1]:
+        if np.linalg.svd(values, compute_uv=False)[-1] > MIN_SINGULAR and len(values) <= values.shape[1]:
             vectors.append(unit)
 
 
@@ -201,7 +201,7 @@ def _terms(matrices: Any, p: list[Any]) -> int:
     return count
 
 
-def _program(matrices: list[dict[tuple[int, int], Ratio]], old: Program) -> Program:
+def _program(matrices: list[dict[tuple[int, int], Ratio]], old: MatrixProgram) -> MatrixProgram:
     """The instructions of matrices of rational functions."""
     steps: list[tuple[str, int, tuple[int, ...], Any]] = [("input", i, (), 0.0) for i in range(old.inputs)]
 
@@ -228,23 +228,23 @@ def _program(matrices: list[dict[tuple[int, int], Ratio]], old: Program) -> Prog
             top = polynomial(r.num)
             made.append((i, j, top if r.den is None else step("div", top, polynomial(r.den))))
         entries.append(tuple(made))
-    return Program(tuple(steps), tuple(entries), old.shapes, old.inputs)
+    return MatrixProgram(tuple(steps), tuple(entries), old.shapes, old.inputs)
 
 
 TOLERANCE = 9e-4  # relative distance between the proven bound and the witness
-UNSTABLE = "the nominal loop is unstable"
+UNSTABLE_TEXT = "the nominal loop is unstable"
 PLACES = 64  # nominal places of a box whose poles are computed at once
 
 
 @on_one_thread
-class Uncertain(Protocol):
+class ParametricLoop(Protocol):
     """What gives itself as a system and a law in parameters by name, as the loop of a machine does."""
 
     def uncertain(self, names: Sequence[str]) -> tuple[UncertainSystem, Compensator]: ...
 
 
 def robust_margin(
-    system: UncertainSystem | Uncertain,
+    system: UncertainSystem | ParametricLoop,
     compensator: Compensator | Any = None,
     ranges: Ranges | None = None,
     over: Mapping[str, tuple[float, float]] | None = None,
@@ -287,7 +287,7 @@ def robust_margin(
     >>> f"{found.lower:.2f} {found.upper:.2f} {found.witness['k']:.2f}"
     '5.00 5.00 2.00'
     """
-    effort = Effort(tolerance, time, budget, progress)
+    effort = ProofEffort(tolerance, time, budget, progress)
     over = {} if over is None else over
     named, law, ranges = _either_form(system, compensator, ranges, over)
     box = box_of(named.names, named.nominal, named.limits, ranges, over)
@@ -295,7 +295,7 @@ def robust_margin(
 
 
 def _either_form(
-    system: UncertainSystem | Uncertain, compensator: Any, ranges: Ranges | None, over: Mapping[str, Any]
+    system: UncertainSystem | ParametricLoop, compensator: Any, ranges: Ranges | None, over: Mapping[str, Any]
 ) -> tuple[UncertainSystem, Compensator, Ranges]:
     """System, law and ranges of robust_margin(system, compensator, ranges) or of robust_margin(loop, ranges)."""
     if isinstance(system, UncertainSystem):
@@ -329,7 +329,7 @@ def common_margin(
 
     Raises InputError for loops that differ in parameters or sample times.
     """
-    effort = Effort(tolerance, None, budget, progress, "margin")
+    effort = ProofEffort(tolerance, None, budget, progress, "margin")
     loops = [(system, law_of(system, law, "margin")) for system, law in _pairs(places)]
     first, law = loops[0]
     for system, other in loops[1:]:
@@ -380,7 +380,7 @@ def margin_at(
             named = dict(zip(box.names, p.tolist(), strict=True))
             moved = dict(zip(box.names, (p - box.nominal).tolist(), strict=True))
             return Margin(wider.lower, t, frequency, named, moved, wider.sensitivity, (), 0.0)
-    return margin_of(problem, box, Effort(tolerance))
+    return margin_of(problem, box, ProofEffort(tolerance))
 
 
 def law_of(system: UncertainSystem, compensator: Any, caller: str = "robust_margin") -> Compensator:
@@ -435,7 +435,7 @@ def margin_of_polynomial(
     '7.00, 7.00'
     """
     caller = "margin_of_polynomial"
-    effort = Effort(tolerance, time, None, progress, caller)
+    effort = ProofEffort(tolerance, time, None, progress, caller)
     outside = by_name(caller, "over", {} if over is None else over, '{"k": (1, 2)}')
     values = _middles({**by_name(caller, "box", box, '{"k": (1, 2)}'), **outside}, nominal)
     names = tuple(values)
@@ -487,7 +487,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 @dataclass(frozen=True)
-class Effort:
+class ProofEffort:
     """The tolerance of a search and what it may take. Raises InputError for an invalid tolerance or time."""
 
     tolerance: float | None = None
@@ -509,7 +509,7 @@ class Effort:
         return budget if self.time is None else replace(budget, time=self.time)
 
 
-def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
+def margin_of(problem: Problem, box: Box, effort: ProofEffort) -> Margin:
     """The margin of a problem over a box; zero when the nominal loop is unstable. Raises Interrupted on Ctrl-C."""
     begun, standing = clock.monotonic(), Standing(effort.progress)
     if not box.most > 0:
@@ -518,19 +518,19 @@ def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
     try:
         found, ended = in_rounds(effort.limits, ask, rank_of)
     except KeyboardInterrupt as stop:
-        raise Interrupted(_interrupted(problem, box, standing, clock.monotonic() - begun)) from stop
-    is_open = bool(found.reason) and found.reason not in (UNSTABLE, problem.traits.approximate)
+        raise Interrupted(_interrupted_margin(problem, box, standing, clock.monotonic() - begun)) from stop
+    is_open = bool(found.reason) and found.reason not in (UNSTABLE_TEXT, problem.traits.approximate)
     reason = ended.explain(found.reason) if is_open else found.reason
     return replace(found, seconds=clock.monotonic() - begun, work=ended.work, reason=reason)
 
 
 def rank_of(found: Margin) -> float:
     """The proven bound, infinite where nothing is open."""
-    return found.lower or 0.0 if found.reason and found.reason != UNSTABLE else math.inf
+    return found.lower or 0.0 if found.reason and found.reason != UNSTABLE_TEXT else math.inf
 
 
 def _ask(
-    problem: Problem, box: Box, effort: Effort, standing: Standing, work: float, patient: bool
+    problem: Problem, box: Box, effort: ProofEffort, standing: Standing, work: float, patient: bool
 ) -> Margin:
     """The margin that is found with some work."""
     places = box.nominal_places()
@@ -540,7 +540,7 @@ def _ask(
         unstable = problem.instability(places[k : k + PLACES]) >= 0
         if unstable.any():
             where = dict(zip(box.names, places[k + int(unstable.argmax())].tolist(), strict=True))
-            return Margin(0.0, 0.0, None, where, {}, {}, (), 0.0, UNSTABLE)
+            return Margin(0.0, 0.0, None, where, {}, {}, (), 0.0, UNSTABLE_TEXT)
     if why := problem.traits.approximate:
         upper, frequency, witness = first_loss(problem, box, box.limit)
         named = None if witness is None else dict(zip(box.names, witness.tolist(), strict=True))
@@ -551,9 +551,9 @@ def _ask(
         return search(question)
 
 
-def _interrupted(problem: Problem, box: Box, standing: Standing, seconds: float) -> Margin:
+def _interrupted_margin(problem: Problem, box: Box, standing: Standing, seconds: float) -> Margin:
     """What is known of a margin whose search was interrupted."""
     lower = standing.lower if standing.lower > 0 and is_nominal_stable(problem, box) else None
     done = standing.work
-    reason = f"interrupted after {done:.3g} units of work{standing.where(problem)}; {AGAIN * done:.3g} {MORE}"
+    reason = f"interrupted after {done:.3g} units of work{standing.where(problem)}; {GROWTH * done:.3g} {MORE_WORK}"
     return Margin(lower, standing.upper, None, None, {}, {}, (), seconds, reason, "", done)

@@ -13,31 +13,31 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from malta.proof.exclusion import Part, advance, start
+from malta.proof.exclusion import BoxPart, advance, start
 from malta.proof.exclusion.hurwitz import raise_bound, signs_over
 from malta.proof.exclusion.witness import from_cell
 from malta.proof.polynomial.enclosure import Unproven
 from malta.proof.question import Findings, Question
-from malta.work import WorkUp, is_past, spent, work_limit
+from malta.work import WorkUp, is_past, work_done, work_limit
 
 if TYPE_CHECKING:
     from malta.proof.question import Searches
 
-CHEAP = 4000  # cells below which the proof is brought closer to the witness than the tolerance
-FINEST = 3e-7  # how close, relative
+MAX_CHEAP_CELLS = 4000  # cells below which the proof is brought closer to the witness than the tolerance
+FINEST_TOLERANCE = 3e-7  # how close, relative
 PATIENCE = 20_000  # cells without progress after which the proof is given up
-HARD = 4000  # cells after which smaller boxes are proven first
-FEW = 100  # cells of many parameters, of which each may be dear, before multipliers take their turn
-CHEAP_NODES = 128_000  # coefficients of polynomials on these cells, where each has few
+HARD_CELLS = 4000  # cells after which smaller boxes are proven first
+FEW_CELLS = 100  # cells of many parameters, of which each may be dear, before multipliers take their turn
+MAX_CHEAP_NODES = 128_000  # coefficients of polynomials on these cells, where each has few
 LEVELS = 5  # of smaller boxes, each half of the next
-SMALLER = 4  # boxes, each half of the last one, that Hurwitz's determinant is tried on
-LAST = 20.0  # work of a proof that has no other limit, or comes after what cells have proven
+SMALLER_BOXES = 4  # boxes, each half of the last one, that Hurwitz's determinant is tried on
+LAST_WORK = 20.0  # work of a proof that has no other limit, or comes after what cells have proven
 SIGNS = 0.5  # share of the work that is left for Hurwitz's determinant where cells do not settle the question
 TURN, TURN_AFTER = 0.5, 4.0  # share for multipliers in their turn, and how many times what was spent before
 REST = 0.9  # their share where they have proven more than the cells
-ALONE = 0.8  # their share where there are no families
+MULTIPLIER_SHARE = 0.8  # their share where there are no families
 
-BOUNDED = "what the position does is bounded, not followed"
+BOUNDED_TEXT = "what the position does is bounded, not followed"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Attempt:
     """
 
     known: Findings
-    parts: Sequence[Part]
+    parts: Sequence[BoxPart]
     reach: float
     goal: float
     lower: float = 0.0
@@ -75,7 +75,7 @@ class Route:
 
 
 def prove_over(
-    q: Question, known: Findings, parts: Sequence[Part], reach: float
+    q: Question, known: Findings, parts: Sequence[BoxPart], reach: float
 ) -> tuple[Findings, float, Searches]:
     """What is known when all routes were tried, and the largest t for which cells exclude zero, with these cells."""
     a = Attempt(known, parts, reach, known.target(reach))
@@ -107,7 +107,7 @@ def _by_cells(q: Question, a: Attempt) -> Attempt:
     known, smaller, top = a.known, a.smaller, a.known.target(a.reach)
     for level in range(0 if known.is_near(a.lower, q) else LEVELS, 0, -1):
         t = top * 0.5**level
-        known, found, small = _advance(q, known, _start(a.parts, t, t), t, HARD, rest=0.3)
+        known, found, small = _advance(q, known, _start(a.parts, t, t), t, HARD_CELLS, rest=0.3)
         if found > smaller[0]:
             smaller = found, small
         if _is_open(small) or q.is_late():
@@ -133,7 +133,7 @@ def _is_last_due(q: Question, a: Attempt) -> bool:
 
 
 def _at_last(q: Question, a: Attempt) -> Attempt:
-    most = max(LAST, 0.5 * spent()) if a.lower > 0 and not q.patient else math.inf
+    most = max(LAST_WORK, 0.5 * work_done()) if a.lower > 0 and not q.patient else math.inf
     target = min(q.box.limit, a.goal * (1 - a.known.tolerance))
     return replace(a, known=_multiply(q, a.known, target, 1.0, most))
 
@@ -148,7 +148,7 @@ ROUTES = (
     Route(
         "multipliers in their turn",
         lambda q, a: a.is_hard and q.is_many,
-        lambda q, a: _by_multipliers(q, a, TURN, TURN_AFTER * spent()),
+        lambda q, a: _by_multipliers(q, a, TURN, TURN_AFTER * work_done()),
     ),
     Route("Hurwitz's determinant", lambda q, a: a.is_hard and not a.is_covered(q), _by_signs),
     Route(
@@ -159,22 +159,22 @@ ROUTES = (
     Route("cells", _are_cells_due, _by_cells),
 )
 ROUTES_WITHOUT_FAMILIES = (
-    Route("multipliers", lambda q, _a: q.is_many, lambda q, a: _alone(q, a, ALONE)),
+    Route("multipliers", lambda q, _a: q.is_many, lambda q, a: _alone(q, a, MULTIPLIER_SHARE)),
     Route("Hurwitz's determinant", lambda q, a: not a.known.is_settled(q), _by_signs),
     Route("multipliers", lambda q, a: not a.known.is_settled(q), lambda q, a: _alone(q, a, 1.0)),
 )
 LAST_ROUTES = (Route("multipliers at last", _is_last_due, _at_last),)
 
 
-def _first_cells(q: Question, parts: Sequence[Part]) -> int:
+def _first_cells(q: Question, parts: Sequence[BoxPart]) -> int:
     """The number of cells after which other proofs take their turn."""
     nodes = max((part.family.values.shape[1] for part in parts), default=1)
-    return min(HARD, max(FEW, CHEAP_NODES // nodes)) if q.is_many else HARD
+    return min(HARD_CELLS, max(FEW_CELLS, MAX_CHEAP_NODES // nodes)) if q.is_many else HARD_CELLS
 
 
 def _multiply(q: Question, known: Findings, target: float, share: float, most: float = math.inf) -> Findings:
     """Raise the proven bound by multipliers, for a share of the work that is left, and at most `most`."""
-    now = spent()
+    now = work_done()
     if known.structured is None or not now < q.end:
         return known
     until = now + min(share * (q.end - now), most)
@@ -190,12 +190,12 @@ def _compare_signs(q: Question, known: Findings, proven: float) -> Findings:
     """
     if known.signs is not None or q.problem.traits.is_bounded:
         return known
-    now = spent()
-    until = now + SIGNS * (q.end - now) if math.isfinite(q.end) else now + LAST
+    now = work_done()
+    until = now + SIGNS * (q.end - now) if math.isfinite(q.end) else now + LAST_WORK
     if proven >= min(known.upper, q.box.limit) * (1 - q.tolerance):
         until = min(until, now + SIGNS * now)
     t, signs = min(q.box.limit, 1.05 * known.upper), None
-    for _ in range(SMALLER):
+    for _ in range(SMALLER_BOXES):
         with suppress(Unproven, WorkUp), work_limit(until):
             signs = signs_over(q.problem, q.box, t)
             break
@@ -204,12 +204,12 @@ def _compare_signs(q: Question, known: Findings, proven: float) -> Findings:
         return known
     with suppress(WorkUp), work_limit(until):
         if not q.fixed:
-            raise_bound(signs, FINEST, CHEAP)
+            raise_bound(signs, FINEST_TOLERANCE, MAX_CHEAP_CELLS)
         raise_bound(signs, q.tolerance, q.most_cells)
     return replace(known, signs=signs, upper=min(known.upper, signs.upper)).report(q, signs.lower)
 
 
-def _start(parts: Sequence[Part], target: float, until: float) -> Searches:
+def _start(parts: Sequence[BoxPart], target: float, until: float) -> Searches:
     return [
         (part, replace(start(part.family, part.growth, target, until), hasty=True, around=part.around))
         for part in parts
@@ -234,7 +234,7 @@ def _advance(
     It ends when all cells are excluded, after `most` cells, or after the share `rest` of the remaining work.
     """
     tried, stood, since, searches = 0, -1.0, 0, list(searches)
-    now = spent()
+    now = work_done()
     until = q.end if math.isinf(q.end) else now + rest * (q.end - now)
     while True:
         lower = min((s.lower for _, s in searches), default=reach)
@@ -243,7 +243,7 @@ def _advance(
         count = sum(s.count for _, s in searches)
         if lower > stood * (1 + known.tolerance / 10):
             stood, since = lower, count
-        patience = CHEAP if known.tolerance != q.tolerance else math.inf if q.patient else PATIENCE
+        patience = MAX_CHEAP_CELLS if known.tolerance != q.tolerance else math.inf if q.patient else PATIENCE
         over = is_past(until) or count >= most or count - since > patience
         if over or _is_blocked(searches):
             return known, lower, searches
@@ -252,7 +252,7 @@ def _advance(
         if s.finished:
             if rest < 1 or not _is_cheap(q, known, count):
                 return known, lower, searches
-            known = replace(known, tolerance=FINEST)
+            known = replace(known, tolerance=FINEST_TOLERANCE)
             searches = [(own, replace(other, target=known.target(reach))) for own, other in searches]
             continue
         s = advance(s)
@@ -270,7 +270,9 @@ def _advance(
 
 def _is_cheap(q: Question, known: Findings, count: int) -> bool:
     """Whether a proof took so little that its tolerance is lowered, to which the caller gave none."""
-    return not (q.fixed or count > CHEAP or known.tolerance <= FINEST or math.isinf(known.upper))
+    return not (
+        q.fixed or count > MAX_CHEAP_CELLS or known.tolerance <= FINEST_TOLERANCE or math.isinf(known.upper)
+    )
 
 
 def _explain_rest(q: Question, known: Findings, searches: Searches) -> Findings:
@@ -278,7 +280,7 @@ def _explain_rest(q: Question, known: Findings, searches: Searches) -> Findings:
     if known.is_near(worst.lower, q):
         return known
     if q.problem.traits.is_bounded:
-        return known.because(BOUNDED)
+        return known.because(BOUNDED_TEXT)
     count = sum(s.count for _, s in searches)
     why = "not settled within the work" if q.is_late() else f"not settled within {count} cells"
     return known.because(why + replace(q.standing, searches=searches).where(q.problem))

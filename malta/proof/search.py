@@ -15,16 +15,16 @@ from malta.bound import at_least
 from malta.errors import CheckError
 from malta.linear.expressions import NotAnalytic
 from malta.proof.box import EDGE, Box
-from malta.proof.exclusion import Part, Search, cut, growth_over, merge_twins
+from malta.proof.exclusion import BoxPart, CellSearch, cut, growth_over, merge_twins
 from malta.proof.exclusion.witness import nearest, starts
 from malta.proof.loss import confirm, contributions, corner_loss, first_loss
 from malta.proof.margin import Certificate, Margin
-from malta.proof.multipliers.structured import Proof, Structured, rows_of
+from malta.proof.multipliers.structured import MultiplierProof, Structured, rows_of
 from malta.proof.polynomial.enclosure import NO_COEFFICIENTS, Unproven, family_over
 from malta.proof.problem import Problem, is_nominal_stable
 from malta.proof.question import Findings, Question
 from malta.proof.routes import LAST_ROUTES, Attempt, follow, prove_over
-from malta.work import WorkUp, is_past, is_stopped, refuse, spent, work_limit
+from malta.work import WorkUp, is_past, is_stopped, refuse, work_done, work_limit
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
     from malta.proof.polynomial.enclosure import Polynomial
     from malta.proof.question import Searches
 
-FIRST = 3.97  # the first box that is searched, in multiples of the modelled one
-BRIEF, SMALL = 0.5, 0.015  # work, and share of it, that a wider box may take at least
-NEAR = 1.005  # box of couplings, in multiples of where axes by themselves are lost
+FIRST_BOX = 3.97  # the first box that is searched, in multiples of the modelled one
+MIN_WIDER_WORK, MIN_WIDER_SHARE = 0.5, 0.015  # work, and share of it, that a wider box may take at least
+COUPLED_BOX = 1.005  # box of couplings, in multiples of where axes by themselves are lost
 LOOK = 0.2  # share of the work for a first look at the poles of corners
-LOOK_AGAIN = 0.3  # share of what is left for another, or GRACE and LATE of the work beyond its end
-GRACE, LATE = 0.4, 0.1  # work, share
+SECOND_LOOK = 0.3  # share of what is left for another, or GRACE and LATE_SHARE of the work beyond its end
+GRACE, LATE_SHARE = 0.4, 0.1  # work, share
 
 
 def search(q: Question) -> Margin:
@@ -62,32 +62,34 @@ def search(q: Question) -> Margin:
 # witness
 
 
-def _families(q: Question, known: Findings, until: float) -> tuple[Findings, list[Part], float]:
+def _families(q: Question, known: Findings, until: float) -> tuple[Findings, list[BoxPart], float]:
     """The families over a box that holds the nearest witness, or over the largest box that can be enclosed.
 
     Returns the parts of the box and its size t.
     """
-    parts, reach, done, refused = list[Part](), _first_reach(q), 0.0, math.inf
-    why, begun = "", spent()
+    parts, reach, done, refused = list[BoxPart](), _first_reach(q), 0.0, math.inf
+    why, begun = "", work_done()
     while True:
-        now = spent()
+        now = work_done()
         taken = now - begun
         hurried = why == NO_COEFFICIENTS  # a smaller box takes as much
         last = now + (1.0 if hurried else 0.3) * (q.end - now)
-        if done or FIRST < reach >= q.box.limit:
-            last = min(last, now + max(BRIEF, SMALL * q.end, 2 * taken))
+        if done or FIRST_BOX < reach >= q.box.limit:
+            last = min(last, now + max(MIN_WIDER_WORK, MIN_WIDER_SHARE * q.end, 2 * taken))
         try:
             parts = parts_over(q.problem, q.box, reach, min(until, last))
         except Unproven as error:
             refused, why = reach, str(error)
             if is_past(until) or reach < 1e-3 or (done and taken > q.dear):
                 break
-            reach = done + 0.6 * (reach - done) if done else FIRST if reach > 2 * FIRST else 0.5 * reach
+            reach = (
+                done + 0.6 * (reach - done) if done else FIRST_BOX if reach > 2 * FIRST_BOX else 0.5 * reach
+            )
         else:
             done = reach
             for part in parts:
                 known = _descend(known, part, until)
-            taken = spent() - begun
+            taken = work_done() - begun
             if known.upper <= done or done >= q.box.limit or taken > min(0.3 * (until - begun), 4 * q.dear):
                 break
             wanted = (6 if taken < q.dear else 1.5) * done
@@ -101,15 +103,15 @@ def _families(q: Question, known: Findings, until: float) -> tuple[Findings, lis
         )
         if why in ("", NO_COEFFICIENTS):
             refuse()
-    room = NEAR if q.problem.traits.is_bounded else 1.05  # couplings grow with the box
-    if known.upper < done / (3 if room > NEAR else room) and not is_past(until):
+    room = COUPLED_BOX if q.problem.traits.is_bounded else 1.05  # couplings grow with the box
+    if known.upper < done / (3 if room > COUPLED_BOX else room) and not is_past(until):
         with suppress(Unproven):  # narrower families over a smaller box; the larger ones remain valid
             parts = parts_over(q.problem, q.box, room * known.upper, until)
             done = room * known.upper
     return known, parts, done
 
 
-def parts_over(problem: Problem, box: Box, reach: float, last: float) -> list[Part]:
+def parts_over(problem: Problem, box: Box, reach: float, last: float) -> list[BoxPart]:
     """The families of all groups over box(reach), cut into parts where one expansion does not do.
 
     last : of the work, at which the search gives up
@@ -117,7 +119,7 @@ def parts_over(problem: Problem, box: Box, reach: float, last: float) -> list[Pa
     Raises Unproven when a matrix has no value on the box, or when the work is up.
     """
     sides = box.sides(reach)
-    parts: list[Part] = []
+    parts: list[BoxPart] = []
     try:
         with work_limit(last):
             if (enclose := problem.traits.enclose) is not None:
@@ -131,24 +133,24 @@ def parts_over(problem: Problem, box: Box, reach: float, last: float) -> list[Pa
     return merge_twins(parts)
 
 
-def _part_over(f: Polynomial, moves: tuple[Any, ...], box: Box, sides: FloatArray) -> list[Part]:
-    return [Part(f, sides, family_over(f, sides, moves), growth_over(sides, f.inverted, box))]
+def _part_over(f: Polynomial, moves: tuple[Any, ...], box: Box, sides: FloatArray) -> list[BoxPart]:
+    return [BoxPart(f, sides, family_over(f, sides, moves), growth_over(sides, f.inverted, box))]
 
 
 def _first_reach(q: Question) -> float:
     """The size of the first box: a little beyond the loss by the poles of its corners.
 
-    Of several parameters at most FIRST: families of a larger box are dear, and the nearest loss may be no corner.
+    Of several parameters at most FIRST_BOX: families of a larger box are dear, and the nearest loss may be no corner.
     """
     one = np.count_nonzero(q.box.down) + np.count_nonzero(q.box.up) == 1
-    most = q.box.limit if one else min(q.box.limit, FIRST)
-    now = spent()
+    most = q.box.limit if one else min(q.box.limit, FIRST_BOX)
+    now = work_done()
     with work_limit(now + LOOK * (q.end - now)):
         t = corner_loss(q.problem, q.box, most)
     return most if t is None else min(most, 1.02 * t)
 
 
-def _descend(known: Findings, part: Part, until: float) -> Findings:
+def _descend(known: Findings, part: BoxPart, until: float) -> Findings:
     misses = 0
     for distance, branch, x, u in starts(part.family, part.growth):
         if is_past(until) or misses > 4 or (misses > 1 and distance > 3 * known.upper):
@@ -162,7 +164,7 @@ def _descend(known: Findings, part: Part, until: float) -> Findings:
 
 
 def _prove_all(
-    q: Question, known: Findings, parts: list[Part], reach: float
+    q: Question, known: Findings, parts: list[BoxPart], reach: float
 ) -> tuple[Findings, float, Searches]:
     """The proven bound and the searches of the proof."""
     known, lower, searches = prove_over(q, known, parts, reach)
@@ -211,7 +213,9 @@ def _margin(q: Question, known: Findings, lower: float, loss: Loss, proofs: list
     )  # fmt: skip
 
 
-def _whole_proof(q: Question, count: int, lower: float, multipliers: Proof | None = None) -> Certificate:
+def _whole_proof(
+    q: Question, count: int, lower: float, multipliers: MultiplierProof | None = None
+) -> Certificate:
     axes, top = len(q.box.names), q.problem.physical(math.inf)
     return Certificate(
         count, (0.0, top), np.zeros((0, 3)), np.zeros((0, axes, 2)), np.zeros(0),
@@ -219,8 +223,8 @@ def _whole_proof(q: Question, count: int, lower: float, multipliers: Proof | Non
     )  # fmt: skip
 
 
-def _certificate(q: Question, part: Part, s: Search) -> Certificate:
-    cells, boxes, c = s.excluded(len(part.family.shape))
+def _certificate(q: Question, part: BoxPart, s: CellSearch) -> Certificate:
+    cells, boxes, c = s.excluded_cells(len(part.family.shape))
     top = q.problem.physical(math.inf)
     return Certificate(
         s.count, (0.0, top), cells, boxes, np.angle(c), part.sides, part.of.inverted, part.family.scale
@@ -242,10 +246,10 @@ def _loss(q: Question, known: Findings, reach: float) -> tuple[Findings, Loss]:
 
 
 def _first_loss(q: Question) -> Loss:
-    """The first loss along the box's diagonals that is found in LOOK_AGAIN of the work left, or a little more."""
-    now = spent()
-    late = GRACE if is_stopped() else GRACE + LATE * q.end
-    with work_limit(now + max(LOOK_AGAIN * (q.end - now), late)):
+    """The first loss along the box's diagonals that is found in SECOND_LOOK of the work left, or a little more."""
+    now = work_done()
+    late = GRACE if is_stopped() else GRACE + LATE_SHARE * q.end
+    with work_limit(now + max(SECOND_LOOK * (q.end - now), late)):
         return first_loss(q.problem, q.box, q.box.limit)
 
 

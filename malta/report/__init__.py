@@ -99,7 +99,7 @@ _OLD = {
     "stroke": "stroke_figure",
     "loads": "recovery_figure",
 }
-_INNER = {  # others, which are parts of what prints them
+_INNER_PLACES = {  # others, which are parts of what prints them
     "front_rows": "design",
     **dict.fromkeys(
         ("box_text", "rare_event_sentence", "run_text", "sensitivity_sentence", "tolerance_sentence"),
@@ -130,9 +130,9 @@ __all__, _load, __dir__ = contents(__name__, _NAMES)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _INNER:
+    if name in _INNER_PLACES:
         warnings.warn(f"malta.report.{name} goes without another name", DeprecationWarning, stacklevel=2)
-        return getattr(import_module(f"malta.report.tables.{_INNER[name]}"), name)
+        return getattr(import_module(f"malta.report.tables.{_INNER_PLACES[name]}"), name)
     if name not in _OLD:
         return _load(name)
     new = _OLD[name]

@@ -49,12 +49,12 @@ from malta.synthesis.spec import Spec
 from malta.synthesis.synthesize import synthesize
 from malta.units import in_unit
 
-ABOUT, NEAR = 0.05, 0.2  # largest relative differences from an "about", and "within x %"
+ABOUT_TOLERANCE, WITHIN_SHARE = 0.05, 0.2  # largest relative differences from an "about", and "within x %"
 # In front of a factor from a bound, below which one it has two decimals, and the largest one that is shown.
-FACTOR, BESIDE, FAR = ", x ", 1.1, 1000.0
+FACTOR, FACTOR_LIMIT, MAX_FACTOR = ", x ", 1.1, 1000.0
 ROUNDING = 1e-9
-OTHER = "of another design"  # no design of the ledger is meant to reproduce the row
-LQG_ONLY = "of an LQG only"
+OTHER_DESIGN_NOTE = "of another design"  # no design of the ledger is meant to reproduce the row
+LQG_NOTE = "of an LQG only"
 Word = Literal["reproduced", "near", "kept", "input", "differs", "partly", "beside", "ours", "other"]
 # Words of claims and the beginnings of verdicts that they stand for, the first that counts first; see word_of.
 WORDS: dict[Word, tuple[str, ...]] = {
@@ -68,7 +68,7 @@ WORDS: dict[Word, tuple[str, ...]] = {
 ZONE_NOTE = f"ISO 14839-3 zone {ZONES[0][1]} ends at {ZONES[0][0]:g}"
 
 
-class Claim(NamedTuple):
+class LedgerClaim(NamedTuple):
     """A line of the ledger."""
 
     subject: str
@@ -85,7 +85,7 @@ class Ledger:
     machine: str
     source: str  # the paper
     designs: tuple[str, ...]
-    claims: tuple[Claim, ...]
+    claims: tuple[LedgerClaim, ...]
     reproducing: tuple[str, ...] = ()  # those of the designs that are meant to reproduce the paper
 
     @property
@@ -189,7 +189,7 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
     A verdict follows from the numbers: "reproduced", "within x %", "not reproduced" with the reason, and others.
 
     specs : designs of one machine, from `malta.read_design`
-    published : what the paper prints, from `malta.model.published`
+    published : what the paper prints, from `malta.model.read_published`
     progress : called with the share of the work that is done, 0 to 1
 
     Returns a Ledger: for each claim the paper's figure, that of each design, and the verdict.
@@ -198,7 +198,7 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
 
     >>> import malta
     >>> spec = malta.read_design("design/halbach_pid.toml")
-    >>> found = malta.ledger([spec], malta.model.published("data/halbach.toml"))
+    >>> found = malta.ledger([spec], malta.model.read_published("data/halbach.toml"))
     >>> pitch = found.claims[0]
     >>> found.designs, pitch.subject, pitch.published, pitch.ours
     (('halbach_pid',), 'pitch, 2π/k [mm]', '29.778', ('29.778',))
@@ -222,35 +222,35 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
 
 def claim_of(
     row: Row, found: Sequence[Evidence], published: Mapping[str, Any], reproducing: Sequence[str]
-) -> Claim:
+) -> LedgerClaim:
     """The line of the ledger for a row and the evidence of all designs.
 
     reproducing : names of the designs that are meant to reproduce the paper
     """
     shown = [e for e in found if not row.of_lqg or e.spec.kind == "LQG"]
     figures = [row.value(e) if e in shown else math.nan for e in found]
-    ours = tuple(_shown(row, figure) for figure in figures)
+    ours = tuple(_show_figure(row, figure) for figure in figures)
     unit = {"1": "", "percent": " [%]", "um": " [µm]", "urad": " [µrad]", "deg": " [°]"}.get(
         row.unit, f" [{row.unit}]"
     )
     subject = row.subject + unit
     if row.published is None:
-        return Claim(subject, "–", ours, "ours" + (f": {row.note}" if row.note else ""), "ours")
-    target, printed = _printed(row, published)
+        return LedgerClaim(subject, "–", ours, "ours" + (f": {row.note}" if row.note else ""), "ours")
+    target, printed = _print_published(row, published)
     judged = [e for e in shown if _is_judged(row, e.spec.name, reproducing)]
     if not judged:
         note = f"; {row.note}" if row.note and shown else ""
-        return Claim(subject, printed, ours, (OTHER if shown else LQG_ONLY) + note, "other")
+        return LedgerClaim(subject, printed, ours, (OTHER_DESIGN_NOTE if shown else LQG_NOTE) + note, "other")
     own = [_in_unit(figure, row.unit) for figure, e in zip(figures, found, strict=True) if e in judged]
     built = [row.by_construction(e) if callable(row.by_construction) else row.by_construction for e in judged]
     words = [
         verdict_word(row, target, value, by_construction=one) for value, one in zip(own, built, strict=True)
     ]
     verdict = verdict_of(row, words, [e.spec.name for e in judged])
-    return Claim(subject, printed, ours, verdict, word_of(words))
+    return LedgerClaim(subject, printed, ours, verdict, word_of(words))
 
 
-def _printed(row: Row, published: Mapping[str, Any]) -> tuple[PublishedFigure, str]:
+def _print_published(row: Row, published: Mapping[str, Any]) -> tuple[PublishedFigure, str]:
     """What the paper prints, or what the row says that its text implies, in the row's unit; and shown so."""
     if isinstance(row.published, str):
         value, half, about = published_figure(published, row.published)
@@ -271,7 +271,7 @@ def _in_unit(figure: float, unit: str) -> float:
     return Chance(value, in_unit(figure.half, unit)) if isinstance(figure, Chance) else value
 
 
-def _shown(row: Row, figure: float) -> str:
+def _show_figure(row: Row, figure: float) -> str:
     """A figure in the row's form, with its interval if it is one of chance; "–" for none."""
     if math.isnan(figure):
         return "–"
@@ -334,7 +334,11 @@ def _comparison(row: Row, target: PublishedFigure, value: float) -> str:
     if bounded:
         return _distance(bound, value)
     off = abs(value / bound - 1) if bound else math.inf
-    return f"within {math.ceil((off - ROUNDING) * 100)} %" if off <= NEAR + ROUNDING else "not reproduced"
+    return (
+        f"within {math.ceil((off - ROUNDING) * 100)} %"
+        if off <= WITHIN_SHARE + ROUNDING
+        else "not reproduced"
+    )
 
 
 def is_reproduced(target: PublishedFigure, value: float) -> bool:
@@ -343,7 +347,7 @@ def is_reproduced(target: PublishedFigure, value: float) -> bool:
     >>> is_reproduced(PublishedFigure(25.67, 0.005), 24.70), is_reproduced(PublishedFigure(25.0, 0.5, True), 24.0)
     (False, True)
     """
-    half = max(target.half, ABOUT * abs(target.value) if target.about else 0.0)
+    half = max(target.half, ABOUT_TOLERANCE * abs(target.value) if target.about else 0.0)
     if isinstance(value, Chance):
         half += value.half
     return abs(value - target.value) <= half + ROUNDING * abs(target.value)
@@ -359,8 +363,8 @@ def _distance(bound: float, value: float) -> str:
         return "on the other side of zero" if bound else "other than zero"
     ratio = abs(value / bound)
     size = max(ratio, 1 / ratio) if ratio else math.inf
-    shown = f"> {FAR:.0f}" if size > FAR else f"{size:.0f}" if size >= 10 else f"{size:.1f}"
-    if size < BESIDE:  # "x 1.0" would say nothing
+    shown = f"> {MAX_FACTOR:.0f}" if size > MAX_FACTOR else f"{size:.0f}" if size >= 10 else f"{size:.1f}"
+    if size < FACTOR_LIMIT:  # "x 1.0" would say nothing
         shown = f"{math.ceil(100 * size - ROUNDING) / 100:.2f}"
     return f"{'larger' if ratio > 1 else 'smaller'}{FACTOR}{shown}"
 
@@ -413,7 +417,7 @@ TITLE = re.compile(r"^###? (?P<machine>\w+), .*\n", re.MULTILINE)
 COUNT = re.compile(r"(?<=<summary>)\d+(?= figures)")
 
 
-class Place(NamedTuple):
+class ClaimsPlace(NamedTuple):
     """A table of claims in a text: from `begin`, the end of its title, and `start` to `end`."""
 
     machine: str
@@ -423,7 +427,7 @@ class Place(NamedTuple):
     end: int
 
 
-def find_tables(text: str, name: str) -> list[Place]:
+def find_tables(text: str, name: str) -> list[ClaimsPlace]:
     """Find the tables of claims in a text. Raises InputError, naming the file, where there is none."""
     places, titles = [], list(TITLE.finditer(text))
     for header in HEADER.finditer(text):
@@ -433,7 +437,7 @@ def find_tables(text: str, name: str) -> list[Place]:
         rest = re.compile(r"(?:\|.*\n)+").match(text, header.start())
         assert rest is not None  # the header is such a line
         designs = tuple(re.findall(r"`(\w+)`", header["designs"]))
-        places.append(Place(above[-1]["machine"], designs, above[-1].end(), header.start(), rest.end()))
+        places.append(ClaimsPlace(above[-1]["machine"], designs, above[-1].end(), header.start(), rest.end()))
     if not places:
         raise InputError(name, "claims", "no table", 'a line "| claim | published | `DESIGN` | verdict |"')
     return places

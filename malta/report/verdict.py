@@ -32,8 +32,8 @@ LABEL = 14  # columns of a terminal, of the labels
 BLOCKS = "▁▂▃▄▅▆▇█"
 STYLES = {"good": "bold green", "near": "bold yellow", "bad": "bold red", "": "bold"}
 SIGNS = {"good": "✓", "near": "?", "bad": "✗", "": "–"}  # for readers without colours
-NEAREST = 2  # requirements that are named though they hold
-NAMED = 3  # failing requirements that are named
+SHOWN_NEAR_LIMITS = 2  # requirements that are named though they hold
+SHOWN_FAILURES = 3  # failing requirements that are named
 
 
 class Stair(NamedTuple):
@@ -136,11 +136,13 @@ def _requirements(outcomes: Sequence[Outcome]) -> VerdictLine:
     failed = sorted((one for one in asked if one.verdict == "fails"), key=lambda one: -one.ratio)
     undecided = [one for one in asked if one.verdict == "undecided"]
     held = sorted((one for one in asked if one.holds), key=lambda one: -one.ratio)
-    notes = [f"{one.words} {one.found_text}, asked {one.asked_text}" for one in (*failed, *undecided)][:NAMED]
+    notes = [f"{one.words} {one.found_text}, asked {one.asked_text}" for one in (*failed, *undecided)][
+        :SHOWN_FAILURES
+    ]
     more = len(failed) + len(undecided) - len(notes)
     notes += [f"{more} more"] if more else []
     if not failed and not undecided:
-        near = ", ".join(f"{one.words} {one.nearness}" for one in held[:NEAREST])
+        near = ", ".join(f"{one.words} {one.nearness}" for one in held[:SHOWN_NEAR_LIMITS])
         return VerdictLine("requirements", f"all {len(asked)} hold", f"nearest their limits: {near}", "good")
     parts = [f"{len(failed)} of {len(asked)} {'FAILS' if len(failed) == 1 else 'FAIL'}"] if failed else []
     parts += [f"{len(undecided)} undecided"] if undecided else []

@@ -12,7 +12,7 @@ from malta.gains.schema import GainFile
 from malta.model.data import MachineFile
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
-from malta.synthesis.design_file import LQG, NOT_BESIDE, ONLY_LQG
+from malta.synthesis.design_file import EXCLUDED_TABLES, LQG, LQG_ONLY_KEYS
 from malta.synthesis.design_tables import AnyBound, DesignFile, specification_record
 from malta.synthesis.requirements import requirements_for
 
@@ -75,7 +75,7 @@ def _drop_title(node: Schema) -> Schema:
     return {key: value for key, value in node.items() if key != "title"}
 
 
-PUBLISHED: Schema = {
+PUBLISHED_SCHEMA: Schema = {
     "type": "object",
     "description": "what the machine's paper prints under a name of its published figures",
     "properties": {"published": {"description": 'dotted name, as "table_II.state"'}},
@@ -114,10 +114,10 @@ def design_schema(plant: Plant | None = None) -> Schema:
     if plant is not None:
         _name_signals(schema, plant)
     schema = change_nodes(schema, _or_published)
-    schema["$defs"]["Published"] = PUBLISHED
+    schema["$defs"]["Published"] = PUBLISHED_SCHEMA
     laws: Schema = {"required": list(LQG)}
-    for law, others in NOT_BESIDE.items():
-        alone = {"properties": dict.fromkeys((*ONLY_LQG, *others), False)}
+    for law, others in EXCLUDED_TABLES.items():
+        alone = {"properties": dict.fromkeys((*LQG_ONLY_KEYS, *others), False)}
         laws = {"if": {"required": [law]}, "then": alone, "else": laws}
     return schema | {"allOf": [laws]}
 
@@ -185,7 +185,7 @@ def _or_published(node: Schema) -> Schema:
 
 
 # Tables of quantities, and quantities.
-NUMERIC = ("Quantity", "BoundsTable", "RecoveryTable", "Specification")
+NUMERIC_TABLES = ("Quantity", "BoundsTable", "RecoveryTable", "Specification")
 
 
 def _is_numeric(node: Schema) -> bool:
@@ -194,7 +194,9 @@ def _is_numeric(node: Schema) -> bool:
     if isinstance(node.get("additionalProperties"), dict):
         inside.append(node["additionalProperties"])
     name = str(node.get("$ref", "")).rpartition("/")[2]
-    return node.get("type") in ("number", "integer") or name in NUMERIC or any(map(_is_numeric, inside))
+    return (
+        node.get("type") in ("number", "integer") or name in NUMERIC_TABLES or any(map(_is_numeric, inside))
+    )
 
 
 def _alternative(node: Schema) -> Schema:
@@ -216,7 +218,7 @@ SCHEMAS: dict[str, Callable[[], Schema]] = {"gain": gain_schema, "design": desig
 ['data', 'design', 'gain']
 """
 
-OF_MACHINES: dict[str, Callable[[Plant], Schema]] = {"design": design_schema, "data": data_schema}
+MACHINE_SCHEMAS: dict[str, Callable[[Plant], Schema]] = {"design": design_schema, "data": data_schema}
 
 
 def schema(name: str, plant: Plant | None = None) -> Schema:
@@ -235,7 +237,7 @@ def schema(name: str, plant: Plant | None = None) -> Schema:
     >>> parameters["properties"]["m"]["unit"]
     'kg'
     """
-    known = SCHEMAS if plant is None else OF_MACHINES
+    known = SCHEMAS if plant is None else MACHINE_SCHEMAS
     if name not in known:
         raise InputError("schema", "name", repr(name), "one of " + ", ".join(known))
-    return SCHEMAS[name]() if plant is None else OF_MACHINES[name](plant)
+    return SCHEMAS[name]() if plant is None else MACHINE_SCHEMAS[name](plant)

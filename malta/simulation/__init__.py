@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from malta.contents import contents
 
 if TYPE_CHECKING:
-    from malta.simulation.engine.batch import replayed as replayed, simulate_many as simulate_many
+    from malta.simulation.engine.batch import replay_run as replay_run, simulate_many as simulate_many
     from malta.simulation.engine.digest import Batch as Batch
     from malta.simulation.experiments import Experiment as Experiment
     from malta.simulation.experiments.time_optimal import fastest_stroke as fastest_stroke
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from malta.simulation.trajectory import Trajectory as Trajectory, stroke_figures as stroke_figures
 
 _NAMES = {
-    "malta.simulation.engine.batch": "replayed simulate_many",
+    "malta.simulation.engine.batch": "replay_run simulate_many",
     "malta.simulation.engine.digest": "Batch",
     "malta.simulation.experiments": "Experiment",
     "malta.simulation.experiments.time_optimal": "fastest_stroke",
@@ -29,4 +29,4 @@ _NAMES = {
     "malta.simulation.scenario": "Fault",
     "malta.simulation.trajectory": "Trajectory stroke_figures",
 }
-__all__, __getattr__, __dir__ = contents(__name__, _NAMES)
+__all__, __getattr__, __dir__ = contents(__name__, _NAMES, {"replayed": "malta.simulation.replay_run"})

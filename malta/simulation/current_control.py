@@ -14,9 +14,9 @@ from malta.arrays import FloatArray
 from malta.model.actuator import Actuator
 from malta.model.data import plant_of
 from malta.model.equations import note
-from malta.model.plant import placed
+from malta.model.plant import place_states
 from malta.model.signals import Drive
-from malta.simulation.layout import Loop, Setup, Signals
+from malta.simulation.layout import LoopPlan, Setup, Symbols
 from malta.synthesis.controller import Add
 
 # Half-bridges on a DC link: voltages and duty cycles within their limits, star points, the link voltage.
@@ -97,7 +97,7 @@ def link_voltage(V: float, C: float, energy: float) -> float:
 
 
 def control_currents(
-    loop: Loop, signals: Signals, current: Any, known: Any, errors: Any, add: Add = operator.add
+    loop: LoopPlan, signals: Symbols, current: Any, known: Any, errors: Any, add: Add = operator.add
 ) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """PI control of the axis currents: u = Kp e + Q' I + emf(x), I' = Ki Q e, with the error e of the axis currents.
 
@@ -115,7 +115,7 @@ def control_currents(
     plant, c, s, g = loop
     machine, controller, given = signals
     believed, drive = plant_of(c.parameters), plant.drive
-    estimate = placed(believed, known[: len(believed.controlled)])
+    estimate = place_states(believed, known[: len(believed.controlled)])
     # The link voltage is measured: the modulators know of a sag at once.
     V = machine["link"] * (1 - given["sag"] if s.faulty else 1)
     if s.fidelity == "dq":
@@ -163,7 +163,7 @@ def control_currents(
     return command, {"u_integral": integral, "u_limited": limited}, row
 
 
-def reading_errors(loop: Loop, machine: Any, noise: Any) -> Any:
+def reading_errors(loop: LoopPlan, machine: Any, noise: Any) -> Any:
     """What the sensors of the phase currents read, less the currents, A. noise: of each sensor, A."""
     drive = loop.plant.drive
     if drive.sensors is None:
@@ -175,7 +175,7 @@ def reading_errors(loop: Loop, machine: Any, noise: Any) -> Any:
     return read - i
 
 
-def keep_if_missed(s: Setup, signals: Signals, command: Any) -> Any:
+def keep_if_missed(s: Setup, signals: Symbols, command: Any) -> Any:
     """The command, or the last one where the controller misses this step (a fault)."""
     given, controller = signals.given, signals.controller
     return ca.if_else(given["missed"], controller["command"], command) if s.faulty else command

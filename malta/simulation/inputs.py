@@ -19,7 +19,7 @@ from scipy.special import erf
 from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
 from malta.model.data import plant_of
-from malta.model.plant import Plant, off_stroke, outputs_at, placed, position_in
+from malta.model.plant import Plant, off_stroke, outputs_at, place_states, position_in
 from malta.simulation import references
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.layout import electronics_of, layout_of, noise_scales
@@ -209,7 +209,7 @@ def _effects(plant: Plant) -> ca.Function:
     kind = ca.MX if plant.actuator.tabulated else ca.SX
     chosen = list(plant.controlled)
     controlled = kind.sym("x", len(chosen))
-    x = placed(plant, controlled)
+    x = place_states(plant, controlled)
     v, w = kind.sym("v", len(plant.inputs)), kind.sym("w", len(plant.disturbances))
     rate = plant.f(x, v, w)[chosen]
     by_v, by_w = (ca.densify(ca.vec(ca.densify(ca.jacobian(rate, u)))) for u in (v, w))
@@ -218,7 +218,7 @@ def _effects(plant: Plant) -> ca.Function:
     return ca.Function("effects", [controlled], [ca.densify(by_v), ca.densify(by_w)])
 
 
-LONGEST = 4_000_000  # samples: 200 s at 20 kHz, 2 GB of trajectory
+MAX_SAMPLES = 4_000_000  # samples: 200 s at 20 kHz, 2 GB of trajectory
 
 
 class Inputs(NamedTuple):
@@ -230,11 +230,11 @@ class Inputs(NamedTuple):
 
 
 def inputs_of(run: Simulation) -> Inputs:
-    """The inputs of every sample of a simulation. Raises InputError for more than LONGEST samples."""
+    """The inputs of every sample of a simulation. Raises InputError for more than MAX_SAMPLES samples."""
     scenario, Ts = run.scenario, run.controller.sample_time
     samples = scenario.samples(Ts)
-    if samples > LONGEST:
-        raise InputError(scenario.where, "duration", f"{samples} samples", f"at most {LONGEST}")
+    if samples > MAX_SAMPLES:
+        raise InputError(scenario.where, "duration", f"{samples} samples", f"at most {MAX_SAMPLES}")
     before = scenario.settling_samples(Ts)
     t = np.arange(-before, samples - before) * Ts
     motion = motion_of(scenario, run.plant, run.controller, np.maximum(t, 0.0))

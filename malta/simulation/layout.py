@@ -22,13 +22,13 @@ from malta.model.parameters import acting_names, twins_of
 from malta.model.plant import Plant, symbolic
 from malta.model.signals import Electronics
 from malta.synthesis.controller import Controller, CurrentLoop, gains_of
-from malta.synthesis.schedule import SCHEDULED
+from malta.synthesis.schedule import SCHEDULED_MATRICES
 
 # Names of numbers_of that all machines of a batch share: those of the controller and of its samples.
-SHARED = (
+SHARED_NUMBERS = (
     *("Ad", "Bd", "Cd", "K", "Ki", "L", "force_limit", "control_time", "Kp", "Ki_current", "rate"),
     *("pause", "braking", "lead", "ahead", "grid_ends", "substep"),
-    *("places", *(f"{name}_steps" for name in SCHEDULED)),
+    *("places", *(f"{name}_steps" for name in SCHEDULED_MATRICES)),
 )
 
 Fidelity = Literal["force", "dq", "phase"]
@@ -67,7 +67,7 @@ class Layout(NamedTuple):
     row: dict[str, int]  # outputs of a sample: a row of the trajectory
 
 
-class Loop(NamedTuple):
+class LoopPlan(NamedTuple):
     """The closed loop that a control period is built of."""
 
     plant: Plant  # the simulated machine
@@ -76,7 +76,7 @@ class Loop(NamedTuple):
     numbers: Mapping[str, Any]  # of machine, controller and sensors by name: constants or symbols
 
 
-class Signals(NamedTuple):
+class Symbols(NamedTuple):
     """Symbols of one sample by name, sized by a layout."""
 
     machine: Mapping[str, Any]
@@ -217,9 +217,9 @@ def _winding_counts(plant: Plant) -> tuple[int, int]:
     return (0, 0) if drive is None else (len(drive.axes), len(drive.phases))
 
 
-def signals_of(sizes: Layout, kind: Any) -> Signals:
+def signals_of(sizes: Layout, kind: Any) -> Symbols:
     """Symbols of CasADi's `kind`, SX or MX, for every signal of a layout."""
-    return Signals(*({name: kind.sym(name, size) for name, size in part.items()} for part in sizes[:3]))
+    return Symbols(*({name: kind.sym(name, size) for name, size in part.items()} for part in sizes[:3]))
 
 
 def _symbolic_parameters(plant: Plant, g: Mapping[str, Any]) -> Any:

@@ -38,9 +38,9 @@ from malta.simulation import current_control
 from malta.simulation.current_control import control_currents, keep_if_missed, reading_errors
 from malta.simulation.layout import (
     Layout,
-    Loop,
+    LoopPlan,
     Setup,
-    Signals,
+    Symbols,
     command_size,
     electronics_of,
     layout_of,
@@ -51,9 +51,9 @@ from malta.simulation.layout import (
 from malta.simulation.readings import initial_readings, measurement, step_readings
 from malta.synthesis.controller import (
     Controller,
-    commanded,
-    estimated,
-    filtered,
+    command_forces,
+    estimate_states,
+    filter_reading,
     freeze_moving,
     frozen_axes,
     look_ahead,
@@ -64,11 +64,11 @@ from malta.synthesis.schedule import interpolate
 # Motion of the machine between two samples: one step of the classical Runge–Kutta method under held commands.
 
 
-OPENING = 20e-6  # s, time constant with which the current of an open phase decays
+OPENING_TIME = 20e-6  # s, time constant with which the current of an open phase decays
 SENSORS = ("lagged", "late", "clock")  # states of the machine that belong to its sensors
 
 
-def advance(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
+def advance(loop: LoopPlan, signals: Symbols, held: Any, jitter: Any) -> Any:
     """The machine's state after one Runge–Kutta step under held commands, or after one period of its electronics."""
     own = {name: value for name, value in signals.machine.items() if name not in SENSORS}
     moved = _move(loop, signals._replace(machine=own), held, jitter)
@@ -76,19 +76,19 @@ def advance(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
     return ca.vertcat(moved, *(after[name] for name in signals.machine if name in SENSORS))
 
 
-def motion(loop: Loop, signals: Signals, x: Any, inputs: Any) -> Any:
+def motion(loop: LoopPlan, signals: Symbols, x: Any, inputs: Any) -> Any:
     """x' under the inputs, the machine's loads and what acts from outside."""
     plant, s = loop.plant, loop.setup
     w = plant.load(x) + _outside(loop, signals)
     return plant.f(x, inputs, w + plant.contacts.bearing(x) if s.bearing else w)
 
 
-def _outside(loop: Loop, signals: Signals) -> Any:
+def _outside(loop: LoopPlan, signals: Symbols) -> Any:
     """The disturbance; structural zeros, which cost nothing, where there is none."""
     return signals.given["w"] if loop.setup.disturbed else ca.SX(len(loop.plant.disturbances), 1)
 
 
-def _move(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
+def _move(loop: LoopPlan, signals: Symbols, held: Any, jitter: Any) -> Any:
     """The same without the sensors' states."""
     plant, s, h = loop.plant, loop.setup, loop.numbers["substep"]
     machine, given = signals.machine, signals.given
@@ -182,7 +182,7 @@ def _phase_slope(
     for star in drive.stars if s.faulty else ():
         phases = list(star)
         lost[phases] += closed[phases] * ca.sum1(flowing[phases]) / ca.fmax(ca.sum1(closed[phases]), 1)
-    di = net / actuator.L - lost / OPENING
+    di = net / actuator.L - lost / OPENING_TIME
     power = ca.dot(u, flowing)
     return drive.force(drive.to_axes(x) @ flowing), ca.vertcat(
         di, current_control.link_slope(drive, V, power)
@@ -219,7 +219,7 @@ def period_of(
         plant, g, theta = with_symbols(plant, values)
         names = tuple(name for name, symbol in g.items() for _ in range(symbol.nnz()))
     sizes = layout_of(plant, c, s)
-    loop, signals = Loop(plant, c, s, g), signals_of(sizes, ca.SX)
+    loop, signals = LoopPlan(plant, c, s, g), signals_of(sizes, ca.SX)
     machine, controller, given = signals
     state = ca.vertcat(*machine.values(), *controller.values())
     around = ca.vertcat(*given.values())
@@ -315,7 +315,7 @@ def initial_state(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, c
     return ca.densify(ca.vertcat(*(values.get(name, ca.SX.zeros(size)) for name, size in state.items())))
 
 
-def _decide_function(loop: Loop, theta: Any, sizes: Layout) -> ca.Function:
+def _decide_function(loop: LoopPlan, theta: Any, sizes: Layout) -> ca.Function:
     """The function `decide` of Period: in CasADi's SX; in MX where the controller looks something up in a table."""
     plant = loop.plant
     kind = ca.MX if plant_of(loop.controller.parameters).actuator.tabulated else ca.SX
@@ -352,7 +352,7 @@ def _decide_function(loop: Loop, theta: Any, sizes: Layout) -> ca.Function:
 
 
 def _control_law(
-    loop: Loop, signals: Signals, y: Any, v0: Any, errors: Any
+    loop: LoopPlan, signals: Symbols, y: Any, v0: Any, errors: Any
 ) -> tuple[dict[str, Any], Any, dict[str, Any]]:
     """The control law and the current controllers at measurements y and with errors of read currents.
 
@@ -363,15 +363,15 @@ def _control_law(
     C = _scheduled_C(c, y) if s.scheduled else None
     g = interpolate(g, c.schedule, given["p_ref"])
     p_ref, v_ff = given["p_ref"], given["v_ff"]
-    taken = filtered(c.tracks, y, p_ref)
-    xi_hat = given["xi_hat"] if s.outside else estimated(g, controller["xi_pred"], taken, C)
+    taken = filter_reading(c.tracks, y, p_ref)
+    xi_hat = given["xi_hat"] if s.outside else estimate_states(g, controller["xi_pred"], taken, C)
     if s.anticipated:  # like v0, these forces cancel a load and move nothing: the filter is not told of them
         v0 = v0 + given["v_known"]
     believed = plant_of(c.parameters)
     xi_ref = law_reference(c, believed, g, given)
     frozen_now = freeze_moving(g, controller["frozen"], given["dp_ref"])
     e = sum_errors(g, controller["e"], frozen_now, y, p_ref)
-    xi_pred, saturated, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
+    xi_pred, saturated, v = command_forces(g, xi_hat, e, xi_ref, v_ff, v0)
     if s.open_loop:
         v, saturated = v_ff + v0, 0 * saturated  # open loop: no limit of the feedback is reached
     xi_pred, place = look_ahead(g, xi_pred, p_ref if s.open_loop else y, given["dp_ref"])

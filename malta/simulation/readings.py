@@ -22,18 +22,18 @@ from numpy.typing import NDArray
 
 from malta.arrays import FloatArray
 from malta.model.plant import Plant
-from malta.simulation.layout import Loop, Setup
+from malta.simulation.layout import LoopPlan, Setup
 
-TINY = 1e-6  # share of a step that rounding may take from the clock
+CLOCK_ROUNDING = 1e-6  # share of a step that rounding may take from the clock
 
 
-def signals(loop: Loop, x: Any) -> Any:
+def signals(loop: LoopPlan, x: Any) -> Any:
     """The outputs at a state with the errors of the sensors."""
     plant = loop.plant
     return plant.sensors.sense(x, loop.numbers["errors"]) if loop.setup.sensed else plant.h(x, 0)
 
 
-def measurement(loop: Loop, machine: Mapping[str, Any], noise: Any) -> Any:
+def measurement(loop: LoopPlan, machine: Mapping[str, Any], noise: Any) -> Any:
     """y: what the sensors read now, with noise and, where the setup says so, resolution."""
     plant, s = loop.plant, loop.setup
     now = signals(loop, machine["x"])
@@ -53,7 +53,7 @@ def measurement(loop: Loop, machine: Mapping[str, Any], noise: Any) -> Any:
     )
 
 
-def step_readings(loop: Loop, machine: Mapping[str, Any], x: Any) -> dict[str, Any]:
+def step_readings(loop: LoopPlan, machine: Mapping[str, Any], x: Any) -> dict[str, Any]:
     """The states of the sensors after a step that took the machine to x."""
     s, h = loop.setup, loop.numbers["substep"]
     if not s.lagging and s.late is None:
@@ -88,7 +88,7 @@ def _lag_outputs(s: Any, before: Any, after: Any, lags: tuple[Any, ...], h: Any)
     return ca.vertcat(*found)
 
 
-def _late(loop: Loop, machine: Mapping[str, Any], before: Any, after: Any) -> dict[str, Any]:
+def _late(loop: LoopPlan, machine: Mapping[str, Any], before: Any, after: Any) -> dict[str, Any]:
     """The blocks of late readings and the clock after a step in which the readings went from `before` to `after`."""
     plant, _, s, g = loop
     assert s.late is not None
@@ -96,7 +96,7 @@ def _late(loop: Loop, machine: Mapping[str, Any], before: Any, after: Any) -> di
     rest = plant.sensors.dead_time - s.late * Ts
     clock = machine["clock"] + h
     share = (Ts - rest - machine["clock"]) / h  # of this step, until the reading is caught
-    caught = ca.logic_and(share > TINY, share < 1 + TINY)
+    caught = ca.logic_and(share > CLOCK_ROUNDING, share < 1 + CLOCK_ROUNDING)
     blocks = machine["late"]
     last = ca.if_else(caught, before + share * (after - before), blocks[-p:])
     ends = clock > Ts - h / 2
@@ -120,7 +120,7 @@ def _is_zero(step: Any) -> bool:
 
 _Keys = TypeVar("_Keys", np.uint64, "NDArray[np.uint64]")
 GAMMA = 0x9E3779B97F4A7C15
-TOGETHER = 4  # samples whose noise the engine draws at once
+NOISE_SAMPLES_AT_ONCE = 4  # samples whose noise the engine draws at once
 _SIGN = np.uint32(0x80000000)
 # log(1 + f) / f, cos(pi a) and sin(pi a) / a of a^2: minimax, errors about 1e-7
 LOGARITHM = (

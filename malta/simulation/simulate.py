@@ -33,7 +33,7 @@ from malta.linear.sampling import sample
 from malta.model.data import plant_of
 from malta.model.linearize import is_commutated
 from malta.model.parameters import shape_parameters, units_of
-from malta.model.plant import Plant, placed
+from malta.model.plant import Plant, place_states
 from malta.simulation import references
 from malta.simulation.engine.engines import Engine, EngineChoice, engine_of, evaluate, substeps_until
 from malta.simulation.inputs import (
@@ -237,7 +237,7 @@ def _measurement(c: Controller) -> tuple[Callable[..., FloatArray], Callable[...
     """The functions x -> dh/dx and x -> h(x) of the controller's machine."""
     believed = plant_of(c.parameters)
     x = ca.SX.sym("x", len(c.A))
-    y = believed.h(placed(believed, x), 0)
+    y = believed.h(place_states(believed, x), 0)
     function = ca.Function("h", [x], [y, ca.jacobian(y, x)])
     return (
         lambda estimate: np.array(function(estimate)[1]),
@@ -248,8 +248,8 @@ def _measurement(c: Controller) -> tuple[Callable[..., FloatArray], Callable[...
 # What a simulation begins with, remembered for runs that can only begin with the same again.
 
 
-REMEMBERED = 8  # simulations
-LARGEST = 4_000_000  # bytes of a simulation that is remembered
+MAX_KEPT_SIMULATIONS = 8  # simulations
+MAX_KEPT_BYTES = 4_000_000  # bytes of a simulation that is remembered
 
 
 class Prepared(NamedTuple):
@@ -291,9 +291,9 @@ def prepare(plant: Plant, controller: Controller, scenario: Scenario) -> Prepare
         steps = substeps_of(plant, controller, run.setup, scenario)
         fast = electronics_noise(run, substeps_until(len(inputs.t), steps))
         found = Prepared(run, inputs, state, stages, steps, noise, fast)
-        if is_repeatable(scenario) and found.size <= LARGEST:
+        if is_repeatable(scenario) and found.size <= MAX_KEPT_BYTES:
             _memory[key] = found
-            if len(_memory) > REMEMBERED:
+            if len(_memory) > MAX_KEPT_SIMULATIONS:
                 _memory.popitem(last=False)
     return found
 

@@ -15,8 +15,8 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.display import Curves, Description, display, quantity
 from malta.files import replace_files
-from malta.merits import Merit, reported, reported_merits
-from malta.model.machines import FINE
+from malta.merits import Merit, merit_field, reported_merits
+from malta.model.machines import FINE_UNITS
 from malta.model.plant import Plant, Signal
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.inputs import Inputs
@@ -202,7 +202,7 @@ class Trajectory:
         for k, s in enumerate(self.plant.outputs):
             largest = float(np.abs(off[:, k]).max(initial=0.0))
             rms = math.sqrt((off[:, k] ** 2).mean()) if len(off) else 0.0
-            unit = FINE.get(s.unit, s.unit)
+            unit = FINE_UNITS.get(s.unit, s.unit)
             found += [
                 Merit(f"largest deviation {s.name}", largest, unit, signal=s.name),
                 Merit(f"deviation {s.name}, rms", rms, unit, signal=s.name),
@@ -277,12 +277,12 @@ def label_rows(
 class StrokeFigures:
     """Figures of a stroke, as papers publish them. SI."""
 
-    rise: float = reported("rise, 10-90 %", "ms")  # s, of the true position; NaN when it was not reached
-    overshoot: float = reported("overshoot", "percent", "at most")  # NaN when the run ended early
-    axial_error: float = reported("axial error", "mm", "at most")  # m, largest |z* - z|
-    radial: Mapping[str, float] = reported("deviation {}", "um", "at most")  # m, largest, by radial output
-    force: float = reported("largest thrust", "N")  # N, commanded
-    current: float = reported("largest commanded current", "A")  # A, of any axis
+    rise: float = merit_field("rise, 10-90 %", "ms")  # s, of the true position; NaN when it was not reached
+    overshoot: float = merit_field("overshoot", "percent", "at most")  # NaN when the run ended early
+    axial_error: float = merit_field("axial error", "mm", "at most")  # m, largest |z* - z|
+    radial: Mapping[str, float] = merit_field("deviation {}", "um", "at most")  # m, largest, by radial output
+    force: float = merit_field("largest thrust", "N")  # N, commanded
+    current: float = merit_field("largest commanded current", "A")  # A, of any axis
 
     @property
     def figures(self) -> tuple[Merit, ...]:

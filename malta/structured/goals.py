@@ -24,15 +24,15 @@ from malta.linear.conversion import from_control
 from malta.linear.interconnection import append, series
 from malta.linear.peaks import response_at
 from malta.linear.system import System
-from malta.structured.loops import Channels, ClosedLoop, Pole, gain_slope, noise, peaks_of
+from malta.structured.loops import ClosedLoop, LawPorts, Pole, gain_slope, noise, peaks_of
 from malta.synthesis.elements import CALLER
 
 At = Literal["sensors", "forces"]
-SLOWEST = 6  # poles of a group that a search looks at
+WATCHED_POLES = 6  # poles of a group that a search looks at
 FIELD = {"sensors": ("reference", "error"), "forces": ("load", "acting")}
 
 
-class Figure(NamedTuple):
+class GoalFigure(NamedTuple):
     """One number of a loop: what it is of, its value over its bound, and the derivative by [D C; B A] of the law."""
 
     goal: str
@@ -60,7 +60,7 @@ class Goal:
     """
 
     name: str
-    figures: Callable[[ClosedLoop], list[Figure]]
+    figures: Callable[[ClosedLoop], list[GoalFigure]]
     hard: bool = True
     unit: str = ""
     peak: tuple[float, At] | None = None
@@ -271,34 +271,34 @@ def _first_order(a: float, b: float, c: float, d: float) -> System:
     return System(np.array([[a]]), np.array([[b]]), np.array([[c]]), np.array([[d]]))
 
 
-def _weighted(system: System, W: System) -> System:
+def _weight(system: System, W: System) -> System:
     """W behind each output."""
     return series(system, append(*[W] * len(system.D)))
 
 
 def _figures_of(
     loop: ClosedLoop,
-    found: tuple[System, Channels],
+    found: tuple[System, LawPorts],
     factor: float,
     shift: float,
     W: System | None,
     of: tuple[str, str],
-) -> list[Figure]:
+) -> list[GoalFigure]:
     """The peaks of factor W (G - shift)."""
     system, by = found
     shifted = replace(system, D=system.D - shift * np.eye(*system.D.shape))
     figures = []
-    for peak in peaks_of(shifted if W is None else _weighted(shifted, W)):
+    for peak in peaks_of(shifted if W is None else _weight(shifted, W)):
         at = 1.0 if W is None else complex(response_at(W, np.array([peak.w]))[0, 0, 0])
         slope = factor * gain_slope(shifted, by, peak, at)
-        figures.append(Figure(*of, peak.w, factor * peak.value, loop.slope(slope)))
+        figures.append(GoalFigure(*of, peak.w, factor * peak.value, loop.slope(slope)))
     return figures
 
 
 def _each_channel(
     goal: str, at: At, channels: Sequence[str] | None, factor: float, shift: float, loop: ClosedLoop,
     W: System | None = None,
-) -> list[Figure]:  # fmt: skip
+) -> list[GoalFigure]:  # fmt: skip
     into, out = FIELD[at]
     names = (loop.model.outputs if at == "sensors" else loop.model.inputs) if channels is None else channels
     return [
@@ -317,14 +317,14 @@ def _each_channel(
 
 def _gain(
     goal: str, inputs: Any, outputs: Any, factor: float, W: System | None, loop: ClosedLoop
-) -> list[Figure]:
+) -> list[GoalFigure]:
     part = loop.part(loop.rows(outputs), loop.columns(inputs))
     return _figures_of(loop, part, factor, 0.0, W, (goal, ""))
 
 
 def _noise(
     goal: str, levels: Mapping[str, float], outputs: Any, limit: float, loop: ClosedLoop
-) -> list[Figure]:
+) -> list[GoalFigure]:
     """Of a sampled loop the sum over samples is the integral over w of |G|^2 T / (1 + (w T/2)^2)."""
     columns = [(k, level) for signal, level in levels.items() for k in loop.columns(signal)]
     size = np.array([level for _, level in columns])
@@ -333,22 +333,22 @@ def _noise(
     T = loop.model.sample_time
     if T is not None:
         k = len(system.D)
-        system = _weighted(system, _first_order(-2 / T, 1.0, 2 / math.sqrt(T), 0.0))
+        system = _weight(system, _first_order(-2 / T, 1.0, 2 / math.sqrt(T), 0.0))
         wide = np.zeros((k, by.B2.shape[1]))
-        by = Channels(np.vstack([by.B2, by.D12]), np.hstack([by.C2, np.zeros((len(by.C2), k))]), wide, by.D21)
+        by = LawPorts(np.vstack([by.B2, by.D12]), np.hstack([by.C2, np.zeros((len(by.C2), k))]), wide, by.D21)
     value, slope = noise(system, by)
     assert slope is not None
-    return [Figure(goal, "", math.nan, value / limit, loop.slope(slope / limit))]
+    return [GoalFigure(goal, "", math.nan, value / limit, loop.slope(slope / limit))]
 
 
-def _poles(asked: _PoleBounds, loop: ClosedLoop) -> list[Figure]:
+def _poles(asked: _PoleBounds, loop: ClosedLoop) -> list[GoalFigure]:
     found = _pole_figures(asked, loop.poles(), loop.model.sample_time, damped=asked.damping > 0)
-    return [Figure("poles", kind, size, value, loop.slope(slope)) for kind, size, value, slope in found]
+    return [GoalFigure("poles", kind, size, value, loop.slope(slope)) for kind, size, value, slope in found]
 
 
-def _law_poles(asked: _PoleBounds, loop: ClosedLoop) -> list[Figure]:
+def _law_poles(asked: _PoleBounds, loop: ClosedLoop) -> list[GoalFigure]:
     found = _pole_figures(asked, loop.law_poles(), loop.model.sample_time, damped=True)
-    return [Figure("stable law", *figure) for figure in found]
+    return [GoalFigure("stable law", *figure) for figure in found]
 
 
 def _pole_figures(
@@ -379,11 +379,11 @@ def _pole_figures(
     return [f for f in found if f[2] >= min(top, 0.5)]
 
 
-def stability(loop: ClosedLoop, rate: float) -> list[Figure]:
+def stability(loop: ClosedLoop, rate: float) -> list[GoalFigure]:
     """1 + Re(pole) / rate of the slowest poles: below 1 where the loop is stable."""
     return [
-        Figure(
+        GoalFigure(
             "stability", "", abs(pole.value), 1 + pole.value.real / rate, loop.slope(pole.slope.real / rate)
         )
-        for pole in loop.poles(SLOWEST)
+        for pole in loop.poles(WATCHED_POLES)
     ]

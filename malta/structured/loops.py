@@ -24,7 +24,7 @@ from malta.linear.conversion import from_control
 from malta.linear.peaks import gains_at, level_frequencies, peak_gain, response_at
 from malta.linear.system import System
 from malta.synthesis.elements import CALLER
-from malta.synthesis.structure import OF_INPUTS, OF_OUTPUTS
+from malta.synthesis.structure import INPUT_CHANNELS, OUTPUT_CHANNELS
 
 # Figures of a stable linear system with their exact derivatives: peaks of its gain, its noise, its poles.
 #
@@ -41,7 +41,7 @@ POINTS = 9  # in each of them
 SHARES = (0.7, 0.85, 0.95, 0.99)  # of the largest gain: maxima are looked for between their crossings
 
 
-class Peak(NamedTuple):
+class SingularPeak(NamedTuple):
     """A local maximum of the largest singular value, with the vectors that belong to it."""
 
     w: float  # rad/s, or infinite
@@ -50,7 +50,7 @@ class Peak(NamedTuple):
     right: ComplexArray
 
 
-def peaks_of(system: System) -> list[Peak]:
+def peaks_of(system: System) -> list[SingularPeak]:
     """The local maxima of a stable system's gain that come near the largest one.
 
     One that rises above a share of the largest, between places where the gain is below it, is found for certain: these
@@ -70,7 +70,7 @@ def peaks_of(system: System) -> list[Peak]:
     before, after = np.append(-np.inf, sizes[:-1]), np.append(sizes[1:], -np.inf)
     tops = np.flatnonzero((sizes >= before) & (sizes > after) & (sizes > SHARES[0] * best))
     low, high = angle[np.maximum(tops - 1, 0)], angle[np.minimum(tops + 1, len(angle) - 1)]
-    found = [_peak_at(system, w) for w in _refined(system, low, high, scale).tolist()]
+    found = [_peak_at(system, w) for w in _refine(system, low, high, scale).tolist()]
     if not found or max(peak.value for peak in found) < best * (1 - 1e-6):
         found.append(_peak_at(system, where))
     return found
@@ -89,7 +89,7 @@ def _frequency(angle: FloatArray, scale: float) -> FloatArray:
     return np.where(angle >= math.pi - 1e-12, np.inf, w)
 
 
-def _refined(system: System, low: FloatArray, high: FloatArray, scale: float) -> FloatArray:
+def _refine(system: System, low: FloatArray, high: FloatArray, scale: float) -> FloatArray:
     """The frequency of the largest gain between each two angles."""
     rows = np.arange(len(low))
     where = high
@@ -102,12 +102,12 @@ def _refined(system: System, low: FloatArray, high: FloatArray, scale: float) ->
     return _frequency(where, scale)
 
 
-def _peak_at(system: System, w: float) -> Peak:
+def _peak_at(system: System, w: float) -> SingularPeak:
     U, s, V = np.linalg.svd(response_at(system, np.array([w]))[0])
-    return Peak(w, float(s[0]), U[:, 0], V[0].conj())
+    return SingularPeak(w, float(s[0]), U[:, 0], V[0].conj())
 
 
-class Channels(NamedTuple):
+class LawPorts(NamedTuple):
     """How a matrix M acts on a system: A + B2 M C2, B1 + B2 M D21, C1 + D12 M C2, D11 + D12 M D21."""
 
     B2: FloatArray
@@ -116,7 +116,7 @@ class Channels(NamedTuple):
     D21: FloatArray
 
 
-def gain_slope(system: System, by: Channels, peak: Peak, weight: complex = 1.0) -> FloatArray:
+def gain_slope(system: System, by: LawPorts, peak: SingularPeak, weight: complex = 1.0) -> FloatArray:
     """The derivative of |weight| sigma_max(G(jw)) by M at a peak, whose frequency needs none: inputs of M x outputs."""
     into, out = by.D12.astype(complex), by.D21.astype(complex)
     if math.isfinite(peak.w) and len(system.A):
@@ -127,7 +127,7 @@ def gain_slope(system: System, by: Channels, peak: Peak, weight: complex = 1.0) 
     return np.real(np.outer(left, out @ peak.right))
 
 
-def noise(system: System, by: Channels | None = None) -> tuple[float, FloatArray | None]:
+def noise(system: System, by: LawPorts | None = None) -> tuple[float, FloatArray | None]:
     """The root of the sum of squares of a stable system's impulse responses (its H2 norm), and its derivative by M.
 
     Raises CheckError for a system with D, whose output has no variance under white noise.
@@ -169,13 +169,13 @@ def poles_of(A: FloatArray, B2: FloatArray, C2: FloatArray, count: int = 0) -> l
 # The loops: a plant closed by a structure, between named signals.
 
 
-ZERO = 1e-9  # of a law's largest entry: a pole of that size is an integral
+INTEGRAL = 1e-9  # of a law's largest entry: a pole of that size is an integral
 ROUNDING = 1e-14  # of the largest entry of A: growth within it is rounding
 JOINS = 1e-12  # of the largest entries of its row and column: smaller ones are rounding
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class TunedPlant:
     """A linear plant that a law is tuned on.
 
     name : of the model, as "nominal" or its parameters in words
@@ -203,10 +203,12 @@ def model_of(
     disturbances: Sequence[str] = (),
     sample_time: float | None = None,
     goals: bool = True,
-) -> Model:
+) -> TunedPlant:
     """Make a model of matrices, of x+ where there is a sample time. Raises InputError for an eigenvalue -1 of those."""
     plane = system if sample_time is None else to_plane(system, sample_time)
-    return Model(name, plane.balanced, tuple(inputs), tuple(outputs), tuple(disturbances), sample_time, goals)
+    return TunedPlant(
+        name, plane.balanced, tuple(inputs), tuple(outputs), tuple(disturbances), sample_time, goals
+    )
 
 
 def to_plane(system: System, Ts: float) -> System:
@@ -220,10 +222,10 @@ def to_plane(system: System, Ts: float) -> System:
     return System(2 / Ts * back @ (A - one), 4 / Ts * back @ back @ B, C, D - C @ back @ B)
 
 
-def models_of_systems(plants: Any) -> list[Model]:
+def models_of_systems(plants: Any) -> list[TunedPlant]:
     """The models of one control system or of several with the same signals. Raises InputError for others."""
     given = list(plants) if isinstance(plants, list | tuple) else [plants]
-    found: list[Model] = []
+    found: list[TunedPlant] = []
     for k, plant in enumerate(given):
         own = from_control(
             plant, CALLER, "plant", expected="a system of python-control with states, or several"
@@ -249,11 +251,11 @@ class ClosedLoop:
     Inputs: references, loads on the forces, disturbances. Outputs: errors, outputs, the law's forces, acting forces.
     """
 
-    model: Model
+    model: TunedPlant
     theta: FloatArray  # [D C; B A] of the law
 
     @cached_property
-    def _open(self) -> tuple[System, Channels, FloatArray]:
+    def _open(self) -> tuple[System, LawPorts, FloatArray]:
         A, B_all, C, D_all = self.model.plane
         p, m = len(self.model.outputs), len(self.model.inputs)
         n, k = len(A), len(self.theta) - m
@@ -273,7 +275,7 @@ class ClosedLoop:
 
         B2, C2 = wide(B, k, k), wide(-C, k, k)
         B2[n:, m:], C2[p:, n:] = np.eye(k), np.eye(k)
-        by = Channels(B2, C2, wide(through, 0, k), wide(e, k, 0))
+        by = LawPorts(B2, C2, wide(through, 0, k), wide(e, k, 0))
         return System(wide(A, k, k), wide(B1, k, 0), wide(out, 0, k), direct), by, wide(-D, k, k)
 
     @cached_property
@@ -288,27 +290,27 @@ class ClosedLoop:
         return left @ self.theta, left, right
 
     @cached_property
-    def whole(self) -> tuple[System, Channels]:
+    def whole(self) -> tuple[System, LawPorts]:
         """The closed loop between all signals, and its channels for derivatives."""
         (A, B1, C1, D11), by, _ = self._open
         M, _, _ = self._acting
         closed = System(
             A + by.B2 @ M @ by.C2, B1 + by.B2 @ M @ by.D21, C1 + by.D12 @ M @ by.C2, D11 + by.D12 @ M @ by.D21
         )
-        return closed, Channels(by.B2, by.C2, by.D12, by.D21)
+        return closed, LawPorts(by.B2, by.C2, by.D12, by.D21)
 
     def slope(self, by_M: FloatArray) -> FloatArray:
         """The derivative by theta, from that by M."""
         _, left, right = self._acting
         return np.asarray(left.T @ by_M @ right.T)
 
-    def part(self, rows: Sequence[int], columns: Sequence[int]) -> tuple[System, Channels]:
+    def part(self, rows: Sequence[int], columns: Sequence[int]) -> tuple[System, LawPorts]:
         """The loop between some signals: only states that the inputs reach and that the outputs see."""
         (A, B, C, D), by = self.whole
         B, C, D = B[:, list(columns)], C[list(rows)], D[np.ix_(rows, columns)]
         joined = self._joined
         x = np.flatnonzero(_reach(joined, B.any(axis=1)) & _reach(joined.T, C.any(axis=0)))
-        channels = Channels(by.B2[x], by.C2[:, x], by.D12[list(rows)], by.D21[:, list(columns)])
+        channels = LawPorts(by.B2[x], by.C2[:, x], by.D12[list(rows)], by.D21[:, list(columns)])
         return System(A[np.ix_(x, x)], B[x], C[:, x], D), channels
 
     @cached_property
@@ -347,19 +349,19 @@ class ClosedLoop:
         A = self.theta[m:, p:]
         B2, C2 = np.eye(len(self.theta))[m:], np.eye(self.theta.shape[1])[:, p:]
         size = float(np.abs(A).max(initial=0.0))
-        return [pole for pole in poles_of(A, B2, C2) if abs(pole.value) > ZERO * size] if size else []
+        return [pole for pole in poles_of(A, B2, C2) if abs(pole.value) > INTEGRAL * size] if size else []
 
     def rows(self, signals: Any) -> list[int]:
         """The outputs of these names. Raises InputError for unknown ones."""
         m = self.model
-        return _picked(
-            signals, dict(zip(OF_OUTPUTS, (m.outputs, m.outputs, m.inputs, m.inputs), strict=True))
+        return _pick(
+            signals, dict(zip(OUTPUT_CHANNELS, (m.outputs, m.outputs, m.inputs, m.inputs), strict=True))
         )
 
     def columns(self, signals: Any) -> list[int]:
         """The inputs of these names. Raises InputError for unknown ones."""
         m = self.model
-        return _picked(signals, dict(zip(OF_INPUTS, (m.outputs, m.inputs, m.disturbances), strict=True)))
+        return _pick(signals, dict(zip(INPUT_CHANNELS, (m.outputs, m.inputs, m.disturbances), strict=True)))
 
 
 def _reach(joined: Any, start: Any) -> Any:
@@ -372,7 +374,7 @@ def _reach(joined: Any, start: Any) -> Any:
         found = more
 
 
-def _picked(signals: Any, known: dict[str, tuple[str, ...]]) -> list[int]:
+def _pick(signals: Any, known: dict[str, tuple[str, ...]]) -> list[int]:
     """Numbers of the signals "kind" or "kind name"."""
     every = [f"{kind} {name}" for kind, names in known.items() for name in names]
     found = []

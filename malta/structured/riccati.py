@@ -41,10 +41,10 @@ from malta.synthesis.elements import CALLER
 
 H_INFINITY = "h_infinity"
 TOLERANCE = 1e-6  # relative, of the smallest gamma
-ABOVE = 1e-3  # relative: the law is that of a gamma so far above the smallest, where its numbers stay small
+GAMMA_RESERVE = 1e-3  # relative, above the smallest gamma: there the law's numbers stay small
 RESIDUAL = 1e-6  # relative, of a Riccati equation
 RANK = 1e-9
-LARGEST = 1e8  # gamma, beyond which no law is looked for
+MAX_GAMMA = 1e8  # gamma, beyond which no law is looked for
 
 
 @display
@@ -142,11 +142,11 @@ def h_infinity(plant: Any, outputs: int, inputs: int) -> Synthesized:
     own = whole.balanced
     problem, back = _normal(own, p2, m2)
     best = _smallest(problem)
-    solved = _solve(problem, best * (1 + ABOVE))
+    solved = _solve(problem, best * (1 + GAMMA_RESERVE))
     if solved is None:
         raise CheckError(f"{H_INFINITY}: the equations have no solution just above gamma = {best:.6g}")
     law = back(_central(problem, solved))
-    norm, w = _checked(own, law, solved.gamma)
+    norm, w = _check_norm(own, law, solved.gamma)
     return Synthesized(law, best, norm, w, solved.coupling, solved.residual)
 
 
@@ -260,9 +260,9 @@ def _smallest(p: _Problem) -> float:
     high = 1.0
     while _solve(p, high) is None:
         high *= 4
-        if high > LARGEST:
+        if high > MAX_GAMMA:
             wanted = "a plant that u stabilizes and y shows, without zeros on the imaginary axis"
-            raise InputError(H_INFINITY, "plant", f"no law up to gamma = {LARGEST:.0e}", wanted)
+            raise InputError(H_INFINITY, "plant", f"no law up to gamma = {MAX_GAMMA:.0e}", wanted)
     low = high / 4
     while low > 1e-12 and _solve(p, low) is not None:
         low, high = low / 4, low
@@ -292,7 +292,7 @@ def _central(p: _Problem, s: _Solved) -> System:
     return System(A, B1, C1, D11)
 
 
-def _checked(P: System, K: System, gamma: float) -> tuple[float, float]:
+def _check_norm(P: System, K: System, gamma: float) -> tuple[float, float]:
     """The norm of the closed loop. Raises CheckError where it has no solution, is unstable, or above gamma."""
     try:
         closed = lft(P, K)
@@ -383,7 +383,7 @@ def shape_loop(plant: Any, before: Any = 1.0, after: Any = 1.0) -> Synthesized:
     '1.4142'
     """
     G = from_control(plant, "shape_loop", "plant")
-    W1, W2 = _shaping(before, G.D.shape[1], "before"), _shaping(after, len(G.D), "after")
+    W1, W2 = _shaping_weight(before, G.D.shape[1], "before"), _shaping_weight(after, len(G.D), "after")
     shaped = series(W1, G, W2)
     A, B, C, D = _system_of(shaped)
     if D.any():
@@ -397,7 +397,7 @@ def shape_loop(plant: Any, before: Any = 1.0, after: Any = 1.0) -> Synthesized:
         )
     X, Z = x[0], z[0]
     best = math.sqrt(1 + float(np.linalg.eigvals(X @ Z).real.max(initial=0.0)))
-    gamma = best * (1 + ABOVE)
+    gamma = best * (1 + GAMMA_RESERVE)
     inner = (1 - gamma**2) * np.eye(n) + X @ Z
     back = np.linalg.inv(inner.T)
     F = -B.T @ X
@@ -405,17 +405,17 @@ def shape_loop(plant: Any, before: Any = 1.0, after: Any = 1.0) -> Synthesized:
     # w = (r, d): y = r - G (u + d); z = (u, y)
     direct = system_matrix(np.zeros((m, p + m)), np.eye(m), np.tile(np.eye(p, p + m), (2, 1)))
     four = System(A, np.hstack([np.zeros((n, p)), B, B]), np.vstack([np.zeros((m, n)), -C, -C]), direct)
-    norm, w = _checked(four, own, gamma)
+    norm, w = _check_norm(four, own, gamma)
     coupling = float(np.abs(np.linalg.eigvals(X @ Z)).max(initial=0.0)) / (gamma**2 - 1)
     return Synthesized(series(W2, own, W1), best, norm, w, coupling, max(x[1], z[1]))
 
 
-def _shaping(one: Any, size: int, field: str) -> System:
+def _shaping_weight(one: Any, size: int, field: str) -> System:
     """A control system, or a number for all signals."""
     return from_control(one, "shape_loop", field) if hasattr(one, "dt") else gain(float(one) * np.eye(size))
 
 
-SLOW = 1.0  # rad/s: a pole below counts as an integral
+INTEGRAL_POLE_RATE = 1.0  # rad/s: a pole below counts as an integral
 
 
 def split_integrals(law: System) -> tuple[System, System]:
@@ -431,7 +431,7 @@ def split_integrals(law: System) -> tuple[System, System]:
     ([[0.0]], [[-10.0]])
     """
     A, B, C, D = law.balanced
-    S, Z, k = linalg.schur(A, sort=lambda re, im: bool(np.hypot(re, im) < SLOW))
+    S, Z, k = linalg.schur(A, sort=lambda re, im: bool(np.hypot(re, im) < INTEGRAL_POLE_RATE))
     V = Z.copy()
     V[:, k:] += Z[:, :k] @ linalg.solve_sylvester(S[:k, :k], -S[k:, k:], -S[:k, k:])
     A, B, C = np.linalg.solve(V, A @ V), np.linalg.solve(V, B), C @ V

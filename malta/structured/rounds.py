@@ -27,7 +27,7 @@ from malta.linear.sampling import add_lags, delay_inputs, sample
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.loop import loop
-from malta.loops.sampled_loops import LAST, SampledLoop, sampled_loop
+from malta.loops.sampled_loops import LAST_STAGE, SampledLoop, sampled_loop
 from malta.loops.windings import chosen_loops
 from malta.margins.travel import travel_margin, worst_sensitivities
 from malta.model.linearize import linearize
@@ -38,7 +38,7 @@ from malta.proof.blocks.gain import Gain, worst_case_gain
 from malta.proof.margin import Margin, Ranges
 from malta.proof.robust import robust_margin
 from malta.structured.goals import Goal
-from malta.structured.loops import Model, model_of, models_of_systems
+from malta.structured.loops import TunedPlant, model_of, models_of_systems
 from malta.structured.search import ROOM, Look, Task, contradiction, random_starts, rate_of, search
 from malta.synthesis.controller import Controller
 from malta.synthesis.elements import CALLER
@@ -52,15 +52,15 @@ Values = Mapping[str, float]
 class Systems:
     """Systems of python-control, without parameters: nothing of them is proven."""
 
-    models: tuple[Model, ...]
+    models: tuple[TunedPlant, ...]
 
     @property
-    def nominal(self) -> list[Model]:
+    def nominal(self) -> list[TunedPlant]:
         return list(self.models)
 
 
 @dataclass(frozen=True, eq=False)
-class Uncertain:
+class UncertainModel:
     """An uncertain system, continuous, or sampled with a delay."""
 
     system: UncertainSystem
@@ -69,10 +69,10 @@ class Uncertain:
     lag: float | None
 
     @property
-    def nominal(self) -> list[Model]:
+    def nominal(self) -> list[TunedPlant]:
         return [self.at({}, goals=True)]
 
-    def at(self, values: Values, *, goals: bool) -> Model:
+    def at(self, values: Values, *, goals: bool) -> TunedPlant:
         s, T = self.system, self.sample_time
         p = np.array([values.get(n, v) for n, v in zip(s.names, s.nominal, strict=True)])
         A, B, C, D = (M[0] for M in s.explicit(p))
@@ -106,7 +106,7 @@ class Uncertain:
 
 
 @dataclass(frozen=True, eq=False)
-class Machine:
+class PlacedMachine:
     """A machine with its hold, delay, current loops and late sensors, at places along its travel."""
 
     plant: Plant
@@ -115,10 +115,10 @@ class Machine:
     zero: Controller = field(repr=False)  # a law that does nothing, with the machine's current loops
 
     @property
-    def nominal(self) -> list[Model]:
+    def nominal(self) -> list[TunedPlant]:
         return [self.at(place, goals=True) for place in self.places]
 
-    def at(self, values: Values, *, goals: bool) -> Model:
+    def at(self, values: Values, *, goals: bool) -> TunedPlant:
         known = units_of(self.plant.parameters)
         parameters = {name: v for name, v in values.items() if name in known}
         states = {name: v for name, v in values.items() if name not in known}
@@ -126,7 +126,7 @@ class Machine:
             at: dict[str, Any] = dict(states)
             found = loop(self.plant, self.zero, parameters=parameters, **at).sampled_forces
         else:
-            found = self._unloaded(parameters, states)
+            found = self._without_loads(parameters, states)
         m, extra = len(self.plant.inputs), found.control.D_y
         into = found.Bd[:, :m]
         pushed = np.zeros((len(found.Ad), 0)) if found.pushed is None else found.pushed
@@ -143,14 +143,14 @@ class Machine:
             disturbances=names[2] if pushed.shape[1] else (), sample_time=self.sample_time, goals=goals,
         )  # fmt: skip
 
-    def _unloaded(self, parameters: Values, states: Values) -> SampledLoop:
+    def _without_loads(self, parameters: Values, states: Values) -> SampledLoop:
         own: Any = self.plant.parameters
         changed = replace(own, **parameters)
         machine = self.plant.variant(changed) if parameters else self.plant
         return sampled_loop(
             linearize(machine, machine.at(**states)), self.zero,
             delay=machine.actuator.delay(self.sample_time),
-            current_loops=chosen_loops(machine, self.zero, LAST), sensors=True, forces_alone=True,
+            current_loops=chosen_loops(machine, self.zero, LAST_STAGE), sensors=True, forces_alone=True,
         )  # fmt: skip
 
     def controller(self, law: System, name: str) -> Controller:
@@ -173,7 +173,7 @@ def _name(values: Values) -> str:
 
 def target_of(
     plant: Any, sample_time: float | None, delay: int, lag: float | None, places: Sequence[Values] | None
-) -> Systems | Uncertain | Machine:
+) -> Systems | UncertainModel | PlacedMachine:
     """What a law is tuned for. Raises InputError for anything else, and for options that it does not have."""
     if isinstance(plant, UncertainSystem):
         T = plant.sample_time if sample_time is None else sample_time
@@ -181,7 +181,7 @@ def target_of(
             raise InputError(CALLER, "sample_time", f"{T} s", f"{plant.sample_time} s, that of the system")
         if T is None and delay:
             raise InputError(CALLER, "delay", f"{delay} samples", "none without a sample time")
-        return Uncertain(plant, T, delay, lag)
+        return UncertainModel(plant, T, delay, lag)
     if delay or lag is not None:
         raise InputError(
             CALLER, "delay, lag", "some", "those of an uncertain system alone: other plants have their own"
@@ -198,7 +198,7 @@ def target_of(
             [{stroke.name: share * stroke.travel} for share in (0.0, 1.0, -1.0)] if plant.has_stroke else [{}]
         )
         zero = controller_of(nothing, plant, name="nothing")
-        return Machine(plant, sample_time, tuple(own if places is None else places), zero)
+        return PlacedMachine(plant, sample_time, tuple(own if places is None else places), zero)
     if sample_time is not None:
         raise InputError(
             CALLER, "sample_time", f"{sample_time} s", "none: systems of python-control have their own"
@@ -374,30 +374,30 @@ def tune(
             raise InputError(
                 CALLER, "ranges", "ranges", "none for systems of python-control: malta.uncertain has some"
             )
-        look, proof, rounds = _search(task, begin), Proof(None, {}, closed=False), 1
+        look, proof, rounds = _search(task, begin), LawProof(None, {}, closed=False), 1
     else:
         asked = _Asked(target, tuple(goals), ranges, wanted, over_box)
-        held = _holding(asked, task) if keep else None
+        held = _try_start(asked, task) if keep else None
         task, look, proof, rounds = _rounds(asked, task, begin, note) if held is None else held
     found = structure.at(look.x)
     values = {key: value for e in found.elements for key, value in e.values.items()}
     system = structure.system(look.x)
-    controller = target.controller(system, name) if isinstance(target, Machine) else None
+    controller = target.controller(system, name) if isinstance(target, PlacedMachine) else None
     return Tuned(
-        values, structure.order, system, first.sample_time, _reached(look, goals), tuple(m.name for m in task.models),
+        values, structure.order, system, first.sample_time, _figures(look, goals), tuple(m.name for m in task.models),
         proof.margin, proof.peaks, None if ranges is None else wanted, proof.closed,
         rounds, clock.monotonic() - begun, controller, proof.against,
     )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class Proof:
+class LawProof:
     """The proofs of a law, and the models that refute it."""
 
     margin: Margin | None
     peaks: Mapping[tuple[str, str], Gain]
     closed: bool
-    refuting: tuple[Model, ...] = ()
+    refuting: tuple[TunedPlant, ...] = ()
     against: str = ""
 
 
@@ -405,16 +405,16 @@ class Proof:
 class _Asked:
     """What shall be proven."""
 
-    target: Uncertain | Machine
+    target: UncertainModel | PlacedMachine
     goals: tuple[Goal, ...]
     ranges: Ranges | None
     margin: float
     over_box: bool
 
-    def prove(self, law: System) -> Proof:
+    def prove(self, law: System) -> LawProof:
         """Prove a law."""
         if self.ranges is None:
-            return Proof(None, {}, closed=False)
+            return LawProof(None, {}, closed=False)
         found = self.target.margin(law, self.ranges, PROOF_TIME)
         holds = found.lower is not None and found.lower >= self.margin
         refuting = []
@@ -431,7 +431,9 @@ class _Asked:
                     holds = holds and not goal.hard
                     if gain.lower > goal.peak[0] * (1 - ROOM):
                         refuting.append(self.target.at(gain.witness, goals=True))
-        return Proof(found, peaks, closed=holds and (stable or not self.over_box), refuting=tuple(refuting))
+        return LawProof(
+            found, peaks, closed=holds and (stable or not self.over_box), refuting=tuple(refuting)
+        )
 
     def _far(self, margin: Margin) -> dict[str, float]:
         """The witness of a margin, as far out as is asked for."""
@@ -453,7 +455,7 @@ def _search(task: Task, starts: Sequence[Any]) -> Look:
     return look
 
 
-def _holding(asked: _Asked, task: Task) -> tuple[Task, Look, Proof, int] | None:
+def _try_start(asked: _Asked, task: Task) -> tuple[Task, Look, LawProof, int] | None:
     """The first values, where they hold all hard goals and the proof closes."""
     look = task.look(np.zeros(len(task.structure.parameters)))
     if look is None or look.hard > 1 + ROOM:
@@ -464,7 +466,7 @@ def _holding(asked: _Asked, task: Task) -> tuple[Task, Look, Proof, int] | None:
 
 def _rounds(
     asked: _Asked, task: Task, starts: Sequence[Any], note: Callable[[str], None] | None
-) -> tuple[Task, Look, Proof, int]:
+) -> tuple[Task, Look, LawProof, int]:
     """Tune and prove until the proof closes, or cannot: then the last law that meets the goals stands."""
     say = note or (lambda _: None)
     say("tuning")
@@ -491,7 +493,7 @@ def _rounds(
     return task, look, proof, count
 
 
-def _reached(look: Look, goals: Sequence[Goal]) -> dict[str, float]:
+def _figures(look: Look, goals: Sequence[Goal]) -> dict[str, float]:
     """The largest figure of each goal, without the room of hard ones."""
     found = {}
     for goal in goals:

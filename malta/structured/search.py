@@ -25,14 +25,14 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
-from malta.structured.goals import Figure, Goal, stability
-from malta.structured.loops import ClosedLoop, Model
+from malta.structured.goals import Goal, GoalFigure, stability
+from malta.structured.loops import ClosedLoop, TunedPlant
 from malta.synthesis.elements import CALLER
 from malta.synthesis.structure import Structure
 
 PENALTY = 30.0  # cost of a hard figure's excess over 1, in that of a soft one
 RADIUS = 0.3  # of the first step, in x
-LARGEST = 1.0
+MAX_RADIUS = 1.0
 FIRST_CURVATURE = 0.1
 SAME_PEAK = 0.3  # of ln w: peaks that are closer are one peak that moved
 WIDTH = 0.5  # figures that are smaller than the largest by this share are left out of a program
@@ -68,7 +68,7 @@ class Look(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Effort:
+class DescentLimits:
     """How long a search goes on.
 
     steps : at most
@@ -84,7 +84,7 @@ class Effort:
 Looker = Callable[["FloatArray"], "Look | None"]  # None: no figures, as of an unstable loop
 
 
-def minimize(look: Looker, start: Look, bounds: FloatArray, effort: Effort) -> Look:
+def minimize(look: Looker, start: Look, bounds: FloatArray, effort: DescentLimits) -> Look:
     """Search from a place with figures to a local minimum of the largest soft one."""
     here, radius, still = start, RADIUS, 0
     H: FloatArray = FIRST_CURVATURE * np.eye(len(start.x))
@@ -97,22 +97,22 @@ def minimize(look: Looker, start: Look, bounds: FloatArray, effort: Effort) -> L
             continue
         d, expected, weights = found
         if not expected > 1e-9 * max(1.0, here.merit):
-            if radius >= LARGEST / 4:
+            if radius >= MAX_RADIUS / 4:
                 break
-            radius, still = min(4 * radius, LARGEST), still + 1
+            radius, still = min(4 * radius, MAX_RADIUS), still + 1
             if still > 2:
                 break
             continue
         there = look(np.clip(here.x + d, bounds[:, 0], bounds[:, 1]))
         gained = -math.inf if there is None else (here.merit - there.merit) / expected
         if there is not None:
-            H = _curved(H, d, here, there, weights)
+            H = _update_curvature(H, d, here, there, weights)
         if there is None or gained < 0.1:
             radius = 0.4 * min(radius, float(np.abs(d).max()))
             if gained <= 1e-3 or there is None:
                 continue
         elif gained > 0.7:
-            radius = min(max(radius, 2 * float(np.abs(d).max())), LARGEST)
+            radius = min(max(radius, 2 * float(np.abs(d).max())), MAX_RADIUS)
         still = still + 1 if here.merit - there.merit < effort.least * max(1.0, here.merit) else 0
         here = there
         if still > 3:
@@ -171,7 +171,9 @@ def _solver(n: int, rows: int) -> ca.Function:
     return _SOLVERS[n, rows]
 
 
-def _curved(H: FloatArray, d: FloatArray, here: Look, there: Look, weights: FloatArray) -> FloatArray:
+def _update_curvature(
+    H: FloatArray, d: FloatArray, here: Look, there: Look, weights: FloatArray
+) -> FloatArray:
     """H with the curvature along d of the figures that bound the program."""
     change = np.zeros(len(d))
     for f, weight in zip(here.figures, weights, strict=True):
@@ -200,7 +202,7 @@ def _near(a: float, b: float) -> bool:
     return abs(math.log(a / b)) < SAME_PEAK
 
 
-def by_x(figures: Sequence[Figure], slope: FloatArray, model: str, *, hard: bool) -> list[Slope]:
+def by_x(figures: Sequence[GoalFigure], slope: FloatArray, model: str, *, hard: bool) -> list[Slope]:
     """Figures with their derivatives by x. slope: of [D C; B A], column by column, by x."""
     return [
         Slope((model, f.goal, f.channel), f.w, f.value, f.slope.ravel(order="F") @ slope, hard)
@@ -209,9 +211,9 @@ def by_x(figures: Sequence[Figure], slope: FloatArray, model: str, *, hard: bool
 
 
 ROOM = 5e-3  # of hard bounds, and of the box of a margin: what a proof may need
-LEAST = 1e-3  # of `rate`: how much poles have to decay
+MIN_DECAY_RATE = 1e-3  # of `rate`: how much poles have to decay
 SPREAD = 1.0  # standard deviation of x of further starts
-FIXED = 1e-7  # relative, within which a pole stays where it is
+FIXED_POLE_TOLERANCE = 1e-7  # relative, within which a pole stays where it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +228,7 @@ class Task:
 
     structure: Structure
     goals: tuple[Goal, ...]
-    models: tuple[Model, ...]
+    models: tuple[TunedPlant, ...]
     rate: float
 
     def look(self, x: FloatArray) -> Look | None:
@@ -264,13 +266,13 @@ class Task:
             return None
         return Look(x, tuple(found)) if all(math.isfinite(f.value) for f in found) else None
 
-    def _stable(self, loop: ClosedLoop) -> list[Figure]:
-        figures = [f._replace(value=f.value + LEAST) for f in stability(loop, self.rate)]
+    def _stable(self, loop: ClosedLoop) -> list[GoalFigure]:
+        figures = [f._replace(value=f.value + MIN_DECAY_RATE) for f in stability(loop, self.rate)]
         top = max((f.value for f in figures), default=0.0)
         return [f for f in figures if f.value > min(top, 1.0) - 0.5]
 
 
-def rate_of(model: Model) -> float:
+def rate_of(model: TunedPlant) -> float:
     """A hundredth of the mean size of a model's poles, 1/s, or that of its unstable ones."""
     size = np.abs(np.linalg.eigvals(model.plane.A)) if len(model.plane.A) else np.zeros(0)
     size = size[size > 1e-6]
@@ -289,12 +291,12 @@ def search(task: Task, starts: Sequence[FloatArray]) -> Look:
         first = task.look_stable(np.clip(x, bounds[:, 0], bounds[:, 1]))
         if first is None:
             continue
-        stable = minimize(task.look_stable, first, bounds, Effort(120, 1.0 - 1e-6))
+        stable = minimize(task.look_stable, first, bounds, DescentLimits(120, 1.0 - 1e-6))
         slowest = min(slowest, stable.merit)
         here = task.look(stable.x)
         if here is None:
             continue
-        found = minimize(task.look, here, bounds, Effort(enough=0.0 if wanted else 1e-12))
+        found = minimize(task.look, here, bounds, DescentLimits(enough=0.0 if wanted else 1e-12))
         if best is None or found.merit < best.merit:
             best = found
         if not wanted and best.hard <= 1:
@@ -322,7 +324,7 @@ def fixed_pole(task: Task) -> tuple[str, complex] | None:
         for _ in range(3):
             theta, _ = task.structure.theta(rng.normal(size=len(task.structure.parameters)))
             closed = np.linalg.eigvals(ClosedLoop(model, theta).whole[0].A)
-            poles = [s for s in poles if np.abs(closed - s).min() <= FIXED * max(abs(s), 1e-3)]
+            poles = [s for s in poles if np.abs(closed - s).min() <= FIXED_POLE_TOLERANCE * max(abs(s), 1e-3)]
         if poles:
             return model.name, complex(poles[0])
     return None

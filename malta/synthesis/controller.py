@@ -59,7 +59,7 @@ from malta.errors import InputError
 from malta.model.equations import note
 from malta.model.plant import Parameters, Plant, Signal, outputs_at
 from malta.model.signals import Coordinates
-from malta.synthesis.schedule import SCHEDULED, Schedule, interpolate
+from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule, interpolate
 
 if TYPE_CHECKING:
     from malta.synthesis.filters import Gains
@@ -296,7 +296,7 @@ class Controller:
     @cached_property
     def summed(self) -> tuple[int, ...]:
         """The outputs whose sums of errors are fed back, by index."""
-        return _summed(self.Ki)
+        return _summed_columns(self.Ki)
 
     @property
     def integrating(self) -> bool:
@@ -326,7 +326,7 @@ class LinearLaw(NamedTuple):
     D_r: FloatArray
 
 
-def _summed(Ki: FloatArray) -> tuple[int, ...]:
+def _summed_columns(Ki: FloatArray) -> tuple[int, ...]:
     """The columns of Ki that are not zero."""
     return tuple(np.flatnonzero(Ki.any(axis=0)).tolist())
 
@@ -354,7 +354,7 @@ def disturbances(inputs: tuple[Signal, ...]) -> tuple[Signal, ...]:
 def gains_of(c: Controller) -> dict[str, ca.DM]:
     """What the law computes with, sparse: exact zeros cost nothing at run time."""
     if c.schedule is None:
-        matrices = {name: ca.sparsify(ca.DM(getattr(c, name))) for name in SCHEDULED}
+        matrices = {name: ca.sparsify(ca.DM(getattr(c, name))) for name in SCHEDULED_MATRICES}
     else:
         matrices = c.schedule.numbers()
     matrices |= {"force_limit": ca.DM(c.limits.force), "control_time": ca.DM(c.sample_time)}
@@ -368,7 +368,7 @@ def gains_of(c: Controller) -> dict[str, ca.DM]:
     return matrices | {"lead": ca.DM(lead), "ahead": ca.sparsify(ca.DM(lead * c.commutation.pull))}
 
 
-def filtered(tracks: Tracks, y: Any, p_ref: Any) -> Any:
+def filter_reading(tracks: Tracks, y: Any, p_ref: Any) -> Any:
     """The reading that step 2 takes: y, or y - p* in a law of errors."""
     return y - p_ref if tracks == "errors" else y
 
@@ -403,31 +403,33 @@ def _braking_force(g: Mapping[str, Any], off: Any) -> Any:
     return found
 
 
-def estimated(g: Mapping[str, Any], xi_pred: Any, y: Any, C: Any = None, add: Add = operator.add) -> Any:
+def estimate_states(
+    g: Mapping[str, Any], xi_pred: Any, y: Any, C: Any = None, add: Add = operator.add
+) -> Any:
     """Step 2, the filter: xi_hat. C: in place of Cd where it is scheduled; add: see Add."""
     return add(xi_pred, g["L"] @ (y - (g["Cd"] if C is None else C) @ xi_pred))
 
 
-def commanded(
+def command_forces(
     g: Mapping[str, Any], xi_hat: Any, e: Any, xi_ref: Any, v_ff: Any, v0: Any
 ) -> tuple[Any, Any, Any]:
     """Steps 3, 4 and 6: (xi_pred, forces that saturate, v) from the estimate and the sums of errors."""
-    wanted = _wanted(g, xi_hat, e, xi_ref, v_ff, v0)
+    wanted = _wanted_forces(g, xi_hat, e, xi_ref, v_ff, v0)
     if "braking" in g:
         wanted = wanted + _braking_force(g, xi_ref - xi_hat)
     note("law", "w = K (xi_ref - xi_hat) + Ki e + v_ff + v0", w=wanted)
     v = ca.fmax(ca.fmin(wanted, g["force_limit"]), -g["force_limit"])
     saturated = v != wanted
     note("limit_forces", "v = w within +-limits.force; saturated: v is not w", v=v, saturated=saturated)
-    return _predicted(g, xi_hat, v, v0), saturated, v
+    return _predict_states(g, xi_hat, v, v0), saturated, v
 
 
-def _wanted(g: Mapping[str, Any], xi_hat: Any, e: Any, xi_ref: Any, v_ff: Any, v0: Any) -> Any:
+def _wanted_forces(g: Mapping[str, Any], xi_hat: Any, e: Any, xi_ref: Any, v_ff: Any, v0: Any) -> Any:
     # The first sum is the same for all machines under one reference: engines compute it once a sample.
     return (g["K"] @ xi_ref + v_ff) + (g["Ki"] @ e - g["K"] @ xi_hat) + v0
 
 
-def _predicted(g: Mapping[str, Any], xi_hat: Any, v: Any, v0: Any) -> Any:
+def _predict_states(g: Mapping[str, Any], xi_hat: Any, v: Any, v0: Any) -> Any:
     return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0)
 
 
@@ -479,9 +481,9 @@ def _symbolic_law(
     args = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     xi_pred, e, frozen, y, p_ref, *given = args.values()
     g = interpolate(g, schedule, p_ref)
-    xi_hat = estimated(g, xi_pred, filtered(tracks, y, p_ref))
+    xi_hat = estimate_states(g, xi_pred, filter_reading(tracks, y, p_ref))
     e_next = sum_errors(g, e, frozen, y, p_ref)
-    xi_pred_next, saturated, v = commanded(g, xi_hat, e_next, *given)
+    xi_pred_next, saturated, v = command_forces(g, xi_hat, e_next, *given)
     return args, {
         "xi_pred_next": xi_pred_next,
         "e_next": e_next,
@@ -495,11 +497,11 @@ def law_at(c: Controller, plant: Plant, x: FloatArray) -> Controller:
     """The law that a controller has at rest at the states x of a plant: itself, or its schedule's matrices there."""
     if c.schedule is None:
         return c
-    return _fixed(c, float(outputs_at(plant, x)[c.schedule.output]))
+    return _fix_schedule(c, float(outputs_at(plant, x)[c.schedule.output]))
 
 
 @lru_cache(maxsize=64)  # records compare by identity: what is known of a fixed law is found again
-def _fixed(c: Controller, r: float) -> Controller:
+def _fix_schedule(c: Controller, r: float) -> Controller:
     assert c.schedule is not None
     return replace(c, **c.schedule.at(r), schedule=None)
 
@@ -510,7 +512,7 @@ def linear_law(c: Controller) -> LinearLaw:
 
     Of a schedule it is the law at the operating point; `law_at` has those at other references.
     """
-    gains = {name: getattr(c, name) for name in SCHEDULED}
+    gains = {name: getattr(c, name) for name in SCHEDULED_MATRICES}
     found = _without_limits(gains, c.sample_time, c.tracks, c.summed)
     k = len(c.states) - len(c.measurements)
     kept = any(M[k:].any() for M in (found.A, found.B_y, found.B_r))
@@ -521,7 +523,7 @@ def linear_law(c: Controller) -> LinearLaw:
 
 def linear_law_of(g: Gains, Ts: float) -> LinearLaw:
     """The same of gains alone, for a search that tries thousands: without references, so r is empty."""
-    return _without_limits(g._asdict(), Ts, "states", _summed(g.Ki), references=False)
+    return _without_limits(g._asdict(), Ts, "states", _summed_columns(g.Ki), references=False)
 
 
 def _without_limits(
@@ -538,10 +540,10 @@ def _without_limits(
     ends = np.cumsum([n, p, p, p, n, m, m]).tolist()
     units = ca.DM.eye(ends[-1])[:, : ends[-1] if references else ends[2]]
     xi_pred, e, y, p_ref, *given = ca.vertsplit(units, [0, *ends])
-    xi_hat = estimated(g, xi_pred, filtered(tracks, y, p_ref))
+    xi_hat = estimate_states(g, xi_pred, filter_reading(tracks, y, p_ref))
     e_next = sum_errors(g, e, 0.0, y, p_ref)
-    v = _wanted(g, xi_hat, e_next, *given)
-    s_next = ca.vertcat(_predicted(g, xi_hat, v, given[-1]), e_next[list(summed), :])
+    v = _wanted_forces(g, xi_hat, e_next, *given)
+    s_next = ca.vertcat(_predict_states(g, xi_hat, v, given[-1]), e_next[list(summed), :])
     s = [*range(n), *(n + k for k in summed)]
     columns = (s, slice(ends[1], ends[2]), slice(ends[2], None))
     return LinearLaw(*(np.array(M)[:, of] for M in (s_next, v) for of in columns))

@@ -24,7 +24,7 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors, require_known
 from malta.files import locate
-from malta.model.data import plant_of, published, read
+from malta.model.data import plant_of, read, read_published
 from malta.model.parameters import units_of
 from malta.model.plant import Parameters, Plant, Signal
 from malta.synthesis.design_tables import (
@@ -107,7 +107,7 @@ def resolve_published(raw: Mapping[str, Any], path: Path) -> dict[str, Any]:
     Raises InputError for a reference to what is not published.
     """
     machine_file = machine_file_of(raw, path)
-    printed = cache(partial(published, machine_file))  # read once, and only where something refers to it
+    printed = cache(partial(read_published, machine_file))  # read once, and only where something refers to it
     found: dict[str, Any] = with_published(raw, printed, machine_file, path)
     return found
 
@@ -166,7 +166,7 @@ def spec_of(
     )
 
 
-LATER = (
+LATER_KEYS = (
     "current_lag",
     "coordinates",
     "position_feedforward",
@@ -181,7 +181,7 @@ LATER = (
 def _fingerprint(content: DesignFile) -> str:
     """SHA-256 of all that shapes the design."""
     other = {"summary", "machine", "cost", "specification", "search", "goals"}
-    other |= {name for name in LATER if getattr(content, name) == DesignFile.model_fields[name].default}
+    other |= {name for name in LATER_KEYS if getattr(content, name) == DesignFile.model_fields[name].default}
     shaping = json.dumps(content.model_dump(exclude=other, exclude_none=True), sort_keys=True)
     return hashlib.sha256(shaping.encode()).hexdigest()
 
@@ -245,8 +245,8 @@ def _law(content: DesignFile, plant: Plant, path: Path) -> Weights | Pid | Struc
 
 
 LQG = ("discretization", "delay", "weights", "bases", "noise")
-ONLY_LQG = (*LQG, "current_lag", "coordinates")
-NOT_BESIDE = {
+LQG_ONLY_KEYS = (*LQG, "current_lag", "coordinates")
+EXCLUDED_TABLES = {
     "pid": (),
     "structure": ("pid", "cost", "search", "pause", "braking", "commutation", "schedule"),
 }
@@ -259,7 +259,7 @@ def _require_law(content: DesignFile, raw: Mapping[str, Any], path: Path) -> Non
         missing = next((name for name in LQG if name not in raw), None)
         if missing is not None:
             raise InputError(path, missing, "nothing", "this key")
-    for name in () if other is None else (*ONLY_LQG, *NOT_BESIDE[other]):
+    for name in () if other is None else (*LQG_ONLY_KEYS, *EXCLUDED_TABLES[other]):
         if name in raw:
             expected = "one of them: an LQG, a PID, or a law of a given structure"
             raise InputError(path, name, f"this key beside [{other}]", expected)

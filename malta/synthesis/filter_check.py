@@ -28,9 +28,9 @@ from malta.synthesis.riccati import EPS, care, lyapunov
 from malta.synthesis.schedule import point_at
 from malta.synthesis.spec import Spec
 
-SETTLED = 1e-10  # of a covariance: what may be left of where it began
+SETTLED_SHARE = 1e-10  # of a covariance: what may be left of where it began
 SAMPLES = 20_000  # at most, some seconds; what is left then is allowed
-ALLOWED = 1e-7  # of the gain, in units in which covariances are of one size
+ALLOWED_ERROR = 1e-7  # of the gain, in units in which covariances are of one size
 
 
 class FilterCheck(NamedTuple):
@@ -122,11 +122,11 @@ def _patience(noisy: Noisy, P: FloatArray) -> tuple[int, float]:
     size, one, K = partial(np.linalg.norm, ord=2), np.eye(len(P)), filter_gain(noisy, P)
     closed = noisy.F @ (one - K @ noisy.H)
     slowest = float(np.abs(eigenvalues(closed)).max())
-    samples = min(math.ceil(math.log(SETTLED) / (2 * math.log(max(slowest, 0.5)))), SAMPLES)
+    samples = min(math.ceil(math.log(SETTLED_SHARE) / (2 * math.log(max(slowest, 0.5)))), SAMPLES)
     left = size(np.linalg.matrix_power(closed, samples)) ** 2 * size(one - P)
     rounding = EPS * size(lyapunov(closed.T, one, discrete=True)) * size(noisy.F) ** 2 * size(P)
     moved = size(np.linalg.solve(innovations(noisy, P), noisy.H)) / np.abs(K).max()
-    return samples, float(ALLOWED + 10 * moved * (left + rounding))
+    return samples, float(ALLOWED_ERROR + 10 * moved * (left + rounding))
 
 
 def _run(noisy: Noisy, samples: int) -> tuple[FloatArray, FloatArray]:

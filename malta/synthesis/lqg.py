@@ -55,9 +55,11 @@ from malta.synthesis.spec import Discretization, Weights
 # Why a linear model has no stabilizing controller, in words: modes that nothing moves or sees, zeros, slow samples.
 
 
-SINGULAR = 1e-10  # of [pole I - A, B] on scales that balance A, in units of A: a mode below is out of reach
+SINGULAR_SIZE = (
+    1e-10  # of [pole I - A, B] on scales that balance A, in units of A: a smaller one is out of reach
+)
 SHARE = 0.1  # of its largest entry: a state with more of it carries a mode
-LONG = 1.0  # a sample in which an unstable mode grows by e or more
+LONG_SAMPLE_GROWTH = 1.0  # a sample in which an unstable mode grows by e or more
 
 
 class LostMode(NamedTuple):
@@ -86,7 +88,7 @@ def lost_modes(A: FloatArray, B: FloatArray) -> list[LostMode]:
         if pole.imag < 0 or pole.real < -1e-9 * size:
             continue
         u, s, _ = linalg.svd(np.hstack([pole * np.eye(len(A)) - balanced, pushed]))
-        if s[-1] < SINGULAR * size and all(abs(pole - one.pole) > 1e-6 * size for one in found):
+        if s[-1] < SINGULAR_SIZE * size and all(abs(pole - one.pole) > 1e-6 * size for one in found):
             found.append(LostMode(complex(pole), _carriers(u[:, -1])))
     return found
 
@@ -120,7 +122,7 @@ def obstacle(model: LinearModel, weights: Weights, Ts: float) -> str:
             "leave out noise.drift, and take integrals"
         )
     fastest = float(linalg.eigvals(A).real.max())
-    if fastest * Ts > LONG:
+    if fastest * Ts > LONG_SAMPLE_GROWTH:
         return (
             f"the sample time of {Ts:.4g} s is too long for the unstable pole at {fastest:.4g} rad/s, which grows "
             f"{math.exp(min(fastest * Ts, 700)):.3g}-fold in it: at most about {0.3 / fastest:.1g} s"

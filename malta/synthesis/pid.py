@@ -27,7 +27,7 @@ from malta.synthesis.filters import Gains
 from malta.synthesis.spec import Pid, PidAxes, require_pairs
 
 
-class Axes(NamedTuple):
+class PidAxisSet(NamedTuple):
     """What each of k axes measures, and the inputs that act for it: s = of_outputs p = of_positions q, v = inputs f."""
 
     of_outputs: FloatArray  # k x p
@@ -85,7 +85,7 @@ def pid(
     )
 
 
-def axes_of(model: LinearModel, axes: PidAxes) -> Axes:
+def axes_of(model: LinearModel, axes: PidAxes) -> PidAxisSet:
     """Find the axes of a PID on a machine.
 
     Raises CheckError where the inputs cannot accelerate each coordinate by itself.
@@ -93,14 +93,14 @@ def axes_of(model: LinearModel, axes: PidAxes) -> Axes:
     half = len(model.A) // 2
     P, one = model.C[:, :half], np.eye(half)
     if axes == "decentralized":
-        return Axes(np.eye(len(P)), P, np.eye(model.B.shape[1]))
+        return PidAxisSet(np.eye(len(P)), P, np.eye(model.B.shape[1]))
     try:
-        return Axes(np.linalg.inv(P), one, np.linalg.inv(model.force_map))
+        return PidAxisSet(np.linalg.inv(P), one, np.linalg.inv(model.force_map))
     except np.linalg.LinAlgError as error:
         raise CheckError(f"pid: axes at the centre of gravity of a {model.plant.name}: {error}") from error
 
 
-def _lagging_inertia(terms: Pid, Ts: float, axes: Axes) -> FloatArray:
+def _lagging_inertia(terms: Pid, Ts: float, axes: PidAxisSet) -> FloatArray:
     """What each input pushes per unit of its output's p*'', as filtered rates lag, kg or kg m^2."""
     a = _decay(terms, Ts)
     pushed = axes.inputs @ ((terms.Kd * Ts * a / (1 - a))[:, None] * axes.of_outputs)
@@ -112,7 +112,7 @@ def _decay(terms: Pid, Ts: float) -> FloatArray:
     return np.array([math.exp(-Ts / time) if time else 0.0 for time in terms.filters])
 
 
-def pid_gains(P: FloatArray, terms: Pid, Ts: float, axes: Axes) -> Gains:
+def pid_gains(P: FloatArray, terms: Pid, Ts: float, axes: PidAxisSet) -> Gains:
     """A PID as the control law runs it, for positions q with p = P q: these and their rates come from the outputs.
 
     The rate of each axis has its own filter: in positions that is M^-1 diag(a) M, with s = M q.
@@ -131,10 +131,10 @@ def pid_gains(P: FloatArray, terms: Pid, Ts: float, axes: Axes) -> Gains:
     )
 
 
-def law_of_outputs(terms: Pid, axes: Axes, outputs: Sequence[int]) -> tuple[Pid, Axes]:
+def law_of_outputs(terms: Pid, axes: PidAxisSet, outputs: Sequence[int]) -> tuple[Pid, PidAxisSet]:
     """The axes that some outputs belong to, alone: their terms, and the axes with these outputs for positions."""
     own = np.array(outputs)
     k = np.flatnonzero(axes.of_outputs[:, own].any(axis=1))
     W = axes.of_outputs[np.ix_(k, own)]
     few = replace(terms, Kp=terms.Kp[k], Ki=terms.Ki[k], Kd=terms.Kd[k], filter=terms.filters[k])
-    return few, Axes(W, W, axes.inputs[np.ix_(own, k)])
+    return few, PidAxisSet(W, W, axes.inputs[np.ix_(own, k)])

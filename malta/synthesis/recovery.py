@@ -41,8 +41,8 @@ from malta.units import is_unit_of, to_si, units_like
 
 BLOCK = 64  # times that one product of matrices gives
 BLOCKS = 32  # in an octave
-SETTLED = 1e-9  # share of the largest deviation: what is left at the end of the grid
-LONGEST = 44  # octaves at most, where a pole is next to 1
+SETTLED_SHARE = 1e-9  # share of the largest deviation: what is left at the end of the grid
+MAX_OCTAVES = 44  # octaves at most, where a pole is next to 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +103,8 @@ def step_response(M: FloatArray, g: FloatArray, C: FloatArray, Ts: float) -> Ste
         raise CheckError(f"an unstable loop, |lambda| = {radius:.6f}, has no answer to a constant load")
     step = system_matrix(M, g, None, np.eye(w))
     out = np.hstack([C, np.zeros((len(C), w))])
-    samples = math.log(SETTLED) / math.log(max(radius, 1e-3))
-    octaves = min(1 + max(math.ceil(math.log2(samples / (BLOCK * BLOCKS))), 0), LONGEST)
+    samples = math.log(SETTLED_SHARE) / math.log(max(radius, 1e-3))
+    octaves = min(1 + max(math.ceil(math.log2(samples / (BLOCK * BLOCKS))), 0), MAX_OCTAVES)
     state, stride, k = np.vstack([np.zeros((n, w)), np.eye(w)]), 1, 0
     times: list[FloatArray] = []
     found: list[FloatArray] = []

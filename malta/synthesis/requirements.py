@@ -1,8 +1,9 @@
 """Requirements: what a design can be asked to reach in [specification], and how each one is judged.
 
 A requirement is one record: its key in the file, its unit, the side that it bounds from, how it is measured on a
-finished design, and how a search estimates it in milliseconds. GENERIC holds what every machine can be asked for. A
-machine's own stand as REQUIREMENTS in the module `requirements` of its folder, and replace generic ones of their name:
+finished design, and how a search estimates it in milliseconds. GENERIC_REQUIREMENTS holds what every machine can be
+asked for. A machine's own stand as REQUIREMENTS in the module `requirements` of its folder, and replace generic ones
+of their name:
 
     def _carried(design, asked, signal):
         e = design.fly("payload", masses=(asked,))
@@ -47,7 +48,7 @@ class Figure(NamedTuple):
     interval: tuple[float, float] | None = None  # CONFIDENCE of the value, where it is a mean over seeds
 
 
-class Noise(NamedTuple):
+class NoiseRms(NamedTuple):
     """Rms by output and by input: what the sensors' noise and steps leave in both."""
 
     motion: FloatArray  # p, of the true outputs, m or rad
@@ -78,7 +79,7 @@ class Design(Protocol):
         """The smallest by the definitions of margins.verify, rad/s, and which one it is."""
 
     @property
-    def noise(self) -> Noise:
+    def noise(self) -> NoiseRms:
         """By the covariance of the machine's linear loop, each reading's step q as noise of variance q^2 / 12."""
 
     @property
@@ -106,7 +107,7 @@ class TrialFigures:
     outputs: tuple[int, ...]  # p of the plant's
     inputs: tuple[int, ...]  # m of the plant's
     model: Linear  # continuous, n states
-    noise: Noise  # p motions and m forces
+    noise: NoiseRms  # p motions and m forces
     margin: float | None  # None: not asked for
     peak_sensitivity: float
     bandwidth: float  # rad/s
@@ -178,7 +179,7 @@ def requirements_for(plant: Plant) -> dict[str, Requirement]:
     """List what a machine's designs can be asked for, by name: generic requirements, then the machine's own."""
     mine: Sequence[Requirement] = attribute_of(plant, "requirements", "REQUIREMENTS", ())
     names = {r.name for r in mine}
-    return {r.name: r for r in (*(g for g in GENERIC if g.name not in names), *mine)}
+    return {r.name: r for r in (*(g for g in GENERIC_REQUIREMENTS if g.name not in names), *mine)}
 
 
 def ratio_of(asked: float, found: float, *, at_least: bool) -> float:
@@ -338,7 +339,7 @@ def _index(signals: Sequence[Signal], name: str) -> list[int]:
     return [k for k, s in enumerate(signals) if s.name == name]
 
 
-GENERIC = (
+GENERIC_REQUIREMENTS = (
     Requirement(
         "noise_motion",
         lambda design, _asked, signal: [

@@ -39,16 +39,16 @@ Solver = Literal[
 ]  # who finds X; the first is imported where it is asked, in two seconds
 
 RESIDUAL = 1e-9  # largest accepted relative residual of a Riccati equation
-GIVEN = 1e-8  # of the terms of an equation: what a library's rounding may be worth, more than the condition explains
-REFINED = 1e-13  # the residual above which a solution is refined: rounding leaves less than a tenth of it
+LIBRARY_ROUNDING = 1e-8  # of the terms of an equation, beyond what the condition explains
+REFINED_RESIDUAL = 1e-13  # above it a solution is refined; rounding leaves less than a tenth of it
 EPS = float(np.finfo(float).eps)
 STEPS = 8  # of Newton's at most; each squares the error
 ROUNDING = 1e-16  # couplings below this, relative to what else acts on and from both ends, are none
-BALANCED = 1e-3  # the last change of scales that are rounded to powers of two
+LAST_SCALE_CHANGE = 1e-3  # the last change of scales that are rounded to powers of two
 DOUBLINGS = 64  # at most: sums of 2^64 samples
 
 
-class Solution(NamedTuple):
+class RiccatiSolution(NamedTuple):
     """X, the optimal gain, and the relative residual that X leaves."""
 
     X: FloatArray
@@ -68,7 +68,7 @@ class _Equation(NamedTuple):
     discrete: bool
 
 
-class _Found(NamedTuple):
+class _ScaledSolution(NamedTuple):
     """A solution of a scaled equation, its gain, A - B K, and the relative residual."""
 
     equation: _Equation
@@ -87,7 +87,7 @@ def care(
     *,
     N: FloatArray | None = None,
     solver: Solver = "scipy",
-) -> Solution:
+) -> RiccatiSolution:
     """Solve A'X + XA - (XB + N) R^-1 (B'X + N') + Q = 0 for the stabilizing X; K = R^-1 (B'X + N').
 
     The Kalman filter is the dual: care(A.T, C.T, W, V).K.T with intensities W, V. X >= 0 where [Q N; N' R] >= 0; other
@@ -97,7 +97,9 @@ def care(
     Raises InputError (shapes, NaN, R not > 0) and CheckError (no stabilizing solution, residual above 1e-9, a solver
     whose X is further off than the condition allows, X not >= 0 where the weights are); `what` opens the message.
     """
-    return _by_parts(A, B, Q, R, np.zeros_like(B) if N is None else N, _Task(what, solver, discrete=False))
+    return _by_parts(
+        A, B, Q, R, np.zeros_like(B) if N is None else N, _RiccatiTask(what, solver, discrete=False)
+    )
 
 
 def dare(
@@ -109,7 +111,7 @@ def dare(
     what: str = "DARE",
     *,
     solver: Solver = "scipy",
-) -> Solution:
+) -> RiccatiSolution:
     """Solve the discrete Riccati equation for the cost sum x'Qx + 2 x'Nu + u'Ru; u = -Kx, the stabilizing one.
 
     R may be singular, as what an input moves costs, too: R + B'XB > 0.
@@ -119,11 +121,11 @@ def dare(
     S = np.zeros_like(B) if N is None else N
     _check_shapes(A, B, Q, R, S, what)
     if not _is_definite(R):
-        return _with_known_cost(A, B, Q, R, S, _Task(what, solver, discrete=True))
-    return _by_parts(A, B, Q, R, S, _Task(what, solver, discrete=True))
+        return _with_known_cost(A, B, Q, R, S, _RiccatiTask(what, solver, discrete=True))
+    return _by_parts(A, B, Q, R, S, _RiccatiTask(what, solver, discrete=True))
 
 
-class _Task(NamedTuple):
+class _RiccatiTask(NamedTuple):
     """What an equation is for, as messages say it, who solves it, and of which kind it is."""
 
     what: str
@@ -132,8 +134,8 @@ class _Task(NamedTuple):
 
 
 def _with_known_cost(
-    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, task: _Task
-) -> Solution:
+    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, task: _RiccatiTask
+) -> RiccatiSolution:
     """The solution as X0 + Y, with X0 such that R + B'X0B > 0: the equation of Y has this as its weight of inputs.
 
     x+'X0 x+ - x'X0 x is a sum that ends at rest, so it changes no optimum.
@@ -153,13 +155,13 @@ def _with_known_cost(
     residual = float(np.linalg.norm(sum(terms)) / sum(np.linalg.norm(term) for term in terms))
     if not residual <= RESIDUAL:
         raise CheckError(f"{task.what}: the relative residual is {residual:.1e}, allowed {RESIDUAL:.0e}")
-    return Solution(X, Y.K, residual)
+    return RiccatiSolution(X, Y.K, residual)
 
 
 @np.errstate(all="ignore")  # what overflows fails its check below
 def _by_parts(
-    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, task: _Task
-) -> Solution:
+    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, task: _RiccatiTask
+) -> RiccatiSolution:
     X, K, residual = np.zeros_like(A), np.zeros_like(B.T), 0.0
     for i, j in _parts(A, B, Q, R, N, task.what):
         ii, ij = np.ix_(i, i), np.ix_(i, j)
@@ -172,15 +174,15 @@ def _by_parts(
         X[ii] = found.X * unit / np.outer(t, t)
         K[np.ix_(j, i)] = linalg.solve_triangular(U.T, found.K / t + S.T, lower=False)
         residual = max(residual, found.residual)
-    return Solution(X, K, residual)
+    return RiccatiSolution(X, K, residual)
 
 
 # A slider moves one weight: the equations of other axes, and the filter's, are the same.
 @lru_cache(maxsize=64)
-def _solution_of(shape: tuple[int, int], a: bytes, b: bytes, q: bytes, task: _Task) -> _Found:
+def _solution_of(shape: tuple[int, int], a: bytes, b: bytes, q: bytes, task: _RiccatiTask) -> _ScaledSolution:
     """The first solution that is as good as rounding allows, or else the best; R is the identity."""
     A, B, Q = (np.frombuffer(entries).reshape(shape[0], -1) for entries in (a, b, q))
-    candidates: list[_Found] = []
+    candidates: list[_ScaledSolution] = []
     failures: list[Exception] = []
     what, discrete = task.what, task.discrete
     balanced = _balance(A - discrete * np.eye(len(A)), B @ B.T, Q)
@@ -198,7 +200,7 @@ def _solution_of(shape: tuple[int, int], a: bytes, b: bytes, q: bytes, task: _Ta
             failures.append(error)
             continue
         candidates.append(found)
-        if found.residual <= REFINED:
+        if found.residual <= REFINED_RESIDUAL:
             break
     if not candidates:
         first = failures[0]
@@ -213,7 +215,7 @@ def _solution_of(shape: tuple[int, int], a: bytes, b: bytes, q: bytes, task: _Ta
     return found
 
 
-def _given(
+def _library_solution(
     solver: Solver, A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, *, discrete: bool
 ) -> FloatArray:
     """X as a library finds it. The equation is scaled: neither of them does that."""
@@ -230,7 +232,7 @@ def _hamiltonian(equation: _Equation, solver: Solver) -> FloatArray:
     """X from the stable subspace of the Hamiltonian; time counts in the largest entry of A."""
     A, B, Q, R = equation[:4]
     rate = np.abs(A).max() or 1.0
-    return _given(solver, A / rate, B / np.sqrt(rate), Q / rate, R, discrete=False)
+    return _library_solution(solver, A / rate, B / np.sqrt(rate), Q / rate, R, discrete=False)
 
 
 def _symplectic(equation: _Equation, solver: Solver) -> FloatArray:
@@ -239,7 +241,7 @@ def _symplectic(equation: _Equation, solver: Solver) -> FloatArray:
     X counts in units of Q. Where weights are weak or samples short Q is small beside X, and the I beside this X: the
     ratio is lost in digits. scipy balances the pencil once more and so returns to these units from any other.
     """
-    return _given(solver, *equation[:4], discrete=True)
+    return _library_solution(solver, *equation[:4], discrete=True)
 
 
 def _bilinear(equation: _Equation, solver: Solver) -> FloatArray:
@@ -261,20 +263,20 @@ def _bilinear(equation: _Equation, solver: Solver) -> FloatArray:
     return _hamiltonian(found, solver) / equation.unit
 
 
-def _compare(given: _Found, found: _Found, solver: Solver) -> None:
+def _compare(given: _ScaledSolution, found: _ScaledSolution, solver: Solver) -> None:
     """CheckError where refining has moved X by more than the condition of the equation allows."""
     if found is given:
         return
     apart = np.linalg.norm(given.X - found.X, 2) / np.linalg.norm(found.X, 2)
-    if apart <= GIVEN:  # a condition is 1 or more
+    if apart <= LIBRARY_ROUNDING:  # a condition is 1 or more
         return
-    allowed = GIVEN * _condition(found)
+    allowed = LIBRARY_ROUNDING * _condition(found)
     if not apart <= allowed:
         said = f"the solution of {solver} is {apart:.1e} from its refinement"
         raise CheckError(f"{said}, and the condition of the equation allows {allowed:.1e}")
 
 
-def _condition(found: _Found) -> float:
+def _condition(found: _ScaledSolution) -> float:
     """How many times a relative change of the terms of the equation changes X, relative to X.
 
     The Lyapunov operator of A - B K takes what the terms change by to what X does (Kenney, Hewer, SIAM J. Control
@@ -289,7 +291,7 @@ def _condition(found: _Found) -> float:
     return float(back * (terms + size(Q) / size(X)))
 
 
-def _refine(found: _Found) -> _Found:
+def _refine(found: _ScaledSolution) -> _ScaledSolution:
     """Newton's steps (Kleinman, IEEE Trans. Autom. Control 13(1), 1968), where and while they lower the residual.
 
     A step solves the Lyapunov equation of the loop that X closes. From a gain that does not stabilize, Newton's
@@ -297,7 +299,7 @@ def _refine(found: _Found) -> _Found:
     """
     A, B, Q, R, _, _, discrete = found.equation
     best = found
-    for _ in range(0 if found.residual <= REFINED else STEPS):
+    for _ in range(0 if found.residual <= REFINED_RESIDUAL else STEPS):
         X, K = best.X, best.K
         F = A - discrete * np.eye(len(A)) - B @ K  # of x+ - x: its products with X are as small as Q
         left = F.T @ X + X @ F + K.T @ R @ K + Q + discrete * F.T @ X @ F
@@ -308,7 +310,7 @@ def _refine(found: _Found) -> _Found:
     return best if best is found or _stands(best) else found
 
 
-def _stands(found: _Found) -> bool:
+def _stands(found: _ScaledSolution) -> bool:
     """Whether the closed loop stays stable when rounding moves it: rounding of A - B K, and of Q through X and K."""
     A, B, Q, R, _, _, discrete = found.equation
     size, closed = np.linalg.norm, found.closed
@@ -350,7 +352,7 @@ def _on_scales(t: FloatArray, A: FloatArray, B: FloatArray, Q: FloatArray, *, di
     )
 
 
-def _evaluate(equation: _Equation, X: FloatArray) -> _Found:
+def _evaluate(equation: _Equation, X: FloatArray) -> _ScaledSolution:
     """The gain of X and the residual that it leaves, relative to the terms of the equation."""
     A, B, Q, R = equation[:4]
     X = _symmetric(X)
@@ -362,7 +364,7 @@ def _evaluate(equation: _Equation, X: FloatArray) -> _Found:
         terms = [A.T @ X, X @ A, -K.T @ K, Q]
     size = sum(np.linalg.norm(term) for term in terms)
     residual = float(np.nan_to_num(np.linalg.norm(sum(terms)) / size, nan=np.inf)) if size else 0.0
-    return _Found(equation, X, K, A - B @ K, residual)
+    return _ScaledSolution(equation, X, K, A - B @ K, residual)
 
 
 def _parts(
@@ -428,7 +430,7 @@ def _balance(A: FloatArray, G: FloatArray, Q: FloatArray) -> FloatArray:
         # G_ii and Q_ii change with t_i^2, squared here: with the fourth root of off-diagonal entries they oscillate.
         step = np.sqrt(np.sqrt(np.where((falls > 0) & (grows > 0), falls / grows, 1.0)))
         s = s * step
-        if np.abs(step - 1).max(initial=0.0) < BALANCED:
+        if np.abs(step - 1).max(initial=0.0) < LAST_SCALE_CHANGE:
             break
     t = np.sqrt(s)
     return _powers_of_two(t)
@@ -451,7 +453,7 @@ def _powers_of_two(t: FloatArray) -> FloatArray:
     return np.asarray(np.exp2(np.round(np.log2(t))))  # scaling by them adds no rounding
 
 
-def _check(found: _Found, what: str, *, definite: bool) -> None:
+def _check(found: _ScaledSolution, what: str, *, definite: bool) -> None:
     poles = eigenvalues(found.closed)
     discrete = found.equation.discrete
     excess = np.abs(poles).max() - 1 if discrete else poles.real.max()
@@ -464,7 +466,7 @@ def _check(found: _Found, what: str, *, definite: bool) -> None:
         raise CheckError(f"{what}: the solution is not positive semidefinite")
 
 
-def _rounding_of_poles(found: _Found) -> float:
+def _rounding_of_poles(found: _ScaledSolution) -> float:
     """How far rounding of A and B K may move the slowest pole of A - B K: |y'| (|A| + |B| |K|) |x| / |y'x|; a double
     pole at most, and the largest pole's at least."""
     A, B = found.equation[:2]

@@ -23,7 +23,7 @@ from malta.errors import InputError
 from malta.model.equations import note
 from malta.model.plant import OperatingPoint, Plant, outputs_at
 
-SCHEDULED = ("Ad", "Bd", "Cd", "K", "Ki", "L")
+SCHEDULED_MATRICES = ("Ad", "Bd", "Cd", "K", "Ki", "L")
 
 
 @display
@@ -56,7 +56,7 @@ class Schedule:
     L: FloatArray
 
     def __post_init__(self) -> None:
-        for name in ("places", *SCHEDULED):
+        for name in ("places", *SCHEDULED_MATRICES):
             object.__setattr__(self, name, readonly(getattr(self, name)))
         p = self.places
         if len(p) < 2 or not (np.isfinite(p).all() and (np.diff(p) > 0).all()):
@@ -71,7 +71,7 @@ class Schedule:
         """The matrices at a reference r of the output, SI."""
         shares = [min(max((r - a) / (b - a), 0.0), 1.0) for a, b in self.cells]
         found = {}
-        for name in SCHEDULED:
+        for name in SCHEDULED_MATRICES:
             matrices = getattr(self, name)
             M = np.array(matrices[0])
             for share, step in zip(shares, np.diff(matrices, axis=0), strict=True):
@@ -82,7 +82,7 @@ class Schedule:
     def numbers(self) -> dict[str, ca.DM]:
         """What the law computes with, sparse: the first matrices, and the steps to the next ones beside each other."""
         found = {"places": ca.DM(self.places)}
-        for name in SCHEDULED:
+        for name in SCHEDULED_MATRICES:
             matrices = getattr(self, name)
             found[name] = ca.sparsify(ca.DM(matrices[0]))
             found[f"{name}_steps"] = ca.sparsify(ca.DM(np.hstack([*np.diff(matrices, axis=0)])))
@@ -101,7 +101,7 @@ def interpolate(g: Mapping[str, Any], schedule: Schedule | None, p_ref: Any) -> 
     meaning = f"shares: how far the reference of {schedule.variable} is from each place to the next, 0 to 1"
     note("schedule", meaning, shares=ca.vertcat(*shares))
     found = dict(g)
-    for name in SCHEDULED:
+    for name in SCHEDULED_MATRICES:
         M = found[name]
         for share, step in zip(shares, ca.horzsplit(found.pop(f"{name}_steps"), M.shape[1]), strict=True):
             if step.nnz():  # what is equal at two places costs nothing

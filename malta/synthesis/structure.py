@@ -226,42 +226,46 @@ def sample_law(law: System, Ts: float) -> System:
     return System(back @ (one + half), back @ law.B * Ts, law.C @ back, D, None, Ts)
 
 
-OF_INPUTS = ("reference", "load", "disturbance")
-OF_OUTPUTS = ("error", "output", "force", "acting")
+INPUT_CHANNELS = ("reference", "load", "disturbance")
+OUTPUT_CHANNELS = ("error", "output", "force", "acting")
 
 
-class Kind(NamedTuple):
+class ElementKind(NamedTuple):
     """A kind of elements or goals: its entries, those that have to stand, and their units."""
 
     units: Mapping[str, str]  # "axis": of the axis' gain; "signals": of outputs over inputs; "": no number
     required: tuple[str, ...]
 
 
-WHOLE = ("input", "process", "sensor")  # tables of an LQG with an entry of every signal
+WHOLE_TABLES = ("input", "process", "sensor")  # tables of an LQG with an entry of every signal
 ELEMENTS = {
-    "gain": Kind({"value": "Kp"}, ("value",)),
-    "pid": Kind({"Kp": "Kp", "Ki": "Ki", "Kd": "Kd", "filter": "s"}, ("Kp",)),
-    "lead": Kind({"zero": "rad/s", "pole": "rad/s"}, ("zero", "pole")),
-    "notch": Kind({"frequency": "rad/s", "depth": "1", "damping": "1"}, ("frequency", "depth", "damping")),
-    "transfer": Kind({"numerator": "", "denominator": ""}, ("numerator", "denominator")),
-    "lqg": Kind(dict.fromkeys(("state", "integral", "input", "process", "sensor"), "by signal"), WHOLE),
+    "gain": ElementKind({"value": "Kp"}, ("value",)),
+    "pid": ElementKind({"Kp": "Kp", "Ki": "Ki", "Kd": "Kd", "filter": "s"}, ("Kp",)),
+    "lead": ElementKind({"zero": "rad/s", "pole": "rad/s"}, ("zero", "pole")),
+    "notch": ElementKind(
+        {"frequency": "rad/s", "depth": "1", "damping": "1"}, ("frequency", "depth", "damping")
+    ),
+    "transfer": ElementKind({"numerator": "", "denominator": ""}, ("numerator", "denominator")),
+    "lqg": ElementKind(
+        dict.fromkeys(("state", "integral", "input", "process", "sensor"), "by signal"), WHOLE_TABLES
+    ),
 }
-ALL = "all"  # in place of an axis: all errors, to all inputs
+ALL_AXES = "all"  # in place of an axis: all errors, to all inputs
 SENSORS = {"at": "", "channels": ""}
 POLES = {"decay": "1/s", "damping": "1", "fastest": "rad/s"}
 GOALS = {
-    "sensitivity": Kind({"peak": "1", **SENSORS}, ("peak",)),
-    "disk_margin": Kind({"least": "1", **SENSORS}, ("least",)),
-    "gain_limit": Kind(
+    "sensitivity": ElementKind({"peak": "1", **SENSORS}, ("peak",)),
+    "disk_margin": ElementKind({"least": "1", **SENSORS}, ("least",)),
+    "gain_limit": ElementKind(
         {"inputs": "", "outputs": "", "limit": "signals", "weight": ""}, ("inputs", "outputs", "limit")
     ),
-    "noise_limit": Kind({"levels": "", "outputs": "", "limit": "outputs"}, ("outputs", "limit")),
-    "tracking": Kind({"time": "s", "peak": "1", "steady": "1", "channels": ""}, ("time",)),
-    "poles": Kind(POLES, ()),
-    "stable_law": Kind(POLES, ()),
+    "noise_limit": ElementKind({"levels": "", "outputs": "", "limit": "outputs"}, ("outputs", "limit")),
+    "tracking": ElementKind({"time": "s", "peak": "1", "steady": "1", "channels": ""}, ("time",)),
+    "poles": ElementKind(POLES, ()),
+    "stable_law": ElementKind(POLES, ()),
 }
-PLAIN = {"Kp": "1", "Ki": "1/s", "Kd": "s"}  # of an element behind one that has the axis' unit
-DIMENSIONED = ("gain", "pid", "transfer")
+PLAIN_UNITS = {"Kp": "1", "Ki": "1/s", "Kd": "s"}  # of an element behind one that has the axis' unit
+DIMENSIONED_ELEMENTS = ("gain", "pid", "transfer")
 
 
 @dataclass(frozen=True)
@@ -284,8 +288,8 @@ def read_structure(
     signals that no loop has, and notches that no law of this sample time has.
     """
     axes = table.axes or "decentralized"
-    units = {ALL: _units_of_lqg(plant)} | (
-        dict(_units_by_axis(plant, axes)) if any(axis != ALL for axis in table.law) else {}
+    units = {ALL_AXES: _units_of_lqg(plant)} | (
+        dict(_units_by_axis(plant, axes)) if any(axis != ALL_AXES for axis in table.law) else {}
     )
     law: dict[str, tuple[str, ...]] = {}
     found: dict[str, StructuredElement] = {}
@@ -301,13 +305,15 @@ def read_structure(
             if name not in table.elements:
                 raise where.refuse(axis, repr(name), "one of " + " ".join(table.elements))
             one = table.elements[name]
-            if (one.kind == "lqg") != (axis == ALL) or (axis == ALL and len(names) > 1):
+            if (one.kind == "lqg") != (axis == ALL_AXES) or (axis == ALL_AXES and len(names) > 1):
                 found_here = f"{' '.join(names)} with a {one.kind}"
-                raise where.refuse(axis, found_here, f"one lqg under {ALL}, other elements under an axis")
+                raise where.refuse(
+                    axis, found_here, f"one lqg under {ALL_AXES}, other elements under an axis"
+                )
             element = _element(name, one, own, Ts, _Where(path, f"structure.elements.{name}"))
             if found.setdefault(name, element) != element:
                 raise where.refuse(axis, f"{name} of another unit", "axes of one unit for one element")
-            own = PLAIN if one.kind in DIMENSIONED else own
+            own = PLAIN_UNITS if one.kind in DIMENSIONED_ELEMENTS else own
         law[axis] = tuple(names)
     idle = next((name for name in table.elements if name not in found), None)
     if idle is not None:
@@ -323,7 +329,7 @@ def _units_by_axis(plant: Plant, axes: PidAxes) -> Iterator[tuple[str, Mapping[s
     gains = pid_signals(plant, axes)
     for k, signal in enumerate(gains["Kp"]):
         name = plant.outputs[k].name if axes == "decentralized" else signal.name
-        yield name, {key: gains[key][k].unit for key in PLAIN}
+        yield name, {key: gains[key][k].unit for key in PLAIN_UNITS}
 
 
 def _units_of_lqg(plant: Plant) -> Mapping[str, str]:
@@ -336,7 +342,7 @@ def _units_of_lqg(plant: Plant) -> Mapping[str, str]:
     return {f"{table}.{s.name}": s.unit for table, signals in tables.items() for s in signals}
 
 
-def _entries(table: Any, kind: Kind, where: _Where) -> Iterator[tuple[str, Any, str]]:
+def _entries(table: Any, kind: ElementKind, where: _Where) -> Iterator[tuple[str, Any, str]]:
     """The entries that a table has, with their units. Raises InputError for those of other kinds, and missing ones."""
     for key in type(table).model_fields:
         value = getattr(table, key)
@@ -406,7 +412,7 @@ def _sizes(
     known = [name.partition(".")[2] for name in units if name.startswith(f"{key}.")]
     _require_known(list(table), known, where, key)
     missing = next((name for name in known if name not in table), None)
-    if missing is not None and key in WHOLE:
+    if missing is not None and key in WHOLE_TABLES:
         raise where.refuse(key, f"no {missing}", "an entry of " + " ".join(known))
     found = {
         f"{key}.{name}": _si(q, units[f"{key}.{name}"], where, f"{key}.{name}") for name, q in table.items()
@@ -422,14 +428,16 @@ def _goal(name: str, table: GoalTable, plant: Plant, where: _Where) -> Structure
     arguments: dict[str, Any] = {}
     for key, value, unit in _entries(table, GOALS[table.kind], where):
         if unit in ("signals", "outputs"):
-            of = _unit_of(table.outputs or [], OF_OUTPUTS, plant, where, "outputs")
+            of = _unit_of(table.outputs or [], OUTPUT_CHANNELS, plant, where, "outputs")
             over = (
-                _unit_of(table.inputs or [], OF_INPUTS, plant, where, "inputs") if unit == "signals" else "1"
+                _unit_of(table.inputs or [], INPUT_CHANNELS, plant, where, "inputs")
+                if unit == "signals"
+                else "1"
             )
             arguments[key] = _si(value, of if over == "1" else f"({of}) / ({over})", where, key)
         elif key == "levels":
             arguments[key] = {
-                s: _si(q, _unit_of([s], OF_INPUTS, plant, where, key), where, f"{key}.{s}")
+                s: _si(q, _unit_of([s], INPUT_CHANNELS, plant, where, key), where, f"{key}.{s}")
                 for s, q in value.items()
             }
         elif key == "weight":
@@ -519,7 +527,7 @@ def places_in(law: StructuredLaw, model: LinearModel) -> tuple[Place, ...]:
 def _place(axis: str, element: Element, model: LinearModel, axes: PidAxes) -> Place:
     """An element on its axis, or of all errors."""
     m, p = len(model.plant.inputs), len(model.plant.outputs)
-    if axis == ALL:
+    if axis == ALL_AXES:
         return Place(np.eye(m), element, np.eye(p))
     sides, names = axes_of(model, axes), [name for name, _ in _units_by_axis(model.plant, axes)]
     k = names.index(axis)

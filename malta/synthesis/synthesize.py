@@ -20,12 +20,12 @@ from malta.synthesis.feedforward import commutate_ahead
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
 from malta.synthesis.riccati import Solver
-from malta.synthesis.schedule import SCHEDULED, Schedule, point_at
+from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule, point_at
 from malta.synthesis.spec import Spec
 from malta.synthesis.structure import structured_controller
 
 CALLER = "schedule_laws"
-ALIKE = ("parameters", "sample_time", "states", "forces", "measurements")  # of all laws of a schedule
+COMMON_FIELDS = ("parameters", "sample_time", "states", "forces", "measurements")  # of all laws of a schedule
 
 
 def schedule_laws(
@@ -64,7 +64,7 @@ def schedule_laws(
         variable,
         _output(base, variable),
         np.array([_place(c, variable) for c in ordered]),
-        **{name: np.array([getattr(c, name) for c in ordered]) for name in SCHEDULED},
+        **{name: np.array([getattr(c, name) for c in ordered]) for name in SCHEDULED_MATRICES},
     )
     here = _place(base, variable)
     if not made.places[0] <= here <= made.places[-1]:
@@ -93,7 +93,7 @@ def _require_alike(base: Controller, law: Controller) -> None:
     if law.schedule is not None or law.commutation is not None:
         found = "a scheduled law" if law.schedule is not None else "a law that commutates ahead"
         raise InputError(CALLER, law.name, found, "a plain LQG or PID")
-    for name in ALIKE:
+    for name in COMMON_FIELDS:
         if getattr(law, name) != getattr(base, name):
             raise InputError(CALLER, law.name, f"another {name.replace('_', ' ')}", "laws of one form")
     plant = plant_of(law.parameters)

@@ -32,7 +32,7 @@ from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
 from malta.synthesis.elements import CALLER, Bounds, Element, Matrices, keep_sign
 from malta.synthesis.lqg import check_sizes, out_of_reach
-from malta.synthesis.riccati import Solution, care
+from malta.synthesis.riccati import RiccatiSolution, care
 from malta.synthesis.spec import Weights
 
 
@@ -245,7 +245,7 @@ def _entry(size: int, i: int, value: float) -> FloatArray:
 
 
 def _slopes(
-    A: FloatArray, B: FloatArray, R: FloatArray, solution: Solution, changes: Sequence[Change]
+    A: FloatArray, B: FloatArray, R: FloatArray, solution: RiccatiSolution, changes: Sequence[Change]
 ) -> list[FloatArray]:
     """How the gain changes with Q and R: one Schur form of the closed loop serves all Lyapunov equations.
 

@@ -32,7 +32,7 @@ from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import disturbance_map, push_through
 from malta.loops.time_domain import covariance, noise_variance
 from malta.loops.windings import (
-    Windings,
+    WindingModel,
     emf_slope,
     estimated_rows,
     sample_driven,
@@ -48,7 +48,7 @@ from malta.synthesis.feedforward import current_loop_of, holding_gain, static_fe
 from malta.synthesis.filters import Gains, gain_at_rest
 from malta.synthesis.lqg import gains
 from malta.synthesis.recovery import StepResponse, step_response
-from malta.synthesis.requirements import Noise, Requirement, TrialFigures, requirements_for
+from malta.synthesis.requirements import NoiseRms, Requirement, TrialFigures, requirements_for
 from malta.synthesis.spec import Spec, Weights
 
 # The sampled machine at the corners of its box of parameters, and where each corner of the growing box is lost.
@@ -56,7 +56,7 @@ from malta.synthesis.spec import Spec, Weights
 
 Indices = NDArray[np.int_]
 STEP = 0.15  # of the multiples of the box at which the machine is sampled; linear between them
-NEAR = 1.3  # times the smallest margin, beyond which no corner is looked at
+CORNER_FACTOR = 1.3  # times the smallest margin, beyond which no corner is looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,17 +77,17 @@ class SampledMachine:
 
 
 def corner_margins(table: SampledMachine, F: LinearLaw) -> FloatArray:
-    """Multiples of the box at which each corner becomes unstable, by bisection; at most NEAR times the smallest."""
+    """Multiples of the box at which each corner becomes unstable; at most CORNER_FACTOR times the smallest."""
     every = np.arange(table.Ad.shape[1])
     top = STEP * (len(table.Ad) - 1)
     smallest = _first_lost(table, F, every, (0.0, top), 13)
-    far = min(max(NEAR * smallest, STEP), top)
+    far = min(max(CORNER_FACTOR * smallest, STEP), top)
     found = np.full(len(every), far)
     low, high = np.full(len(every), smallest), found.copy()
-    near = every[_lost(table, F, every, far)]
+    near = every[_is_lost(table, F, every, far)]
     for _ in range(9 if len(near) else 0):  # all that are near at once, each between its own bounds
         t = (low[near] + high[near]) / 2
-        lost = _lost(table, F, near, t)
+        lost = _is_lost(table, F, near, t)
         high[near[lost]], low[near[~lost]] = t[lost], t[~lost]
     found[near] = low[near]
     return found
@@ -100,7 +100,7 @@ def _first_lost(
     low, high = between
     for _ in range(halvings):
         t = (low + high) / 2
-        lost = _lost(table, F, which, t)
+        lost = _is_lost(table, F, which, t)
         if lost.any():
             high, which = t, which[lost]  # the others are lost later
         else:
@@ -108,7 +108,7 @@ def _first_lost(
     return low
 
 
-def _lost(table: SampledMachine, F: LinearLaw, which: Indices, t: float | FloatArray) -> NDArray[np.bool_]:
+def _is_lost(table: SampledMachine, F: LinearLaw, which: Indices, t: float | FloatArray) -> NDArray[np.bool_]:
     """Which of some corners are unstable at t times the box, one t for all or one each."""
     t = np.broadcast_to(np.asarray(t), which.shape)
     k = np.minimum((t / STEP).astype(int), len(table.Ad) - 2)
@@ -120,7 +120,7 @@ def _lost(table: SampledMachine, F: LinearLaw, which: Indices, t: float | FloatA
     return lost
 
 
-class Part(NamedTuple):
+class MachinePart(NamedTuple):
     """Continuous states of a machine that close loops by themselves: x' = A x + B v, p = C x."""
 
     A: FloatArray
@@ -136,12 +136,12 @@ class Part(NamedTuple):
 class Driven(NamedTuple):
     """The windings of a machine and the current controllers that drive them."""
 
-    windings: Windings
+    windings: WindingModel
     loop: CurrentLoop
     induced: FloatArray  # M^+ emf(x): inputs x states
 
 
-class Place(NamedTuple):
+class StrokePlace(NamedTuple):
     """The nominal machine at a position of its stroke, with its loads at their trim, and loads from outside."""
 
     position: float  # m
@@ -151,19 +151,19 @@ class Place(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class TuningGroup:
     """Some states, inputs and outputs of the machine that close loops by themselves."""
 
     states: tuple[int, ...]
     inputs: tuple[int, ...]
     outputs: tuple[int, ...]
-    model: Part
+    model: MachinePart
     nominal: SampledMachine  # with its loads, at their trim
     slope: FloatArray  # of v0(z), which acts against them: inputs x outputs
     forecast: FloatArray  # of induced voltages, that current controllers take off: inputs x states, or none
     corners: SampledMachine | None  # levels x corners
     variance: FloatArray  # of a measurement, m2
-    places: tuple[Place, ...]  # where loads act from outside: operating point and ends; or none
+    places: tuple[StrokePlace, ...]  # where loads act from outside: operating point and ends; or none
     role: tuple[Any, ...]  # what the requirements see in it: stroke, thrust, bounds of its signals
     requirements: tuple[tuple[str, str, Requirement], ...]  # figure, signal, requirement, with an estimate
 
@@ -189,7 +189,7 @@ class Group:
         )  # fmt: skip
 
 
-def groups_of(spec: Spec) -> list[Group]:
+def groups_of(spec: Spec) -> list[TuningGroup]:
     """Find the groups of a design's machine, each with what its trials need.
 
     Raises InputError for a machine whose currents are held between samples, and for one that has states which no input
@@ -210,19 +210,19 @@ def groups_of(spec: Spec) -> list[Group]:
     slope = _slope(plant, position)
     names = tuple(spec.uncertainty)
     proven = "margin" in spec.specification
-    driven = _driven(spec)
+    driven = _driven_windings(spec)
     windings = None if driven is None else driven.windings
     systems = [of_plant(plant, names, at=place, windings=windings) for place in positions] if proven else []
     trims = _loaded_places(spec)
-    held = _with_windings(spec, driven, Part(loaded.A, loaded.B, model.C))
+    held = _with_windings(spec, driven, MachinePart(loaded.A, loaded.B, model.C))
     found = []
     for i, j, o in _components(spec, positions):
-        part = Part(model.A[np.ix_(i, i)], model.B[np.ix_(i, j)], model.C[np.ix_(o, i)])
+        part = MachinePart(model.A[np.ix_(i, i)], model.B[np.ix_(i, j)], model.C[np.ix_(o, i)])
         forecast = np.zeros((0, 0)) if driven is None else driven.induced[np.ix_(j, i)]
         nominal = _sample(spec, driven, _cut(spec, driven, held, (i, j, o)), forecast)
         places = tuple(_place(spec, driven, *at, (i, j, o), forecast) for at in trims)
         found.append(
-            Group(
+            TuningGroup(
                 tuple(i.tolist()),
                 tuple(j.tolist()),
                 tuple(o.tolist()),
@@ -299,7 +299,7 @@ def _loaded_places(spec: Spec) -> list[tuple[LinearModel, FloatArray]]:
     ]
 
 
-def _driven(spec: Spec) -> Driven | None:
+def _driven_windings(spec: Spec) -> Driven | None:
     """The windings of a machine that current controllers drive, as in its own loop; None for lagging currents."""
     plant = spec.plant
     loop = current_loop_of(plant.actuator, current_loop_delay=spec.current_loop_delay)
@@ -310,20 +310,20 @@ def _driven(spec: Spec) -> Driven | None:
     return Driven(windings, loop, windings.axes @ emf_slope(plant, point.x)[:, list(plant.controlled)])
 
 
-def _with_windings(spec: Spec, driven: Driven | None, whole: Part) -> Part:
+def _with_windings(spec: Spec, driven: Driven | None, whole: MachinePart) -> MachinePart:
     """The machine with its windings between samples; unchanged for lagging currents."""
     if driven is None:
         return whole
     x = spec.plant.at(**spec.operating_point).x
-    return Part(*(np.array(ca.DM(M)) for M in with_windings(spec.plant, driven.windings, x, *whole)))
+    return MachinePart(*(np.array(ca.DM(M)) for M in with_windings(spec.plant, driven.windings, x, *whole)))
 
 
-def _cut(spec: Spec, driven: Driven | None, whole: Part, group: tuple[Any, Any, Any]) -> Part:
+def _cut(spec: Spec, driven: Driven | None, whole: MachinePart, group: tuple[Any, Any, Any]) -> MachinePart:
     """A group's part of the machine; of each of its inputs the current in the winding is a state and an output."""
     i, j, o = group
     if driven is not None:
         i, o = np.append(i, len(spec.plant.design_states) + j), np.append(o, len(spec.plant.outputs) + j)
-    return Part(whole.A[np.ix_(i, i)], whole.B[np.ix_(i, j)], whole.C[np.ix_(o, i)])
+    return MachinePart(whole.A[np.ix_(i, i)], whole.B[np.ix_(i, j)], whole.C[np.ix_(o, i)])
 
 
 def _place(
@@ -333,17 +333,19 @@ def _place(
     slope: FloatArray,
     group: tuple[Any, Any, Any],
     forecast: FloatArray,
-) -> Place:
+) -> StrokePlace:
     """The group's part of a place."""
     i, j, o = group
-    whole = _with_windings(spec, driven, Part(model.A, model.B, model.C))
+    whole = _with_windings(spec, driven, MachinePart(model.A, model.B, model.C))
     part = _cut(spec, driven, whole, group)
     machine = _sample(spec, driven, part, forecast)
     pushed = push_through(part.A, disturbance_map(model)[i], spec.sample_time, len(machine.Ad))
-    return Place(position_in(model.plant, model.operating_point.x), machine, slope[np.ix_(j, o)], pushed)
+    return StrokePlace(
+        position_in(model.plant, model.operating_point.x), machine, slope[np.ix_(j, o)], pushed
+    )
 
 
-def _pushes(spec: Spec, outputs: Any, places: Sequence[Place]) -> tuple[Any, ...]:
+def _pushes(spec: Spec, outputs: Any, places: Sequence[StrokePlace]) -> tuple[Any, ...]:
     """What differs between mirror images where loads from outside are bounded: loads, bounds, places."""
     names = {spec.plant.outputs[k].name for k in outputs}
     bounds = []
@@ -370,7 +372,7 @@ def _estimates(spec: Spec) -> tuple[tuple[str, str, Requirement], ...]:
     return tuple(found)
 
 
-def _sample(spec: Spec, driven: Driven | None, part: Part, forecast: FloatArray) -> SampledMachine:
+def _sample(spec: Spec, driven: Driven | None, part: MachinePart, forecast: FloatArray) -> SampledMachine:
     """A part behind its current loops: from forces, and where there is a forecast from voltages beside them."""
     A, B, C = part
     actuator, m, Ts = spec.plant.actuator, B.shape[1], spec.sample_time
@@ -396,7 +398,7 @@ def _corners(
     for system in systems:
         for corner in signs:
             rows = np.array([system.nominal * (1 + t * share * corner) for t in levels])
-            wholes = [Part(*matrices) for matrices in zip(*system.at(rows), strict=True)]
+            wholes = [MachinePart(*matrices) for matrices in zip(*system.at(rows), strict=True)]
             parts = [_cut(spec, driven, whole, group) for whole in wholes]
             key = b"".join(np.abs(M).round(9).tobytes() for part in parts for M in part)
             if key not in made:
@@ -407,7 +409,7 @@ def _corners(
     return SampledMachine(*(M.swapaxes(0, 1) for M in stacked))
 
 
-def figures_of(spec: Spec, group: Group, weights: Weights, delay: int) -> dict[str, float]:
+def figures_of(spec: Spec, group: TuningGroup, weights: Weights, delay: int) -> dict[str, float]:
     """Compute the linear figures of a group in a trial, by requirement; none where its loop is unstable.
 
     Beside the margin stands that of every corner, "margin 3": a search that sees one alone runs into the next.
@@ -422,7 +424,7 @@ def figures_of(spec: Spec, group: Group, weights: Weights, delay: int) -> dict[s
     return figures_of_gains(spec, group, g)
 
 
-def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
+def figures_of_gains(spec: Spec, group: TuningGroup, g: Gains) -> dict[str, float]:
     """Compute the linear figures of a group under gains, by requirement; none where its loop is unstable."""
     Ts = spec.sample_time
     law = linear_law_of(g, Ts)
@@ -466,7 +468,7 @@ def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
 
 
 def _follower(
-    spec: Spec, group: Group, g: Gains, closed: FloatArray, known: int
+    spec: Spec, group: TuningGroup, g: Gains, closed: FloatArray, known: int
 ) -> Callable[[float, FloatArray, ComplexArray], ComplexArray]:
     """`TrialFigures.follow` of a trial.
 
@@ -490,12 +492,12 @@ def _follower(
     return follow
 
 
-def _with_forecast(group: Group, g: Gains, law: LinearLaw) -> LinearLaw:
+def _with_forecast(group: TuningGroup, g: Gains, law: LinearLaw) -> LinearLaw:
     """The law with the induced voltages that it forecasts as further outputs, where there are any."""
     return with_estimated_emf(law, estimated_rows(group.forecast, g.L, g.Cd)) if group.forecast.size else law
 
 
-def _answer(group: Group, place: Place, g: Gains, law: LinearLaw, Ts: float) -> StepResponse:
+def _answer(group: TuningGroup, place: StrokePlace, g: Gains, law: LinearLaw, Ts: float) -> StepResponse:
     """Outputs of a group under a unit step of each load from outside. Raises CheckError for an unstable loop."""
     closed = place.machine.close(_with_forecast(group, g, law._replace(D_y=law.D_y + place.slope)))
     k = len(law.A)
@@ -505,7 +507,7 @@ def _answer(group: Group, place: Place, g: Gains, law: LinearLaw, Ts: float) -> 
 
 
 def _response(
-    group: Group, g: Gains, law: LinearLaw, Ts: float, *, known: int, alone: bool
+    group: TuningGroup, g: Gains, law: LinearLaw, Ts: float, *, known: int, alone: bool
 ) -> tuple[float, float]:
     """Peak sensitivity and bandwidth, rad/s; known: blocks of forces under way that count at rest.
 
@@ -524,7 +526,7 @@ def _response(
     return largest_gain(cut.sensitivity(i) for i in cut.sensors).value, bandwidth
 
 
-def _noise(group: Group, law: LinearLaw, closed: FloatArray) -> Noise:
+def _noise(group: TuningGroup, law: LinearLaw, closed: FloatArray) -> NoiseRms:
     """Rms of the group's outputs and commands."""
     noise = np.vstack([group.nominal.Bd @ law.D_y, law.B_y])
     X = covariance(closed, noise * group.variance @ noise.T)
@@ -532,4 +534,4 @@ def _noise(group: Group, law: LinearLaw, closed: FloatArray) -> Noise:
     out = group.nominal.Cd @ X[:k, :k] @ group.nominal.Cd.T
     command = np.hstack([law.D_y @ group.nominal.Cd, law.C])
     force = np.diag(command @ X @ command.T + law.D_y * group.variance @ law.D_y.T)[: len(group.inputs)]
-    return Noise(np.sqrt(np.diag(out)), np.sqrt(force))
+    return NoiseRms(np.sqrt(np.diag(out)), np.sqrt(force))

@@ -40,17 +40,17 @@ from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import position_at, position_in
 from malta.synthesis.controller import Controller, linear_law_of, with_readings
-from malta.synthesis.pid import Axes, axes_of, law_of_outputs, pid_gains
+from malta.synthesis.pid import PidAxisSet, axes_of, law_of_outputs, pid_gains
 from malta.synthesis.requirements import ratio_of
 from malta.synthesis.spec import Loads, Pid, Spec, pid_signals
-from malta.tuning.groups import Group, figures_of_gains, groups_of
+from malta.tuning.groups import TuningGroup, figures_of_gains, groups_of
 from malta.tuning.search import (
-    UNSTABLE,
+    UNSTABLE_RATIO,
     Effort,
     Journal,
     Progress,
-    Search,
     Trial,
+    TrialSearch,
     apply_trial,
     at_least_of,
     base_of,
@@ -67,17 +67,17 @@ from malta.tuning.search import (
 # none.
 
 
-EXACT = {"load_error", "noise_motion", "peak_sensitivity", "bandwidth"}  # tuning.pid computes these
-BETWEEN = 1e-3  # of a margin: the corners of the box are interpolated between samples of the machine
-OF = " of "  # between the name of an estimate and the outputs that it is of
+EXACT_FIGURES = {"load_error", "noise_motion", "peak_sensitivity", "bandwidth"}  # tuning.pid computes these
+CORNER_TOLERANCE = 1e-3  # of a margin: the corners of the box are interpolated between samples of the machine
+ESTIMATE_JOINT = " of "  # between the name of an estimate and the outputs that it is of
 
 
 class Estimates(NamedTuple):
     """The groups of a machine whose figures [specification] bounds; of mirror images one."""
 
     spec: Spec
-    axes: Axes
-    groups: tuple[Group, ...]
+    axes: PidAxisSet
+    groups: tuple[TuningGroup, ...]
 
     def figures(self, terms: Pid, outputs: Sequence[int]) -> list[dict[str, float]]:
         """Compute the figures of the groups among some outputs, named as "force_noise of x1 x2"."""
@@ -86,7 +86,7 @@ class Estimates(NamedTuple):
             if set(group.outputs) <= set(outputs):
                 own = " ".join(self.spec.plant.outputs[k].name for k in group.outputs)
                 figures = _figures(self.spec, group, terms, self.axes)
-                found.append({f"{name}{OF}{own}": value for name, value in figures.items()})
+                found.append({f"{name}{ESTIMATE_JOINT}{own}": value for name, value in figures.items()})
         return found
 
 
@@ -97,10 +97,10 @@ def estimates_of(spec: Spec, touched: Sequence[set[int]]) -> Estimates:
     """
     model = linearize(spec.plant, spec.plant.at(**spec.operating_point))
     terms, axes = spec.pid, axes_of(model, spec.axes)
-    asked = {base_of(name) for name in spec.specification} - EXACT
+    asked = {base_of(name) for name in spec.specification} - EXACT_FIGURES
     if terms is None or not asked or model.E.any():
         return Estimates(spec, axes, ())
-    distinct: dict[tuple[object, ...], Group] = {}
+    distinct: dict[tuple[object, ...], TuningGroup] = {}
     for group in groups_of(spec):
         few, _ = law_of_outputs(terms, axes, group.outputs)
         numbers = tuple(tuple(v.tolist()) for v in (few.Kp, few.Ki, few.Kd, few.filters))
@@ -111,37 +111,37 @@ def estimates_of(spec: Spec, touched: Sequence[set[int]]) -> Estimates:
 
 def outputs_of(figure: str) -> list[str]:
     """Name the outputs that a figure is of: of "noise_motion x" and of estimates; none of one of the whole machine."""
-    _, of, own = figure.rpartition(OF)
+    _, of, own = figure.rpartition(ESTIMATE_JOINT)
     return own.split() if of else own.split()[1:]
 
 
 def name_of(figure: str) -> str:
     """Return a figure's name in [specification]: "force_noise" of "force_noise of x1 x2"."""
-    name, of, own = figure.rpartition(OF)
+    name, of, own = figure.rpartition(ESTIMATE_JOINT)
     return name if of else own
 
 
-def _figures(spec: Spec, group: Group, terms: Pid, axes: Axes) -> dict[str, float]:
+def _figures(spec: Spec, group: TuningGroup, terms: Pid, axes: PidAxisSet) -> dict[str, float]:
     """The estimates of one group; none where its loop is unstable."""
     P = group.model.C[:, : len(group.states) // 2]
     few, own = law_of_outputs(terms, axes, group.outputs)
     gains = pid_gains(P, few, spec.sample_time, own._replace(of_positions=own.of_outputs @ P))
     figures = {}
     for name, value in figures_of_gains(spec, group, gains).items():
-        if base_of(name) not in EXACT:
-            figures[name] = (1 - BETWEEN if base_of(name) == "margin" else 1.0) * value
+        if base_of(name) not in EXACT_FIGURES:
+            figures[name] = (1 - CORNER_TOLERANCE if base_of(name) == "margin" else 1.0) * value
     return figures
 
 
 JOINS = 1e-9  # of the largest entries of its row and column: smaller ones are rounding
-STEEP = 30.0  # cost of a bound's logarithm in that of the load error: far beyond what any bound is worth
-LEAST = 1e-6  # ratio to a bound that counts; nearer to nothing is as good
+BOUND_COST = 30.0  # cost of a bound's logarithm in that of the load error: far beyond what any bound is worth
+MIN_BOUND_RATIO = 1e-6  # ratio to a bound that counts; nearer to nothing is as good
 ROOM = 1e-5  # below a bound, for what a part's grid and rounding may hide of the whole machine
 RADII = ((0.05, 1e-3), (0.01, 1e-4))  # of COBYQA's trust region at first and last, in the unit cube
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class PidPart:
     """Some outputs with the forces of the same index, the sampled states behind them, and what acts from outside."""
 
     outputs: tuple[int, ...]  # k of them
@@ -156,7 +156,7 @@ class Part:
     forecast: FloatArray  # k x 2 k, of voltages by positions and rates of the outputs; empty: none
 
 
-def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> Part:
+def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> PidPart:
     """Describe all of a machine as one part, with what the loads leave in its states."""
     machine, plant, Ts = loop_of_model(model, controller).sampled, model.plant, controller.sample_time
     x = model.operating_point.x
@@ -170,7 +170,7 @@ def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> P
     slope = np.zeros((B.shape[1], len(machine.Cd)))
     if plant.has_stroke:
         slope[:, plant.stroke_output] = controller.feedforward.slope(position_in(plant, x))
-    return Part(
+    return PidPart(
         tuple(range(len(machine.Cd))), machine.Ad, machine.Bd, machine.Cd, slope, push, shaken,
         _forecast(model, controller, machine),
     )  # fmt: skip
@@ -188,7 +188,7 @@ def _forecast(model: LinearModel, controller: Controller, machine: SampledLoop) 
     return np.hstack([slope[:, :half] @ back, slope[:, half:] @ back])
 
 
-def parts_of(whole: Part) -> list[Part]:
+def parts_of(whole: PidPart) -> list[PidPart]:
     """Split a machine into parts that nothing joins to each other."""
     n, m = len(whole.Ad), len(whole.Cd)
     M = np.abs(system_matrix(whole.Ad, whole.Bd, whole.Cd))
@@ -207,7 +207,7 @@ def parts_of(whole: Part) -> list[Part]:
         i, o = np.flatnonzero(label[:n] == k), np.flatnonzero(label[n:] == k)
         inputs = np.concatenate([o + first for first in range(0, whole.Bd.shape[1], m)])
         parts.append(
-            Part(
+            PidPart(
                 tuple(o.tolist()),
                 whole.Ad[np.ix_(i, i)],
                 whole.Bd[np.ix_(i, inputs)],
@@ -221,14 +221,14 @@ def parts_of(whole: Part) -> list[Part]:
     return parts
 
 
-def close_loop(part: Part, terms: Pid, Ts: float, axes: Axes | None = None) -> SampledLoop:
+def close_loop(part: PidPart, terms: Pid, Ts: float, axes: PidAxisSet | None = None) -> SampledLoop:
     """Close a part's loop with gains, as `malta.loop` closes the whole machine's.
 
     axes : of the whole machine; None: each output with the input of its index
     """
     k = len(part.outputs)
     one = np.eye(len(terms.Kp))
-    few, own = law_of_outputs(terms, axes or Axes(one, one, one), part.outputs)
+    few, own = law_of_outputs(terms, axes or PidAxisSet(one, one, one), part.outputs)
     g = pid_gains(np.eye(k), few, Ts, own)
     law = linear_law_of(g, Ts)
     linear = law._replace(D_y=law.D_y + part.slope)
@@ -239,7 +239,7 @@ def close_loop(part: Part, terms: Pid, Ts: float, axes: Axes | None = None) -> S
     return SampledLoop(part.Ad, part.Bd, part.Cd, linear, Ts)
 
 
-def loop_figures(spec: Spec, part: Part, loop: SampledLoop) -> dict[str, float]:
+def loop_figures(spec: Spec, part: PidPart, loop: SampledLoop) -> dict[str, float]:
     """Compute the figures of a part's loop, by name and output; none where the loop is unstable."""
     closed, c, n, Ts = loop.closed, loop.control, len(part.Ad), loop.sample_time
     if not np.isfinite(closed).all():
@@ -286,7 +286,7 @@ def _ratios(spec: Spec, figures: Mapping[str, float]) -> list[float]:
         bound = asked.get(name, asked.get(base_of(name)))
         if bound is not None:
             ratio = ratio_of(bound, value, at_least=base_of(name) in at_least)
-            ratios.append(min(max(ratio, LEAST), 1 / LEAST))
+            ratios.append(min(max(ratio, MIN_BOUND_RATIO), 1 / MIN_BOUND_RATIO))
     return ratios
 
 
@@ -295,13 +295,13 @@ def load_error(figures: Mapping[str, float]) -> float:
     return math.hypot(*(value for name, value in figures.items() if name.startswith("load_error")))
 
 
-def goal_value(search: Search, u: FloatArray, outputs: Collection[str]) -> float:
+def goal_value(search: TrialSearch, u: FloatArray, outputs: Collection[str]) -> float:
     """The logarithm of these outputs' load error; beyond a bound it costs more than it can gain."""
     figures = _of(search.figures(u), outputs)
     if not figures:
-        return UNSTABLE + distance_outside(u)
+        return UNSTABLE_RATIO + distance_outside(u)
     beyond = max([math.log(ratio) + ROOM for ratio in _ratios(search.spec, figures)], default=0.0)
-    return math.log(load_error(figures)) + STEEP * (max(beyond, 0.0) + distance_outside(u))
+    return math.log(load_error(figures)) + BOUND_COST * (max(beyond, 0.0) + distance_outside(u))
 
 
 def _of(figures: Mapping[str, float], outputs: Collection[str]) -> dict[str, float]:
@@ -314,7 +314,7 @@ def _of(figures: Mapping[str, float], outputs: Collection[str]) -> dict[str, flo
     return found
 
 
-def _polish(search: Search, u: FloatArray, trials: int, outputs: Collection[str]) -> FloatArray:
+def _polish(search: TrialSearch, u: FloatArray, trials: int, outputs: Collection[str]) -> FloatArray:
     """The place: the best of what COBYQA tries on its way, bounds given as their ratios' logarithms."""
     if not (trials and len(u)):
         return u
@@ -381,10 +381,10 @@ def search_gains(
         there = spec
         for some, chosen, generations in rounds:
             names = [spec.plant.outputs[o].name for o in chosen]
-            search = Search(there, some, spec.delay, journal, compute, among=variables)
+            search = TrialSearch(there, some, spec.delay, journal, compute, among=variables)
             u = search.evolve(partial(goal_value, search, outputs=names), generations)
             u = _polish(search, u, 3 * effort.polish * len(some), names)
             there = apply_trial(there, combine(there, [(search, u)]))
-        search = Search(there, variables, spec.delay, journal, compute)
+        search = TrialSearch(there, variables, spec.delay, journal, compute)
         places.append((search, search.start))
     return combine(spec, places), ()

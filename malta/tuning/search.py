@@ -31,7 +31,7 @@ from malta.synthesis.synthesize import synthesize
 
 Progress = Callable[[float], None]
 DIGITS = 5  # significant, of what is tried and written
-UNSTABLE = 1e3  # ratio that stands for no figures at all
+UNSTABLE_RATIO = 1e3  # ratio that stands for no figures at all
 
 
 class Trial(NamedTuple):
@@ -128,7 +128,7 @@ class Journal:
 
     @staticmethod
     @contextmanager
-    def _writing(path: Path) -> Iterator[None]:
+    def _write_locked(path: Path) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -144,7 +144,7 @@ class Journal:
         if key not in self.known:
             self.known[key] = compute()
             if self.path is not None:
-                with self._writing(self.path), self.path.open("a", encoding="utf-8") as file:
+                with self._write_locked(self.path), self.path.open("a", encoding="utf-8") as file:
                     file.write(json.dumps([key, self.known[key]]) + "\n")
         self.counted += 1
         if self.progress is not None:
@@ -157,7 +157,7 @@ def round_off(value: float) -> float:
     return float(f"{value:.{DIGITS}g}")
 
 
-class Search:
+class TrialSearch:
     """The trials of some of the numbers, with one delay, the others as they stand in the design."""
 
     def __init__(
@@ -232,7 +232,7 @@ def separate(touched: Sequence[set[int]], groups: int) -> list[tuple[tuple[int, 
     return found
 
 
-def combine(spec: Spec, places: Sequence[tuple[Search, FloatArray]]) -> Trial:
+def combine(spec: Spec, places: Sequence[tuple[TrialSearch, FloatArray]]) -> Trial:
     """Make one trial of the places that the searches of a design's parts ended at."""
     values = [round_off(spec.value_of(v)) for v in spec.search]
     for search, u in places:

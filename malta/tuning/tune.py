@@ -36,15 +36,15 @@ from malta.model.plant import Plant
 from malta.synthesis.requirements import Trade, ratio_of, requirements_for
 from malta.synthesis.spec import Spec, Weights
 from malta.tuning import groups, pid
-from malta.tuning.groups import STEP, Group, figures_of, groups_of
+from malta.tuning.groups import STEP, TuningGroup, figures_of, groups_of
 from malta.tuning.search import (
     DIGITS,
-    UNSTABLE,
+    UNSTABLE_RATIO,
     Effort,
     Journal,
     Progress,
-    Search,
     Trial,
+    TrialSearch,
     apply_trial,
     at_least_of,
     base_of,
@@ -69,7 +69,7 @@ from malta.tuning.verify import judge
 # The radius follows how well the last step was foretold.
 
 
-SMALLEST, LARGEST, FIRST = 2e-3, 0.5, 0.2  # of the radius
+MIN_RADIUS, MAX_RADIUS, FIRST_RADIUS = 2e-3, 0.5, 0.2  # of the radius
 DIFFERENCES = (0.02, 0.06, 0.007)  # steps of u, the next where one leads no further
 TRIES = 5  # smaller radii with one linearization
 LEAST_GAIN = 1e-6  # of a step
@@ -83,7 +83,7 @@ class Point(NamedTuple):
     r: FloatArray
 
 
-class Merit(NamedTuple):
+class BoundPenalty(NamedTuple):
     """How bounds count beside the objective."""
 
     steep: float = 1.0
@@ -97,7 +97,7 @@ class Merit(NamedTuple):
 Look = Callable[["FloatArray"], tuple[float, "FloatArray"] | None]  # (f, r) of a place; None: unstable
 
 
-def descend(look: Look, u: FloatArray, merit: Merit, trials: int) -> FloatArray:
+def descend(look: Look, u: FloatArray, merit: BoundPenalty, trials: int) -> FloatArray:
     """Go down from a place until a number of trials or until no step leads further; an unstable place stays.
 
     >>> import numpy as np
@@ -114,19 +114,19 @@ def descend(look: Look, u: FloatArray, merit: Merit, trials: int) -> FloatArray:
     start = look(u) if len(u) and trials > 0 else None
     if start is None:
         return u
-    here, radius, stuck, used = Point(u, *start), FIRST, 0, 1
+    here, radius, stuck, used = Point(u, *start), FIRST_RADIUS, 0, 1
     while used < trials and stuck < len(DIFFERENCES):
         slopes = _slopes(look, here, DIFFERENCES[stuck])
         there, radius, tries = _advance(look, here, slopes, merit, radius)
         used += len(u) + tries
         here = there or here
-        if radius < SMALLEST:
-            stuck, radius = stuck + 1, FIRST / 2
+        if radius < MIN_RADIUS:
+            stuck, radius = stuck + 1, FIRST_RADIUS / 2
     return here.u
 
 
 def _advance(
-    look: Look, here: Point, slopes: tuple[FloatArray, FloatArray], merit: Merit, radius: float
+    look: Look, here: Point, slopes: tuple[FloatArray, FloatArray], merit: BoundPenalty, radius: float
 ) -> tuple[Point | None, float, int]:
     """The next place, or None, the next radius, and how many places were tried."""
     for tries in range(1, TRIES + 1):
@@ -137,10 +137,10 @@ def _advance(
         if gain > LEAST_GAIN:
             share = gain / max(merit.of(here) - foretold, 1e-12)
             if share > 0.7:
-                return there, min(radius * 1.5, LARGEST), tries
+                return there, min(radius * 1.5, MAX_RADIUS), tries
             return there, radius * (1.0 if share > 0.3 else 0.6), tries
         radius *= 0.4
-        if radius < SMALLEST:
+        if radius < MIN_RADIUS:
             break
     return None, radius, tries
 
@@ -157,7 +157,7 @@ def _slopes(look: Look, here: Point, step: float) -> tuple[FloatArray, FloatArra
 
 
 def _step(
-    here: Point, slopes: tuple[FloatArray, FloatArray], merit: Merit, radius: float
+    here: Point, slopes: tuple[FloatArray, FloatArray], merit: BoundPenalty, radius: float
 ) -> tuple[FloatArray, float]:
     """The step of the linear program, and what it promises."""
     slope, J = slopes
@@ -175,8 +175,8 @@ def _step(
 
 
 FRONT = (0.6, 0.7, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1)  # of the margin that is asked for
-LEAST = 1e-3  # ratio below which a figure counts as nothing
-FRUGAL = Merit(steep=100.0, floor=0.0)  # what noise can gain beside a bound that is missed
+MIN_RATIO = 1e-3  # ratio below which a figure counts as nothing
+NOISE_PENALTY = BoundPenalty(steep=100.0, floor=0.0)  # what noise can gain beside a bound that is missed
 TRADES: tuple[Trade, ...] = get_args(Trade)  # what the front has against the margin
 
 
@@ -184,7 +184,7 @@ class _Cluster(NamedTuple):
     """Groups that variables join, and those variables."""
 
     variables: tuple[int, ...]
-    groups: tuple[Group, ...]
+    groups: tuple[TuningGroup, ...]
 
 
 def clusters_of(spec: Spec) -> list[_Cluster]:
@@ -203,7 +203,7 @@ def clusters_of(spec: Spec) -> list[_Cluster]:
             )
     clusters = []
     for variables, members in separate(touched, len(groups)):
-        distinct: dict[Any, Group] = {}
+        distinct: dict[Any, TuningGroup] = {}
         for k in members:
             g = groups[k]
             # Mirror images stay so under every weight that the search tries.
@@ -225,30 +225,32 @@ def _differ(a: Weights, b: Weights) -> bool:
     return any((getattr(a, name) != getattr(b, name)).any() for name in names)
 
 
-def cluster_search(spec: Spec, cluster: _Cluster, delay: int, journal: Journal) -> Search:
+def cluster_search(spec: Spec, cluster: _Cluster, delay: int, journal: Journal) -> TrialSearch:
     """The trials of one cluster with one delay."""
     at_least = at_least_of(spec.plant)
 
     def compute(design: Spec) -> dict[str, float]:
         return merge([figures_of(spec, g, design.weights, delay) for g in cluster.groups], at_least)
 
-    return Search(spec, cluster.variables, delay, journal, compute)
+    return TrialSearch(spec, cluster.variables, delay, journal, compute)
 
 
-def worst_ratio(search: Search, u: FloatArray) -> float:
+def worst_ratio(search: TrialSearch, u: FloatArray) -> float:
     """What is minimized: the worst ratio, and a little of all of them."""
     ratios = _ratios(search.spec, search.figures(u), search.spec.specification)
-    return (max(ratios) + 0.01 * sum(ratios) / len(ratios) if ratios else UNSTABLE) + distance_outside(u)
+    return (max(ratios) + 0.01 * sum(ratios) / len(ratios) if ratios else UNSTABLE_RATIO) + distance_outside(
+        u
+    )
 
 
-def _look_worst(search: Search, u: FloatArray) -> tuple[float, FloatArray] | None:
+def _look_worst(search: TrialSearch, u: FloatArray) -> tuple[float, FloatArray] | None:
     """The logarithms of all ratios; None for an unstable loop."""
     figures = search.figures(u)
     return (0.0, _logs(search.spec, figures, search.spec.specification)) if figures else None
 
 
 def _look_frugal(
-    search: Search, u: FloatArray, margin: float, kinds: Collection[str]
+    search: TrialSearch, u: FloatArray, margin: float, kinds: Collection[str]
 ) -> tuple[float, FloatArray] | None:
     """The logarithm of noise or motion, and of the ratios at a margin with everything else as it is asked for."""
     figures = search.figures(u)
@@ -260,10 +262,10 @@ def _look_frugal(
 
 
 def _logs(spec: Spec, figures: Mapping[str, float], asked: Mapping[str, float]) -> FloatArray:
-    """Logarithms of ratios, each corner's margin among them; LEAST for what is next to nothing."""
+    """Logarithms of ratios, each corner's margin among them; MIN_RATIO for what is next to nothing."""
     corners = {name: asked["margin"] for name in figures if "margin" in asked and base_of(name) == "margin"}
     ratios = _ratios(spec, figures, {**asked, **corners})
-    return np.asarray(np.log(np.clip(ratios or [LEAST], LEAST, 1 / LEAST)))
+    return np.asarray(np.log(np.clip(ratios or [MIN_RATIO], MIN_RATIO, 1 / MIN_RATIO)))
 
 
 def _ratios(spec: Spec, figures: Mapping[str, float], asked: Mapping[str, float]) -> list[float]:
@@ -301,15 +303,15 @@ def search_weights(
     Raises InputError for a machine whose groups no LQG can be searched for, and for a variable without effect.
     """
     clusters = clusters_of(spec)
-    journal.expect(_expected(clusters, spec, effort), progress)
-    found: dict[int, list[tuple[Search, FloatArray]]] = {}
+    journal.expect(_count_trials(clusters, spec, effort), progress)
+    found: dict[int, list[tuple[TrialSearch, FloatArray]]] = {}
     for delay in spec.delays:
         found[delay] = []
         for search in (cluster_search(spec, cluster, delay, journal) for cluster in clusters):
             goal = partial(worst_ratio, search)
             u = search.evolve(goal, effort.generations)
             look = partial(_look_worst, search)
-            found[delay].append((search, descend(look, u, Merit(), effort.polish * len(search.low))))
+            found[delay].append((search, descend(look, u, BoundPenalty(), effort.polish * len(search.low))))
     worst = {delay: max(worst_ratio(s, u) for s, u in places) for delay, places in found.items()}
     # More states are worth it only where they help.
     delay = min(d for d, ratio in worst.items() if ratio <= 1.01 * min(worst.values()))
@@ -317,7 +319,7 @@ def search_weights(
     return trial, _front(spec, found[delay], effort, trial)
 
 
-def _expected(clusters: Sequence[_Cluster], spec: Spec, effort: Effort) -> int:
+def _count_trials(clusters: Sequence[_Cluster], spec: Spec, effort: Effort) -> int:
     """About how many trials there will be."""
     total = 0
     for cluster in clusters:
@@ -328,7 +330,7 @@ def _expected(clusters: Sequence[_Cluster], spec: Spec, effort: Effort) -> int:
 
 
 def _front(
-    spec: Spec, places: Sequence[tuple[Search, FloatArray]], effort: Effort, best: Trial
+    spec: Spec, places: Sequence[tuple[TrialSearch, FloatArray]], effort: Effort, best: Trial
 ) -> tuple[Trial, ...]:
     """For margins about the one that is asked for: least force noise, least motion; margins then proven."""
     margin = spec.specification.get("margin")
@@ -347,7 +349,7 @@ def _front(
 
 
 def frugal_trials(
-    spec: Spec, places: Sequence[tuple[Search, FloatArray]], trade: Trade, polish: int
+    spec: Spec, places: Sequence[tuple[TrialSearch, FloatArray]], trade: Trade, polish: int
 ) -> Iterator[Trial]:
     """Descend to the least noise of the force, or motion, for one margin after the other; margins are estimates.
 
@@ -362,7 +364,7 @@ def frugal_trials(
             continue
         for k, (search, _) in enumerate(places):
             look = partial(_look_frugal, search, margin=share * margin, kinds=_names_of(spec.plant, trade))
-            around[k] = descend(look, around[k], FRUGAL, polish * len(search.low))
+            around[k] = descend(look, around[k], NOISE_PENALTY, polish * len(search.low))
         yield combine(spec, [(s, u) for (s, _), u in zip(places, around, strict=True)])
 
 
@@ -385,7 +387,7 @@ def _best_of(spec: Spec, trials: Sequence[Trial], best: Trial) -> tuple[Trial, .
 
 @display
 @dataclass(frozen=True, eq=False)
-class Tuned:
+class TuningResult:
     """What a search found."""
 
     spec: Spec  # with the weights that were found
@@ -419,7 +421,7 @@ def tune(
     effort: Effort = Effort(),  # noqa: B008
     restart: bool = False,
     progress: Progress | None = None,
-) -> Tuned:
+) -> TuningResult:
     """Search the numbers of [search] in a design file for the figures of [specification].
 
     spec : the design, from `malta.read_design`
@@ -458,7 +460,7 @@ def tune(
     requirements = judge(chosen)
     if progress is not None:
         progress(1.0)
-    return Tuned(chosen, trial, requirements, front, len(trials.known))
+    return TuningResult(chosen, trial, requirements, front, len(trials.known))
 
 
 def problem_sha256(spec: Spec) -> str:
@@ -466,7 +468,7 @@ def problem_sha256(spec: Spec) -> str:
     asked, searched = dict(spec.specification), (spec.search, spec.delays)
     loads = asdict(spec.loads) if spec.loads else None
     pushes = [asdict(bound) for bound in spec.recovery.values()]
-    settings = (FRONT, DIGITS, groups.STEP, groups.NEAR)
+    settings = (FRONT, DIGITS, groups.STEP, groups.CORNER_FACTOR)
     content = [describe(spec.parameters), asked, loads, pushes, searched, spec.sha256, *settings]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

@@ -13,7 +13,7 @@ from malta.errors import CheckError, InputError
 from malta.files import locate
 from malta.gains.file import content_of, read
 from malta.loops.loop import Loop, loop_of_model
-from malta.loops.sampled_loops import LAST
+from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.time_domain import bounded_deviation, noise_of, worst_along
 from malta.loops.windings import CurrentLoops
 from malta.margins.loop_report import BANDWIDTHS, LoopReport, Outcome
@@ -31,7 +31,7 @@ from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.recovery import RecoveryBound
-from malta.synthesis.requirements import Figure, Noise, Requirement, requirements_for
+from malta.synthesis.requirements import Figure, NoiseRms, Requirement, requirements_for
 from malta.synthesis.spec import Spec
 from malta.tuning.pid import loads_of, loop_figures, whole_machine
 from malta.tuning.search import base_of, model_and_controller
@@ -74,7 +74,7 @@ class SynthesizedDesign:
         return Figure(bandwidths[narrow], BANDWIDTHS[narrow])
 
     @cached_property
-    def noise(self) -> Noise:
+    def noise(self) -> NoiseRms:
         """Motion and commanded forces at rest, rms, by the covariance of the machine's linear loop."""
         return noise_of(self.loop.sampled, self.plant)
 
@@ -175,7 +175,7 @@ def _load_errors(design: SynthesizedDesign) -> list[Outcome]:
     return outcomes
 
 
-MOST = 0.5  # of the time of a verification, which the margins take
+MARGIN_SHARE = 0.5  # of the time of a verification, which the margins take
 
 
 def verify(
@@ -186,7 +186,7 @@ def verify(
     stages: bool | None = None,
     spec: Spec | None = None,
     flights: bool = False,
-    current_loops: CurrentLoops = LAST,
+    current_loops: CurrentLoops = LAST_STAGE,
     proof: bool = True,
     worst_case: bool | None = None,
     time: float | None = None,
@@ -249,7 +249,12 @@ def verify(
     found, box = linear_report(model, controller, None, current_loops), dict(uncertainty or {})
     if box:
         found = staged_report(
-            found, box, progress=lambda share: reach(MOST * share), bounds=bounds, time=time, proof=proof
+            found,
+            box,
+            progress=lambda share: reach(MARGIN_SHARE * share),
+            bounds=bounds,
+            time=time,
+            proof=proof,
         )
     if controller.schedule is not None:
         found = replace(
@@ -260,7 +265,7 @@ def verify(
         whole = controller.schedule is None and bool(box)
         worst_case = proof and whole and LoopAlong(plant, controller, tuple(box), current_loops).covers_travel
     worst = worst_sensitivities(plant, controller, box, current_loops, time=time) if worst_case else {}
-    reach((1 + MOST) / 2)
+    reach((1 + MARGIN_SHARE) / 2)
     carried = payload(plant, controller) if found.stable and proof else None
     return with_requirements(replace(found, worst=worst, payload=carried), spec, proof=proof, flights=flights)
 
@@ -292,7 +297,7 @@ def with_requirements(found: LoopReport, spec: Spec | None, *, proof: bool, flig
         if flights
         else [n for n in entries_without_flights(spec) if proof or n != "margin"]
     )
-    same = found.current_loops == LAST and dict(found.uncertainty) == dict(spec.uncertainty)
+    same = found.current_loops == LAST_STAGE and dict(found.uncertainty) == dict(spec.uncertainty)
     known = "margin" not in names or (same and found.robust is not None)
     try:
         outcomes = judge(spec, found.controller, names=names, verified=found if known else None)

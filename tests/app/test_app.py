@@ -22,7 +22,7 @@ import malta
 from malta.app import followers
 from malta.app.files import Edit, TakenError, fingerprint, inside, open_design, save_design
 from malta.app.picture import View, map_document, picture, solve
-from malta.app.server import LARGEST, PAGES, Server
+from malta.app.server import MAX_DOCUMENT_BYTES, PAGES, Server
 from malta.app.session import Session
 from malta.app.worker import work
 from malta.errors import InputError
@@ -374,7 +374,7 @@ def test_an_eigenvalue_margin_that_would_make_an_answer_late_is_left_out(
     mass = client.session.files.fields["machine.m"].value
     assert isinstance(mass, float | int)
     for number, (room, given) in enumerate([(0.0, False), (float("inf"), True), (0.0, False)]):
-        monkeypatch.setattr("malta.app.answers.SLOW", room)
+        monkeypatch.setattr("malta.app.answers.LONGEST_ANSWER_TIME", room)
         found = client.ask("evaluate", number=number, values={"machine.m": mass * (1 + 1e-3 * number)})
         assert found["stable"]
         assert (found["margin"] is not None) == given
@@ -387,13 +387,13 @@ def test_the_rest_of_an_answer_makes_it_the_whole_picture(
     client = Client(BALL, tmp_path)
     values = {"machine.m": 1.1 * float(client.session.files.fields["machine.m"].value)}
     whole = picture(solve(client.session.files.apply(client.session.files.edit(values))), View())
-    monkeypatch.setattr("malta.app.answers.SLOW", 0.0)
+    monkeypatch.setattr("malta.app.answers.LONGEST_ANSWER_TIME", 0.0)
     first = client.ask("evaluate", number=1, values=values)
     assert first["missing"] == ["frequency", "run", "load", "figures", "margin"]
     early = {one["label"]: one["value"] for one in first["figures"]}
     assert {"peak |S|", "bandwidth, T", "crossover, L", "slowest pole"} <= early.keys()
     monkeypatch.setattr(
-        "malta.app.answers.SLOW", 1e9
+        "malta.app.answers.LONGEST_ANSWER_TIME", 1e9
     )  # of the margin, which is left to the background otherwise
     rest = client.ask("rest", number=1)
     given = {**first, **rest}
@@ -409,7 +409,7 @@ def test_the_rest_of_an_answer_makes_it_the_whole_picture(
 def test_figures_of_the_first_answer_are_those_of_verify(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("malta.app.answers.SLOW", 0.0)
+    monkeypatch.setattr("malta.app.answers.LONGEST_ANSWER_TIME", 0.0)
     client = Client(HALBACH, tmp_path)
     spec = client.session.files.apply(Edit()).spec
     model = malta.linearize(spec.plant, spec.plant.at(**spec.operating_point))
@@ -430,7 +430,7 @@ def test_a_session_keeps_nothing_of_the_machines_that_it_leaves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "malta.app.answers.SLOW", float("inf")
+        "malta.app.answers.LONGEST_ANSWER_TIME", float("inf")
     )  # margins are traced here, whatever else the computer does
     client = Client(BALL, tmp_path)
     field = client.session.files.fields["machine.m"]
@@ -522,7 +522,7 @@ def test_the_page_is_served_to_whoever_has_its_address(server: Server) -> None:
         ("POST", "/ask", {"Origin": "null"}, 403),
         ("POST", "/ask", {"Origin": "http://127.0.0.1:1"}, 403),
         ("POST", "/ask", {"Content_Type": "text/plain"}, 415),
-        ("POST", "/ask", {"Content_Length": str(LARGEST + 1)}, 413),
+        ("POST", "/ask", {"Content_Length": str(MAX_DOCUMENT_BYTES + 1)}, 413),
         ("POST", "/ask", {"Content_Length": "-1"}, 411),
         ("POST", "/ask", {"Content_Length": "9" * 5000}, 413),  # more digits than Python reads
         ("GET", "//[x", {}, 404),

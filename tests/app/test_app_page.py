@@ -124,7 +124,7 @@ def test_parts_of_a_picture_that_follow_stay_grey_until_they_come(
     page: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gate, complete = threading.Event(), Answers.complete
-    monkeypatch.setattr("malta.app.answers.SLOW", 0.0)
+    monkeypatch.setattr("malta.app.answers.LONGEST_ANSWER_TIME", 0.0)
     monkeypatch.setattr(Answers, "complete", lambda *found: gate.wait(60) and complete(*found))
     row(page, "stiffness")[0].send_keys("\ue014")
     wait(lambda: len(page.find_elements("css selector", ".card.old")) == 4)

@@ -147,9 +147,9 @@ def test_every_shipped_design_has_sliders(path: Path) -> None:
 # --- searches ---
 
 
-def searching(path: Path, **values: Any) -> worker.Search:
+def searching(path: Path, **values: Any) -> worker.TuningRequest:
     files = open_design(path)
-    return worker.Search(files, files.apply(files.edit(values)), View(), lambda _share: None)
+    return worker.TuningRequest(files, files.apply(files.edit(values)), View(), lambda _share: None)
 
 
 @pytest.mark.slow
@@ -198,7 +198,7 @@ def test_a_search_without_a_goal_is_one_sentence(path: Path, task: Any, says: st
 def test_a_machine_that_differs_is_not_tuned_for() -> None:
     files = open_design(BALL)
     edited = files.apply(files.edit({"machine.m": 120.0}, redesign=False))
-    search = worker.Search(files, edited, View(), lambda _share: None)
+    search = worker.TuningRequest(files, edited, View(), lambda _share: None)
     with pytest.raises(InputError, match="a design for the machine's numbers"):
         next(worker.candidates(search))
 

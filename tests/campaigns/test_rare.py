@@ -20,9 +20,9 @@ from malta.campaigns.plan import Plan
 from malta.campaigns.rare import (
     LEVELS,
     REPETITIONS,
-    Estimate,
     Level,
-    Runs,
+    LevelRuns,
+    RareEventEstimate,
     Subset,
     rare_event,
     read_design_point,
@@ -33,7 +33,7 @@ from malta.campaigns.rare import (
 from malta.campaigns.result import runs_within_bounds, runs_within_specification
 from malta.campaigns.run import campaign
 from malta.campaigns.store import seal
-from malta.campaigns.summary import Bounds
+from malta.campaigns.summary import RunLimits
 from malta.simulation.readings import keys
 
 if TYPE_CHECKING:
@@ -77,7 +77,9 @@ def radial(u: FloatArray, _: NDArray[np.int64]) -> FloatArray:
     return found
 
 
-def estimates(severity: Severity, dimensions: int, count: int = 25, parts: int = 1) -> list[Estimate]:
+def estimates(
+    severity: Severity, dimensions: int, count: int = 25, parts: int = 1
+) -> list[RareEventEstimate]:
     """Of the smallest effort that is allowed, each by a seed of its own."""
     return [
         repeated_subset_simulation(severity, dimensions, parts, samples=2000, seed=seed)
@@ -85,7 +87,7 @@ def estimates(severity: Severity, dimensions: int, count: int = 25, parts: int =
     ]
 
 
-def assert_agrees(found: list[Estimate], expected: float) -> None:
+def assert_agrees(found: list[RareEventEstimate], expected: float) -> None:
     """The mean to three standard errors and a bias, and intervals that contain the probability."""
     p = np.array([f.probability for f in found])
     assert all(f.reached for f in found)
@@ -114,12 +116,12 @@ def test_a_failure_in_every_direction() -> None:
 
 def test_an_interval_by_hand() -> None:
     """Of 1, 2, 3 and 6 in a million: mean and variance of their logarithms by hand, t(3) of a table."""
-    none = Runs(np.zeros((1, 0)), np.zeros((1, 1), np.int64), np.ones(1))
+    none = LevelRuns(np.zeros((1, 0)), np.zeros((1, 1), np.int64), np.ones(1))
     some = [
         Subset((Level(0.5, 0.1, math.nan), Level(1.0, 1e-5 * n, 0.4)), 900, none, 0.9, 500)
         for n in (1, 2, 3, 6)
     ]
-    found = Estimate(tuple(some))
+    found = RareEventEstimate(tuple(some))
     mean, variance = math.log(1e-6) + math.log(36) / 4, 0.562468
     half = 3.18245 * math.sqrt(variance / 4 + variance**2 / 6)
     assert found.probability == pytest.approx(math.exp(mean + variance / 2), rel=1e-4)
@@ -229,7 +231,7 @@ def test_severities_that_seldom_differ() -> None:
 def test_limits_are_those_of_the_campaign() -> None:
     plan = shaky(0.3, 256)
     found = campaign(plan)
-    published = malta.model.published("data/tubular.toml")
+    published = malta.model.read_published("data/tubular.toml")
     touched = limit_of(plan, "touchdown").severity(found.batch)
     np.testing.assert_array_equal(touched < 1, found.completed)
     assert 0 < found.completed.mean() < 1
@@ -237,7 +239,7 @@ def test_limits_are_those_of_the_campaign() -> None:
     np.testing.assert_array_equal(far < 1, found.completed & (found.batch.deviation[:, 1] <= 20e-6))
     y1 = found.batch.deviation[found.completed, 1]
     np.testing.assert_allclose(far[found.completed], y1 / 20e-6, rtol=1e-12)
-    bounds = Bounds(published)
+    bounds = RunLimits(published)
     outside = limit_of(plan, "published", bounds=bounds).severity(found.batch)
     np.testing.assert_array_equal(outside < 1, runs_within_bounds(found, published))
     assert slug("rise, 10-90 %") == "rise" in merits_of(plan)
@@ -257,7 +259,7 @@ def test_a_specification_is_a_limit() -> None:
     spec = malta.read_design("design/robust.toml")
     box = dict.fromkeys(BOX, 0.2)
     found = campaign(Plan(gains.read("design/gains/robust.json"), "stroke", box, samples=64))
-    limit = limit_of(found.plan, "specification", bounds=Bounds(spec=spec))
+    limit = limit_of(found.plan, "specification", bounds=RunLimits(spec=spec))
     within = runs_within_specification(found, spec)
     assert within is not None
     assert 0 < within.sum() < 64

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.stats import chi2, qmc
 
-from malta.campaigns.plan import MOST, latin_hypercube, permute, sobol
+from malta.campaigns.plan import MAX_RUNS, latin_hypercube, permute, sobol
 from malta.simulation.readings import keys
 
 
@@ -56,16 +56,16 @@ def test_dimensions_and_neighbours_are_independent() -> None:
 
 
 def test_the_largest_plan_keeps_every_point_in_its_stratum() -> None:
-    points = latin_hypercube(1, MOST, 2, MOST - 5000, 5000)
-    strata = np.floor(points * MOST)
+    points = latin_hypercube(1, MAX_RUNS, 2, MAX_RUNS - 5000, 5000)
+    strata = np.floor(points * MAX_RUNS)
     assert points.min() > 0
     assert points.max() < 1
     for column in strata.T:
         assert len(set(column.tolist())) == 5000
-    numbers = np.array([0, 1, MOST - 1], dtype=np.uint64)
+    numbers = np.array([0, 1, MAX_RUNS - 1], dtype=np.uint64)
     assert np.array_equal(
-        np.floor(latin_hypercube(1, MOST, 1, MOST - 1, 1)[:, 0] * MOST),
-        permute(numbers, MOST, keys(1, np.array([-1]))[0])[-1:],
+        np.floor(latin_hypercube(1, MAX_RUNS, 1, MAX_RUNS - 1, 1)[:, 0] * MAX_RUNS),
+        permute(numbers, MAX_RUNS, keys(1, np.array([-1]))[0])[-1:],
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from malta.campaigns import summary as module
-from malta.campaigns.summary import ACCURACY, EXACT, Sketch, histogram, merge, quantiles, sketch_of
+from malta.campaigns.summary import ACCURACY, MAX_EXACT_VALUES, Sketch, histogram, merge, quantiles, sketch_of
 
 SHARES = (0.0, 0.01, 0.05, 0.5, 0.95, 0.99, 0.999, 1.0)
 LIMIT = 50  # values that are kept in these tests
@@ -21,7 +21,7 @@ finite = st.floats(
 
 @pytest.fixture(autouse=True)
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "EXACT", LIMIT)
+    monkeypatch.setattr(module, "MAX_EXACT_VALUES", LIMIT)
 
 
 def _content(sketch: Sketch) -> Any:
@@ -93,7 +93,7 @@ def test_memory_is_that_of_the_range_not_of_the_values() -> None:
     assert (found.count, found.values) == (120_000, ())
     assert len(found.counts) <= 11  # powers of two
     assert sum(part.nbytes for part in found.counts.values()) <= 11 * 8 * 2**module.BITS
-    assert EXACT == 100_000
+    assert MAX_EXACT_VALUES == 100_000
     assert np.isnan(quantiles(Sketch(), [0.5])).all()
 
 

@@ -24,15 +24,15 @@ from malta.campaigns.run import (
     BLOCK,
     FILES,
     LARGE_BLOCK,
-    Session,
+    RunExecution,
     Sum,
     block_size,
     campaign,
     replay,
     summarize,
 )
-from malta.campaigns.store import MANIFEST, Block, block_name, figure_shapes, fly
-from malta.campaigns.summary import Bounds, Summary, join, summary_of, worst_of, worst_runs
+from malta.campaigns.store import MANIFEST, RunBlock, block_name, figure_shapes, fly
+from malta.campaigns.summary import RunLimits, Summary, join, summary_of, worst_of, worst_runs
 from malta.simulation.engine.digest import Batch, verdicts
 
 if TYPE_CHECKING:
@@ -57,8 +57,8 @@ def plan(shaky: Controller) -> Plan:
 
 
 @pytest.fixture(scope="module")
-def bounds(published: dict[str, Any]) -> Bounds:
-    return Bounds(published, malta.read_design("design/robust.toml"))
+def bounds(published: dict[str, Any]) -> RunLimits:
+    return RunLimits(published, malta.read_design("design/robust.toml"))
 
 
 @pytest.fixture(scope="module")
@@ -85,15 +85,15 @@ def _content(found: Summary) -> dict[str, Any]:
     }
 
 
-def _page(found: Campaign | Summary, bounds: Bounds) -> str:
+def _page(found: Campaign | Summary, bounds: RunLimits) -> str:
     console = Console(width=100, record=True, file=io.StringIO())
     console.print(report.campaign_tables(found, bounds.published, 7, bounds.spec))
     return console.export_text()
 
 
-def _blocks(flown: Campaign, size: int) -> list[Block]:
+def _blocks(flown: Campaign, size: int) -> list[RunBlock]:
     return [
-        Block(
+        RunBlock(
             flown.values[k : k + size],
             Batch(**{n: getattr(flown.batch, n)[k : k + size] for n in Batch.__dataclass_fields__}),
             "compiled",
@@ -103,7 +103,9 @@ def _blocks(flown: Campaign, size: int) -> list[Block]:
 
 
 @pytest.mark.slow
-def test_a_summary_of_blocks_is_that_of_the_arrays(flown: Campaign, bounds: Bounds, tmp_path: Path) -> None:
+def test_a_summary_of_blocks_is_that_of_the_arrays(
+    flown: Campaign, bounds: RunLimits, tmp_path: Path
+) -> None:
     """Read from the folder and simulated anew; tables too, and pictures to the byte."""
     wanted = summary_of(flown, bounds)
     assert flown.folder is not None
@@ -125,7 +127,7 @@ def test_a_summary_of_blocks_is_that_of_the_arrays(flown: Campaign, bounds: Boun
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-def test_a_summary_by_hand(flown: Campaign, bounds: Bounds) -> None:
+def test_a_summary_by_hand(flown: Campaign, bounds: RunLimits) -> None:
     found = summary_of(flown, bounds)
     assert found.ends == flown.ends
     assert found.rate == flown.rate
@@ -146,8 +148,8 @@ def test_a_summary_by_hand(flown: Campaign, bounds: Bounds) -> None:
     assert (rise.better, rise.relation, rise.meaning.group) == ("low", "about", "campaign")
     names, limited = verdicts(flown.plan.plant), flown.batch.saturated.max(axis=1) > 0
     ways = dict(zip(summary.ways_to_end(flown.plan), found.bands[0], strict=True))  # over m
-    assert ways[summary.WITHIN].sum() == found.within
-    assert ways[summary.LIMITED].sum() == (flown.completed & limited & ~within).sum()
+    assert ways[summary.WITHIN_BOUNDS_TEXT].sum() == found.within
+    assert ways[summary.LIMITED_TEXT].sum() == (flown.completed & limited & ~within).sum()
     for code, name in enumerate(names[1:], start=1):
         assert ways[name].sum() == (flown.batch.verdict == code).sum()
     m = flown.values[:, 0] / flown.plan.parameters.m
@@ -156,12 +158,12 @@ def test_a_summary_by_hand(flown: Campaign, bounds: Bounds) -> None:
 
 @pytest.mark.parametrize("few", [False, True])
 def test_blocks_join_in_any_order_to_the_bit(
-    flown: Campaign, bounds: Bounds, monkeypatch: pytest.MonkeyPatch, few: bool
+    flown: Campaign, bounds: RunLimits, monkeypatch: pytest.MonkeyPatch, few: bool
 ) -> None:
     """Also where values are counted and most of the worst runs are dropped."""
     if few:
-        monkeypatch.setattr(sketch, "EXACT", 40)
-        monkeypatch.setattr(summary, "KEPT", 9)
+        monkeypatch.setattr(sketch, "MAX_EXACT_VALUES", 40)
+        monkeypatch.setattr(summary, "KEPT_RUNS", 9)
     parts = [
         summary_of(gather(flown.plan, {16 * k: block}), bounds) for k, block in enumerate(_blocks(flown, 16))
     ]
@@ -186,7 +188,7 @@ def test_the_worst_runs_are_those_of_all(flown: Campaign, monkeypatch: pytest.Mo
     order = np.lexsort((flown.index, np.where(done, closest, flown.batch.duration), done))
     assert 10 < (~done).sum() < 150
     assert worst_of(flown, 208) == order.tolist()
-    monkeypatch.setattr(summary, "KEPT", 180)
+    monkeypatch.setattr(summary, "KEPT_RUNS", 180)
     whole = reduce(
         join, [summary_of(gather(flown.plan, {16 * k: b})) for k, b in enumerate(_blocks(flown, 16))]
     )
@@ -197,10 +199,10 @@ def test_the_worst_runs_are_those_of_all(flown: Campaign, monkeypatch: pytest.Mo
 # --- memory ---
 
 
-def _invented(kept: list[weakref.ref[Any]] | None = None) -> Callable[..., Block]:
+def _invented(kept: list[weakref.ref[Any]] | None = None) -> Callable[..., RunBlock]:
     """A `fly` that invents figures, faster than any simulation."""
 
-    def fly(plan: Plan, first: int, count: int, *_: Any) -> Block:
+    def fly(plan: Plan, first: int, count: int, *_: Any) -> RunBlock:
         rng = np.random.default_rng(first)
         columns = {name: rng.uniform(0.1, 1, (count, *shape)) for name, shape in figure_shapes(plan).items()}
         columns["completed"] = (rng.uniform(size=count) < 0.9).astype(float)
@@ -210,7 +212,7 @@ def _invented(kept: list[weakref.ref[Any]] | None = None) -> Callable[..., Block
         if kept is not None:
             kept.append(weakref.ref(batch))
             assert sum(ref() is not None for ref in kept) <= 2
-        return Block(draw_machines(plan, first, count).values, batch, "compiled")
+        return RunBlock(draw_machines(plan, first, count).values, batch, "compiled")
 
     return fly
 
@@ -231,8 +233,8 @@ def test_no_block_stays_in_memory(plan: Plan, tmp_path: Path, monkeypatch: pytes
 def test_memory_does_not_grow_with_the_runs(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three times the runs: less than a tenth more, where their figures alone would be twice as many bytes."""
     monkeypatch.setattr(MODULE, "fly", _invented())
-    monkeypatch.setattr(sketch, "EXACT", 2000)
-    monkeypatch.setattr(summary, "KEPT", 50)
+    monkeypatch.setattr(sketch, "MAX_EXACT_VALUES", 2000)
+    monkeypatch.setattr(summary, "KEPT_RUNS", 50)
     peaks = []
     for samples in (4000, 12_000):
         wanted = Plan(plan.controller, "stroke", BOX, samples=samples)
@@ -245,7 +247,7 @@ def test_memory_does_not_grow_with_the_runs(plan: Plan, monkeypatch: pytest.Monk
 
 def test_blocks_grow_with_the_campaign(plan: Plan) -> None:
     sizes = {
-        samples: block_size(Plan(plan.controller, "stroke", BOX, samples=samples), Session())
+        samples: block_size(Plan(plan.controller, "stroke", BOX, samples=samples), RunExecution())
         for samples in (1, 10_000, FILES * BLOCK, FILES * BLOCK + 1, 1_000_000, 100_000_000)
     }
     assert [*sizes.values()] == [BLOCK, BLOCK, BLOCK, 2 * BLOCK, 4 * BLOCK, LARGE_BLOCK]
@@ -280,7 +282,7 @@ def test_ctrl_c_anywhere_counts_every_block_once(
     wanted = _content(summarize(plan, block=16))
     for name, late in (("early", False), ("late", True)):
 
-        def interrupted(self: Sum, first: int, block: Block, late: bool = late) -> None:
+        def interrupted(self: Sum, first: int, block: RunBlock, late: bool = late) -> None:
             once = first == 64 and first not in self and not (tmp_path / "pressed").exists()
             if late or not once:
                 add(self, first, block)

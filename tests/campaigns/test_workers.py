@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from malta.simulation.engine import batch as workers
-from malta.simulation.engine.compiled import LANES, Lanes, Part, Shared, numbers_in_lanes, repeat_in_lanes
+from malta.simulation.engine.compiled import LANES, Lanes, Shared, TimeSpan, numbers_in_lanes, repeat_in_lanes
 
 SAMPLES, SUBSTEPS = 100, 4
 
 
-def _work(groups: int, parts: int = 1) -> workers.Work:
+def _work(groups: int, parts: int = 1) -> workers.LaneWork:
     empty = np.zeros((groups, 1, LANES))
     keys = np.zeros((groups, LANES), dtype=np.uint64)
     shared = Shared(np.zeros((SAMPLES, 1)), np.zeros((2, 3)), SUBSTEPS, uniform=False)
-    return workers.Work(
-        Lanes(empty, empty, empty, keys, empty), shared, [Part(slice(None), keys) for _ in range(parts)]
+    return workers.LaneWork(
+        Lanes(empty, empty, empty, keys, empty), shared, [TimeSpan(slice(None), keys) for _ in range(parts)]
     )
 
 
@@ -76,7 +76,7 @@ def test_an_error_ends_all_threads(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_who_is_told_may_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     """Calls that wait until progress was reported: what raises there ends the work, and nothing waits for ever."""
-    monkeypatch.setattr(workers, "LOOK", 1e-3)
+    monkeypatch.setattr(workers, "PROGRESS_INTERVAL", 1e-3)
     stopped, calls = threading.Event(), list[slice]()
 
     def call(_: Any, chosen: slice, *__: Any) -> None:

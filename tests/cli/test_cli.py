@@ -25,7 +25,7 @@ from malta import gains
 from malta.__main__ import HELP
 from malta.cli import main as cli
 from malta.cli.main import renew
-from malta.cli.options import GENERAL, design_files, read_options
+from malta.cli.options import SCENARIO_FIELDS, design_files, read_options
 from malta.errors import InputError
 from malta.model.plant import Plant
 from malta.report.ledger import Ledger
@@ -644,7 +644,7 @@ def test_the_scenarios_of_the_machine_are_listed(run: Run) -> None:
         assert max(map(len, out.splitlines())) <= WIDTH
         own, _, general = out.partition("Every scenario takes")
         assert [line.split()[0] for line in own.splitlines()[4:] if line[:2].strip()] == list(names)
-        assert [line.split()[0] for line in general.splitlines()[1:]] == list(GENERAL)
+        assert [line.split()[0] for line in general.splitlines()[1:]] == list(SCENARIO_FIELDS)
     assert "radius=0.0002 m" in out
 
 
@@ -670,7 +670,7 @@ OLD = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in GENERAL if name != "settle"])  # which had none
+@pytest.mark.parametrize("name", [name for name in SCENARIO_FIELDS if name != "settle"])  # which had none
 def test_a_general_option_is_that_of_its_old_flag(run: Run, name: str) -> None:
     """--option delay=2 for --delay 2: options of the version before work, and say what to write."""
     value = (OLD | {"fidelity": "dq", "noise": "2"}).get(name)

@@ -13,7 +13,7 @@ from jsonschema import Draft202012Validator
 
 import malta
 from malta.cli.documents.published import ALL_SCHEMAS, MODELS, schema_of as schema
-from malta.report.ledger import Claim, Ledger
+from malta.report.ledger import Ledger, LedgerClaim
 from malta.units import distinct, identifier, unit_factor, unit_suffix
 
 pytestmark = pytest.mark.usefixtures("proven_once")
@@ -138,7 +138,7 @@ def test_campaign_and_its_status(run: Run, tmp_path: Path) -> None:
 
 
 def test_claims(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    claim = Claim("poles [rad/s]", "1", ("2",), "not reproduced; so", "differs")
+    claim = LedgerClaim("poles [rad/s]", "1", ("2",), "not reproduced; so", "differs")
     ledger = Ledger("tubular", "A. Author", ("a",), (claim,), ("a",))
     monkeypatch.setattr("malta.cli.pages.compute_ledgers", lambda *_: [ledger])
     found = document(run("claims", "design/table2.toml", "--json"), "claims-output")

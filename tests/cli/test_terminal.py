@@ -16,7 +16,7 @@ from rich.console import Console
 import malta
 from malta.cli.main import Commands
 from malta.margins.loop_report import Outcome
-from malta.report.ledger import Claim, Ledger
+from malta.report.ledger import Ledger, LedgerClaim
 from malta.report.tables import COLOURS, end_cell
 
 FILES = {
@@ -125,7 +125,7 @@ def test_the_end_of_a_run_has_a_colour(end: str, code: str) -> None:
 
 def test_the_verdict_on_a_claim_has_a_colour_and_the_same_word_elsewhere_has_none() -> None:
     rows = [("near the centre", "within 2 %", "near"), ("pole", "reproduced", "reproduced")]
-    claims = [Claim(subject, "1.0", ("1.0",), verdict, word) for subject, verdict, word in rows]  # type: ignore[arg-type]
+    claims = [LedgerClaim(subject, "1.0", ("1.0",), verdict, word) for subject, verdict, word in rows]  # type: ignore[arg-type]
     lines = malta.report.claims_table(Ledger("table", "paper", ("one",), tuple(claims)))
     shown = printed(lines, force_terminal=True, color_system="standard")
     assert "near the centre" in shown

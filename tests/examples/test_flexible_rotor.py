@@ -143,7 +143,7 @@ def test_every_course_of_the_speed_is_proven(example: Any, plant: malta.model.Pl
     law = example("law")
     par: Any = plant.parameters
     ((system, compensator),), _ = travel_loops(plant, law.controller(plant), ("Omega",))
-    found = malta.proof.varying(system, compensator, "Omega", (0.0, par.Omega_max), time=300)
+    found = malta.proof.prove_rate(system, compensator, "Omega", (0.0, par.Omega_max), time=300)
     assert found.rate is not None
     assert 2000 < found.rate < 1e4
     assert found.decay == pytest.approx(16, rel=0.1)

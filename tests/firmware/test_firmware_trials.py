@@ -9,7 +9,7 @@ import pytest
 from exported import EXACT, HERE, of_each_kind, require, run, run_test, target, write_folder
 
 from malta.firmware.program import Precision
-from malta.firmware.supervisor import AWAKE, MONITORS, TRANSITIONS, absent_monitors, monitors_of
+from malta.firmware.supervisor import IN_USE, MONITORS, TRANSITIONS, absent_monitors, monitors_of
 from malta.firmware.vectors import out_of_reach, watch_table
 
 LINES = 95.0  # % of each file that a run executes
@@ -93,6 +93,6 @@ def test_what_is_out_of_reach_is_in_the_table(name: str) -> None:
     table = watch_table(t)
     assert bool(out_of_reach(t)) == (name == "halbach")
     for one in out_of_reach(t):
-        assert one.state in AWAKE
+        assert one.state in IN_USE
         assert table[one.key][one.state] not in ("", "(gates are off)")
         assert len(one.reason) > 20

@@ -22,7 +22,7 @@ from malta.errors import InputError
 from malta.firmware import fmu as module
 from malta.firmware.flight import FLAGS
 from malta.firmware.fmu import PARTS, Part, build_fmu, unit_of
-from malta.firmware.machine import Machine, command_field
+from malta.firmware.machine import FirmwareMachine, command_field
 from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.supervisor import MONITORS, STATES
@@ -692,8 +692,8 @@ def test_bad_input_gets_a_sentence() -> None:
 
 
 def test_a_machine_takes_as_many_substeps_as_a_simulation() -> None:
-    assert Machine(target("robust")).substeps == 4
-    assert Machine(target("halbach")).substeps == pytest.approx(805.664, abs=1e-3)
+    assert FirmwareMachine(target("robust")).substeps == 4
+    assert FirmwareMachine(target("halbach")).substeps == pytest.approx(805.664, abs=1e-3)
 
 
 @pytest.mark.parametrize("part", PARTS)

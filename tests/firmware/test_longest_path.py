@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from exported import require, run, target, texts
 
-from malta.firmware.cost import APART as FLAGS, LISTING, PROCESSORS, cost_on, longest_path, passes_of
+from malta.firmware.cost import CC_FLAGS as FLAGS, LISTING, PROCESSORS, cost_on, longest_path, passes_of
 from malta.firmware.export import folder_files
 
 C = """int f(int x) {

@@ -223,7 +223,7 @@ def hear(port: serial_line.Port) -> Frame:
 def test_a_garbled_request_is_asked_for_again(target: str) -> None:
     """The target says so at once; what is no request as well; and after half a frame it finds the next one."""
     with serial_line.serial_port(target, 115200) as port:
-        line = serial_line.Line(port, target, 2.0)
+        line = serial_line.SerialLine(port, target, 2.0)
         assert line.ask(1, b"")[0] == 1
         damaged = bytearray(frame_bytes(Frame(2, 9, b"\1")))
         damaged[-1] ^= 1

@@ -24,8 +24,8 @@ from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.sources import phase_currents, sources
 from malta.firmware.supervisor import (
-    FLYING,
-    LONG,
+    ENDLESS_SAMPLES,
+    IN_FLIGHT,
     MONITORS,
     STATES,
     TIMES,
@@ -48,8 +48,8 @@ from malta.firmware.supervisor_text import (
     supervisor_members,
     supervisor_sources,
 )
-from malta.firmware.vectors import UNWATCHED, watch_lines, watch_table
-from malta.machines.tubular.experiments.faults import SOFT
+from malta.firmware.vectors import UNWATCHED_STATES, watch_lines, watch_table
+from malta.machines.tubular.experiments.faults import MAX_LANDING_SPEED
 from malta.simulation.engine.compiled import compiler
 
 pytestmark = pytest.mark.usefixtures("proven_once")
@@ -426,10 +426,12 @@ def test_counts_end_where_samples_stand_for_ever() -> None:
     """A machine that is off for days with sensors that are: 2^31 samples of 50 us are 30 hours."""
     bench = Bench()
     bench.step(y=dict.fromkeys(range(5), 0.0))
-    bench.supervisor.unchanged, bench.supervisor.samples = LONG - 1, LONG - 1
-    bench.supervisor.repeated[:] = [LONG - 1] * 5
+    bench.supervisor.unchanged, bench.supervisor.samples = ENDLESS_SAMPLES - 1, ENDLESS_SAMPLES - 1
+    bench.supervisor.repeated[:] = [ENDLESS_SAMPLES - 1] * 5
     assert bench.step(3, y=dict.fromkeys(range(5), 0.0)) == "OFF"
-    assert [bench.supervisor.unchanged, bench.supervisor.samples, *bench.supervisor.repeated] == [LONG] * 7
+    assert [bench.supervisor.unchanged, bench.supervisor.samples, *bench.supervisor.repeated] == [
+        ENDLESS_SAMPLES
+    ] * 7
 
 
 def test_machines_have_the_monitors_that_make_sense() -> None:
@@ -497,7 +499,10 @@ def test_a_filter_without_a_sensor_keeps_what_it_knows_of_disturbances() -> None
 @pytest.mark.slow
 def test_a_sensor_that_sticks_in_a_hold_is_landed_without() -> None:
     """By the design that estimates disturbances too, and after a bounce nothing throws the mover across."""
-    for name, during, most in (("robust_observer", "hold", SOFT), ("calibrated", "stroke", 0.26)):
+    for name, during, most in (
+        ("robust_observer", "hold", MAX_LANDING_SPEED),
+        ("calibrated", "stroke", 0.26),
+    ):
         c = malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
         e = malta.experiment(
             "supervised-faults", malta.plant_of(c.parameters), c, during=during, only="stuck"
@@ -701,7 +706,7 @@ def test_no_number_of_the_supervisor_is_ever_anything_else() -> None:
         assert np.isfinite(values).all(), k
         assert np.isfinite(view(bench.outputs, "command")).all()
         assert (np.abs(view(bench.outputs, "v")) <= bench.t.controller.limits.force * (1 + 1e-12)).all()
-        assert bench.supervisor.enable == int(bench.now in FLYING)
+        assert bench.supervisor.enable == int(bench.now in IN_FLIGHT)
     assert {"OFF", "OFFSETS", "SENSORS", "FAULT"} <= seen
 
 
@@ -853,7 +858,7 @@ def test_every_cell_of_the_table_of_monitors_has_a_reaction_or_a_reason(name: st
         for state in STATES:
             watched = any(row.key == key and state in row.states for row in monitors_of(TARGETS[name]))
             assert cells[state].startswith("(") == (not watched)
-    reasons = {reason for keys, _, reason in UNWATCHED for key in keys if key in table}
+    reasons = {reason for keys, _, reason in UNWATCHED_STATES for key in keys if key in table}
     assert len(watch_lines(TARGETS[name])) == 3 + len(table) + len(reasons)
 
 
@@ -891,7 +896,7 @@ def test_it_prevents_touchdowns(during: str, counts: tuple[int, int, int]) -> No
     assert tuple(merit.value for merit in e.merits) == counts
     speeds = {case.label: case.merits[2].value for case in e.cases}
     assert speeds["y1 stuck"] > 0.1
-    assert speeds["y1 stuck (s)"] < SOFT
+    assert speeds["y1 stuck (s)"] < MAX_LANDING_SPEED
     assert speeds["y1 biased by 50 um (s)"] < 0.005
     assert math.isnan(speeds["DC link sags by 90 % for 50 ms (s)"])
     assert not e.failed

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from exported import EXACT, require, run, target, write_folder
 
-from malta.firmware.supervisor import AWAKE, FLYING, STATES, TRANSITIONS, monitors_of
+from malta.firmware.supervisor import IN_FLIGHT, IN_USE, STATES, TRANSITIONS, monitors_of
 
 NUMBERS = {state: k for k, state in enumerate(STATES)}
 RELATION = """
@@ -277,5 +277,5 @@ def test_stops_are_heard_at_once_in_every_state_in_which_gates_may_be_on() -> No
     for name in ("halbach", "robust"):
         for key in ("STOP", "STO"):
             (row,) = [row for row in monitors_of(target(name, "double")) if row.key == key]
-            assert (row.samples, row.reaction, row.states) == (1, "FAULT", AWAKE)
-            assert set(FLYING) < set(row.states)
+            assert (row.samples, row.reaction, row.states) == (1, "FAULT", IN_USE)
+            assert set(IN_FLIGHT) < set(row.states)

@@ -8,7 +8,7 @@ from pathlib import Path
 from hypothesis import strategies as st
 
 from fuzz.oracle import Ended, line, observe
-from malta.cli.options import GENERAL
+from malta.cli.options import SCENARIO_FIELDS
 
 GAINS = tuple(f"design/gains/{name}.json" for name in ("table2", "halbach", "tubular_pid"))
 PLACES = (
@@ -66,7 +66,7 @@ OWN = (
     "way",
     "x",
     "",
-    *GENERAL,
+    *SCENARIO_FIELDS,
 )
 
 _numbers = st.sampled_from(NUMBERS) | st.floats().map(repr) | st.integers(-5, 500).map(str)

@@ -23,10 +23,10 @@ from malta.campaigns.run import campaign
 from malta.campaigns.store import MANIFEST, block_name, read_plan, seal
 from malta.checker import file as checked_file
 from malta.firmware.signals import Target
-from malta.firmware.sources import LAYOUT, MAGIC, MEMBERS, ORDER, Ring, ring_of
+from malta.firmware.sources import LAYOUT, MAGIC, MEMBERS, ORDER, RingLayout, ring_of
 from malta.gains.certified import check
-from malta.identification.calibration import Estimate
-from malta.identification.commission import Commissioning, Entry, Finding, read_journal
+from malta.identification.calibration import Interval95
+from malta.identification.commission import Commissioning, JournalEntry, StepFinding, read_journal
 from malta.linear.uncertain import Compensator
 from malta.machines.tubular.experiments.strokes import forces_of, record
 from malta.proof import certificate
@@ -268,7 +268,7 @@ def _log_npz(tree: Any, case: Case) -> bytes:
 
 
 @cache
-def _dump() -> tuple[Ring, dict[str, Any]]:
+def _dump() -> tuple[RingLayout, dict[str, Any]]:
     """The ring of the Halbach motor, and its dump as tables: members of the head, lines of text, samples."""
     controller = malta.gains.read(ROOT / "design" / "gains" / "halbach.json")
     ring = ring_of(Target(controller, "float", logged=4.0), "0" * 64)
@@ -278,7 +278,7 @@ def _dump() -> tuple[Ring, dict[str, Any]]:
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _dump_bytes(ring: Ring, tree: Any) -> bytes:
+def _dump_bytes(ring: RingLayout, tree: Any) -> bytes:
     lines = ["\t".join(map(str, line)) for line in tree["text"]]
     text = "\n".join([*lines, ""]).encode(errors="surrogatepass")
     text += bytes(-len(text) % 8)
@@ -306,11 +306,14 @@ def read_dump_file(case: Case, folder: Path) -> Ended | None:
 @cache
 def _journal() -> dict[str, Any]:
     """A day's journal of two steps, the second of which failed."""
-    estimate = Estimate(0.4e-6, 0.01e-6, "m")
-    findings = (Finding("noise of x1", estimate, 0.0, 1e-6), Finding("disk margin", Estimate(0.3, 0.02), 0.2))
+    estimate = Interval95(0.4e-6, 0.01e-6, "m")
+    findings = (
+        StepFinding("noise of x1", estimate, 0.0, 1e-6),
+        StepFinding("disk margin", Interval95(0.3, 0.02), 0.2),
+    )
     entries = (
-        Entry("still", "Is it quiet?", "still.npz", "0" * 64, findings),
-        Entry("loop", "Is it as predicted?", "", "", (), "too loud"),
+        JournalEntry("still", "Is it quiet?", "still.npz", "0" * 64, findings),
+        JournalEntry("loop", "Is it as predicted?", "", "", (), "too loud"),
     )
     done = Commissioning("mine.json", "1" * 64, "tubular", "", entries, ("still", "loop", "stroke"))
     return done.document | {"signature": done.signature}

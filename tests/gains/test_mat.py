@@ -23,7 +23,13 @@ from scipy.sparse import csc_array
 
 from malta.errors import InputError
 from malta.gains import encodings, encodings as mat
-from malta.gains.encodings import COMPRESSED, DEEPEST, LARGEST, MATRIX, read_mat
+from malta.gains.encodings import (
+    COMPRESSED_ELEMENT,
+    MATRIX,
+    MAX_DECOMPRESSED_BYTES,
+    MAX_STRUCT_DEPTH,
+    read_mat,
+)
 
 COMMITTED = sorted(Path("design/gains").glob("*.mat"))
 SMALL = Path("design/gains/halbach_pid.mat")
@@ -120,7 +126,7 @@ def test_whatever_scipy_writes_is_read_as_scipy_reads_it(
 
 
 def _element(kind: int, content: bytes) -> bytes:
-    if 0 < len(content) <= 4 and kind not in (MATRIX, COMPRESSED):
+    if 0 < len(content) <= 4 and kind not in (MATRIX, COMPRESSED_ELEMENT):
         return struct.pack("<I", len(content) << 16 | kind) + content.ljust(4, b"\0")
     return struct.pack("<II", kind, len(content)) + content + b"\0" * (-len(content) % 8)
 
@@ -166,7 +172,7 @@ def test_what_matlab_and_octave_write_is_read_as_scipy_reads_it(array: bytes) ->
     """Numbers in the smallest type, text in 16 bits, and each of them compressed."""
     _assert_same(_file(array))
     packed = zlib.compress(array)
-    compressed = struct.pack("<II", COMPRESSED, len(packed)) + packed
+    compressed = struct.pack("<II", COMPRESSED_ELEMENT, len(packed)) + packed
     _assert_same(_file(compressed, array.replace(b"\1\0\1\0x", b"\1\0\1\0y")))
 
 
@@ -189,7 +195,7 @@ def _deep(levels: int) -> bytes:
 
 def _packed(content: bytes) -> bytes:
     packed = zlib.compress(content)
-    return struct.pack("<II", COMPRESSED, len(packed)) + packed
+    return struct.pack("<II", COMPRESSED_ELEMENT, len(packed)) + packed
 
 
 ONE = _element(9, struct.pack("<d", 1.0))
@@ -253,12 +259,12 @@ REFUSED: dict[str, tuple[bytes, str]] = {
         _file(_array(2, 1, 1, _element(5, bytes(4)), _element(1, b"a"), NUMBER, name="x")),
         "1 bytes of names of 0 bytes each",
     ),
-    "structs without end": (_deep(DEEPEST + 1), f"more than {DEEPEST} structs in structs"),
+    "structs without end": (_deep(MAX_STRUCT_DEPTH + 1), f"more than {MAX_STRUCT_DEPTH} structs in structs"),
     "compressed twice": (_file(_packed(_packed(NUMBER))), "an element of type 15 in place of a matrix"),
     "two compressed in one": (_file(_packed(NUMBER + NUMBER)), "not one matrix"),
     "more after the compressed data": (
         _file(
-            struct.pack("<II", COMPRESSED, len(zlib.compress(NUMBER)) + 8)
+            struct.pack("<II", COMPRESSED_ELEMENT, len(zlib.compress(NUMBER)) + 8)
             + zlib.compress(NUMBER)
             + NUMBER[:8]
         ),
@@ -270,11 +276,11 @@ REFUSED: dict[str, tuple[bytes, str]] = {
     ),
     "nothing compressed": (_file(_packed(b"")), "not one matrix"),
     "no compressed data": (
-        _file(struct.pack("<II", COMPRESSED, 8) + b"malta123"),
+        _file(struct.pack("<II", COMPRESSED_ELEMENT, 8) + b"malta123"),
         "a compressed element that is damaged",
     ),
     "half of the compressed data": (
-        _file(struct.pack("<II", COMPRESSED, 20) + zlib.compress(NUMBER)[:20]),
+        _file(struct.pack("<II", COMPRESSED_ELEMENT, 20) + zlib.compress(NUMBER)[:20]),
         "a compressed element that is damaged",
     ),
 }
@@ -297,27 +303,27 @@ def test_names_may_have_spaces() -> None:
 
 
 def test_structs_may_be_as_deep_as_the_limit() -> None:
-    assert "a" in read_mat(_deep(DEEPEST - 2))["x"]
+    assert "a" in read_mat(_deep(MAX_STRUCT_DEPTH - 2))["x"]
 
 
 def test_compressed_data_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of one element and of all: what is beyond is not unpacked, and no memory is taken for it."""
-    monkeypatch.setattr(mat, "LARGEST", 4000)
+    monkeypatch.setattr(mat, "MAX_DECOMPRESSED_BYTES", 4000)
     parts = [_packed(_array(6, 1, 1500, _element(1, bytes(1500)), name=name)) for name in "xyz"]
     assert set(read_mat(_file(*parts[:2]))) == {"x", "y"}
     for arrays in (parts, [_packed(_array(6, 1, 5000, _element(1, bytes(5000)), name="x"))]):
         with pytest.raises(ValueError, match="of more than 4000 bytes"):
             read_mat(_file(*arrays))
     monkeypatch.undo()
-    unpacked = 4 * LARGEST
+    unpacked = 4 * MAX_DECOMPRESSED_BYTES
     bomb = _file(_packed(_array(6, 1, unpacked, _element(1, bytes(unpacked)), name="x")))
     assert len(bomb) < unpacked / 900
     tracemalloc.start()
-    with pytest.raises(ValueError, match=f"of more than {LARGEST} bytes"):
+    with pytest.raises(ValueError, match=f"of more than {MAX_DECOMPRESSED_BYTES} bytes"):
         read_mat(bomb)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 3 * LARGEST
+    assert peak < 3 * MAX_DECOMPRESSED_BYTES
 
 
 # --- files made to break a reader ---

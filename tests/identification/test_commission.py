@@ -17,8 +17,16 @@ from conftest import Run
 import malta
 from malta.errors import CheckError, InputError
 from malta.identification import calibration, measure as measuring
-from malta.identification.calibration import Estimate
-from malta.identification.commission import JOURNAL, Bench, Finding, Step, commission, read_journal, steps_of
+from malta.identification.calibration import Interval95
+from malta.identification.commission import (
+    JOURNAL,
+    Bench,
+    Check,
+    StepFinding,
+    commission,
+    read_journal,
+    steps_of,
+)
 from malta.identification.noise import dc_log, noise_table, process_noise
 from malta.machines.tubular import bench as tubular
 from malta.model.equilibrium import trim
@@ -41,14 +49,14 @@ def bench(*, errors: bool = True) -> Bench:
     return Bench(CONTROLLER, malta.plant_of(replace(par, **TRUE)), ERRORS if errors else {}, 0)
 
 
-def found_in(step: str, *, errors: bool = True) -> dict[str, Estimate]:
+def found_in(step: str, *, errors: bool = True) -> dict[str, Interval95]:
     one = next(one for one in steps_of(PLANT, {}) if one.name == step)
     return {
         finding.name: finding.found for finding in one.judge(CONTROLLER, one.record(bench(errors=errors)))
     }
 
 
-def holds(found: Estimate, truth: float, times: float = 1.5) -> bool:
+def holds(found: Interval95, truth: float, times: float = 1.5) -> bool:
     """Whether a truth is near an interval of 95 %: 1.5 times it has 99.7 %."""
     return abs(found.value - truth) < times * found.half
 
@@ -147,20 +155,20 @@ def test_polarity_centre_cogging_and_fall_of_the_machine() -> None:
     assert holds(found_in("drop")["unstable pole over the gain file's"], math.sqrt(9000 / 8626.7))
 
 
-def made_steps(limit: float, flown: list[str]) -> tuple[Step, ...]:
+def made_steps(limit: float, flown: list[str]) -> tuple[Check, ...]:
     """Two steps that record without a machine, and note that they did; the second has a limit."""
 
     def record(name: str, _: Bench) -> malta.identification.Log:
         flown.append(name)
         return a_log(1e-3 * np.arange(400), y=(["a"], np.random.default_rng(0).normal(0, 1, (400, 1))))
 
-    def judge(high: float, _: Any, log: malta.identification.Log) -> Sequence[Finding]:
-        return [Finding("noise", calibration.at_rest(log)["a"][1], 0.0, high)]
+    def judge(high: float, _: Any, log: malta.identification.Log) -> Sequence[StepFinding]:
+        return [StepFinding("noise", calibration.at_rest(log)["a"][1], 0.0, high)]
 
     from functools import partial
 
     return tuple(
-        Step(name, f"Is {name} quiet?", "nothing", "nothing", partial(record, name), partial(judge, high))
+        Check(name, f"Is {name} quiet?", "nothing", "nothing", partial(record, name), partial(judge, high))
         for name, high in (("one", math.inf), ("two", limit))
     )
 
@@ -211,9 +219,9 @@ def test_logs_of_a_bench_are_judged_and_waited_for(tmp_path: Path) -> None:
 
 
 def test_a_finding_holds_where_all_of_its_interval_does() -> None:
-    assert Finding("a", Estimate(1.0, 0.1), 0.9, 1.2).holds
-    assert not Finding("a", Estimate(1.0, 0.3), 0.9, 1.2).holds
-    assert not Finding("a", Estimate(math.nan, 0.0), 0.0, 1.0).holds
+    assert StepFinding("a", Interval95(1.0, 0.1), 0.9, 1.2).holds
+    assert not StepFinding("a", Interval95(1.0, 0.3), 0.9, 1.2).holds
+    assert not StepFinding("a", Interval95(math.nan, 0.0), 0.0, 1.0).holds
 
 
 def test_noise_of_phase_currents_is_that_of_the_forces() -> None:
@@ -249,8 +257,8 @@ def test_a_machine_without_current_sensors_says_so() -> None:
 
 
 def test_the_noise_that_is_written_is_read_by_a_design(tmp_path: Path) -> None:
-    process = {s.name: Estimate(0.05 + 0.001 * k, 0.0, "N") for k, s in enumerate(PLANT.inputs)}
-    sensor = {s.name: Estimate(1e-7 * (k + 1), 0.0, "m") for k, s in enumerate(PLANT.outputs)}
+    process = {s.name: Interval95(0.05 + 0.001 * k, 0.0, "N") for k, s in enumerate(PLANT.inputs)}
+    sensor = {s.name: Interval95(1e-7 * (k + 1), 0.0, "m") for k, s in enumerate(PLANT.outputs)}
     text = Path("design/table2.toml").read_text().replace("../data", str(Path("data").resolve()))
     begin, end = text.index("[noise]"), text.index("sensor = { published")
     rest = text[end:].partition("\n")[2]

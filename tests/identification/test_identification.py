@@ -18,9 +18,9 @@ from malta.firmware.step import started_state, step_function, zero_reference
 from malta.identification import ExcitationPlan, Identified, Log
 from malta.identification.data_file import read_identified, write_data
 from malta.identification.excite import model_at, predicted_spectra
-from malta.identification.prediction import Noise, predict
+from malta.identification.prediction import NoiseModel, predict
 from malta.identification.response import ResponseModel
-from malta.identification.spectra import spectrum_of, straightened
+from malta.identification.spectra import spectrum_of, straighten
 from malta.machines.tubular.plant import plant as tubular
 from malta.model.plant import Signal
 from malta.simulation.inputs import interleaved_multisine
@@ -297,7 +297,7 @@ def test_prediction_errors_are_least_wherever_the_search_begins(log: Log, found:
     mean = y.mean(axis=0), i.mean(axis=0)
     plant = malta.plant_of(CONTROLLER.parameters)
     model = ResponseModel(plant, found.names, tuple(log.names("i")), *mean, log.sample_time)
-    noise = Noise(np.diff(y, axis=0).var(axis=0) / 2, found.in_time.process**2)
+    noise = NoiseModel(np.diff(y, axis=0).var(axis=0) / 2, found.in_time.process**2)
     ends = [predict(model, found.values + off * sigma, noise, i, y) for off in (0.0, 3.0, -3.0)]
     for end in ends[1:]:
         assert np.abs((end.values - ends[0].values) / sigma).max() < 0.01
@@ -364,7 +364,7 @@ def test_curvature_is_taken_off_the_lines(plant: Plant, plan: ExcitationPlan) ->
         return float(np.abs(e[s.lines, :4]).max())
 
     assert left(s) > 0.3e-9
-    assert left(straightened(model, s, model.start)) < 0.02 * left(s)
+    assert left(straighten(model, s, model.start)) < 0.02 * left(s)
 
 
 def test_errors_of_sensors_are_parameters_too(plan: ExcitationPlan) -> None:

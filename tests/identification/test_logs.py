@@ -97,7 +97,7 @@ def test_compiled_c_reads_the_doubles_of_numpy(tmp_path: Path, monkeypatch: pyte
     for module in (log_files, None):
         if module is None:
             monkeypatch.setattr(log_files, "_fast_columns", lambda *_: None)
-        monkeypatch.setattr(log_files, "MOST", np.inf)
+        monkeypatch.setattr(log_files, "MAX_READING", np.inf)
         found.append(malta.identification.read_log(path))
     for group, table in found[0].columns.items():
         assert np.array_equal(table.view(np.uint64), found[1].columns[group].view(np.uint64)), group

@@ -48,7 +48,7 @@ def emf() -> Parameters:
 
 @pytest.fixture(scope="module")
 def printed() -> dict[str, Any]:
-    return malta.model.published("data/halbach.toml")
+    return malta.model.read_published("data/halbach.toml")
 
 
 def _array(value: Any) -> FloatArray:

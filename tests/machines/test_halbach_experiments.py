@@ -24,7 +24,7 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 import malta
 from malta.linear.sampling import sample_noise
 from malta.machines.halbach import electronics, electronics as motor, paper as claims, plant as halbach
-from malta.machines.halbach.electronics import IDEAL, Options
+from malta.machines.halbach.electronics import IDEAL_ELECTRONICS, Options
 from malta.machines.halbach.experiments import responses, steps_reference
 from malta.machines.halbach.open_loop import (
     FAULTS,
@@ -35,7 +35,7 @@ from malta.machines.halbach.open_loop import (
     positions_at_rest,
     servo_step,
 )
-from malta.machines.halbach.paper import Evidence, open_loop_dip, rise_of_dip
+from malta.machines.halbach.paper import HalbachEvidence, open_loop_dip, rise_of_dip
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import published_value
 from malta.model.plant import Plant
@@ -59,11 +59,11 @@ SCENARIOS = ("step", "stairs", "ramp", "force", "budget", "identify")
 
 @pytest.fixture(scope="module")
 def printed() -> dict[str, Any]:
-    return malta.model.published(ROOT / "data" / "halbach.toml")
+    return malta.model.read_published(ROOT / "data" / "halbach.toml")
 
 
 @pytest.fixture(scope="module")
-def evidence(printed: dict[str, Any]) -> Mapping[str, Evidence]:
+def evidence(printed: dict[str, Any]) -> Mapping[str, HalbachEvidence]:
     """Both designs, from their files through all experiments."""
     specs = (malta.read_design(ROOT / "design" / f"{name}.toml") for name in DESIGNS)
     return {spec.name: claims.evidence(spec, printed) for spec in specs}
@@ -95,7 +95,7 @@ def found(e: Experiment, case: int | str, label: str) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DESIGNS)
-def test_gain_files_are_of_their_design_files(evidence: Mapping[str, Evidence], name: str) -> None:
+def test_gain_files_are_of_their_design_files(evidence: Mapping[str, HalbachEvidence], name: str) -> None:
     made, read = evidence[name].controller, controller_of(name)
     assert read.spec_sha256 == made.spec_sha256
     for matrix in ("Ad", "Bd", "Cd", "K", "Ki", "L"):
@@ -117,7 +117,7 @@ def test_noise_of_the_design_is_that_of_the_sensors() -> None:
     )
 
 
-def _closed(e: Evidence) -> tuple[FloatArray, FloatArray]:
+def _closed(e: HalbachEvidence) -> tuple[FloatArray, FloatArray]:
     """The sampled loop, the motor's states first, and how an error of a reading enters it: angle and law."""
     law, H = linear_law(e.controller), e.par.k * e.par.F_z
     Ad, Bd, C = sampled_model(e.model, e.par.T_laser)
@@ -145,7 +145,9 @@ def test_20_readings_against_plain_python(controller: Controller) -> None:
     assert run.y.std() > 10e-6
 
 
-def test_small_steps_against_matrices(controller: Controller, evidence: Mapping[str, Evidence]) -> None:
+def test_small_steps_against_matrices(
+    controller: Controller, evidence: Mapping[str, HalbachEvidence]
+) -> None:
     """On the held model; it knows nothing of the current loops, whose 2 ms are the difference."""
     e, step = evidence[controller.name], 1e-6
     law = linear_law(controller)
@@ -154,7 +156,7 @@ def test_small_steps_against_matrices(controller: Controller, evidence: Mapping[
     run = simulate(
         plant_for(controller),
         controller,
-        Scenario("step", 1.65, reference, fidelity="phase", electronics=IDEAL),
+        Scenario("step", 1.65, reference, fidelity="phase", electronics=IDEAL_ELECTRONICS),
     )
     xi, s = np.zeros(2), np.zeros(len(law.A))
     for k, x in enumerate(run.p[:, 0]):
@@ -168,7 +170,7 @@ def test_small_steps_against_matrices(controller: Controller, evidence: Mapping[
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_noise_by_source_against_covariances(evidence: Mapping[str, Evidence], name: str) -> None:
+def test_noise_by_source_against_covariances(evidence: Mapping[str, HalbachEvidence], name: str) -> None:
     """Of the sampled loop; where the motor stands sets how noise of the phases adds up."""
     e = evidence[name]
     M, reading = _closed(e)
@@ -193,7 +195,7 @@ def test_noise_by_source_against_covariances(evidence: Mapping[str, Evidence], n
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_step_of_100_um_with_all_errors(evidence: Mapping[str, Evidence], name: str) -> None:
+def test_step_of_100_um_with_all_errors(evidence: Mapping[str, HalbachEvidence], name: str) -> None:
     """Fig. 9. The PID has no set-point weight, and overshoots a jump by 78 %: its reference is a quintic."""
     step, case = evidence[name].experiments["step"], {"halbach": "jumps", "halbach_pid": "quintics"}[name]
     assert step.run.scenario.fidelity == "phase"
@@ -230,7 +232,7 @@ def test_the_calm_design_answers_what_the_paper_asked() -> None:
     assert malta.verify(model, weak, {}).peak_sensitivity["x"] == pytest.approx(7.06, abs=0.02)
 
 
-def test_what_differs_from_the_paper_is_said(evidence: Mapping[str, Evidence]) -> None:
+def test_what_differs_from_the_paper_is_said(evidence: Mapping[str, HalbachEvidence]) -> None:
     """The laser as a main contributor, and a smoother force under vector control: neither, by any of our designs."""
     for e in evidence.values():
         assert claims.share_of_error("laser", e) == pytest.approx(0.03, abs=0.01)
@@ -239,7 +241,7 @@ def test_what_differs_from_the_paper_is_said(evidence: Mapping[str, Evidence]) -
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_stairs(evidence: Mapping[str, Evidence], printed: dict[str, Any], name: str) -> None:
+def test_stairs(evidence: Mapping[str, HalbachEvidence], printed: dict[str, Any], name: str) -> None:
     """Fig. 7: the second step is dead; closed, it switches between what voltages there are; fine ones are not seen."""
     stairs = evidence[name].experiments["stairs"]
     stands, _ = positions_at_rest(stairs.cases[0].run)
@@ -255,7 +257,7 @@ def test_stairs(evidence: Mapping[str, Evidence], printed: dict[str, Any], name:
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_ramps_through_the_travel(evidence: Mapping[str, Evidence], name: str) -> None:
+def test_ramps_through_the_travel(evidence: Mapping[str, HalbachEvidence], name: str) -> None:
     """Fig. 8: 50 mm at 1, 2 and 5 mm/s."""
     ramp = evidence[name].experiments["ramp"]
     assert [case.label for case in ramp.cases] == ["1 mm/s", "2 mm/s", "5 mm/s"]
@@ -277,7 +279,7 @@ def test_ramps_without_feedforward_start_later(controller: Controller) -> None:
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_error_budget(evidence: Mapping[str, Evidence], name: str) -> None:
+def test_error_budget(evidence: Mapping[str, HalbachEvidence], name: str) -> None:
     """Sec. 5.1: current sampling decides; how much depends on where in a pitch the motor stands."""
     budget = evidence[name].experiments["budget"]
     rms = {case.label: 1e6 * case.merits[0].value for case in budget.cases}
@@ -292,7 +294,7 @@ def test_error_budget(evidence: Mapping[str, Evidence], name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_vertical_force_of_a_move(evidence: Mapping[str, Evidence], name: str) -> None:
+def test_vertical_force_of_a_move(evidence: Mapping[str, HalbachEvidence], name: str) -> None:
     """Fig. 10, sound: only the jump of the open loop disturbs the vertical force, and not for good."""
     force = evidence[name].experiments["force"]
     assert found(force, "open loop", "lowest") == pytest.approx(-0.503, abs=1e-3)
@@ -314,7 +316,7 @@ def test_vertical_force_with_the_induced_voltage() -> None:
 
 @pytest.mark.parametrize("name", DESIGNS)
 def test_no_fault_explains_figure_10(
-    evidence: Mapping[str, Evidence], printed: dict[str, Any], name: str
+    evidence: Mapping[str, HalbachEvidence], printed: dict[str, Any], name: str
 ) -> None:
     """The paper's steady -18 % (open loop) and +7 % (position controller) with 0 under vector control.
 
@@ -400,7 +402,7 @@ def test_lqg_of_a_mass_with_friction_falls_into_a_limit_cycle() -> None:
     late: Parameters = malta.read("data/halbach.toml", preset="late")
     spec = malta.read_design("design/halbach.toml")
     reference = partial(move_reference, distance=100e-6, rise=0.0, begin=1.1)
-    scenario = Scenario("step", 20.0, reference, fidelity="phase", electronics=IDEAL)
+    scenario = Scenario("step", 20.0, reference, fidelity="phase", electronics=IDEAL_ELECTRONICS)
     swing, limits = [], []
     for F_z in (0.0, late.F_z):  # commutation without vertical force holds no spring
         believed = halbach.plant(replace(late, F_z=F_z))
@@ -450,7 +452,7 @@ def test_compiled_simulation_is_much_faster_than_the_virtual_machine() -> None:
 
 @pytest.mark.slow
 def test_every_row_of_the_ledger_has_its_verdict(
-    evidence: Mapping[str, Evidence], printed: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    evidence: Mapping[str, HalbachEvidence], printed: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     judged = claims.evidence(malta.read_design(ROOT / "design" / "halbach_calm.toml"), printed)
     known = {**evidence, judged.spec.name: judged}

@@ -13,7 +13,7 @@ from hypothesis import given, strategies as st
 
 import malta
 from malta.machines.halbach import electronics, electronics as motor, plant as halbach
-from malta.machines.halbach.electronics import IDEAL, REAL, Options
+from malta.machines.halbach.electronics import IDEAL_ELECTRONICS, REAL_ELECTRONICS, Options
 from malta.machines.halbach.plant import Parameters
 from malta.model.parameters import shape_parameters
 from malta.model.plant import Plant, symbolic
@@ -26,13 +26,13 @@ State = dict[str, Any]
 PLACE = st.floats(-50e-3, 50e-3)
 FORCE = st.floats(-10, 10)
 OPTIONS = [
-    REAL,
-    IDEAL,
-    *(replace(REAL, pwm=pwm) for pwm in ("exact", "fine")),
-    replace(REAL, adc_steps=False),
-    replace(REAL, adc_noise=False),
-    *(replace(REAL, mean_of=n) for n in (1, 2, 7)),
-    *(replace(REAL, pwm=pwm, current_loops=False) for pwm in ("plain", "exact", "fine")),
+    REAL_ELECTRONICS,
+    IDEAL_ELECTRONICS,
+    *(replace(REAL_ELECTRONICS, pwm=pwm) for pwm in ("exact", "fine")),
+    replace(REAL_ELECTRONICS, adc_steps=False),
+    replace(REAL_ELECTRONICS, adc_noise=False),
+    *(replace(REAL_ELECTRONICS, mean_of=n) for n in (1, 2, 7)),
+    *(replace(REAL_ELECTRONICS, pwm=pwm, current_loops=False) for pwm in ("plain", "exact", "fine")),
 ]
 FAULTY: dict[str, Any] = {"r_a": 0.9, "r_b": 0.95, "r_c": 1.25, "a_a": 0.8, "a_b": 1.1, "a_c": 1.05}
 
@@ -326,7 +326,7 @@ def test_it_starts_with_rolling_means_full_of_what_flows(par: Parameters, plant:
 @pytest.mark.parametrize("loops", [True, False])
 def test_it_starts_in_a_steady_state(par: Parameters, loops: bool) -> None:
     """With exact parts nothing moves; with loops not even where windings are unequal."""
-    o = replace(IDEAL, current_loops=loops)
+    o = replace(IDEAL_ELECTRONICS, current_loops=loops)
     p = replace(par, r_a=0.9, r_c=1.3) if loops else par
     e, machine = electronics.electronics(p, o), halbach.plant(p)
     y = ca.DM([4e-3])
@@ -342,7 +342,7 @@ def test_it_starts_in_a_steady_state(par: Parameters, loops: bool) -> None:
 
 
 def test_limits_are_kept_in_mind(par: Parameters) -> None:
-    e = electronics.electronics(par, IDEAL)
+    e = electronics.electronics(par, IDEAL_ELECTRONICS)
     period, place = _period(e), ca.DM([0.0])
     machine = halbach.plant(par)
     for forces, flags in (

@@ -14,7 +14,7 @@ import pytest
 
 import malta
 from malta.machines.halbach import electronics, electronics as motor, paper as claims
-from malta.machines.halbach.electronics import DEAD_ENDS, IDEAL, IQ_BITS, Options
+from malta.machines.halbach.electronics import DEAD_ENDS, IDEAL_ELECTRONICS, IQ_BITS, Options
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import plant_of, published_value
 from malta.simulation.scenario import Scenario
@@ -34,7 +34,7 @@ def par() -> Parameters:
 @pytest.fixture(scope="module")
 def paper(par: Parameters) -> Any:
     """The part of the evidence that needs no design."""
-    printed = malta.model.published("data/halbach.toml")
+    printed = malta.model.read_published("data/halbach.toml")
     return SimpleNamespace(par=par, value=lambda key: published_value(printed, key))
 
 
@@ -94,7 +94,7 @@ def test_the_ends_cost_eight_times_in_place_and_a_hundred_times_in_force(par: Pa
 
 def test_the_ends_in_flight() -> None:
     """At 5 N the ends of the paper's DSP change no bit of a flight. Ends that meet leave the plain PWM's steps."""
-    voltages = replace(IDEAL, current_loops=False)
+    voltages = replace(IDEAL_ELECTRONICS, current_loops=False)
     plain, fine, ended, met = (
         hold("halbach", options, 100, open_loop=True)
         for options in (
@@ -129,12 +129,12 @@ def test_fixed_point_angles_at_rest() -> None:
     """The PID never rests: 0.7 nm rms with 24 bits, and 250 times as much with 16. The LQG comes to rest."""
     worst = {}
     for name, bits in (("halbach_pid", IQ_BITS), ("halbach_pid", 16), ("halbach", IQ_BITS)):
-        run = hold(name, replace(IDEAL, angle_bits=bits))
+        run = hold(name, replace(IDEAL_ELECTRONICS, angle_bits=bits))
         worst[name, bits] = 1e9 * float((run.p[40:, 0] - PLACE).std())
     assert 0.2 < worst["halbach_pid", IQ_BITS] < 1.0
     assert 100 < worst["halbach_pid", 16] / worst["halbach_pid", IQ_BITS] < 500
     assert worst["halbach", IQ_BITS] < 0.05
-    exact = hold("halbach_pid", IDEAL)
+    exact = hold("halbach_pid", IDEAL_ELECTRONICS)
     assert 1e9 * float((exact.p[40:, 0] - PLACE).std()) < 0.01
 
 

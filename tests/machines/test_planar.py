@@ -21,7 +21,7 @@ from hypothesis import given, settings, strategies as st
 import malta
 from malta.machines.planar import commutation, field as planar_field, plant as planar
 from malta.machines.planar.field import ODD_X, ODD_Y, Series
-from malta.model.data import published as read_published, published_value
+from malta.model.data import published_value, read_published
 from malta.model.equations import rotation
 from malta.model.plant import symbolic
 from malta.simulation.engine.engines import translate
@@ -60,7 +60,7 @@ def exact(par: planar.Parameters, truth: Series) -> Series:
 
 
 @pytest.fixture(scope="module")
-def table(par: planar.Parameters, truth: Series) -> planar_field.Table:
+def table(par: planar.Parameters, truth: Series) -> planar_field.FieldTable:
     return planar_field.table(par, truth, 35)
 
 
@@ -295,7 +295,9 @@ def test_overlapping_rectangles_make_too_much_torque(par: planar.Parameters, tru
 
 
 @pytest.mark.parametrize("kind", ["truth", "analytical", "table"])
-def test_mirror_images(par: planar.Parameters, truth: Series, table: planar_field.Table, kind: str) -> None:
+def test_mirror_images(
+    par: planar.Parameters, truth: Series, table: planar_field.FieldTable, kind: str
+) -> None:
     """Mirrored in x: F_x, T_y, T_z turn their signs; in y: F_y, T_x, T_z. And 2 tau_n is a period."""
     models: dict[str, planar_field.CoilModel] = {
         "truth": truth,
@@ -354,7 +356,7 @@ def test_eight_harmonics_beat_the_table(par: planar.Parameters, truth: Series) -
 
 
 def test_height_goes_with_the_fundamental(
-    par: planar.Parameters, truth: Series, table: planar_field.Table
+    par: planar.Parameters, truth: Series, table: planar_field.FieldTable
 ) -> None:
     """e^(-pi z / tau_n) is exact for the fundamental alone: 0.014 N at 2 mm, 0.032 N on the magnets, at the nodes."""
     x, y, _ = quarter(par, 35)
@@ -380,7 +382,7 @@ def test_a_table_is_made_of_samples_that_mirror(par: planar.Parameters, truth: S
         planar_field.table(par, lambda x, y, z: truth(x, y, z) * np.nan, 4)
 
 
-def test_the_traced_table_is_the_table(par: planar.Parameters, table: planar_field.Table) -> None:
+def test_the_traced_table_is_the_table(par: planar.Parameters, table: planar_field.FieldTable) -> None:
     """CasADi's interpolant and numpy's gather, over every quarter and on the edges of cells."""
     p = ca.MX.sym("p", 3)
     traced = ca.Function("traced", [p], [table(p[0], p[1], p[2])])
@@ -403,7 +405,7 @@ def test_the_coil_pitch_decides(par: planar.Parameters, truth: Series) -> None:
     # With torques at 0.1 m, as an independent computation counted them: 2.1 and 2.4.
     for preset, worst in (("pitch_14_3", 2.11), ("pitch_16_3", 2.44)):
         lever = replace(malta.read(FILE, preset=preset), I_x=par.m * 0.1**2)
-        assert commutation.conditioning(lever, truth, 16).max() == pytest.approx(worst, abs=0.01)
+        assert commutation.condition_numbers(lever, truth, 16).max() == pytest.approx(worst, abs=0.01)
     wide = malta.read(FILE, preset="pitch_22_3")
     assert commutation.check_pitch(wide, truth) == pytest.approx(2.884, abs=2e-3)
     span = 3 * wide.coil_pitch + wide.l_c + wide.w_c
@@ -487,7 +489,7 @@ def test_limited_currents_keep_the_direction_of_the_wrench(par: planar.Parameter
     ],
 )
 def test_a_position_outside_is_refused(
-    par: planar.Parameters, table: planar_field.Table, name: str, p: list[float]
+    par: planar.Parameters, table: planar_field.FieldTable, name: str, p: list[float]
 ) -> None:
     """In one sentence that names the coordinate, before any NaN."""
     with pytest.raises(malta.InputError, match="expected a position from") as caught:

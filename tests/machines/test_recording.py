@@ -14,9 +14,9 @@ from conftest import refusal
 
 import malta
 from malta.machines.tubular.experiments.strokes import (
-    OWN,
-    RECORDED,
-    SLOW,
+    OWN_TABLE,
+    RECORDED_TABLE,
+    SLOW_STROKE,
     ForceLog,
     force_log,
     forces_of,
@@ -186,13 +186,13 @@ def _axial_error(e: Experiment, label: str) -> float:
 @pytest.mark.slow
 def test_the_recorded_v0_takes_an_error_of_the_cogging_off(recorded: Experiment) -> None:
     """The stroke is as good as with the right v0, whichever way the cogging is displaced."""
-    right = _axial_error(recorded, OWN)
-    assert _axial_error(recorded, RECORDED) == pytest.approx(right, rel=0.05)
+    right = _axial_error(recorded, OWN_TABLE)
+    assert _axial_error(recorded, RECORDED_TABLE) == pytest.approx(right, rel=0.05)
     for side in ("more", "less"):
-        known = _axial_error(recorded, f"phi_c 0.5 rad {side}: {RECORDED}")
+        known = _axial_error(recorded, f"phi_c 0.5 rad {side}: {RECORDED_TABLE}")
         assert known == pytest.approx(right, rel=0.05)
-        assert abs(_axial_error(recorded, f"phi_c 0.5 rad {side}: {OWN}") / right - 1) > 0.1
-    assert [case.label for case in recorded.cases[:3]] == [SLOW, OWN, RECORDED]
+        assert abs(_axial_error(recorded, f"phi_c 0.5 rad {side}: {OWN_TABLE}") / right - 1) > 0.1
+    assert [case.label for case in recorded.cases[:3]] == [SLOW_STROKE, OWN_TABLE, RECORDED_TABLE]
     assert recorded.merits[4].value < 0.05  # N of thrust, of a cogging of 0.5 N
 
 

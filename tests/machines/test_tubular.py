@@ -364,8 +364,8 @@ def test_sensors_agree_with_small_angles_to_second_order(par: tubular.Parameters
 def test_a_tilted_axis_pierces_the_sensor_planes_where_geometry_says(par: tubular.Parameters) -> None:
     """A tilt beta alone moves x by tan(beta) per metre of z, a tilt alpha alone moves y by -tan(alpha)."""
     z, angle = 4e-3, 0.2
-    beta = np.array(tubular.measured(par, ca.DM([0, 0, z, 0, angle, 0]))).ravel()
-    alpha = np.array(tubular.measured(par, ca.DM([0, 0, z, angle, 0, 0]))).ravel()
+    beta = np.array(tubular.measure_outputs(par, ca.DM([0, 0, z, 0, angle, 0]))).ravel()
+    alpha = np.array(tubular.measure_outputs(par, ca.DM([0, 0, z, angle, 0, 0]))).ravel()
     planes = np.array([-par.l_S, par.l_S]) - z
     np.testing.assert_allclose(beta[[0, 2]], math.tan(angle) * planes, rtol=1e-14)
     np.testing.assert_allclose(alpha[[1, 3]], -math.tan(angle) * planes, rtol=1e-14)
@@ -400,7 +400,7 @@ def test_position_of_inverts_the_sensors(par: tubular.Parameters) -> None:
     rng = np.random.default_rng(6)
     plant = tubular.plant(par, small_angle=True)
     back = _numeric(lambda x: plant.position_of(plant.h(x, NO_INPUT)), 12)
-    exact = _numeric(lambda x: tubular.position_of(par, tubular.measured(par, x)), 12)
+    exact = _numeric(lambda x: tubular.position_of(par, tubular.measure_outputs(par, x)), 12)
     for _ in range(100):
         x = rng.uniform(-SIZE, SIZE)
         np.testing.assert_allclose(back(x), x[:5], rtol=0, atol=1e-12)

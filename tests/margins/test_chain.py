@@ -31,10 +31,10 @@ from malta.loops.classical import (
     nominal_loop,
 )
 from malta.loops.parametric_plants import uncertain
-from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
+from malta.loops.sampled_loops import LAST_STAGE, loaded_loop, machine_law, machine_system
 from malta.margins.loop_report import LoopReport
 from malta.margins.travel import place_margin
-from malta.margins.verify import MACHINE, SAMPLED, compensators, linear_report, staged_report
+from malta.margins.verify import MACHINE_STAGE, SAMPLED_STAGE, compensators, linear_report, staged_report
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
 from malta.proof.blocks.gain import Gain
@@ -65,7 +65,9 @@ CHAINED = [pytest.param(name, marks=SLOW) for name in DESIGNS]
 def robustness(plant: Plant, c: Controller, box: Mapping[str, float], **options: Any) -> LoopReport:
     """The margins of all stages, without what else `malta.verify` computes."""
     model = linearize(plant, plant.point(c.operating_point[0]))
-    return staged_report(linear_report(model, c, None, options.pop("current_loops", LAST)), box, **options)
+    return staged_report(
+        linear_report(model, c, None, options.pop("current_loops", LAST_STAGE)), box, **options
+    )
 
 
 @cache
@@ -92,7 +94,7 @@ def _sampled(name: str, z: float = 0.0) -> tuple[UncertainSystem, Compensator]:
 def test_margins_go_where_the_chain_says(name: str) -> None:
     found = chain_of(name)
     assert [link.name for link in found.chain] == STAGES
-    assert STAGES[-2:] == [SAMPLED, MACHINE]
+    assert STAGES[-2:] == [SAMPLED_STAGE, MACHINE_STAGE]
     assert [link.broken_at for link in found.chain] == ["forces"] * 2 + ["sensors"] * 5
     by_name = {link.name: link for link in found.chain}
     for state_feedback in ("LQR", "LQI"):  # Kalman's inequality; R is diagonal
@@ -310,7 +312,7 @@ def test_cogging_that_is_stiffer_than_the_axial_loop_shows() -> None:
     found = robustness(plant, c, BOX, proof=False)
     by_name = {link.name: link.peak for link in found.chain}
     assert by_name["+ current loops"] == pytest.approx(6.93, abs=0.01)
-    assert by_name[SAMPLED] == pytest.approx(36.0, abs=0.1)
+    assert by_name[SAMPLED_STAGE] == pytest.approx(36.0, abs=0.1)
     assert [math.isnan(place.peak) for place in found.places] == [False, False, True, True]
     quiet = plant_of(replace(c.parameters, F_c=0.0))
     smooth = replace(c, feedforward=replace(c.feedforward, v0=c.feedforward.v0 * [1, 1, 1, 1, 0]))
@@ -326,7 +328,7 @@ def test_force_constants_that_the_controller_does_not_know() -> None:
     margins = malta.verify(malta.linearize(weak, weak.at()), c)
     largest = max(v for k, v in margins.peak_sensitivity.items() if k != "sigma_max")
     assert found.chain[-1].peak == pytest.approx(largest, rel=1e-5)
-    law = compensators(weak, c)[SAMPLED][0]
+    law = compensators(weak, c)[SAMPLED_STAGE][0]
     loops = [
         closed_loop(uncertain(weak, ["m"], believed=b), law, np.array([0.36]))[0]
         for b in (plant_of(c.parameters), None)

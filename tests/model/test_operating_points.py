@@ -15,7 +15,7 @@ import malta
 from malta.app.linear_run import linear_run
 from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import loaded_model, machine_loop, machine_system
-from malta.model.equilibrium import commanded
+from malta.model.equilibrium import with_command
 from malta.model.plant import OperatingPoint
 from malta.simulation.experiments.catalogue import held_payload
 
@@ -173,7 +173,7 @@ def test_the_command_of_a_point_is_kept() -> None:
     assert malta.linearize(plant, mirror).B[1, 0] == pytest.approx(
         -malta.linearize(plant, here).B[1, 0], rel=1e-9
     )
-    assert commanded(plant, mirror).v == pytest.approx(-here.v, rel=1e-9)
+    assert with_command(plant, mirror).v == pytest.approx(-here.v, rel=1e-9)
 
 
 PROVEN = {  # a machine, what its controller believes otherwise, and whether its command is a formula of the parameters

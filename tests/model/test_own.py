@@ -15,7 +15,7 @@ from conftest import refusal
 import malta
 from malta import report
 from malta.campaigns.result import bounds_of
-from malta.margins.travel import NOWHERE
+from malta.margins.travel import NO_EXTENT
 from malta.model import machines
 from malta.model.machines import inputs_of, lateral_outputs, outputs_of, part_of, require_part, stroke_unit
 from malta.model.plant import Signal
@@ -56,8 +56,8 @@ def rest(
 @pytest.fixture
 def toy(designs: dict[str, Design], monkeypatch: pytest.MonkeyPatch) -> Plant:
     """MALTA under another name, with one experiment and no word for anything."""
-    ours = machines._installed()
-    monkeypatch.setattr(machines, "_installed", lambda: ours | {"toy": "malta.machines.toy.plant"})
+    ours = machines._installed_machines()
+    monkeypatch.setattr(machines, "_installed_machines", lambda: ours | {"toy": "malta.machines.toy.plant"})
     tubular, model = machines.machine("tubular"), ModuleType("malta.machines.toy.plant")
     vars(model).update(Parameters=tubular.Parameters, plant=tubular.plant)
     monkeypatch.setitem(sys.modules, model.__name__, model)
@@ -83,8 +83,8 @@ def test_what_a_module_lacks_is_not_taken_for_a_machine_that_is_not_there(
     (tmp_path / "toy").mkdir()
     (tmp_path / "toy" / "claims.py").write_text("import nothing_of_that_name\n")
     (tmp_path / "toy" / "plant.py").write_text("Parameters = plant = dict\n")
-    ours = machines._installed()
-    monkeypatch.setattr(machines, "_installed", lambda: ours | {"toy": "malta.machines.toy.plant"})
+    ours = machines._installed_machines()
+    monkeypatch.setattr(machines, "_installed_machines", lambda: ours | {"toy": "malta.machines.toy.plant"})
     package = sys.modules["malta.machines"]
     monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
     with pytest.raises(ModuleNotFoundError, match="nothing_of_that_name"):
@@ -202,11 +202,11 @@ def test_the_gang_of_four_of_angles_says_its_units(toy: Plant) -> None:
 
     angles = replace(toy, outputs=(Signal("x1", "m"), Signal("a", "rad")))
     gang = {"x1": (1.0, 1.0, 2e-6, 3e6), "a": (1.0, 1.0, 4e-6, 5e6)}
-    found: Any = SimpleNamespace(gang=gang, extent=NOWHERE, plant=angles)
+    found: Any = SimpleNamespace(gang=gang, extent=NO_EXTENT, plant=angles)
     text = printed(report.gang_table(found))
     for cell in ("2.0 µm/N", "3.000 N/µm", "4.0 µrad/(N m)", "5.000 N m/µrad"):
         assert cell in text
-    found = SimpleNamespace(gang={"x1": gang["x1"]}, extent=NOWHERE, plant=toy)
+    found = SimpleNamespace(gang={"x1": gang["x1"]}, extent=NO_EXTENT, plant=toy)
     assert "from force |SP| [µm/N]" in printed(report.gang_table(found))
 
 

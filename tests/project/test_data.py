@@ -15,7 +15,7 @@ from conftest import refusal
 import malta
 from malta import units
 from malta.machines.tubular import plant as tubular
-from malta.model.data import published as read_published
+from malta.model.data import read_published
 from malta.model.parameters import units_of
 from malta.tables import load_toml
 from malta.units import to_si, unit_factor
@@ -280,7 +280,7 @@ def test_known_symbols_are_the_units_of_pint() -> None:
     """Each with each prefix, bit by bit; in products, whose factors round by their order, nearly so."""
     single = [prefix + symbol for prefix in ("", *units._PREFIXES) for symbol in units._SYMBOLS]
     tails = ("/s^2", "/(V)^2", " m / (rad/ms)", "/(kg m)", "^2/V", "*s**-1", " / m / rad", "(m)")
-    for unit in [*single, *units._WHOLE, *(one + tail for one in single for tail in tails)]:
+    for unit in [*single, *units._UNPREFIXED_SYMBOLS, *(one + tail for one in single for tail in tails)]:
         found, (factor, root) = units._plain_root_units(unit), units._pint_root_units(unit)
         assert found is not None, unit
         assert found[1] == root, unit

@@ -35,7 +35,7 @@ SLOW = {
     "malta.simulation.fastest_stroke",
     "malta.ledger",
     "malta.structured.tune_design",
-    "malta.simulation.replayed",
+    "malta.simulation.replay_run",
     "malta.report.CampaignFigures",
     "malta.report.campaign",
     "malta.report.chain_figure",

@@ -128,7 +128,7 @@ def test_machines_and_version_without_metadata(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(machines, "entry_points", lambda group: [])  # noqa: ARG005
     monkeypatch.setattr(metadata, "version", missing)
-    assert set(machines._installed.__wrapped__()) == {"tubular", "halbach", "planar"}
+    assert set(machines._installed_machines.__wrapped__()) == {"tubular", "halbach", "planar"}
     assert files.version() == "unknown"
 
 

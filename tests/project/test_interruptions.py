@@ -124,7 +124,7 @@ def test_work_speaks_when_it_reports_and_when_it_does_not(
 ) -> None:
     monkeypatch.setattr(output, "PATIENCE", 0.0)
     monkeypatch.setattr(output, "INTERVAL", 0.05)
-    with output.working("sorting") as work:
+    with output.progress_on("sorting") as work:
         silent = said_by(capsys)
         work.report(0.25)
         work.bound(0.5, float("inf"))
@@ -134,21 +134,21 @@ def test_work_speaks_when_it_reports_and_when_it_does_not(
     assert re.fullmatch(
         r"malta: sorting: proven 50\.00 %, lost at not found, 25 %, [\d.e-]+ s, about [\d.e-]+ s left", last
     )
-    with output.working("nothing"):
+    with output.progress_on("nothing"):
         pass
     monkeypatch.setattr(output, "PATIENCE", 10.0)
-    with output.working("quick work") as work:
+    with output.progress_on("quick work") as work:
         work.report(0.5)
     assert "quick" not in capsys.readouterr().err
 
 
 def test_ctrl_c_that_a_library_drops_is_pressed_again(monkeypatch: pytest.MonkeyPatch) -> None:
     def wait(seconds: float, *, insists: bool) -> None:
-        with output.working("sorting", insists=insists) as work:
+        with output.progress_on("sorting", insists=insists) as work:
             work.pressed.append(0.0)  # long ago
             time.sleep(seconds)
 
-    monkeypatch.setattr(output, "DROPPED", 0.05)
+    monkeypatch.setattr(output, "INTERRUPT_TIME", 0.05)
     with pytest.raises(KeyboardInterrupt):
         wait(60, insists=True)
     wait(0.4, insists=False)

@@ -53,7 +53,7 @@ def test_long_work_is_refused_in_seconds(clock: _Clock, seconds: float, times: f
         malta.InputError, match=rf"^stroke: found about {said} of work, expected at most 10 min, or"
     ):
         _reports(clock, seconds, times=times)
-    assert clock.now == 1800.0 + output.ENOUGH
+    assert clock.now == 1800.0 + output.ESTIMATE_INTERVAL
 
 
 def test_who_agreed_may_wait(clock: _Clock) -> None:
@@ -79,9 +79,9 @@ def test_durations_are_told_as_people_tell_them(seconds: float, text: str) -> No
 def test_the_commands_refuse_and_obey(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
-    monkeypatch.setattr(output, "ENOUGH", 0.0)
-    monkeypatch.setattr(output, "LONGEST", 1e-9)
-    monkeypatch.setattr("malta.simulation.engine.batch.LOOK", 1e-3)
+    monkeypatch.setattr(output, "ESTIMATE_INTERVAL", 0.0)
+    monkeypatch.setattr(output, "UNCONFIRMED_TIME", 1e-9)
+    monkeypatch.setattr("malta.simulation.engine.batch.PROGRESS_INTERVAL", 1e-3)
     own = {
         "simulate": ("--option", "substeps=500", "--option", "fidelity=force", "--out", tmp_path),
         "campaign": ("--samples", "1024", "--option", "fidelity=force", "--spread", "1%", "--out", tmp_path),

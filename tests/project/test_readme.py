@@ -13,7 +13,7 @@ import malta
 from malta.campaigns.result import yields_of
 from malta.campaigns.run import main_campaign
 from malta.machines.tubular.paper import SOURCE
-from malta.machines.tubular.paper.quantities import FEWER, MACHINES
+from malta.machines.tubular.paper.quantities import FEWER_SHARE, MACHINES
 from malta.report.ledger import find_tables
 
 pytestmark = pytest.mark.usefixtures("proven_once")
@@ -93,7 +93,7 @@ def test_the_table_of_claims_is_computed(
     monkeypatch.setattr("malta.machines.tubular.paper.quantities.MACHINES", FEW)
     monkeypatch.setattr("malta.machines.tubular.paper.quantities.LEARNERS", LEARNERS)
     specs = [malta.read_design(f"design/{name}.toml") for name in designs]
-    ledger = malta.ledger(specs, malta.model.published(f"data/{machine}.toml"))
+    ledger = malta.ledger(specs, malta.model.read_published(f"data/{machine}.toml"))
     found, shown = _cells(ledger.markdown()), _shown(ledger.title, designs)
     assert list(shown) == list(found)
     assert len(found) > 35
@@ -103,7 +103,9 @@ def test_the_table_of_claims_is_computed(
             continue
         numbers = [[_number(cell) for cell in row[1:-1]] for row in (shown[subject], cells)]
         if subject.startswith(DRAWN):
-            count = round(FEWER * FEW) if "no rest before" in subject or "fed forward" in subject else FEW
+            count = (
+                round(FEWER_SHARE * FEW) if "no rest before" in subject or "fed forward" in subject else FEW
+            )
             count = LEARNERS if "first stroke" in subject or "second stroke" in subject else count
             within = partial(_is_of_sample, count) if "[%]" in subject else _is_as_large
             assert [within(*pair) for pair in zip(*numbers, strict=True)] == [True] * len(numbers[0])
@@ -136,7 +138,7 @@ def _is_of_sample(count: int, shown: float | None, found: float | None) -> bool:
 def test_yields_of_the_flagship_are_those_of_all_machines() -> None:
     """All of them; the last digits of the arithmetic decide for machines at a bound."""
     shown = _shown(f"tubular, {SOURCE}", DESIGNS["tubular"])
-    published = malta.model.published("data/tubular.toml")
+    published = malta.model.read_published("data/tubular.toml")
     for name in ("robust",):
         k = DESIGNS["tubular"].index(name)
         controller = malta.gains.read(f"design/gains/{name}.json")

@@ -18,7 +18,7 @@ from malta.campaigns import store
 from malta.campaigns.plan import Plan
 from malta.campaigns.run import campaign
 from malta.campaigns.store import block_name, seal
-from malta.errors import LONGEST, InputError, shorten
+from malta.errors import MAX_SENTENCE_LENGTH, InputError, shorten
 from malta.files import file_exists
 from malta.model.sensors import MOST_DELAY
 from malta.simulation.experiments import PlannedRun, fly_all
@@ -47,12 +47,12 @@ LONG = "w" * 5000
 )
 def test_a_sentence_has_at_most_300_characters(where: str, field: str, found: str, expected: str) -> None:
     error = InputError(where, field, found, expected)
-    assert len(str(error)) <= LONGEST == 300
+    assert len(str(error)) <= MAX_SENTENCE_LENGTH == 300
     assert str(error).isprintable()
     assert "a.toml: " in str(error)
     assert f": found {error.found}, expected {error.expected}" in str(error)
     again = InputError("b.toml", error.field, error.found, error.expected)  # as a reader that knows the file
-    assert len(str(again)) <= LONGEST
+    assert len(str(again)) <= MAX_SENTENCE_LENGTH
 
 
 def test_a_short_sentence_is_whole() -> None:
@@ -84,7 +84,7 @@ def test_arguments_that_are_wrong_are_one_sentence(run: Run, arguments: list[str
     assert (code, out) == (2, "")
     sentence = one_sentence(err)
     assert found in sentence
-    assert len(sentence) <= LONGEST
+    assert len(sentence) <= MAX_SENTENCE_LENGTH
 
 
 def test_no_arguments_get_the_help(run: Run) -> None:

@@ -18,17 +18,17 @@ from malta.simulation.engine import compiled
 
 TEXT = (Path(__file__).parents[2] / "SECURITY.md").read_text(encoding="utf-8")
 LIMITS = {
-    "a file": files.LARGEST,
-    "a log": log_files.LARGEST,
-    "a certificate": checked_file.LARGEST,
-    "elements of a MAT-file, decompressed": encodings.LARGEST,
-    "members of an archive": tables.MANY,
-    "tables in tables": tables.DEEPEST,
-    "a unit": units.LONGEST,
+    "a file": files.MAX_FILE_BYTES,
+    "a log": log_files.MAX_LOG_BYTES,
+    "a certificate": checked_file.MAX_BYTES,
+    "elements of a MAT-file, decompressed": encodings.MAX_DECOMPRESSED_BYTES,
+    "members of an archive": tables.MAX_MEMBERS,
+    "tables in tables": tables.MAX_DEPTH,
+    "a unit": units.MAX_UNIT_LENGTH,
     "a delay": sensors.MOST_DELAY,
     "steps in a sample": scenario.MOST_SUBSTEPS,
-    "runs of a series together": inputs.LONGEST,
-    "runs of a campaign": plan.MOST,
+    "runs of a series together": inputs.MAX_SAMPLES,
+    "runs of a campaign": plan.MAX_RUNS,
     "a compilation": compiled.PATIENCE,
     "the check of a certificate": inspect.signature(check.check).parameters["seconds"].default,
 }
@@ -41,4 +41,4 @@ def test_the_limits_are_those_of_the_code() -> None:
 
 def test_the_patience_is_that_of_the_code() -> None:
     assert "more than ten minutes" in TEXT
-    assert output.LONGEST == 600
+    assert output.UNCONFIRMED_TIME == 600

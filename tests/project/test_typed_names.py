@@ -16,7 +16,7 @@ from malta.campaigns.plan import SAMPLERS, Law
 from malta.campaigns.run import campaign
 from malta.cli import main as cli
 from malta.cli.documents.published import ALL_SCHEMAS
-from malta.cli.options import GENERAL
+from malta.cli.options import SCENARIO_FIELDS
 from malta.cli.report import KINDS
 from malta.firmware.fmu import PARTS, PLATFORMS, platforms_named
 from malta.model.machines import machine, machine_names
@@ -123,7 +123,7 @@ LISTS = (
     Names("parameter that is learned", ["K_D"], lambda name: malta.learn(CONTROLLER, LOG, parameter=name)),
     Names("parameter that is measured", PARAMETERS, lambda name: _measured(name)),
     Names("command", ["design", "campaign", "commission"], _line("NAME")),
-    Names("--option", GENERAL, _line(f"simulate {GAINS} --option NAME=1")),
+    Names("--option", SCENARIO_FIELDS, _line(f"simulate {GAINS} --option NAME=1")),
     Names("--set", PARAMETERS, _line(f"simulate {GAINS} --set NAME=1")),
     Names("--set of a design", ["bases", "delay", "m"], _line("design design/robust.toml --set NAME=1")),
     Names("--sensor", SENSOR_ERRORS, _line(f"simulate {GAINS} --sensor NAME=1um")),

@@ -11,7 +11,7 @@ import pytest
 from flint import arb, fmpq
 
 import malta
-from malta.linear.expressions import EXACT
+from malta.linear.expressions import EXACT_ARITHMETIC
 from malta.proof.groups import loop_of
 from malta.proof.robust import in_plain_basis, law_of, problem_of
 
@@ -83,7 +83,9 @@ def test_the_loop_in_another_basis_is_the_same_loop() -> None:
         other = in_plain_basis(loop)
         changed += other is not loop
         p = [fmpq(int(k), 7) for k in rng.integers(1, 30, 2)]
-        one, two = (_polynomial(each.program.run(p, EXACT), each.descriptor) for each in (loop, other))
+        one, two = (
+            _polynomial(each.program.run(p, EXACT_ARITHMETIC), each.descriptor) for each in (loop, other)
+        )
         assert one == two
     assert changed > 3
 

@@ -16,7 +16,7 @@ from malta.errors import InputError
 from malta.linear.uncertain import responses
 from malta.proof import Dynamic
 from malta.proof.blocks import Block, probe, weight_of
-from malta.proof.blocks.transfer import Signals, mu_bound, performance, transfer
+from malta.proof.blocks.transfer import LoopSignals, mu_bound, performance, transfer
 
 ONE = weight_of(1.0, "")
 
@@ -106,7 +106,7 @@ def test_the_blocks_close_the_loop_as_m_says(
         return np.linalg.det(np.eye(r.G_y.shape[1]) - r.G_y @ r.F)
 
     ratio = difference(entries) / difference(0 * entries) * np.prod(1 - d[back])
-    M = transfer(Signals(responses(s, F, p, w)), blocks)
+    M = transfer(LoopSignals(responses(s, F, p, w)), blocks)
     assert ratio == pytest.approx(np.linalg.det(np.eye(4) - M @ np.diag(d)), rel=1e-9)
 
 
@@ -197,7 +197,7 @@ def test_compliance_of_the_flagship_in_its_travel() -> None:
     for _ in range(60):
         p = s.nominal * (1 + np.array([0.2, 0.2, 0]) * np.clip(rng.uniform(-2, 2, 3), -1, 1))
         p[-1] = rng.uniform(-plant.stroke.travel, plant.stroke.travel)
-        worst = max(worst, float(np.abs(transfer(Signals(responses(s, law, p, w)), [block])).max()))
+        worst = max(worst, float(np.abs(transfer(LoopSignals(responses(s, law, p, w)), [block])).max()))
     assert 0.9 * m.lower < worst <= m.upper
 
 
@@ -220,7 +220,7 @@ def test_several_blocks_beside_parameters() -> None:
 
     def mu(p: np.ndarray[Any, Any], w: np.ndarray[Any, Any]) -> Any:
         sizes = np.array([b.weight.at(w) for b in blocks]).T
-        return mu_bound(transfer(Signals(responses(s, law, p, w)), blocks) * sizes[:, :, None], blocks)[0]
+        return mu_bound(transfer(LoopSignals(responses(s, law, p, w)), blocks) * sizes[:, :, None], blocks)[0]
 
     w = np.geomspace(0.1, 1e4, 800)
     for k in 10 + 4 * m.lower * np.linspace(-1, 1, 11):

@@ -18,7 +18,7 @@ from malta.linear.branches import INTERVALS, Interval, resolve_branches, without
 from malta.linear.expressions import POINTS, NotAnalytic, program
 from malta.loops.parametric_plants import of_plant
 from malta.model import Actuator, Plant, Signal, si
-from malta.proof.box import ENDS, FAR, box_of, within_branches
+from malta.proof.box import DOMAIN_END_TEXT, SEARCH_LIMIT, box_of, within_branches
 from malta.proof.certificate import certificate_of
 
 
@@ -124,7 +124,7 @@ def test_the_margin_ends_where_the_branch_does() -> None:
     assert m.lower == pytest.approx(2.5, rel=1e-3)
     assert m.lower is not None
     assert m.lower < 2.5
-    assert str(m).endswith(f"no unstable machine found up to t = 2.5, where {ENDS}")
+    assert str(m).endswith(f"no unstable machine found up to t = 2.5, where {DOMAIN_END_TEXT}")
 
 
 def test_certificates_do_not_cover_branches() -> None:
@@ -158,9 +158,9 @@ def test_branches_of_any_model_are_those_at_the_nominal_place() -> None:
     assert 20 < inside < 180
     whole = box_of(("x", "y"), np.array([2.0, 0.9]), (), {"x": 0.1, "y": 0.1}, {})
     ended = within_branches(whole, positive)
-    assert ended.ends == ENDS
+    assert ended.ends == DOMAIN_END_TEXT
     assert ended.most == pytest.approx(10 / 9, rel=1e-6)  # y < 1
-    assert within_branches(whole, None).limit == FAR
+    assert within_branches(whole, None).limit == SEARCH_LIMIT
 
 
 def test_what_has_no_branch_is_left_as_it_is() -> None:

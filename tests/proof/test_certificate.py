@@ -23,12 +23,12 @@ from flint import arb, fmpq
 from tampering import claiming, written
 
 import malta
-from malta.checker.check import tiled
+from malta.checker.check import tiles_box
 from malta.checker.loop import determinant_bounds
 from malta.errors import CheckError, InputError
 from malta.gains.certified import check, origin_of
 from malta.linear.uncertain import Compensator
-from malta.loops.sampled_loops import LAST
+from malta.loops.sampled_loops import LAST_STAGE
 from malta.margins.travel import travel_loops, travel_margin
 from malta.proof import certificate
 
@@ -53,7 +53,7 @@ def shipped(name: str, folder: Path) -> tuple[Path, dict[str, Any]]:
     ranges = dict.fromkeys(("m", "A", "b") if plant.name == "halbach" else ("m", "K_A", "K_D", "K_B"), 0.2)
     margin = travel_margin(plant, controller, ranges)
     places, over = travel_loops(plant, controller, tuple(ranges))
-    origin = origin_of(gains, plant, controller, LAST, len(places))
+    origin = origin_of(gains, plant, controller, LAST_STAGE, len(places))
     path = certificate.write_certificate(folder / "certificate.json", places, ranges, over, margin, origin)
     assert path.stat().st_size < 1_000_000
     content = json.loads(path.read_text())
@@ -517,10 +517,10 @@ def test_a_check_ends_in_time(document: dict[str, Any], tmp_path: Path) -> None:
 def test_tiles_without_a_gap() -> None:
     half, whole = fmpq(1, 2), [(fmpq(0), fmpq(1))] * 2
     left, low, high = ((0, half), (0, 1)), ((half, 1), (0, half)), ((half, 1), (half, 1))
-    assert tiled([left, low, high], whole)
-    assert not tiled([left, low], whole)
-    assert not tiled([left, low, ((half, 1), (half + fmpq(1, 10**30), 1))], whole)
-    assert not tiled([], whole)
+    assert tiles_box([left, low, high], whole)
+    assert not tiles_box([left, low], whole)
+    assert not tiles_box([left, low, ((half, 1), (half + fmpq(1, 10**30), 1))], whole)
+    assert not tiles_box([], whole)
 
 
 def test_determinant_bounds_are_bounds() -> None:

@@ -18,7 +18,7 @@ from tampering import claiming, written
 
 import malta
 from malta.checker import file as checked_file
-from malta.checker.check import Verdict
+from malta.checker.check import CertificateVerdict
 from malta.errors import InputError
 from malta.gains.certified import check, origin_of
 from malta.loops.windings import CurrentLoops
@@ -228,7 +228,7 @@ def other(value: Any, rng: np.random.Generator) -> Any:
     return number * factor if number else factor - 1
 
 
-def require_implied(found: Verdict, document: Content) -> None:
+def require_implied(found: CertificateVerdict, document: Content) -> None:
     """What holds implies the claim in the gain file's box: of the same loop, no narrower box, no longer travel."""
     assert found.claim < LOST
     t, originals = found.stated.lower, {p["name"]: p for p in document["claim"]["parameters"]}
@@ -320,7 +320,7 @@ def test_boxes_hold_their_shares_exactly() -> None:
 def two_places(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Every model along a travel is too long for one proof, so that two places stand for it."""
     travel._loops_along.cache_clear()
-    monkeypatch.setattr(travel, "LONG", 0)
+    monkeypatch.setattr(travel, "MAX_ENCLOSED_OPERATIONS", 0)
     yield
     travel._loops_along.cache_clear()
 
@@ -407,7 +407,7 @@ def test_a_law_verified_again_is_the_same_law(document: Content, tmp_path: Path)
     assert "its box is too small: m" in check_of(document, tmp_path, written(content, tmp_path)).failures[0]
 
 
-def check_of(document: Content, folder: Path, gains: Path) -> Verdict:
+def check_of(document: Content, folder: Path, gains: Path) -> CertificateVerdict:
     """The check of a certificate in a folder of its own."""
     (folder / "own").mkdir(exist_ok=True)
     return check(written(document, folder / "own"), gains)

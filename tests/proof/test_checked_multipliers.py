@@ -14,14 +14,14 @@ import pytest
 from test_many_parameters import asked, chain, ranges
 
 import malta
-from malta.proof.multipliers import Blocks, Multiplier
+from malta.proof.multipliers import BlockSizes, Multiplier
 from malta.proof.multipliers.checked import refusal
-from malta.proof.multipliers.structured import Proof, Shown, worst
+from malta.proof.multipliers.structured import MultiplierProof, Shown, worst
 from malta.work import WorkUp, work_limit
 
 
 @cache
-def proven(n: int, T: float | None, target: float = 1.0) -> Proof:
+def proven(n: int, T: float | None, target: float = 1.0) -> MultiplierProof:
     s = asked(chain(n, T))
     with work_limit(30.0), suppress(WorkUp):
         s.raise_bound(target, 30.0)
@@ -50,12 +50,12 @@ def test_a_margin_keeps_its_proof() -> None:
     assert refusal(whole.multipliers, time.monotonic() + 3) in ("", "time was up")
 
 
-def with_cells(proof: Proof, change: Callable[[list[Shown]], list[Shown]]) -> Proof:
+def with_cells(proof: MultiplierProof, change: Callable[[list[Shown]], list[Shown]]) -> MultiplierProof:
     last = proof.layers[-1]
     return replace(proof, layers=(*proof.layers[:-1], last._replace(cells=tuple(change(list(last.cells))))))
 
 
-def with_multipliers(proof: Proof, change: Callable[[Any], Any]) -> Proof:
+def with_multipliers(proof: MultiplierProof, change: Callable[[Any], Any]) -> MultiplierProof:
     def turn(shown: Shown) -> Shown:
         m = shown.multiplier
         return shown if m is None else shown._replace(multiplier=change(m))
@@ -63,7 +63,7 @@ def with_multipliers(proof: Proof, change: Callable[[Any], Any]) -> Proof:
     return with_cells(proof, lambda cells: [turn(shown) for shown in cells])
 
 
-TAMPERED: dict[str, Callable[[Proof], Proof]] = {
+TAMPERED: dict[str, Callable[[MultiplierProof], MultiplierProof]] = {
     "a cell less": lambda p: with_cells(p, lambda cells: cells[:-1]),
     "a narrower cell": lambda p: with_cells(
         p, lambda cells: [c._replace(cell=replace(c.cell, high=c.cell.low + 0.9 * (c.cell.high - c.cell.low)))
@@ -99,6 +99,6 @@ def test_a_box_with_an_unstable_loop_is_refused() -> None:
 
 def test_no_parameter_is_worst_where_none_has_an_effect() -> None:
     N, D = np.diag([2.0, 1.0]) + 0j, np.eye(2) + 0j
-    m = Multiplier(D, np.zeros((2, 2), dtype=complex), Blocks((1, 1)))
+    m = Multiplier(D, np.zeros((2, 2), dtype=complex), BlockSizes((1, 1)))
     assert worst(N, m, np.array([1, 0]), 2, 7) == 1  # the direction of the larger gain
     assert worst(N, m, np.array([-1, -1]), 2, 7) == 7

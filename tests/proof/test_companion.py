@@ -12,7 +12,7 @@ from flint import fmpq
 import malta
 from malta.proof.groups import groups
 from malta.proof.multipliers.pencil import Rows
-from malta.proof.problem import MOST, companion
+from malta.proof.problem import MAX_SIGNALS, companion
 
 NAMES = tuple(f"q{i}" for i in range(14))
 
@@ -82,7 +82,7 @@ def test_pencils_hold_the_polynomial_all_over_their_box() -> None:
 def test_dense_products_have_no_short_loop() -> None:
     count = 7
     every = {tuple(int(x) for x in np.binary_repr(k, count)): fmpq(1, 3) for k in range(2**count)}
-    assert 2**count > MOST
+    assert 2**count > MAX_SIGNALS
     assert companion(NAMES[:count], [every, every], None) is None
 
 

@@ -17,8 +17,8 @@ from malta.linear.uncertain import responses
 from malta.margins.travel import travel_loops, worst_sensitivities
 from malta.model.data import plant_of
 from malta.proof.blocks import Block, gain, weight_of
-from malta.proof.blocks.gain import Blocks
-from malta.proof.blocks.transfer import Peak, Signals, frequencies, patterns, transfer
+from malta.proof.blocks.gain import BlockLoop
+from malta.proof.blocks.transfer import GainPeak, LoopSignals, frequencies, patterns, transfer
 from malta.proof.polynomial.family import align, combine, family
 from malta.proof.robust import problem_of
 
@@ -94,7 +94,7 @@ def test_integrators_on_both_sides_of_a_gain_take_no_digits() -> None:
         Block("effort", "sensors", (0,), tuple(range(5)), weight_of(1.0, "test")),
     ]
     w, p = np.geomspace(1e-17, 10, 50), s.nominal * np.array([0.8, 1.2, 0])
-    M = transfer(Signals(responses(s, law, p, w)), blocks)
+    M = transfer(LoopSignals(responses(s, law, p, w)), blocks)
     S, effort = np.linalg.norm(M[:, :5, :5], axis=(1, 2)), np.linalg.norm(M[:, 5:, 5], axis=1)
     assert S.max() < 1e-3
     assert S[w < 1e-4].max() < 1e-6
@@ -191,14 +191,14 @@ def test_a_search_that_missed_the_largest_gain_leads_to_no_bound_below_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """T = 2 k / (s + 1 + 2 k) is 0.7436 at 90 % of the way to the end of the box and 0.75 there."""
-    found = Peak(0.7438, 0.0, np.array([1.4505]))
+    found = GainPeak(0.7438, 0.0, np.array([1.4505]))
     monkeypatch.setattr(gain, "_largest", lambda *_: found)
     T = malta.worst_case_gain(first_order(), [[-2.0]], {"k": 0.5}, of="complementary", tolerance=1e-4)
     assert T.upper is None or T.upper >= 0.75
 
 
 def test_no_bound_is_proven_of_a_loop_whose_stability_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Blocks, "stable", lambda _: False)
+    monkeypatch.setattr(BlockLoop, "stable", lambda _: False)
     T = malta.worst_case_gain(first_order(), [[-2.0]], {"k": 0.5}, of="complementary")
     assert (T.upper, T.reason) == (None, "the nominal loop is not proven stable")
     m = malta.dynamic_margin(first_order(), [[-2.0]], {"k": 0.5}, malta.proof.Dynamic(0.1))

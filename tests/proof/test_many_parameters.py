@@ -16,7 +16,7 @@ from scipy import linalg
 import malta
 from malta.linear.uncertain import Compensator, UncertainSystem, instability
 from malta.proof.box import Box, box_of
-from malta.proof.multipliers import Blocks, Branch, Multiplier, excludes_zero, multiplier, response
+from malta.proof.multipliers import BlockSizes, Branch, Multiplier, excludes_zero, multiplier, response
 from malta.proof.multipliers.pencil import LEVELS, gains_of_level
 from malta.proof.multipliers.structured import Structured, rows_of
 from malta.proof.problem import OfLoop
@@ -162,22 +162,22 @@ def test_responses_hold_over_their_interval(T: float | None) -> None:
 def test_multipliers_of_one_repeated_parameter_are_exact() -> None:
     """1 - delta N is singular for real delta at the real eigenvalues of N alone."""
     N = np.array([[0.0, 2.0], [-2.0, 0.0]]) + 0.5 * np.eye(2)
-    _, beta = multiplier(N.astype(complex), Blocks((2,)), None, 0.0, 1e-3)
+    _, beta = multiplier(N.astype(complex), BlockSizes((2,)), None, 0.0, 1e-3)
     assert beta < 0.1
-    _, beta = multiplier(np.diag([0.5, -0.8]).astype(complex), Blocks((2,)), None, 0.0, 1e-3)
+    _, beta = multiplier(np.diag([0.5, -0.8]).astype(complex), BlockSizes((2,)), None, 0.0, 1e-3)
     assert beta == pytest.approx(0.8, rel=1e-2)
 
 
 def test_multipliers_of_another_structure_are_not_taken() -> None:
     """One of 1 - N diag(a, a, b) passes F > 0 for 1 - N diag(a, b, b) too, of which it proves nothing."""
     s = asked(chain(2, None))
-    taken: list[Blocks] = []
+    taken: list[BlockSizes] = []
     for cell in s.cover(1.0):
         own = s._branch(cell)
         assert own is not None
         blocks = own.channels[0].blocks
         size = blocks.size
-        other = Blocks((size,))  # full matrices, that show more than there is
+        other = BlockSizes((size,))  # full matrices, that show more than there is
         D = np.eye(size) + 0j
         _, near, done = s._level(replace(cell, near=Multiplier(D, 0 * D, other)))
         if done and near is not None:

@@ -73,7 +73,7 @@ def test_another_law_of_the_same_plant_has_the_margin_that_it_has_alone(sample_t
         found = []
         for own in laws:
             if anew:
-                for kept in (robust.problem_of, minors._known, groups._program, groups._symbolic):
+                for kept in (robust.problem_of, minors._kept_minors, groups._program, groups._symbolic):
                     kept.cache_clear()
             margin = malta.robust_margin(system, own, {"m": 0.2, "d": 1.0})
             found.append((margin.lower, margin.upper))

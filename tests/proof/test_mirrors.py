@@ -10,9 +10,9 @@ from malta.linear.uncertain import Compensator
 from malta.proof import robust
 from malta.proof.groups import groups, loop_of
 from malta.proof.polynomial import minors, minors as mirrors
-from malta.proof.polynomial.minors import Image, Places, first_alike, image_of
+from malta.proof.polynomial.minors import Image, MinorPlaces, first_alike, image_of
 
-ONE, TWO = Places((0, 1), (1,)), Places((2, 3), (1,))
+ONE, TWO = MinorPlaces((0, 1), (1,)), MinorPlaces((2, 3), (1,))
 
 
 def planes(
@@ -89,7 +89,7 @@ def test_the_margin_of_mirror_images_is_that_without_sharing(
     assert shared.lower is not None
     assert shared.upper < 0.75 * margin(1.0).upper
     monkeypatch.setattr(mirrors, "image_of", lambda *_: None)
-    for known in (robust.problem_of, minors._known, mirrors._firsts):
+    for known in (robust.problem_of, minors._kept_minors, mirrors._firsts):
         known.cache_clear()
     alone = margin(0.5)
     assert (shared.lower, shared.upper) == pytest.approx((alone.lower, alone.upper), rel=1e-12)

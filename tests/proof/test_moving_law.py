@@ -34,7 +34,7 @@ def _damping() -> Compensator:
 def test_a_constant_law_has_the_bound_of_the_affine_proof() -> None:
     """One bound of P, and two of curvature and of the motion within a sample: the older one is coarser."""
     spring, law = malta.uncertain(_spring, {"k": 2.0}), _damping()
-    affine = malta.proof.varying(spring, law, "k", (1.0, 3.0))
+    affine = malta.proof.prove_rate(spring, law, "k", (1.0, 3.0))
     whole = rate_of_cells([(spring, law, (1.0, 3.0))])
     halves = rate_of_cells([(spring, law, (1.0, 2.0)), (spring, law, (2.0, 3.0))])
     assert affine.rate is not None
@@ -82,7 +82,7 @@ def test_the_enclosure_holds_the_loop_and_its_curvature(magnet: tuple[Any, Any])
         for cell in scheduled_loops._cells_of(cells):
             p, h = (cell.low + cell.high) / 2, 1e-5
             below, here, above = (middle(cell.at(p + d)) for d in (-h, 0.0, h))
-            second, _ = cell.bent(arb(p, h))
+            second, _ = cell.curvature(arb(p, h))
             i = float(magnet[0].position_of([p])[2])
             own = np.abs(np.linalg.eigvals(malta.loop(*magnet, q=p, i=i).matrix)).max()
             assert np.abs(np.linalg.eigvals(here)).max() == pytest.approx(own, rel=1e-9)

@@ -33,7 +33,7 @@ def growth(rate: float, damping: float, frequency: float) -> float:
 
 
 def test_courses_below_the_bound_fall_and_parametric_resonance_is_above_it() -> None:
-    found = malta.proof.varying(spring(0.2), law(), "k", (LOW, HIGH))
+    found = malta.proof.prove_rate(spring(0.2), law(), "k", (LOW, HIGH))
     assert found.rate is not None
     assert found.decay is not None
     assert 0.05 < found.rate < 2 * np.sqrt(3)  # of k = 2 + sin(2 sqrt(3) t), Mathieu's first tongue
@@ -44,7 +44,7 @@ def test_courses_below_the_bound_fall_and_parametric_resonance_is_above_it() -> 
 
 
 def test_more_damping_allows_more() -> None:
-    rates = [malta.proof.varying(spring(d), law(), "k", (LOW, HIGH)).rate or 0.0 for d in (0.2, 1.0)]
+    rates = [malta.proof.prove_rate(spring(d), law(), "k", (LOW, HIGH)).rate or 0.0 for d in (0.2, 1.0)]
     assert rates[1] > 5 * rates[0]
 
 
@@ -53,13 +53,13 @@ def test_a_delay_and_a_law_with_states_are_part_of_the_loop() -> None:
     c = control.ss(lead)
     late = malta.proof.Compensator(c.A, c.B, c.C, c.D, sample_time=T, delay=3)
     at_once = malta.proof.Compensator(c.A, c.B, c.C, c.D, sample_time=T)
-    found = [malta.proof.varying(spring(0.2), F, "k", (LOW, HIGH)) for F in (at_once, late)]
+    found = [malta.proof.prove_rate(spring(0.2), F, "k", (LOW, HIGH)) for F in (at_once, late)]
     assert all(f.rate is not None for f in found)
     assert (found[0].decay or 0) > (found[1].decay or 0)
 
 
 def test_an_unstable_frozen_value_is_no_proof() -> None:
-    found = malta.proof.varying(spring(), law(1.5), "k", (LOW, HIGH))  # k - 1.5 < 0 at k = 1
+    found = malta.proof.prove_rate(spring(), law(1.5), "k", (LOW, HIGH))  # k - 1.5 < 0 at k = 1
     assert found.rate is None
     assert str(found) == "k in 1 .. 3: nothing proven (the loop is unstable at a frozen value)"
     assert isinstance(found, RateBound)
@@ -73,4 +73,4 @@ def test_what_is_not_covered_is_refused() -> None:
         (malta.uncertain(lambda k: ([[-k]], [[k]], [[1]]), {"k": 2.0}), law(), "k", "depend on k"),
     ):
         with pytest.raises(malta.InputError, match=words):
-            malta.proof.varying(system, compensator, name, (LOW, HIGH))
+            malta.proof.prove_rate(system, compensator, name, (LOW, HIGH))

@@ -21,7 +21,7 @@ from malta import report
 from malta.campaigns.result import figures_of
 from malta.linear.uncertain import instability
 from malta.margins.loop_report import LoopReport, zone
-from malta.margins.travel import NOWHERE, Extent, extent_of, positions_of, travel_loops, travel_margin
+from malta.margins.travel import NO_EXTENT, Extent, extent_of, positions_of, travel_loops, travel_margin
 from malta.model import machines
 from malta.model.checks import check_numbers, check_symbols
 from malta.model.machines import machine
@@ -87,7 +87,7 @@ def test_malta_does_not_know_the_rotor() -> None:
         assert not [word for word in ("414286", "examples/rotor", "Omega_max", "retainer") if word in text], (
             source
         )
-    assert "rotor" not in machines._installed()
+    assert "rotor" not in machines._installed_machines()
 
 
 def test_the_gains_of_the_coils_are_the_printed_ones(rotor: Any, par: Any) -> None:
@@ -222,12 +222,12 @@ def agree(
 def test_words_say_what_a_proof_covers(plant: Plant, controllers: dict[str, Controller]) -> None:
     speed = "for all Omega in 0 .. 2094 rad/s"
     assert str(extent_of(plant)) == speed
-    assert str(NOWHERE) == ""
+    assert str(NO_EXTENT) == ""
     assert str(Extent("z", 0.01)) == "over the travel"
     assert str(Extent("z", 0.01, {"a": (0, 1)}, {"a": "1"})) == "over the travel and for all a in 0 .. 1"
     found = malta.verify(malta.linearize(plant, plant.at()), controllers["rotor_pid"], {"k_i": 0.1})
     assert f"robust {speed}: proven 440." in str(found)
-    nowhere: LoopReport = replace(found, extent=NOWHERE)
+    nowhere: LoopReport = replace(found, extent=NO_EXTENT)
     assert "robust: proven 440." in str(nowhere)
 
 
@@ -273,7 +273,7 @@ def test_tables_of_a_machine_without_a_travel(
     ]
     report.chain_figure(found, tmp_path / "margins.png")
     assert (tmp_path / "margins.png").stat().st_size > 10_000
-    point = replace(found, extent=NOWHERE, places=found.places[1:2])
+    point = replace(found, extent=NO_EXTENT, places=found.places[1:2])
     text = "\n".join(printed(table) for table in (report.chain_table(point), report.places_table(point)))
     assert "Omega" not in text
     assert "travel" not in text

@@ -19,7 +19,7 @@ from malta import gains
 from malta.linear.expressions import NotAnalytic, program
 from malta.linear.uncertain import closed_loop, instability
 from malta.loops.parametric_plants import model_of
-from malta.margins.travel import NOT_BETWEEN, LoopAlong, margin_anywhere, travel_margin
+from malta.margins.travel import NOT_BETWEEN_TEXT, LoopAlong, margin_anywhere, travel_margin
 from malta.model.data import plant_of
 from malta.proof.box import box_of
 from malta.proof.weak_coupling import HeldLoop, coupling_bounds, taylor
@@ -66,7 +66,7 @@ def test_taylor_models_hold_what_they_enclose() -> None:
     """Every operation on intervals of y, against numpy at points of them."""
     y = taylor.variable(-1.0, 2.0, 40)
     one = taylor.constant(3.5, 40)
-    wave = taylor.multiply(taylor.sine(taylor.scaled(y, 5.0)), taylor.cosine(y))
+    wave = taylor.multiply(taylor.sine(taylor.scale(y, 5.0)), taylor.cosine(y))
     cases: dict[str, tuple[taylor.Taylor, Callable[[Any], Any]]] = {
         "wave": (wave, lambda x: np.sin(5 * x) * np.cos(x)),
         "inverse": (taylor.inverse(taylor.add(one, wave)), lambda x: 1 / (3.5 + np.sin(5 * x) * np.cos(x))),
@@ -240,7 +240,7 @@ def test_the_planar_motor_is_proven_between_places() -> None:
     plant, controller, problem = machine()
     found = travel_margin(plant, controller, BOX, names=NAMES)
     assert found.lower is not None
-    assert NOT_BETWEEN not in found.reason
+    assert NOT_BETWEEN_TEXT not in found.reason
     assert 1 < found.upper / found.lower < 1.01
     assert found.upper == pytest.approx(3.702, abs=2e-3)
     box, rng = box_at(problem), np.random.default_rng(4)
@@ -264,7 +264,7 @@ def test_couplings_are_bounded_where_a_cell_is() -> None:
     controller = gains.read("design/gains/planar_pid.json")
     found = travel_margin(plant_of(controller.parameters), controller, BOX, names=NAMES)
     assert found.lower is not None
-    assert NOT_BETWEEN not in found.reason
+    assert NOT_BETWEEN_TEXT not in found.reason
     assert 1 < found.upper / found.lower < 1.01
     assert found.upper == pytest.approx(4.587, abs=2e-3)
 
@@ -272,7 +272,7 @@ def test_couplings_are_bounded_where_a_cell_is() -> None:
 @pytest.mark.slow
 def test_a_stronger_coupling_proves_less() -> None:
     """The bound follows what couples the axes: ten times the stiffness of held currents costs some of it."""
-    from malta.proof.robust import Effort, margin_of
+    from malta.proof.robust import ProofEffort, margin_of
     from malta.work import Budget
 
     _, _, problem = machine()
@@ -284,7 +284,7 @@ def test_a_stronger_coupling_proves_less() -> None:
         }
 
     stiff = replace(problem, machine=replace(h, Z=grown(h.Z), E=grown(h.E)))
-    one, ten = (margin_of(x, box_at(problem), Effort(budget=Budget(20))).lower for x in (problem, stiff))
+    one, ten = (margin_of(x, box_at(problem), ProofEffort(budget=Budget(20))).lower for x in (problem, stiff))
     assert one is not None
     assert ten is not None
     assert 0.5 * one < ten < 0.99 * one

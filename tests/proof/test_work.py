@@ -22,7 +22,7 @@ from malta.linear.expressions import program
 from malta.linear.rational import symbolic
 from malta.margins.travel import travel_margin
 from malta.proof import Budget, Interrupted
-from malta.work import MORE, WorkUp, is_past, metered, remembered, spend, spent, work_limit
+from malta.work import MORE_WORK, WorkUp, count_work, is_past, remember, spend, work_done, work_limit
 
 LIMIT = 0.3  # units of work
 SAMPLED = control.c2d(control.tf([-0.3, -0.3], [0.2, 1]), 0.1, "tustin")
@@ -126,7 +126,7 @@ KINDS: dict[str, Callable[[], Any]] = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_search_ends_with_its_work(kind: str) -> None:
     """A last look for a witness may take 0.4 units and a tenth more; one step is not cut in two."""
-    with metered(LIMIT) as meter:
+    with count_work(LIMIT) as meter:
         found = KINDS[kind]()
     assert meter.work < 1.2 * LIMIT + 0.8
     assert found.reason
@@ -187,7 +187,7 @@ def test_a_clock_that_ends_a_search_is_named(hasty: Callable[[float], None]) -> 
     hasty(1e4)
     found = malta.robust_margin(system, SAMPLED, box, time=10.0)
     assert "the clock ended the search after" in found.reason
-    assert found.reason.endswith(f"{2 * found.work:.3g} {MORE}")
+    assert found.reason.endswith(f"{2 * found.work:.3g} {MORE_WORK}")
     assert found.lower is None or found.lower <= found.upper
 
 
@@ -195,7 +195,7 @@ def test_time_that_is_given_is_used() -> None:
     """A tenth of a unit leaves this loop open; rounds that follow decide it, long before the minute is over."""
     system, box = chain(2)
     brief = malta.robust_margin(system, [[-0.3]], box, budget=Budget(0.1, patient=False))
-    assert brief.reason.endswith(MORE)
+    assert brief.reason.endswith(MORE_WORK)
     found = malta.robust_margin(system, [[-0.3]], box, budget=Budget(time=60.0))
     assert not found.reason
     assert found.work > brief.work
@@ -240,7 +240,7 @@ def test_a_search_over_the_travel_ends_with_its_work_and_with_the_clock(
     """The machine's model is written out within the time as well."""
     spec = malta.read_design(ROOT / f"design/{design}.toml")
     controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at(**spec.operating_point)))
-    with metered(LIMIT) as meter:
+    with count_work(LIMIT) as meter:
         travel_margin(spec.plant, controller, spec.uncertainty)
     assert meter.work < 1.2 * LIMIT + 0.8
     hasty(1e3)
@@ -257,13 +257,13 @@ def test_the_nearest_limit_counts() -> None:
         assert not is_past()
         with work_limit(500.0), pytest.raises(WorkUp):
             spend(51.0)
-        assert spent() == 0.0  # what was too dear counts nothing
+        assert work_done() == 0.0  # what was too dear counts nothing
         spend(49.0)
         assert is_past(49.0)
         assert not is_past()
         assert is_past(price=2.0)
-    with metered(10.0) as outer:
-        with metered(20.0) as inner:
+    with count_work(10.0) as outer:
+        with count_work(20.0) as inner:
             assert inner.end == outer.end
             spend(3.0)
         assert outer.work == 3.0
@@ -279,12 +279,12 @@ def test_what_is_remembered_counts_each_time() -> None:
 
     for _ in range(3):
         with work_limit(1.0):
-            assert remembered(known, "it", made) == "made"
-            assert spent() == pytest.approx(0.3)
+            assert remember(known, "it", made) == "made"
+            assert work_done() == pytest.approx(0.3)
     with work_limit(0.25):
         with pytest.raises(WorkUp):
-            remembered(known, "it", made)
-        assert spent() == pytest.approx(0.1)  # as the first time
+            remember(known, "it", made)
+        assert work_done() == pytest.approx(0.1)  # as the first time
 
 
 @pytest.mark.parametrize(
@@ -298,7 +298,7 @@ def test_a_budget_of_nothing_is_refused(limits: Any) -> None:
 def test_an_expansion_that_was_ended_is_begun_again() -> None:
     """Nothing that the end of one search left undone is remembered by the next one."""
     system, box = chain(2)
-    with metered(1.0, -1.0), pytest.raises(WorkUp):
+    with count_work(1.0, -1.0), pytest.raises(WorkUp):
         symbolic(program(system.matrices))
     found = malta.robust_margin(system, [[-0.3]], box, time=1e-6)
     assert found.lower is None

@@ -19,20 +19,20 @@ import malta
 from malta import references
 from malta.loops.sampled_loops import machine_loop
 from malta.machines.tubular import paper as tubular
-from malta.machines.tubular.experiments.disturbances import RESTING
+from malta.machines.tubular.experiments.disturbances import REST_SAMPLES
 from malta.machines.tubular.paper import quantities as tubular_evidence
 from malta.machines.tubular.paper.quantities import (
     EXPERIMENT_NAMES,
     SEEDS,
-    Evidence,
+    TubularEvidence,
     is_solved_for_ratio,
     mean_of_seeds,
 )
 from malta.model.data import PublishedFigure, half_of_last_digit, plant_of, published_figure, published_value
 from malta.report import ledger as claims
-from malta.report.ledger import Chance, Claim, Ledger, Row, is_reproduced
+from malta.report.ledger import Chance, Ledger, LedgerClaim, Row, is_reproduced
 from malta.simulation.engine.compiled import compiler
-from malta.simulation.experiments import REAL, step_wrench
+from malta.simulation.experiments import AS_BUILT, step_wrench
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.units import in_unit
@@ -76,11 +76,11 @@ class Found(NamedTuple):
     """A ledger of both designs, made once, with what it was made from."""
 
     ledger: Ledger
-    evidence: tuple[Evidence, ...]
+    evidence: tuple[TubularEvidence, ...]
     shares: tuple[float, ...]
     values: dict[tuple[str, str], float]  # what `value` has computed: some rows bisect
 
-    def claim(self, start: str) -> Claim:
+    def claim(self, start: str) -> LedgerClaim:
         """The only claim whose subject begins so."""
         (claim,) = [c for c in self.ledger.claims if c.subject.startswith(start)]
         return claim
@@ -96,11 +96,11 @@ class Found(NamedTuple):
 
 @pytest.fixture(scope="module")
 def found(designs: dict[str, Design], published: dict[str, Any]) -> Found:
-    made: list[Evidence] = []
+    made: list[TubularEvidence] = []
     shares: list[float] = []
     compute = tubular.evidence
 
-    def kept(*arguments: Any) -> Evidence:
+    def kept(*arguments: Any) -> TubularEvidence:
         made.append(compute(*arguments))
         return made[-1]
 
@@ -174,7 +174,7 @@ def test_rows_are_well_formed(published: dict[str, Any]) -> None:
 @pytest.mark.parametrize("machine", ["tubular", "halbach", "planar"])
 def test_what_the_paper_calls_about_is_marked(machine: str) -> None:
     """`about` and no other words: the rule asks the file, not a text."""
-    content = malta.model.published(f"data/{machine}.toml")
+    content = malta.model.read_published(f"data/{machine}.toml")
     for key in _figures(content):
         entry: Any = content
         for part in key.split("."):
@@ -279,7 +279,7 @@ def test_what_the_text_implies_has_the_digits_that_are_shown(
     shown: str, target: float, printed: str, half: float
 ) -> None:
     row = Row("a figure", shown, lambda _: math.nan, target)
-    figure, text = claims._printed(row, {})
+    figure, text = claims._print_published(row, {})
     assert text == printed
     assert figure.half == pytest.approx(half)
 
@@ -448,22 +448,22 @@ def test_only_designs_that_are_meant_to_reproduce_a_paper_are_judged(published: 
 def test_a_claim_shows_its_figures(found: Found, published: dict[str, Any]) -> None:
     values = iter([16.2e-3, math.nan, 17e-3, 17e-3])
 
-    def claim(**changes: Any) -> Claim:
+    def claim(**changes: Any) -> LedgerClaim:
         row = Row("rise", "{:.2f} ms", lambda _: next(values), "figure_12.rise_time")
         return claims.claim_of(row._replace(**changes), found.evidence, published, NAMES)
 
-    assert claim() == Claim(
+    assert claim() == LedgerClaim(
         "rise [ms]", "16.2", ("16.20", "–"), "table2: reproduced; calibrated: not reproduced", "partly"
     )
     at_most = claim(relation="at most", published="figure_13.radial_deviation", shown="{:.0f} um")
-    assert at_most == Claim(
+    assert at_most == LedgerClaim(
         "rise [µm]", "≤ 20", ("17000", "17000"), "not reproduced: larger, x 850", "differs"
     )
     values = iter([0.5, 0.25] * 3)
-    assert claim(published=None, shown="{:.2f} percent", note="so") == Claim(
+    assert claim(published=None, shown="{:.2f} percent", note="so") == LedgerClaim(
         "rise [%]", "–", ("50.00", "25.00"), "ours: so", "ours"
     )
-    assert claim(published=0.5, shown="±{:.1f}") == Claim(
+    assert claim(published=0.5, shown="±{:.1f}") == LedgerClaim(
         "rise", "±0.5", ("±0.5", "±0.2"), "table2: reproduced; calibrated: not reproduced", "partly"
     )
     assert claim(published=None, shown="{:.2f} deg").ours == (
@@ -970,7 +970,7 @@ def test_rests_are_those_of_many_seeds(found: Found) -> None:
     """The mean square over seeds, of runs made one by one."""
     for name, e in zip(NAMES, found.evidence, strict=True):
         y = [
-            malta.simulate(e.spec.plant, e.controller, rest_scenario(seed)).y[-RESTING:].std(axis=0)
+            malta.simulate(e.spec.plant, e.controller, rest_scenario(seed)).y[-REST_SAMPLES:].std(axis=0)
             for seed in range(SEEDS)
         ]
         for k, output in enumerate(("x1", "y1", "x2", "y2", "z")):
@@ -979,7 +979,7 @@ def test_rests_are_those_of_many_seeds(found: Found) -> None:
 
 
 def rest_scenario(seed: int) -> Scenario:
-    return replace(Scenario("hold", (RESTING + 6000) * 50e-6, references.hold), seed=seed, **REAL)
+    return replace(Scenario("hold", (REST_SAMPLES + 6000) * 50e-6, references.hold), seed=seed, **AS_BUILT)
 
 
 @pytest.mark.slow

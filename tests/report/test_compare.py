@@ -22,7 +22,7 @@ from malta.cli.documents.loops import compare_output
 from malta.margins.verify import linear_report
 from malta.merits import MEANINGS, Merit, figure, find_best, four_digits
 from malta.report.page.analysis import Subject
-from malta.report.page.comparison import Comparison, Row, compare, comparison_tables, names_of
+from malta.report.page.comparison import Comparison, MeritRow, compare, comparison_tables, names_of
 from malta.report.page.report import comparison_page
 from malta.report.tables.margins import position_text
 
@@ -44,7 +44,7 @@ def carts() -> Comparison:
     return compare([subject_of(soft), subject_of(stiff)])
 
 
-def row_of(found: Comparison, key: str) -> Row:
+def row_of(found: Comparison, key: str) -> MeritRow:
     (row,) = [one for one in found.rows if one.key == key]
     return row
 

@@ -86,7 +86,7 @@ def machine(name: str) -> tuple[malta.model.Plant, malta.synthesis.Controller, A
     c = malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
     plant = malta.plant_of(c.parameters)
     kind = next((kind for kind in ("halbach", "planar") if name.startswith(kind)), "tubular")
-    return plant, c, malta.model.published(ROOT / "data" / f"{kind}.toml")
+    return plant, c, malta.model.read_published(ROOT / "data" / f"{kind}.toml")
 
 
 def drawn_experiments() -> list[Any]:
@@ -236,7 +236,7 @@ def _contrast(rows: Any, paper: str) -> Any:
 
 def test_lines_are_told_apart_without_colour() -> None:
     """By dash, or by steps of lightness, on a light page and on a dark one; a light grid or fill is no line."""
-    styles = (*figures.STYLES, *figures.MORE)
+    styles = (*figures.STYLES, *figures.MORE_STYLES)
     assert len({(style["color"], style["linestyle"]) for style in styles}) == len(styles)
     light = _rows(*dict.fromkeys(style["color"] for style in styles))
     for rows, paper, least in ((light, "ffffff", 13.0), (document.dark_colours(light), "1a1a1a", 11.0)):

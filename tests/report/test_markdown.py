@@ -8,7 +8,7 @@ import pytest
 from conftest import ROOT, Run
 
 from malta.errors import InputError
-from malta.report.ledger import Claim, Ledger, find_tables, replace_tables
+from malta.report.ledger import Ledger, LedgerClaim, find_tables, replace_tables
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -42,7 +42,7 @@ Some words with 12 figures of speech.
 
 
 def _ledger(machine: str, *designs: str) -> Ledger:
-    claim = Claim("new", "4", ("5",) * len(designs), "within 7 %", "near")
+    claim = LedgerClaim("new", "4", ("5",) * len(designs), "within 7 %", "near")
     return Ledger(machine, "an author", designs, (claim, claim, claim))
 
 

@@ -15,7 +15,7 @@ from conftest import ROOT, Run
 from PIL import Image
 
 import malta
-from malta.machines.tubular.plant import measured
+from malta.machines.tubular.plant import measure_outputs
 from malta.model.equations import Body
 from malta.report.page.motion import (
     VIEW,
@@ -31,7 +31,7 @@ from malta.report.page.motion import (
 from malta.simulation.trajectory import save
 
 if TYPE_CHECKING:
-    from malta.report.page.motion import Motion
+    from malta.report.page.motion import Animation
 
 GAINS = ROOT / "design" / "gains" / "calibrated.json"
 MACHINES = ("tubular", pytest.param("planar", marks=pytest.mark.slow), "halbach")
@@ -46,7 +46,7 @@ def run_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def stroke(run_file: Path) -> Motion:
+def stroke(run_file: Path) -> Animation:
     return read_motion(run_file, malta.plant_of(malta.gains.read(GAINS).parameters))
 
 
@@ -72,12 +72,12 @@ def test_a_body_is_closed_and_its_faces_look_outwards(form: Any) -> None:
     assert volume == pytest.approx(whole if form == "box" else np.pi / 4 * whole, rel=0.01)
 
 
-def test_points_of_the_mover_are_where_the_sensors_see_them(stroke: Motion) -> None:
+def test_points_of_the_mover_are_where_the_sensors_see_them(stroke: Animation) -> None:
     """The axis at a sensor plane, by the picture's rotation and by the machine's own h(x)."""
     par: Any = malta.gains.read(GAINS).parameters
     pose = np.array([2e-4, -1e-4, 0.0, 1e-3, -2e-3, 0.3])
     ends = mesh_of(stroke.bodies[-1])._replace(points=np.array([[0, 0, -par.l_S], [0, 0, par.l_S]]))
-    seen = np.array(measured(par, np.append(pose, np.zeros(6)))).ravel()
+    seen = np.array(measure_outputs(par, np.append(pose, np.zeros(6)))).ravel()
     found = place_points(ends, pose)
     assert found[:, :2].ravel().tolist() == pytest.approx(seen[:4].tolist(), abs=2e-8)
 
@@ -91,7 +91,7 @@ def test_a_camera_keeps_lengths_and_what_is_up(up: int) -> None:
     assert view[1] @ np.eye(3)[up] > 0.5
 
 
-def test_small_motion_is_magnified_and_the_stroke_is_not(stroke: Motion) -> None:
+def test_small_motion_is_magnified_and_the_stroke_is_not(stroke: Animation) -> None:
     mover = len(stroke.bodies) - 1
     assert stroke.up == 1
     assert stroke.small[mover].tolist() == [True, True, False, True, True, True]
@@ -104,7 +104,7 @@ def test_small_motion_is_magnified_and_the_stroke_is_not(stroke: Motion) -> None
     assert np.diff(axial) == pytest.approx(10e-3, rel=0.01)
 
 
-def test_the_page_has_the_run_and_runs_no_other_script(stroke: Motion) -> None:
+def test_the_page_has_the_run_and_runs_no_other_script(stroke: Animation) -> None:
     html = motion_page(stroke, "<b>about</b>").html
     assert "<b>about" not in html
     assert not re.search(r"(src|href)=\"(?!data:)", html)
@@ -115,7 +115,7 @@ def test_the_page_has_the_run_and_runs_no_other_script(stroke: Motion) -> None:
     assert (z["unit"], z["values"][0]) == ("mm", pytest.approx(-5, rel=1e-3))
 
 
-def test_arrows_are_the_forces_that_acted_where_the_modules_are(stroke: Motion, run_file: Path) -> None:
+def test_arrows_are_the_forces_that_acted_where_the_modules_are(stroke: Animation, run_file: Path) -> None:
     """At rest the modules carry the weight of the mover, upwards; the drives push along the stroke."""
     par: Any = malta.gains.read(GAINS).parameters
     one, two, drives = stroke.arrows
@@ -137,11 +137,11 @@ def test_arrows_are_the_forces_that_acted_where_the_modules_are(stroke: Motion, 
 
 
 def test_many_runs_stay_in_a_small_page_with_fewer_frames_each(
-    stroke: Motion, monkeypatch: pytest.MonkeyPatch
+    stroke: Animation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each run is there from its beginning to its end."""
     alone = len(motion_page(stroke).html)
-    monkeypatch.setattr("malta.report.page.motion.LARGEST", alone)
+    monkeypatch.setattr("malta.report.page.motion.MAX_PAGE_BYTES", alone)
     html = motion_page([stroke] * 5).html
     assert len(html) < 1.5 * alone
     for run in runs_of(html):
@@ -163,7 +163,7 @@ def test_a_machine_inside_its_margin_comes_to_rest_and_beyond_it_touches_down(
     assert np.abs(x[0][-20:]).max() < 0.1 * np.abs(x[0][0]) < 10 * np.abs(x[1][-1])
 
 
-def test_the_picture_moves_and_is_small(stroke: Motion) -> None:
+def test_the_picture_moves_and_is_small(stroke: Animation) -> None:
     content = motion_gif(stroke, frames=6)
     assert len(content) < 600_000
     with Image.open(io.BytesIO(content)) as picture:
@@ -204,7 +204,7 @@ def test_the_command_writes_and_refuses(run_file: Path, tmp_path: Path, run: Run
 
 
 @pytest.mark.slow
-def test_the_page_runs_in_a_browser(stroke: Motion, tmp_path: Path, browser: Any) -> None:
+def test_the_page_runs_in_a_browser(stroke: Animation, tmp_path: Path, browser: Any) -> None:
     """Without an error, no wider than a telephone; the scrubber moves the mover."""
     page = motion_page(stroke).save(tmp_path / "m.html")
     open_page(browser, page, width=390, scheme="dark")

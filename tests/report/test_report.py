@@ -23,7 +23,7 @@ from malta import report
 from malta.display import micro
 from malta.machines.tubular.experiments import EXPERIMENTS
 from malta.report import figures
-from malta.report.ledger import Claim, Ledger
+from malta.report.ledger import Ledger, LedgerClaim
 from malta.simulation.experiments import Case, Experiment, Merit
 from malta.simulation.scenario import Scenario
 from malta.simulation.trajectory import Verdict
@@ -556,14 +556,14 @@ LEDGER = Ledger(
     "A. Author, 2021",
     ("table2", "calibrated", "a_design_of_a_long_name"),
     (
-        Claim(
+        LedgerClaim(
             "poles of x, y [rad/s]",
             "±218.92",
             ("±218.92", "±218.93", "1"),
             "not reproduced; " + "said at length, " * 9,
             "differs",
         ),
-        Claim(
+        LedgerClaim(
             "a claim with a subject that is longer than its line [N m/rad]",
             "–",
             ("1", "2", "3"),

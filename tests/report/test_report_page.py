@@ -23,7 +23,7 @@ from malta.report.figures.drawing import STYLES, new_figure, printable
 from malta.report.page.analysis import Subject, analyse, key_figures
 from malta.report.page.document import Front, Page, dark_colour, pdf_of, render
 from malta.report.page.report import page_of
-from malta.report.page.sections import Picture, Section, Sheet
+from malta.report.page.sections import Illustration, PageTable, Section
 from malta.report.verdict import SIGNS, verdict_lines
 
 if TYPE_CHECKING:
@@ -118,8 +118,10 @@ def curves_page() -> Page:
         upper.legend()
         return figure
 
-    rows = Sheet("Numbers", ("a", "b"), (("1", "2"),), (False, True))
-    return render(Front("Test", "Curves", "about"), [Section("one", "One", (Picture(draw, "Curves."), rows))])
+    rows = PageTable("Numbers", ("a", "b"), (("1", "2"),), (False, True))
+    return render(
+        Front("Test", "Curves", "about"), [Section("one", "One", (Illustration(draw, "Curves."), rows))]
+    )
 
 
 def test_a_figure_says_what_its_panels_lines_and_legends_are() -> None:

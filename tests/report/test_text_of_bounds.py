@@ -25,7 +25,7 @@ from malta.cli.identification import _proven_contraction
 from malta.cli.output import _bounds_text
 from malta.firmware import export
 from malta.firmware.signals import Target
-from malta.margins.loop_report import Link, LoopReport, Outcome, Place
+from malta.margins.loop_report import ChainStage, LoopReport, Outcome, TravelPlace
 from malta.margins.margin_map import MarginMap
 from malta.proof.blocks.gain import Gain
 from malta.proof.loss import RayBound
@@ -91,8 +91,11 @@ def spoiled(lower: float | None) -> LoopReport:
     return replace(
         found,
         robust=margin,
-        chain=(Link("LQR", margin, 1.0, "forces"), Link("sampled", margin, 1.6, "sensors", loaded=True)),
-        places=(Place(0.0, margin, 1.6, 0.4, 1e-3),),
+        chain=(
+            ChainStage("LQR", margin, 1.0, "forces"),
+            ChainStage("sampled", margin, 1.6, "sensors", loaded=True),
+        ),
+        places=(TravelPlace(0.0, margin, 1.6, 0.4, 1e-3),),
         tolerance={"m": (margin, margin)},
         mass=margin,
         worst={"y": gain_of(lower)},
@@ -156,7 +159,7 @@ def eigenvalue_text(lower: float | None) -> str:
 
 def front_text(lower: float | None) -> str:
     from malta.tuning.search import Trial
-    from malta.tuning.tune import Tuned as Found
+    from malta.tuning.tune import TuningResult as Found
 
     trial = Trial((223.0, 50, 0.051), 1, {"margin": lower or 0.0, "force_noise f": 0.01, "motion y": 1e-6})
     found = Found(ball()[1], trial, (), (trial,), trials=3)
@@ -181,11 +184,11 @@ def merits_text(lower: float | None) -> str:
 def certificate_text(lower: float | None) -> str:
     from flint import fmpq
 
-    from malta.checker.file import Claim
+    from malta.checker.file import StabilityClaim
     from malta.report.tables.design import claim_share
 
     share = 0.0 if lower is None or math.isinf(lower) else lower
-    return claim_share(Claim(fmpq(*share.as_integer_ratio()), None, None, None, ()))
+    return claim_share(StabilityClaim(fmpq(*share.as_integer_ratio()), None, None, None, ()))
 
 
 PLACES: dict[str, Callable[[float | None], str]] = {

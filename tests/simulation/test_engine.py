@@ -222,12 +222,12 @@ def _everything(state: Any, around: Any, theta: Any) -> Any:
 def _parts_of(statements: int) -> Iterator[None]:
     """Every function that is longer is cut in parts of so many statements."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(translate, "WHOLE", statements)
-        patch.setattr(translate, "PART", statements)
+        patch.setattr(translate, "MAX_WHOLE_STATEMENTS", statements)
+        patch.setattr(translate, "MAX_PART_STATEMENTS", statements)
         yield
 
 
-@pytest.fixture(scope="module", params=[translate.WHOLE, 7], ids=["whole", "in parts"])
+@pytest.fixture(scope="module", params=[translate.MAX_WHOLE_STATEMENTS, 7], ids=["whole", "in parts"])
 def everything(request: pytest.FixtureRequest) -> Trial:
     """Some 130 expressions in every operation that the engine knows, in one library for each number of lanes."""
     with _parts_of(request.param):
@@ -326,7 +326,7 @@ def _tilts(state: Any, around: Any, _: Any) -> Any:
     return ca.vertcat(ca.sin(x), ca.cos(x), 1 / ca.cos(x), ca.tan(x))
 
 
-@pytest.fixture(scope="module", params=[translate.WHOLE, 1], ids=["whole", "in parts"])
+@pytest.fixture(scope="module", params=[translate.MAX_WHOLE_STATEMENTS, 1], ids=["whole", "in parts"])
 def tilted(request: pytest.FixtureRequest) -> Trial:
     """Sine, cosine and their quotients of a state and an input: angles of a mover, as the engine sees it."""
     with _parts_of(request.param):
@@ -499,7 +499,7 @@ def _long(state: Any, around: Any, theta: Any) -> Any:
 
 def test_a_long_function_is_compiled_in_parts() -> None:
     """With the limits as they are, near tilts and far ones."""
-    assert f"decide_{translate.WHOLE // translate.PART}(" in _engine_text(_long)
+    assert f"decide_{translate.MAX_WHOLE_STATEMENTS // translate.MAX_PART_STATEMENTS}(" in _engine_text(_long)
     trial = _trial(_long)
     rng = np.random.default_rng(5)
     for size in (1e-3, 1.0):

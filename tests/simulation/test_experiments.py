@@ -96,7 +96,7 @@ def test_defaults_are_the_published_figures(plant: Plant, published: dict[str, A
     ):
         assert found == pytest.approx(published_value(published, key), rel=1e-12), key
     assert default("tilt", "frequency") == published["figure_16"]["frequency"]["value"]  # Hz, not rad/s
-    assert published["table_III"]["samples"] == rest.RESTING
+    assert published["table_III"]["samples"] == rest.REST_SAMPLES
 
 
 @pytest.mark.parametrize("name", ["stroke", "hold", "tilt", "payload", "thermal"])
@@ -240,10 +240,10 @@ def _rest(design: Design) -> Rest:
     B = np.vstack([B, np.eye(5)])
     P, W = np.pad(P, (0, 5)), B @ np.diag(white) @ B.T
     true = np.zeros(5)
-    for _ in range(rest.RESTING):
+    for _ in range(rest.REST_SAMPLES):
         true += np.diag(C @ P[:n, :n] @ C.T)
         P = A @ P @ A.T + W
-    samples = rest.RESTING
+    samples = rest.REST_SAMPLES
     return Rest(np.sqrt(white), np.sqrt(true / samples), np.sqrt(np.diag(P)[n:]) / samples)
 
 
@@ -555,9 +555,9 @@ def test_before_the_pick_nothing_moves(design: Design, flown: Flown) -> None:
     for options, limit in ((QUIET, 1e-11), ({}, 1e-6)):
         for case in flown(design.spec.name, "payload", **options).cases:
             run = case.run
-            before = run.t <= lifting.PICKED
+            before = run.t <= lifting.PICKING_TIME
             assert np.abs(run.p - run.reference)[before][:, :4].max() < limit
-            after = (run.t > lifting.PICKED + 5e-3) & (run.t < 0.1)
+            after = (run.t > lifting.PICKING_TIME + 5e-3) & (run.t < 0.1)
             assert np.abs(run.p)[after][:, [1, 3]].max() > 15e-6
             assert np.abs(run.p)[after][:, [0, 2]].max() < 2e-6  # weight does not push sideways
 

@@ -15,7 +15,14 @@ import malta
 from malta.errors import InputError
 from malta.firmware.supervisor import MONITORS
 from malta.machines.tubular.experiment_figures import supervised_faults_figure
-from malta.machines.tubular.experiments.faults import KINDS, PHASES, SOFT, Outcome, draw_blows, totals_of
+from malta.machines.tubular.experiments.faults import (
+    KINDS,
+    MAX_LANDING_SPEED,
+    PHASES,
+    FaultOutcome,
+    draw_blows,
+    totals_of,
+)
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.experiments import Case, Experiment
 from malta.synthesis.controller import Controller
@@ -43,8 +50,8 @@ def fly(**options: Any) -> Experiment:
     return malta.experiment("supervised-faults", malta.plant_of(c.parameters), c, **options)
 
 
-def outcomes(e: Experiment) -> dict[str, list[Outcome]]:
-    return {label: [Outcome(*row) for row in rows] for label, rows in e.curves.items()}
+def outcomes(e: Experiment) -> dict[str, list[FaultOutcome]]:
+    return {label: [FaultOutcome(*row) for row in rows] for label, rows in e.curves.items()}
 
 
 @pytest.mark.slow
@@ -83,7 +90,7 @@ def test_its_figure_has_a_mark_for_each_moment_and_no_defects() -> None:
     plant, rng = malta.plant_of(robust().parameters), np.random.default_rng(1)
     hold = malta.Scenario("hold", 2e-3, malta.references.hold)
     run = malta.simulate(plant, robust(), hold)
-    rows = {kind.label: rng.uniform(0.01, 0.3, (5, len(Outcome._fields))) for kind in KINDS}
+    rows = {kind.label: rng.uniform(0.01, 0.3, (5, len(FaultOutcome._fields))) for kind in KINDS}
     for n, found in enumerate(rows.values()):
         found[:, -1] = n
         found[0, -2] = math.nan  # it flies on
@@ -138,7 +145,13 @@ def test_no_supervised_fault_is_worse_than_a_fall() -> None:
     for label, rows in found.items():
         for row in rows:
             assert row.current <= OVER * limit, label
-            bound = FALL if label in OFF else PUSHED if label in PUSHING else max(SOFT, 1.1 * row.speed_alone)
+            bound = (
+                FALL
+                if label in OFF
+                else PUSHED
+                if label in PUSHING
+                else max(MAX_LANDING_SPEED, 1.1 * row.speed_alone)
+            )
             assert row.speed < bound, label
             assert row.speed < FALL, label
             assert math.isnan(row.safe) or row.safe < 0.27, label

@@ -18,7 +18,7 @@ from malta.arrays import FloatArray
 from malta.machines.halbach import electronics
 from malta.simulation.current_control import duty_cycles
 from malta.simulation.period import limited_currents
-from malta.synthesis.controller import commanded, gains_of
+from malta.synthesis.controller import command_forces, gains_of
 
 CASES = 400
 EPS = np.finfo(float).eps
@@ -151,7 +151,7 @@ def test_forces_are_within_their_limits(name: str) -> None:
     g = gains_of(c)
     (m, n), p = g["K"].shape, g["Ki"].shape[1]
     names = [ca.SX.sym(f"a{k}", size) for k, size in enumerate((n, p, n, m, m))]
-    f = ca.Function("commanded", names, [commanded(g, *names)[2]])
+    f = ca.Function("commanded", names, [command_forces(g, *names)[2]])
     most = float(c.limits.force.max())
     (v,) = roughly(f, [scattered(rng, f.nnz_in(k), most) for k in range(5)], rng)
     assert (np.abs(v) <= c.limits.force[:, None]).all()

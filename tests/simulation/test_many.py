@@ -15,7 +15,7 @@ from hypothesis import given, settings, strategies as st
 import malta
 from malta import references
 from malta.simulation.engine import compiled
-from malta.simulation.engine.batch import record_run, replayed, simulate_many
+from malta.simulation.engine.batch import record_run, replay_run, simulate_many
 from malta.simulation.engine.digest import Batch, verdicts
 from malta.simulation.engine.engines import engine_of, library_of
 from malta.simulation.layout import FIDELITIES, Fidelity
@@ -83,7 +83,7 @@ def _assert_replayed(
     runs = [
         malta.simulate(machine, design.controller, scenario_k)
         for machine, scenario_k in (
-            replayed(design.plant, scenario, changes, first + k, first) for k in range(len(batch.duration))
+            replay_run(design.plant, scenario, changes, first + k, first) for k in range(len(batch.duration))
         )
     ]
     figures = [expected(run) for run in runs]
@@ -254,7 +254,7 @@ def test_each_run_has_its_own_sensor_errors(calibrated: Design) -> None:
         runs = [
             malta.simulate(machine, calibrated.controller, scenario_k)
             for machine, scenario_k in (
-                replayed(calibrated.plant, scenario, varied, k, sensor_errors=errors) for k in range(9)
+                replay_run(calibrated.plant, scenario, varied, k, sensor_errors=errors) for k in range(9)
             )
         ]
         wanted = np.array([np.abs(run.p - run.reference).max(axis=0) for run in runs])
@@ -288,7 +288,7 @@ def test_how_a_lift_off_ends(calibrated: Design) -> None:
     names = [verdicts(calibrated.plant)[int(k)] for k in batch.verdict]
     assert names == ["not lifted", "completed", "not lifted"]
     for k, name in enumerate(names):
-        machine, scenario_k = replayed(calibrated.plant, scenario, changes, k)
+        machine, scenario_k = replay_run(calibrated.plant, scenario, changes, k)
         run = malta.simulate(machine, calibrated.controller, scenario_k)
         assert run.verdict.name == name
         np.testing.assert_allclose(batch.saturated[k], run.saturated.mean(axis=0), atol=1e-12)
@@ -298,7 +298,7 @@ def test_how_a_lift_off_ends(calibrated: Design) -> None:
 def _replay(
     plant: Any, design: Design, scenario: Scenario, changes: dict[str, FloatArray], k: int
 ) -> tuple[Any, Any, Any]:
-    machine, scenario_k = replayed(plant, scenario, changes, k)
+    machine, scenario_k = replay_run(plant, scenario, changes, k)
     return machine, design.controller, scenario_k
 
 
@@ -380,7 +380,7 @@ def test_parts_of_a_run_have_the_noise_of_other_runs(calibrated: Design) -> None
     batch = simulate_many(plant, controller, scenario, changes, noise=parts)
     runs = []
     for k, row in enumerate(parts):
-        machine, scenario_k = replayed(plant, scenario, changes, k)
+        machine, scenario_k = replay_run(plant, scenario, changes, k)
         runs.append(malta.simulate(machine, controller, replace(scenario_k, run=tuple(row.tolist()))))
         np.testing.assert_allclose(batch.deviation[k], _expected(runs[k])["deviation"], rtol=1e-9)
         recorded = record_run(plant, controller, scenario, changes, k, noise=parts)
@@ -401,7 +401,7 @@ def test_indices_beyond_the_first_are_replayed(calibrated: Design) -> None:
     scenario = _stroke(fidelity="force")
     batch = simulate_many(calibrated.plant, calibrated.controller, scenario, changes, first=1000)
     _assert_replayed(calibrated, batch, scenario, changes, first=1000)
-    machine, again = replayed(calibrated.plant, scenario, changes, 1002, first=1000)
+    machine, again = replay_run(calibrated.plant, scenario, changes, 1002, first=1000)
     assert again.run == 1002
     assert machine.parameters == replace(
         calibrated.spec.parameters, **{name: float(values[2]) for name, values in changes.items()}

@@ -13,7 +13,7 @@ from conftest import Run
 
 import malta
 from malta.simulation.engine.batch import record_run
-from malta.simulation.experiments.catalogue import settling
+from malta.simulation.experiments.catalogue import settling_option
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -86,7 +86,7 @@ def test_figures_of_many_machines_are_of_the_stroke_alone(bearing: bool) -> None
     assert batch.completed[0] == 1
     assert batch.duration.min() < 0 < batch.duration.max() == 0.1
     for k in range(len(pull["K_A"])):
-        machine, own = malta.simulation.replayed(plant, scenario, pull, k)
+        machine, own = malta.simulation.replay_run(plant, scenario, pull, k)
         for name, wanted in _figures(malta.simulate(machine, controller, own)).items():
             found = getattr(batch, name)[k]
             if name == "last" and bearing and not batch.completed[k]:
@@ -128,8 +128,8 @@ def test_what_may_settle() -> None:
     with pytest.raises(malta.InputError, match="at most"):
         malta.simulate(*_machine(), malta.Scenario.stroke(settle=1e4))
     plant, _ = _machine()
-    assert settling("stroke", plant) == {"settle": 0.3}
-    assert settling("hold", plant) == {}
+    assert settling_option("stroke", plant) == {"settle": 0.3}
+    assert settling_option("hold", plant) == {}
 
 
 def test_commands_settle(run: Run, tmp_path: Path) -> None:

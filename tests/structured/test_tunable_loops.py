@@ -15,7 +15,7 @@ import malta
 from malta import structured
 from malta.linear.peaks import peak_gain, response_at
 from malta.linear.system import System
-from malta.structured.loops import ClosedLoop, Model, models_of_systems, noise, peaks_of
+from malta.structured.loops import ClosedLoop, TunedPlant, models_of_systems, noise, peaks_of
 from malta.synthesis.structure import Structure, places_of, sample_law
 
 GOALS = {
@@ -31,7 +31,7 @@ GOALS = {
 }
 
 
-def levitated(Ts: float | None, law: structured.Element, D: float = 0.0) -> tuple[Model, Structure]:
+def levitated(Ts: float | None, law: structured.Element, D: float = 0.0) -> tuple[TunedPlant, Structure]:
     """A body with a negative stiffness, and a law for it."""
     plant = control.ss([[0, 1], [400, -2]], [[0], [10]], [[1, 0]], D)
     (model,) = models_of_systems(plant if Ts is None else control.c2d(plant, Ts, "zoh"))

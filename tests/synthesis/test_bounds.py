@@ -21,7 +21,7 @@ from tampering import claiming
 import malta
 from malta.checker import check, file as checked_file, loop as checked_loop
 from malta.linear.uncertain import Compensator, closed_loop
-from malta.margins.loop_report import Stage
+from malta.margins.loop_report import StagePeak
 from malta.margins.travel import smallest_margin
 from malta.proof import certificate, exclusion
 from malta.proof.box import below
@@ -31,7 +31,7 @@ from malta.proof.polynomial import characteristic as degrees, enclosure
 from malta.proof.polynomial.closed_loop import loop_parts
 from malta.proof.polynomial.family import nodes, restrict, restriction_rounding
 from malta.proof.problem import OfLoop
-from malta.work import WorkUp, metered, work_limit
+from malta.work import WorkUp, count_work, work_limit
 
 RANGES = {"m": 0.3, "k": 0.3}
 
@@ -144,7 +144,7 @@ def test_an_enclosure_ends_in_time_where_later_places_take_longer(monkeypatch: p
     f, _ = _polynomial(SIDES.tolist())
     clock = iter([0.0, 0.0, 0.0])
     monkeypatch.setattr(time, "monotonic", lambda: next(clock, 1e9))
-    with metered(1e6, 1.0), pytest.raises(WorkUp):
+    with count_work(1e6, 1.0), pytest.raises(WorkUp):
         enclosure.values_within(f, [(fmpq(1), fmpq(4))] * 3)
 
 
@@ -172,9 +172,9 @@ def test_a_half_plane_holds_all_discs() -> None:
         assert (inner[found] > 0).all()
 
 
-def _search(smallest: list[float], target: float) -> exclusion.Search:
+def _search(smallest: list[float], target: float) -> exclusion.CellSearch:
     nothing: Any = None
-    return exclusion.Search(
+    return exclusion.CellSearch(
         nothing, nothing, np.zeros((0, 3)), np.zeros((0, 1, 2)), np.array(smallest), np.zeros(0), target
     )
 
@@ -263,7 +263,7 @@ def _loop() -> Any:
     """The loop of that certificate, sampled."""
     content = copy.deepcopy(_certificate())
     content["loops"][0]["sample_time"] = (0.8).hex()
-    return checked_file.loop(checked_file.Field(Path("c"), "", content["loops"][0]), 2)
+    return checked_file.loop(checked_file.DocumentValue(Path("c"), "", content["loops"][0]), 2)
 
 
 def test_what_interpolation_leaves_out_is_in_the_radius() -> None:
@@ -274,8 +274,8 @@ def test_what_interpolation_leaves_out_is_in_the_radius() -> None:
         (1, {1} if f.group.inverted[1] else set(), (fmpq(25, 10), fmpq(55, 10))),
     )]  # fmt: skip
     for degree, kept in ((1, 0), (2, 1), (4, 1), (4, 4)):
-        axes = [checked_file.Axis(degree, fmpq(3, 2), kept)] * 2
-        values, left = check.interpolated(f, box, axes)
+        axes = [checked_file.AxisEnclosure(degree, fmpq(3, 2), kept)] * 2
+        values, left = check.interpolate(f, box, axes)
         balls, shape = check.bernstein(values, left, axes)
         each = math.prod(shape)
         for at in itertools.product((0.0, 0.21, 0.5, 0.83, 1.0), repeat=2):
@@ -290,8 +290,8 @@ def test_terms_that_are_not_kept_are_in_the_radius() -> None:
     """Interpolation leaves out next to nothing here: what the balls have to cover are the terms that are cut."""
     (f,) = checked_loop.split(_loop())
     box = [(fmpq(9, 10), fmpq(11, 10)), (fmpq(36, 10), fmpq(44, 10))]
-    axes = [checked_file.Axis(8, fmpq(3), 0)] * 2
-    balls, shape = check.bernstein(*check.interpolated(f, box, axes), axes)
+    axes = [checked_file.AxisEnclosure(8, fmpq(3), 0)] * 2
+    balls, shape = check.bernstein(*check.interpolate(f, box, axes), axes)
     assert shape == (1, 1)
     for at in itertools.product((0.0, 1.0), repeat=2):
         exact = f.at([a + (b - a) * arb(u) for (a, b), u in zip(box, at, strict=True)])
@@ -302,15 +302,15 @@ def test_cells_that_overlap_tile_nothing() -> None:
     """Their volumes add up to that of the box, and half of it is not covered."""
     half, whole = fmpq(1, 2), [(fmpq(0), fmpq(1))] * 2
     left = ((fmpq(0), half), (fmpq(0), fmpq(1)))
-    assert not check.tiled([left, left], whole)
-    assert check.tiled([left, ((half, fmpq(1)), (fmpq(0), fmpq(1)))], whole)
+    assert not check.tiles_box([left, left], whole)
+    assert check.tiles_box([left, ((half, fmpq(1)), (fmpq(0), fmpq(1)))], whole)
 
 
 def test_what_is_left_out_is_at_least_the_error_of_the_interpolant() -> None:
     (f,) = checked_loop.split(_loop())
     box = [(fmpq(7, 10), fmpq(17, 10)), (fmpq(25, 10), fmpq(55, 10))]
-    axes = [checked_file.Axis(1, fmpq(3, 2), 1)] * 2
-    values, left = check.interpolated(f, box, axes)
+    axes = [checked_file.AxisEnclosure(1, fmpq(3, 2), 1)] * 2
+    values, left = check.interpolate(f, box, axes)
     for at in itertools.product((0.0, 0.5, 1.0), repeat=2):
         exact = f.at([a + (b - a) * arb(u) for (a, b), u in zip(box, at, strict=True)])
         t = [[1.0, 1 - 2 * u] for u in at]
@@ -350,7 +350,7 @@ def test_expressions_have_a_length() -> None:
     context = fmpq_mpoly_ctx.get(["p", "q"], Ordering.lex)
     p, q = context.gens()
     with pytest.raises(checked_loop.Refused, match="too long"):
-        checked_loop.Ratio((1 + p + q) ** 80, context.constant(1))
+        checked_loop.CheckedRatio((1 + p + q) ** 80, context.constant(1))
 
 
 # What counts as proven
@@ -372,7 +372,7 @@ def test_a_place_without_a_proof_leaves_nothing_proven() -> None:
 
 @pytest.mark.parametrize(("radius", "stable"), [(0.999, True), (1.0, False), (1.5, False), (math.nan, False)])
 def test_a_loop_is_stable_below_one(radius: float, stable: bool) -> None:
-    assert Stage("loop", {}, 0.0, radius).stable is stable
+    assert StagePeak("loop", {}, 0.0, radius).stable is stable
 
 
 def test_an_unstable_loop_is_refused_though_zero_is_excluded(tmp_path: Path) -> None:
@@ -392,8 +392,8 @@ def test_an_unstable_loop_is_refused_though_zero_is_excluded(tmp_path: Path) -> 
     assert check.check(path).failures == ("loop, group 1: the nominal loop is not shown to be stable",)
 
 
-def _field(value: Any) -> checked_file.Field:
-    return checked_file.Field(Path("c"), "x", value)
+def _field(value: Any) -> checked_file.DocumentValue:
+    return checked_file.DocumentValue(Path("c"), "x", value)
 
 
 def test_fields_of_certificates_have_bounds() -> None:
@@ -418,7 +418,7 @@ def test_fields_of_certificates_have_bounds() -> None:
 
 def test_certificates_have_a_size(tmp_path: Path) -> None:
     path = tmp_path / "c.json"
-    path.write_bytes(b" " * (checked_file.LARGEST + 1))
+    path.write_bytes(b" " * (checked_file.MAX_BYTES + 1))
     with pytest.raises(
         checked_file.Unreadable, match="found 4000001 bytes, expected a certificate of at most 4000000"
     ):

@@ -47,7 +47,7 @@ class Question(NamedTuple):
     R: FloatArray
     N: FloatArray
     what: str
-    found: riccati.Solution
+    found: riccati.RiccatiSolution
 
 
 class Design(NamedTuple):
@@ -66,8 +66,8 @@ def shipped(request: pytest.FixtureRequest) -> Design:
     model = malta.linearize(spec.plant, spec.plant.at(**spec.operating_point))
     asked: dict[str, list[Question]] = {"care": [], "dare": []}
 
-    def noted(name: str, *given: Any, solver: riccati.Solver) -> riccati.Solution:
-        found: riccati.Solution = getattr(riccati, name)(*given, solver=solver)
+    def noted(name: str, *given: Any, solver: riccati.Solver) -> riccati.RiccatiSolution:
+        found: riccati.RiccatiSolution = getattr(riccati, name)(*given, solver=solver)
         A, B, Q, R, *rest = given
         N = rest[0] if name == "dare" else np.zeros_like(B)
         asked[name].append(Question(A, B, Q, R, N, str(rest[-1]), found))

@@ -15,7 +15,7 @@ from conftest import ROOT
 import malta
 from malta.linear.sampling import sample
 from malta.processes import environment
-from malta.synthesis.filter_check import ALLOWED, check_filter
+from malta.synthesis.filter_check import ALLOWED_ERROR, check_filter
 
 DESIGNS = sorted(p for p in ROOT.glob("design/*.toml"))
 EXAMPLES = [ROOT / "examples" / name for name in ("magnet/design/scheduled.toml", "rotor/design/rotor.toml")]
@@ -69,7 +69,7 @@ def test_a_filter_too_slow_to_wait_for_is_compared_as_far_as_it_came() -> None:
     slow = replace(spec, law=weights, sample_time=1e-4)
     found = check_filter(slow, model, malta.lqg(model, weights, 1e-4, "zoh"))
     assert (found.samples, found.apart < found.allowed) == (20_000, True)
-    assert found.allowed > 100 * ALLOWED
+    assert found.allowed > 100 * ALLOWED_ERROR
 
 
 @pytest.mark.slow

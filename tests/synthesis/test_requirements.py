@@ -16,7 +16,7 @@ import malta
 from malta.loops.sampled_loops import machine_loop
 from malta.loops.time_domain import noise_of
 from malta.machines.tubular.requirements import REQUIREMENTS
-from malta.synthesis.requirements import GENERIC, requirements_for
+from malta.synthesis.requirements import GENERIC_REQUIREMENTS, requirements_for
 from malta.synthesis.spec import Loads, Pid, Spec
 from malta.tuning.groups import figures_of, groups_of
 from malta.tuning.search import Effort, at_least_of, merge, model_and_controller
@@ -51,12 +51,12 @@ def test_every_machine_can_bound_its_outputs_and_inputs_one_by_one(tmp_path: Pat
 
 def test_a_machines_own_replace_generic_ones_of_their_name(tmp_path: Path) -> None:
     motor = malta.read_design(motor_file(tmp_path, MOTION)).plant
-    assert list(requirements_for(motor).values()) == list(GENERIC)
+    assert list(requirements_for(motor).values()) == list(GENERIC_REQUIREMENTS)
     tubular = malta.read_design(ROOT / "design" / "robust.toml").plant
     known = requirements_for(tubular)
     assert known["force_noise"] in REQUIREMENTS
     assert {"margin", "motion", "payload"} < known.keys()
-    assert len(known) == len(GENERIC) + len(REQUIREMENTS) - 1
+    assert len(known) == len(GENERIC_REQUIREMENTS) + len(REQUIREMENTS) - 1
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def test_a_machine_of_ones_own_without_a_stroke_is_tuned_for_its_own_requirement
 
 
 def test_generic_code_names_no_machines_requirements() -> None:
-    own = {r.name for r in REQUIREMENTS} - {r.name for r in GENERIC}
+    own = {r.name for r in REQUIREMENTS} - {r.name for r in GENERIC_REQUIREMENTS}
     assert len(own) == 8
     names = re.compile(rf"\b({'|'.join(sorted(own))})\b")
     for folder in ("synthesis", "tuning", "report"):

@@ -301,7 +301,7 @@ def test_a_pendulum_at_any_sample_time_and_weight(sign: int, Ts: float) -> None:
     for r in 10.0 ** np.arange(-4, 9) * Ts:
         R = np.array([[r]])
         X, K, residual = dare(A, B, Q, R)
-        assert residual <= riccati.REFINED
+        assert residual <= riccati.REFINED_RESIDUAL
         off = np.abs(exact_gain(A, B, Q, r) - K)
         assert (off <= of_gain(A, B, Q, R, X, sampled=True, residual=residual)).all()
 
@@ -370,15 +370,15 @@ def test_what_the_solver_leaves_is_refined(
     """From a solution that is off by what its condition allows; one by 0.1 % is refused, or by 30 %."""
     A, B = (PENDULUM, PUSH) if solve is care else sample(PENDULUM, PUSH, 0.01)
     Q, R = np.diag([1, 0.01]), np.array([[1e-3]])
-    right, first = solve(A, B, Q, R, solver=solver), riccati._given
+    right, first = solve(A, B, Q, R, solver=solver), riccati._library_solution
     for off in (1 - 1e-8, 1 + 1e-7):
-        monkeypatch.setattr(riccati, "_given", lambda *a, off=off, **k: first(*a, **k) * off)
+        monkeypatch.setattr(riccati, "_library_solution", lambda *a, off=off, **k: first(*a, **k) * off)
         X, K, residual = solve(A, B, Q, R, solver=solver)
         assert residual < 1e-15
         assert pytest.approx(right.X, rel=1e-11) == X
         assert pytest.approx(right.K, rel=1e-11) == K
     for off in (0.999, 1.3):
-        monkeypatch.setattr(riccati, "_given", lambda *a, off=off, **k: first(*a, **k) * off)
+        monkeypatch.setattr(riccati, "_library_solution", lambda *a, off=off, **k: first(*a, **k) * off)
         with pytest.raises(
             malta.CheckError, match=f": the solution of {solver} is .* from its refinement, and "
         ):

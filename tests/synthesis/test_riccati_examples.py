@@ -16,7 +16,7 @@ import pytest
 from conftest import ROOT
 from scipy import linalg
 
-from malta.synthesis.riccati import Solution, care, dare
+from malta.synthesis.riccati import RiccatiSolution, care, dare
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
@@ -44,7 +44,7 @@ def matrices(name: str) -> dict[str, FloatArray]:
     return found
 
 
-def solve(name: str) -> Solution:
+def solve(name: str) -> RiccatiSolution:
     M = matrices(name)
     if name.startswith("DAREX"):
         return dare(M["A"], M["B"], M["Q"], M["R"], M["N"])

@@ -22,7 +22,7 @@ from malta.margins.scheduled_loops import loops_between_places
 from malta.margins.travel import travel_margin, worst_sensitivities
 from malta.simulation.references import Motion
 from malta.synthesis.controller import Controller, law, law_at
-from malta.synthesis.schedule import SCHEDULED, Schedule, point_at
+from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule, point_at
 
 MAGNET = "examples/magnet/design/scheduled.toml"
 RISE = 0.1  # s
@@ -57,7 +57,7 @@ def _rest(plant: malta.model.Plant, place: float) -> dict[str, Any]:
 
 def test_a_schedule_of_equal_matrices_is_the_fixed_law_to_the_bit(spec: Any, controller: Controller) -> None:
     assert controller.schedule is not None
-    matrices: dict[str, Any] = {k: np.array([getattr(controller, k)] * 5) for k in SCHEDULED}
+    matrices: dict[str, Any] = {k: np.array([getattr(controller, k)] * 5) for k in SCHEDULED_MATRICES}
     equal = replace(controller.schedule, **matrices)
     runs = [
         malta.simulate(spec.plant, replace(controller, schedule=one), _along(-1e-3, 1e-3))
@@ -156,7 +156,7 @@ def test_the_margin_holds_at_random_places(spec: Any, controller: Controller) ->
 def test_nothing_is_proven_where_the_law_is_unstable_at_a_place(spec: Any, controller: Controller) -> None:
     """The fixed law as a schedule of equal matrices: lost at the near end."""
     assert controller.schedule is not None
-    matrices: dict[str, Any] = {k: np.array([getattr(controller, k)] * 2) for k in SCHEDULED}
+    matrices: dict[str, Any] = {k: np.array([getattr(controller, k)] * 2) for k in SCHEDULED_MATRICES}
     equal = Schedule("y", 0, np.array([2e-3, 3e-3]), **matrices)
     margin = travel_margin(spec.plant, replace(controller, schedule=equal), {"R": 0.2}, time=20)
     assert not margin.lower
@@ -174,7 +174,7 @@ def test_gain_files_hold_the_matrices_of_all_places(
     assert found.schedule is not None
     assert controller.schedule is not None
     assert found.schedule.variable == "y"
-    for name in ("places", *SCHEDULED):
+    for name in ("places", *SCHEDULED_MATRICES):
         assert np.array_equal(getattr(found.schedule, name), getattr(controller.schedule, name))
 
 

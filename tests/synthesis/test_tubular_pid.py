@@ -29,7 +29,7 @@ from malta.synthesis.controller import law
 from malta.synthesis.pid import axes_of, pid
 from malta.synthesis.spec import Pid
 from malta.tuning.pid import (
-    BETWEEN,
+    CORNER_TOLERANCE,
     close_loop,
     estimates_of,
     loads_of,
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from malta.machines.tubular.paper.quantities import Evidence
+    from malta.machines.tubular.paper.quantities import TubularEvidence
     from malta.model.linearize import LinearModel
     from malta.synthesis.spec import Spec
 
@@ -76,7 +76,7 @@ def design(spec: Spec) -> SynthesizedDesign:
 
 
 @pytest.fixture(scope="module")
-def found(spec: Spec, published: dict[str, Any]) -> Iterator[Evidence]:
+def found(spec: Spec, published: dict[str, Any]) -> Iterator[TubularEvidence]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("malta.machines.tubular.paper.quantities.MACHINES", 16)
         patch.setattr("malta.machines.tubular.paper.quantities.LEARNERS", 2)
@@ -244,7 +244,7 @@ def test_estimates_are_what_is_measured(spec: Spec, axes: str) -> None:
     del figures["margin"]
     proven = design.margins.robust
     assert proven is not None
-    assert margin / (1 - BETWEEN) == pytest.approx(proven.lower, rel=2e-3)
+    assert margin / (1 - CORNER_TOLERANCE) == pytest.approx(proven.lower, rel=2e-3)
     noise = design.noise
     assert figures["force_noise"] == pytest.approx(noise.force[:4].max(), rel=1e-6)
     assert figures["thrust_noise"] == pytest.approx(noise.force[4], rel=1e-6)
@@ -331,7 +331,7 @@ def test_a_number_of_the_search_is_written_to_its_own_axis(spec: Spec) -> None:
 
 
 @pytest.mark.slow
-def test_a_pid_has_no_verdict_on_figures_of_an_lqg(found: Evidence, published: dict[str, Any]) -> None:
+def test_a_pid_has_no_verdict_on_figures_of_an_lqg(found: TubularEvidence, published: dict[str, Any]) -> None:
     lines = {row.subject: claims.claim_of(row, [found], published, ["tubular_pid"]) for row in tubular.rows()}
     only = {subject for subject, line in lines.items() if line.verdict == "of an LQG only"}
     assert only == {"LQR: stiffness over attraction, K1/k", "LQR: share of the 20 % box"}
@@ -344,7 +344,7 @@ def test_a_pid_has_no_verdict_on_figures_of_an_lqg(found: Evidence, published: d
     assert (line.ours, line.verdict, line.word) == (("4.0", "–"), "reproduced", "reproduced")
 
 
-def test_what_the_paper_calls_unsuitable_holds_what_it_claims(found: Evidence) -> None:
+def test_what_the_paper_calls_unsuitable_holds_what_it_claims(found: TubularEvidence) -> None:
     """300 % of the box, as many as the paper has of full state feedback, with the sampled loop and single axes."""
     assert claims.machine_share(found) == pytest.approx(3.0030, abs=1e-3)
     assert claims.peak_sensitivity(found) == pytest.approx(2.0, abs=1e-3)

@@ -29,7 +29,7 @@ from malta.tuning import tune as lqg
 from malta.tuning.groups import figures_of
 from malta.tuning.search import Effort, Journal, Trial, apply_trial, at_least_of, merge
 from malta.tuning.tune import (
-    Tuned,
+    TuningResult,
     cluster_search,
     clusters_of,
     design_text,
@@ -268,7 +268,7 @@ def test_the_drive_constant_scales_the_thrust_alone(spec: Spec) -> None:
 # --- the search ---
 
 
-def same(a: Tuned, b: Tuned) -> None:
+def same(a: TuningResult, b: TuningResult) -> None:
     assert a.trial == b.trial
     assert a.front == b.front
     assert a.requirements == b.requirements

@@ -23,7 +23,7 @@ from malta.machines.halbach import electronics, plant as halbach
 from malta.synthesis.spec import Pid
 from malta.tuning import pid, verify
 from malta.tuning.pid import close_loop, goal_value, loads_of, loop_figures, parts_of, whole_machine
-from malta.tuning.search import Effort, Journal, Search, model_and_controller, separate
+from malta.tuning.search import Effort, Journal, TrialSearch, model_and_controller, separate
 from malta.tuning.tune import design_text, problem_sha256, tune as tuned
 from malta.tuning.verify import judge
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
-    from malta.tuning.tune import Tuned
+    from malta.tuning.tune import TuningResult
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -129,7 +129,7 @@ def mover(tmp_path_factory: pytest.TempPathFactory) -> Spec:
 
 
 @pytest.fixture(scope="module")
-def found(motor: Spec) -> Tuned:
+def found(motor: Spec) -> TuningResult:
     return tuned(motor)
 
 
@@ -146,16 +146,16 @@ def figures_of(spec: Spec) -> dict[str, float]:
     )
 
 
-def search_of(spec: Spec) -> Search:
+def search_of(spec: Spec) -> TrialSearch:
     (part,) = parts_of(whole_machine(*model_and_controller(spec), loads_of(spec)))
 
     def compute(design: Spec) -> dict[str, float]:
         return loop_figures(spec, part, close_loop(part, terms_of(design), spec.sample_time))
 
-    return Search(spec, (0, 1, 2), 0, Journal(None, "", restart=False), compute)
+    return TrialSearch(spec, (0, 1, 2), 0, Journal(None, "", restart=False), compute)
 
 
-def goal(search: Search, u: Any) -> float:
+def goal(search: TrialSearch, u: Any) -> float:
     return goal_value(search, u, ["x"])
 
 
@@ -242,7 +242,7 @@ def test_an_unstable_loop_has_no_figures(motor: Spec) -> None:
 
 
 @pytest.mark.slow
-def test_no_grid_beats_what_is_found(motor: Spec, found: Tuned) -> None:
+def test_no_grid_beats_what_is_found(motor: Spec, found: TuningResult) -> None:
     """All of the cube, and a finer grid about the place."""
     search = search_of(motor)
     best, own = search_of(found.spec), found.trial.values
@@ -256,7 +256,7 @@ def test_no_grid_beats_what_is_found(motor: Spec, found: Tuned) -> None:
     assert sorted(values)[100] > least + 0.01
 
 
-def test_the_bounds_hold_where_it_counts(found: Tuned) -> None:
+def test_the_bounds_hold_where_it_counts(found: TuningResult) -> None:
     rows = {r.name: r for r in found.requirements}
     assert list(rows) == ["load_error x", "noise_motion x", "peak_sensitivity"]
     assert found.reached
@@ -268,7 +268,7 @@ def test_the_bounds_hold_where_it_counts(found: Tuned) -> None:
     assert found.front == ()
 
 
-def test_a_tighter_bound_on_motion_costs_load_error(motor: Spec, found: Tuned) -> None:
+def test_a_tighter_bound_on_motion_costs_load_error(motor: Spec, found: TuningResult) -> None:
     asked = {**motor.specification, "noise_motion x": 2.3e-6}
     calm = tuned(replace(motor, specification=asked), effort=Effort(generations=5))
     assert calm.reached
@@ -351,7 +351,7 @@ def test_bandwidth_and_margin_are_judge(motor: Spec, monkeypatch: pytest.MonkeyP
 
 
 def test_what_is_found_is_written_with_everything_else_kept(
-    motor: Spec, found: Tuned, tmp_path: Path
+    motor: Spec, found: TuningResult, tmp_path: Path
 ) -> None:
     target = tmp_path / "deep" / "motor_pid.toml"
     target.parent.mkdir()

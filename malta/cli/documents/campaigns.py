@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import Field
 
 from malta.cli.documents.loops import (
+    DocumentPart,
     End,
     Files,
     LoopPart,
     Number,
-    Part,
     ShareOfRuns,
     as_key,
     loop_fields,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from malta.campaigns.run import Status
     from malta.campaigns.studies import Index, Sensitivity, Tolerances
     from malta.campaigns.summary import Distribution, Runs, Summary
-    from malta.firmware.flight import Difference
+    from malta.firmware.flight import SignalDifference
     from malta.firmware.program import Precision
     from malta.margins.loop_report import LoopReport
     from malta.simulation.experiments import Experiment
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 Manifest = dict[str, Any]
 
 
-class HeadPart(Part):
+class HeadPart(DocumentPart):
     """What every document of a campaign begins with."""
 
     gains: str
@@ -44,14 +44,14 @@ class HeadPart(Part):
     manifest: Manifest = Field(description="all that the runs depend on, as in campaign.json")
 
 
-class PercentilesPart(Part):
+class PercentilesPart(DocumentPart):
     """How exact the percentiles are."""
 
     exact: bool
     relative_error: float
 
 
-class DistributionPart(Part):
+class DistributionPart(DocumentPart):
     """A figure of merit over the completed runs, SI."""
 
     READS: ClassVar = {"smallest": "sketch.smallest", "published": "merit.bound"}
@@ -67,7 +67,7 @@ class DistributionPart(Part):
     published: Number
 
 
-class RunPart(Part):
+class RunPart(DocumentPart):
     """One run."""
 
     run: int
@@ -105,7 +105,7 @@ class CampaignOutput(RunsPart):
     files: Files
 
 
-class BlocksPart(Part):
+class BlocksPart(DocumentPart):
     """Blocks in the folder of a campaign."""
 
     READS: ClassVar = {"done": "blocks", "all": "of", "runs": "size", "bytes": "stored"}
@@ -129,7 +129,7 @@ class StatusOutput(RunsPart):
     left_s: Number
 
 
-class LevelPart(Part):
+class LevelPart(DocumentPart):
     """A level of a subset simulation."""
 
     threshold: Number = Field(description="severity; 1 is the limit")
@@ -137,7 +137,7 @@ class LevelPart(Part):
     acceptance: Number
 
 
-class RepetitionPart(Part):
+class RepetitionPart(DocumentPart):
     """One of the repetitions of a subset simulation, which have no run in common."""
 
     probability: Number = Field(description="null where no run failed")
@@ -146,7 +146,7 @@ class RepetitionPart(Part):
     levels: list[LevelPart]
 
 
-class DesignPointPart(Part):
+class DesignPointPart(DocumentPart):
     """The failed run whose machine is nearest the middle of the box."""
 
     values: dict[str, float] = Field(description="of what varies, SI")
@@ -178,7 +178,7 @@ class RareOutput(HeadPart):
     design_point: DesignPointPart | None
 
 
-class IndexPart(Part):
+class IndexPart(DocumentPart):
     """Sobol indices of a factor, with half the width of their 95 % intervals."""
 
     first: Number
@@ -204,7 +204,7 @@ class SobolOutput(HeadPart):
     merits: dict[str, Indices]
 
 
-class SpreadPart(Part):
+class SpreadPart(DocumentPart):
     """The largest spread of a parameter that keeps the yield."""
 
     factor: float = Field(description="in multiples of today's")
@@ -338,7 +338,7 @@ def _run_part(found: Summary, runs: Runs, row: int) -> RunPart:
 MERITS = "figures of merit; a key ends in its SI unit, and in _share where 0.01 is 1 %"
 
 
-class CasePart(Part):
+class CasePart(DocumentPart):
     """A run of an experiment."""
 
     READS: ClassVar = {"verdict": "run.verdict", "limits": "run.limits"}
@@ -349,7 +349,7 @@ class CasePart(Part):
     merits: dict[str, Number] = Field(description=MERITS)
 
 
-class StrokePart(Part):
+class StrokePart(DocumentPart):
     """Figures of a stroke, as papers publish them."""
 
     READS: ClassVar = {"error_along": "axial_error"}
@@ -362,7 +362,7 @@ class StrokePart(Part):
     current_A: Number
 
 
-class ExperimentPart(Part):
+class ExperimentPart(DocumentPart):
     """Verdicts, limits and figures of merit of each run of an experiment."""
 
     READS: ClassVar = {
@@ -383,14 +383,14 @@ class ExperimentPart(Part):
     stroke: StrokePart | None = None
 
 
-class SignalPart(Part):
+class SignalPart(DocumentPart):
     """How far a signal is apart in two flights at most, and its range; SI."""
 
     largest: Number
     range: Number
 
 
-class FlightPart(Part):
+class FlightPart(DocumentPart):
     """A flight of the exported C against the simulation's own law."""
 
     case: str
@@ -409,7 +409,7 @@ class SimulateOutput(ExperimentPart):
     exported: list[FlightPart] = Field(default=[], description="of --controller c")
 
 
-class ObserverPart(Part):
+class ObserverPart(DocumentPart):
     """How far the observer's gain is from that of filterpy's filter, which ran until it stood."""
 
     samples: int
@@ -426,7 +426,7 @@ class DesignPart(LoopPart, ExperimentPart):
     observer: ObserverPart | None = Field(default=None, description="of an LQG")
 
 
-class DesignOutput(Part):
+class DesignOutput(DocumentPart):
     """What `malta design --json` prints: the designs whose gain files stand."""
 
     kind: Literal["malta-design-output"] = Field(default="malta-design-output", alias="schema")
@@ -452,7 +452,7 @@ def _stroke(experiment: Experiment) -> StrokePart:
     return StrokePart.of(found, errors_across=across)
 
 
-def flights(found: Mapping[str, Mapping[Precision, Sequence[Difference]]]) -> list[FlightPart]:
+def flights(found: Mapping[str, Mapping[Precision, Sequence[SignalDifference]]]) -> list[FlightPart]:
     """The differences of the exported C's flights, by case and precision."""
     return [
         FlightPart(case=label, precision=precision, signals={d.name: SignalPart.of(d) for d in rows})

@@ -40,7 +40,7 @@ Shares = Annotated[
 UNIT = re.compile(r"_(?:rad_per_s|rad|share|kg|s|N|A|si|per_s)$")  # at the end of a key
 
 
-class Part(BaseModel):
+class DocumentPart(BaseModel):
     """A table of a document, which renders a record: a key has the record's field of its name, without its unit."""
 
     model_config = ConfigDict(
@@ -67,17 +67,17 @@ class Part(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _read(cls, record: Any) -> Any:
-        return record if isinstance(record, Mapping | Part) else cls.fields_of(record)
+        return record if isinstance(record, Mapping | DocumentPart) else cls.fields_of(record)
 
 
-class End(Part):
+class End(DocumentPart):
     """How a run ended, and when."""
 
     name: str = Field(description='"completed", "diverged", "interrupted" or the contact that was touched')
     time_s: Number
 
 
-class ShareOfRuns(Part):
+class ShareOfRuns(DocumentPart):
     """A share of runs with its 95 % interval (Clopper-Pearson)."""
 
     passed: int
@@ -105,7 +105,7 @@ def with_keys(table: Mapping[str, Any]) -> dict[str, Any]:
 Poles = list[tuple[float, float]]
 
 
-class PolesPart(Part):
+class PolesPart(DocumentPart):
     """Poles as [real, imaginary] in rad/s; of sampled systems ln(lambda) / Ts."""
 
     open_loop: Poles
@@ -114,7 +114,7 @@ class PolesPart(Part):
     closed_loop: Poles
 
 
-class LoopPart(Part):
+class LoopPart(DocumentPart):
     """Stability, poles, bandwidths and peak sensitivities of a loop."""
 
     READS: ClassVar = {"poles_rad_per_s": "poles.pairs"}
@@ -127,7 +127,7 @@ class LoopPart(Part):
     )
 
 
-class MarginPart(Part):
+class MarginPart(DocumentPart):
     """A margin in multiples of the uncertainty."""
 
     lower: Number = Field(description="proven: every loop within it is stable; null where nothing is proven")
@@ -141,13 +141,13 @@ class MarginPart(Part):
     time_up: bool = Field(description="the search ended with its work or its time: more may prove more")
 
 
-OF_MARGIN = {key: f"margin.{UNIT.sub('', key)}" for key in MarginPart.model_fields}
+MARGIN_FIELDS = {key: f"margin.{UNIT.sub('', key)}" for key in MarginPart.model_fields}
 
 
 class LinkPart(MarginPart):
     """A stage from the ideal loop to the machine's."""
 
-    READS: ClassVar = OF_MARGIN | {"stage": "name", "peak_sensitivity": "peak", "at": "broken_at"}
+    READS: ClassVar = MARGIN_FIELDS | {"stage": "name", "peak_sensitivity": "peak", "at": "broken_at"}
 
     stage: str
     peak_sensitivity: Number
@@ -158,7 +158,7 @@ class LinkPart(MarginPart):
 class PlacePart(MarginPart):
     """The machine's loop at a place of its travel, or at a value of a parameter."""
 
-    READS: ClassVar = OF_MARGIN | {"peak_sensitivity": "peak"}
+    READS: ClassVar = MARGIN_FIELDS | {"peak_sensitivity": "peak"}
 
     position: float
     unit: str = Field(description="SI unit of the position")
@@ -167,7 +167,7 @@ class PlacePart(MarginPart):
     delay_s: Number
 
 
-class DiskPart(Part):
+class DiskPart(DocumentPart):
     """A disk margin."""
 
     channels: str
@@ -177,7 +177,7 @@ class DiskPart(Part):
     frequency_rad_per_s: Number
 
 
-class GangPart(Part):
+class GangPart(DocumentPart):
     """Gang of four at a sensor; SP in `unit`/N, FS in N/`unit`, of a torque N m in place of N."""
 
     S: Number
@@ -187,14 +187,14 @@ class GangPart(Part):
     unit: str
 
 
-class TolerancePart(Part):
+class TolerancePart(DocumentPart):
     """Margins of a parameter alone."""
 
     down: MarginPart
     up: MarginPart
 
 
-class GainPart(Part):
+class WorstGainPart(DocumentPart):
     """The largest gain over the uncertainty."""
 
     READS: ClassVar = {"found": "lower", "proven": "upper"}
@@ -205,7 +205,7 @@ class GainPart(Part):
     reason: str
 
 
-class RobustPart(Part):
+class RobustPart(DocumentPart):
     """Margins over an uncertainty and over the travel."""
 
     READS: ClassVar = {"worst_sensitivity": "worst"}
@@ -219,26 +219,26 @@ class RobustPart(Part):
     tolerance: dict[str, TolerancePart]
     mass_kg: MarginPart | None = Field(description="mass margin of the linear loop: lower and upper in kg")
     places: list[PlacePart]
-    worst_sensitivity: dict[str, GainPart] = Field(
+    worst_sensitivity: dict[str, WorstGainPart] = Field(
         description="largest |S| over the uncertainty; {}: not asked"
     )
 
 
-class LeftPart(Part):
+class LeftPart(DocumentPart):
     """What is left of a deviation."""
 
     after_s: float
     value: Number
 
 
-class CompliancePart(Part):
+class CompliancePart(DocumentPart):
     """The largest amplitude over frequency under a load of this amplitude."""
 
     peak: Number
     frequency_rad_per_s: Number
 
 
-class DeviationPart(Part):
+class DeviationPart(DocumentPart):
     """What a constant load does to an output."""
 
     unit: str
@@ -249,14 +249,14 @@ class DeviationPart(Part):
     compliance: CompliancePart
 
 
-class RecoveryPart(Part):
+class RecoveryPart(DocumentPart):
     """The answer to a constant load from outside."""
 
     load: dict[str, float] = Field(description="N or N m, by disturbance")
     outputs: dict[str, DeviationPart]
 
 
-class PayloadPart(Part):
+class PayloadPart(DocumentPart):
     """How much the machine carries beside its mover; null: any, or not flown."""
 
     held_kg: Number
@@ -264,7 +264,7 @@ class PayloadPart(Part):
     dropped_kg: Number
 
 
-class RequirementPart(Part):
+class RequirementPart(DocumentPart):
     """A requirement on a design, and what the design reaches; SI."""
 
     name: str
@@ -336,7 +336,7 @@ def _recovery(found: Recovery) -> RecoveryPart:
 # The documents of `malta report` and `malta compare`.
 
 
-class ReportOutput(Part):
+class ReportOutput(DocumentPart):
     """What `malta report --json` prints."""
 
     READS: ClassVar = {"design": "subject.controller.name"}
@@ -349,7 +349,7 @@ class ReportOutput(Part):
     files: Files
 
 
-class ComparedDesign(Part):
+class ComparedDesign(DocumentPart):
     """A design of a comparison."""
 
     READS: ClassVar = {"gains": "subject.source", "machine": "plant.name", "stable": "report.stable"}
@@ -360,7 +360,7 @@ class ComparedDesign(Part):
     stable: bool
 
 
-class ComparedFigure(Part):
+class ComparedFigure(DocumentPart):
     """A figure of merit of all designs."""
 
     key: str
@@ -370,7 +370,7 @@ class ComparedFigure(Part):
     best: list[str] = Field(description="designs whose value is the better one; none of a tie")
 
 
-class CompareOutput(Part):
+class CompareOutput(DocumentPart):
     """What `malta compare --json` prints."""
 
     kind: Literal["malta-compare-output"] = Field(default="malta-compare-output", alias="schema")

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
-from malta.cli.documents.loops import Files, Name, Number, Part, RequirementPart
+from malta.cli.documents.loops import DocumentPart, Files, Name, Number, RequirementPart
 from malta.identification.response import units_of_model
 from malta.report.ledger import Word
 from malta.units import identifier
 
 if TYPE_CHECKING:
-    from malta.checker.file import Claim
+    from malta.checker.file import StabilityClaim
     from malta.identification.dump import ExactReplay
     from malta.identification.identify import Identified
     from malta.identification.log import Log
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from malta.identification.windings import Windings
     from malta.proof.blocks.gain import Gain
     from malta.synthesis.spec import Spec
-    from malta.tuning.tune import Tuned
+    from malta.tuning.tune import TuningResult
 
 
-class ClaimedParameter(Part):
+class ClaimedParameter(DocumentPart):
     """A parameter of a certificate's box; SI."""
 
     name: str
@@ -38,7 +38,7 @@ class ClaimedParameter(Part):
     high: float
 
 
-class CertifiedPart(Part):
+class CertifiedPart(DocumentPart):
     """What a certificate says that it is of; null where it is of matrices alone."""
 
     machine: str | None
@@ -53,7 +53,7 @@ class CertifiedPart(Part):
     parameters: list[ClaimedParameter]
 
 
-class CheckOutput(Part):
+class CheckOutput(DocumentPart):
     """What `malta check --json` prints."""
 
     kind: Literal["malta-check-output"] = Field(default="malta-check-output", alias="schema")
@@ -69,7 +69,7 @@ class CheckOutput(Part):
     failures: list[str]
 
 
-def certified_part(claim: Claim) -> CertifiedPart:
+def certified_part(claim: StabilityClaim) -> CertifiedPart:
     """What a certificate says that it is of."""
     from malta.checker.file import double
 
@@ -93,7 +93,7 @@ def certified_part(claim: Claim) -> CertifiedPart:
     )
 
 
-class SearchPart(Part):
+class SearchPart(DocumentPart):
     """How a design was found."""
 
     trials: int
@@ -102,7 +102,7 @@ class SearchPart(Part):
     front: list[dict[str, Number]] = Field(description="figures of the trials of the Pareto front")
 
 
-class TuneOutput(Part):
+class TuneOutput(DocumentPart):
     """What `malta tune --json` prints."""
 
     kind: Literal["malta-tune-output"] = Field(default="malta-tune-output", alias="schema")
@@ -113,7 +113,7 @@ class TuneOutput(Part):
     search: SearchPart | None = Field(default=None, description="null with --check, which searches nothing")
 
 
-class ClaimPart(Part):
+class ClaimPart(DocumentPart):
     """A published number, ours for each design, and the verdict; as text, with the printed digits."""
 
     subject: str
@@ -123,7 +123,7 @@ class ClaimPart(Part):
     word: Word = Field(description="the verdict in one word")
 
 
-class LedgerPart(Part):
+class LedgerPart(DocumentPart):
     """All published numbers on a machine."""
 
     machine: str
@@ -135,7 +135,7 @@ class LedgerPart(Part):
     claims: list[ClaimPart]
 
 
-class ClaimsOutput(Part):
+class ClaimsOutput(DocumentPart):
     """What `malta claims --json` prints."""
 
     kind: Literal["malta-claims-output"] = Field(default="malta-claims-output", alias="schema")
@@ -143,7 +143,7 @@ class ClaimsOutput(Part):
     ledgers: list[LedgerPart]
 
 
-class ExportOutput(Part):
+class ExportOutput(DocumentPart):
     """What `malta export --json` prints."""
 
     kind: Literal["malta-export-output"] = Field(default="malta-export-output", alias="schema")
@@ -153,7 +153,7 @@ class ExportOutput(Part):
     files: Files
 
 
-class VectorPart(Part):
+class VectorPart(DocumentPart):
     """What a target made of a recorded vector."""
 
     READS: ClassVar = {"largest_difference": "largest"}
@@ -164,7 +164,7 @@ class VectorPart(Part):
     largest_difference: Number = Field(description="of a force, N or N m, or of a command")
 
 
-class PilOutput(Part):
+class PilOutput(DocumentPart):
     """What `malta pil --json` prints."""
 
     READS: ClassVar = {"samples_per_s": "samples_per_second", "requests_sent_again": "repeated"}
@@ -181,7 +181,7 @@ class PilOutput(Part):
     slowest_step_counts: int | None = Field(description="of the target's timer; null where it has none")
 
 
-def tune_output(spec: Spec, tuned: Tuned, files: Sequence[Path]) -> TuneOutput:
+def tune_output(spec: Spec, tuned: TuningResult, files: Sequence[Path]) -> TuneOutput:
     """The document of a search."""
     from malta.synthesis.requirements import requirements_for
 
@@ -201,7 +201,7 @@ def tune_output(spec: Spec, tuned: Tuned, files: Sequence[Path]) -> TuneOutput:
 # The documents of `malta excite`, `log`, `identify`, `learn`, `replay`, `measure` and `commission`.
 
 
-class ExciteOutput(Part):
+class ExciteOutput(DocumentPart):
     """What `malta excite --json` prints."""
 
     READS: ClassVar = {"lines_Hz": "signal.frequencies", "crest_factor": "signal.crest_factor"}
@@ -222,7 +222,7 @@ class ExciteOutput(Part):
     files: Files
 
 
-class SignalStatistics(Part):
+class SignalStatistics(DocumentPart):
     """Statistics of a column of a log, in its unit."""
 
     unit: str
@@ -232,7 +232,7 @@ class SignalStatistics(Part):
     deviation: Number = Field(description="standard deviation")
 
 
-class LogOutput(Part):
+class LogOutput(DocumentPart):
     """What `malta log --json` prints."""
 
     READS: ClassVar = {"log": "source", "jitter_s": "survey.jitter", "findings": "survey.findings"}
@@ -252,7 +252,7 @@ class LogOutput(Part):
     files: Files
 
 
-class IdentifiedParameter(Part):
+class IdentifiedParameter(DocumentPart):
     """A parameter with its interval."""
 
     unit: str
@@ -268,7 +268,7 @@ class IdentifiedParameter(Part):
     )
 
 
-class IdentifyOutput(Part):
+class IdentifyOutput(DocumentPart):
     """What `malta identify --json` prints."""
 
     READS: ClassVar = {"log": "log.source", "chi2_per_dof": "chi2", "chi2_limit": "limit"}
@@ -292,7 +292,7 @@ class IdentifyOutput(Part):
     files: Files
 
 
-class LearnOutput(Part):
+class LearnOutput(DocumentPart):
     """What `malta learn --json` prints."""
 
     kind: Literal["malta-learn-output"] = Field(default="malta-learn-output", alias="schema")
@@ -307,7 +307,7 @@ class LearnOutput(Part):
     files: Files
 
 
-class LearnedV0Output(Part):
+class LearnedV0Output(DocumentPart):
     """What `malta learn --v0 --json` prints."""
 
     kind: Literal["malta-learned-v0-output"] = Field(default="malta-learned-v0-output", alias="schema")
@@ -320,7 +320,7 @@ class LearnedV0Output(Part):
     files: Files
 
 
-class LearnedStrokesOutput(Part):
+class LearnedStrokesOutput(DocumentPart):
     """What `malta learn --strokes --json` prints."""
 
     READS: ClassVar = {"axial_error_m": "axial_error"}
@@ -341,14 +341,14 @@ class LearnedStrokesOutput(Part):
     files: Files
 
 
-class Explained(Part):
+class Explained(DocumentPart):
     """What a change of a parameter would explain of the innovations."""
 
     change: float = Field(description="as a share of the parameter's value")
     share: float = Field(description="of the power beyond that of the gain file's own machine")
 
 
-class ReplayOutput(Part):
+class ReplayOutput(DocumentPart):
     """What `malta replay --json` prints."""
 
     READS: ClassVar = {"difference_at_once": "at_once", "innovation_rms": "rms", "sensor_noise": "expected"}
@@ -371,7 +371,7 @@ class ReplayOutput(Part):
     refusal: str = Field(description="why the log is not of this law on its machine; empty: it is")
 
 
-class MeasuredCurve(Part):
+class MeasuredCurve(DocumentPart):
     """A magnitude over the lines, as measured and as predicted; NaN becomes null."""
 
     measured: list[Number]
@@ -381,7 +381,7 @@ class MeasuredCurve(Part):
     high: list[Number]
 
 
-class MeasuredSensor(Part):
+class MeasuredSensor(DocumentPart):
     """The loop at a sensor, the others closed."""
 
     peak: float = Field(description="largest measured |S|")
@@ -396,7 +396,7 @@ class MeasuredSensor(Part):
     compliance: dict[str, MeasuredCurve] = Field(description="|S P| by force, SI")
 
 
-class MeasureOutput(Part):
+class MeasureOutput(DocumentPart):
     """What `malta measure GAINS LOG --json` prints."""
 
     READS: ClassVar = {"logs": "source", "law_missed_share": "law"}
@@ -417,7 +417,7 @@ class MeasureOutput(Part):
     files: Files
 
 
-class MeasurePlanOutput(Part):
+class MeasurePlanOutput(DocumentPart):
     """What `malta measure GAINS --plan --json` prints."""
 
     kind: Literal["malta-measure-plan-output"] = Field(default="malta-measure-plan-output", alias="schema")
@@ -435,7 +435,7 @@ class MeasurePlanOutput(Part):
     current_A: dict[str, float] = Field(description="largest deviation of each current from that at rest")
 
 
-class CommissionFinding(Part):
+class CommissionFinding(DocumentPart):
     """A figure of a step, with half of its 95 % interval and its limits."""
 
     READS: ClassVar = {"unit": "found.unit", "value": "found.value", "half": "found.half"}
@@ -449,7 +449,7 @@ class CommissionFinding(Part):
     holds: bool
 
 
-class CommissionStep(Part):
+class CommissionStep(DocumentPart):
     """What a step of the checklist found."""
 
     name: str
@@ -461,7 +461,7 @@ class CommissionStep(Part):
     findings: list[CommissionFinding]
 
 
-class CommissionOutput(Part):
+class CommissionOutput(DocumentPart):
     """What `malta commission --json` prints."""
 
     kind: Literal["malta-commission-output"] = Field(default="malta-commission-output", alias="schema")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from malta.cli.documents.loops import Files, Number, Part
+from malta.cli.documents.loops import DocumentPart, Files, Number
 
 if TYPE_CHECKING:
     from malta.loops.classical import ChannelMargins
@@ -25,7 +25,7 @@ Poles = Annotated[list[list[float]], Field(description="rows of real and imagina
 POINTS = 500  # of a line over time
 
 
-class MarginsPart(Part):
+class MarginsPart(DocumentPart):
     """The margins of one channel with the others closed; null where nothing bounds them, or the loop is unstable."""
 
     READS: ClassVar = {
@@ -55,28 +55,28 @@ class MarginsPart(Part):
     unstable_poles: int = Field(description="with this channel open")
 
 
-class GainPart(Part):
+class LoopGainPart(DocumentPart):
     """The loop gain of a channel with the others closed."""
 
     magnitude: Line
     phase_rad: Line
 
 
-class PlanePart(Part):
+class PlanePart(DocumentPart):
     """The same in the complex plane."""
 
     real: Line
     imaginary: Line
 
 
-class SensitivityPart(Part):
+class SensitivityPart(DocumentPart):
     """|S_ii| and |T_ii| of a channel."""
 
     S: Line
     T: Line
 
 
-class GangPart(Part):
+class GangCurvesPart(DocumentPart):
     """Magnitudes of the gang of four of an output and the force of its axis."""
 
     output_unit: str
@@ -88,7 +88,7 @@ class GangPart(Part):
     FS: Line = Field(description="force_unit over output_unit")
 
 
-class PolesPart(Part):
+class PoleZeroPart(DocumentPart):
     """Poles and zeros; of sampled loops ln(z) / T."""
 
     closed_loop_rad_per_s: Poles
@@ -97,7 +97,7 @@ class PolesPart(Part):
     zeros_rad_per_s: Poles
 
 
-class AnswerPart(Part):
+class AnswerPart(DocumentPart):
     """The answer of an output to a unit step, and what is read off."""
 
     READS: ClassVar = {"peak_at_s": "peak_time"}
@@ -122,7 +122,7 @@ class LoadPart(AnswerPart):
     compliance: Line
 
 
-class LoopPart(Part):
+class LoopCurvesPart(DocumentPart):
     """One loop; a kind that was not asked for is null."""
 
     name: str
@@ -130,17 +130,17 @@ class LoopPart(Part):
     sample_time_s: Number = Field(description="null: continuous")
     margins: list[MarginsPart]
     frequency_rad_per_s: list[float]
-    bode: dict[str, GainPart] | None = Field(default=None, description="by channel; of nichols too")
+    bode: dict[str, LoopGainPart] | None = Field(default=None, description="by channel; of nichols too")
     nyquist: dict[str, PlanePart] | None = None
     sigma: dict[str, list[Line]] | None = Field(default=None, description="of L, S and T, the largest first")
     sensitivity: dict[str, SensitivityPart] | None = None
-    gang: dict[str, GangPart] | None = None
-    pzmap: PolesPart | None = None
+    gang: dict[str, GangCurvesPart] | None = None
+    pzmap: PoleZeroPart | None = None
     step: dict[str, AnswerPart] | None = None
     load: list[LoadPart] | None = None
 
 
-class LocusPart(Part):
+class LocusPart(DocumentPart):
     """A root locus: closed-loop poles over a parameter, a list for each branch."""
 
     name: str
@@ -154,7 +154,7 @@ class LocusPart(Part):
     nominal_rad_per_s: Poles
 
 
-class MapPart(Part):
+class MapPart(DocumentPart):
     """A margin map: growth of the worst pole over two parameters, and the proven box."""
 
     name: str
@@ -174,13 +174,13 @@ class MapPart(Part):
     growth_per_s: list[list[Number]] = Field(description="a row for each y, positive where unstable")
 
 
-class PlotOutput(Part):
+class PlotOutput(DocumentPart):
     """What `malta plot --json` prints."""
 
     kind: Literal["malta-plot-output"] = Field(default="malta-plot-output", alias="schema")
     version: Literal[1] = 1
     at: Literal["sensors", "forces"]
-    loops: list[LoopPart]
+    loops: list[LoopCurvesPart]
     root_loci: list[LocusPart]
     margin_maps: list[MapPart]
     files: Files
@@ -206,7 +206,7 @@ def plot_output(
 
 def _loop_part(
     curves: LoopCurves, kinds: Sequence[str], channels: Sequence[str] | None, at: Place
-) -> LoopPart:
+) -> LoopCurvesPart:
     r, S, T = curves.responses, *curves.responses.cut(at)[1:]
     gain, here = r.alone(at), _indices(curves, channels, at)
     outputs = _indices(curves, channels, "sensors")
@@ -234,7 +234,7 @@ def _loop_part(
         of_kind["pzmap"] = _poles_part(curves)
     if {"step", "load"} & {*kinds}:
         of_kind |= _answers(curves, kinds, outputs)
-    return LoopPart(
+    return LoopCurvesPart(
         name=curves.name,
         stable=curves.stable,
         sample_time_s=curves.loop.sample_time,
@@ -266,23 +266,23 @@ def _sizes(values: Any) -> list[float | None]:
     return found
 
 
-def _gain_part(gain: Any) -> GainPart:
-    return GainPart(magnitude=_sizes(gain), phase_rad=np.unwrap(np.angle(gain)).tolist())
+def _gain_part(gain: Any) -> LoopGainPart:
+    return LoopGainPart(magnitude=_sizes(gain), phase_rad=np.unwrap(np.angle(gain)).tolist())
 
 
-def _gang_part(curves: LoopCurves, k: int) -> GangPart:
+def _gang_part(curves: LoopCurves, k: int) -> GangCurvesPart:
     r, output, force = curves.responses, curves.loop.outputs[k], curves.loop.inputs[k]
     sizes = {key: _sizes(getattr(r, key)[:, k, k]) for key in ("S", "T", "SP", "FS")}
-    return GangPart(output_unit=output.unit, force=force.name, force_unit=force.unit, **sizes)
+    return GangCurvesPart(output_unit=output.unit, force=force.name, force_unit=force.unit, **sizes)
 
 
 def _pairs(values: Any) -> list[list[float]]:
     return [[float(value.real), float(value.imag)] for value in values]
 
 
-def _poles_part(curves: LoopCurves) -> PolesPart:
+def _poles_part(curves: LoopCurves) -> PoleZeroPart:
     sets = {f"{name}_rad_per_s": _pairs(values) for name, values in curves.poles.items()}
-    return PolesPart(**sets, zeros_rad_per_s=_pairs(curves.zeros))
+    return PoleZeroPart(**sets, zeros_rad_per_s=_pairs(curves.zeros))
 
 
 def _answers(curves: LoopCurves, kinds: Sequence[str], outputs: dict[str, int]) -> dict[str, Any]:

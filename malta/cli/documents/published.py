@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 from malta.cli.documents import campaigns, loops, others, plots
-from malta.cli.documents.loops import Part
+from malta.cli.documents.loops import DocumentPart
 from malta.errors import InputError
 from malta.schemas import SCHEMAS
 from malta.schemas.files import DRAFT
@@ -22,9 +22,9 @@ _KINDS = {
     str(model.model_fields["kind"].default): model
     for module in (campaigns, loops, others, plots)
     for model in vars(module).values()
-    if isinstance(model, type) and issubclass(model, Part) and "kind" in model.model_fields
+    if isinstance(model, type) and issubclass(model, DocumentPart) and "kind" in model.model_fields
 }
-MODELS: dict[str, type[Part]] = {f"{name}-output": _KINDS[f"malta-{name}-output"] for name in NAMES}
+MODELS: dict[str, type[DocumentPart]] = {f"{name}-output": _KINDS[f"malta-{name}-output"] for name in NAMES}
 
 
 def output_schema(name: str) -> dict[str, Any]:

@@ -138,7 +138,7 @@ def servo(par: Parameters, F_z: float, displacement: float = 0.0) -> tuple[Float
 
 
 Pwm = Literal["exact", "plain", "fine"]
-MEAN_OF = 32  # samples in the rolling mean of a current, Sec. 4.2
+MEAN_SAMPLES = 32  # samples in the rolling mean of a current, Sec. 4.2
 # Counts at either end of a period within which the edges of the high-resolution PWM have the counter's steps. Sec. 4.1
 # says "near 0 % and 100 %"; the manual of the PWM module, Texas Instruments SPRUGE8, has three clocks.
 DEAD_ENDS = 3
@@ -152,7 +152,7 @@ class Options:
     pwm: Pwm = "plain"  # duty cycles: exact, in steps of the counter, or in those of the high-resolution PWM
     adc_steps: bool = True
     adc_noise: bool = True
-    mean_of: int = MEAN_OF  # samples in the rolling mean of a current
+    mean_of: int = MEAN_SAMPLES  # samples in the rolling mean of a current
     current_loops: bool = True  # vector control; without loops, voltages are R times the wanted currents
     dead_ends: int = 0  # counts at either end of a duty cycle without fine steps; the paper's: DEAD_ENDS
     angle_bits: int | None = None  # of a turn of the Park angle, and of its cosine and sine; None: exact
@@ -175,8 +175,8 @@ def _one_of(choices: Any) -> str:
     return "one of " + ", ".join(get_args(choices))
 
 
-REAL = Options()
-IDEAL = Options("exact", adc_steps=False, adc_noise=False)
+REAL_ELECTRONICS = Options()
+IDEAL_ELECTRONICS = Options("exact", adc_steps=False, adc_noise=False)
 
 
 def pwm_step(par: Parameters, pwm: Pwm) -> Any:
@@ -290,7 +290,7 @@ def dead_zones(par: Parameters, F_z: float, pwm: Pwm) -> tuple[FloatArray, Float
     return switched / par.k, np.diff(np.concatenate([switched, switched[:1] + 2 * math.pi])) / par.k
 
 
-class CurrentLoop(NamedTuple):
+class DqCurrentLoop(NamedTuple):
     """PI controller of Id and of Iq, u = Kp e + Ki integral of e."""
 
     Kp: float  # V/A
@@ -303,7 +303,7 @@ def current_delay(par: Parameters, mean_of: int) -> float:
     return (1.5 + (mean_of - 1) / 2) / par.f_pwm
 
 
-def current_loop(par: Parameters, mean_of: int) -> CurrentLoop:
+def current_loop(par: Parameters, mean_of: int) -> DqCurrentLoop:
     """Gains of the current loops for a rolling mean of `mean_of` samples.
 
     The zero of the controller cancels the winding's pole, which leaves w e^(-s delay) / s; the crossover w follows from
@@ -311,7 +311,7 @@ def current_loop(par: Parameters, mean_of: int) -> CurrentLoop:
     rad/s, 27 times faster than the motor on its spring.
     """
     w = (math.pi / 2 - par.pm_cc) / current_delay(par, mean_of)
-    return CurrentLoop(w * par.L, w * par.R, w)
+    return DqCurrentLoop(w * par.L, w * par.R, w)
 
 
 def force_noise(par: Parameters, x: float | None = None) -> float:
@@ -338,9 +338,9 @@ def electronics(par: Parameters, options: Options | None = None) -> Electronics:
 
     The duty cycles computed in a period act in the next one. The loops know R, L and k, but not that the phases differ.
 
-    options : what the electronics consist of; None: REAL, as in the paper
+    options : what the electronics consist of; None: REAL_ELECTRONICS, as in the paper
     """
-    parts = _Parts(par, REAL if options is None else options)
+    parts = _Electronics(par, REAL_ELECTRONICS if options is None else options)
     o = parts.options
     return Electronics(
         period=1 / par.f_pwm,
@@ -360,7 +360,7 @@ def electronics(par: Parameters, options: Options | None = None) -> Electronics:
 SET_POINTS = (Signal("Id_ref", "A"), Signal("Iq_ref", "A"), Signal("cos_kx", "1"), Signal("sin_kx", "1"))
 
 
-class _Parts(NamedTuple):
+class _Electronics(NamedTuple):
     """The electronics' parameters, and the options of what they consist of."""
 
     par: Parameters
@@ -375,7 +375,7 @@ def _state_sizes(o: Options) -> dict[str, int]:
     return sizes
 
 
-def _references(parts: _Parts, i: Any, y: Any) -> Any:
+def _references(parts: _Electronics, i: Any, y: Any) -> Any:
     """(Id*, Iq*, cos k y, sin k y) of wanted phase currents i at a reading y: constant until the next reading.
 
     Id* and Iq* are the wanted forces over A, and have no angle in them: what is fixed-point is the angle of the loops.
@@ -398,7 +398,7 @@ def fixed_point_angle(par: Parameters, x: Any, bits: int = IQ_BITS) -> Any:
     return _round_half_up(ca.vertcat(ca.cos(2 * math.pi * turns), ca.sin(2 * math.pi * turns)) * one) / one
 
 
-def _start(parts: _Parts, x: Any, i: Any) -> dict[str, Any]:
+def _start(parts: _Electronics, x: Any, i: Any) -> dict[str, Any]:
     """The electronics' state in a steady state at the position x[0] with phase currents i."""
     par, o = parts
     P, n = park(x[0], par.k), o.mean_of
@@ -417,7 +417,7 @@ def _start(parts: _Parts, x: Any, i: Any) -> dict[str, Any]:
 
 
 def _move(
-    parts: _Parts, x: Any, i: Any, state: Mapping[str, Any], held: Any, w: Any, noise: Any
+    parts: _Electronics, x: Any, i: Any, state: Mapping[str, Any], held: Any, w: Any, noise: Any
 ) -> tuple[Any, Any, dict[str, Any]]:
     """One PWM period: (x, i, state) at its end. held: `_references`; w: outer force; noise: of two current samples."""
     par, o = parts
@@ -433,7 +433,7 @@ def _move(
 
 
 def _control_currents(
-    parts: _Parts, i: Any, state: Mapping[str, Any], P: Any, wanted: Any, noise: Any
+    parts: _Electronics, i: Any, state: Mapping[str, Any], P: Any, wanted: Any, noise: Any
 ) -> tuple[Any, Any, Callable[[Any], dict[str, Any]]]:
     """PI control of Id and Iq: phase voltages, whether a sample was out of range, and the state for a limit flag.
 

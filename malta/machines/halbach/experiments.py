@@ -26,13 +26,13 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.machines.halbach import electronics
-from malta.machines.halbach.electronics import IDEAL, IQ_BITS, MEAN_OF, Options, Pwm
-from malta.machines.halbach.open_loop import F_MOST, force, identify, lift_deviation, stairs
+from malta.machines.halbach.electronics import IDEAL_ELECTRONICS, IQ_BITS, MEAN_SAMPLES, Options, Pwm
+from malta.machines.halbach.open_loop import MAX_FORCE, force, identify, lift_deviation, stairs
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
-    QUIET,
-    REAL,
+    AS_BUILT,
+    NO_NOISE,
     Experiment,
     Merit,
     PlannedRun,
@@ -54,7 +54,7 @@ def electronics_options(
 ) -> dict[str, Any]:
     """Options with a record of the electronics; None for those of the paper, as fidelity "force" takes none."""
     found = Options(pwm, adc_steps, adc_noise, mean_of, current_loops)
-    parts = None if found == electronics.REAL else found
+    parts = None if found == electronics.REAL_ELECTRONICS else found
     return {"fidelity": "phase", "electronics": parts} | dict(options)
 
 
@@ -75,16 +75,18 @@ class Source(NamedTuple):
 
 
 SOURCES: Mapping[str, Source] = {
-    "laser": Source(IDEAL, REAL),
-    "current noise": Source(replace(IDEAL, adc_noise=True), QUIET),
-    "current steps": Source(replace(IDEAL, adc_steps=True), QUIET),
-    "PWM": Source(replace(IDEAL, pwm="plain"), QUIET),
-    f"angle of {IQ_BITS} bits": Source(replace(IDEAL, angle_bits=IQ_BITS), QUIET, 0.3e-3),  # exact at x = 0
-    "all": Source(electronics.REAL, REAL),
-    "all, fine PWM": Source(replace(electronics.REAL, pwm="fine"), REAL),
+    "laser": Source(IDEAL_ELECTRONICS, AS_BUILT),
+    "current noise": Source(replace(IDEAL_ELECTRONICS, adc_noise=True), NO_NOISE),
+    "current steps": Source(replace(IDEAL_ELECTRONICS, adc_steps=True), NO_NOISE),
+    "PWM": Source(replace(IDEAL_ELECTRONICS, pwm="plain"), NO_NOISE),
+    f"angle of {IQ_BITS} bits": Source(
+        replace(IDEAL_ELECTRONICS, angle_bits=IQ_BITS), NO_NOISE, 0.3e-3
+    ),  # exact at x = 0
+    "all": Source(electronics.REAL_ELECTRONICS, AS_BUILT),
+    "all, fine PWM": Source(replace(electronics.REAL_ELECTRONICS, pwm="fine"), AS_BUILT),
 }
-LASTING, FIRST = 500, 40  # readings of a run, and the first of them that counts
-ALONG = 7  # places along half a pitch, for current noise alone
+RUN_READINGS, FIRST_READING = 500, 40  # readings of a run, and the first of them that counts
+PLACES_ALONG = 7  # places along half a pitch, for current noise alone
 
 
 def budget(
@@ -100,14 +102,14 @@ def budget(
     The fixed-point angle is not among all: the paper prints no format.
     """
     believed: Any = controller.parameters
-    spots = np.linspace(0, math.pi / believed.k, ALONG)
+    spots = np.linspace(0, math.pi / believed.k, PLACES_ALONG)
     asked = [(name, *source[:2], place + source.aside) for name, source in SOURCES.items()]
     asked += [(f"current noise at {1e3 * x:.1f} mm", *SOURCES["current noise"][:2], float(x)) for x in spots]
     wanted = []
     for label, parts, sensors, x in asked:
         own = {"fidelity": "phase", "electronics": parts} | sensors
         reference = partial(references.hold, x=x)
-        scenario = scenario_of("budget", LASTING * controller.sample_time, reference, own | options)
+        scenario = scenario_of("budget", RUN_READINGS * controller.sample_time, reference, own | options)
         wanted.append(PlannedRun(label, scenario, _rest_merits))
     flown, cut = fly(plant, controller, wanted, progress, options)
     shown, along = flown[: len(SOURCES)], flown[len(SOURCES) :]
@@ -120,7 +122,7 @@ def budget(
 
 def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
     """Rms, mean and peak to peak of the position error after the first readings."""
-    error = (run.p - run.reference)[FIRST:, 0]
+    error = (run.p - run.reference)[FIRST_READING:, 0]
     if len(error) == 0:
         error = np.array([math.nan])
     return (
@@ -131,7 +133,7 @@ def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
 
 
 STEP, COUNT = 100e-6, 20  # m, Fig. 9
-BEFORE, PAUSE, REST = 5, 40, 400  # readings before the steps, between them, after the last
+LEAD_READINGS, PAUSE, REST = 5, 40, 400  # readings before the steps, between them, after the last
 
 
 def step_cases(
@@ -144,7 +146,7 @@ def step_cases(
     pwm: Pwm = "plain",
     adc_noise: bool = True,
     adc_steps: bool = True,
-    mean_of: int = MEAN_OF,
+    mean_of: int = MEAN_SAMPLES,
     current_loops: bool = True,
     **options: Any,
 ) -> list[PlannedRun]:
@@ -154,14 +156,14 @@ def step_cases(
     wanted = []
     for label, taken in (("jumps", 0.0), ("quintics", rise)):
         reference = partial(steps_reference, distance=distance, rise=taken, count=count, Ts=Ts)
-        scenario = scenario_of("step", (BEFORE + PAUSE * count + REST) * Ts, reference, own)
+        scenario = scenario_of("step", (LEAD_READINGS + PAUSE * count + REST) * Ts, reference, own)
         wanted.append(PlannedRun(label, scenario, partial(_step_merits, distance=distance, count=count)))
     return wanted
 
 
 def steps_reference(_: Plant, distance: float, rise: float, count: int, Ts: float) -> Reference:
     """`count` steps of `distance` (m) away from 0 and back, with a rise of `rise` (s); 0: jumps at readings."""
-    begin = (BEFORE + PAUSE * np.arange(count)) * Ts
+    begin = (LEAD_READINGS + PAUSE * np.arange(count)) * Ts
 
     def at(t: FloatArray) -> Motion:
         later = np.asarray(t)[:, None] - begin
@@ -177,10 +179,10 @@ def steps_reference(_: Plant, distance: float, rise: float, count: int, Ts: floa
 
 def responses(run: Trajectory, distance: float, count: int) -> FloatArray:
     """Responses to the steps of `steps_reference`, count x readings: 0 before a step, 1 after, NaN after the run."""
-    wanted = BEFORE + PAUSE * count
+    wanted = LEAD_READINGS + PAUSE * count
     x = np.full(wanted, np.nan)
     x[: min(wanted, len(run.p))] = run.p[:wanted, 0]
-    shares = x[BEFORE:].reshape(count, PAUSE) / distance
+    shares = x[LEAD_READINGS:].reshape(count, PAUSE) / distance
     shares[1::2] = 1 - shares[1::2]
     return shares
 
@@ -194,7 +196,7 @@ def _step_merits(run: Trajectory, distance: float, count: int) -> tuple[Merit, .
         k = int(outside[-1])
         edge = 1 + math.copysign(0.05, mean[k] - 1)
         settled = (k + float((mean[k] - edge) / (mean[k] - mean[k + 1]))) * Ts
-    tail = (run.p - run.reference)[BEFORE + PAUSE * count - PAUSE // 2 :, 0]
+    tail = (run.p - run.reference)[LEAD_READINGS + PAUSE * count - PAUSE // 2 :, 0]
     if len(tail) == 0:
         tail = np.array([math.nan])
     return (
@@ -206,7 +208,7 @@ def _step_merits(run: Trajectory, distance: float, count: int) -> tuple[Merit, .
     )
 
 
-STILL, SETTLING = 20, 2.0  # readings before and after the ramp; s, until the start at full speed has decayed
+REST_READINGS, SETTLING = 20, 2.0  # before and after the ramp; s, until the start at full speed has decayed
 
 
 def ramp_cases(
@@ -218,13 +220,13 @@ def ramp_cases(
     pwm: Pwm = "plain",
     adc_noise: bool = True,
     adc_steps: bool = True,
-    mean_of: int = MEAN_OF,
+    mean_of: int = MEAN_SAMPLES,
     current_loops: bool = True,
     **options: Any,
 ) -> list[PlannedRun]:
     """Through the travel, half of `distance` to either side of the middle, at each of the speeds (m/s)."""
     own = electronics_options(options, pwm, adc_noise, adc_steps, mean_of, current_loops)
-    still, wanted = STILL * controller.sample_time, []
+    still, wanted = REST_READINGS * controller.sample_time, []
     for speed in speeds:
         moving = abs(distance) / speed
         reference = partial(ramp_reference, distance=distance, speed=speed, start=still)
@@ -291,8 +293,8 @@ def check(name: str, option: str, value: Any) -> None:
         raise InputError("simulate", f"{name}: {option}", repr(value), "1 to 1000 steps")
     elif option == "rise":
         references.check_rise(value)
-    elif option == "F_z" and not 0 < value <= F_MOST:
-        raise InputError("simulate", f"{name}: F_z", f"{value:g} N", f"above 0 and at most {F_MOST:g} N")
+    elif option == "F_z" and not 0 < value <= MAX_FORCE:
+        raise InputError("simulate", f"{name}: F_z", f"{value:g} N", f"above 0 and at most {MAX_FORCE:g} N")
     elif option in ("distance", "speeds", "place"):
         values = value if option == "speeds" else (value,)
         if not all(

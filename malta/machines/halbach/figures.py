@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.machines.halbach.experiments import BEFORE, PAUSE, responses
-from malta.machines.halbach.open_loop import AFTER, CALM, FAULTS, LAWS, PRINTED, commanded_lift, lift_force
+from malta.machines.halbach.experiments import LEAD_READINGS, PAUSE, responses
+from malta.machines.halbach.open_loop import FAULTS, LAWS, LEAD, PAPER_NAMES, TAIL, commanded_lift, lift_force
 from malta.report.figures.drawing import (
-    MORE,
+    MORE_STYLES,
     REFERENCE,
     STYLES,
     Published,
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from malta.simulation.experiments import Case, Experiment
     from malta.simulation.trajectory import Trajectory
 
-ASKED: dict[str, Any] = {"color": "#c1440e", "linestyle": (0, (5, 2)), "linewidth": 1.2}
-EACH: dict[str, Any] = {"color": "#b5b5b5", "linewidth": 0.7}
+ASKED_STYLE: dict[str, Any] = {"color": "#c1440e", "linestyle": (0, (5, 2)), "linewidth": 1.2}
+RUN_STYLE: dict[str, Any] = {"color": "#b5b5b5", "linewidth": 0.7}
 
 
 def step_figure(e: Experiment, _: Published | None = None) -> Figure:
@@ -76,16 +76,16 @@ def _draw_steps(axes: Axes, case: Case) -> None:
     run = case.run
     moved = run.scenario.reference(run.plant)(run.t).p[:, 0]
     distance = float(moved[np.abs(moved).argmax()])
-    count = (round(run.scenario.duration / run.controller.sample_time) - BEFORE) // PAUSE
+    count = (round(run.scenario.duration / run.controller.sample_time) - LEAD_READINGS) // PAUSE
     count = min(count, int(np.count_nonzero(np.diff(np.sign(np.abs(moved) - abs(distance) / 2)))))
     shares = responses(run, distance, max(count, 1))
     ms = 1e3 * run.controller.sample_time * np.arange(PAUSE)
     shown = ms < 1200
     for k, share in enumerate(shares):
         named = {"label": "each step"} if k == 0 else {}
-        axes.plot(ms[shown], 1e6 * distance * share[shown], **EACH | named)
+        axes.plot(ms[shown], 1e6 * distance * share[shown], **RUN_STYLE | named)
     axes.plot(ms[shown], 1e6 * distance * shares.mean(axis=0)[shown], label="mean", **STYLES[0])
-    asked = run.reference[BEFORE : BEFORE + PAUSE, 0]
+    asked = run.reference[LEAD_READINGS : LEAD_READINGS + PAUSE, 0]
     axes.plot(ms[shown][: len(asked)], 1e6 * asked[shown[: len(asked)]], label="reference", **REFERENCE)
     finish_axes(axes, "time after the step begins [ms]", f"position, {case.label} [µm]")
 
@@ -120,7 +120,7 @@ def ramp_figure(e: Experiment, _: Published | None = None) -> Figure:
     """Position and error over time; error and vertical force along the travel, by stretches, for each speed. Fig. 8."""
     figure = new_page(runs_of(e), f"ramps{ending_text(e.run)}", merits_phrase(e.cases, 0), hspace=0.42)
     (position, begin), (along, lift) = figure.subplots(2, 2)
-    for n, (case, style) in enumerate(zip(e.cases, cycle((*STYLES, *MORE)), strict=False)):
+    for n, (case, style) in enumerate(zip(e.cases, cycle((*STYLES, *MORE_STYLES)), strict=False)):
         run, aside = case.run, (n - (len(e.cases) - 1) / 2) / (len(e.cases) + 1)
         error, place = 1e6 * (run.p - run.reference)[:, 0], 1e3 * run.reference[:, 0]
         moving = np.diff(run.reference[:, 0], append=run.reference[-1, 0]) != 0
@@ -166,7 +166,7 @@ def force_figure(e: Experiment, published: Published | None = None) -> Figure:
     position = figure.add_subplot(grid[1, 0], sharex=lift)
     for case, style in zip(sound, STYLES, strict=False):
         run = case.run
-        start = run.scenario.duration * CALM / (CALM + AFTER)
+        start = run.scenario.duration * LEAD / (LEAD + TAIL)
         shown = (run.t > start - 0.5) & (run.t < start + 5)
         draw_line(lift, run.t[shown] - start, lift_force(run)[shown], label=case.label, **style)
         draw_line(position, run.t[shown] - start, 1e3 * run.p[shown, 0], **style)
@@ -191,7 +191,7 @@ def _draw_faults(axes: Axes, e: Experiment, published: Published | None) -> None
         mark = {"marker": MARKERS[k], "markersize": 6, "linestyle": "none", "color": style["color"]}
         axes.plot(changes, heights, label=law, **mark)
         if published is not None:
-            value = published_in_unit(published, f"figure_10.{PRINTED[law]}", "percent")
+            value = published_in_unit(published, f"figure_10.{PAPER_NAMES[law]}", "percent")
             axes.axvline(value, color=style["color"], linewidth=0.9, linestyle=style["linestyle"])
     if published is not None:
         axes.plot([], [], color="#5a5a5a", linewidth=0.9, label="lines: published")
@@ -233,8 +233,8 @@ def identify_figure(e: Experiment, _: Published | None = None) -> Figure:
     figure = new_page([run], f"a step of the open loop{ending_text(run)}", micro(text), hspace=0.2)
     position, difference = figure.subplots(2, 1, sharex=True)
     draw_line(position, run.t, 1e3 * run.p[:, 0], label="motor", **STYLES[0])
-    draw_line(position, run.t, 1e3 * linear, label="linear servo, eq. (5)", **ASKED)
-    draw_line(difference, run.t, 1e3 * (linear - run.p[:, 0]), **ASKED)
+    draw_line(position, run.t, 1e3 * linear, label="linear servo, eq. (5)", **ASKED_STYLE)
+    draw_line(difference, run.t, 1e3 * (linear - run.p[:, 0]), **ASKED_STYLE)
     fitted = 1e3 * (e.curves["fitted"] - run.p[:, 0])
     draw_line(difference, run.t, fitted, label="m and b fitted to the laser's readings", **STYLES[1])
     finish_axes(position, "", "position [mm]")

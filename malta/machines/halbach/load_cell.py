@@ -11,7 +11,7 @@ from malta.errors import CheckError, InputError
 from malta.machines.halbach import electronics
 from malta.model.plant import Plant
 
-FEWEST, NORMAL = 8, 1.96  # readings; standard deviations of an interval of 95 %
+MIN_READINGS, SIGMAS = 8, 1.96  # readings; standard deviations of an interval of 95 %
 TURNS = 500  # pitches in a record, at most
 TURN = np.exp(2j * np.pi / 3)  # from a phase to the next
 # The simulated record: places 0.25 mm apart, the currents of Fig. 2, and our assumption of the cell's noise.
@@ -57,9 +57,11 @@ def fit_motor_law(x: FloatArray, i: FloatArray, F: FloatArray) -> MotorFit:
     from scipy.optimize import minimize_scalar
 
     x, F = np.ravel(np.asarray(x, dtype=float)), np.asarray(F, dtype=float)
-    if len(x) < FEWEST or F.shape != (len(x), 2) or np.shape(i) not in ((3,), (len(x), 3)):
+    if len(x) < MIN_READINGS or F.shape != (len(x), 2) or np.shape(i) not in ((3,), (len(x), 3)):
         found = f"{len(x)} places, currents {np.shape(i)}, forces {F.shape}"
-        raise InputError("fit_motor_law", "x, i, F", found, f"n >= {FEWEST} places, (3,) or (n, 3), (n, 2)")
+        raise InputError(
+            "fit_motor_law", "x, i, F", found, f"n >= {MIN_READINGS} places, (3,) or (n, 3), (n, 2)"
+        )
     force, current = F @ [1, 1j], np.asarray(i) @ [1, 1 / TURN, TURN] * np.ones(len(x))
     middle, span = x.mean(), np.ptp(x)
     if not (np.isfinite([*x, *force, *current]).all() and span > 0 and np.abs(current).any()):
@@ -86,7 +88,7 @@ def fit_motor_law(x: FloatArray, i: FloatArray, F: FloatArray) -> MotorFit:
         raise CheckError(f"fit_motor_law: no motor law explains half of the record of {len(x)} places")
     sigma = np.sqrt(left / (2 * len(x) - 3))
     around = x - np.average(x, weights=power)
-    A_half, k_half = NORMAL * sigma / np.sqrt(energy), NORMAL * sigma / np.sqrt(power @ around**2)
+    A_half, k_half = SIGMAS * sigma / np.sqrt(energy), SIGMAS * sigma / np.sqrt(power @ around**2)
     pitch = 2 * np.pi / k
     rms = float(np.sqrt(left / 2 / len(x)))
     pitch_half, origin = pitch / k * k_half, middle - phase / k

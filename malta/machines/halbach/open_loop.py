@@ -16,12 +16,12 @@ from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.linear.sampling import sample
 from malta.machines.halbach import electronics, electronics as motor
-from malta.machines.halbach.electronics import IDEAL, Options, Pwm
-from malta.machines.halbach.load_cell import FEWEST, NORMAL, MotorFit, fit_motor_law, simulated_record
+from malta.machines.halbach.electronics import IDEAL_ELECTRONICS, Options, Pwm
+from malta.machines.halbach.load_cell import MIN_READINGS, SIGMAS, MotorFit, fit_motor_law, simulated_record
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
-    QUIET,
+    NO_NOISE,
     Experiment,
     Merit,
     PlannedRun,
@@ -55,8 +55,8 @@ def lift_force(run: Trajectory) -> FloatArray:
 
 
 MOVE = 5e-3  # m
-CALM, AFTER = 100, 120  # readings before a move, and from its beginning to the end
-FASTER = 50  # control periods of the open loop in a period of the laser
+LEAD, TAIL = 100, 120  # readings before a move, and from its beginning to the end
+SAMPLES_PER_READING = 50  # control periods of the open loop in a period of the laser
 FAULTS: Mapping[str, Mapping[str, float]] = {  # that may explain the paper: angle in rad, outer force in N
     "sound": {},
     "windings x 0.9, 0.9, 1.25": {"r_a": 0.9, "r_b": 0.9, "r_c": 1.25},
@@ -69,7 +69,9 @@ LAWS: Mapping[str, tuple[bool, bool]] = {  # feedback of the position, of the cu
     "position control": (True, False),
     "vector control": (True, True),
 }
-PRINTED = dict(zip(LAWS, ("open_loop", "position_controller", "vector_control"), strict=True))  # figure_10
+PAPER_NAMES = dict(
+    zip(LAWS, ("open_loop", "position_controller", "vector_control"), strict=True)
+)  # figure_10
 
 
 def force(
@@ -115,24 +117,24 @@ def _flight(
 ) -> tuple[Plant, Controller, PlannedRun]:
     """One run of `force`: the machine with a fault, its controller, and the scenario.
 
-    The open loop has no feedback from the laser, so its controller runs FASTER times as often.
+    The open loop has no feedback from the laser, so its controller runs SAMPLES_PER_READING times as often.
     """
     par: Any = plant.parameters
     (position, vector), faulty = LAWS[law], dict(FAULTS[fault])
     angle, push = faulty.pop("angle", 0.0), faulty.pop("push", 0.0)
     machine = plant.variant(replace(par, **faulty)) if faulty else plant
-    begin, end = CALM * controller.sample_time, (CALM + AFTER) * controller.sample_time
+    begin, end = LEAD * controller.sample_time, (LEAD + TAIL) * controller.sample_time
     own: dict[str, Any] = {"fidelity": "phase"} | dict(options)
-    own["electronics"] = replace(own["electronics"] or electronics.REAL, current_loops=vector)
+    own["electronics"] = replace(own["electronics"] or electronics.REAL_ELECTRONICS, current_loops=vector)
     if not position:
-        controller = replace(controller, sample_time=controller.sample_time / FASTER)
+        controller = replace(controller, sample_time=controller.sample_time / SAMPLES_PER_READING)
         own |= {"open_loop": True, "delay": 0}
     if angle and position:  # the open loop takes the angle from the reference
         own["sensor_errors"] = {"offset_x": angle / par.k}
     if push:
         own["disturbance"] = partial(constant_force, size=push)
     reference = partial(move_reference, distance=distance, rise=rise if position else 0.0, begin=begin)
-    printed = f"figure_10.{PRINTED[law]}" if fault == "sound" and distance == MOVE else ""
+    printed = f"figure_10.{PAPER_NAMES[law]}" if fault == "sound" and distance == MOVE else ""
     merits = partial(_move_merits, begin=begin, printed=printed)
     label = law if fault == "sound" else f"{law}, {fault}"
     return machine, controller, PlannedRun(label, scenario_of("force", end, reference, own), merits)
@@ -198,9 +200,9 @@ def stairs(
     wanted = []
     for law in ("open loop", "position control"):
         for pwm, name in PWMS.items():
-            parts = replace(IDEAL, pwm=pwm, current_loops=False)
+            parts = replace(IDEAL_ELECTRONICS, pwm=pwm, current_loops=False)
             own = {"fidelity": "phase", "electronics": parts, "open_loop": law == "open loop"}
-            scenario = scenario_of("stairs", LEVELS * STAY * Ts, reference, QUIET | own | options)
+            scenario = scenario_of("stairs", LEVELS * STAY * Ts, reference, NO_NOISE | own | options)
             wanted.append(PlannedRun(f"{law}, {name}", scenario, merits))
     cases, cut = fly(plant, controller, wanted, progress, options)
     believed: Any = controller.parameters
@@ -241,15 +243,15 @@ def _stairs_merits(run: Trajectory, distance: float) -> tuple[Merit, ...]:
     )
 
 
-IDENTIFIED, LASTS = 2e-3, 6.0  # m, s: step and duration of the identification
-F_MOST = 1e4  # N, largest F_z to ask for: far beyond any supply, far from the largest float
+IDENTIFICATION_STEP, IDENTIFICATION_TIME = 2e-3, 6.0  # m, s: step and duration of the identification
+MAX_FORCE = 1e4  # N, largest F_z to ask for: far beyond any supply, far from the largest float
 
 
 def identify(
     plant: Plant,
     controller: Controller,
     *,
-    distance: float = IDENTIFIED,
+    distance: float = IDENTIFICATION_STEP,
     F_z: float = 1.0,
     progress: Progress | None = None,
     **options: Any,
@@ -261,19 +263,19 @@ def identify(
     """
     par: Any = plant.parameters
     believed: Any = controller.parameters
-    fast = controller.sample_time / FASTER
+    fast = controller.sample_time / SAMPLES_PER_READING
     commanding = replace(controller, sample_time=fast, parameters=replace(believed, F_z=F_z))
     own = {
         "fidelity": "phase",
-        "electronics": replace(IDEAL, current_loops=False),
+        "electronics": replace(IDEAL_ELECTRONICS, current_loops=False),
         "open_loop": True,
         "delay": 0,
     }
     scenario = scenario_of(
         "identify",
-        LASTS,
+        IDENTIFICATION_TIME,
         partial(move_reference, distance=distance, rise=0.0, begin=0.0),
-        QUIET | own | options,
+        NO_NOISE | own | options,
     )
     wanted = PlannedRun("motor", replace(scenario, start={"x": 0.0}), lambda _: ())
     (case,), cut = fly(plant, commanding, [wanted], progress, options)
@@ -323,7 +325,7 @@ def identify(
 def _fit_to_readings(run: Trajectory, distance: float, K: float) -> ServoFit:
     """The servo fitted to what the laser reads of a run; NaN where none fits, as of a run that ended early."""
     try:
-        return fit_servo(run.t[::FASTER], run.y[::FASTER, 0], distance, K)
+        return fit_servo(run.t[::SAMPLES_PER_READING], run.y[::SAMPLES_PER_READING, 0], distance, K)
     except (CheckError, InputError):
         return ServoFit(*[math.nan] * 5)
 
@@ -368,9 +370,9 @@ def fit_servo(t: FloatArray, x: FloatArray, distance: float, K: float) -> ServoF
     """
     from scipy.optimize import least_squares
 
-    if len(t) < FEWEST or len(t) != len(x):
+    if len(t) < MIN_READINGS or len(t) != len(x):
         raise InputError(
-            "fit_servo", "x", f"{len(x)} readings at {len(t)} times", f"{FEWEST} or more, of one each"
+            "fit_servo", "x", f"{len(x)} readings at {len(t)} times", f"{MIN_READINGS} or more, of one each"
         )
     if not (np.isfinite([*t, *x, distance, K]).all() and distance and K > 0):
         raise InputError("fit_servo", "t, x, distance, K", "NaN or infinity", "finite numbers, K above 0")
@@ -387,7 +389,7 @@ def fit_servo(t: FloatArray, x: FloatArray, distance: float, K: float) -> ServoF
     if not (found.success and period < t[-1] - t[0]):
         raise CheckError(f"fit_servo: no servo of {K:g} N/m fits the record of {t[-1] - t[0]:g} s")
     lags = int(np.ceil(period / (t[1] - t[0])))
-    shares = NORMAL * np.sqrt(_variances(np.asarray(found.jac), found.fun, lags))
+    shares = SIGMAS * np.sqrt(_variances(np.asarray(found.jac), found.fun, lags))
     rest = abs(distance) * rms(found.fun)
     return ServoFit(float(m), float(m * shares[0]), float(b), float(b * shares[1]), rest)
 

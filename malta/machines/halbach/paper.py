@@ -12,13 +12,13 @@ import numpy as np
 
 from malta.files import shipped_path
 from malta.machines.halbach import electronics
-from malta.machines.halbach.electronics import MEAN_OF
+from malta.machines.halbach.electronics import MEAN_SAMPLES
 from malta.machines.halbach.experiments import COUNT, PAUSE, STEP, responses
 from malta.machines.halbach.open_loop import (
     FAULTS,
     LAWS,
     MOVE,
-    PRINTED,
+    PAPER_NAMES,
     move_reference,
     positions_at_rest,
     sound_moves,
@@ -42,7 +42,7 @@ EXPERIMENT_NAMES = ("step", "stairs", "ramp", "force", "budget", "identify")
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class HalbachEvidence:
     """A design, its margins and its experiments, beside the published figures."""
 
     spec: Spec
@@ -64,15 +64,15 @@ class Evidence:
         return published_value(self.published, key)
 
 
-def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
+def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> HalbachEvidence:
     """Design a controller, prove its margins and run all experiments; the moves of `force` quicker as well."""
     found = run_design(spec, EXPERIMENT_NAMES, progress)
     rise = rise_of_dip(spec.plant, published_value(published, "figure_10.open_loop"))
     experiments = found.experiments | {"quick": sound_moves(spec.plant, found.controller, rise)}
-    return Evidence(spec, published, found.model, found.controller, found.margins, experiments)
+    return HalbachEvidence(spec, published, found.model, found.controller, found.margins, experiments)
 
 
-def figure_2(e: Evidence) -> tuple[float, float]:
+def figure_2(e: HalbachEvidence) -> tuple[float, float]:
     """Amplitude of the forces along a pitch at the currents of Fig. 2, N, and their phase difference, rad."""
     i = np.array([e.value(f"figure_2.I_{phase}") for phase in "abc"])
     places = np.arange(360) / 360 * 2 * math.pi / e.par.k
@@ -81,33 +81,33 @@ def figure_2(e: Evidence) -> tuple[float, float]:
     return float(np.abs(waves).max()), abs(float(np.angle(waves[1] / waves[0])))
 
 
-def sampled_pole(e: Evidence) -> float:
+def sampled_pole(e: HalbachEvidence) -> float:
     """The smaller pole of the motor over the time between readings, with the Park angle constant."""
     Ad = sampled_model(e.model, e.par.T_laser)[0]
     return float(min(np.linalg.eigvals(Ad).real))
 
 
-def current_for_step(e: Evidence) -> float:
+def current_for_step(e: HalbachEvidence) -> float:
     """Largest change of a phase current for the paper's example of a displacement, A."""
     step, F_z = e.value("sensitivity.displacement"), e.value("sensitivity.F_z")
     i = [np.array(electronics.phase_currents(e.par, x, 0, F_z)) for x in (0.0, step)]
     return float(np.abs(i[1] - i[0]).max())
 
 
-def pwm_step_of(pwm: electronics.Pwm) -> Callable[[Evidence], float]:
+def pwm_step_of(pwm: electronics.Pwm) -> Callable[[HalbachEvidence], float]:
     """A function of the evidence: the step of a phase voltage, V."""
     return lambda e: float(electronics.pwm_step(e.par, pwm))
 
 
-def duty(e: Evidence, sign: int) -> float:
+def duty(e: HalbachEvidence, sign: int) -> float:
     """Duty cycle at the paper's example of a current, or at its negative."""
     return float(electronics.duty_cycles(e.par, e.par.R * sign * e.value("pwm.current")))
 
 
-def duty_of(end: Callable[[FloatArray], Any]) -> Callable[[Evidence], float]:
+def duty_of(end: Callable[[FloatArray], Any]) -> Callable[[HalbachEvidence], float]:
     """A function of the evidence: the least or greatest duty cycle of the half-bridges along a pitch at rest."""
 
-    def duty_at_force(e: Evidence) -> float:
+    def duty_at_force(e: HalbachEvidence) -> float:
         places = np.linspace(0, 2 * math.pi / e.par.k, 361)
         V = [e.par.R * electronics.phase_currents(e.par, x, 0, e.par.F_z) for x in places]
         return float(end(np.array([np.array(electronics.duty_cycles(e.par, v)).ravel() for v in V])))
@@ -115,17 +115,17 @@ def duty_of(end: Callable[[FloatArray], Any]) -> Callable[[Evidence], float]:
     return duty_at_force
 
 
-def bits_of_mean(e: Evidence) -> float:
+def bits_of_mean(e: HalbachEvidence) -> float:
     """Bits that the rolling mean adds to a current sample: log2 of the errors' ratio, over the printed range."""
     rng, most = np.random.default_rng(0), e.value("pwm.current")
     i = rng.uniform(-most, most, (4000, 1))
-    noisy = i + e.par.s_adc * rng.standard_normal((len(i), electronics.MEAN_OF))
+    noisy = i + e.par.s_adc * rng.standard_normal((len(i), electronics.MEAN_SAMPLES))
     codes = np.array(electronics.sample_current(e.par, noisy, steps=True)[0])
     error = codes * electronics.adc_step(e.par) - e.par.I_adc - i
     return math.log2(float(error.std() / error.mean(axis=1).std()))
 
 
-def samples_of_range(e: Evidence) -> float:
+def samples_of_range(e: HalbachEvidence) -> float:
     """The number of samples whose range is the printed one, on average."""
     wanted, low, high = e.value("current_sampling.range"), 2, 100_000
     while high - low > 1:
@@ -134,25 +134,25 @@ def samples_of_range(e: Evidence) -> float:
     return float(high)
 
 
-def rest_in_dead_ends(dead_ends: int, e: Evidence) -> float:
+def rest_in_dead_ends(dead_ends: int, e: HalbachEvidence) -> float:
     """Largest error of the resting place at DEAD_FORCE with high-resolution PWM, m."""
     places = np.linspace(0, math.pi / 3 / e.par.k, 1001)  # a sixth of a pitch: the phases take turns
     found = electronics.resting_positions(e.par, places, DEAD_FORCE, "fine", dead_ends)
     return float(np.abs(found - places).max())
 
 
-def first_stair(e: Evidence) -> float:
+def first_stair(e: HalbachEvidence) -> float:
     """Position on the first stair in the open loop with plain PWM, m."""
     return float(positions_at_rest(e.experiments["stairs"].cases[0].run)[0][1])
 
 
-def ramp_distance(e: Evidence) -> float:
+def ramp_distance(e: HalbachEvidence) -> float:
     """Distance of the first ramp, m."""
     run = e.experiments["ramp"].run
     return float(run.p[-1, 0] - run.p[0, 0])
 
 
-def mean_step(e: Evidence) -> float:
+def mean_step(e: HalbachEvidence) -> float:
     """Mean motion from a second after a jump of the reference, m."""
     return STEP * float(responses(e.experiments["step"].run, STEP, COUNT)[:, PAUSE // 2 :].mean())
 
@@ -189,12 +189,12 @@ def open_loop_dip(plant: Plant, rise: float) -> float:
     return least - 1
 
 
-def share_of_error(source: str, e: Evidence) -> float:
+def share_of_error(source: str, e: HalbachEvidence) -> float:
     """The error at rest by one source of noise over that by all, rms."""
     return case_merit("budget", source, "position, rms", e) / case_merit("budget", "all", "position, rms", e)
 
 
-def vector_over_position(e: Evidence) -> float:
+def vector_over_position(e: HalbachEvidence) -> float:
     """Largest change of the vertical force in the quicker move: under vector control over position control."""
     vector, position = (
         case_merit("quick", law, "highest", e) for law in ("vector control", "position control")
@@ -202,7 +202,7 @@ def vector_over_position(e: Evidence) -> float:
     return vector / position
 
 
-def largest_lift_change(fault: str, e: Evidence) -> float:
+def largest_lift_change(fault: str, e: HalbachEvidence) -> float:
     """Largest change of the vertical force with a fault, over the three laws, as a share."""
     return max(abs(case_merit("force", f"{law}, {fault}", 0, e)) for law in LAWS)
 
@@ -308,14 +308,14 @@ ELECTRONICS: tuple[Row, ...] = (
     Row(
         "current sensor: noise after the rolling mean",
         "{:.1f} mA",
-        lambda e: e.par.s_adc / math.sqrt(MEAN_OF),
+        lambda e: e.par.s_adc / math.sqrt(MEAN_SAMPLES),
         "current_sampling.noise_of_mean",
         why=MEAN,
     ),
     Row(
-        f"current sensor: range of {MEAN_OF} samples",
+        f"current sensor: range of {MEAN_SAMPLES} samples",
         "{:.2f} A",
-        lambda e: electronics.expected_range(e.par, MEAN_OF),
+        lambda e: electronics.expected_range(e.par, MEAN_SAMPLES),
         "current_sampling.range",
         why="the paper does not say how many samples: as many as its mean takes are our reading",
     ),
@@ -361,7 +361,7 @@ ELECTRONICS: tuple[Row, ...] = (
 )
 
 
-TEN = "ten times too large: it goes as the step of the voltage, 15 µm × 26.2 µV / 5.86 mV"
+TENFOLD = "ten times too large: it goes as the step of the voltage, 15 µm × 26.2 µV / 5.86 mV"
 OPEN_LOOP: tuple[Row, ...] = (
     Row(
         "smallest motion, plain PWM",
@@ -374,7 +374,7 @@ OPEN_LOOP: tuple[Row, ...] = (
         "{:.3f} um",
         partial(merit, "stairs", "longest dead zone, high-resolution PWM"),
         "open_loop.smallest_motion_fine",
-        why=TEN,
+        why=TENFOLD,
     ),
     Row(
         "Fig. 7a: second stair of 10 µm",
@@ -388,8 +388,10 @@ OPEN_LOOP: tuple[Row, ...] = (
 )
 
 
-MAIN = "one of “the two main contributors”, read as a tenth of the rms at least; each run has its own noise"
-FEW = "the laser reads 0.12 µm rms wrong, which no loop here enlarges; the current sensors' noise is a force"
+SHARE = "one of “the two main contributors”, read as a tenth of the rms at least; each run has its own noise"
+LASER = (
+    "the laser reads 0.12 µm rms wrong, which no loop here enlarges; the current sensors' noise is a force"
+)
 JUMP = "no set-point weight: a jump of the reference enters the proportional part"
 CLOSED_LOOP: tuple[Row, ...] = (
     *(
@@ -457,7 +459,7 @@ CLOSED_LOOP: tuple[Row, ...] = (
         )
     ),
     *(
-        Row(f"noise of {name} alone, of all", "{:.0f} percent", share, 0.1, "at least", note=MAIN, why=FEW)
+        Row(f"noise of {name} alone, of all", "{:.0f} percent", share, 0.1, "at least", note=SHARE, why=LASER)
         for name, share in (
             ("the laser", partial(share_of_error, "laser")),
             ("the current sensors", partial(share_of_error, "current noise")),
@@ -486,7 +488,7 @@ CLOSED_LOOP: tuple[Row, ...] = (
 )
 
 
-WHY = "no steady change follows from the motor law, and no fault below has both signs and 0 under vector control"
+CAUSE = "no steady change follows from the motor law, and no fault below has both signs and 0 under vector control"
 TRANSIENT = "largest change on the way, of the sign that the paper prints"
 LIFT: tuple[Row, ...] = (
     *(
@@ -494,8 +496,8 @@ LIFT: tuple[Row, ...] = (
             f"Fig. 10: {law}, steady change",
             "{:.2f} percent",
             partial(case_merit, "force", law, 0),
-            f"figure_10.{PRINTED[law]}",
-            why=WHY,
+            f"figure_10.{PAPER_NAMES[law]}",
+            why=CAUSE,
         )
         for law in ("open loop", "position control")
     ),
@@ -561,23 +563,23 @@ def _lift() -> list[Row]:
     return found
 
 
-READ = "the laser's readings of a simulated record with K known, as Sec. 2.3 does"
+LASER_K = "the laser's readings of a simulated record with K known, as Sec. 2.3 does"
 CELL = "a simulated record of a load cell along 50 mm with noise of 5 mN, as Sec. 2.1 does"
 LINE = "(5) is a line where the motor has a sine, which costs 2 %"
-WHITE = "white noise of the cell, within the interval below"
-CORRELATED = "residuals that are correlated over a period, of a K that is taken as exact"
+NOISE = "white noise of the cell, within the interval below"
+RESIDUALS = "residuals that are correlated over a period, of a K that is taken as exact"
 
 
-def _fitted() -> list[Row]:
+def _fitted_rows() -> list[Row]:
     """Rows of the constants as the paper identified them; their printed figures stand in the machine's data."""
     printed: Any = read(shipped_path("data", "halbach.toml"))
     found: list[Row] = []
     for text, label, shown, value, source, why, interval in (
-        ("step of 2 mm: mass", "mass, fitted", "{:.2f} kg", printed.m, READ, LINE, CORRELATED),
-        ("step of 2 mm: friction", "friction, fitted", "{:.2f} N s/m", printed.b, READ, LINE, CORRELATED),
-        ("load cell: A", "load cell: A", "{:.4f} N/A", printed.A, CELL, WHITE, "white noise of the cell"),
-        ("load cell: k", "load cell: k", "{:.4f} rad/m", printed.k, CELL, WHITE, "white noise of the cell"),
-        ("load cell: l", "load cell: l", "{:.3f} mm", "motor.pitch", CELL, WHITE, "white noise of the cell"),
+        ("step of 2 mm: mass", "mass, fitted", "{:.2f} kg", printed.m, LASER_K, LINE, RESIDUALS),
+        ("step of 2 mm: friction", "friction, fitted", "{:.2f} N s/m", printed.b, LASER_K, LINE, RESIDUALS),
+        ("load cell: A", "load cell: A", "{:.4f} N/A", printed.A, CELL, NOISE, "white noise of the cell"),
+        ("load cell: k", "load cell: k", "{:.4f} rad/m", printed.k, CELL, NOISE, "white noise of the cell"),
+        ("load cell: l", "load cell: l", "{:.3f} mm", "motor.pitch", CELL, NOISE, "white noise of the cell"),
     ):
         half = f"{label.removesuffix(', fitted')}, half of its interval"
         note = f"fitted to {source}; the record's motor has the printed figure"
@@ -603,5 +605,5 @@ def _fitted() -> list[Row]:
 
 def rows() -> list[Row]:
     """All claims of the paper, in the order of the ledger."""
-    motor = [row._replace(of_machine=True) for row in (*MOTOR, *_fitted(), *ELECTRONICS, *OPEN_LOOP)]
+    motor = [row._replace(of_machine=True) for row in (*MOTOR, *_fitted_rows(), *ELECTRONICS, *OPEN_LOOP)]
     return [*motor, *CLOSED_LOOP, *LIFT, *_lift()]

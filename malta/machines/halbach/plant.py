@@ -25,7 +25,7 @@ from functools import partial
 import casadi as ca
 
 from malta.machines.halbach.electronics import (
-    MEAN_OF,
+    MEAN_SAMPLES,
     current_delay,
     current_loop,
     electronics,
@@ -67,10 +67,10 @@ def plant(par: Parameters) -> Plant:
             voltage_limit=par.V_dc / 2,
             R=par.R,
             L=par.L,
-            crossover=current_loop(par, MEAN_OF).crossover,
+            crossover=current_loop(par, MEAN_SAMPLES).crossover,
             phase_margin=par.pm_cc,
             sample_time=1 / par.f_pwm,
-            loop_delay=current_delay(par, MEAN_OF),
+            loop_delay=current_delay(par, MEAN_SAMPLES),
             dead_time=(par.latency + 0.5) * par.T_laser,
             currents=lambda y, v: phase_currents(par, y[0], v[0], par.F_z),
             forces=lambda x, i: forces(par, x[0], i)[0],

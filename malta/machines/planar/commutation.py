@@ -20,19 +20,19 @@ from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError
 from malta.machines.planar.field import (
     CoilModel,
+    CoilShape,
+    FieldTable,
     Series,
-    Shape,
-    Table,
     controller_model,
     model_of_order,
     shape_of,
     simulation_model,
 )
 from malta.machines.planar.parameters import Parameters
-from malta.model.equations import Equation, note, recorded_equations, recording, rotation
+from malta.model.equations import Equation, is_recording, note, recorded_equations, rotation
 
 STEPS = (-1.5, -0.5, 0.5, 1.5)  # coil pitches from the mover's centre, along x and y
-WORST = 10.0  # largest accepted condition of K(p): 2.4 with a pitch of 16/3 tau_n, 20 and more with a bad one
+MAX_CONDITION = 10.0  # of K(p): 2.4 with a pitch of 16/3 tau_n, 20 and more with a bad one
 
 
 # Parameters of K(p) that harmonics do not depend on.
@@ -44,14 +44,14 @@ def factors_of(par: Parameters) -> Any:
     return ca.vertcat(*(getattr(par, name) for name in _FACTORS))
 
 
-def _symbols(shape: Shape) -> tuple[Any, Any]:
+def _symbols(shape: CoilShape) -> tuple[Any, Any]:
     """Parameters of this shape with symbols for all of _FACTORS, and the column of these symbols."""
     symbols = {name: ca.SX.sym(name) for name in _FACTORS}
     return SimpleNamespace(**shape._asdict() | symbols), ca.vertcat(*symbols.values())
 
 
 @lru_cache(maxsize=8)  # a third of a second, for all parameters of a shape
-def forces_function(shape: Shape) -> ca.Function:
+def forces_function(shape: CoilShape) -> ca.Function:
     """(x, i, factors) -> W: the wrench of coil currents on the mover in the state x, tilt included."""
     par, factors = _symbols(shape)
     x, i = ca.SX.sym("x", 12), ca.SX.sym("i", 16)
@@ -60,7 +60,7 @@ def forces_function(shape: Shape) -> ca.Function:
 
 
 @lru_cache(maxsize=8)
-def _currents_function(shape: Shape, order: int) -> ca.Function:
+def _currents_function(shape: CoilShape, order: int) -> ca.Function:
     """(y, W, factors) -> i: coil currents of least loss for a wrench, by a coil model without a table."""
     par, factors = _symbols(shape)
     y, W = ca.SX.sym("y", 6), ca.SX.sym("W", 6)
@@ -69,7 +69,7 @@ def _currents_function(shape: Shape, order: int) -> ca.Function:
 
 
 @lru_cache(maxsize=8)
-def _noted_currents(shape: Shape, order: int) -> tuple[ca.Function, tuple[Equation, ...]]:
+def _noted_currents(shape: CoilShape, order: int) -> tuple[ca.Function, tuple[Equation, ...]]:
     """The same with all results of its equations: (y, W, factors) -> i and these; the equations."""
     par, factors = _symbols(shape)
     y, W = ca.SX.sym("y", 6), ca.SX.sym("W", 6)
@@ -101,7 +101,7 @@ def current_law(par: Parameters, *, numbers: bool) -> Callable[[Any, Any], Any]:
     if not par.cells:
 
         def by_function(y: Any, W: Any) -> Any:
-            if isinstance(W, ca.SX) and recording():
+            if isinstance(W, ca.SX) and is_recording():
                 return _noting_currents(par, y, W)
             return _currents_function(shape_of(par), int(par.order))(y, W, factors_of(par))
 
@@ -225,7 +225,7 @@ def check_position(par: Parameters, p: FloatArray) -> FloatArray:
     return p
 
 
-def conditioning(par: Parameters, model: CoilModel, n: int = 12) -> FloatArray:
+def condition_numbers(par: Parameters, model: CoilModel, n: int = 12) -> FloatArray:
     """Condition numbers of K(p) over a period in x and y, n x n, infinite where K is singular.
 
     Torques are divided by the mover's radius of gyration, sqrt(I_x / m), so that accelerations are compared.
@@ -243,15 +243,15 @@ def conditioning(par: Parameters, model: CoilModel, n: int = 12) -> FloatArray:
 def check_pitch(par: Parameters, model: CoilModel) -> float:
     """The worst condition of K(p) over a period.
 
-    Raises CheckError if it is above WORST: then the coils cannot give every wrench at every position.
+    Raises CheckError if it is above MAX_CONDITION: then the coils cannot give every wrench at every position.
     """
-    worst = float(conditioning(par, model).max())
-    if not worst <= WORST:
+    worst = float(condition_numbers(par, model).max())
+    if not worst <= MAX_CONDITION:
         ratio = par.coil_pitch / par.tau_n
         found = "is singular" if worst == np.inf else f"has a condition of {worst:.3g}"
         raise CheckError(
             f"planar: with a coil pitch of {par.coil_pitch:.6g} m = {ratio:.4g} tau_n, K(p) {found}, allowed is"
-            f" {WORST:g}: the coils' phases do not give forces and torques in every direction at every position"
+            f" {MAX_CONDITION:g}: the coils' phases do not give forces and torques in every direction at every position"
         )
     return worst
 
@@ -261,7 +261,7 @@ def decoupling(par: Parameters, model: CoilModel) -> ca.Function:
 
     A function of SX symbols, or of MX with a Table. It does not check the position: it has no branch and no exception.
     """
-    if isinstance(model, Table):
+    if isinstance(model, FieldTable):
         P, N = ca.MX.sym("p", 3), ca.MX.sym("W", 6)
         K, V = ca.SX.sym("K", 6, 16), ca.SX.sym("W", 6)
         solve = ca.Function("solve", [K, V], [ca.cse(currents(K, V))])

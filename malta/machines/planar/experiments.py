@@ -178,7 +178,7 @@ def timing(
     merits = (
         Merit("table, numpy", plain, "us", "table_2.interpolation", "at most"),
         *(
-            Merit(f"{name}, compiled", seconds, "us", f"table_2.{PRINTED[name]}", "at most")
+            Merit(f"{name}, compiled", seconds, "us", f"table_2.{PRINTED_MODELS[name]}", "at most")
             for name, seconds in compiled.items()
         ),
         Merit("whole step by the table, compiled", whole, "us"),
@@ -199,7 +199,7 @@ def step_function(plant: Plant, controller: Controller, scenario: Scenario) -> c
 
 
 # The paper's names of the coil models; its exact one is FEM, point by point.
-PRINTED = {"table": "interpolation", "analytical": "analytical", "exact": "interpolation"}
+PRINTED_MODELS = {"table": "interpolation", "analytical": "analytical", "exact": "interpolation"}
 
 
 def _no_merits(_: Trajectory) -> tuple[Merit, ...]:
@@ -234,7 +234,7 @@ def compile_function(f: ca.Function) -> Callable[..., tuple[float, FloatArray]] 
     generator.add(f)
     sizes = {"ARG": f.sz_arg(), "RES": f.sz_res(), "IW": f.sz_iw(), "W": f.sz_w()}
     defines = "".join(f"#define SZ_{name} {size + 1}\n" for name, size in sizes.items())
-    library = engine.library(generator.dump() + defines + _TIMED.replace("FUNCTION", f.name()), 1)
+    library = engine.library(generator.dump() + defines + _TIMED_CODE.replace("FUNCTION", f.name()), 1)
     if library is None:
         return None
     timed = library.timed
@@ -250,7 +250,7 @@ def compile_function(f: ca.Function) -> Callable[..., tuple[float, FloatArray]] 
     return call
 
 
-_TIMED = """
+_TIMED_CODE = """
 #include <time.h>
 double timed(const double **given, int n, double *result, int calls) {
   static const double *arg[SZ_ARG]; static double *res[SZ_RES]; static casadi_int iw[SZ_IW]; static double w[SZ_W];

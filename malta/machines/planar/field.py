@@ -32,7 +32,7 @@ ODD_X = (1, 0, 0, 0, 1, 1)
 ODD_Y = (0, 1, 0, 1, 0, 1)
 
 
-class Shape(NamedTuple):
+class CoilShape(NamedTuple):
     """The parameters that harmonics are computed from; turns and remanence are 1, as they are factors of the wrench."""
 
     tau_n: float
@@ -60,7 +60,7 @@ class Modes(NamedTuple):
         return self.k * np.hypot(self.m, self.n)
 
 
-def modes(par: Parameters | Shape, order: int = ORDER) -> Modes:
+def modes(par: Parameters | CoilShape, order: int = ORDER) -> Modes:
     """Harmonics up to `order` in x and in y.
 
     Along x' and y' every kind of block is a product of two alternating square waves, of harmonics a, b = 1, 3, 5, ...:
@@ -116,7 +116,7 @@ class Winding(NamedTuple):
     j_y: FloatArray
 
 
-def winding(par: Parameters | Shape, *, rectangles: bool = False, nodes: int = 64) -> Winding:
+def winding(par: Parameters | CoilShape, *, rectangles: bool = False, nodes: int = 64) -> Winding:
     """A coil of uniform current density: four legs and four round corners of inner radius r_c, l_c between axes.
 
     rectangles: the four l_c x w_c rectangles of (23) and (24), which overlap at the corners.
@@ -149,7 +149,7 @@ def _gauss(nodes: int) -> tuple[FloatArray, FloatArray]:
     return x / 2, w / 2
 
 
-def centre_of_force(par: Parameters | Shape) -> float:
+def centre_of_force(par: Parameters | CoilShape) -> float:
     """Height of the centre of the fundamental's force above a coil's lower face, m: the reference of r_z."""
     k = math.pi / par.tau_n
     return 1 / k - par.h_c / math.expm1(k * par.h_c)
@@ -274,12 +274,12 @@ def _multiples(angle: Any, order: int) -> list[tuple[Any, Any]]:
 
 
 @lru_cache(maxsize=8)
-def unit_series(shape: Shape, order: int) -> Series:
+def unit_series(shape: CoilShape, order: int) -> Series:
     """The whole field's harmonics up to `order`, for one turn and one tesla."""
     return series(shape, modes(shape, order), winding(shape))
 
 
-def series(par: Parameters | Shape, field: Modes, coil: Winding) -> Series:
+def series(par: Parameters | CoilShape, field: Modes, coil: Winding) -> Series:
     """(12), (13) harmonic by harmonic: plan by quadrature, height in closed form, position by addition theorems.
 
     Terms that vanish for a coil of four-fold symmetry are left out.
@@ -314,26 +314,26 @@ def series(par: Parameters | Shape, field: Modes, coil: Winding) -> Series:
 # Coil models of the planar motor: the exact wrench of a coil, the paper's formulas, and its bilinear table.
 #
 # A coil model is a function (x, y, z) -> wrench of 1 A in a level coil there, about its own centre of force, in
-# CasADi or numpy: `Analytical` is the paper's (17)-(24), `Table` its bilinear table, `field.Series` the Fourier
+# CasADi or numpy: `Analytical` is the paper's (17)-(24), `FieldTable` its bilinear table, `field.Series` the Fourier
 # series. Equation numbers are those of the paper named in plant.py.
 
 
 CoilModel = Callable[[Any, Any, Any], Any]
-LEAST = 4e-5  # share of the largest harmonic's force at z = 0: `simulation_model` leaves out smaller ones
+MIN_HARMONIC_SHARE = 4e-5  # of the largest harmonic's force at z = 0: `simulation_model` leaves out less
 
 
-def shape_of(par: Parameters) -> Shape:
+def shape_of(par: Parameters) -> CoilShape:
     """The parameters that the harmonics are computed from."""
-    return Shape(par.tau_n, par.w_c, par.h_c, par.l_c, par.r_c, par.h_m, par.upright)
+    return CoilShape(par.tau_n, par.w_c, par.h_c, par.l_c, par.r_c, par.h_m, par.upright)
 
 
 def simulation_model(par: Parameters, order: int = COIL_ORDER) -> Series:
-    """`exact_model` without the harmonics below LEAST: 22 of 144 are left, at every height.
+    """`exact_model` without the harmonics below MIN_HARMONIC_SHARE: 22 of 144 are left, at every height.
 
     It changes a coil's force by up to 0.2 of 8200 mN/A at a height of 1 mm, and by 0.9 of 9900 mN/A on the magnets.
     """
     whole = unit_series(shape_of(par), order)
-    few = whole.above(LEAST * float(np.abs(whole.G[:3]).max()), 0.0)
+    few = whole.above(MIN_HARMONIC_SHARE * float(np.abs(whole.G[:3]).max()), 0.0)
     return replace(few, scale=par.N_c * par.B_r)
 
 
@@ -396,7 +396,7 @@ def _quarter(par: Parameters, n: int) -> tuple[FloatArray, FloatArray, FloatArra
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class FieldTable:
     """Bilinear interpolation (25)-(29) over a quarter period.
 
     Parities give the other quarters, the factor e^(-pi z / tau_n) gives other heights.
@@ -413,7 +413,7 @@ class Table:
     def __call__(self, x: Any, y: Any, z: Any) -> Any:
         """F_x F_y F_z T_x T_y T_z for 1 A, as `Series`; from CasADi for MX, and for SX where look-ups are recorded."""
         if not isinstance(x, np.ndarray):
-            return self._traced(x, y, z)
+            return self._trace(x, y, z)
         n = len(self.nodes) - 1
         u = np.array([x.ravel(), y.ravel()]) * (n / self.tau_n) % (2 * n)
         beyond = (u > n).view(np.int8)
@@ -428,7 +428,7 @@ class Table:
         values = (weights.T[:, None] @ self.cells[cell[0] * n + cell[1]])[:, 0]
         return (values * _SIGNS[beyond[0], beyond[1]]).reshape(*x.shape, 6)
 
-    def _traced(self, x: Any, y: Any, z: Any) -> Any:
+    def _trace(self, x: Any, y: Any, z: Any) -> Any:
         n = len(self.nodes) - 1
         places, signs = [], []
         for p in (x, y):
@@ -445,7 +445,7 @@ _SIGNS = np.array(
 )
 
 
-def table(par: Parameters, model: CoilModel, n: int) -> Table:
+def table(par: Parameters, model: CoilModel, n: int) -> FieldTable:
     """Sample a coil model at the nodes of an n x n grid over the quarter, at the working height.
 
     Raises InputError for samples without the parities that the other three quarters follow from, for samples that are
@@ -468,4 +468,4 @@ def table(par: Parameters, model: CoilModel, n: int) -> Table:
         )
     corners = [nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, :-1], nodes[1:, 1:]]
     cells = np.stack(corners, axis=2).reshape(n * n, 4, 6)
-    return Table(par.tau_n, par.h, readonly(nodes), readonly(cells))
+    return FieldTable(par.tau_n, par.h, readonly(nodes), readonly(cells))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.report.figures.drawing import (
-    BOUND,
+    BOUND_STYLE,
     STYLES,
     Published,
     add_shared_legend,
@@ -202,19 +202,19 @@ def delay_figure(e: Experiment, _: Published | None = None) -> Figure:
         for case in (case for case in e.cases if case.label.endswith(f", {speed}")):
             knows = case.label.split(",")[0]
             off = np.abs(case.run.p - case.run.reference)[:, 3:].max(axis=1) * 1e6
-            off = np.maximum(off, LEAST)
+            off = np.maximum(off, MIN_ANGLE)
             style = STYLES[0] if knows == "with" else STYLES[1]
             draw_line(axes, case.run.t * 1e3, off, label=f"{knows} the delay", **style)
             mark_end(axes, case.run, case.run.t * 1e3, off)
         axes.set_title(f"{speed} as fast as designed", fontsize=9)
         finish_axes(axes, "time [ms]", "largest angle, off reference [µrad]" if axes is panels[0] else "")
     panels[0].set_yscale("log")
-    panels[0].set_ylim(bottom=LEAST)
+    panels[0].set_ylim(bottom=MIN_ANGLE)
     add_shared_legend(figure)
     return figure
 
 
-LEAST = 1e-4  # urad, smallest value on the logarithmic axis
+MIN_ANGLE = 1e-4  # urad, smallest value on the logarithmic axis
 
 
 def timing_figure(e: Experiment, published: Published | None = None) -> Figure:
@@ -232,7 +232,7 @@ def timing_figure(e: Experiment, published: Published | None = None) -> Figure:
     axes = figure.subplots()
     draw_dots(axes, list(times), list(times.values()), [f"{number(value, 3)} µs" for value in times.values()])
     period = e.run.controller.sample_time * 1e6
-    axes.axvline(period, **BOUND)
+    axes.axvline(period, **BOUND_STYLE)
     label_upright(axes, 1.05 * period, 0.4, f"control period, {period:g} µs", ha="left")
     axes.set_xlim(0.5 * min(times.values()), 4 * period)
     finish_axes(axes, "time of one call [µs]", "")

@@ -18,7 +18,7 @@ from malta.model.linearize import linearize
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
-    QUIET,
+    NO_NOISE,
     Case,
     Experiment,
     Merit,
@@ -42,7 +42,7 @@ LIFT, LIFT_AT, LIFTING = 1e-3, 0.01, 0.02  # m, s, s
 DISTANCE, MOVE_AT, MOVING = 10e-3, 0.03, 0.04
 DURATION = 0.1  # s
 GAP = 50e-6  # m, over the magnets at the start. NOTE: the paper starts on them, where this machine has touched down
-WITHIN = 10e-6  # m: y has arrived
+ARRIVAL_DISTANCE = 10e-6  # m: y has arrived
 
 
 def with_coil_model(controller: Controller, model: str, cells: int = CELLS) -> Controller:
@@ -116,7 +116,7 @@ def step_cases(
     return wanted
 
 
-AHEAD = "place predicted"
+PREDICTION = "place predicted"
 
 
 def steps_ahead(plant: Plant, controller: Controller, **options: Any) -> Experiment:
@@ -128,12 +128,15 @@ def steps_ahead(plant: Plant, controller: Controller, **options: Any) -> Experim
     wanted = step_cases(plant, controller, **moves, **options)[0]
     believed = planar.plant(parameters_of(controller))
     ahead = commutate_ahead(controller, linearize(believed, believed.point(controller.operating_point[0])))
-    flights = [(plant, with_coil_model(ahead, "exact"), wanted._replace(label=f"exact, {AHEAD}"))]
+    flights = [(plant, with_coil_model(ahead, "exact"), wanted._replace(label=f"exact, {PREDICTION}"))]
     cases, cut = fly_all(flights, None, options)
     return Experiment("step", "What is left when currents are where they act?", cases, (), interrupted=cut)
 
 
-FORCES: dict[str, Any] = QUIET | {"fidelity": "force", "substeps": 1}  # the error of one substep is 1e-13 m
+FORCES: dict[str, Any] = NO_NOISE | {
+    "fidelity": "force",
+    "substeps": 1,
+}  # the error of one substep is 1e-13 m
 
 
 def start_of_moves(
@@ -194,8 +197,8 @@ def step_merits(run: Trajectory) -> tuple[Merit, ...]:
 
 
 def arrival(run: Trajectory, target: float) -> float:
-    """Time from the step in y until y stays within WITHIN of the target, s; NaN if it does not."""
-    off = np.flatnonzero(np.abs(run.p[:, 1] - target) > WITHIN)
+    """Time from the step in y until y stays within ARRIVAL_DISTANCE of the target, s; NaN if it does not."""
+    off = np.flatnonzero(np.abs(run.p[:, 1] - target) > ARRIVAL_DISTANCE)
     if not len(off) or off[-1] + 1 == len(run.t):
         return math.nan
     return float(run.t[off[-1] + 1]) - MOVE_AT
@@ -295,9 +298,9 @@ def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
 # approaches its end at a speed from which it can stop: by its `braking`, or, as a linear one, at a rate that is slow.
 
 
-DESIGNED, LINEAR, SOFT = "as designed", "without braking", "soft"  # ends of the labels of cases
+DESIGN_END, LINEAR_END, SOFT_END = "as designed", "without braking", "soft"  # ends of the labels of cases
 Y, Z = 1, 2  # the axes that jump
-SMALLEST = 1e-6  # m: a smaller jump asks for no softer gains
+MIN_JUMP = 1e-6  # m: a smaller jump asks for no softer gains
 
 
 def jump(
@@ -330,8 +333,8 @@ def jump(
     rates = (rate, rate) if rate else braking_rates(plant, distance, lift)
     soft = soften(controller, plant, rates)
     by_table = with_coil_model(controller, "table", cells)
-    laws = {f"table, {DESIGNED}": by_table, f"table, {LINEAR}": replace(by_table, braking=np.zeros(0))}
-    laws |= {f"{model}, {SOFT}": with_coil_model(soft, model, cells) for model in MODELS}
+    laws = {f"table, {DESIGN_END}": by_table, f"table, {LINEAR_END}": replace(by_table, braking=np.zeros(0))}
+    laws |= {f"{model}, {SOFT_END}": with_coil_model(soft, model, cells) for model in MODELS}
     cases, cut = fly_all(_jumps_of(plant, laws, scenario), progress, options)
     merits = tuple(
         Merit(f"rate of approach in {name}", value, "1/s") for name, value in zip("yz", rates, strict=True)
@@ -344,7 +347,7 @@ def soft_jumps(plant: Plant, controller: Controller, *, rate: float = 0.0, **opt
     reference = partial(jumps_reference, place=PLACE, gap=GAP, lift=LIFT, distance=DISTANCE)
     scenario = scenario_of("jump", DURATION, reference, FORCES | options)
     soft = soften(controller, plant, (rate, rate) if rate else braking_rates(plant, DISTANCE, LIFT))
-    laws = {f"{model}, {SOFT}": with_coil_model(soft, model) for model in ("analytical", "table")}
+    laws = {f"{model}, {SOFT_END}": with_coil_model(soft, model) for model in ("analytical", "table")}
     cases, cut = fly_all(_jumps_of(plant, laws, scenario), None, options)
     return Experiment("jump", "What do the coil models leave of jumps?", cases, (), interrupted=cut)
 
@@ -371,7 +374,7 @@ def braking_rates(plant: Plant, distance: float, lift: float) -> tuple[float, fl
         raise InputError("simulate", "jump: F_max", f"{par.F_max} N", f"more than the weight, {weight:.4g} N")
 
     def rate(F: float, d: float) -> float:
-        return math.sqrt(1.5 * F / (par.m * max(abs(d), SMALLEST)))
+        return math.sqrt(1.5 * F / (par.m * max(abs(d), MIN_JUMP)))
 
     return rate(par.F_max, distance), rate(par.F_max - weight, lift)
 

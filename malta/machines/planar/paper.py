@@ -12,7 +12,14 @@ import numpy as np
 
 from malta.machines.planar import commutation, field as planar_field, plant as planar
 from malta.machines.planar.experiments import CURRENT, coil_wrench
-from malta.machines.planar.motions import AHEAD, DESIGNED, LINEAR, SOFT, soft_jumps, steps_ahead
+from malta.machines.planar.motions import (
+    DESIGN_END,
+    LINEAR_END,
+    PREDICTION,
+    SOFT_END,
+    soft_jumps,
+    steps_ahead,
+)
 from malta.margins.loop_report import LoopReport
 from malta.model.data import published_value
 from malta.report.ledger import ZONE_NOTE, Row, case_merit, machine_share, merit, peak_sensitivity, run_design
@@ -30,12 +37,12 @@ TIMES = 5  # the sample rate: how far motion under jumps depends on currents tha
 RATE = 49.6  # 1/s, approach of Kp = 1.2 N/um with the Kd of planar_pid: how far torques depend on gains
 
 
-AT_ONCE = "at once"
-FASTER, SLOWER = f"{AT_ONCE}, {TIMES} times the rate", f"{AT_ONCE}, at {RATE:.0f}/s"
+AT_ONCE_LABEL = "at once"
+FASTER_CASE, SLOWER_CASE = f"{AT_ONCE_LABEL}, {TIMES} times the rate", f"{AT_ONCE_LABEL}, at {RATE:.0f}/s"
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class PlanarEvidence:
     """A design, its margins and its experiments, beside the published figures."""
 
     spec: Spec
@@ -43,12 +50,12 @@ class Evidence:
     parameters: planar.Parameters
     controller: Controller
     margins: LoopReport
-    # experiments : with "ahead", and soft jumps without delay, AT_ONCE, also SLOWER and FASTER; without "delay" for
-    # other laws than an LQG, which predict nothing
+    # experiments : with "ahead", and soft jumps without delay, AT_ONCE_LABEL, also SLOWER_CASE and FASTER_CASE;
+    # without "delay" for other laws than an LQG, which predict nothing
     experiments: Mapping[str, Experiment]
 
 
-def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
+def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> PlanarEvidence:
     """Design a controller, prove its margins and run the experiments."""
     few: dict[str, Any] = {"engine": "virtual machine"}  # runs of a law: compiling it takes longer
     found = run_design(spec, EXPERIMENT_NAMES[: None if spec.kind == "LQG" else -1], progress, **few)
@@ -59,25 +66,25 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
     )
     experiments = found.experiments | {
         "ahead": steps_ahead(spec.plant, found.controller, **few),
-        AT_ONCE: soft_jumps(spec.plant, at_once, delay=0, **few),
-        SLOWER: soft_jumps(spec.plant, at_once, rate=RATE, delay=0, **few),
-        FASTER: soft_jumps(spec.plant, faster, delay=0, **few),
+        AT_ONCE_LABEL: soft_jumps(spec.plant, at_once, delay=0, **few),
+        SLOWER_CASE: soft_jumps(spec.plant, at_once, rate=RATE, delay=0, **few),
+        FASTER_CASE: soft_jumps(spec.plant, faster, delay=0, **few),
     }
-    return Evidence(spec, published, par, found.controller, found.margins, experiments)
+    return PlanarEvidence(spec, published, par, found.controller, found.margins, experiments)
 
 
-def pole_field(e: Evidence) -> float:
+def pole_field(e: PlanarEvidence) -> float:
     """Flux density over a pole at the working height, T."""
     par = e.parameters
     return float(planar_field.flux_density(planar_field.modes(par), np.array([par.tau_n, 0, par.h]))[2])
 
 
-def force_ratio(e: Evidence) -> float:
+def force_ratio(e: PlanarEvidence) -> float:
     """Amplitude of F_z over that of F_x, of one coil."""
     return merit("errors", "F_z, amplitude", e) / merit("errors", "F_x, amplitude", e)
 
 
-def printed_torque(e: Evidence) -> float:
+def printed_torque(e: PlanarEvidence) -> float:
     """T_z of (22), N m, from the printed F_x and from the arms of the coil that the printed F_z, T_x and T_y imply."""
     F_x, F_z, T_x, T_y = (
         published_value(e.published, f"model.amplitude.{k}") for k in ("F_x", "F_z", "T_x", "T_y")
@@ -85,7 +92,7 @@ def printed_torque(e: Evidence) -> float:
     return F_x * (T_x + T_y) / F_z
 
 
-def formula_error(e: Evidence) -> float:
+def formula_error(e: PlanarEvidence) -> float:
     """Largest relative difference of (17)-(21) from quadrature over the rectangles in the fundamental's field."""
     par = replace(e.parameters, C=1.0)
     field = planar_field.fundamental(par, par.B_z * math.exp(math.pi / par.tau_n * par.h))
@@ -98,7 +105,7 @@ def formula_error(e: Evidence) -> float:
     )
 
 
-def implied_step(name: str, e: Evidence) -> float:
+def implied_step(name: str, e: PlanarEvidence) -> float:
     """Step of a table, m, for which the error is the printed one; interpolated as the square of the step."""
     printed = published_value(e.published, f"model.error_interpolation.{name}")
     curves = e.experiments["errors"].curves
@@ -106,7 +113,7 @@ def implied_step(name: str, e: Evidence) -> float:
     return float(np.exp(np.interp(math.log(printed), np.log(error[::-1]), np.log(curves["step"][::-1]))))
 
 
-def misprint_error(e: Evidence) -> float:
+def misprint_error(e: PlanarEvidence) -> float:
     """Largest error of F_x, N, of a table of 10 cells with two weights exchanged as (27) prints them."""
     par, truth = e.parameters, planar_field.exact_model(e.parameters)
     table = planar_field.table(par, truth, 10)
@@ -116,13 +123,13 @@ def misprint_error(e: Evidence) -> float:
     return CURRENT * float(np.abs(printed(x, y, z) - truth(x, y, z))[..., 0].max())
 
 
-def condition(ratio: float, e: Evidence) -> float:
+def condition(ratio: float, e: PlanarEvidence) -> float:
     """Worst condition of K(p) for a coil pitch of `ratio` tau_n."""
     par = replace(e.parameters, coil_pitch=ratio * e.parameters.tau_n)
-    return float(commutation.conditioning(par, planar_field.simulation_model(par)).max())
+    return float(commutation.condition_numbers(par, planar_field.simulation_model(par)).max())
 
 
-def coil_torque(ratio: float, name: str, e: Evidence) -> float:
+def coil_torque(ratio: float, name: str, e: PlanarEvidence) -> float:
     """Amplitude of a torque, N m, of an inner coil at the paper's 3 A for a coil pitch of `ratio` tau_n."""
     par = replace(e.parameters, coil_pitch=ratio * e.parameters.tau_n)
     x, y = np.meshgrid(*[np.linspace(0, 2 * par.tau_n, 141)] * 2, indexing="ij")
@@ -130,13 +137,13 @@ def coil_torque(ratio: float, name: str, e: Evidence) -> float:
     return float(np.abs(wrench[..., [s.name for s in e.spec.plant.inputs].index(name)]).max())
 
 
-def coils_width(ratio: float, e: Evidence) -> float:
+def coils_width(ratio: float, e: PlanarEvidence) -> float:
     """Width of the 4 x 4 coils, m, for a coil pitch of `ratio` tau_n."""
     par = e.parameters
     return 3 * ratio * par.tau_n + par.l_c + par.w_c
 
 
-def residual(e: Evidence) -> float:
+def residual(e: PlanarEvidence) -> float:
     """Largest relative error of the wrench K i of the computed currents, over a period."""
     par = e.parameters
     model, W, worst = planar_field.simulation_model(par), np.array([100.0, 200, 400, 10, 20, 30]), 0.0
@@ -147,24 +154,24 @@ def residual(e: Evidence) -> float:
     return worst
 
 
-def flight(model: str, e: Evidence) -> Trajectory:
+def flight(model: str, e: PlanarEvidence) -> Trajectory:
     """The steps with a coil model, from the place without symmetry: by quintics, or as the label's end says.
 
-    AHEAD: with currents for the predicted place; SOFT: by jumps, with soft gains; an experiment's name after it: there.
+    PREDICTION: with currents for the predicted place; SOFT_END: by jumps, with soft gains; then an experiment's name.
     """
-    label, soft, name = model.partition(SOFT)
+    label, soft, name = model.partition(SOFT_END)
     names = (name.removeprefix(", ") or "jump",) if soft else ("step", "ahead")
     cases = (case for name in names for case in e.experiments[name].cases)
     return next(case.run for case in cases if case.label.startswith(label + soft))
 
 
-def symmetric_deviation(e: Evidence) -> float:
+def symmetric_deviation(e: PlanarEvidence) -> float:
     """Largest deviation of x, theta, psi from (0, 0) with the analytical model: m or rad."""
     run = e.experiments["step"].cases[-1].run  # the analytical model, from (0, 0)
     return float(np.abs(run.p - run.reference)[:, [0, 4, 5]].max())
 
 
-def extreme(model: str, name: str, series: str, of: Callable[[FloatArray], Any], e: Evidence) -> float:
+def extreme(model: str, name: str, series: str, of: Callable[[FloatArray], Any], e: PlanarEvidence) -> float:
     """Smallest or largest deviation of an output, or value of a force, in the steps with a coil model. SI"""
     run = flight(model, e)
     if series == "v":
@@ -173,20 +180,21 @@ def extreme(model: str, name: str, series: str, of: Callable[[FloatArray], Any],
     return float(of((run.p - run.reference)[:, k]))
 
 
-def largest_deviation(model: str, name: str, e: Evidence) -> float:
+def largest_deviation(model: str, name: str, e: PlanarEvidence) -> float:
     """Largest deviation of an output from the reference in the steps with a coil model, SI."""
     return max(-extreme(model, name, "p", np.min, e), extreme(model, name, "p", np.max, e))
 
 
-def jump_ratio(e: Evidence) -> float:
+def jump_ratio(e: PlanarEvidence) -> float:
     """Largest motion in phi under jumps without delay by the analytical model over that by the table."""
     analytical, table = (
-        largest_deviation(f"{model}, {SOFT}, {AT_ONCE}", "phi", e) for model in ("analytical", "table")
+        largest_deviation(f"{model}, {SOFT_END}, {AT_ONCE_LABEL}", "phi", e)
+        for model in ("analytical", "table")
     )
     return analytical / table
 
 
-def extremes_within(model: str, key: str, e: Evidence) -> float:
+def extremes_within(model: str, key: str, e: PlanarEvidence) -> float:
     """How many of the extremes of `_ranges` are within those that the paper prints."""
     rows = _ranges(model, key)
     printed = [published_value(e.published, str(row.published)) for row in rows]
@@ -196,21 +204,21 @@ def extremes_within(model: str, key: str, e: Evidence) -> float:
     )
 
 
-def unfitted_error(name: str, e: Evidence) -> float:
+def unfitted_error(name: str, e: PlanarEvidence) -> float:
     """Largest error of (17)-(24) with C = 1; the wrench of the analytical model is C times that."""
     curves, C = e.experiments["errors"].curves, e.parameters.C
     error = (curves["exact"] + curves["analytical"]) / C - curves["exact"]
     return float(np.abs(error).max(axis=(0, 1))[[s.name for s in e.spec.plant.inputs].index(name)])
 
 
-def implied_compensation(name: str, e: Evidence) -> float:
+def implied_compensation(name: str, e: PlanarEvidence) -> float:
     """C below the fitted one for which the amplitude of a force is off by the printed error."""
     printed = published_value(e.published, f"model.error_analytical.{name}")
     amplitude = merit("errors", f"{name}, amplitude", e)
     return e.parameters.C * (amplitude - printed) / amplitude
 
 
-def angles_at_rest(label: str, e: Evidence) -> float:
+def angles_at_rest(label: str, e: PlanarEvidence) -> float:
     """Angles left at rest in a case of the experiment `delay`, rad; NaN without the experiment."""
     if "delay" not in e.experiments:
         return math.nan
@@ -228,11 +236,11 @@ ARM = (
     "the paper names neither the coil nor the pitch; its F_z and T_x imply an arm of 65 mm, ours is 47 mm: see the "
     "rows with 22/3 τ_n"
 )
-WIDE = 22 / 3  # coil pitch in tau_n whose half is that arm; 4 + 10/3, where K(p) is conditioned as with 16/3
-BOTH = "B_r and the corner radius, not printed, were chosen for it and 0.81 T"
+WIDE_PITCH = 22 / 3  # in tau_n: twice that arm; 4 + 10/3, where K(p) is conditioned as with 16/3
+FIT = "B_r and the corner radius, not printed, were chosen for it and 0.81 T"
 RATIO = "a field without curl gives F_z / F_x = 2 for the fundamental, this coil's 1.99 with all harmonics"
-NOTES = {"F_x": BOTH, "F_y": BOTH}
-FITTED = (
+NOTES = {"F_x": FIT, "F_y": FIT}
+FITTED_ROWS = (
     "C is fitted to the truth, so that harmonics alone are missing; the paper's are amplitudes 7 to 9 % off"
 )
 NO_C = "the paper prints no C: between 1 and the fitted one lies what its own errors imply"
@@ -241,7 +249,7 @@ ERRORS = {
     "N m": "of an inner coil; the rectangles of (23), (24) overlap: 3.8 times a rounded coil's own torque",
 }
 COIL: tuple[Row, ...] = (
-    Row("field over a pole at 1 mm", "{:.2f} T", pole_field, "field.B_z", note=BOTH, by_construction=True),
+    Row("field over a pole at 1 mm", "{:.2f} T", pole_field, "field.B_z", note=FIT, by_construction=True),
     *(
         Row(
             f"one coil at 3 A: {name}",
@@ -250,7 +258,7 @@ COIL: tuple[Row, ...] = (
             f"model.amplitude.{name}",
             note=NOTES.get(name, ""),
             why={"F_x": "", "F_y": "", "F_z": RATIO}.get(name, ARM),
-            by_construction=NOTES.get(name) == BOTH,
+            by_construction=NOTES.get(name) == FIT,
         )
         for name, unit in WRENCH
     ),
@@ -258,7 +266,7 @@ COIL: tuple[Row, ...] = (
         Row(
             f"the same with coils 22/3 τ_n apart: {name}",
             "{:.2f} N m",
-            partial(coil_torque, WIDE, name),
+            partial(coil_torque, WIDE_PITCH, name),
             f"model.amplitude.{name}",
             note="preset pitch_22_3",
             why="at most 1.63 by the printed F_x, F_z, T_x and T_y" if name == "T_z" else "F_z is 4 % less",
@@ -268,7 +276,7 @@ COIL: tuple[Row, ...] = (
     Row(
         "width of the coils, 22/3 τ_n apart",
         "{:.0f} mm",
-        partial(coils_width, WIDE),
+        partial(coils_width, WIDE_PITCH),
         note="what it costs: a plate of 400 mm has the printed mass and inertias, and 16/3 τ_n take 348 mm of it",
     ),
     Row("F_z over F_x", "{:.2f}", force_ratio, "implied.force_ratio", why=RATIO),
@@ -318,7 +326,7 @@ COIL: tuple[Row, ...] = (
             partial(case_merit, "errors", "analytical", f"{name}, largest error"),
             f"model.error_analytical.{name}",
             "beside",
-            note=FITTED,
+            note=FITTED_ROWS,
         )
         for name, unit in WRENCH
     ),
@@ -370,7 +378,7 @@ HOUR = (
 MOVER: tuple[Row, ...] = (
     Row("condition of K(p), at most", "{:.2f}", partial(condition, 16 / 3), note=f"16/3 τ_n; {PITCH}"),
     Row("the same with 14/3 τ_n", "{:.2f}", partial(condition, 14 / 3), note=PITCH),
-    Row("the same with 22/3 τ_n", "{:.2f}", partial(condition, WIDE), note="wider than the plate"),
+    Row("the same with 22/3 τ_n", "{:.2f}", partial(condition, WIDE_PITCH), note="wider than the plate"),
     Row("the same with 4 τ_n", "{:.0f}", partial(condition, 4.0), note="all coils in phase: singular"),
     Row("K K⁺ W − W over W, at most", "{:.0e}", residual, note="over a period at the working height"),
     *(
@@ -419,10 +427,10 @@ MOVER: tuple[Row, ...] = (
 )
 
 
-AHEAD_EXACT = f"exact, {AHEAD}"
-MISSING = "start, gains and pitch are missing, and with them the motion; ours holds currents for 200 µs"
-LATE = "with the machine's sample of delay, which the paper's diagram does not name"
-RECTANGLES = f"{MISSING}; and the overlapping rectangles of (23), (24) make too much torque"
+AHEAD_EXACT = f"exact, {PREDICTION}"
+MISSING_NOTE = "start, gains and pitch are missing, and with them the motion; ours holds currents for 200 µs"
+DELAY_NOTE = "with the machine's sample of delay, which the paper's diagram does not name"
+RECTANGLES = f"{MISSING_NOTE}; and the overlapping rectangles of (23), (24) make too much torque"
 STEPS: tuple[Row, ...] = (
     Row(
         "y within 10 µm after its step of 10 mm",
@@ -477,10 +485,12 @@ def _step_rows() -> list[Row]:
     ]
 
 
-BRAKES = "its braking; the least for 10 mm is 28.3 ms, at ±1000 N all the way"
-SWINGS = "±1000 N are too little for gains this fast: a linear law brakes too late and swings about its end"
-SLOW = "y and z approach their ends at the fastest rate that brakes within ±1000 N, √(3 F / 2 m d)"
-SLOWEST = "Kp = 1.2 N/µm of the PID: gains, which the paper does not print, decide about its torques"
+BRAKING_NOTE = "its braking; the least for 10 mm is 28.3 ms, at ±1000 N all the way"
+SWING_NOTE = (
+    "±1000 N are too little for gains this fast: a linear law brakes too late and swings about its end"
+)
+APPROACH_NOTE = "y and z approach their ends at the fastest rate that brakes within ±1000 N, √(3 F / 2 m d)"
+GAINS_NOTE = "Kp = 1.2 N/µm of the PID: gains, which the paper does not print, decide about its torques"
 
 
 def _jump_rows() -> list[Row]:
@@ -489,27 +499,29 @@ def _jump_rows() -> list[Row]:
     found = [
         Row(f"jumps, {law}: {text}", shown, partial(last, f"table, {law}", label), note=note)
         for law, text, shown, label, note in (
-            (DESIGNED, "y within 10 µm after", "{:.1f} ms", "y within 10 um after its step", BRAKES),
-            (DESIGNED, "y, overshoot", "{:.1f} um", "y, overshoot", ""),
-            (LINEAR, "y off at 0.1 s", "{:.2f} mm", "y, left at the end", SWINGS),
-            (SOFT, "y off at 0.1 s", "{:.1f} um", "y, left at the end", SLOW),
-            (SOFT, "y, overshoot", "{:.1f} um", "y, overshoot", ""),
-            (SOFT, "z off at 0.1 s", "{:.1f} um", "z, left at the end", ""),
+            (DESIGN_END, "y within 10 µm after", "{:.1f} ms", "y within 10 um after its step", BRAKING_NOTE),
+            (DESIGN_END, "y, overshoot", "{:.1f} um", "y, overshoot", ""),
+            (LINEAR_END, "y off at 0.1 s", "{:.2f} mm", "y, left at the end", SWING_NOTE),
+            (SOFT_END, "y off at 0.1 s", "{:.1f} um", "y, left at the end", APPROACH_NOTE),
+            (SOFT_END, "y, overshoot", "{:.1f} um", "y, overshoot", ""),
+            (SOFT_END, "z off at 0.1 s", "{:.1f} um", "z, left at the end", ""),
         )
     ]
     found.append(
         Row(
-            f"jumps, {SOFT}: largest force",
+            f"jumps, {SOFT_END}: largest force",
             "{:.0f} N",
-            partial(last, f"table, {SOFT}", "largest force"),
+            partial(last, f"table, {SOFT_END}", "largest force"),
             "steps.force_limit",
             note="an input: commands are limited there, and reach it as the paper's do",
             by_construction=True,
         )
     )
     keys = {"analytical": "analytical", "table": "interpolation"}
-    for model, why in (("analytical", RECTANGLES), ("table", MISSING)):
-        found += [row._replace(why=why) for row in _ranges(f"{model}, {SOFT}, {AT_ONCE}", keys[model])]
+    for model, why in (("analytical", RECTANGLES), ("table", MISSING_NOTE)):
+        found += [
+            row._replace(why=why) for row in _ranges(f"{model}, {SOFT_END}, {AT_ONCE_LABEL}", keys[model])
+        ]
     found += [
         Row(
             f"jumps, {model}: of 16 extremes within the paper's",
@@ -518,26 +530,28 @@ def _jump_rows() -> list[Row]:
             note=note,
         )
         for model, note in (
-            (f"table, {SOFT}, {AT_ONCE}", "currents are held for 200 µs"),
-            (f"table, {SOFT}, {FASTER}", "currents are held for 40 µs, gains as before"),
-            (f"table, {SOFT}", LATE),
+            (f"table, {SOFT_END}, {AT_ONCE_LABEL}", "currents are held for 200 µs"),
+            (f"table, {SOFT_END}, {FASTER_CASE}", "currents are held for 40 µs, gains as before"),
+            (f"table, {SOFT_END}", DELAY_NOTE),
         )
     ]
     for model, key in keys.items():
-        found += [row._replace(relation="beside", note=LATE) for row in _ranges(f"{model}, {SOFT}", key)]
+        found += [
+            row._replace(relation="beside", note=DELAY_NOTE) for row in _ranges(f"{model}, {SOFT_END}", key)
+        ]
     found += [
         Row(
-            f"jumps, {model}, {SLOWER}: T_x, {side}",
+            f"jumps, {model}, {SLOWER_CASE}: T_x, {side}",
             "{:.3f} N m",
-            partial(extreme, f"{model}, {SOFT}, {SLOWER}", "T_x", "v", of),
-            note=SLOWEST,
+            partial(extreme, f"{model}, {SOFT_END}, {SLOWER_CASE}", "T_x", "v", of),
+            note=GAINS_NOTE,
         )
         for model in keys
         for side, of in (("lowest", np.min), ("highest", np.max))
     ]
     found.append(
         Row(
-            f"jumps, {AT_ONCE}: phi moved, analytical over table",
+            f"jumps, {AT_ONCE_LABEL}: phi moved, analytical over table",
             "{:.1f}",
             jump_ratio,
             "implied.phi_ratio",

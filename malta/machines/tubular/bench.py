@@ -18,7 +18,7 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import CheckError
 from malta.identification.calibration import (
-    Estimate,
+    Interval95,
     at_rest,
     magnetic_centre,
     quadrature,
@@ -29,8 +29,8 @@ from malta.identification.calibration import (
 )
 from malta.identification.commission import (
     Bench,
-    Finding,
-    Step,
+    Check,
+    StepFinding,
     fly,
     judge_noise,
     loop_step,
@@ -50,39 +50,39 @@ from malta.synthesis.controller import Controller
 PLANES = (("x1", "y1"), ("x2", "y2"))
 PUSH = 6.0  # N, of each module along the ring: more than the weight
 TURNS = 2.0  # 1/s, around the ring
-SETTLED = 0.1  # s, after which the mover rolls steadily
+SETTLING_TIME = 0.1  # s, after which the mover rolls steadily
 PULSE = 2.0  # N, of the thrust
 RATE = 40.0  # 1/s, of these pulses: the mover goes 0.1 mm
-ZERO = 0.05  # A: largest current without a command
+ZERO_CURRENT = 0.05  # A: largest current without a command
 GAIN = 0.05  # largest error of a sensor's gain, and cross talk
 OFFSET = 20e-6  # m, largest of a sensor, and of the magnetic centre
 HALL = 0.05  # largest error of amplitude, and of phase, rad
-LIFTED = 10e-6  # m, largest deviation after the lift-off
-DIFFERS = 0.2  # of K_A / m and its like
-SLOW = 3.0  # s, of the slow stroke
+MAX_LIFT_DEVIATION = 10e-6  # m, largest deviation after the lift-off
+MISMATCH = 0.2  # of K_A / m and its like
+SLOW_STROKE_TIME = 3.0  # s, of the slow stroke
 
 
-def steps(box: Mapping[str, float]) -> tuple[Step, ...]:
+def steps(box: Mapping[str, float]) -> tuple[Check, ...]:
     """The checklist, in its order. box: share by which each parameter may differ."""
     on_ring = "no current but that of the test, mover on its bearing"
     return (
-        Step("rest", "Do currents read zero, sensors still?", "drive off, mover on its bearing", "a current above 1 A",
+        Check("rest", "Do currents read zero, sensors still?", "drive off, mover on its bearing", "a current above 1 A",
              _record_rest, _judge_rest),
         noise_step(_record_dc),
-        Step("ring", "How do the radial sensors read the ring?", on_ring, "a bearing that warms up",
+        Check("ring", "How do the radial sensors read the ring?", on_ring, "a bearing that warms up",
              _record_ring, _judge_ring),
-        Step("hall", "Are the axial sensors' signals in quadrature?", "mover moved by hand over 28 mm", "an end stop",
+        Check("hall", "Are the axial sensors' signals in quadrature?", "mover moved by hand over 28 mm", "an end stop",
              _record_hall, _judge_hall),
-        Step("polarity", "Does the thrust push the way it is commanded?", on_ring, "an end stop",
+        Check("polarity", "Does the thrust push the way it is commanded?", on_ring, "an end stop",
              _record_thrust, _judge_thrust),
-        Step("lift", "Does it rise and stay?", "polarity and sensors passed", "touchdown after 60 ms, current limit",
+        Check("lift", "Does it rise and stay?", "polarity and sensors passed", "touchdown after 60 ms, current limit",
              _record_lift, _judge_lift),
-        Step("centre", "Where is the magnetic centre?", "in flight", "touchdown", _record_centre, _judge_centre),
+        Check("centre", "Where is the magnetic centre?", "in flight", "touchdown", _record_centre, _judge_centre),
         loop_step(box),
         stroke_step(),
-        Step("cogging", "What holds it along the travel?", "in flight, 16 mm of travel", "touchdown",
+        Check("cogging", "What holds it along the travel?", "in flight, 16 mm of travel", "touchdown",
              _record_slow, _judge_slow),
-        Step("drop", "How fast does it fall?", "in flight, then currents off", "none: it lands on its bearing",
+        Check("drop", "How fast does it fall?", "in flight, then currents off", "none: it lands on its bearing",
              _record_drop, _judge_drop),
     )  # fmt: skip
 
@@ -127,35 +127,38 @@ def _record_dc(bench: Bench) -> Log:
         return record_noise(bench)
     push = np.array([0.0, -par.K_B, 0.0, -par.K_B, 0.0])
     return part_of_log(
-        _on_bearing(bench, "noise", 1.0 + SETTLED, lambda t: np.tile(push, (len(t), 1))),
-        round(SETTLED / bench.controller.sample_time),
+        _on_bearing(bench, "noise", 1.0 + SETTLING_TIME, lambda t: np.tile(push, (len(t), 1))),
+        round(SETTLING_TIME / bench.controller.sample_time),
     )
 
 
-def _judge_rest(controller: Controller, log: Log) -> list[Finding]:
+def _judge_rest(controller: Controller, log: Log) -> list[StepFinding]:
     """Means of the measured currents, and noise of the sensors.
 
     With the drive off, the means are the offsets of the current sensors. On the simulated bench it is on, and its
     controllers hold the readings at zero.
     """
     currents = at_rest(log, "i") if log.names("i") else {}
-    offsets = [Finding(f"mean of {name}", mean, -ZERO, ZERO) for name, (mean, _) in currents.items()]
+    offsets = [
+        StepFinding(f"mean of {name}", mean, -ZERO_CURRENT, ZERO_CURRENT)
+        for name, (mean, _) in currents.items()
+    ]
     return [*offsets, *judge_noise(controller, log)]
 
 
 def _record_ring(bench: Bench) -> Log:
     def push(t: FloatArray) -> FloatArray:
-        angle = 2 * math.pi * TURNS * np.maximum(t - SETTLED / 2, 0) - math.pi / 2
+        angle = 2 * math.pi * TURNS * np.maximum(t - SETTLING_TIME / 2, 0) - math.pi / 2
         c, s = PUSH * np.cos(angle), PUSH * np.sin(angle)
         return np.column_stack([c, s, c, s, 0 * t])
 
-    return _on_bearing(bench, "ring", 2 * SETTLED + 1 / TURNS, push)
+    return _on_bearing(bench, "ring", 2 * SETTLING_TIME + 1 / TURNS, push)
 
 
-def _judge_ring(controller: Controller, log: Log) -> list[Finding]:
+def _judge_ring(controller: Controller, log: Log) -> list[StepFinding]:
     """Gains, cross talk and offsets of the radial sensors, and the polarity of the bearing coils."""
     par: Any = controller.parameters
-    log = part_of_log(log, round(SETTLED / log.sample_time))
+    log = part_of_log(log, round(SETTLING_TIME / log.sample_time))
     sag = (par.m * par.g / 2 + par.K_A * par.r_max + PUSH) / par.k_t  # of a bearing, downwards
     findings = []
     for x, y in PLANES:
@@ -166,14 +169,14 @@ def _judge_ring(controller: Controller, log: Log) -> list[Finding]:
             (f"gain of {y}", found.gain_y),
             (f"cross talk {x} {y}", found.cross),
         )
-        findings += [Finding(name, e._replace(half=e.half + unsure), -GAIN, GAIN) for name, e in ends]
+        findings += [StepFinding(name, e._replace(half=e.half + unsure), -GAIN, GAIN) for name, e in ends]
         offsets = ((x, found.offset_x), (y, found.offset_y))
         findings += [
-            Finding(f"offset of {name}", e._replace(half=e.half + sag), -OFFSET, OFFSET)
+            StepFinding(f"offset of {name}", e._replace(half=e.half + sag), -OFFSET, OFFSET)
             for name, e in offsets
         ]
     for force, sensor in zip(("fx_B1", "fy_B1", "fx_B2", "fy_B2"), ("x1", "y1", "x2", "y2"), strict=True):
-        findings.append(Finding(f"{sensor} by {force}", slope(log, ("v", force), sensor), 0.0))
+        findings.append(StepFinding(f"{sensor} by {force}", slope(log, ("v", force), sensor), 0.0))
     return findings
 
 
@@ -193,10 +196,12 @@ def _record_hall(bench: Bench) -> Log:
     return Log("run hall", bench.truth.name, bench.controller.name, Ts, 0.0, t, {"y": raw}, signals)
 
 
-def _judge_hall(_: Controller, log: Log) -> list[Finding]:
+def _judge_hall(_: Controller, log: Log) -> list[StepFinding]:
     """Amplitude and phase of the sine beside the cosine, and offsets of both."""
     found = quadrature(*log.table("y", ["hall_cosine", "hall_sine"]).T)
-    return [Finding(f"hall {name.replace('_', ' ')}", e, -HALL, HALL) for name, e in found._asdict().items()]
+    return [
+        StepFinding(f"hall {name.replace('_', ' ')}", e, -HALL, HALL) for name, e in found._asdict().items()
+    ]
 
 
 def _record_thrust(bench: Bench) -> Log:
@@ -208,11 +213,11 @@ def _record_thrust(bench: Bench) -> Log:
     return _on_bearing(bench, "polarity", 0.5, push)
 
 
-def _judge_thrust(controller: Controller, log: Log) -> list[Finding]:
+def _judge_thrust(controller: Controller, log: Log) -> list[StepFinding]:
     """1 / m as the thrust sees it: its sign is the polarity."""
     par: Any = controller.parameters
     found = slope(log, ("v", "f_D"), "z", free=True)
-    return [Finding("z'' by f_D", found, 0.5 / par.m, 2 / par.m)]
+    return [StepFinding("z'' by f_D", found, 0.5 / par.m, 2 / par.m)]
 
 
 def _record_lift(bench: Bench) -> Log:
@@ -220,16 +225,16 @@ def _record_lift(bench: Bench) -> Log:
     return fly(bench, one, ends=("completed",))
 
 
-def _judge_lift(controller: Controller, log: Log) -> list[Finding]:
+def _judge_lift(controller: Controller, log: Log) -> list[StepFinding]:
     """The largest deviation of the radial readings in the last third."""
     plant = plant_of(controller.parameters)
     y = log.table("y", [s.name for s in plant.outputs])[-log.samples // 3 :, :4]
     return [
-        Finding(
+        StepFinding(
             "off its place after the lift-off",
-            Estimate(float(np.abs(y).max()), plant.sensors.resolution[0], "m"),
+            Interval95(float(np.abs(y).max()), plant.sensors.resolution[0], "m"),
             0,
-            LIFTED,
+            MAX_LIFT_DEVIATION,
         )
     ]
 
@@ -239,24 +244,29 @@ def _record_centre(bench: Bench) -> Log:
     return fly(bench, Scenario("centre", 2.0, reference, settle=0.5))
 
 
-def _judge_centre(controller: Controller, log: Log) -> list[Finding]:
+def _judge_centre(controller: Controller, log: Log) -> list[StepFinding]:
     """The magnetic centre at each sensor, and the attraction over that of the gain file."""
     found = magnetic_centre(log, plant_of(controller.parameters))
-    places = [Finding(f"magnetic centre, {name}", e, -OFFSET, OFFSET) for name, e in found.centre.items()]
-    return [*places, Finding("K_A / K_B over the gain file's", found.stiffness, 1 - DIFFERS, 1 + DIFFERS)]
+    places = [StepFinding(f"magnetic centre, {name}", e, -OFFSET, OFFSET) for name, e in found.centre.items()]
+    return [
+        *places,
+        StepFinding("K_A / K_B over the gain file's", found.stiffness, 1 - MISMATCH, 1 + MISMATCH),
+    ]
 
 
 def _record_slow(bench: Bench) -> Log:
-    return fly(bench, Scenario.stroke(16e-3, rise=0.8, duration=SLOW, profile="quintic", settle=0.3))
+    return fly(
+        bench, Scenario.stroke(16e-3, rise=0.8, duration=SLOW_STROKE_TIME, profile="quintic", settle=0.3)
+    )
 
 
-def _judge_slow(controller: Controller, log: Log) -> list[Finding]:
+def _judge_slow(controller: Controller, log: Log) -> list[StepFinding]:
     """Amplitude and phase of the cogging."""
     par: Any = controller.parameters
     size, phase = wave(log, plant_of(par), par.L_p)
     return [
-        Finding("cogging", size, 0.0, 0.05 * 2 * par.K_D * par.I_max),
-        Finding("phase of the cogging", phase),
+        StepFinding("cogging", size, 0.0, 0.05 * 2 * par.K_D * par.I_max),
+        StepFinding("phase of the cogging", phase),
     ]
 
 
@@ -271,10 +281,10 @@ def _record_drop(bench: Bench) -> Log:
     return part_of_log(log, 4, int(fallen[0]))
 
 
-def _judge_drop(controller: Controller, log: Log) -> list[Finding]:
+def _judge_drop(controller: Controller, log: Log) -> list[StepFinding]:
     """The unstable pole over that of the gain file's machine, sqrt(2 K_A / m)."""
     par: Any = controller.parameters
     expected = math.sqrt(2 * par.K_A / par.m)
     found = unstable_pole(log, "y1")
-    share = Estimate(found.value / expected, found.half / expected)
-    return [Finding("unstable pole over the gain file's", share, 1 - DIFFERS, 1 + DIFFERS)]
+    share = Interval95(found.value / expected, found.half / expected)
+    return [StepFinding("unstable pole over the gain file's", share, 1 - MISMATCH, 1 + MISMATCH)]

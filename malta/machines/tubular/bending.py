@@ -24,7 +24,7 @@ from malta.machines.tubular.parameters import Parameters
 from malta.model.data import published_figures, published_value
 from malta.proof.blocks import Dynamic
 
-FREE = 4.730040744862704  # k of the first mode of a free beam
+FREE_BEAM_ROOT = 4.730040744862704  # k of the first mode of a free beam
 SIZE = 2.0  # the square of sqrt 2: two forces, and two sensors, of one plane
 
 
@@ -61,12 +61,12 @@ def tube(par: Parameters) -> Tube:
 def first_bending(par: Parameters, E: float) -> float:
     """w_1 of the mover, rad/s, with a modulus E of its material, N/m^2."""
     found = tube(par)
-    return FREE**2 * math.sqrt(E * found.area_moment / (par.m * found.length**3))
+    return FREE_BEAM_ROOT**2 * math.sqrt(E * found.area_moment / (par.m * found.length**3))
 
 
 def shape(par: Parameters, z: float) -> float:
     """The mode's displacement at z from the middle, m; its square is 1 on the average over the tube."""
-    k, u = FREE / 2, FREE * z / tube(par).length
+    k, u = FREE_BEAM_ROOT / 2, FREE_BEAM_ROOT * z / tube(par).length
     return float(np.cos(u) / np.cos(k) + np.cosh(u) / np.cosh(k))
 
 

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.firmware.supervisor import MONITORS, STATES
-from malta.machines.tubular.experiments.commissioning import WITH
-from malta.machines.tubular.experiments.disturbances import KNOWN
-from malta.machines.tubular.experiments.faults import Outcome
+from malta.machines.tubular.experiments.commissioning import SUFFIX
+from malta.machines.tubular.experiments.disturbances import FED_SHARES
+from malta.machines.tubular.experiments.faults import FaultOutcome
 from malta.machines.tubular.experiments.lifting import PLANES
-from malta.machines.tubular.experiments.strokes import OWN, RECORDED
+from malta.machines.tubular.experiments.strokes import OWN_TABLE, RECORDED_TABLE
 from malta.report.figures.drawing import (
     CROSS,
-    MORE,
+    MORE_STYLES,
     NOTE,
     REFERENCE,
     STYLES,
@@ -119,11 +119,11 @@ def supervised_faults_figure(e: Experiment, _: Published | None = None) -> Figur
 
 def _draw_speeds(axes: Axes, e: Experiment) -> None:
     """Two bars for each fault: alone, and with the supervisor."""
-    labels = list(dict.fromkeys(case.label.removesuffix(WITH) for case in e.cases))
+    labels = list(dict.fromkeys(case.label.removesuffix(SUFFIX) for case in e.cases))
     speeds = [case.merits[2].value * 1e3 for case in e.cases]
     for case, speed in zip(e.cases, speeds, strict=True):
-        supervised = case.label.endswith(WITH)
-        place = labels.index(case.label.removesuffix(WITH)) + (0.2 if supervised else -0.2)
+        supervised = case.label.endswith(SUFFIX)
+        place = labels.index(case.label.removesuffix(SUFFIX)) + (0.2 if supervised else -0.2)
         text = "no contact"
         if speed >= 0:
             axes.barh(place, speed, height=0.36, **LOOKS[supervised])
@@ -150,12 +150,12 @@ def _moments_figure(e: Experiment) -> Figure:
     title = "faults at random moments of lift, operation, stroke and landing"
     figure = new_page(runs_of(e), title, found, **places)
     panels = figure.subplots(1, 3, sharey=True)
-    classes = {label: [Outcome(*row) for row in rows] for label, rows in e.curves.items()}
+    classes = {label: [FaultOutcome(*row) for row in rows] for label, rows in e.curves.items()}
     for n, rows in enumerate(classes.values()):
         shown: tuple[tuple[list[float], list[float]], ...] = (
             ([row.speed_alone * 1e3 for row in rows], [row.speed * 1e3 for row in rows]),
             ([row.current_alone for row in rows], [row.current for row in rows]),
-            ([], [max(row.safe * 1e3, SOONEST) for row in rows]),
+            ([], [max(row.safe * 1e3, MIN_TIME) for row in rows]),
         )
         for axes, values in zip(panels, shown, strict=True):
             for supervised_run, marks in zip((False, True), values, strict=True):
@@ -166,26 +166,26 @@ def _moments_figure(e: Experiment) -> Figure:
     dashes: dict[str, Any] = {"color": "#2b2b2b", "linewidth": 0.8, "linestyle": "--"}
     panels[1].axvline(limit, label=f"limit of an axis, {limit:g} A", **dashes)
     panels[2].set_xscale("log")
-    panels[0].set_yticks(range(len(classes)), [_named(*one) for one in classes.items()], fontsize=7)
+    panels[0].set_yticks(range(len(classes)), [_name_class(*one) for one in classes.items()], fontsize=7)
     panels[0].set_ylim(len(classes) - 0.4, -0.6)
     for axes, label in zip(panels, ("fastest contact [mm/s]", "current of an axis [A]"), strict=False):
         finish_axes(axes, label, "")
         axes.set_xlim(-0.03 * axes.get_xlim()[1], 1.05 * axes.get_xlim()[1])
-    panels[2].set_xlim(SOONEST / 1.5, LATEST)
+    panels[2].set_xlim(MIN_TIME / 1.5, MAX_TIME)
     finish_axes(panels[2], "off or landed after [ms]", "")
-    panels[2].set_xlim(SOONEST / 1.5, LATEST)
+    panels[2].set_xlim(MIN_TIME / 1.5, MAX_TIME)
     add_shared_legend(figure)
     return figure
 
 
-def _named(label: str, rows: Sequence[Outcome]) -> str:
+def _name_class(label: str, rows: Sequence[FaultOutcome]) -> str:
     """A class of faults, and below it the monitors that acted last, the most frequent first."""
     acted = [MONITORS[int(row.monitor)].lower().replace("_", " ") for row in rows if row.monitor >= 0]
     names = sorted(set(acted), key=lambda name: (-acted.count(name), name))
     return f"{micro(label)}\n({', '.join(names[:3]) or 'no monitor'})"
 
 
-SOONEST, LATEST = 1e-2, 1e3  # ms, of the axis of times
+MIN_TIME, MAX_TIME = 1e-2, 1e3  # ms, of the axis of times
 MARKS: dict[bool, dict[str, Any]] = {
     False: {"color": "#2b2b2b", "marker": "x", "markersize": 4, "linestyle": "none"},
     True: {
@@ -205,14 +205,16 @@ LOOKS: dict[bool, dict[str, Any]] = {
 def _draw_deviations(axes: Axes, e: Experiment) -> None:
     """The largest radial deviation over time of two faults that end in a touchdown without the supervisor."""
     struck = e.run.scenario.faults[0].at
-    alone = [case for case in e.cases if not case.label.endswith(WITH)]
+    alone = [case for case in e.cases if not case.label.endswith(SUFFIX)]
     down = [case.label for case in alone if ended_early(case.run)][:2]
     styles = iter(STYLES)
-    for case in (case for case in e.cases if case.label.removesuffix(WITH) in down):
+    for case in (case for case in e.cases if case.label.removesuffix(SUFFIX) in down):
         run = case.run
         radial = [k for k in range(run.p.shape[1]) if k != run.plant.stroke_output]
         ms, off = (run.t - struck) * 1e3, np.abs(run.p[:, radial]).max(axis=1) * 1e6
-        label = micro(case.label.removesuffix(WITH)) + (", supervised" if case.label.endswith(WITH) else "")
+        label = micro(case.label.removesuffix(SUFFIX)) + (
+            ", supervised" if case.label.endswith(SUFFIX) else ""
+        )
         draw_largest(axes, ms, np.maximum(off, 0.1), label=label, **next(styles))
         if case.merits[1].value >= 0:
             k = min(int(np.searchsorted(ms, case.merits[1].value * 1e3)), len(ms) - 1)
@@ -238,7 +240,7 @@ def recording_figure(e: Experiment, _: Published | None = None) -> Figure:
     (table, difference), (own, recorded) = figure.subplots(2, 2)
     _draw_tables(table, difference, e)
     top = 0.0
-    for axes, what in ((own, OWN), (recorded, RECORDED)):
+    for axes, what in ((own, OWN_TABLE), (recorded, RECORDED_TABLE)):
         drawn = [case for case in e.cases if case.label.endswith(what)]
         for case in drawn:
             run, ms = case.run, case.run.t * 1e3
@@ -289,7 +291,9 @@ def _machine(label: str) -> str:
 def _style(label: str, e: Experiment) -> dict[str, Any]:
     """The line of a machine, the same in all panels."""
     machines = list(dict.fromkeys(_machine(case.label) for case in e.cases))
-    return dict(STYLES[machines.index(_machine(label))]) if _machine(label) in machines else dict(MORE[0])
+    return (
+        dict(STYLES[machines.index(_machine(label))]) if _machine(label) in machines else dict(MORE_STYLES[0])
+    )
 
 
 # The figure of the experiment capture: maps of starts that return, and releases from just inside and beyond.
@@ -297,9 +301,9 @@ def _style(label: str, e: Experiment) -> dict[str, Any]:
 
 SCALES = {"x": "mm", "y": "mm", "z": "mm", "alpha": "mrad", "beta": "mrad"}  # 1e3 of each SI value
 RETURNS = "#cfcfcf"
-SHOWN = 60.0  # ms, of the releases
-BESIDE: dict[str, Any] = {"color": "#000000", "linestyle": (0, (5, 2)), "linewidth": 1.3}
-INSIDE: dict[str, Any] = {"color": "#1f77b4", "linestyle": "-", "linewidth": 1.3}
+SHOWN_TIME = 60.0  # ms, of the releases
+OUTER_STYLE: dict[str, Any] = {"color": "#000000", "linestyle": (0, (5, 2)), "linewidth": 1.3}
+INNER_STYLE: dict[str, Any] = {"color": "#1f77b4", "linestyle": "-", "linewidth": 1.3}
 
 
 def capture_figure(e: Experiment, _: Published | None = None) -> Figure:
@@ -314,14 +318,14 @@ def capture_figure(e: Experiment, _: Published | None = None) -> Figure:
     for axes, plane in zip(maps, PLANES, strict=True):
         _draw_map(axes, e, plane)
     highest = float(np.abs(e.curves["clearance x beta"][:, 0]).max()) * 1e3
-    for case, style in zip(e.cases, (*STYLES, *MORE), strict=False):
+    for case, style in zip(e.cases, (*STYLES, *MORE_STYLES), strict=False):
         run, ms = case.run, case.run.t * 1e3
         off = np.abs(run.p[:, :4]).max(axis=1) * 1e3
         draw_line(traces, ms, off, label=case.label.removesuffix(", inside"), **style)
         if run.verdict.completed:
             highest = max(highest, float(off.max()))
     finish_axes(traces, "time [ms]", "off centre, largest [mm]", legend=4)
-    traces.set_xlim(0, SHOWN)
+    traces.set_xlim(0, SHOWN_TIME)
     traces.set_ylim(0, 1.3 * highest)
     return figure
 
@@ -337,20 +341,20 @@ def _draw_map(axes: Axes, e: Experiment, plane: tuple[str, str]) -> None:
     axes.plot([], [], label="returns", marker="s", markersize=8, linestyle="none", color=RETURNS)
     if f"bound {name}" in e.curves:
         bound = e.curves[f"bound {name}"] * 1e3
-        axes.plot(*np.vstack([bound, bound[:1]]).T, label="force limit, at best", **BESIDE)
+        axes.plot(*np.vstack([bound, bound[:1]]).T, label="force limit, at best", **OUTER_STYLE)
     else:  # the travel along, and across what is allowed at the centre
         reach = float(np.abs(e.curves[f"bound {' '.join(PLANES[0])}"][:, 0]).max()) * 1e3
         for side in (-reach, reach):
-            axes.axhline(side, label="force limit, at best", **BESIDE)
+            axes.axhline(side, label="force limit, at best", **OUTER_STYLE)
     edge = e.curves[f"clearance {name}"] * 1e3
-    axes.plot(*np.vstack([edge, edge[:1]]).T, label="clearance", **INSIDE)
+    axes.plot(*np.vstack([edge, edge[:1]]).T, label="clearance", **INNER_STYLE)
     finish_axes(axes, f"{plane[0]} [{SCALES[plane[0]]}]", f"{plane[1]} [{SCALES[plane[1]]}]", legend=3)
 
 
 # The figure of the experiment carrier: the carrier's move, radial deviations and bearing forces.
 
 
-SMOOTHED = 50  # samples of a mean of the noisy force
+SMOOTHING_SAMPLES = 50  # samples of a mean of the noisy force
 
 
 def carrier_figure(e: Experiment, _: Published | None = None) -> Figure:
@@ -363,15 +367,15 @@ def carrier_figure(e: Experiment, _: Published | None = None) -> Figure:
     for case in e.cases:
         run, ms = case.run, case.run.t * 1e3
         place, __, label = case.label.partition(", ")
-        style = STYLES[list(KNOWN).index(label)]
+        style = STYLES[list(FED_SHARES).index(label)]
         radial = [k for k in range(run.p.shape[1]) if k != run.plant.stroke_output]
         off = np.maximum(np.abs((run.p - run.reference)[:, radial]).max(axis=1) * 1e6, 0.1)
         axes = still if place == "rest" else stroke
         draw_largest(axes, ms, off, label=label, **style)
         mark_end(axes, run, ms, off)
         if place == "rest":
-            count = len(ms) // SMOOTHED * SMOOTHED
-            means = (s[:count].reshape(-1, SMOOTHED).mean(axis=1) for s in (ms, run.v[:, 0]))
+            count = len(ms) // SMOOTHING_SAMPLES * SMOOTHING_SAMPLES
+            means = (s[:count].reshape(-1, SMOOTHING_SAMPLES).mean(axis=1) for s in (ms, run.v[:, 0]))
             force.plot(*means, **style)
     for axes in (still, stroke):
         axes.set_yscale("log")

@@ -17,13 +17,13 @@ from malta.machines.tubular.experiment_figures import (
     recording_figure,
     supervised_faults_figure,
 )
-from malta.machines.tubular.experiments.disturbances import RESTING
+from malta.machines.tubular.experiments.disturbances import REST_SAMPLES
 from malta.model.data import plant_of
 from malta.report.figures.drawing import (
-    BOUND,
+    BOUND_STYLE,
     CROSS,
     DOT,
-    MORE,
+    MORE_STYLES,
     NOTE,
     PAPER,
     REFERENCE,
@@ -116,7 +116,7 @@ def hold_figure(e: Experiment, published: Published | None = None) -> Figure:
     """Histograms of measured and true positions at rest, in bins of the sensors' resolution. Fig. 14, Table III."""
     run, axis = e.run, e.run.plant.stroke_output
     names = [s.name for s in run.plant.outputs]
-    y, p = run.y[-RESTING:] * 1e6, run.p[-RESTING:] * 1e6
+    y, p = run.y[-REST_SAMPLES:] * 1e6, run.p[-REST_SAMPLES:] * 1e6
     sensors = run.plant.sensors
     bins = [1e6 * (r or s / 3) or 1.0 for r, s in zip(sensors.resolution, sensors.noise, strict=True)]
     rms, widest = np.sqrt((p**2).mean(axis=0)), np.abs(y).max(axis=0)
@@ -178,7 +178,7 @@ def tilt_figure(e: Experiment, published: Published | None = None) -> Figure:
             published_in_unit(published, "figure_16.deviation", "um"),
             np.linspace(0, 2 * math.pi, 181),
         )
-        blow_up.plot(bound * np.cos(angle), bound * np.sin(angle), **BOUND)
+        blow_up.plot(bound * np.cos(angle), bound * np.sin(angle), **BOUND_STYLE)
         blow_up.annotate("published bound", (0, -1.08 * bound), ha="center", va="top", **NOTE | PAPER)
     for axes in (tracking, deviation):
         axes.set_yscale("log")
@@ -236,7 +236,7 @@ def payload_figure(e: Experiment, published: Published | None = None) -> Figure:
     for axes in (axial, radial):
         axes.set_xlim(0, (e.run.scenario.duration - begin) * 1e3)
     masses = [(run.scenario.changes[0][1]["m"] - plant.stroke.mass) * 1e3 for run in runs]
-    for case, mass, style in zip(e.cases, masses, cycle((*STYLES, *MORE))):
+    for case, mass, style in zip(e.cases, masses, cycle((*STYLES, *MORE_STYLES))):
         run, y = case.run, case.run.p[:, lowest] * 1e6
         last = int(np.searchsorted(run.t, begin))
         shown = slice(0, min(last, end_of(run) + 1))
@@ -253,10 +253,10 @@ def payload_figure(e: Experiment, published: Published | None = None) -> Figure:
     draw_bound(largest, clearance(plant) * 1e6, "touchdown bearing", where="above left")
     if published is not None:
         payload = published_in_unit(published, "position_controller.payload", "kg") * 1e3
-        largest.axvline(payload, **BOUND)
+        largest.axvline(payload, **BOUND_STYLE)
         label_upright(largest, payload, 0.26, "published payload", ha="right")
-    draw_published(axial, published, "figure_12.axial_error", "mm", EMPTY, both=True, where="above left")
-    draw_published(radial, published, "figure_13.radial_deviation", "um", EMPTY, where="above left")
+    draw_published(axial, published, "figure_12.axial_error", "mm", NO_PAYLOAD, both=True, where="above left")
+    draw_published(radial, published, "figure_13.radial_deviation", "um", NO_PAYLOAD, where="above left")
     finish_axes(sag, "time after the pick [ms]", f"sag {plant.outputs[lowest].name} [µm]")
     finish_axes(largest, "picked mass [g]", "largest sag [µm]")
     largest.set(xlim=(0, 1.1 * max(masses)), ylim=(0, None))
@@ -267,7 +267,7 @@ def payload_figure(e: Experiment, published: Published | None = None) -> Figure:
     return figure
 
 
-EMPTY = "published, empty"  # the paper's bounds hold for a stroke without payload
+NO_PAYLOAD = "published, empty"  # the paper's bounds hold for a stroke without payload
 
 
 def _half_way(run: Trajectory) -> float:
@@ -349,7 +349,7 @@ def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
     marks = [CROSS if touched else DOT for touched in down]
     draw_dots(dots, [micro(case.label) for case in e.cases], deviations, texts, marks)
     dots.set_xlim(min(0.1, 0.5 * min(deviations)), 2 * edge)
-    dots.axvline(edge, **BOUND)
+    dots.axvline(edge, **BOUND_STYLE)
     label_upright(dots, 1.1 * edge, 0.62, "touchdown bearing", ha="left")
     struck = e.run.scenario.faults[0].at
     traces.set_xlim(-20, (e.run.scenario.duration - struck) * 1e3)

@@ -28,8 +28,8 @@ from malta.machines.tubular.parameters import Parameters as Parameters
 from malta.model.actuator import Actuator
 from malta.model.contacts import Contacts
 from malta.model.equations import (
-    EXACT,
-    SMALL_ANGLE,
+    EXACT_TRIG,
+    SMALL_ANGLE_TRIG,
     Body,
     Resultant,
     Trig,
@@ -56,7 +56,7 @@ from malta.model.stroke import Stroke
 # angular rates, so it is left out.
 
 
-def centre_of_gravity(par: Parameters, q_r: Any, trig: Trig = EXACT) -> Any:
+def centre_of_gravity(par: Parameters, q_r: Any, trig: Trig = EXACT_TRIG) -> Any:
     """r = R_IR c: from the mover's axis to its centre of gravity, in frame I, m."""
     return rotation(q_r, trig).T @ ca.vertcat(par.c_x, par.c_y, 0)
 
@@ -87,7 +87,7 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
     small_angle: the paper's own equations (sin a = a, cos a = 1; attraction without an axial part).
     """
     x, u, w = ca.SX.sym("x", 12), ca.SX.sym("u", 5), ca.SX.sym("w", 6)
-    trig = SMALL_ANGLE if small_angle else EXACT
+    trig = SMALL_ANGLE_TRIG if small_angle else EXACT_TRIG
     K_B1, K_B2 = bearing_constants(par)
     constants = (K_B1, K_B1, K_B2, K_B2, 2 * par.K_D)  # f_D = f_D1 + f_D2, eq. (17)
     return Plant(
@@ -99,7 +99,7 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
         disturbances=WRENCH,
         uncontrolled=("gamma", "gamma_dot"),
         f=trace("f", [x, u, w], lambda x, u, w: ca.vertcat(x[6:], _acceleration(par, x, u, w, trig))),
-        h=lambda x, _: measured(par, x, trig),
+        h=lambda x, _: measure_outputs(par, x, trig),
         load=lambda x: load(par, x, trig),
         position_of=lambda p: position_of(par, p),
         preload=lambda _: ca.DM.zeros(5),
@@ -111,7 +111,7 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
             bearing=trace("bearing", [x], lambda x: touchdown_bearing(par, x, trig)),
         ),
         sensors=Sensors(
-            sense=lambda x, errors: sensed(par, x, errors, trig),
+            sense=lambda x, errors: sense_outputs(par, x, errors, trig),
             errors=SENSOR_ERRORS,
             lag=(*[par.tau_s] * 4, 0.0),
             dead_time=par.T_s,
@@ -166,7 +166,7 @@ def _acceleration(par: Parameters, x: Any, u: Any, w: Any, trig: Trig) -> Any:
     inertia, q_r, dq_r = (par.I_xx, par.I_yy, par.I_zz), x[3:6], x[9:12]
     q_B = principal_angles(q_r, inertia)
     n, r = rotation(q_r, trig)[2, :2].T, centre_of_gravity(par, q_r, trig)
-    F_I, M_I = _wrench(par, x, u, n, conservative=trig is EXACT)
+    F_I, M_I = _wrench(par, x, u, n, conservative=trig is EXACT_TRIG)
     # The points of force lie on the mover's axis: T_B = sum of l_i e_z x F_i, in frame B, from the moment sum l_i F_i.
     T_B = ca.cross(ca.SX([0, 0, 1]), rotate(q_B, M_I, trig)) + rotate(q_B, w[3:] - ca.cross(r, F_I), trig)
     a_O, ddq_r = acceleration(par.m, inertia, q_r, dq_r, F_I + w[:3], T_B, trig)
@@ -195,7 +195,7 @@ def _wrench(par: Parameters, x: Any, u: Any, n: Any, *, conservative: bool) -> t
     return ca.vertcat(F_xy, F_z), ca.vertcat(M_xy, -z * f_D)
 
 
-def load(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
+def load(par: Parameters, x: Any, trig: Trig = EXACT_TRIG) -> Any:
     """Gravity (missing from eq. (6)), cogging and the pull of magnets off the centre, as a wrench at the centre of
     gravity.
 
@@ -206,13 +206,13 @@ def load(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
     force, torque = ca.vertcat(0, 0, cogging), ca.DM.zeros(3)
     for side, l_i in zip(SIDES, levers(par, x[2]), strict=True):
         F = attraction(par, side, ca.DM.zeros(2))
-        force += ca.vertcat(F, -ca.dot(F, n[:2]) if trig is EXACT else 0)
+        force += ca.vertcat(F, -ca.dot(F, n[:2]) if trig is EXACT_TRIG else 0)
         torque += ca.cross(l_i * n, ca.vertcat(F, 0))
     torque -= ca.cross(centre_of_gravity(par, x[3:6], trig), force)
     return ca.vertcat(force + ca.vertcat(0, -par.m * par.g, 0), torque)
 
 
-def measured(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
+def measure_outputs(par: Parameters, x: Any, trig: Trig = EXACT_TRIG) -> Any:
     """p = (x1, y1, x2, y2, z): where the mover's axis intersects the planes z = -l_S and z = +l_S.
 
     With small angles this is p = P_0(z) q, eq. (15).
@@ -222,20 +222,20 @@ def measured(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
     return ca.vertcat(x[0:2] - (par.l_S + x[2]) * slope, x[0:2] + (par.l_S - x[2]) * slope, x[2])
 
 
-def contact(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
+def contact(par: Parameters, x: Any, trig: Trig = EXACT_TRIG) -> Any:
     """Shares of the clearances that are used up, 1 at contact; touchdown bearings are in the sensor planes."""
-    p = measured(par, x, trig)
+    p = measure_outputs(par, x, trig)
     radii = [ca.sqrt(p[i] ** 2 + p[i + 1] ** 2) / par.r_max for i in (0, 2)]
     return ca.vertcat(*radii, ca.fabs(p[4]) / par.z_max)
 
 
-def touchdown_bearing(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
+def touchdown_bearing(par: Parameters, x: Any, trig: Trig = EXACT_TRIG) -> Any:
     """Wrench of the touchdown bearings in the sensor planes: k_t delta + d_t delta', never pulling, without friction.
 
     delta is how far the mover's axis is beyond the clearance r_max at the plane. `x` is a CasADi SX symbol.
     """
     rates = ca.vertcat(x[6:12], ca.SX.zeros(6))
-    p = measured(par, x, trig)
+    p = measure_outputs(par, x, trig)
     dp = ca.jtimes(p, x, rates)
     force, torque = ca.SX.zeros(3), ca.SX.zeros(3)
     middle = x[0:3] + centre_of_gravity(par, x[3:6], trig)
@@ -250,9 +250,9 @@ def touchdown_bearing(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
     return ca.vertcat(force, torque)
 
 
-def sensed(par: Parameters, x: Any, errors: Any, trig: Trig = EXACT) -> Any:
+def sense_outputs(par: Parameters, x: Any, errors: Any, trig: Trig = EXACT_TRIG) -> Any:
     """Sensor signals before noise: eddy-current sensors with gain and offset errors, Hall sensors for z."""
-    p = measured(par, x, trig)
+    p = measure_outputs(par, x, trig)
     radial = [(1 + errors[i]) * p[i] + errors[4 + i] for i in range(4)]
     z = hall_position(p[4], (p[0], p[2]), (p[1], p[3]), par.L_p, (errors[8], errors[9], errors[10]))
     return ca.vertcat(*radial, z)

@@ -31,7 +31,7 @@ from malta.synthesis.requirements import (
 DRIVE = "K_D"  # the force constant of the drive, which scales the thrust and no other force
 DRIVE_ERROR = 0.05  # of the drive's force constant, in the strokes of tracking_error
 TILT, TILTING = 200e-6, 2.0  # m, Hz: the tilt of the experiment
-ANY: tuple[Law, ...] = get_args(Law)
+ANY_LAW: tuple[Law, ...] = get_args(Law)
 SIGMAS = 4.5  # the largest of 10 000 normal samples, in standard deviations
 
 
@@ -136,7 +136,7 @@ REQUIREMENTS = (
         "tracking_error",
         _of_strokes(0),
         "m",
-        laws=ANY,
+        laws=ANY_LAW,
         flown=True,
         meaning="axial error in the stroke with 5 % error of K_D, either way",
     ),
@@ -144,7 +144,7 @@ REQUIREMENTS = (
         "radial_deviation",
         _of_strokes(1),
         "m",
-        laws=ANY,
+        laws=ANY_LAW,
         flown=True,
         meaning="radial deviation in the same strokes",
     ),
@@ -152,7 +152,7 @@ REQUIREMENTS = (
         "tilt_deviation",
         _tilt,
         "m",
-        laws=ANY,
+        laws=ANY_LAW,
         estimate=_tilt_estimate,
         flown=True,
         meaning="deviation of sensor plane 2 in the tilt",
@@ -162,7 +162,7 @@ REQUIREMENTS = (
         _payload,
         "kg",
         at_least=True,
-        laws=ANY,
+        laws=ANY_LAW,
         flown=True,
         meaning="mass that is picked up and carried through a stroke, at least",
     ),
@@ -170,7 +170,7 @@ REQUIREMENTS = (
         "lift_off",
         _lift_off,
         at_least=True,
-        laws=ANY,
+        laws=ANY_LAW,
         form="switch",
         flown=True,
         meaning="whether it lifts off from rest on the bearing",

@@ -156,7 +156,7 @@ def weight_of(weight: Any, where: str) -> Weight:
 
 At = Literal["sensors", "forces"]
 Channels = int | tuple[int, ...]
-MOST = 4  # blocks: 2^4 polynomials
+MAX_BLOCKS = 4  # blocks: 2^4 polynomials
 
 
 @display
@@ -264,9 +264,9 @@ def channels_of(channel: Any, count: int, name: str, where: str) -> tuple[int, .
 def check_blocks(blocks: Sequence[Block], where: str) -> None:
     """Raise InputError for more blocks, or more full ones, than a proof supports."""
     full = sum(b.full for b in blocks)
-    if len(blocks) > MOST or full > 1:
+    if len(blocks) > MAX_BLOCKS or full > 1:
         found = f"{len(blocks)} complex blocks, {full} of them full"
-        raise InputError(where, "dynamics", found, f"at most {MOST}, at most one of them full")
+        raise InputError(where, "dynamics", found, f"at most {MAX_BLOCKS}, at most one of them full")
 
 
 # the plant with the entries of blocks as parameters

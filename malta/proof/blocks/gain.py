@@ -37,10 +37,10 @@ from malta.proof.blocks import (
     shape_of,
     weight_of,
 )
-from malta.proof.blocks.polydisc import Part, Size, is_zero_free, parts_of
+from malta.proof.blocks.polydisc import PolydiscPart, Size, is_zero_free, parts_of
 from malta.proof.blocks.transfer import (
-    Peak,
-    Signals,
+    GainPeak,
+    LoopSignals,
     climb,
     frequencies,
     mu_bound,
@@ -111,12 +111,12 @@ def dynamic_margin(
     blocks = blocks_of(system, dynamic, "dynamic_margin")
     if not blocks:
         raise InputError("dynamic_margin", "dynamic", "no block", "at least one malta.proof.Dynamic")
-    asked = Blocks.of(system, law, box, blocks, "dynamic_margin")
+    asked = BlockLoop.of(system, law, box, blocks, "dynamic_margin")
     if asked.unstable():
         reason = "the nominal loop is unstable"
         return Margin(0.0, 0.0, None, None, {}, {}, (), clock.monotonic() - begun, reason)
 
-    def ask(until: float, _: bool) -> tuple[Peak | None, float | None, str]:
+    def ask(until: float, _: bool) -> tuple[GainPeak | None, float | None, str]:
         lost = _loss(asked, SEARCH * until)
         t = math.inf if lost is None else _size(asked, lost)
         return lost, *_prove_dynamic(asked, min(t, asked.box.limit), tolerance, until)
@@ -134,7 +134,7 @@ def dynamic_margin(
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks:
+class BlockLoop:
     """A loop with complex blocks, over a box of parameters."""
 
     system: UncertainSystem
@@ -148,7 +148,7 @@ class Blocks:
     @classmethod
     def of(
         cls, system: UncertainSystem, law: Compensator, box: Box, blocks: Sequence[Block], where: str
-    ) -> Blocks:
+    ) -> BlockLoop:
         """The loop of a system and a compensator with blocks.
 
         Raises InputError for blocks that cannot be combined.
@@ -177,7 +177,7 @@ class Blocks:
         if p.ndim == 1 and len(w) > 1:
             found = _signals_on_grid(self.system, self.law, p.tobytes(), w.tobytes())
         else:
-            found = Signals(responses(self.system, self.law, p, w))
+            found = LoopSignals(responses(self.system, self.law, p, w))
         M = transfer(found, self.blocks)
         scale = np.array([b.weight.at(w) for b in self.blocks for _ in b.columns])
         return np.asarray(M * scale.T[:, :, None])
@@ -195,7 +195,7 @@ class Blocks:
 
         return [partial(on, b.weight) for b in self.blocks]
 
-    def parts(self, reach: float, shares: Sequence[float], until: float) -> list[Part]:
+    def parts(self, reach: float, shares: Sequence[float], until: float) -> list[PolydiscPart]:
         """The groups' polynomials over box(reach), for blocks of these shares of their weights.
 
         Raises Unproven when they cannot be enclosed.
@@ -215,8 +215,8 @@ class Blocks:
 
 
 @lru_cache(maxsize=64)  # searches of several gains begin at the same places; records compare by identity
-def _signals_on_grid(system: UncertainSystem, law: Compensator, p: bytes, w: bytes) -> Signals:
-    return Signals(responses(system, law, np.frombuffer(p), np.frombuffer(w)))
+def _signals_on_grid(system: UncertainSystem, law: Compensator, p: bytes, w: bytes) -> LoopSignals:
+    return LoopSignals(responses(system, law, np.frombuffer(p), np.frombuffer(w)))
 
 
 @lru_cache(maxsize=8)  # gains of several channels need the same families; records compare by identity
@@ -235,7 +235,7 @@ def _scale_probe(
     """A block with its unit scaled by a power of two to about the loop's own gain."""
     if b.kind in ("multiplicative", "feedback"):
         return b
-    M = transfer(Signals(responses(system, law, nominal, frequencies(problem, nominal))), [b])
+    M = transfer(LoopSignals(responses(system, law, nominal, frequencies(problem, nominal))), [b])
     size = float(np.abs(M[np.isfinite(M)]).max(initial=0.0))
     return replace(b, unit=2.0 ** -min(max(round(1 + math.log2(size)), -500), 500)) if size > 0 else b
 
@@ -260,26 +260,26 @@ def check_effort(caller: str, tolerance: Any, time: Any) -> None:
         positive(caller, "time", time, endless=True)
 
 
-def _size(asked: Blocks, place: Peak) -> float:
+def _size(asked: BlockLoop, place: GainPeak) -> float:
     """The smallest t whose box and blocks contain the parameters and blocks of a peak."""
     return max(float(asked.box.margin(place.p)), 1 / place.value if place.value > 0 else math.inf)
 
 
-def _loss(asked: Blocks, until: float) -> Peak | None:
+def _loss(asked: BlockLoop, until: float) -> GainPeak | None:
     """The peak at the smallest t for which a loss of stability was found; None within the limits of the parameters."""
     box, every = asked.box, patterns(len(asked.box.names))
-    seen: list[Peak] = []
+    seen: list[GainPeak] = []
 
     def value(p: FloatArray, w: FloatArray) -> FloatArray:
         return mu_bound(asked.transfer(p, w), asked.blocks)[0]
 
-    def peak(t: float, chosen: FloatArray) -> Peak:
+    def peak(t: float, chosen: FloatArray) -> GainPeak:
         starts = [box.nominal, *asked.starts(t, chosen)]
         found = climb(value, asked.problem, box.near_sides(t), starts, until)
         seen.append(found)
         return found
 
-    def nearest() -> Peak:
+    def nearest() -> GainPeak:
         return min(seen, key=lambda place: _size(asked, place))
 
     peak(0.0, every)
@@ -289,7 +289,7 @@ def _loss(asked: Blocks, until: float) -> Peak | None:
             with work_limit(until):
                 t, w, p = first_loss(asked.problem, box, high)  # by the parameters alone
             if p is not None and w is not None:
-                seen.append(Peak(1 / t, w, p))
+                seen.append(GainPeak(1 / t, w, p))
                 high = t
         top = peak(high, every)
         for _ in range(ROUNDS):
@@ -304,7 +304,9 @@ def _loss(asked: Blocks, until: float) -> Peak | None:
     return best if math.isfinite(_size(asked, best)) else None
 
 
-def _narrow(peak: Callable[[float, FloatArray], Peak], high: float, chosen: FloatArray, until: float) -> None:
+def _narrow(
+    peak: Callable[[float, FloatArray], GainPeak], high: float, chosen: FloatArray, until: float
+) -> None:
     """Search the t with t |M| = 1 below `high`, where t |M| > 1, by secants in log t."""
 
     def excess(x: float) -> float:
@@ -339,9 +341,11 @@ def _pattern(box: Box, t: float, p: FloatArray) -> FloatArray:
     return np.array([np.clip(x, -1, 1), 0 * x])
 
 
-def _prove_dynamic(asked: Blocks, upper: float, tolerance: float, until: float) -> tuple[float | None, str]:
+def _prove_dynamic(
+    asked: BlockLoop, upper: float, tolerance: float, until: float
+) -> tuple[float | None, str]:
     """The largest t for which stability is proven, and the reason when there is none."""
-    parts: list[Part] = []
+    parts: list[PolydiscPart] = []
     reason = ""
     for step in DYNAMIC_STEPS:
         if is_past(until):
@@ -361,8 +365,8 @@ Of = Literal["sensitivity", "complementary", "compliance", "effort"]
 
 TOLERANCE = 3e-3  # relative distance between the proven bound and the largest gain found
 STEPS = (1, 3, 10, 30, 100, 300, 1000)  # bounds that are tried, in multiples of the tolerance
-LEAST = 1e-12  # a gain below this counts as zero, and one of the bounds NOTHING is proven
-NOTHING = (1e-12, 1e-9, 1e-6, 1e-3, 1.0)
+ZERO_GAIN = 1e-12  # a gain below this counts as zero, and one of the bounds ZERO_GAIN_BOUNDS is proven
+ZERO_GAIN_BOUNDS = (1e-12, 1e-9, 1e-6, 1e-3, 1.0)
 
 
 @display
@@ -467,12 +471,12 @@ def worst_case_gain(
     if not box.most > 1:
         raise InputError("worst_case_gain", "ranges", "a box that reaches a limit", "one within the limits")
     blocks = [*blocks_of(system, dynamics, "worst_case_gain"), last]
-    asked = Blocks.of(system, law, box, blocks, "worst_case_gain")
+    asked = BlockLoop.of(system, law, box, blocks, "worst_case_gain")
     if asked.unstable():
         reason = "the nominal loop is unstable"
         return Gain(math.inf, None, math.nan, {}, 0, clock.monotonic() - begun, reason)
 
-    def ask(until: float, _: bool) -> tuple[Peak, float | None, int, str]:
+    def ask(until: float, _: bool) -> tuple[GainPeak, float | None, int, str]:
         found = _largest(asked, SEARCH * until)
         return found, *_prove(asked, found.value, tolerance, until)
 
@@ -506,7 +510,7 @@ def _performance_block(system: UncertainSystem, of: Of, at: At, channel: Any) ->
     return Block(of, "sensors", driven, read, one)  # type: ignore[arg-type]
 
 
-def _largest(asked: Blocks, until: float) -> Peak:
+def _largest(asked: BlockLoop, until: float) -> GainPeak:
     """The largest gain that a search finds until the work is up; infinite at an unstable plant of the box."""
 
     def value(p: FloatArray, w: FloatArray) -> FloatArray:
@@ -516,11 +520,11 @@ def _largest(asked: Blocks, until: float) -> Peak:
     worst = asked.problem.instability(np.array(starts))
     if worst.max() >= 0:
         p = starts[int(worst.argmax())]
-        return Peak(math.inf, asked.problem.critical_frequency(p), p)
+        return GainPeak(math.inf, asked.problem.critical_frequency(p), p)
     return climb(value, asked.problem, asked.box.near_sides(1.0), starts, until)
 
 
-def _prove(asked: Blocks, lower: float, tolerance: float, until: float) -> tuple[float | None, int, str]:
+def _prove(asked: BlockLoop, lower: float, tolerance: float, until: float) -> tuple[float | None, int, str]:
     """The smallest bound that is proven, the number of cells, and the reason when nothing is proven."""
     if not math.isfinite(lower):
         return None, 0, "the box holds an unstable loop"
@@ -529,7 +533,9 @@ def _prove(asked: Blocks, lower: float, tolerance: float, until: float) -> tuple
     except Unproven as error:
         return None, 0, str(error)
     count, last = 0, len(asked.blocks) - 1
-    for bound in [lower * (1 + step * tolerance) for step in STEPS] if lower > LEAST else NOTHING:
+    for bound in (
+        [lower * (1 + step * tolerance) for step in STEPS] if lower > ZERO_GAIN else ZERO_GAIN_BOUNDS
+    ):
         sizes = [*asked.sizes(1.0)[:last], asked.sizes(1 / bound)[last]]
         found, cells = is_zero_free(parts, 1 + 1e-9, sizes, until)
         count += cells

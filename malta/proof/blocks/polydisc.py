@@ -47,7 +47,7 @@ Matrix = tuple[tuple[tuple[Family, ...], ...], ...]  # rows x columns of a_{S + 
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class PolydiscPart:
     """One group's polynomial over a part of the box, with the terms of the blocks that act on the group.
 
     scalars: indices of blocks; sets: a_S, S a number whose binary digits say which of the scalars
@@ -64,7 +64,7 @@ class Part:
 
 def parts_of(
     problem: OfLoop, blocks: Sequence[tuple[Block, list[int]]], box: Box, reach: float, most: Sequence[float]
-) -> list[Part]:
+) -> list[PolydiscPart]:
     """The groups' polynomials over parts of box(reach).
 
     blocks : each with the numbers of its entries among the problem's parameters; other entries are zero
@@ -87,7 +87,7 @@ def parts_of(
         for i in pins:
             p[i] = acb(disc, disc)
     groups = problem.parts(p, neglect=known)
-    found: list[Part] = []
+    found: list[PolydiscPart] = []
     owners = _owners([f for f, _ in groups], blocks)
     for (f, moves), acting in zip(groups, owners, strict=True):
         scaled = tuple(arb(grown) * c for c in moves)
@@ -115,7 +115,7 @@ def _part(
     moves: tuple[Any, ...],
     acting: list[tuple[int, Block, list[int]]],
     box: Box,
-) -> list[Part]:
+) -> list[PolydiscPart]:
     """The families of one group, from its values with entries at zero and at -unit."""
     known: dict[frozenset[int], Family] = {}
     count = len(f.names) - len(sides)
@@ -154,7 +154,7 @@ def _part(
     flat = iter(made)
     sets = tuple(next(flat) for _ in sums)
     matrix = tuple(tuple(tuple(next(flat) for _ in plain) for _ in row) for row in entries)
-    part = Part(
+    part = PolydiscPart(
         growth,
         sets[0].scale,
         tuple(k for k, _, _ in scalars),
@@ -222,7 +222,7 @@ Size = Callable[["FloatArray", int], Expanded]  # of a block, on cells of a scal
 
 
 def is_zero_free(
-    parts: Sequence[Part], target: float, sizes: Sequence[Size], until: float
+    parts: Sequence[PolydiscPart], target: float, sizes: Sequence[Size], until: float
 ) -> tuple[bool, int]:
     """Whether no polynomial has a zero on box(target) with blocks of these radii, and the number of cells."""
     count = 0
@@ -236,7 +236,9 @@ def is_zero_free(
     return True, count
 
 
-def _level(part: Part, level: int, target: float, sizes: Sequence[Size], until: float) -> tuple[bool, int]:
+def _level(
+    part: PolydiscPart, level: int, target: float, sizes: Sequence[Size], until: float
+) -> tuple[bool, int]:
     """One step of the induction: blocks before `level` on circles, block `level` in its disc, the later ones zero."""
     growth = part.growth
     axes = len(growth.low) - len(part.scalars)
@@ -259,7 +261,7 @@ def _level(part: Part, level: int, target: float, sizes: Sequence[Size], until: 
 class _Circles:
     """f on cells with the blocks before `level` on circles and block `level` in a disc; phases follow `axes`."""
 
-    part: Part
+    part: PolydiscPart
     level: int
     axes: int
     sizes: Sequence[Size]
@@ -289,7 +291,7 @@ class _Circles:
         return CellBounds(f.terms, f.radius, none, discs.astype(complex), moves, sure)
 
 
-def _half_plane(f: _Sum, g: _Sum) -> ComplexArray:
+def _half_plane(f: _BlockSum, g: _BlockSum) -> ComplexArray:
     """The direction c of f in the middle if Re(conj(c) f) > |g| on the whole cell, else zero.
 
     All of g lies within an angle e of d, so that |g| <= Re(conj(d) g) / cos(e): the condition is linear in f and g.
@@ -358,7 +360,7 @@ def _circle(sizes: list[Expanded], phases: FloatArray, last: Expanded | None) ->
     )
 
 
-class _Sum(NamedTuple):
+class _BlockSum(NamedTuple):
     """A sum over sets of blocks, on cells: expansions in frequency and in phases, and bounds of their errors."""
 
     terms: list[ComplexArray]  # in frequency: cells x nodes
@@ -369,7 +371,7 @@ class _Sum(NamedTuple):
 
 def _sum_over(
     families: Sequence[Family], circle: _Circle, cells: FloatArray, boxes: FloatArray, like: Family
-) -> _Sum:
+) -> _BlockSum:
     """The sum, by e^(j x) = 1 + j x + rest, |rest| <= x^2 / 2, x the sum of a set's phases minus their middles."""
     terms: list[Any] = [0.0] * 4
     slopes: list[Any] = [0.0] * circle.spread.shape[1]
@@ -389,10 +391,10 @@ def _sum_over(
         disc = disc + beyond[:, None] * (np.abs(found[0]) + high) + (np.abs(value) * x)[:, None] * high
         disc = disc + steep[:, None] * np.abs(found[-1])
         radius = radius + size * (rest + 1e-14 * (np.abs(found[0]) + high).max(axis=1))  # rounded products
-    return _Sum(terms, slopes, np.asarray(disc), np.asarray(radius))
+    return _BlockSum(terms, slopes, np.asarray(disc), np.asarray(radius))
 
 
-def _largest(matrix: list[list[_Sum]]) -> FloatArray:
+def _largest(matrix: list[list[_BlockSum]]) -> FloatArray:
     """An upper bound of the largest singular value of the matrix at each node: cells x nodes."""
     if len(matrix) == len(matrix[0]) == 1:
         (one,) = matrix[0]

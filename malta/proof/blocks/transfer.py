@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray, readonly
-from malta.linear.uncertain import Responses
+from malta.linear.uncertain import ResponseMatrices
 from malta.proof.blocks import Block
 from malta.work import is_past
 
@@ -38,10 +38,10 @@ CALL, VALUE = 9e-4, 5e-6  # work of values, and of each of them
 
 
 @dataclass(frozen=True, eq=False)
-class Signals:
+class LoopSignals:
     """The signals of a loop from additions to sensors, to commands and from forces on the plant, side by side."""
 
-    of: Responses
+    of: ResponseMatrices
 
     @cached_property
     def y(self) -> ComplexArray:
@@ -61,7 +61,7 @@ class Signals:
         return np.asarray(np.linalg.solve(np.eye(m) - r.F @ r.G_y, r.F @ law_reads))
 
 
-def transfer(signals: Signals, blocks: Sequence[Block]) -> ComplexArray:
+def transfer(signals: LoopSignals, blocks: Sequence[Block]) -> ComplexArray:
     """M from the outputs of the blocks, in their order, to their inputs: frequencies x columns x rows."""
     q, m = signals.of.G_y.shape[1:]
     total = sum(len(b.rows) for b in blocks)
@@ -116,8 +116,8 @@ def mu_bound(M: ComplexArray, blocks: Sequence[Block]) -> tuple[FloatArray, Comp
     back, w = _adjoint(tiled), np.ones_like(b)
     for _ in range(STEPS):
         a = _unit(tiled @ b)
-        w = _unit(back @ _balanced(a, w, blocks)[0])
-        b = _balanced(a, w, blocks)[1]
+        w = _unit(back @ _balance(a, w, blocks)[0])
+        b = _balance(a, w, blocks)[1]
     made = _dyads(a, w, blocks)
     size = np.abs(np.linalg.eigvals(tiled @ made)).max(axis=1).reshape(STARTS, -1)
     best = size.argmax(axis=0), np.arange(len(M))
@@ -156,7 +156,7 @@ def _parts(blocks: Sequence[Block]) -> list[tuple[slice, slice]]:
     return [(slice(*i), slice(*j)) for i, j in zip(pairwise(rows), pairwise(columns), strict=True)]
 
 
-def _balanced(a: ComplexArray, w: ComplexArray, blocks: Sequence[Block]) -> tuple[ComplexArray, ComplexArray]:
+def _balance(a: ComplexArray, w: ComplexArray, blocks: Sequence[Block]) -> tuple[ComplexArray, ComplexArray]:
     """Scale a to the norms of w block by block, and w to those of a."""
     rows, columns = [len(b.rows) for b in blocks], [len(b.columns) for b in blocks]
     read, given = _norms(a, columns), _norms(w, rows)
@@ -215,18 +215,18 @@ def _behind_one(M: ComplexArray) -> FloatArray:
 
 CORNERS = 32
 PLACES = 4  # starts of ascents at most
-AROUND = np.array([0.5, 0.8, 0.9, 0.95, 0.98, 1.0, 1.02, 1.05, 1.1, 1.25, 2.0])
+PEAK_FACTORS = np.array([0.5, 0.8, 0.9, 0.95, 0.98, 1.0, 1.02, 1.05, 1.1, 1.25, 2.0])
 ENDS = (0.01, 100.0)  # beyond the slowest and the fastest pole
-FAR_ENDS = (1e-5, 1e4)  # that stand for zero and for infinity
+LIMIT_FREQUENCIES = (1e-5, 1e4)  # that stand for zero and for infinity
 GRID = 80
 STEP = 1e-8  # of relative places and log frequencies, for slopes
-AHEAD = 0.02 / 4.0 ** np.arange(7)  # log frequencies either way that an ascent looks at last
-REAL = 1e-3  # share of |s| below which an imaginary part shows no peak: of a real pole it is rounding
+ASCENT_STEPS = 0.02 / 4.0 ** np.arange(7)  # log frequencies either way that an ascent looks at last
+MIN_IMAGINARY_SHARE = 1e-3  # of |s|: a smaller imaginary part shows no peak; of a real pole it is rounding
 
 Value = Callable[["FloatArray", "FloatArray"], "FloatArray"]  # of p, or rows of p, and of rows of w
 
 
-class Peak(NamedTuple):
+class GainPeak(NamedTuple):
     value: float
     frequency: float  # rad/s
     p: FloatArray
@@ -250,14 +250,14 @@ def frequencies(problem: OfLoop, p: FloatArray) -> FloatArray:
 def _frequencies(problem: OfLoop, place: bytes) -> FloatArray:
     with np.errstate(all="ignore"):
         s: ComplexArray = problem.poles(np.frombuffer(place))
-    known = np.concatenate([np.abs(s), np.abs(s.imag[np.abs(s.imag) > REAL * np.abs(s)])])
+    known = np.concatenate([np.abs(s), np.abs(s.imag[np.abs(s.imag) > MIN_IMAGINARY_SHARE * np.abs(s)])])
     known = known[np.isfinite(known) & (known > 0)]
     top = _top(problem)
     if not len(known):
         known = np.array([1.0])
     wide = np.geomspace(known.min() * ENDS[0], min(known.max() * ENDS[1], top), GRID)
-    far = np.array([known.min(), known.max()]) * FAR_ENDS
-    w = np.unique(np.concatenate([wide, far, (known[:, None] * AROUND).ravel()]))
+    far = np.array([known.min(), known.max()]) * LIMIT_FREQUENCIES
+    w = np.unique(np.concatenate([wide, far, (known[:, None] * PEAK_FACTORS).ravel()]))
     return readonly(np.append(w[w < top], top) if math.isfinite(top) else w)
 
 
@@ -269,16 +269,16 @@ def _top(problem: OfLoop) -> float:
 
 def climb(
     value: Value, problem: OfLoop, sides: FloatArray, starts: Sequence[FloatArray], until: float
-) -> Peak:
+) -> GainPeak:
     """The largest value found within the sides of a box (P x 2) until the work is up, from the best of some starts."""
-    places: list[Peak] = []
+    places: list[GainPeak] = []
     for p in starts:
         w = frequencies(problem, p)
         if is_past(until, CALL + VALUE * len(w)) and places:
             break
         v = value(p, w)
         inner = np.flatnonzero((v >= np.append(v[1:], -np.inf)) & (v >= np.append(-np.inf, v[:-1])))
-        places += [Peak(float(v[k]), float(w[k]), p) for k in inner[np.argsort(v[inner])[-3:]]]
+        places += [GainPeak(float(v[k]), float(w[k]), p) for k in inner[np.argsort(v[inner])[-3:]]]
     places.sort(key=lambda place: -place.value)
     if not math.isfinite(places[0].value):
         return places[0]
@@ -291,7 +291,7 @@ def climb(
     return best
 
 
-def _uphill(value: Value, place: Peak, sides: FloatArray, top: float, until: float) -> Peak:
+def _uphill(value: Value, place: GainPeak, sides: FloatArray, top: float, until: float) -> GainPeak:
     """Ascend from a place to the next maximum, by L-BFGS in parameters and log frequency, then in frequency alone."""
     from scipy import optimize  # here: it takes long to import, and few commands need it
 
@@ -309,7 +309,7 @@ def _uphill(value: Value, place: Peak, sides: FloatArray, top: float, until: flo
         found = value(p, w)
         k = int(np.where(np.isnan(found), -np.inf, found).argmax())
         if found[k] > best.value:
-            best = Peak(float(found[k]), float(w[k]), p[k])
+            best = GainPeak(float(found[k]), float(w[k]), p[k])
         return np.where(np.isfinite(found), -np.log(np.maximum(found, 1e-300)), -700.0)
 
     bounds = np.array([(0.0, 1.0)] * len(free) + [(-3.0, 3.0)])
@@ -319,7 +319,7 @@ def _uphill(value: Value, place: Peak, sides: FloatArray, top: float, until: flo
         found = losses(np.vstack([z, z + np.diag(h)]))
         return float(found[0]), (found[1:] - found[0]) / h
 
-    def coordinates(of: Peak) -> FloatArray:
+    def coordinates(of: GainPeak) -> FloatArray:
         x = np.clip((of.p[free] - low) / width, 0, 1)
         return np.append(x, math.log(of.frequency / place.frequency))
 
@@ -332,6 +332,6 @@ def _uphill(value: Value, place: Peak, sides: FloatArray, top: float, until: flo
         slopes, coordinates(place), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60},
         callback=stop,
     )  # type: ignore[call-overload]  # fmt: skip
-    for half in AHEAD:
+    for half in ASCENT_STEPS:
         losses(coordinates(best) + np.linspace(-half, half, 9)[:, None] * np.eye(len(free) + 1)[-1])
     return best

@@ -34,7 +34,7 @@ from malta.work import is_past
 ORDER = 4
 
 
-class Expansion(NamedTuple):
+class FrequencyExpansion(NamedTuple):
     """f on intervals of frequency (rows): b_m at the nodes of the family, and a bound of the error."""
 
     terms: tuple[ComplexArray, ...]  # b_0, b_1, b_2, b_3: cells x nodes
@@ -60,7 +60,7 @@ def cover(f: Family) -> FloatArray:
     return np.array([*cells, [1, 0, 1 / edges[-1]]])
 
 
-def expand(f: Family, cells: FloatArray, like: Family | None = None) -> Expansion:
+def expand(f: Family, cells: FloatArray, like: Family | None = None) -> FrequencyExpansion:
     """The expansions on intervals (rows of branch, from, to), each on a scale of its own, or on those of `like`."""
     n = f.degree
     high = cells[:, 0] == 1
@@ -88,7 +88,7 @@ def expand(f: Family, cells: FloatArray, like: Family | None = None) -> Expansio
     rounding = whole * ((4 * n + 32) * EPS + restriction_rounding(f.shape))
     lasting = rounding @ size + whole @ f.radius * (1 + 1e-9)
     radius = rest @ size * (1 + 1e-9) + lasting
-    return Expansion(tuple(terms), radius + 1e-290, lasting)
+    return FrequencyExpansion(tuple(terms), radius + 1e-290, lasting)
 
 
 def _shifts(f: Family, power: FloatArray, m_end: FloatArray, e_end: FloatArray) -> FloatArray:
@@ -115,10 +115,10 @@ def _product(weight: FloatArray, turn: ComplexArray, values: FloatArray) -> Comp
 GUARD = 1e-9  # rad that a half plane must have to spare
 BATCH = 1024
 CALL, CELL, NODE = 1.2e-3, 5e-6, 5e-7  # work of a batch, of each cell, and of each coefficient on it
-NARROW = 1e-4  # of an interval of frequency, whose expansion leaves out less than rounding
-HOPELESS = 0.1  # variation of f on a cell, in radii, below which smaller cells exclude no more
-FEW, MANY = 24, 96  # cells up to which they are cut thrice, and twice, at once
-STUCK = 14  # splits beyond the first of a cell that holds a candidate for the witness
+MIN_INTERVAL_WIDTH = 1e-4  # of an interval of frequency, whose expansion leaves out less than rounding
+ROUNDING_VARIATION = 0.1  # variation of f on a cell, in radii, below which smaller cells exclude no more
+FEW_CELLS, MANY_CELLS = 24, 96  # cells up to which they are cut thrice, and twice, at once
+MAX_EXTRA_SPLITS = 14  # splits beyond the first of a cell that holds a candidate for the witness
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +203,7 @@ def growth_over(sides: FloatArray, inverted: tuple[bool, ...], box: Box) -> Grow
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class OpenCell:
     """A cell from which zero is not excluded: an interval of frequency and a part of the box."""
 
     branch: int
@@ -224,7 +224,7 @@ class CellBounds(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class CellSearch:
     """Open and finished cells of one family. `lower`: zero is excluded on every box(t) with t below it."""
 
     family: Family
@@ -249,40 +249,40 @@ class Search:
     def finished(self) -> bool:
         return not (self.smallest < self.target).any()
 
-    def excluded(self, axes: int) -> tuple[FloatArray, FloatArray, ComplexArray]:
+    def excluded_cells(self, axes: int) -> tuple[FloatArray, FloatArray, ComplexArray]:
         """Cells from which zero is excluded: intervals, boxes, directions."""
         if not self.done:
             return np.zeros((0, 3)), np.zeros((0, axes, 2)), np.zeros(0, dtype=complex)
         cells, boxes, c = zip(*self.done, strict=True)
         return np.vstack(cells), np.vstack(boxes), np.concatenate(c)
 
-    def first(self) -> Cell | None:
+    def first(self) -> OpenCell | None:
         """The open cell of smallest t."""
         if not len(self.cells):
             return None
         return self._cell(int(self.smallest.argmin()))
 
-    def _cell(self, k: int) -> Cell:
+    def _cell(self, k: int) -> OpenCell:
         b, lo, hi = self.cells[k]
-        return Cell(int(b), (float(lo), float(hi)), self.boxes[k], float(self.smallest[k]))
+        return OpenCell(int(b), (float(lo), float(hi)), self.boxes[k], float(self.smallest[k]))
 
-    def hardest(self) -> Cell | None:
+    def hardest(self) -> OpenCell | None:
         """The open cell of smallest t that was split most often, if further splits seem useless."""
-        stuck = (self.depth >= STUCK) & (self.smallest < self.target)
+        stuck = (self.depth >= MAX_EXTRA_SPLITS) & (self.smallest < self.target)
         if not stuck.any():
             return None
         return self._cell(int(np.lexsort((-self.depth, np.where(stuck, self.smallest, np.inf)))[0]))
 
 
-def start(family: Family, growth: Growth, target: float, until: float = np.inf) -> Search:
+def start(family: Family, growth: Growth, target: float, until: float = np.inf) -> CellSearch:
     """A search up to `target`, which may later rise to `until`."""
     cells = cover(family)
     boxes = np.tile(growth.inside(max(target, until)), (len(cells), 1, 1))
     zero = np.zeros(len(cells))
-    return Search(family, growth, cells, boxes, growth.smallest(boxes), zero, target)
+    return CellSearch(family, growth, cells, boxes, growth.smallest(boxes), zero, target)
 
 
-def advance(s: Search) -> Search:
+def advance(s: CellSearch) -> CellSearch:
     """The search after a batch of open cells of the smallest t: zero is excluded from them, or they are split."""
     batch = s.smallest < s.target
     if not batch.any():
@@ -294,7 +294,7 @@ def advance(s: Search) -> Search:
         batch[order[:most]] = True
     cells, boxes, depth = s.cells[batch], s.boxes[batch], s.depth[batch]
     is_past(price=CALL + CELL * len(cells) + NODE * len(cells) * s.family.values.shape[1])
-    found = _expanded(s, cells, boxes)
+    found = _expand(s, cells, boxes)
     terms, radius = found.terms, found.radius
     c = half_plane([*terms, found.discs], radius)
     if found.sure is not None:
@@ -311,10 +311,13 @@ def advance(s: Search) -> Search:
     )
     bad = ~good
     if bad.any():
-        narrow = cells[:, 2] - cells[:, 1] < NARROW * cells[:, 2]  # the radius is not the expansion's
+        narrow = (
+            cells[:, 2] - cells[:, 1] < MIN_INTERVAL_WIDTH * cells[:, 2]
+        )  # the radius is not the expansion's
         spread = _spread(terms)
         hopeless = bad & (
-            narrow & (spread < HOPELESS * radius) | (spread < HOPELESS * found.discs.real.max(axis=1))
+            narrow & (spread < ROUNDING_VARIATION * radius)
+            | (spread < ROUNDING_VARIATION * found.discs.real.max(axis=1))
         )
         blocked = min(s.blocked, float(s.growth.smallest(boxes[hopeless]).min(initial=np.inf)))
         moves = [m[bad] for m in found.moves]
@@ -329,19 +332,21 @@ def _spread(terms: list[ComplexArray]) -> FloatArray:
     return np.asarray(np.abs(b0 - b0[:, :1]).max(axis=1) + sum(np.abs(t).max(axis=1) for t in terms[1:]))
 
 
-def on_boxes(f: Family, cells: FloatArray, boxes: FloatArray, like: Family | None = None) -> Expansion:
+def on_boxes(
+    f: Family, cells: FloatArray, boxes: FloatArray, like: Family | None = None
+) -> FrequencyExpansion:
     """The expansion of each cell with its coefficients over the cell's own box."""
     unique, index = np.unique(cells, axis=0, return_inverse=True)
     with np.errstate(over="ignore", invalid="ignore"):
-        e: Expansion = expand(f, unique, like)
+        e: FrequencyExpansion = expand(f, unique, like)
         index, count = index.ravel(), len(e.terms)
         together = np.stack(e.terms, axis=1)[index].reshape(len(index), -1)  # one more axis, which is not cut
         whole = np.concatenate([np.broadcast_to([0.0, 1.0], (len(index), 1, 2)), boxes], axis=1)
         cut = restrict(together, (count, *f.shape), whole).reshape(len(index), count, -1)
-    return Expansion(tuple(np.moveaxis(cut, 1, 0)), e.radius[index], e.lasting[index])
+    return FrequencyExpansion(tuple(np.moveaxis(cut, 1, 0)), e.radius[index], e.lasting[index])
 
 
-def _expanded(s: Search, cells: FloatArray, boxes: FloatArray) -> CellBounds:
+def _expand(s: CellSearch, cells: FloatArray, boxes: FloatArray) -> CellBounds:
     if s.around is not None:
         return s.around(cells, boxes)
     e = on_boxes(s.family, cells, boxes)
@@ -377,7 +382,9 @@ def half_plane(terms: list[ComplexArray], radius: FloatArray) -> ComplexArray:
     return c
 
 
-def _split(s: Search, cells: FloatArray, boxes: FloatArray, depth: FloatArray, found: CellBounds) -> Search:
+def _split(
+    s: CellSearch, cells: FloatArray, boxes: FloatArray, depth: FloatArray, found: CellBounds
+) -> CellSearch:
     """Split each cell in two across the axis that moves f most: frequency, a parameter or a further axis."""
     shape, terms, radius = s.family.shape, found.terms, found.radius
     count = terms[0].shape[1]
@@ -422,7 +429,7 @@ def _split(s: Search, cells: FloatArray, boxes: FloatArray, depth: FloatArray, f
 
 def _rounds(count: int) -> int:
     """The number of cuts at once: a few cells take as much time as one."""
-    return 1 if count > MANY else 2 if count > FEW else 3
+    return 1 if count > MANY_CELLS else 2 if count > FEW_CELLS else 3
 
 
 def _middles(boxes: FloatArray, growth: Growth) -> FloatArray:
@@ -440,7 +447,7 @@ PATCHES = 64  # parts of a box at most
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class BoxPart:
     """One characteristic polynomial on one part of the box."""
 
     of: Polynomial
@@ -486,9 +493,9 @@ def _halves(sides: FloatArray, axis: int, nominal: float) -> list[FloatArray]:
     return found
 
 
-def merge_twins(parts: list[Part]) -> list[Part]:
+def merge_twins(parts: list[BoxPart]) -> list[BoxPart]:
     """Merge groups whose coefficients agree to rounding, as those of the two planes of a round body."""
-    kept: list[Part] = []
+    kept: list[BoxPart] = []
     for part in parts:
         for k, other in enumerate(kept):
             both = _merge(other, part)
@@ -500,7 +507,7 @@ def merge_twins(parts: list[Part]) -> list[Part]:
     return kept
 
 
-def _merge(one: Part, two: Part) -> Part | None:
+def _merge(one: BoxPart, two: BoxPart) -> BoxPart | None:
     """A part whose radius covers both families; None when they differ by more than rounding."""
     f, g = one.family, two.family
     if one.around is not None or two.around is not None:
@@ -517,4 +524,4 @@ def _merge(one: Part, two: Part) -> Part | None:
     if not (apart <= 1e-9 * f.size()).all():
         return None
     radius = np.maximum(f.radius, g.radius + apart * (1 + 1e-9))
-    return Part(one.of, one.sides, Family(f.shape, f.values, radius, f.exponents, f.scale), one.growth)
+    return BoxPart(one.of, one.sides, Family(f.shape, f.values, radius, f.exponents, f.scale), one.growth)

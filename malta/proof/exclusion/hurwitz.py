@@ -32,10 +32,10 @@ from malta.proof.problem import Problem, hurwitz
 from malta.work import check_clock, spend
 
 BITS = 640  # of balls: Bernstein coefficients of degree d lose about 2 d of them
-LARGEST = 14  # degree in s
+MAX_POLYNOMIAL_DEGREE = 14  # degree in s
 DETERMINANT, HALVING = 3e-7, 4e-6  # work of a determinant, by its order cubed; of a cell, by its coefficients
 MOST_PLACES = 4000  # at which a_k, or H, is evaluated
-HIGHEST = 40  # degree of an interpolation along one parameter
+MAX_INTERPOLATION_DEGREE = 40  # degree of an interpolation along one parameter
 TAIL = -70.0  # log2 of what an interpolation may leave out, relative to each coefficient
 
 
@@ -79,7 +79,7 @@ class Tensor(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Axes:
+class BoxAxes:
     """A box in exact numbers: v = low + (high - low) u; p = v, or 1 / v where inverted."""
 
     low: list[Any]
@@ -120,7 +120,7 @@ class Function:
     """a_0, a_n or H over a part of the box, positive at the nominal values; of: the polynomial in s."""
 
     of: Polynomial
-    axes: Axes
+    axes: BoxAxes
     tensor: Tensor  # Bernstein coefficients
     slack: Any  # bound of what these leave out
 
@@ -151,9 +151,9 @@ def functions_over(f: Polynomial, box: Box, moves: Sequence[Any], sides: FloatAr
     low, high = ends_of(f, sides)
     nominal = [exact(x) for x in box.nominal.tolist()]
     rates = [[exact(x) for x in rate.tolist()] for rate in (box.down, box.up)]
-    axes = Axes(low, high, f.inverted, nominal, *rates)
+    axes = BoxAxes(low, high, f.inverted, nominal, *rates)
     here = _values(f, [axes.middle(i) for i in range(len(nominal))])
-    if len(here) - 1 > LARGEST:
+    if len(here) - 1 > MAX_POLYNOMIAL_DEGREE:
         raise Unproven(f"a polynomial of degree {len(here) - 1} in s")
     powers, tails = _enclose(f, axes)
     for k, bound in enumerate(f.coupling_bounds(moves, [(arb(a), arb(b)) for a, b in sides.tolist()]) or ()):
@@ -186,7 +186,7 @@ def _values(f: Polynomial, v: list[Any]) -> list[Any]:
         raise Unproven(f"the matrices have no value on the box: {error}") from error
 
 
-def _enclose(f: Polynomial, axes: Axes) -> tuple[list[Tensor], list[Any]]:
+def _enclose(f: Polynomial, axes: BoxAxes) -> tuple[list[Tensor], list[Any]]:
     """The coefficients a_k as polynomials of u, by powers, and bounds of what these leave out."""
     known = f.degrees
     free = [i for i, d in enumerate(known) if d is None and axes.low[i] < axes.high[i]]
@@ -197,7 +197,7 @@ def _enclose(f: Polynomial, axes: Axes) -> tuple[list[Tensor], list[Any]]:
         tails = [arb(0)] * len(middle)
         size = [pair(arb(c)) for c in middle]
         for order, i in enumerate(free):
-            degrees[i], left = _sampling(f.names[i], i, discs_of(f, i, axes.low, axes.high, size))
+            degrees[i], left = _interpolation_nodes(f.names[i], i, discs_of(f, i, axes.low, axes.high, size))
             tails = [one + two * 4**order for one, two in zip(tails, left, strict=True)]
     if math.prod(d + 1 for d in degrees) > MOST_PLACES:
         raise Unproven("too many coefficients")
@@ -219,17 +219,17 @@ def _enclose(f: Polynomial, axes: Axes) -> tuple[list[Tensor], list[Any]]:
     return found, tails or [arb(0)] * len(found)
 
 
-def _sampling(name: str, axis: int, discs: list[Disc]) -> tuple[int, list[Any]]:
+def _interpolation_nodes(name: str, axis: int, discs: list[Disc]) -> tuple[int, list[Any]]:
     """The lowest degree of an interpolation at Chebyshev nodes that leaves out little enough, and what it leaves out.
 
     Lebesgue's constant is below 4. Raises TooWide when the degree is too high.
     """
-    best = HIGHEST + 1, discs[0]
+    best = MAX_INTERPOLATION_DEGREE + 1, discs[0]
     for disc in discs:
         rest = disc.share + 3 - math.log2(disc.radius - 1) - TAIL
         best = min(best, (max(1, math.ceil(rest / math.log2(disc.radius))), disc), key=lambda pair: pair[0])
     degree, disc = best
-    if degree > HIGHEST:
+    if degree > MAX_INTERPOLATION_DEGREE:
         raise TooWide(axis, f"{name}: its range is too wide for one expansion")
     radius = arb(disc.radius)
     scale = 5 / (radius**degree * (radius - 1))
@@ -331,13 +331,13 @@ def _determinant_slack(sizes: list[Any], tails: list[Any]) -> Any:
 
 
 SIGN_SNAP = fmpq(1, 256)  # of a range: in cells that narrow, a parameter about zero is tried at zero
-DEEPEST = 60  # halvings of a side
+MAX_HALVINGS = 60  # halvings of a side
 SIGN_PARTS = 16  # of a box
 MOST_CORNERS = 64  # of a cell, that are tried as witnesses
 HALF = fmpq(1, 2)
 
 
-class Cell(NamedTuple):
+class PositivityCell(NamedTuple):
     """A part of the box on which a function is not proven positive; t: the smallest of any of its points."""
 
     t: Any
@@ -356,7 +356,7 @@ class Signs:
 
     reach: Any  # the box that the functions cover
     upper: float = math.inf
-    cells: list[Cell] = field(default_factory=list)
+    cells: list[PositivityCell] = field(default_factory=list)
     witness: FloatArray | None = None
     count: int = 0
     blocked: bool = False
@@ -372,7 +372,7 @@ class Signs:
         t = function.axes.smallest(sides)
         if t is not None and t < self.reach and float(t) < self.upper:
             self.count += 1
-            heapq.heappush(self.cells, Cell(t, self.count, function, tensor, sides))
+            heapq.heappush(self.cells, PositivityCell(t, self.count, function, tensor, sides))
 
     def advance(self) -> None:
         """Take the open cell of the smallest t: try its corners as witnesses, and halve it."""
@@ -383,7 +383,7 @@ class Signs:
         self._try_corners(cell)
         axis = _axis(cell)
         low, high = cell.sides[axis]
-        if (high - low) * 2**DEEPEST <= 1:
+        if (high - low) * 2**MAX_HALVINGS <= 1:
             self.blocked = True
             heapq.heappush(self.cells, cell)
             return
@@ -392,7 +392,7 @@ class Signs:
             sides = [*cell.sides[:axis], side, *cell.sides[axis + 1 :]]
             self.add(cell.function, cell.tensor.along(axis, M), sides)
 
-    def _try_corners(self, cell: Cell) -> None:
+    def _try_corners(self, cell: PositivityCell) -> None:
         function, axes = cell.function, cell.function.axes
         free = [i for i, (a, b) in enumerate(zip(axes.low, axes.high, strict=True)) if a < b]
         ends = [(0, 1) if i in free else (0,) for i in range(len(cell.sides))]
@@ -401,7 +401,7 @@ class Signs:
                 self._try(function, [side[k] for side, k in zip(cell.sides, at, strict=True)])
         self._try_zeros(cell)
 
-    def _try_zeros(self, cell: Cell) -> None:
+    def _try_zeros(self, cell: PositivityCell) -> None:
         """A root may touch the boundary where a parameter is zero, and a halved cell has no corner there."""
         axes, u, any_zero = cell.function.axes, [], False
         for i, ((a, b), low, high) in enumerate(zip(cell.sides, axes.low, axes.high, strict=True)):
@@ -431,7 +431,7 @@ class Signs:
             self.witness = np.array([float(arb(x)) for x in p])
 
 
-def _axis(cell: Cell) -> int:
+def _axis(cell: PositivityCell) -> int:
     """The axis along which the function changes most; else the widest one."""
     shape = cell.tensor.shape
     sizes = [abs(x) for x in cell.tensor.values]
@@ -460,7 +460,7 @@ def signs_over(problem: Problem, box: Box, reach: float) -> Signs:
     Raises Unproven where the determinant has too many coefficients or a matrix has no value; WorkUp as spend does.
     """
     sides = box.sides(reach)
-    found = Signs(_covered(box, sides))
+    found = Signs(_covered_box(box, sides))
     try:
         with precision(BITS):
             for f, moves in problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
@@ -473,7 +473,7 @@ def signs_over(problem: Problem, box: Box, reach: float) -> Signs:
     return found
 
 
-def _covered(box: Box, sides: FloatArray) -> Any:
+def _covered_box(box: Box, sides: FloatArray) -> Any:
     """The largest t with box(t) within these sides, exactly."""
     t = fmpq(2) ** 40
     for i, (low, high) in enumerate(sides.tolist()):

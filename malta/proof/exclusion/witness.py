@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray
-from malta.proof.exclusion import Cell, Growth, cover
+from malta.proof.exclusion import Growth, OpenCell, cover
 from malta.proof.polynomial.family import Family, basis
 from malta.work import is_past
 
@@ -192,11 +192,11 @@ def gradients(f: Family, zero: Zero) -> tuple[ComplexArray, complex]:
 # infinity (the Nyquist frequency) the equation is that of one real coefficient.
 
 
-MOST = 60  # steps of a descent
-BEYOND = 1.2  # a descent ends beyond this multiple of the smallest t known
-CLOSE = 1e-9  # relative gain of a step below which a descent ends
-FAR = 1.5  # |change of ln x| beyond which a root counts as another one
-NEAR = 0.3  # |change of ln x| within which a root belongs to its start
+MAX_DESCENT_STEPS = 60  # steps of a descent
+DESCENT_LIMIT = 1.2  # a descent ends beyond this multiple of the smallest t known
+MIN_DESCENT_GAIN = 1e-9  # relative gain of a step below which a descent ends
+MAX_ROOT_MOVE = 1.5  # |change of ln x| beyond which a root counts as another one
+SAME_ROOT_DISTANCE = 0.3  # |change of ln x| within which a root belongs to its start
 
 
 class _Place(NamedTuple):
@@ -213,7 +213,7 @@ def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: f
     """Descend from a start to a zero of f of smallest t; None when none with t below `below` is found."""
     here = _find_root(f, g, branch, x, u, below)
     trust, widest, best = 0.5, 1.0, None
-    for k in range(MOST if here is not None else 0):
+    for k in range(MAX_DESCENT_STEPS if here is not None else 0):
         assert here is not None
         if is_past(price=DESCENT + 3 * VALUE * f.values.size):
             break
@@ -225,14 +225,14 @@ def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: f
             continue
         t, cost, du = found
         left = here.t + cost * abs(here.value) - t
-        if (k > 2 and t > BEYOND * below) or t - 3 * left > below:
+        if (k > 2 and t > DESCENT_LIMIT * below) or t - 3 * left > below:
             break
         there = _follow_root(f, g, branch, here.x, np.clip(here.u + du, 0, 1))
         gain = -np.inf if there is None else left - (there.t + cost * abs(there.value) - t)
         if abs(here.value) < 1e-9:
             zero = _as_zero(f, branch, here)
             best = zero if zero is not None and (best is None or zero.t < best.t) else best
-            if zero is not None and left <= CLOSE * here.t:
+            if zero is not None and left <= MIN_DESCENT_GAIN * here.t:
                 break
         if there is None or gain < 0.1 * left:
             trust = widest = min(trust, float(np.abs(du).max(initial=0.0))) / 3
@@ -259,7 +259,7 @@ def _find_root(f: Family, g: Growth, branch: int, x: complex, u: FloatArray, bel
     if x == 0:
         return _follow_root(f, g, branch, 0.0, u)
     for _ in range(12):
-        here = _follow_root(f, g, branch, x, u, NEAR)
+        here = _follow_root(f, g, branch, x, u, SAME_ROOT_DISTANCE)
         if here is not None:
             return here
         a, slopes = coefficients_at(f, u)
@@ -277,7 +277,7 @@ def _find_root(f: Family, g: Growth, branch: int, x: complex, u: FloatArray, bel
 
 
 def _follow_root(
-    f: Family, g: Growth, branch: int, x: complex, u: FloatArray, far: float = FAR
+    f: Family, g: Growth, branch: int, x: complex, u: FloatArray, far: float = MAX_ROOT_MOVE
 ) -> _Place | None:
     """The root next to x at u, by Newton's method in ln x; None when ln x changes by more than `far`."""
     a, slopes = coefficients_at(f, u)
@@ -379,7 +379,7 @@ def _grow_box(
     return np.inf, np.zeros(len(s))
 
 
-def from_cell(f: Family, g: Growth, cell: Cell, below: float) -> Zero | None:
+def from_cell(f: Family, g: Growth, cell: OpenCell, below: float) -> Zero | None:
     """A zero with t below `below` in a cell that resists: the zero next to its middle, and the descent from there."""
     low, high = cell.interval
     u, best = cell.box.mean(axis=1), None

@@ -27,20 +27,20 @@ import numpy as np
 from scipy import linalg
 
 from malta.arrays import ComplexArray, FloatArray
-from malta.proof.multipliers.pencil import EPS, Expansion, Pencil
+from malta.proof.multipliers.pencil import EPS, BoxTerms, Pencil
 from malta.work import spend
 
 STEPS = 60  # of the level, at most
-INNER = 5  # Newton steps for each
+NEWTON_STEPS = 5  # Newton steps for each
 SHARE = 0.3  # of the way from the level reached to the one that stands
-FLAT = 0.01  # relative progress below which the level is the best there is
+MIN_PROGRESS = 0.01  # relative progress below which the level is the best there is
 STEP = 1e-6  # of N, for the slopes of a centre
 SLACK = 1e-6  # what keeps G within thousands of D where nothing else does
-NEWTON, SQUARED = 1.5e-4, 8e-8  # work of a Newton step, and times the square of its coordinates
+NEWTON, COORDINATE = 1.5e-4, 8e-8  # work of a Newton step, and times the square of its coordinates
 
 
 @dataclass(frozen=True)
-class Blocks:
+class BlockSizes:
     """The sizes of the real blocks, and of a complex block at the end, which may be empty."""
 
     real: tuple[int, ...]
@@ -56,7 +56,7 @@ class Multiplier(NamedTuple):
 
     D: ComplexArray
     G: ComplexArray
-    blocks: Blocks  # whose structure D and G have: it shows nothing of others
+    blocks: BlockSizes  # whose structure D and G have: it shows nothing of others
     x: float = 0.0
     slopes: tuple[ComplexArray, ComplexArray] | None = None  # none: constant
 
@@ -83,7 +83,7 @@ class Basis(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _basis(blocks: Blocks) -> Basis:
+def _basis(blocks: BlockSizes) -> Basis:
     pairs: list[tuple[int, int]] = []
     at = 0
     for r in blocks.real:
@@ -95,7 +95,7 @@ def _basis(blocks: Blocks) -> Basis:
     return Basis(a, b, own, np.flatnonzero(a < b), np.where(a < b, 1.0, 0.5))
 
 
-def units(N: ComplexArray, blocks: Blocks) -> FloatArray:
+def units(N: ComplexArray, blocks: BlockSizes) -> FloatArray:
     """Scales of the channels that balance N, powers of two."""
     size = np.abs(N) + 1e-12 * np.abs(N).max(initial=0.0) + 1e-300
     right, left = np.ones(len(N)), np.ones(len(N))
@@ -110,10 +110,10 @@ def units(N: ComplexArray, blocks: Blocks) -> FloatArray:
 
 def multiplier(
     N: ComplexArray,
-    blocks: Blocks,
+    blocks: BlockSizes,
     first: Multiplier | None,
     wanted: float,
-    flat: float = FLAT,
+    flat: float = MIN_PROGRESS,
     along: ComplexArray | None = None,
     *,
     hasty: bool = False,
@@ -146,7 +146,7 @@ def multiplier(
 class _Centres:
     """Analytic centres of b D - S(D, G) > 0, D > 0 with S = N* D N + j (G N - N* G), b = beta^2."""
 
-    def __init__(self, N: ComplexArray, blocks: Blocks) -> None:
+    def __init__(self, N: ComplexArray, blocks: BlockSizes) -> None:
         self.N, self.H, self.blocks, self.basis = N, N.conj().T, blocks, _basis(blocks)
         self.own = self.basis.own + len(self.basis.off)  # coordinates of G
         self.count = self.own + (blocks.other > 0)  # of D
@@ -236,8 +236,8 @@ class _Centres:
 
     def centre(self, x: FloatArray, b: float) -> FloatArray:
         """Newton steps towards the centre for b."""
-        for _ in range(INNER):
-            spend(NEWTON + SQUARED * len(x) ** 2)
+        for _ in range(NEWTON_STEPS):
+            spend(NEWTON + COORDINATE * len(x) ** 2)
             try:
                 inverses = self._inverses(x, b)
                 g = self._gradient(x, b, *inverses)
@@ -300,7 +300,7 @@ class Fold(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _fold(blocks: Blocks) -> Fold:
+def _fold(blocks: BlockSizes) -> Fold:
     a, b, own, off, w = _basis(blocks)
     n, size = blocks.size, len(a)
     across, right, left = b[:, None] * n + a, b[:, None] * n + b, a[:, None] * n + a
@@ -320,19 +320,19 @@ def _fold(blocks: Blocks) -> Fold:
     )
 
 
-FINE = 1e-11  # of the largest: what a slope has below that is no channel
-COARSE = 3e-4  # where a hold curves the slopes
-SMALL = 1e-7  # of M: a rest below that is taken with the rounding
-SMALLEST = 1e-10  # where slopes are factored to the last digit
+SLOPE_TOLERANCE = 1e-11  # of the largest: what a slope has below that is no channel
+HOLD_SLOPE_TOLERANCE = 3e-4  # where a hold curves the slopes
+MAX_ROUNDED_REST = 1e-7  # of M: a rest below that is taken with the rounding
+FACTOR_TOLERANCE = 1e-10  # where slopes are factored to the last digit
 GUARD = 1e-13
 
 
-class Channels(NamedTuple):
+class Slopes(NamedTuple):
     """Slopes factored, constant parts and those of jx: sum_i delta_i M_i = B Delta C, and the block of what is left."""
 
     B: tuple[FloatArray, FloatArray]
     C: tuple[FloatArray, FloatArray]
-    blocks: Blocks
+    blocks: BlockSizes
     owners: FloatArray  # parameter of each channel; -1: of the block
 
 
@@ -345,7 +345,7 @@ class Branch:
     x: float
 
     @cached_property
-    def parts(self) -> tuple[Expansion, Expansion]:
+    def parts(self) -> tuple[BoxTerms, BoxTerms]:
         own = self.pencil.branch(self.branch)
         size = own[0].size + self.x * own[1].size
         rows, columns = np.ones(len(size)), np.ones(len(size))
@@ -354,7 +354,7 @@ class Branch:
             columns = 1 / np.maximum((size * rows[:, None]).max(axis=0), 1e-300)
         rows, columns = (np.exp2(np.round(np.log2(v))) for v in (rows, columns))
         turn = rows[:, None] * columns
-        return tuple(Expansion(p.middle * turn, p.slopes * turn, p.rest * turn) for p in own)  # type: ignore[return-value]
+        return tuple(BoxTerms(p.middle * turn, p.slopes * turn, p.rest * turn) for p in own)  # type: ignore[return-value]
 
     @cached_property
     def finite(self) -> bool:
@@ -362,12 +362,12 @@ class Branch:
         return all(np.isfinite(M).all() for p in self.parts for M in (p.middle, p.slopes, p.rest))
 
     @cached_property
-    def channels(self) -> tuple[Channels, FloatArray, FloatArray]:
+    def channels(self) -> tuple[Slopes, FloatArray, FloatArray]:
         """The channels, and the rest of the constant part and of the factor of x."""
         one, two = self.parts
         n = len(one.middle)
         rest = [one.rest.copy(), two.rest.copy()]
-        coarse = COARSE if self.pencil.curved else FINE
+        coarse = HOLD_SLOPE_TOLERANCE if self.pencil.curved else SLOPE_TOLERANCE
         kept: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = []
         sizes, owners = [], []
         for i, (a, b) in enumerate(zip(one.slopes, two.slopes, strict=True)):
@@ -385,7 +385,7 @@ class Branch:
                 )
         other = 0
         whole = rest[0] + self.x * rest[1]
-        whole = np.where(whole > (SMALL if self.pencil.curved else SMALLEST), whole, 0)
+        whole = np.where(whole > (MAX_ROUNDED_REST if self.pencil.curved else FACTOR_TOLERANCE), whole, 0)
         if whole.any():
             rest = [np.where(whole > 0, 0, part) for part in rest]
             u, v = np.sqrt(whole.sum(axis=1)), np.sqrt(whole.sum(axis=0))
@@ -399,7 +399,7 @@ class Branch:
         B0, B1, C0, C1 = (
             (np.hstack if k < 2 else np.vstack)([part[k] for part in kept]) for k in range(4)
         )  # fmt: skip
-        return Channels((B0, B1), (C0, C1), Blocks(tuple(sizes), other), np.array(owners)), rest[0], rest[1]
+        return Slopes((B0, B1), (C0, C1), BlockSizes(tuple(sizes), other), np.array(owners)), rest[0], rest[1]
 
 
 def _factors(

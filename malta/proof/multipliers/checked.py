@@ -17,22 +17,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from flint import acb, acb_mat, arb, arb_mat, fmpq
 
-from malta.checker.check import tiled
+from malta.checker.check import tiles_box
 from malta.linear.expressions import exact
-from malta.proof.multipliers import SMALL, SMALLEST, Branch
+from malta.proof.multipliers import FACTOR_TOLERANCE, MAX_ROUNDED_REST, Branch
 from malta.proof.polynomial.enclosure import precision
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray, FloatArray
     from malta.proof.multipliers.pencil import Pencil
-    from malta.proof.multipliers.structured import Cell, Proof, Shown
+    from malta.proof.multipliers.structured import MultiplierCell, MultiplierProof, Shown
 
 BITS = 128
 TERMS = 4  # of Taylor series along frequency
-NARROWEST = 2.0**-9  # part of an interval of frequency
+MIN_INTERVAL_SHARE = 2.0**-9  # part of an interval of frequency
 
 
-def refusal(proof: Proof, until: float = np.inf) -> str:
+def refusal(proof: MultiplierProof, until: float = np.inf) -> str:
     """Why a proof by multipliers does not hold, in words; empty when all of it was confirmed until a time."""
     before: FloatArray | None = None
     with precision(BITS):
@@ -73,12 +73,12 @@ def _gap(shown: list[Shown], sides: FloatArray) -> str:
             for c in cells
             if c.branch == branch
         ]
-        if not tiled(tiles, [(fmpq(0), ends[branch]), *box]):
+        if not tiles_box(tiles, [(fmpq(0), ends[branch]), *box]):
             return "the cells leave a gap"
     return ""
 
 
-def _is_regular(pencil: Pencil, cell: Cell, multiplier: Any) -> bool:
+def _is_regular(pencil: Pencil, cell: MultiplierCell, multiplier: Any) -> bool:
     """Whether the pencil is regular on a cell, or on parts of its interval one by one."""
     branch = Branch(pencil, cell.branch, cell.top)
     todo = [(exact(cell.low), exact(cell.high))]
@@ -90,7 +90,7 @@ def _is_regular(pencil: Pencil, cell: Cell, multiplier: Any) -> bool:
         except ZeroDivisionError:  # a matrix of balls that may be singular
             pass
         middle = (low + high) / 2
-        if high - low <= exact(NARROWEST) * (exact(cell.high) - exact(cell.low)):
+        if high - low <= exact(MIN_INTERVAL_SHARE) * (exact(cell.high) - exact(cell.low)):
             return False
         todo += [(low, middle), (middle, high)]
     return True
@@ -128,7 +128,7 @@ def _is_positive_on(branch: Branch, low: Any, high: Any, multiplier: Any) -> boo
     size = sum((_sizes(N) for N in terms), arb_mat(n, n))
     d, g = _sizes(D) + _sizes(dD), _sizes(G) + _sizes(dG)
     left = (size + rest).transpose() * d * rest + g * rest
-    F[0] = _widened(F[0], left + left.transpose())
+    F[0] = _widen(F[0], left + left.transpose())
     return _is_positive(D + dD) and _is_positive(D - dD) and _is_positive_series(F)
 
 
@@ -139,10 +139,10 @@ def _response(branch: Branch, low: Any, high: Any) -> tuple[list[Any], Any] | No
     channels = branch.channels[0]
     (B0, B1), (C0, C1) = ([_complex(M) for M in pair] for pair in (channels.B, channels.C))
     turn = acb(0, 1)
-    rest = _remaining(branch, arb(high))
+    rest = _bound_remainder(branch, arb(high))
     if rest is None:
         return None
-    L = _widened(_complex(one.middle) + _complex(two.middle) * (turn * x0), rest)
+    L = _widen(_complex(one.middle) + _complex(two.middle) * (turn * x0), rest)
     columns = len(channels.B[0].T)
     wide = acb_mat(
         n, n + 2 * columns,
@@ -165,7 +165,7 @@ def _response(branch: Branch, low: Any, high: Any) -> tuple[list[Any], Any] | No
     return terms, _sizes(C) * beyond + _sizes(moved) * (beyond + _sizes(g[-1]))
 
 
-def _remaining(branch: Branch, high: Any) -> Any:
+def _bound_remainder(branch: Branch, high: Any) -> Any:
     """Entrywise bounds of R; None where its larger entries are more than the complex block at the end covers."""
     one, two = branch.parts
     channels, n = branch.channels[0], len(one.middle)
@@ -181,7 +181,7 @@ def _remaining(branch: Branch, high: Any) -> Any:
     if other:
         u, v = np.abs(channels.B[0][:, other]).sum(axis=1), np.abs(channels.C[0][other]).sum(axis=0)
         rows, columns = [arb(0)] * n, [arb(0)] * n
-        least = SMALL if branch.pencil.curved else SMALLEST
+        least = MAX_ROUNDED_REST if branch.pencil.curved else FACTOR_TOLERANCE
         for i in range(n):
             for j in range(n):
                 if u[i] and v[j] and not table[i][j] < least:
@@ -227,10 +227,10 @@ def _is_positive(F: Any) -> bool:
 
 
 def _pair(D: ComplexArray, G: ComplexArray, blocks: Any) -> tuple[Any, Any]:
-    return _structured(D, blocks, beside=True), _structured(G, blocks, beside=False)
+    return _structure(D, blocks, beside=True), _structure(G, blocks, beside=False)
 
 
-def _structured(M: ComplexArray, blocks: Any, *, beside: bool) -> Any:
+def _structure(M: ComplexArray, blocks: Any, *, beside: bool) -> Any:
     """The Hermitian part of M within its real blocks; `beside`, as D has, one multiple of the identity."""
     kept, at = np.zeros_like(M), 0
     for r in blocks.real:
@@ -273,7 +273,7 @@ def _upper(M: Any) -> Any:
     return arb_mat(M.nrows(), M.ncols(), [arb(x.upper()) for x in M.entries()])
 
 
-def _widened(M: Any, by: Any) -> Any:
+def _widen(M: Any, by: Any) -> Any:
     """Balls about those of M with radii `by` more."""
     radii = [acb(arb(0, r.upper()), arb(0, r.upper())) for r in by.entries()]
     return M + acb_mat(M.nrows(), M.ncols(), radii)

@@ -21,7 +21,7 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.linear.rational import TooLarge
-from malta.linear.uncertain import Group
+from malta.linear.uncertain import StateGroup
 from malta.proof.groups import C, UncertainLoop
 from malta.proof.polynomial.characteristic import clear_denominators
 
@@ -32,7 +32,7 @@ EPS = 2.0**-52
 
 
 @dataclass(frozen=True, eq=False)
-class Expansion:
+class BoxTerms:
     """The value in the middle of the box, slopes per half side, and an entrywise bound of the error with rounding."""
 
     middle: FloatArray  # n x m
@@ -43,31 +43,31 @@ class Expansion:
     def size(self) -> FloatArray:
         return np.asarray(np.abs(self.middle) + np.abs(self.slopes).sum(axis=0))
 
-    def __add__(self, other: Expansion) -> Expansion:
+    def __add__(self, other: BoxTerms) -> BoxTerms:
         rest = self.rest + other.rest + 2 * EPS * (self.size + other.size)
-        return Expansion(self.middle + other.middle, self.slopes + other.slopes, rest)
+        return BoxTerms(self.middle + other.middle, self.slopes + other.slopes, rest)
 
-    def times(self, a: float) -> Expansion:
+    def times(self, a: float) -> BoxTerms:
         rest = abs(a) * (self.rest + 2 * EPS * self.size)
-        return Expansion(a * self.middle, a * self.slopes, rest * (1 + 4 * EPS))
+        return BoxTerms(a * self.middle, a * self.slopes, rest * (1 + 4 * EPS))
 
-    def columns(self, gains: FloatArray) -> Expansion:
+    def columns(self, gains: FloatArray) -> BoxTerms:
         """The product with a constant matrix from the right."""
         rest = (self.rest + 4 * (len(gains) + 1) * EPS * self.size) @ np.abs(gains)
-        return Expansion(self.middle @ gains, self.slopes @ gains, rest * (1 + 1e-12))
+        return BoxTerms(self.middle @ gains, self.slopes @ gains, rest * (1 + 1e-12))
 
-    def part(self, rows: slice, columns: slice) -> Expansion:
-        return Expansion(self.middle[rows, columns], self.slopes[:, rows, columns], self.rest[rows, columns])
+    def part(self, rows: slice, columns: slice) -> BoxTerms:
+        return BoxTerms(self.middle[rows, columns], self.slopes[:, rows, columns], self.rest[rows, columns])
 
 
-def constant(matrix: FloatArray, count: int) -> Expansion:
+def constant(matrix: FloatArray, count: int) -> BoxTerms:
     """A matrix that depends on none of `count` parameters."""
-    return Expansion(matrix, np.zeros((count, *matrix.shape)), np.zeros(matrix.shape))
+    return BoxTerms(matrix, np.zeros((count, *matrix.shape)), np.zeros(matrix.shape))
 
 
-def stack(rows: Sequence[Sequence[Expansion]]) -> Expansion:
+def stack(rows: Sequence[Sequence[BoxTerms]]) -> BoxTerms:
     """A matrix from rows of blocks."""
-    return Expansion(
+    return BoxTerms(
         np.vstack([np.hstack([part.middle for part in row]) for row in rows]),
         np.concatenate([np.concatenate([part.slopes for part in row], axis=2) for row in rows], axis=1),
         np.vstack([np.hstack([part.rest for part in row]) for row in rows]),
@@ -75,7 +75,7 @@ def stack(rows: Sequence[Sequence[Expansion]]) -> Expansion:
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class PolynomialTable:
     """A matrix of polynomials in p: monomials, each with its place."""
 
     shape: tuple[int, int]
@@ -83,7 +83,7 @@ class Table:
     powers: Any
     gains: FloatArray
 
-    def over(self, c: FloatArray, r: FloatArray) -> Expansion:
+    def over(self, c: FloatArray, r: FloatArray) -> BoxTerms:
         """The expansion on |p - c| <= r."""
         e, count = self.powers, len(c)
         each = np.where(e > 0, c, 1.0) ** e
@@ -99,7 +99,7 @@ class Table:
         # (|c| + r)^e less its value and slopes: terms of second order, none of them negative
         beyond = np.where(e.sum(axis=1) > 1, np.maximum(size - linear, 0), 0)
         rounding = 8 * (count + int(e.max(initial=1)) + 4) * EPS * size
-        return Expansion(self._sum_terms(middle), slopes, self._sum_terms(beyond + rounding))
+        return BoxTerms(self._sum_terms(middle), slopes, self._sum_terms(beyond + rounding))
 
     def _sum_terms(self, values: FloatArray) -> FloatArray:
         found = np.zeros(self.shape)
@@ -107,7 +107,7 @@ class Table:
         return found
 
 
-def table(shape: tuple[int, int], entries: dict[tuple[int, int], Any], count: int) -> Table:
+def table(shape: tuple[int, int], entries: dict[tuple[int, int], Any], count: int) -> PolynomialTable:
     """The table of polynomials over the rationals in the first `count` of their variables."""
     places, powers, gains = [], [], []
     for at, polynomial in entries.items():
@@ -116,7 +116,7 @@ def table(shape: tuple[int, int], entries: dict[tuple[int, int], Any], count: in
             powers.append([int(k) for k in monomial[:count]])
             gains.append(int(gain.p) / int(gain.q))
     k = len(gains)
-    return Table(
+    return PolynomialTable(
         shape,
         np.array(places, dtype=int).reshape(k, 2),
         np.array(powers, dtype=int).reshape(k, count),
@@ -139,10 +139,10 @@ def table(shape: tuple[int, int], entries: dict[tuple[int, int], Any], count: in
 
 BERNOULLI = 36  # terms of c
 LEVELS = 3  # of the fraction: up to these, its coefficients have the sign of those of c and are not larger
-LARGEST = 4.8  # norm of Y up to which c is taken: its series ends at 2 pi
+MAX_SERIES_NORM = 4.8  # norm of Y up to which c is taken: its series ends at 2 pi
 POWERS = 30  # of a matrix, towards its largest eigenvector
 EXPONENTIAL = 80  # terms of e^Y
-STEEPEST = 16.0  # norm of Y up to which e^Y is
+MAX_EXPONENTIAL_NORM = 16.0  # norm of Y up to which e^Y is
 
 
 @lru_cache(maxsize=LEVELS + 1)
@@ -164,7 +164,7 @@ def gains_of_level(level: int) -> tuple[float, ...]:
     return tuple(found)
 
 
-def quotient(A: Expansion, dens: Expansion) -> Expansion | None:
+def quotient(A: BoxTerms, dens: BoxTerms) -> BoxTerms | None:
     """A over the diagonal of dens; None where that may vanish."""
     d0 = np.diag(dens.middle)[:, None]
     moved = np.diagonal(dens.slopes, axis1=1, axis2=2)[:, :, None]
@@ -178,10 +178,10 @@ def quotient(A: Expansion, dens: Expansion) -> Expansion | None:
     size = np.abs(middle) + (np.abs(A.slopes / d0) + np.abs(middle * moved / d0)).sum(axis=0)
     rest = rest + 8 * EPS * size
     linear = np.abs(slopes).sum(axis=0)
-    return Expansion(middle, slopes, (rest + (linear + rest) * share / (1 - share)) * (1 + 1e-12))
+    return BoxTerms(middle, slopes, (rest + (linear + rest) * share / (1 - share)) * (1 + 1e-12))
 
 
-def square_hold_series(A: Expansion, dens: Expansion, T: float, *, level: int = 0) -> Expansion | None:
+def square_hold_series(A: BoxTerms, dens: BoxTerms, T: float, *, level: int = 0) -> BoxTerms | None:
     """dens (1 + c(Y)) 2 + ... = 2 dens + 2 dens c(T A / dens); None where the series does not do.
 
     level : for c(Y) less its fraction up to this level, and no slopes of it but a bound
@@ -189,12 +189,12 @@ def square_hold_series(A: Expansion, dens: Expansion, T: float, *, level: int = 
     own = quotient(A, dens)
     if own is None:
         return None
-    c = _function(own.times(T), gains_of_level(level), LARGEST, even=True)
+    c = _function(own.times(T), gains_of_level(level), MAX_SERIES_NORM, even=True)
     if c is None:
         return None
     if level:
         moves = np.abs(c.slopes).sum(axis=0) * (1 + 1e-12)
-        c = Expansion(c.middle, np.zeros_like(c.slopes), c.rest + moves)
+        c = BoxTerms(c.middle, np.zeros_like(c.slopes), c.rest + moves)
     d0, moved = np.diag(dens.middle)[:, None], np.diagonal(dens.slopes, axis1=1, axis2=2)[:, :, None]
     beside, wide = np.diag(dens.rest)[:, None], np.abs(moved).sum(axis=0)
     linear = np.abs(c.slopes).sum(axis=0)
@@ -205,25 +205,27 @@ def square_hold_series(A: Expansion, dens: Expansion, T: float, *, level: int = 
         + beside * whole
         + 8 * EPS * (np.abs(d0) + wide) * whole
     )
-    curved = Expansion(d0 * c.middle, d0 * c.slopes + moved * c.middle, rest)
+    curved = BoxTerms(d0 * c.middle, d0 * c.slopes + moved * c.middle, rest)
     return (dens + curved).times(2.0)
 
 
-def hold_series(A: Expansion, B: Expansion, dens: Expansion, T: float) -> tuple[Expansion, Expansion] | None:
+def hold_series(A: BoxTerms, B: BoxTerms, dens: BoxTerms, T: float) -> tuple[BoxTerms, BoxTerms] | None:
     """e^(A T) - 1 and what u does over a sample, of A / dens and B / dens; None where they are too steep."""
     n, m, count = len(A.middle), B.middle.shape[1], len(A.slopes)
     one, two = quotient(A, dens), quotient(B, dens)
     if one is None or two is None:
         return None
-    none = Expansion(np.zeros((m, n + m)), np.zeros((count, m, n + m)), np.zeros((m, n + m)))
+    none = BoxTerms(np.zeros((m, n + m)), np.zeros((count, m, n + m)), np.zeros((m, n + m)))
     Y = stack([[one, two], [none]]).times(T)
-    found = _function(Y, [1 / math.factorial(k) for k in range(1, EXPONENTIAL + 1)], STEEPEST, even=False)
+    found = _function(
+        Y, [1 / math.factorial(k) for k in range(1, EXPONENTIAL + 1)], MAX_EXPONENTIAL_NORM, even=False
+    )
     if found is None:
         return None
     return found.part(slice(0, n), slice(0, n)), found.part(slice(0, n), slice(n, n + m))
 
 
-def _function(Y: Expansion, b: Sequence[float], largest: float, *, even: bool) -> Expansion | None:
+def _function(Y: BoxTerms, b: Sequence[float], largest: float, *, even: bool) -> BoxTerms | None:
     """sum_k b_k Z^k, k from 1, with Z = Y, or Y^2 where even."""
     extra = np.abs(Y.slopes).sum(axis=0) + Y.rest
     size = np.abs(Y.middle)
@@ -246,7 +248,7 @@ def _function(Y: Expansion, b: Sequence[float], largest: float, *, even: bool) -
     rounding = 4 * len(b) * len(size) * EPS * whole
     tails = 2 * tail * weights[:, None] / weights
     left = np.maximum(whole - bound - linear[0], 0) + 4 * rounding + tails
-    return Expansion(value / turn, moved / turn, left / turn)
+    return BoxTerms(value / turn, moved / turn, left / turn)
 
 
 def _norm(M: FloatArray) -> tuple[float, FloatArray]:
@@ -273,31 +275,31 @@ def _sum(Y: FloatArray, slopes: FloatArray, b: Sequence[float], even: bool) -> t
 
 
 TERMS = 20_000  # of all entries, beyond which they are not expanded
-LIFTED = 8  # states up to which the fraction of a hold has rows of its own
-WIDEST = 40  # rows of a pencil with these, beyond the first level
+MAX_LIFTED_STATES = 8  # states up to which the fraction of a hold has rows of its own
+MAX_LIFTED_ROWS = 40  # rows of a pencil with these, beyond the first level
 # Largest ratio of bounds with and without these rows: where they cost little, and one level else.
-LESS = (0.2, 0.05)
-MORE = 2  # times the coordinates of multipliers without these rows, that cost little
+MAX_BOUND_RATIOS = (0.2, 0.05)
+MAX_COORDINATE_RATIO = 2  # times the coordinates of multipliers without these rows, that cost little
 
 
 @dataclass(frozen=True, eq=False)
 class Pencil:
     """M on a box. dynamic: rows with v, which are multiplied by 1 / v towards infinity."""
 
-    constant: Expansion
-    linear: Expansion
+    constant: BoxTerms
+    linear: BoxTerms
     dynamic: Any
     curved: bool  # whether a hold makes slopes of full rank and terms beyond them
 
-    def branch(self, k: int) -> tuple[Expansion, Expansion]:
+    def branch(self, k: int) -> tuple[BoxTerms, BoxTerms]:
         """The constant part and the factor of jx (k = 1: of 1 / x) of M, for k = 1 of M / v in the dynamic rows."""
         if k == 0:
             return self.constant, self.linear
         d = self.dynamic
 
-        def pick(one: Expansion, two: Expansion | None, sign: float) -> Expansion:
+        def pick(one: BoxTerms, two: BoxTerms | None, sign: float) -> BoxTerms:
             zero = np.zeros_like(one.middle)
-            return Expansion(
+            return BoxTerms(
                 np.where(d[:, None], sign * one.middle, zero if two is None else two.middle),
                 np.where(d[:, None], sign * one.slopes, 0 if two is None else two.slopes),
                 np.where(d[:, None], one.rest, zero if two is None else two.rest),
@@ -313,7 +315,7 @@ class Rows:
     Raises TooLarge for more than TERMS.
     """
 
-    def __init__(self, loop: UncertainLoop, group: Group) -> None:
+    def __init__(self, loop: UncertainLoop, group: StateGroup) -> None:
         s, law = loop.symbolic, loop.law
         assert s is not None
         self.loop, self.group, self.count = loop, group, loop.program.inputs
@@ -331,7 +333,7 @@ class Rows:
         ]  # fmt: skip
         y, m = len(self.reads), len(self.inputs)
 
-        def pick(rows: list[dict[Any, Any]], kind: str, columns: dict[int, int]) -> Table:
+        def pick(rows: list[dict[Any, Any]], kind: str, columns: dict[int, int]) -> PolynomialTable:
             entries = {
                 (i, columns[at[1]]): polynomial
                 for i, row in enumerate(rows)
@@ -340,7 +342,7 @@ class Rows:
             }
             return table((len(rows), len(columns)), entries, p)
 
-        def below(rows: list[dict[Any, Any]]) -> Table:
+        def below(rows: list[dict[Any, Any]]) -> PolynomialTable:
             return table((len(rows),) * 2, {(i, i): row.get(None, one) for i, row in enumerate(rows)}, p)
 
         own, out = found[:n], [found[n + k] for k in self.reads]
@@ -353,7 +355,7 @@ class Rows:
     def size(self) -> int:
         """The number of rows of the pencil."""
         law, m = self.loop.law, len(self.inputs)
-        lifted = self.loop.sampled and len(self.group.states) <= LIFTED
+        lifted = self.loop.sampled and len(self.group.states) <= MAX_LIFTED_STATES
         return self.driven * (2 if lifted else 1) + len(self.group.own) + m * law.delay + len(self.reads)
 
     @property
@@ -390,7 +392,7 @@ class Rows:
         when the channels of the parameters, of which each level has its own, stay few.
         """
         T, r = self.loop.law.sample_time, 0.1 * np.abs(c)
-        if T is None or not self.loop.sampled or len(self.group.states) > LIFTED:
+        if T is None or not self.loop.sampled or len(self.group.states) > MAX_LIFTED_STATES:
             return 0
         A, dens = self.A.over(c, r), self.dens.over(c, r)
         whole = square_hold_series(A, dens, T)
@@ -401,16 +403,16 @@ class Rows:
             for other in (dens, whole)
         )
         for level in range(1, LEVELS + 1):
-            if level > 1 and self.size + (level - 1) * self.driven > WIDEST:
+            if level > 1 and self.size + (level - 1) * self.driven > MAX_LIFTED_ROWS:
                 break
             beyond = square_hold_series(A, dens, T, level=level)
             share = math.inf if beyond is None else beyond.rest.sum() / whole.rest.sum()
-            cheap = (level + 1) ** 2 * with_rows <= MORE * without
-            if (cheap and share < LESS[0]) or (level == 1 and share < LESS[1]):
+            cheap = (level + 1) ** 2 * with_rows <= MAX_COORDINATE_RATIO * without
+            if (cheap and share < MAX_BOUND_RATIOS[0]) or (level == 1 and share < MAX_BOUND_RATIOS[1]):
                 return level
         return 0
 
-    def _plant(self, dens: Expansion, c: FloatArray, r: FloatArray) -> tuple[Expansion, ...] | None:
+    def _plant(self, dens: BoxTerms, c: FloatArray, r: FloatArray) -> tuple[BoxTerms, ...] | None:
         """P_0 and P_1 of the rows of x and of the lags: the columns of these states, then of their inputs."""
         law, loop, T = self.loop.law, self.loop, self.loop.law.sample_time
         A, B = self.A.over(c, r), self.B.over(c, r)
@@ -441,7 +443,7 @@ class Rows:
             driven,
         )
 
-    def _join(self, plant: tuple[Expansion, ...], below: Expansion, c: FloatArray, r: FloatArray) -> Pencil:
+    def _join(self, plant: tuple[BoxTerms, ...], below: BoxTerms, c: FloatArray, r: FloatArray) -> Pencil:
         """The whole pencil; its columns are x with lags, the compensator's states, stored inputs, y, and x_k of c."""
         law, own, late = self.loop.law, list(self.group.own), self.loop.law.delay
         n, k, m, y = len(plant[0].middle), len(own), len(self.inputs), len(self.reads)
@@ -455,7 +457,7 @@ class Rows:
         stored = [eye[n + k + m * d : n + k + m * (d + 1)] for d in range(late)]
         asked = np.zeros((k, N))
         asked[:, w], asked[:, z] = law.A[np.ix_(own, own)], law.B[np.ix_(own, self.reads)]
-        P0, P1 = _Sum(N, self.count), _Sum(N, self.count)
+        P0, P1 = _PencilSum(N, self.count), _PencilSum(N, self.count)
         for P, of_x, of_u in ((P0, plant[0], plant[2]), (P1, plant[1], plant[3])):
             P.add(x, x, of_x)
             P.add(x, slice(0, N), of_u.columns([wanted, *stored][-1]))
@@ -490,13 +492,13 @@ def _rank(a: FloatArray, b: FloatArray) -> int:
     return int(min(np.linalg.matrix_rank(np.hstack([a, b])), np.linalg.matrix_rank(np.vstack([a, b]))))
 
 
-class _Sum:
+class _PencilSum:
     """A square matrix, made of parts."""
 
     def __init__(self, n: int, count: int) -> None:
         self.total = constant(np.zeros((n, n)), count)
 
-    def add(self, rows: slice, columns: slice, part: Expansion) -> None:
+    def add(self, rows: slice, columns: slice, part: BoxTerms) -> None:
         whole = self.total.part(rows, columns) + part
         self.total.middle[rows, columns] = whole.middle
         self.total.slopes[:, rows, columns] = whole.slopes

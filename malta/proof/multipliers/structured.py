@@ -20,32 +20,32 @@ from scipy import linalg
 
 from malta.linear.rational import TooLarge
 from malta.proof.groups import UncertainLoop, groups
-from malta.proof.multipliers import Blocks, Branch, Multiplier, excludes_zero, multiplier, response
+from malta.proof.multipliers import BlockSizes, Branch, Multiplier, excludes_zero, multiplier, response
 from malta.proof.multipliers.pencil import TERMS, Pencil, Rows
-from malta.work import is_past, spend, spent
+from malta.work import is_past, spend, work_done
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray
     from malta.proof.box import Box
     from malta.proof.problem import Problem
 
-NEAR = 0.98  # beta up to which splitting frequency is expected to do
-NARROWEST = 1e-9  # of an interval of frequency, relative; of a part of a box, in sides of box(1)
-LOWEST = 1e-5  # end of the one from zero, relative to the octave that it was cut from
-REMEMBERED = 64  # pencils
-LARGEST = 40  # rows of a group's pencil, beyond which families of its smaller groups are cheaper
-ROUGH = 0.1  # how close the first beta is to the smallest, relative
-SMALLEST = 1e-6  # of the target: boxes below that are not tried
+SPLIT_BETA = 0.98  # beta up to which splitting frequency is expected to do
+MIN_INTERVAL = 1e-9  # of an interval of frequency, relative; of a part of a box, in sides of box(1)
+FIRST_INTERVAL_END = 1e-5  # end of the one from zero, relative to the octave that it was cut from
+MAX_KEPT_PENCILS = 64  # pencils
+MAX_PENCIL_ROWS = 40  # rows of a group's pencil, beyond which families of its smaller groups are cheaper
+FIRST_BETA_TOLERANCE = 0.1  # how close the first beta is to the smallest, relative
+MIN_BOX_SHARE = 1e-6  # of the target: boxes below that are not tried
 FIRST_STEP, LAST_STEP = 1.2, 1.003  # from one box to the next
-NOT_FAR = 1.3  # times what stands: boxes up to that are tried at once
-WIDER = 1.3  # the next interval of frequency than the last one
-HASTY = 0.4  # share of the last interval's width from which on a failure means that it was too wide
+DIRECT_BOX_FACTOR = 1.3  # times what stands: boxes up to that are tried at once
+INTERVAL_GROWTH = 1.3  # the next interval of frequency than the last one
+HASTY_WIDTH_SHARE = 0.4  # of the last interval's width: a failure from there on means that it was too wide
 PATIENCE = 0.4  # share of the work that is left for one box
 LEVEL = 3.5e-6  # work of a cell beside Newton steps, times the square of its rows
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class MultiplierCell:
     """An interval of frequency of a branch, and a part of the box, with a multiplier to begin with."""
 
     rows: int
@@ -60,7 +60,7 @@ class Cell:
 class Shown(NamedTuple):
     """A cell of a proof and the multiplier that excludes it; None where it lies in the layer before, or is empty."""
 
-    cell: Cell
+    cell: MultiplierCell
     multiplier: Multiplier | None
 
 
@@ -72,7 +72,7 @@ class Layer(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Proof:
+class MultiplierProof:
     """A proof by multipliers, which `multipliers.checked.refusal` checks again: boxes, the smallest first."""
 
     rows: tuple[Rows, ...]
@@ -80,39 +80,39 @@ class Proof:
     layers: tuple[Layer, ...]
 
 
-class Attempt(NamedTuple):
+class CellsResult(NamedTuple):
     """The result for cells: beta of one that was not excluded, if any, and the cells left when the work was up."""
 
     beta: float
-    cell: Cell | None
-    left: list[Cell]
+    cell: MultiplierCell | None
+    left: list[MultiplierCell]
 
 
-class Step(NamedTuple):
+class FrequencyStep(NamedTuple):
     """The width of the next interval of frequency on a part of the box, relative to its end."""
 
     sides: FloatArray | None = None
     share: float = math.inf
     good: float = math.inf  # width of the last excluded interval
 
-    def hasty(self, cell: Cell) -> bool:
+    def hasty(self, cell: MultiplierCell) -> bool:
         """Whether the interval is about as wide as an excluded neighbour, so that a narrower one will be excluded."""
-        wide = cell.high - cell.low > HASTY * self.good * cell.high
+        wide = cell.high - cell.low > HASTY_WIDTH_SHARE * self.good * cell.high
         return cell.sides is self.sides and cell.low > 0 and wide
 
-    def cut(self, cell: Cell) -> tuple[Cell, list[Cell]]:
+    def cut(self, cell: MultiplierCell) -> tuple[MultiplierCell, list[MultiplierCell]]:
         """The first part of the cell of that width, and the rest, if any."""
         width = self.share * cell.high
         if cell.sides is not self.sides or cell.low == 0 or not cell.low + 1.2 * width < cell.high:
             return cell, []
         return replace(cell, high=cell.low + width), [replace(cell, low=cell.low + width)]
 
-    def after(self, cell: Cell, done: bool) -> Step:
+    def after(self, cell: MultiplierCell, done: bool) -> FrequencyStep:
         if not cell.low:
             return self
         share = (cell.high - cell.low) / cell.high
         good = share if done else self.good if cell.sides is self.sides else math.inf
-        return Step(cell.sides, (WIDER if done else 0.5) * share, good)
+        return FrequencyStep(cell.sides, (INTERVAL_GROWTH if done else 0.5) * share, good)
 
 
 @dataclass(eq=False)
@@ -129,9 +129,9 @@ class Structured:
     count: int = 0
     layers: list[Layer] = field(default_factory=list, repr=False)
     _shown: dict[float, list[Shown]] = field(default_factory=dict, repr=False)  # by t of begun boxes
-    _order: list[Cell] = field(default_factory=list, repr=False)  # those that resist first
+    _order: list[MultiplierCell] = field(default_factory=list, repr=False)  # those that resist first
     # t of the largest box that was begun, and its cells that are left
-    _open: tuple[float, list[Cell]] | None = None
+    _open: tuple[float, list[MultiplierCell]] | None = None
     _branches: dict[Any, tuple[Pencil | None, dict[Any, Branch]]] = field(default_factory=dict, repr=False)
 
     def _is_late(self, until: float) -> bool:
@@ -154,7 +154,7 @@ class Structured:
                 t, cells = begun
             else:
                 cells = self._begin(self._order or self.cover(t), t)
-            begun, now = None, spent()
+            begun, now = None, work_done()
             found = self._prove(cells, now + PATIENCE * (until - now), self._shown[t], split=True)
             if found.cell is None:
                 self._raise_to(t, report)
@@ -171,7 +171,7 @@ class Structured:
         """The next box to be tried: the target if it is near, else one a little larger than the proven one."""
         if not self.lower:
             return target / 64
-        return target if target <= NOT_FAR * self.lower else FIRST_STEP * self.lower
+        return target if target <= DIRECT_BOX_FACTOR * self.lower else FIRST_STEP * self.lower
 
     def _raise_to(self, t: float, report: Callable[[float], object]) -> None:
         if t > self.lower:
@@ -179,27 +179,29 @@ class Structured:
             self.layers.append(Layer(t, tuple(self._shown.pop(t))))
         report(self.lower)
 
-    def proof(self) -> Proof:
+    def proof(self) -> MultiplierProof:
         """What shows that box(lower) is stable when the nominal loop is."""
-        return Proof(tuple(self.rows), self.box, tuple(self.layers))
+        return MultiplierProof(tuple(self.rows), self.box, tuple(self.layers))
 
-    def _begin(self, cells: list[Cell], t: float) -> list[Cell]:
+    def _begin(self, cells: list[MultiplierCell], t: float) -> list[MultiplierCell]:
         """The cells on box(t), of which none is shown yet."""
         kept = self._open[0] if self._open is not None else t
         self._shown = {u: shown for u, shown in self._shown.items() if u == kept} | {t: []}
         sides = self.box.sides(t)
         return [replace(cell, sides=sides) for cell in cells]
 
-    def _prove_whole(self, target: float, until: float, report: Callable[[float], object]) -> list[Cell]:
+    def _prove_whole(
+        self, target: float, until: float, report: Callable[[float], object]
+    ) -> list[MultiplierCell]:
         """Prove the largest box possible without a cut, and return the cells of all frequencies, the hardest first."""
         t, (beta, cells) = target, self._survey(target, until)
-        while not cells and not self._is_late(until) and t > SMALLEST * target:
+        while not cells and not self._is_late(until) and t > MIN_BOX_SHARE * target:
             t /= 2
             beta, cells = self._survey(t, until)
         t *= min(1.0, 0.95 / max(beta, 1e-9)) if math.isfinite(beta) else 0.1
-        now = spent()
+        now = work_done()
         last = now + 0.7 * (until - now)
-        while cells and not self._is_late(last) and t > SMALLEST * target:
+        while cells and not self._is_late(last) and t > MIN_BOX_SHARE * target:
             found = self._prove(self._begin(cells, t), last, self._shown[t], split=False)
             if found.cell is None:
                 self._raise_to(t, report)
@@ -208,7 +210,7 @@ class Structured:
             t *= min(0.9, max(0.9 / found.beta, 0.6))
         return cells
 
-    def _survey(self, t: float, until: float) -> tuple[float, list[Cell]]:
+    def _survey(self, t: float, until: float) -> tuple[float, list[MultiplierCell]]:
         """The largest beta on box(t) at a grid of frequencies, and the cells by falling beta; none: t is too large."""
         found, near = [], None
         for cell in self.cover(t):
@@ -222,9 +224,9 @@ class Structured:
                 if r is not None and own.channels[0].blocks.real and not self._is_late(until):
                     try:
                         # slopes alone: higher terms are slow, and matter in large boxes only
-                        blocks = Blocks(own.channels[0].blocks.real)
+                        blocks = BlockSizes(own.channels[0].blocks.real)
                         N = r.terms[0][: blocks.size, : blocks.size]
-                        near, beta = multiplier(N, blocks, near, 0.0, ROUGH)
+                        near, beta = multiplier(N, blocks, near, 0.0, FIRST_BETA_TOLERANCE)
                     except (np.linalg.LinAlgError, ValueError):
                         near = None
                 found.append((beta, replace(part, near=near)))
@@ -233,14 +235,16 @@ class Structured:
             c for _, c in found
         ]
 
-    def _prove(self, cells: list[Cell], last: float, shown: list[Shown], *, split: bool) -> Attempt:
+    def _prove(
+        self, cells: list[MultiplierCell], last: float, shown: list[Shown], *, split: bool
+    ) -> CellsResult:
         """Exclude all cells in order of frequency, by intervals as wide as the last excluded ones, into `shown`."""
-        todo, step = list(reversed(cells)), Step()
+        todo, step = list(reversed(cells)), FrequencyStep()
         inner = self.box.sides(self.lower) if self.lower else None
         while todo:
             cell = todo.pop()
             if self._is_late(last):
-                return Attempt(math.inf, cell, [cell, *reversed(todo)])
+                return CellsResult(math.inf, cell, [cell, *reversed(todo)])
             if inner is not None and split and _within(cell.sides, inner):
                 shown.append(Shown(replace(cell, near=None), None))
                 continue
@@ -252,21 +256,24 @@ class Structured:
                 step = step.after(cell, True)
                 if todo and (todo[-1].near is None or _is_next(cell, todo[-1])):
                     todo[-1] = replace(todo[-1], near=m)
-            elif beta < NEAR:
-                if cell.high - cell.low < NARROWEST * cell.high or cell.high < LOWEST * cell.top:
-                    return Attempt(1.0, cell, [])
+            elif beta < SPLIT_BETA:
+                if (
+                    cell.high - cell.low < MIN_INTERVAL * cell.high
+                    or cell.high < FIRST_INTERVAL_END * cell.top
+                ):
+                    return CellsResult(1.0, cell, [])
                 step = step.after(cell, False)
                 todo += [replace(half, near=m) for half in reversed(across_frequency(cell))]
-            elif split and self._width(cell.sides).max() > NARROWEST:
+            elif split and self._width(cell.sides).max() > MIN_INTERVAL:
                 todo += self._across_box(cell, m)
             else:
-                return Attempt(beta, cell, [])
-        return Attempt(0.0, None, [])
+                return CellsResult(beta, cell, [])
+        return CellsResult(0.0, None, [])
 
-    def _branch(self, cell: Cell) -> Branch | None:
+    def _branch(self, cell: MultiplierCell) -> Branch | None:
         key = (cell.rows, cell.sides.tobytes())
         if key not in self._branches:
-            while len(self._branches) >= REMEMBERED:
+            while len(self._branches) >= MAX_KEPT_PENCILS:
                 self._branches.pop(next(iter(self._branches)))
             self._branches[key] = self.rows[cell.rows].over(cell.sides), {}
         pencil, known = self._branches[key]
@@ -277,15 +284,15 @@ class Structured:
         found = known[cell.branch, cell.top]
         return found if found.finite else None
 
-    def cover(self, t: float) -> list[Cell]:
+    def cover(self, t: float) -> list[MultiplierCell]:
         """The cells of all frequencies and all groups on box(t)."""
         found, sides = [], self.box.sides(t)
         for k, rows in enumerate(self.rows):
             for branch, low, high in intervals(rows, self.box.nominal):
-                found.append(Cell(k, sides, branch, low, high, high))
+                found.append(MultiplierCell(k, sides, branch, low, high, high))
         return found
 
-    def _level(self, cell: Cell, *, hasty: bool = False) -> tuple[float, Multiplier | None, bool]:
+    def _level(self, cell: MultiplierCell, *, hasty: bool = False) -> tuple[float, Multiplier | None, bool]:
         """The beta in the middle of a cell, its multiplier, and whether the cell is excluded."""
         self.count += 1
         spend(LEVEL * self.rows[cell.rows].size ** 2)
@@ -308,11 +315,11 @@ class Structured:
             if hasty and beta >= 1 and near is not None:
                 return 0.0, near, False
             done = beta < 1 and excludes_zero(found, m := m._replace(x=x), half)
-            if NEAR <= beta < 1 and not done:
+            if SPLIT_BETA <= beta < 1 and not done:
                 narrow = response(own, x, x)
                 if narrow is not None and excludes_zero(narrow, m):
                     return 0.0, m, False
-                m, beta = multiplier(found.terms[0], blocks, m, NEAR)
+                m, beta = multiplier(found.terms[0], blocks, m, SPLIT_BETA)
         except (np.linalg.LinAlgError, ValueError):
             return math.inf, None, False
         return beta, m, done
@@ -321,7 +328,7 @@ class Structured:
         """The widths of a part of a box, in those of box(1)."""
         return np.asarray((sides[:, 1] - sides[:, 0]) / np.maximum(self.box.up + self.box.down, 1e-300))
 
-    def _across_box(self, cell: Cell, m: Multiplier | None) -> list[Cell]:
+    def _across_box(self, cell: MultiplierCell, m: Multiplier | None) -> list[MultiplierCell]:
         sides = cell.sides
         axis = int(self._width(sides).argmax())
         own = self._branch(cell)
@@ -337,10 +344,10 @@ class Structured:
         return made
 
 
-def _first(cells: list[Cell], hard: Cell) -> list[Cell]:
+def _first(cells: list[MultiplierCell], hard: MultiplierCell) -> list[MultiplierCell]:
     """The cells with the one that a part of resisted in front, each once."""
 
-    def holds(c: Cell) -> bool:
+    def holds(c: MultiplierCell) -> bool:
         return (c.rows, c.branch) == (hard.rows, hard.branch) and c.low <= hard.low and hard.high <= c.high
 
     return sorted(cells, key=lambda c: not holds(c))
@@ -350,12 +357,12 @@ def _within(sides: FloatArray, outer: FloatArray) -> bool:
     return bool((sides[:, 0] >= outer[:, 0]).all() and (sides[:, 1] <= outer[:, 1]).all())
 
 
-def _is_next(cell: Cell, other: Cell) -> bool:
+def _is_next(cell: MultiplierCell, other: MultiplierCell) -> bool:
     """Whether the other cell is the next one along frequency."""
     return cell.sides is other.sides and cell.branch == other.branch and cell.high == other.low
 
 
-def across_frequency(cell: Cell) -> list[Cell]:
+def across_frequency(cell: MultiplierCell) -> list[MultiplierCell]:
     low, high = cell.low, cell.high
     middle = math.sqrt(low * high) if low > 0 and high > 4 * low else low + 0.5 * (high - low)
     if low == 0:
@@ -415,5 +422,5 @@ def _rows_of(loop: UncertainLoop | None) -> list[Rows] | None:
         found = [Rows(loop, group) for group in groups(loop)]
     except TooLarge:
         return None
-    small = sum(rows.cost for rows in found) <= TERMS and max(rows.size for rows in found) <= LARGEST
+    small = sum(rows.cost for rows in found) <= TERMS and max(rows.size for rows in found) <= MAX_PENCIL_ROWS
     return found if small else None

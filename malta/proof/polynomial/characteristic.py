@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from flint import acb, acb_mat, arb, arb_mat, ctx, fmpq, fmpq_mat
 
-from malta.linear.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program, finite
+from malta.linear.expressions import BALLS, EXACT_ARITHMETIC, POINTS, MatrixProgram, NotAnalytic, finite
 from malta.linear.rational import Ratio, Symbolic, over_common_denominator, value
-from malta.linear.uncertain import Group
+from malta.linear.uncertain import StateGroup
 from malta.proof.groups import A, B, C, D, E, UncertainLoop, divide_by_descriptor, rational
 from malta.proof.polynomial.closed_loop import (
     closed_loop,
@@ -63,7 +63,7 @@ def depends(s: Symbolic, atom: int, i: int) -> bool:
     return False
 
 
-def clear_denominators(loop: UncertainLoop, g: Group, s: Symbolic) -> list[dict[Any, Any]]:
+def clear_denominators(loop: UncertainLoop, g: StateGroup, s: Symbolic) -> list[dict[Any, Any]]:
     """The rows of the polynomial matrix with determinant a: first those of x, then those of y; columns x, u, y."""
     rows: list[dict[Any, Ratio]] = []
     for i in g.states:
@@ -127,9 +127,9 @@ def _rank(rows: list[dict[Any, Any]], i: int) -> int:
     return int(fmpq_mat(table).rank())
 
 
-MOST = 20_000  # places that are remembered
+MAX_KEPT_PLACES = 20_000  # places that are remembered
 PLACE = 2.5e-4  # work of a place
-STEP, CUBED = 2e-6, 1e-6  # work of an operation of the model, and times the cube of the states
+STEP, STATES_WORK = 2e-6, 1e-6  # work of an operation of the model, and times the cube of the states
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ class Characteristic:
     """The characteristic polynomial of one group of a loop."""
 
     loop: UncertainLoop
-    group: Group
+    group: StateGroup
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -233,7 +233,7 @@ class Characteristic:
     @cached_property
     def price(self) -> float:
         """The work of the coefficients at one place."""
-        return PLACE + STEP * len(self.loop.program.steps) + CUBED * len(self.group.states) ** 3
+        return PLACE + STEP * len(self.loop.program.steps) + STATES_WORK * len(self.group.states) ** 3
 
     # values
 
@@ -258,7 +258,7 @@ class Characteristic:
         known, place = self.minors.known, (ctx.prec, tuple(terms))
         if place not in known:
             for one in (known, self.minors.resolvents):
-                if len(one) > MOST:
+                if len(one) > MAX_KEPT_PLACES:
                     one.clear()
             known[place] = self._minors_at(p, terms, matrix)
         pi, beta = known[place]
@@ -292,7 +292,7 @@ class Characteristic:
         program = self.loop.program.only(matrices)
         if not (self.exact or (self.loop.program.rational and self.loop.program.short)):
             return program.run([arb(x) for x in p], POINTS)
-        return program.run(p, EXACT)
+        return program.run(p, EXACT_ARITHMETIC)
 
     # bounds
 
@@ -454,17 +454,17 @@ def pair(c: Any) -> tuple[float, int]:
 
 
 @lru_cache(maxsize=256)
-def _parameters_of(program: Program, *matrices: int) -> tuple[int, ...]:
+def _parameters_of(program: MatrixProgram, *matrices: int) -> tuple[int, ...]:
     return tuple(sorted(frozenset().union(*(on for k, on in enumerate(program.depends) if k in matrices))))
 
 
 @lru_cache(maxsize=64)
-def _denominators(loop: UncertainLoop, g: Group) -> tuple[Any, ...]:
+def _denominators(loop: UncertainLoop, g: StateGroup) -> tuple[Any, ...]:
     assert loop.symbolic is not None
     return tuple(row[None] for row in clear_denominators(loop, g, loop.symbolic) if None in row)
 
 
-def _multiplier(loop: UncertainLoop, g: Group, p: Sequence[Any]) -> Any:
+def _multiplier(loop: UncertainLoop, g: StateGroup, p: Sequence[Any]) -> Any:
     found = fmpq(1)
     for den in _denominators(loop, g):
         found *= den(*p)

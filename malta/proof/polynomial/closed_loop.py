@@ -15,7 +15,7 @@ from scipy import linalg, sparse
 from malta.arrays import FloatArray
 from malta.linear.expressions import BALLS, NotAnalytic, exact, finite
 from malta.linear.rational import Ratio, Symbolic, value
-from malta.linear.uncertain import Group
+from malta.linear.uncertain import StateGroup
 from malta.proof.groups import (
     A,
     B,
@@ -48,7 +48,7 @@ class DrivenGroup(NamedTuple):
 
 
 def driven_group(
-    loop: UncertainLoop, g: Group, entries: list[list[tuple[int, int, Any]]], matrix: Any
+    loop: UncertainLoop, g: StateGroup, entries: list[list[tuple[int, int, Any]]], matrix: Any
 ) -> DrivenGroup:
     """A group with its law, from the entries of A, B, C, D and E as numbers of `matrix`, a type of flint.
 
@@ -91,7 +91,7 @@ def drive(loop: UncertainLoop, matrix: Any, a: Any, b: Any, c: Any, d: Any) -> t
     return a, b, c, d
 
 
-def law_matrix(loop: UncertainLoop, g: Group) -> list[list[Any]]:
+def law_matrix(loop: UncertainLoop, g: StateGroup) -> list[list[Any]]:
     """The rows of the law's own A, of differences where it is discrete."""
     rows = rational(loop.law.A[np.ix_(g.own, g.own)])
     if loop.law.sample_time is None:
@@ -260,7 +260,9 @@ def _sizes(rows: int, columns: int, entries: Iterable[tuple[int, int, Any]]) -> 
     return found
 
 
-def majorant_matrix(loop: UncertainLoop, g: Group, entries: list[list[tuple[int, int, Any]]]) -> FloatArray:
+def majorant_matrix(
+    loop: UncertainLoop, g: StateGroup, entries: list[list[tuple[int, int, Any]]]
+) -> FloatArray:
     """Entrywise bounds of the closed loop's state matrix (of differences where discrete), from balls of the entries.
 
     Raises NotAnalytic when numbers overflow, or the direct feedthrough is too large.
@@ -333,7 +335,7 @@ def driven_bounds(loop: UncertainLoop, abcd: Bounds, diagonal: FloatArray) -> Bo
 
 
 ROUNDS = 20
-SAFE = 1 + 1e-9
+ROUNDING_FACTOR = 1 + 1e-9
 
 
 def coefficient_bounds(m: FloatArray, roots: FloatArray) -> list[Any]:
@@ -365,7 +367,7 @@ def power_of_two(x: float) -> Any:
     if not math.isfinite(x):
         raise NotAnalytic("numbers that overflow")
     whole = math.floor(x)
-    return arb(2.0 ** (x - whole) * SAFE) * arb(2) ** whole
+    return arb(2.0 ** (x - whole) * ROUNDING_FACTOR) * arb(2) ** whole
 
 
 def _heights(full: FloatArray) -> FloatArray:
@@ -378,7 +380,7 @@ def _heights(full: FloatArray) -> FloatArray:
             d = 1 / np.where(columns > 0, columns, 1)
         d = np.exp2(np.round(np.log2(np.clip(d, 1e-200, 1e200))))
         rows = (full @ d[:, :, None])[:, :, 0]
-        heights = np.log2(rows * SAFE).sum(axis=1) - np.log2(d).sum(axis=1)
+        heights = np.log2(rows * ROUNDING_FACTOR).sum(axis=1) - np.log2(d).sum(axis=1)
     return np.where(np.isnan(heights), np.inf, heights)
 
 
@@ -390,7 +392,7 @@ def _heights(full: FloatArray) -> FloatArray:
 # of det M_k. Lag, hold and delay have |h| <= 1 there and are left out of M.
 
 
-SMALL = 1e-11  # relative size below which a coupling may be rounding
+COUPLING_TOLERANCE = 1e-11  # relative size below which a coupling may be rounding
 TERM = 4e-6  # work of a term in balls
 
 
@@ -467,25 +469,25 @@ def _ratio(r: Ratio, values: list[Any]) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class LoopPart:
+class GroupPart:
     """A group, and bounds of the coefficients (of s or g) by which neglected couplings can move its determinant."""
 
-    group: Group
+    group: StateGroup
     moves: tuple[Any, ...]
 
 
-def loop_parts(loop: UncertainLoop, couplings: Couplings | None, p: Sequence[Any]) -> list[LoopPart]:
+def loop_parts(loop: UncertainLoop, couplings: Couplings | None, p: Sequence[Any]) -> list[GroupPart]:
     """The groups of a loop over real balls p, split further at couplings of the size of rounding."""
     exact = groups(loop)
     if couplings is None or loop.direct or _is_coupled(loop) or not any(len(g.states) > 1 for g in exact):
-        return [LoopPart(g, ()) for g in exact]
+        return [GroupPart(g, ()) for g in exact]
     try:
         size = couplings.bounds(p)
     except NotAnalytic:
-        return [LoopPart(g, ()) for g in exact]
+        return [GroupPart(g, ()) for g in exact]
     if not np.isfinite(size).all():
-        return [LoopPart(g, ()) for g in exact]
-    found: list[LoopPart] = []
+        return [GroupPart(g, ()) for g in exact]
+    found: list[GroupPart] = []
     for g in exact:
         members = [*g.states, *(loop.states + i for i in g.own)]
         found += _split(loop, g, members, size[np.ix_(members, members)])
@@ -497,11 +499,11 @@ def _is_coupled(loop: UncertainLoop) -> bool:
     return loop.descriptor and any(i != j for i, j, _ in loop.program.entries[E])
 
 
-def _split(loop: UncertainLoop, g: Group, members: list[int], size: FloatArray) -> list[LoopPart]:
+def _split(loop: UncertainLoop, g: StateGroup, members: list[int], size: FloatArray) -> list[GroupPart]:
     _, (units, _) = linalg.matrix_balance(size, permute=False, separate=True)
     size = size * units / units[:, None]
     rows, columns = size.max(axis=1), size.max(axis=0)
-    touch = size > SMALL * np.sqrt(rows[:, None] * columns[None, :])
+    touch = size > COUPLING_TOLERANCE * np.sqrt(rows[:, None] * columns[None, :])
     n = loop.states
     if loop.sampled or loop.descriptor:  # couplings inside the exponential are all kept
         s = loop.symbolic
@@ -513,7 +515,7 @@ def _split(loop: UncertainLoop, g: Group, members: list[int], size: FloatArray) 
     # a coupling above rounding in one direction joins two groups
     _, label = sparse.csgraph.connected_components(touch, directed=False)
     if label.max() == 0:
-        return [LoopPart(g, ())]
+        return [GroupPart(g, ())]
     acting = sorted({i for i, _, _ in loop.program.entries[B]})
     found = []
     for k in range(int(label.max()) + 1):
@@ -521,9 +523,9 @@ def _split(loop: UncertainLoop, g: Group, members: list[int], size: FloatArray) 
         states = tuple(members[i] for i in mine if members[i] < n)
         own = tuple(members[i] - n for i in mine if members[i] >= n)
         inputs = tuple(i for i in acting if i in states)
-        group = Group(states, own, inputs if len(inputs) < loop.program.shapes[B][1] else None)
+        group = StateGroup(states, own, inputs if len(inputs) < loop.program.shapes[B][1] else None)
         outside = size[mine][:, label != k].sum(axis=1)
-        found.append(LoopPart(group, _moves(size[np.ix_(mine, mine)], outside)))
+        found.append(GroupPart(group, _moves(size[np.ix_(mine, mine)], outside)))
     return found
 
 

@@ -21,17 +21,17 @@ from malta.arrays import FloatArray
 from malta.linear.expressions import NotAnalytic, exact
 from malta.proof.polynomial.characteristic import pair
 from malta.proof.polynomial.family import Family, family, nodes
-from malta.work import check_clock, remembered, spend
+from malta.work import check_clock, remember, spend
 
 MOST_NODES = 20_000  # places of exact coefficients, at most
 MOST_BALLS = 6000  # places where they take an exponential
-PLENTY = 1500  # places beyond which more may be left out
+FEW_PLACES_LIMIT = 1500  # places beyond which more may be left out
 TAILS = (1e-9, 1e-7, 3e-6)  # what interpolation may leave out, relative to each coefficient
-WORST = 1e-5  # beyond which the box is cut
-HIGHEST = 16  # degree of an interpolation along one parameter
+MAX_TAIL = 1e-5  # beyond which the box is cut
+MAX_DEGREE = 16  # degree of an interpolation along one parameter
 LEBESGUE = 4.0  # 1 + Lambda up to that degree: Lambda <= 1 + 2 / pi log(d + 1), below 2.81
 RADII = tuple(2.0**k for k in (0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20, 25, 32, 40))
-MIDDLE = RADII.index(2.0**12)  # where the search of discs begins
+FIRST_RADIUS = RADII.index(2.0**12)  # where the search of discs begins
 BITS = 128  # of ball arithmetic, in which numbers of up to 128 bits take the least time
 MOST_BITS = 640  # beyond which a coefficient is taken as the ball that it is
 DISC = 5.0  # times the work of a place, that of a disc
@@ -120,15 +120,15 @@ def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = ()) -> Fam
 
 
 FAMILIES: WeakKeyDictionary[Polynomial, dict[Any, tuple[Family, Sequence[float]]]] = WeakKeyDictionary()
-REMEMBERED = 4_000_000  # numbers in the families of a polynomial, beyond which the oldest are forgotten
+MAX_KEPT_NUMBERS = 4_000_000  # numbers in the families of a polynomial, beyond which the oldest are forgotten
 
 
 def family_over(f: Polynomial, sides: FloatArray, moves: tuple[Any, ...]) -> Family:
     """The family of a polynomial over `sides`, remembered: several margins need it over the same box."""
     known = FAMILIES.setdefault(f, {})
     key = (sides.tobytes(), tuple(pair(m) for m in moves))
-    found = remembered(known, key, lambda: over_box(f, sides, moves))
-    while len(known) > 1 and sum(other.values.size for other, _ in known.values()) > REMEMBERED:
+    found = remember(known, key, lambda: over_box(f, sides, moves))
+    while len(known) > 1 and sum(other.values.size for other, _ in known.values()) > MAX_KEPT_NUMBERS:
         known.pop(next(iter(known)))
     return found
 
@@ -204,7 +204,7 @@ def _plan(f: Polynomial, low: list[Any], high: list[Any], known: tuple[int | Non
             else Side(0 if low[i] == high[i] else d or 0, False, None)
             for i, d in enumerate(known)
         ]  # fmt: skip
-        if math.prod(side.degree + 1 for side in plan) <= PLENTY:
+        if math.prod(side.degree + 1 for side in plan) <= FEW_PLACES_LIMIT:
             break
     return plan
 
@@ -229,7 +229,7 @@ def discs_of(
     """
     found: list[Disc] = []
     refused = NotAnalytic("no disc about its range")
-    for radii in (RADII[MIDDLE:], RADII[:MIDDLE][::-1]):
+    for radii in (RADII[FIRST_RADIUS:], RADII[:FIRST_RADIUS][::-1]):
         least = min((_wanted_degree(disc, TAILS[0]) for disc in found), default=math.inf)
         if len(found) > 1 and least < _wanted_degree(found[0], TAILS[0]):
             break  # larger discs are the better ones
@@ -239,7 +239,7 @@ def discs_of(
                 disc = _disc(f, i, low, high, size, radius)
             except NotAnalytic as error:
                 refused = error
-                if radius >= RADII[MIDDLE]:  # nor on larger discs
+                if radius >= RADII[FIRST_RADIUS]:  # nor on larger discs
                     break
                 continue
             found.append(disc)
@@ -280,7 +280,7 @@ def interpolation_side(name: str, axis: int, discs: list[Disc], tail: float) -> 
     for disc in discs:
         radius, share, most = disc
         rest = share + 3 - math.log2(radius - 1)
-        degree = max(1, min(math.ceil(_wanted_degree(disc, tail)), HIGHEST))
+        degree = max(1, min(math.ceil(_wanted_degree(disc, tail)), MAX_DEGREE))
         left = rest - degree * math.log2(radius)
         enough = left <= math.log2(tail)
         rank = (not enough, degree if enough else 0, left)
@@ -289,7 +289,7 @@ def interpolation_side(name: str, axis: int, discs: list[Disc], tail: float) -> 
             best = Side(degree, True, tuple((m * scale, e) for m, e in most))
             best_rank = rank
     assert best is not None
-    if best_rank[2] > math.log2(WORST):
+    if best_rank[2] > math.log2(MAX_TAIL):
         raise TooWide(axis, f"{name}: its range is too wide for one expansion")
     return best
 

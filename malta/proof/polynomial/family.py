@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from malta.arrays import FloatArray
 
 EPS = 2.0**-52
-WIDE = 8  # nodes of the following axes from which on values are multiplied in place
-FEW = 6  # degree up to which a restriction is one product of matrices
+MIN_NODES_IN_PLACE = 8  # nodes of the following axes from which on values are multiplied in place
+MAX_PRODUCT_DEGREE = 6  # degree up to which a restriction is one product of matrices
 COLUMNS = 4096  # of a product of exact matrices at once
-ROUND = 4e-6  # work of rounding an entry
+ROUNDING_WORK = 4e-6  # work of rounding an entry
 ENTRY, BIT = 5e-8, 1.3e-9  # work of a product of entries, and of each bit of exact ones
 
 
@@ -176,7 +176,7 @@ def combine(f: Family, g: Family, a: float, b: float) -> Family:
 def _round_to_doubles(shape: Sequence[int], table: Any, tails: Any) -> Family:
     """Bernstein coefficients (nodes x k, exact or balls) as a family."""
     each, count = table.shape
-    spend(ROUND * each * count)
+    spend(ROUNDING_WORK * each * count)
     mantissas, radii, powers = (np.zeros((count, each)) for _ in range(3))
     for (b, k), x in np.ndenumerate(table):
         mantissas[k, b], radii[k, b], powers[k, b] = binary(x)
@@ -280,7 +280,7 @@ def restriction(degree: int, low: FloatArray, high: FloatArray) -> FloatArray:
 
     Row i holds the blossom at (d - i) times low and i times high.
     """
-    if degree <= FEW:
+    if degree <= MAX_PRODUCT_DEGREE:
         j, rest, k, left, weights = _blossoms(degree)
         powers = [np.power(x[:, None], np.arange(degree + 1)) for x in (low, 1 - low, high, 1 - high)]
         terms = powers[0][:, j] * powers[1][:, rest] * powers[2][:, k] * powers[3][:, left]
@@ -293,7 +293,7 @@ def restriction(degree: int, low: FloatArray, high: FloatArray) -> FloatArray:
     return M
 
 
-@lru_cache(maxsize=FEW + 1)
+@lru_cache(maxsize=MAX_PRODUCT_DEGREE + 1)
 def _blossoms(degree: int) -> tuple[Any, ...]:
     """Powers of low, 1 - low, high, 1 - high in each term, and the terms' weights in each entry: terms x entries."""
     terms = [(i, j, k) for i in range(degree + 1) for j in range(degree - i + 1) for k in range(i + 1)]
@@ -322,7 +322,7 @@ def restrict(values: Any, shape: tuple[int, ...], boxes: FloatArray) -> Any:
         if count > 1 and not ((low == 0).all() and (high == 1).all()):
             M = restriction(count - 1, low, high)
             array = values.reshape(cells, before, count, -1)
-            if array.shape[3] >= WIDE:  # wide enough to multiply in place
+            if array.shape[3] >= MIN_NODES_IN_PLACE:  # wide enough to multiply in place
                 flat = np.ascontiguousarray(array).view(float)
                 values = (M[:, None] @ flat).view(values.dtype)
             else:

@@ -19,9 +19,9 @@ from flint import arb, arb_mat, arb_poly, ctx, fmpq_mat, fmpq_poly
 from scipy import sparse
 
 from malta.arrays import FloatArray
-from malta.linear.expressions import NotAnalytic, Program, exact
+from malta.linear.expressions import MatrixProgram, NotAnalytic, exact
 from malta.linear.rational import Ratio, Symbolic
-from malta.linear.uncertain import Group
+from malta.linear.uncertain import StateGroup
 from malta.proof.groups import A, B, C, E, UncertainLoop, rational
 from malta.proof.polynomial.closed_loop import (
     all_bounds,
@@ -44,7 +44,7 @@ from malta.proof.polynomial.closed_loop import (
 # in their last digit make no mirror image.
 
 
-class Places(NamedTuple):
+class MinorPlaces(NamedTuple):
     """A group's states by their numbers in the loop, and its rows with inputs by their own."""
 
     states: tuple[int, ...]
@@ -59,11 +59,11 @@ class Places(NamedTuple):
 class Image(NamedTuple):
     """A group as the mirror image of the group `of`, and the signs of its states."""
 
-    of: Places
+    of: MinorPlaces
     signs: tuple[int, ...]
 
 
-def first_alike(program: Program, s: Symbolic | None, places: Places) -> Image:
+def first_alike(program: MatrixProgram, s: Symbolic | None, places: MinorPlaces) -> Image:
     """A group as an image of the first group of a program's system that it mirrors: of itself when there is none."""
     firsts = _firsts(program)
     if places not in firsts:
@@ -74,12 +74,12 @@ def first_alike(program: Program, s: Symbolic | None, places: Places) -> Image:
 
 
 @lru_cache(maxsize=64)
-def _firsts(program: Program) -> dict[Places, Image]:
+def _firsts(program: MatrixProgram) -> dict[MinorPlaces, Image]:
     del program
     return {}
 
 
-def image_of(s: Symbolic, one: Places, two: Places) -> Image | None:
+def image_of(s: Symbolic, one: MinorPlaces, two: MinorPlaces) -> Image | None:
     """The second group as an image of the first; None where they differ, as exact expressions, in more than signs."""
     if one.rows != two.rows or len(one.states) != len(two.states):
         return None
@@ -116,7 +116,7 @@ def _signs(related: list[tuple[int, int, int]], count: int) -> tuple[int, ...] |
 
 
 MOST_WEIGHTS = 16  # sets of factors that are remembered
-MOST = 24  # minors beyond which the closed loop's own matrix is cheaper
+MAX_MINORS = 24  # minors beyond which the closed loop's own matrix is cheaper
 
 Pair = tuple[tuple[int, ...], tuple[int, ...]]
 
@@ -129,7 +129,7 @@ class Minors:
     """
 
     loop: UncertainLoop
-    group: Group
+    group: StateGroup
     rows: tuple[int, ...]  # states, by their number in the group
     inputs: tuple[int, ...]
     outputs: tuple[int, ...]
@@ -137,7 +137,7 @@ class Minors:
     @cached_property
     def image(self) -> Image:
         """This group as an image of the one whose resolvent stands for its own (minors.py)."""
-        own = Places(self.group.states, self.rows)
+        own = MinorPlaces(self.group.states, self.rows)
         return first_alike(self.loop.program, self.loop.symbolic, own)
 
     @property
@@ -333,12 +333,14 @@ class Minors:
     @property
     def known(self) -> dict[Any, Any]:
         """The remembered minors of the system at places and on discs, which do not depend on the compensator."""
-        return _known(self.loop.program, self._kind, self.group.states, self.rows, self.inputs, self.outputs)
+        return _kept_minors(
+            self.loop.program, self._kind, self.group.states, self.rows, self.inputs, self.outputs
+        )
 
     @property
     def resolvents(self) -> dict[Any, Any]:
         """The remembered resolvents at places, those of images too."""
-        return _known(self.loop.program, self._kind, self.image.of)
+        return _kept_minors(self.loop.program, self._kind, self.image.of)
 
     @property
     def _kind(self) -> tuple[Any, ...]:
@@ -347,7 +349,7 @@ class Minors:
 
 
 @lru_cache(maxsize=64)  # laws change, the system stays
-def _known(program: Program, *of: Any) -> dict[Any, Any]:
+def _kept_minors(program: MatrixProgram, *of: Any) -> dict[Any, Any]:
     del program, of
     return {}
 
@@ -372,7 +374,7 @@ def _unit_columns(matrix: Any, n: int, rows: tuple[int, ...]) -> Any:
     return dense(matrix, n, len(rows), ((i, k, 1) for k, i in enumerate(rows)))
 
 
-def minors(loop: UncertainLoop, g: Group) -> Minors | None:
+def minors(loop: UncertainLoop, g: StateGroup) -> Minors | None:
     """The minors of a group; None for direct feedthrough or too many minors, where the matrix itself is cheaper."""
     if loop.direct or not g.states:
         return None
@@ -387,7 +389,7 @@ def minors(loop: UncertainLoop, g: Group) -> Minors | None:
     inputs = [t for t in inputs if law.C[t, own].any() or law.D[t, outputs].any()]
     outputs = [s for s in outputs if law.B[own, s].any() or law.D[inputs, s].any()]
     found = Minors(loop, g, tuple(rows), tuple(inputs), tuple(outputs))
-    return found if found.count <= MOST else None
+    return found if found.count <= MAX_MINORS else None
 
 
 def _determinant_by_row(row: list[Any], rest: list[Any]) -> Any:

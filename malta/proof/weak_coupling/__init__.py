@@ -34,25 +34,25 @@ from malta.arrays import FloatArray
 from malta.linear.expressions import NotAnalytic
 from malta.linear.uncertain import Compensator
 from malta.proof.box import Box
-from malta.proof.exclusion import CellBounds, Part, growth_over, on_boxes
+from malta.proof.exclusion import BoxPart, CellBounds, growth_over, on_boxes
 from malta.proof.polynomial.enclosure import Unproven
 from malta.proof.polynomial.family import Family, scale_of
 from malta.proof.problem import Problem, Traits, physical
-from malta.proof.weak_coupling.axes import Axes, axes_of, members_of, state_matrix, stiff_axes
-from malta.proof.weak_coupling.held_currents import Bounds, HeldMachine, dominating_solution
+from malta.proof.weak_coupling.axes import AxisGroup, axes_of, members_of, state_matrix, stiff_axes
+from malta.proof.weak_coupling.held_currents import HeldMachine, MatrixBounds, dominating_solution
 from malta.work import is_past
 
-SMALL = 1e-11  # gains of a compensator below this, relative, may be rounding and do not join groups
-LARGEST = 4  # axes of a group
-LOOSE = 1e4  # how much larger bounds by coefficients are, about
+GAIN_TOLERANCE = 1e-11  # gains of a compensator below this, relative, may be rounding and do not join groups
+MAX_GROUP_AXES = 4  # axes of a group
+COEFFICIENT_LOOSENESS = 1e4  # how much larger bounds by coefficients are, about
 LIMIT = 0.3  # of the rows, where weights are chosen
 HALVINGS = 9
 SWEEP = 50  # frequencies at which weights are chosen
 FLOOR = 1e-6  # of what was seen, so that all weights are positive
 TERMS = 10  # of series in the stiffness
-SAFE = 1 + 1e-9
+ROUNDING_FACTOR = 1 + 1e-9
 GRID = 8  # parts of each side of a box on which couplings are bounded
-MOST = 4000  # such parts
+MAX_BOX_PARTS = 4000  # such parts
 BOUNDS, PERRON = 1.6e-3, 1.4e-2  # work of the bounds over a part, and of a try of weights
 CORNERS = 6  # parameters whose corners are all looked at for weights
 
@@ -71,7 +71,7 @@ class Coupling:
     T: float
 
     def onto_group(
-        self, g: Axes, N: FloatArray, off: FloatArray
+        self, g: AxisGroup, N: FloatArray, off: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The coupling to a group: M0^-1 e in rows of q, q' and a; bounds by coefficients; errors of the first.
 
@@ -80,21 +80,21 @@ class Coupling:
         n, r = len(self.W), len(g.axes)
         members, axes, T = members_of(g, n), list(g.axes), self.T
         d = self.weights[members][:, None]
-        by_state = (self.rest @ self.weights)[members] * SAFE / d
+        by_state = (self.rest @ self.weights)[members] * ROUNDING_FACTOR / d
         through = _response_to_moves(N, r, T)
         loose = _response_to_moves(off, r, T)
         own = self.forces(axes, self.weights) / d
-        scaled, loose = through * own[..., None], loose * own * SAFE
+        scaled, loose = through * own[..., None], loose * own * ROUNDING_FACTOR
         beyond = ((np.abs(N).max(axis=3) + off) * by_state).sum(axis=2)
         size = (np.abs(scaled).max(axis=3) + loose).sum(axis=2)
         more = np.maximum(
             beyond[:, : 3 * r].max(axis=1), (beyond + size)[:, 3 * r :].max(axis=1, initial=0.0)
         )
-        return scaled[:, : 3 * r], more * SAFE, loose[:, : 3 * r].max(axis=(1, 2))
+        return scaled[:, : 3 * r], more * ROUNDING_FACTOR, loose[:, : 3 * r].max(axis=(1, 2))
 
     def forces(self, axes: Sequence[int], weights: FloatArray) -> FloatArray:
         """W d, V d of some axes: what is forced on them and what moves them, for other weights d as well."""
-        return np.concatenate([(M @ weights)[list(axes)] for M in (self.W, self.V)]) * SAFE
+        return np.concatenate([(M @ weights)[list(axes)] for M in (self.W, self.V)]) * ROUNDING_FACTOR
 
 
 def _response_to_moves(N: FloatArray, r: int, T: float) -> FloatArray:
@@ -110,7 +110,7 @@ class _CoupledGroup:
     coupling : over a part of the box
     """
 
-    group: Axes
+    group: AxisGroup
     sides: FloatArray
     plain: Family
     coupling: Callable[[FloatArray], Coupling]
@@ -132,7 +132,7 @@ class _CoupledGroup:
         e = on_boxes(beside, cells, np.concatenate([whole, boxes], axis=1), family)
         size = sum(np.abs(t) for t in e.terms) + e.radius[:, None]
         share = self._shares(boxes)[:, None, :, None]
-        discs = (size.reshape(len(cells), *shape) * share).sum(axis=2).max(axis=1) * SAFE
+        discs = (size.reshape(len(cells), *shape) * share).sum(axis=2).max(axis=1) * ROUNDING_FACTOR
         return CellBounds(list(f.terms), f.radius, f.lasting, discs.astype(complex), [])
 
     def _shares(self, boxes: FloatArray) -> FloatArray:
@@ -148,11 +148,11 @@ class _CoupledGroup:
             inside = low[:, None] + own * (high - low)[:, None] + pad[:, None] * [-1, 1]
             here = self.coupling(inside).forces(self.group.axes, whole.weights)
             with np.errstate(invalid="ignore"):
-                found.append(np.where(here < most, here / most * SAFE, 1))
+                found.append(np.where(here < most, here / most * ROUNDING_FACTOR, 1))
         return np.array(found)[index.ravel()]
 
 
-def _part(g: Axes, coupling: Callable[[FloatArray], Coupling], sides: FloatArray, box: Box) -> Part:
+def _part(g: AxisGroup, coupling: Callable[[FloatArray], Coupling], sides: FloatArray, box: Box) -> BoxPart:
     """A group's polynomial over a box, with its coupling."""
     values, radius, _, _ = g.over(sides)
     with np.errstate(divide="ignore"):
@@ -162,7 +162,7 @@ def _part(g: Axes, coupling: Callable[[FloatArray], Coupling], sides: FloatArray
     family = Family(shape, values, radius, exponents, scale)
     group: Any = g  # a part uses `inverted` alone
     around = _CoupledGroup(g, sides, family, coupling).on
-    return Part(group, sides, family, growth_over(sides, g.inverted, box), around)
+    return BoxPart(group, sides, family, growth_over(sides, g.inverted, box), around)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,10 +182,10 @@ class HeldLoop:
         return self.law.sample_time
 
     @cached_property
-    def groups(self) -> tuple[Axes, ...]:
+    def groups(self) -> tuple[AxisGroup, ...]:
         """The axes in groups that share loops.
 
-        Raises Unproven for a group of more than LARGEST axes, and for states of the compensator outside all groups.
+        Raises Unproven for a group of more than MAX_GROUP_AXES axes, and for states of the law outside all groups.
         """
         n, label = len(self.machine.lead), _labels(self.law)
         if not set(label[n:].tolist()) <= set(label[:n].tolist()):
@@ -193,7 +193,7 @@ class HeldLoop:
         found = []
         for k in dict.fromkeys(label[:n].tolist()):
             axes = tuple(i for i in range(n) if label[i] == k)
-            if len(axes) > LARGEST:
+            if len(axes) > MAX_GROUP_AXES:
                 raise Unproven(f"{len(axes)} axes in one loop")
             own = tuple(i for i in range(len(self.law.A)) if label[n + i] == k)
             found.append(axes_of(self.machine, self.law, axes, own))
@@ -220,7 +220,7 @@ class HeldLoop:
         del p, neglect
         return [(g, ()) for g in self.groups]
 
-    def enclose(self, box: Box, reach: float) -> list[Part]:
+    def enclose(self, box: Box, reach: float) -> list[BoxPart]:
         """The groups with their coupling over box(reach). Raises NotAnalytic or Unproven when it has no bounds."""
         sides = box.sides(reach)
         whole, known = self._bounds(sides), dict[bytes, Coupling]()
@@ -231,7 +231,7 @@ class HeldLoop:
                 known[sides.tobytes()] = Coupling(*whole, self._weights(box, reach), self.T)
             if (key := inside.tobytes()) not in known:
                 found = known[sides.tobytes()]
-                if len(known) < MOST:
+                if len(known) < MAX_BOX_PARTS:
                     is_past(price=BOUNDS)
                     with suppress(NotAnalytic):
                         W, V, _ = self._bounds(inside)
@@ -247,7 +247,7 @@ class HeldLoop:
             self.machine.bounds([arb(low).union(arb(high)) for low, high in sides.tolist()])
         )
 
-    def _coupling_within(self, bounds: Bounds) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _coupling_within(self, bounds: MatrixBounds) -> tuple[FloatArray, FloatArray, FloatArray]:
         """W, V and the dropped gains within bounds of the machine. Raises NotAnalytic."""
         loose = [i for i in range(len(bounds.Z)) if i not in self._stiff]
         bounds.beside[loose, loose] = bounds.Z[loose, loose]
@@ -324,8 +324,8 @@ class HeldLoop:
                     return np.ones(len(seen)), math.inf
                 moves, G = found
                 one = (moves @ forces[[*g.axes, *(n + i for i in g.axes)]]).max(axis=0)
-                one += (G @ rest[members]).max(axis=0) * LOOSE
-                one[3 * r :] *= LOOSE
+                one += (G @ rest[members]).max(axis=0) * COEFFICIENT_LOOSENESS
+                one[3 * r :] *= COEFFICIENT_LOOSENESS
                 seen[members] = np.maximum(seen[members], one)
             if count == len(corners) or (math.isfinite(most) and not count & (count - 1)):
                 vector, rho = _perron_of(seen)
@@ -333,7 +333,7 @@ class HeldLoop:
                     break
         return vector, rho
 
-    def _responses(self, g: Axes, values: tuple[float, ...]) -> tuple[FloatArray, FloatArray] | None:
+    def _responses(self, g: AxisGroup, values: tuple[float, ...]) -> tuple[FloatArray, FloatArray] | None:
         """|M0^-1| of a group to its forces and moves and to all, at frequencies; None where M0 is unstable."""
         r, stiff = len(g.axes), stiff_axes(self.machine, g.axes)
         k = dict(zip(stiff, values[r:], strict=True))
@@ -376,7 +376,9 @@ def _labels(law: Compensator) -> Any:
         size = np.abs(M)
         if not size.size:
             return size > 0
-        return size > SMALL * np.sqrt(size.max(axis=1, keepdims=True) * size.max(axis=0, keepdims=True))
+        return size > GAIN_TOLERANCE * np.sqrt(
+            size.max(axis=1, keepdims=True) * size.max(axis=0, keepdims=True)
+        )
 
     touch = np.zeros((n + k, n + k), dtype=bool)
     touch[:n, :n], touch[:n, n:] = is_joined(law.D), is_joined(law.C)
@@ -385,7 +387,7 @@ def _labels(law: Compensator) -> Any:
 
 
 def coupling_bounds(
-    bounds: Bounds, T: float, dropped: tuple[FloatArray, ...]
+    bounds: MatrixBounds, T: float, dropped: tuple[FloatArray, ...]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Bounds of W, of V and of the compensator's dropped gains, from those of the machine.
 
@@ -417,16 +419,16 @@ def coupling_bounds(
         short += term * (2 * k + 2)
         skew += term * k
         late += term * ((2 * k + 2) * (2 * k - 1) / 2)
-    less, short, skew, late = (M * SAFE for M in (less, short, skew, late))
+    less, short, skew, late = (M * ROUNDING_FACTOR for M in (less, short, skew, late))
     q, rate, a = (slice(k * n, (k + 1) * n) for k in range(3))
-    W = np.hstack([Z, E * T, shares + E * (T**2 / 2), np.zeros((n, len(dropped[0])))]) * SAFE
+    W = np.hstack([Z, E * T, shares + E * (T**2 / 2), np.zeros((n, len(dropped[0])))]) * ROUNDING_FACTOR
     driven = W.copy()  # with a itself, which Gamma(X) - Gamma0 acts on
     driven[:, a] += eye
     up = W * (T**2 / 2) + less @ driven
     up[:, rate] += short / T
     whole = eye * (T**2 / 2) + less  # of Gamma(X), the first part
-    moved = dominating_solution(whole @ E * SAFE, up * SAFE)
-    W[:, q] = beside * SAFE
+    moved = dominating_solution(whole @ E * ROUNDING_FACTOR, up * ROUNDING_FACTOR)
+    W[:, q] = beside * ROUNDING_FACTOR
     W = W + (short @ driven + (eye * T**2 + short) @ E @ moved) / T**2
     W[:, rate] += whole @ X / T
     V = skew @ driven + skew @ E @ moved
@@ -434,4 +436,4 @@ def coupling_bounds(
     rest = np.zeros((3 * n + len(dropped[0]),) * 2)
     rest[a, 3 * n :], rest[a, q] = b[:, None] * dropped[2], b[:, None] * dropped[3]
     rest[3 * n :, 3 * n :], rest[3 * n :, q] = dropped[0], dropped[1]
-    return W * SAFE, V * SAFE, rest * SAFE
+    return W * ROUNDING_FACTOR, V * ROUNDING_FACTOR, rest * ROUNDING_FACTOR

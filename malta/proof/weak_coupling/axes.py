@@ -28,11 +28,11 @@ from malta.proof.polynomial.family import EPS, binary
 from malta.proof.weak_coupling.held_currents import HeldMachine, Lead
 
 BITS = 320
-STIFF = 2  # axes of a group whose own stiffness is kept
+MAX_OWN_STIFFNESSES = 2  # axes of a group whose own stiffness is kept
 
 
 @dataclass(frozen=True, eq=False)
-class Axes:
+class AxisGroup:
     """A group of axes with its states of the compensator; polynomials of g = z - 1 are mapped to v.
 
     factors : the b_i, then the k_i other than zero
@@ -102,14 +102,14 @@ class Axes:
         return values, radius, N, np.tensordot(slack, sizes, axes=(0, 0)).max(axis=3)
 
 
-def members_of(g: Axes, n: int) -> list[int]:
+def members_of(g: AxisGroup, n: int) -> list[int]:
     """The indices of a group's states among all: positions, rates, accelerations, states of the compensator."""
     return [*(k * n + i for k in range(3) for i in g.axes), *(3 * n + k for k in g.own)]
 
 
 def stiff_axes(machine: HeldMachine, axes: Sequence[int]) -> tuple[int, ...]:
     """The axes of a group whose k_i is other than zero and is kept: subsets of large groups would be many."""
-    return tuple(i for i in axes if machine.stiff[i].coefficient) if len(axes) <= STIFF else ()
+    return tuple(i for i in axes if machine.stiff[i].coefficient) if len(axes) <= MAX_OWN_STIFFNESSES else ()
 
 
 def state_matrix(
@@ -131,7 +131,7 @@ def state_matrix(
     return A
 
 
-def axes_of(machine: HeldMachine, law: Compensator, axes: tuple[int, ...], own: tuple[int, ...]) -> Axes:
+def axes_of(machine: HeldMachine, law: Compensator, axes: tuple[int, ...], own: tuple[int, ...]) -> AxisGroup:
     """Determinants and adjugates of a group, for every subset of its b and k."""
     vertices, stiff = [], stiff_axes(machine, axes)
     factors = tuple(machine.lead[i] for i in axes) + tuple(machine.stiff[i] for i in stiff)
@@ -154,7 +154,7 @@ def axes_of(machine: HeldMachine, law: Compensator, axes: tuple[int, ...], own: 
                 N = [x + sign * y for x, y in zip(N, R, strict=True)]
             determinants.append(f)
             adjugates.append(N)
-        return Axes(axes, own, machine.names, factors, *_stored(determinants, adjugates))
+        return AxisGroup(axes, own, machine.names, factors, *_map_terms(determinants, adjugates))
 
 
 def _exact(
@@ -193,7 +193,7 @@ def _adjugate(H: Any) -> tuple[list[Any], list[Any]]:
     return c[::-1], R[::-1]
 
 
-def _stored(
+def _map_terms(
     determinants: list[list[Any]], adjugates: list[list[Any]]
 ) -> tuple[tuple[list[Any], ...], FloatArray, FloatArray, tuple[int, ...]]:
     """The terms mapped from g to v: determinants, adjugates, bounds of their errors, heights."""

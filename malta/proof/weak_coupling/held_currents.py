@@ -25,7 +25,7 @@ from malta.proof.weak_coupling import taylor
 from malta.proof.weak_coupling.taylor import Evaluation, Laurent, Monomial, Value
 
 INTERVALS = 160  # pieces of the travel
-SURE = 1e-5  # half width of the forces at rest, relative to the largest one; checked over each box
+REST_FORCE_TOLERANCE = 1e-5  # half width, relative to the largest force; checked over each box
 
 
 class Ranged(NamedTuple):
@@ -45,7 +45,7 @@ Table = Mapping[tuple[int, int], Ranged]
 Balls = Mapping[tuple[int, int], list[tuple[Any, Monomial]]]  # of a Table: coefficients and monomials
 
 
-class Bounds(NamedTuple):
+class MatrixBounds(NamedTuple):
     """Entrywise bounds of matrices over a box."""
 
     Z: FloatArray
@@ -87,7 +87,7 @@ class HeldMachine:
             for table in tables
         )
 
-    def bounds(self, p: Sequence[Any]) -> Bounds:
+    def bounds(self, p: Sequence[Any]) -> MatrixBounds:
         """Entrywise bounds over real balls p.
 
         Raises NotAnalytic when a bound is infinite, or when the forces at rest leave their assumed range.
@@ -111,16 +111,16 @@ class HeldMachine:
             return found
 
         b = np.array([float((arb(c) * monomial(m)).abs_upper()) * (1 + 1e-9) for c, m in self.lead])
-        return self._checked(b, [size(t) for t in self._balls])
+        return self._check(b, [size(t) for t in self._balls])
 
-    def _checked(self, b: FloatArray, sizes: Sequence[FloatArray]) -> Bounds:
+    def _check(self, b: FloatArray, sizes: Sequence[FloatArray]) -> MatrixBounds:
         """The bounds of these sizes. Raises NotAnalytic as `bounds` does."""
         Z, beside, E, shares, ratios, rest = sizes
         if not all(np.isfinite(M).all() for M in (Z, beside, E, shares, ratios, rest, b)):
             raise NotAnalytic("a parameter that divides reaches zero")
         if self.rest and not (dominating_solution(ratios, rest[:, :1]) <= 1).all():
             raise NotAnalytic("forces at rest that are not what they were taken for")
-        return Bounds(Z, beside, E, shares, b)
+        return MatrixBounds(Z, beside, E, shares, b)
 
     @cached_property
     def _sums(self) -> tuple[FloatArray, FloatArray, tuple[tuple[list[Any], FloatArray, FloatArray], ...]]:
@@ -141,7 +141,7 @@ class HeldMachine:
         exponents = np.array([*(m for _, m in self.lead), *column], dtype=float)
         return np.array([c for c, _ in self.lead]), exponents.reshape(-1, len(self.names)), tuple(found)
 
-    def bounds_near(self, p: FloatArray) -> Bounds:
+    def bounds_near(self, p: FloatArray) -> MatrixBounds:
         """The bounds at one p in doubles, to rounding: to choose by, not to prove with.
 
         Raises NotAnalytic as `bounds` does.
@@ -156,7 +156,7 @@ class HeldMachine:
                     i, j = np.array(places).T
                     found[i, j] = np.abs(middle @ values) + half @ np.abs(values)
                 sizes.append(found)
-            return self._checked(np.abs(leads * values[:n]), sizes)
+            return self._check(np.abs(leads * values[:n]), sizes)
 
     def at(self, y: float) -> HeldMachine:
         """The machine at one position of the interval, enclosed as on the piece that holds it."""
@@ -262,7 +262,7 @@ def _forces_at_rest(of: ca.Function, nominal: FloatArray, y: float, n: int) -> t
         scale = float(np.prod(nominal**own)) if x else 1.0
         found.append(Lead(float(x / scale) if x else 0.0, tuple(int(e) for e in own)))
     top = found[int(np.abs(v).argmax())]
-    return found, Lead(SURE * abs(top.coefficient), top.monomial)
+    return found, Lead(REST_FORCE_TOLERANCE * abs(top.coefficient), top.monomial)
 
 
 def _interval_about(run: Evaluation, wanted: Lead, room: Lead) -> Value:

@@ -17,12 +17,12 @@ from typing import NamedTuple
 import numpy as np
 
 from malta.arrays import FloatArray
-from malta.linear.expressions import NotAnalytic, Program
+from malta.linear.expressions import MatrixProgram, NotAnalytic
 from malta.work import check_clock
 
 ORDER = 6
 EPS = 2.0**-52
-TINY = 1e-300  # error of underflow
+UNDERFLOW_ERROR = 1e-300  # error of underflow
 
 
 class Taylor(NamedTuple):
@@ -49,7 +49,7 @@ def variable(low: float, high: float, count: int) -> Taylor:
     half = (high - low) / (2 * count) * (1 + 1e-9) + 4 * EPS * edge
     c = np.zeros((ORDER + 1, count))
     c[0], c[1] = (edges[1:] + edges[:-1]) / 2, half
-    return Taylor(c, np.full(count, TINY))
+    return Taylor(c, np.full(count, UNDERFLOW_ERROR))
 
 
 def constant(x: float, count: int) -> Taylor:
@@ -68,9 +68,9 @@ def subtract(a: Taylor, b: Taylor) -> Taylor:
     return Taylor(c, (a.radius + b.radius) * (1 + 2 * EPS) + EPS * np.abs(c).sum(axis=0))
 
 
-def scaled(a: Taylor, x: float) -> Taylor:
+def scale(a: Taylor, x: float) -> Taylor:
     c = a.c * x
-    return Taylor(c, a.radius * abs(x) * (1 + EPS) + EPS * np.abs(c).sum(axis=0) + TINY)
+    return Taylor(c, a.radius * abs(x) * (1 + EPS) + EPS * np.abs(c).sum(axis=0) + UNDERFLOW_ERROR)
 
 
 @lru_cache(maxsize=1)
@@ -92,7 +92,7 @@ def multiply(a: Taylor, b: Taylor) -> Taylor:
     total = below[0]
     beyond = (x * (total - below)).sum(axis=0)
     left = a.radius * (total + b.radius) + x.sum(axis=0) * (b.radius + (3 * n + 8) * EPS * total)
-    return Taylor(c, (beyond + left) * (1 + 32 * EPS) + TINY)
+    return Taylor(c, (beyond + left) * (1 + 32 * EPS) + UNDERFLOW_ERROR)
 
 
 def divide(a: Taylor, b: Taylor) -> Taylor:
@@ -112,7 +112,7 @@ def inverse(b: Taylor) -> Taylor:
     rest = subtract(constant(1.0, g.shape[1]), multiply(b, found)).size()
     if not (rest < 0.5).all():
         raise NotAnalytic("a division by what may be zero")
-    return Taylor(g, found.size() * rest / (1 - rest) * (1 + 8 * EPS) + TINY)
+    return Taylor(g, found.size() * rest / (1 - rest) * (1 + 8 * EPS) + UNDERFLOW_ERROR)
 
 
 def root(a: Taylor) -> Taylor:
@@ -129,7 +129,9 @@ def root(a: Taylor) -> Taylor:
     least = g[0] - np.abs(g[1:]).sum(axis=0) * (1 + 16 * EPS)  # of g, which then is the positive root of g^2
     if not ((least > 0) & (rest < 0.5 * least**2)).all():
         raise NotAnalytic("a root or logarithm at zero or below")
-    return Taylor(g, rest / least * (1 + 8 * EPS) + TINY)  # |sqrt(a) - g| = |a - g^2| / (sqrt(a) + g)
+    return Taylor(
+        g, rest / least * (1 + 8 * EPS) + UNDERFLOW_ERROR
+    )  # |sqrt(a) - g| = |a - g^2| / (sqrt(a) + g)
 
 
 def sine(a: Taylor) -> Taylor:
@@ -190,7 +192,7 @@ class Evaluation:
         exponents = tuple(int(i == k) for k in range(len(self.none)))
         return Laurent({exponents: constant(1.0, self.count)})
 
-    def run(self, program: Program, inputs: Sequence[Value]) -> list[list[tuple[int, int, Value]]]:
+    def run(self, program: MatrixProgram, inputs: Sequence[Value]) -> list[list[tuple[int, int, Value]]]:
         """The entries (row, column, value) of each matrix.
 
         Raises NotAnalytic for expressions without this form, WorkUp where the clock ends the question.
@@ -247,8 +249,8 @@ class Evaluation:
             a, b = b, a
         if isinstance(b, float):
             if isinstance(a, Laurent):
-                return Laurent({m: scaled(c, b) for m, c in a.terms.items()})
-            return scaled(self._model(a), b)
+                return Laurent({m: scale(c, b) for m, c in a.terms.items()})
+            return scale(self._model(a), b)
         if not isinstance(a, Laurent) and not isinstance(b, Laurent):
             return multiply(self._model(a), b)
         found: dict[Monomial, Taylor] = {}

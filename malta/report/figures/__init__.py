@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.errors import InputError
-from malta.model.machines import KINDS, Group, attribute_of, outputs_of
+from malta.model.machines import KINDS, SignalGroup, attribute_of, outputs_of
 from malta.report.figures.campaign import (
     distributions_figure as distributions_figure,
     worst_figure as worst_figure,
     yield_figure as yield_figure,
 )
 from malta.report.figures.drawing import (
-    MORE as MORE,
+    MORE_STYLES as MORE_STYLES,
     POINTS as POINTS,
     STYLES as STYLES,
     Published,
@@ -43,7 +43,7 @@ from malta.report.figures.drawing import (
     new_page,
     number as number,
     save as save,
-    saved,
+    save_figure,
 )
 from malta.simulation.experiments import Case, Experiment
 from malta.simulation.experiments.catalogue import experiments_of
@@ -65,7 +65,7 @@ def experiment_figure(
     """Draw an experiment: the machine's own figure of it, or that of its first run; save it where a path is given.
 
     e : the experiment
-    published : figures of the machine's paper, from `malta.model.published`; None: none
+    published : figures of the machine's paper, from `malta.model.read_published`; None: none
     path : .png, .svg or .pdf file; None: nothing is written
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
@@ -89,7 +89,7 @@ def experiment_figure(
     }
     if e.name not in drawn:
         raise InputError("figure", "experiment", repr(e.name), "one of " + ", ".join(drawn))
-    return saved(drawn[e.name](e, published), path)
+    return save_figure(drawn[e.name](e, published), path)
 
 
 def stroke_figure(
@@ -98,7 +98,7 @@ def stroke_figure(
     """Draw a run: the machine's own figure of a stroke; of a machine without one, errors, forces and clearances.
 
     run : from `malta.simulate`
-    published : figures of the machine's paper, from `malta.model.published`; None: none
+    published : figures of the machine's paper, from `malta.model.read_published`; None: none
     path : .png, .svg or .pdf file; None: nothing is written
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
@@ -108,7 +108,7 @@ def stroke_figure(
     >>> plant = malta.plant_of(controller.parameters)
     >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(10e-3))
     >>> figure = malta.report.stroke_figure(
-    ...     run, malta.model.published("data/tubular.toml")
+    ...     run, malta.model.read_published("data/tubular.toml")
     ... )
     >>> len(figure.axes) > 2
     True
@@ -116,8 +116,8 @@ def stroke_figure(
     draw = attribute_of(run.plant, "figures", "stroke_figure")
     if draw is None:
         alone = Experiment("run", run.scenario.name, (Case(run.scenario.name, run, ()),), ())
-        return saved(run_figure(alone), path)
-    return saved(draw(run, published), path)
+        return save_figure(run_figure(alone), path)
+    return save_figure(draw(run, published), path)
 
 
 def run_figure(e: Experiment, _: Published | None = None) -> Figure:
@@ -157,7 +157,7 @@ def run_figure(e: Experiment, _: Published | None = None) -> Figure:
     return figure
 
 
-def _largest_error(run: Trajectory, group: Group) -> float:
+def _largest_error(run: Trajectory, group: SignalGroup) -> float:
     """Largest error of a group of outputs, SI."""
     return float(np.abs((run.p - run.reference)[:, group.columns]).max())
 
@@ -169,7 +169,7 @@ def _stroke_unit(run: Trajectory) -> str:
     return stroke.fine if small else {"m": "mm", "rad": "mrad"}.get(stroke.unit, stroke.unit)
 
 
-def _draw_errors(axes: Axes, x: str, run: Trajectory, group: Group, unit: str) -> None:
+def _draw_errors(axes: Axes, x: str, run: Trajectory, group: SignalGroup, unit: str) -> None:
     """Errors of the outputs of a group."""
     error = in_unit(1.0, unit) * (run.p - run.reference)
     several = len(group.columns) > 1
@@ -228,7 +228,7 @@ def log_figure(log: Log) -> Figure:
     ):
         micro = {"m": 1e6, "rad": 1e6}.get(log.signals[group][0].unit, 1.0)
         for signal, values in zip(log.signals[group], log.columns[group].T, strict=True):
-            axes.plot(*_thinned(log.t, micro * values), lw=0.8, label=signal.name)
+            axes.plot(*_thin(log.t, micro * values), lw=0.8, label=signal.name)
         unit = log.signals[group][0].unit
         finish_axes(
             axes, "time [s]", f"{PANELS[group]} [{'u' if micro != 1 else ''}{unit}]", legend=len(axes.lines)
@@ -236,7 +236,7 @@ def log_figure(log: Log) -> Figure:
     return figure
 
 
-def _thinned(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _thin(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The least and the largest value of each of INTERVALS."""
     each = len(t) // INTERVALS
     if each < 4:

@@ -13,11 +13,11 @@ import numpy as np
 
 from malta.model.machines import lateral_outputs
 from malta.report.figures.drawing import (
-    BOUND,
+    BOUND_STYLE,
     CROSS,
     DOT,
     LEGEND,
-    MORE,
+    MORE_STYLES,
     NOTE,
     STYLES,
     Published,
@@ -31,9 +31,9 @@ from malta.report.figures.drawing import (
     number_logarithm,
     published_in_unit,
     rows_and_columns,
-    saved,
+    save_figure,
 )
-from malta.simulation.engine.digest import LARGEST_FIGURE, verdicts
+from malta.simulation.engine.digest import MAX_FIGURE, verdicts
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from malta.campaigns.studies import Index, Sensitivity
     from malta.campaigns.summary import Distribution, Runs, Summary
 
-SHOWN = 9  # parameters with a panel each, at most
-LEAST = 1e-3  # of a deviation on a logarithmic axis, in its fine unit
+SHOWN_PARAMETERS = 9  # parameters with a panel each, at most
+MIN_DEVIATION = 1e-3  # of a deviation on a logarithmic axis, in its fine unit
 
 
 def campaign_page(found: Summary, what: str, **places: Any) -> Figure:
@@ -74,13 +74,13 @@ def campaign_page(found: Summary, what: str, **places: Any) -> Figure:
 def panels_over_parameters(
     summary: Summary, what: str, **places: Any
 ) -> tuple[Figure, list[tuple[str, Axes]]]:
-    """A page with a panel for each value that was varied, at most SHOWN, side by side with one y axis."""
+    """A page with a panel for each value that was varied, at most SHOWN_PARAMETERS, side by side with one y axis."""
     from malta.campaigns.plan import half_width, varied_names
 
     names = [
         name for name in varied_names(summary.plan) if half_width(summary.plan, name) and summary.runs > 1
     ]
-    shown = names[:SHOWN]
+    shown = names[:SHOWN_PARAMETERS]
     rows, columns = rows_and_columns(len(shown))
     more = f", {len(shown)} of {len(names)} shown" if len(shown) < len(names) else ""
     figure = campaign_page(summary, what + more, **{"hspace": 0.5, "top": 0.8} | places)
@@ -149,7 +149,7 @@ def is_first(axes: Axes) -> bool:
 def _nearness(summary: Summary, runs: Runs) -> tuple[FloatArray, str]:
     """How near each run came to a limit, and what that is, for an axis."""
     plant = summary.plan.plant
-    contact = np.clip(np.nan_to_num(runs.batch.contact, nan=0.0), 0.0, LARGEST_FIGURE)
+    contact = np.clip(np.nan_to_num(runs.batch.contact, nan=0.0), 0.0, MAX_FIGURE)
     if contact.shape[1]:
         beyond = contact.max(axis=0) - np.median(contact, axis=0)
         k = int(beyond.argmax())
@@ -164,7 +164,7 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
     """Draw the worst runs of a campaign: the places of their machines in the box, and their largest errors.
 
     found : the campaign, or its summary
-    published : figures of the machine's paper, from `malta.model.published`; None: none; a summary has its own
+    published : figures of the machine's paper, from `malta.model.read_published`; None: none; a summary has its own
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -181,11 +181,11 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
     """
     from malta.campaigns.plan import half_width, middle_of, varied_names
     from malta.campaigns.result import spread_text
-    from malta.campaigns.summary import Bounds, as_summary, worst_runs
+    from malta.campaigns.summary import RunLimits, as_summary, worst_runs
 
-    summary = as_summary(found, Bounds(published))
+    summary = as_summary(found, RunLimits(published))
     plan, names = summary.plan, varied_names(summary.plan)
-    runs = worst_runs(summary, len(STYLES) + len(MORE))
+    runs = worst_runs(summary, len(STYLES) + len(MORE_STYLES))
     figure = campaign_page(
         summary, "the worst runs and their machines", wspace=0.42, top=0.84, bottom=0.13, right=0.95
     )
@@ -194,7 +194,7 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
     at = np.arange(len(names))
     middle = np.array([middle_of(plan, name) for name in names])
     half = np.array([half_width(plan, name) for name in names])
-    for row, style in zip(range(len(runs.index)), (*STYLES, *MORE), strict=False):
+    for row, style in zip(range(len(runs.index)), (*STYLES, *MORE_STYLES), strict=False):
         where = 100 * (runs.values[row] - middle) / np.where(half == 0, 1, half)
         box.plot(at, where, marker="o", markersize=4, **style)
         # the look of its line, left of the name of the run
@@ -221,7 +221,7 @@ def _draw_errors(axes: Axes, summary: Summary, runs: Runs) -> None:
     across, completed = lateral_outputs(plant)[0], runs.batch.completed == 1
     fine = in_unit(1.0, across.fine)
     known = np.nan_to_num(runs.batch.deviation[:, across.columns], nan=np.inf)  # of runs that diverged
-    values = np.clip(np.minimum(known, LARGEST_FIGURE) * fine, LEAST, None).max(axis=1)
+    values = np.clip(np.minimum(known, MAX_FIGURE) * fine, MIN_DEVIATION, None).max(axis=1)
     label, unit = f"largest {across.name} deviation [{micro(across.fine)}]", micro(across.fine)
     bounds = {"clearance": clearance(plant) * fine} if across.unit == "m" else {}
     key = bounds_of(plan).get(across.unit)
@@ -237,12 +237,12 @@ def _draw_errors(axes: Axes, summary: Summary, runs: Runs) -> None:
         axes.plot(value, row, **(DOT if completed[row] else CROSS))
         place = axes.transAxes.inverted().transform(axes.transData.transform((value, row)))[0]
         beside: dict[str, Any] = {"xytext": (8 if place < 0.5 else -8, 0), "textcoords": "offset points"}
-        text = f"{number(float(value), 3)} {unit}" if value < LARGEST_FIGURE * fine else "diverged"
+        text = f"{number(float(value), 3)} {unit}" if value < MAX_FIGURE * fine else "diverged"
         axes.annotate(
             text, (value, row), ha="left" if place < 0.5 else "right", va="center", **beside, **NOTE
         )
     for text, value in bounds.items():
-        axes.axvline(value, **BOUND)
+        axes.axvline(value, **BOUND_STYLE)
         above: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
         axes.annotate(text, (value, 1.01), **above, **NOTE)
     finish_axes(axes, label, "")
@@ -274,7 +274,7 @@ def _run_label(plan: Plan, index: int, verdict: float) -> str:
     return text if name == "completed" else f"{text}\n{name.replace(' at ', chr(10) + 'at ')}"
 
 
-FINE: Mapping[str, dict[str, Any]] = {  # ways in which runs end, the best first; contacts follow
+END_STYLES: Mapping[str, dict[str, Any]] = {  # ways in which runs end, the best first; contacts follow
     "within the published bounds": {"facecolor": "#ececec"},
     "completed": {"facecolor": "#b4b4b4"},
     "completed, commands limited": {"facecolor": "#b4b4b4", "hatch": "////"},
@@ -287,7 +287,7 @@ TOUCHES: Sequence[dict[str, Any]] = (
     {"facecolor": "#202020", "hatch": "xx"},
 )
 BINS = 40  # of a distribution
-LEFT = 1e-3  # where the lines of the worst runs begin, in the fine unit of their deviation
+LINE_START = 1e-3  # where the lines of the worst runs begin, in the fine unit of their deviation
 
 
 def distributions_figure(found: Campaign | Summary, published: Published | None = None) -> Figure:
@@ -296,7 +296,7 @@ def distributions_figure(found: Campaign | Summary, published: Published | None 
     A figure that is the same in every run, or that the reference makes by a jump, is told in a sentence.
 
     found : the campaign, or its summary
-    published : figures of the machine's paper, from `malta.model.published`; None: none; a summary has its own
+    published : figures of the machine's paper, from `malta.model.read_published`; None: none; a summary has its own
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -311,9 +311,9 @@ def distributions_figure(found: Campaign | Summary, published: Published | None 
     >>> [axes.get_xlabel() for axes in figure.axes][:2]
     ['deviation y [µm]', 'largest f [N]']
     """
-    from malta.campaigns.summary import Bounds, as_summary
+    from malta.campaigns.summary import RunLimits, as_summary
 
-    summary = as_summary(found, Bounds(published))
+    summary = as_summary(found, RunLimits(published))
     told = {m.label: text for m in summary.merits if (text := _without_spread(summary, m))}
     panels: dict[tuple[str, str], list[Distribution]] = {}  # one panel for each kind and unit
     for listed in summary.merits:
@@ -400,7 +400,7 @@ def _draw_distribution(axes: Axes, kind: str, listed: Sequence[Distribution]) ->
         axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.set_ylim(0, None)
     if math.isfinite(bound):
-        axes.axvline(bound, **BOUND)
+        axes.axvline(bound, **BOUND_STYLE)
         text = "published" if merit.relation == "about" else "published bound"
         axes.annotate(
             text, (bound, 1.01), xycoords=("data", "axes fraction"), ha="center", va="bottom", **NOTE
@@ -419,7 +419,7 @@ def yield_figure(found: Campaign | Summary, published: Published | None = None) 
     Where all are completed alike there is nothing to tell apart, and `nearest_figure` stands in its place.
 
     found : the campaign, or its summary
-    published : figures of the machine's paper, from `malta.model.published`; None: none; a summary has its own
+    published : figures of the machine's paper, from `malta.model.read_published`; None: none; a summary has its own
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -435,9 +435,9 @@ def yield_figure(found: Campaign | Summary, published: Published | None = None) 
     ['m [kg]']
     """
     from malta.campaigns.plan import varied_names
-    from malta.campaigns.summary import Bounds, as_summary
+    from malta.campaigns.summary import RunLimits, as_summary
 
-    summary = as_summary(found, Bounds(published))
+    summary = as_summary(found, RunLimits(published))
     if np.count_nonzero(summary.bands.sum(axis=(0, 2))) == 1 and summary.rate.passed == summary.runs:
         return nearest_figure(summary)
     every = varied_names(summary.plan)
@@ -463,7 +463,7 @@ def _draw_bands(axes: Axes, plan: Plan, name: str, counts: Any) -> None:
     total = counts.sum(axis=0)
     base = np.zeros(len(total))
     by_way = dict(zip(ways_to_end(plan), counts, strict=True))
-    for label, style in (dict(FINE) | dict(zip(plan.plant.contacts.names, cycle(TOUCHES)))).items():
+    for label, style in (dict(END_STYLES) | dict(zip(plan.plant.contacts.names, cycle(TOUCHES)))).items():
         if not by_way[label].any():
             continue
         share = 100 * by_way[label] / np.maximum(total, 1)
@@ -487,7 +487,7 @@ def _draw_bands(axes: Axes, plan: Plan, name: str, counts: Any) -> None:
 # The figure of a sensitivity: Sobol indices as bars, a panel for each figure of merit.
 
 
-UPRIGHT = 6  # names of factors below an axis, at most; more are turned
+MAX_UPRIGHT_NAMES = 6  # names of factors below an axis, at most; more are turned
 BARS: dict[str, dict[str, Any]] = {
     "first-order index: alone": {"facecolor": "#d0d0d0", "edgecolor": "#000000", "hatch": "////"},
     "total index: also with others": {"facecolor": "#8c8c8c", "edgecolor": "#000000"},
@@ -524,7 +524,7 @@ def sensitivity_figure(found: Sensitivity, path: str | Path | None = None) -> Fi
     panels = {"yield": found.of_yield, **found.of_merits}
     shown = {label: indices for label, indices in panels.items() if indices}
     rows, columns = rows_and_columns(len(shown))
-    upright = len(found.factors) <= UPRIGHT
+    upright = len(found.factors) <= MAX_UPRIGHT_NAMES
     below = 0.55 if upright else 0.95  # inch, of the names of the factors
     height = 1.05 + rows * (1.9 + below)
     places: dict[str, Any] = {"size": (9.0, height), "left": 0.08, "top": 1 - 1.05 / height, "wspace": 0.22}
@@ -541,7 +541,7 @@ def sensitivity_figure(found: Sensitivity, path: str | Path | None = None) -> Fi
         _draw_indices(axes, label, found.factors, indices)
         axes.set_ylabel("share of the variance [-]" if k % columns == 0 else "")
     add_shared_legend(figure)
-    return saved(figure, path)
+    return save_figure(figure, path)
 
 
 def _draw_indices(axes: Axes, label: str, factors: Sequence[str], indices: Sequence[Index]) -> None:
@@ -562,7 +562,9 @@ def _draw_indices(axes: Axes, label: str, factors: Sequence[str], indices: Seque
     finish_axes(axes, "", "")
     axes.set_title(label.replace("clearance:", "clearance used up,"), fontsize=9)
     turned: dict[str, Any] = (
-        {} if len(factors) <= UPRIGHT else {"rotation": 50, "ha": "right", "rotation_mode": "anchor"}
+        {}
+        if len(factors) <= MAX_UPRIGHT_NAMES
+        else {"rotation": 50, "ha": "right", "rotation_mode": "anchor"}
     )
     axes.set_xticks(at, factors, fontsize=8, **turned)
     axes.set_xlim(-0.6, len(factors) - 0.4)
@@ -619,7 +621,7 @@ def campaign(
 
     found : the campaign, or its summary
     folder : of the files; None: nothing is written
-    published : figures of the machine's paper, from `malta.model.published`; None: none; a summary has its own
+    published : figures of the machine's paper, from `malta.model.read_published`; None: none; a summary has its own
 
     Returns CampaignFigures.
 
@@ -634,10 +636,10 @@ def campaign(
     >>> figures.worst is figures[-1], malta.report.CAMPAIGN_FILES[-1]
     (True, 'worst.png')
     """
-    from malta.campaigns.summary import Bounds, as_summary
+    from malta.campaigns.summary import RunLimits, as_summary
 
-    summary = as_summary(found, Bounds(published))
+    summary = as_summary(found, RunLimits(published))
     figures = CampaignFigures(distributions_figure(summary), yield_figure(summary), worst_figure(summary))
     for figure, name in zip(figures, CAMPAIGN_FILES, strict=True):
-        saved(figure, None if folder is None else Path(folder) / name)
+        save_figure(figure, None if folder is None else Path(folder) / name)
     return figures

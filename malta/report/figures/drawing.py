@@ -46,15 +46,15 @@ STYLES: Sequence[dict[str, Any]] = (  # distinct without colour: by steps of lig
 >>> [style["color"] for style in malta.report.STYLES]
 ['#000000', '#7d2906', '#176aa8', '#8e8e8e']
 """
-MORE: Sequence[dict[str, Any]] = (  # used after STYLES
+MORE_STYLES: Sequence[dict[str, Any]] = (  # used after STYLES
     {"color": "#000000", "linestyle": (0, (7, 2, 1.5, 2)), "linewidth": 1.4},
     {"color": "#7d2906", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
     {"color": "#176aa8", "linestyle": (0, (9, 2, 1.5, 2, 1.5, 2)), "linewidth": 1.4},
     {"color": "#8e8e8e", "linestyle": "-", "linewidth": 1.2},
 )
-BOUND: dict[str, Any] = {"color": "#9a9a9a", "linestyle": (0, (8, 3)), "linewidth": 0.9}
+BOUND_STYLE: dict[str, Any] = {"color": "#9a9a9a", "linestyle": (0, (8, 3)), "linewidth": 0.9}
 BOUND_LINE = "bound"  # marks what is no data
-BEYOND = 2.5  # times the data: bounds further away are arrows
+MAX_BOUND_FACTOR = 2.5  # times the data: bounds further away are arrows
 # A reference that lies under a curve.
 REFERENCE: dict[str, Any] = {"color": "#a9c6e0", "linestyle": "-", "linewidth": 5.0, "zorder": 1.5}
 NOTE: dict[str, Any] = {"fontsize": 8, "color": "#5a5a5a"}
@@ -63,7 +63,7 @@ PAPER: dict[str, Any] = {"bbox": {"facecolor": "#ffffff", "edgecolor": "none", "
 DOT: dict[str, Any] = {"marker": "o", "markersize": 6, "linestyle": "none", "color": "#000000"}
 CROSS: dict[str, Any] = DOT | {"marker": "X", "markersize": 9, "markeredgecolor": "#ffffff", "clip_on": False}
 LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8, "handlelength": 2.4, "columnspacing": 1.5}
-UNPRINTABLE = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+UNPRINTABLE_CHARACTER = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 POINTS = 3000  # of a line; a page does not resolve more
 
 
@@ -115,7 +115,7 @@ def show_plain_texts(figure: Figure) -> None:
 
 def printable(text: str) -> str:
     """A text without the characters that no page may have, as control characters: each becomes a mark."""
-    return UNPRINTABLE.sub("\ufffd", text)
+    return UNPRINTABLE_CHARACTER.sub("\ufffd", text)
 
 
 def save(figure: Figure, path: str | Path, *, dark: bool = False) -> Path:
@@ -188,7 +188,7 @@ def with_dark_mode(svg: bytes, *, always: bool = False) -> bytes:
     return re.sub(r"(<svg\b[^>]*>)", lambda found: found[0] + style, text, count=1).encode()
 
 
-def saved(figure: Figure, path: str | Path | None) -> Figure:
+def save_figure(figure: Figure, path: str | Path | None) -> Figure:
     """The figure itself, saved where a path is given."""
     if path is not None:
         save(figure, path)
@@ -232,11 +232,11 @@ def mark_end(axes: Axes, run: Trajectory, t: FloatArray, values: FloatArray, *, 
         low, high = axes.get_xlim()
         if not (axes.get_autoscalex_on() or low <= t[k] <= high):
             return
-        label = TOUCHED if run.verdict.name.startswith(TOUCHED) else run.verdict.name
+        label = TOUCHDOWN_LABEL if run.verdict.name.startswith(TOUCHDOWN_LABEL) else run.verdict.name
         axes.plot(t[k], values[k], **CROSS | ({"label": label} if named else {}))
 
 
-TOUCHED = "touchdown"
+TOUCHDOWN_LABEL = "touchdown"
 
 
 def ended_early(run: Trajectory) -> bool:
@@ -262,18 +262,18 @@ def draw_bound(
 ) -> None:
     """Draw a line at a value, or at both signs of it, and extend the axes to it; the data decide what they show.
 
-    A bound beyond BEYOND times the data would flatten them: it is an arrow with its number at the edge instead.
+    A bound beyond MAX_BOUND_FACTOR times the data would flatten them: it is an arrow with its number at the edge.
 
     where : place of its text: above, below, or under the lower line of both; left or right
     """
     drawn = [line for line in axes.lines if line.get_gid() != BOUND_LINE]
     reach = max((_reach(line) for line in drawn), default=0.0)
     height, side = where.split()
-    if axes.get_yscale() != "log" and 0 < BEYOND * reach < abs(value):
+    if axes.get_yscale() != "log" and 0 < MAX_BOUND_FACTOR * reach < abs(value):
         _point_to_bound(axes, value, text, side, both=both)
         return
     for sign in (-1, 1) if both else (1,):
-        axes.axhline(sign * value, gid=BOUND_LINE, **BOUND)
+        axes.axhline(sign * value, gid=BOUND_LINE, **BOUND_STYLE)
     axes.annotate(
         text,
         ({"left": 0.015, "right": 0.985}[side], -value if height == "under" else value),
@@ -474,7 +474,7 @@ def draw_group(
             lines[name] = values
         else:
             lines = {f"{twin}, {name}" if known == twin else known: drawn for known, drawn in lines.items()}
-    styles = styles or (*STYLES, *MORE)
+    styles = styles or (*STYLES, *MORE_STYLES)
     if len(lines) > len(styles):
         every = np.array(list(series.values()))
         label = f"all {len(every)}, least to largest"

@@ -39,11 +39,11 @@ def png_of(figure: Figure, *, dark: bool = False) -> bytes:
         return buffer.getvalue()
     canvas.draw()
     drawn = np.asarray(canvas.buffer_rgba())[:, :, :3]
-    Image.fromarray(_darkened(drawn)).save(buffer, "png", compress_level=1)
+    Image.fromarray(_darken(drawn)).save(buffer, "png", compress_level=1)
     return buffer.getvalue()
 
 
-def _darkened(drawn: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def _darken(drawn: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     """A picture, height x width x (red, green, blue), 0 to 255, for a dark page."""
     from malta.report.page.document import dark_colours
 

@@ -18,10 +18,10 @@ from malta.loops.time_domain import Deviation, Recovery, furthest, load_vector, 
 from malta.margins.loop_report import ZONES, LoopReport
 from malta.model.parameters import box_words
 from malta.report.figures.drawing import (
-    BOUND,
+    BOUND_STYLE,
     DOT,
     LEGEND,
-    MORE,
+    MORE_STYLES,
     NOTE,
     PAPER,
     STYLES,
@@ -31,7 +31,7 @@ from malta.report.figures.drawing import (
     front_lines,
     micro,
     new_figure,
-    saved,
+    save_figure,
 )
 from malta.synthesis.requirements import Trade
 from malta.units import unit_factor
@@ -47,13 +47,13 @@ if TYPE_CHECKING:
     from malta.proof.margin import Margin
     from malta.synthesis.controller import Controller
     from malta.synthesis.recovery import StepResponse
-    from malta.tuning.tune import Tuned
+    from malta.tuning.tune import TuningResult
 
 
 LOOKS: tuple[dict[str, Any], dict[str, Any]] = ({"color": "#c9c9c9"}, {"color": "#5a5a5a"})  # stages, machine
 WITNESS: dict[str, Any] = {"color": "#c1440e", "linewidth": 1.6}
 NO_WITNESS: dict[str, Any] = {"marker": ">", "markersize": 7, "linestyle": "none", "color": "#000000"}
-CROWDED = 12.0  # peak |S| up to which the names of the zones have room
+MAX_NAMED_PEAK = 12.0  # peak |S| up to which the names of the zones have room
 
 
 def chain_figure(found: LoopReport, path: str | Path | None = None) -> Figure:
@@ -100,7 +100,7 @@ def chain_figure(found: LoopReport, path: str | Path | None = None) -> Figure:
         for axes in along:
             along_travel = f"position {extent.stroke} [mm]"
             axes.set_xlabel(along_travel if extent.stroke else f"{extent.course} [{extent.unit}]")
-    return saved(figure, path)
+    return save_figure(figure, path)
 
 
 def _draw_stages(left: Axes, right: Axes, found: LoopReport) -> None:
@@ -142,8 +142,8 @@ def _draw_stages(left: Axes, right: Axes, found: LoopReport) -> None:
     right.tick_params(axis="y", length=0)
     right.set_xlim(0, max(5.6, 1.15 * max(link.peak for link in found.chain if not math.isnan(link.peak))))
     for (limit, zone), (_, worse) in pairwise(ZONES):
-        right.axvline(limit, **BOUND)
-        if right.get_xlim()[1] < CROWDED:
+        right.axvline(limit, **BOUND_STYLE)
+        if right.get_xlim()[1] < MAX_NAMED_PEAK:
             where: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
             right.annotate(f"{zone} | {worse}", (limit, 1.005), **where, **NOTE)
     right.set_xlabel("peak |S| [-], zones of ISO 14839-3")
@@ -201,7 +201,7 @@ def _draw_along_course(left: Axes, right: Axes, found: LoopReport, bound: float)
             "upper bound over the box, proven", (0.02, bound), xycoords=("axes fraction", "data"),
             xytext=(0, -3), textcoords="offset points", va="top", **NOTE | PAPER,
         )  # fmt: skip
-    right.axhline(limit, **BOUND)
+    right.axhline(limit, **BOUND_STYLE)
     where: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
     right.annotate(f"end of zone {zone}", (0.985, limit), **where, **NOTE)
     right.set_ylabel("peak |S| [-]")
@@ -229,11 +229,11 @@ def _legend(axes: Axes, bottom: float = 1.0, handles: Sequence[Artist] | None = 
 # The figure of how a machine takes loads from outside: deviation over time, and compliance over frequency.
 
 
-FINE = {"m": "um", "rad": "urad"}  # units that outputs are drawn in
-SHOWN = 1.5  # times the longest time to 1 %
+FINE_UNITS = {"m": "um", "rad": "urad"}  # units that outputs are drawn in
+SHOWN_TIME_FACTOR = 1.5  # times the longest time to 1 %
 POINTS = 400  # of frequency
 # A line that covers another has gaps.
-RECOVERY_LOOKS = (STYLES[0], MORE[1], STYLES[2], MORE[0], *STYLES[1::2], *MORE[2:])
+RECOVERY_LOOKS = (STYLES[0], MORE_STYLES[1], STYLES[2], MORE_STYLES[0], *STYLES[1::2], *MORE_STYLES[2:])
 
 
 def recovery_figure(
@@ -280,9 +280,9 @@ def recovery_figure(
     loop = loop_along(plant, controller).sampled
     answer = loop.answer()
     for (left, right), ((unit, of), lines) in zip(panels, rows.items(), strict=True):
-        _draw_steps(left, plant, answer, lines, FINE.get(unit, unit), of)
-        _draw_compliance(right, plant, loop, lines, FINE.get(unit, unit), of)
-    return saved(figure, path)
+        _draw_steps(left, plant, answer, lines, FINE_UNITS.get(unit, unit), of)
+        _draw_compliance(right, plant, loop, lines, FINE_UNITS.get(unit, unit), of)
+    return save_figure(figure, path)
 
 
 def _draw_steps(
@@ -296,7 +296,9 @@ def _draw_steps(
     """Deviation over time of the output furthest off, after 1 N or 1 N m at t = 0."""
     names = [s.name for s in plant.outputs]
     settled = max(output.settled for _, output in lines)
-    end = min(SHOWN * settled, float(answer.t[-1])) if np.isfinite(settled) else float(answer.t[-1])
+    end = (
+        min(SHOWN_TIME_FACTOR * settled, float(answer.t[-1])) if np.isfinite(settled) else float(answer.t[-1])
+    )
     shown = answer.t <= end
     series = {}
     for load, output in lines:
@@ -341,7 +343,7 @@ LABELS = ("noise of the force [N rms]", "true motion [µm rms]")  # by trade
 MARKS = ((0, "o"), (2, "s"), (1, "D"))  # style of a line and marker
 
 
-def front_figure(tuned: Tuned, path: str | Path | None = None) -> Figure:
+def front_figure(tuned: TuningResult, path: str | Path | None = None) -> Figure:
     """Draw the Pareto front of a search: force noise and motion over the proven margin, the chosen trial ringed.
 
     A dot has the least force noise, or the least motion, that goes with its margin. The chosen trial has to keep the
@@ -354,12 +356,12 @@ def front_figure(tuned: Tuned, path: str | Path | None = None) -> Figure:
 
     >>> import malta
     >>> from malta.tuning.search import Trial
-    >>> from malta.tuning.tune import Tuned
+    >>> from malta.tuning.tune import TuningResult
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
     >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
     >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
-    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
+    >>> tuned = TuningResult(spec, front[1], (), front, trials=120)  # of malta.tune
     >>> figure = malta.report.front_figure(tuned)
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['noise of the force [N rms]', 'true motion [µm rms]']
@@ -384,13 +386,13 @@ def front_figure(tuned: Tuned, path: str | Path | None = None) -> Figure:
                 where = 100 * taken.figures["margin"], scale * taken.figures[name]
                 _draw_points(axes, points, where, STYLES[style] | {"marker": marker, "label": label})
         if "margin" in asked:
-            axes.axvline(100 * asked["margin"], **BOUND)
+            axes.axvline(100 * asked["margin"], **BOUND_STYLE)
             above: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
             axes.annotate("asked for", (100 * asked["margin"], 1.01), **above, **NOTE)
         axes.margins(x=0.04)
         finish_axes(axes, "proven margin [% of the box]", y, legend=2)
         axes.margins(x=0.04)
-    return saved(figure, path)
+    return save_figure(figure, path)
 
 
 def _draw_points(

@@ -14,12 +14,12 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.loops.curves import LoopCurves, loop_curves
-from malta.loops.sampled_loops import LAST
+from malta.loops.sampled_loops import LAST_STAGE
 from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, LoopReport
 from malta.merits import Merit, in_groups
 from malta.model.data import plant_of
 from malta.model.linear import is_linear
-from malta.model.machines import FINE
+from malta.model.machines import FINE_UNITS
 from malta.model.parameters import units_of
 from malta.model.plant import Parameters, Plant, Signal
 from malta.report.figures.drawing import micro, number
@@ -56,7 +56,7 @@ class Subject(NamedTuple):
     source: str = ""  # the gain file, as the user named it
     changes: Sequence[str] = ()  # of the machine, as "m=0.56"
     provenance: Sequence[tuple[str, str]] = ()  # of the gain file: seal, and versions that wrote it
-    current_loops: CurrentLoops = LAST
+    current_loops: CurrentLoops = LAST_STAGE
 
     @property
     def written_from(self) -> Spec | None:
@@ -141,7 +141,7 @@ def _main_job(subject: Subject, notes: list[str], progress: Share | None) -> Exp
 
 
 # Units for values below a size, SI, the smallest first.
-FINER: dict[str, tuple[tuple[str, float], ...]] = {
+FINER_UNITS: dict[str, tuple[tuple[str, float], ...]] = {
     "s": (("us", 1e-3), ("ms", 1.0)),
     "m": (("um", 1e-4), ("mm", 1.0)),
     "rad": (("urad", 1e-4), ("mrad", 0.1)),
@@ -166,7 +166,7 @@ GROUPS = (
 )
 
 
-class Entry(NamedTuple):
+class FileEntry(NamedTuple):
     """A number or a word of a design, as it stands in its files."""
 
     group: str  # of GROUPS
@@ -186,7 +186,7 @@ class Entry(NamedTuple):
             return self.value
         return f"{in_unit(self.value, unit) if unit else self.value:.6g}"
 
-    def equals(self, other: Entry | None) -> bool:
+    def equals(self, other: FileEntry | None) -> bool:
         """Whether another design has the same value, but for rounding."""
         if other is None or isinstance(self.value, str) or isinstance(other.value, str):
             return other is not None and self.value == other.value
@@ -196,7 +196,7 @@ class Entry(NamedTuple):
 def display_unit(unit: str, values: Iterable[float | str]) -> str:
     """The unit in which some values of an SI unit have few digits: "us" of 5e-5 s."""
     sizes = [abs(value) for value in values if not isinstance(value, str) and value]
-    small = (fine for fine, size in FINER.get(unit, ()) if sizes and max(sizes) < size)
+    small = (fine for fine, size in FINER_UNITS.get(unit, ()) if sizes and max(sizes) < size)
     return next(small, unit)
 
 
@@ -207,20 +207,20 @@ def kind_of(controller: Controller) -> str:
     return "linear law of the errors" if controller.tracks == "errors" else "PID"
 
 
-def design_entries(subject: Subject) -> list[Entry]:
+def design_entries(subject: Subject) -> list[FileEntry]:
     """List what a design is: the machine, the law, its weights and its noise, the size of its gains."""
     parts = (_machine, _law, _weights, _noise_entries, _gains, _limits)
     return sorted((entry for part in parts for entry in part(subject)), key=lambda e: GROUPS.index(e.group))
 
 
-def _machine(subject: Subject) -> Iterator[Entry]:
+def _machine(subject: Subject) -> Iterator[FileEntry]:
     parameters = subject.parameters
-    yield Entry("machine", "name", "linear" if is_linear(parameters) else subject.plant.name)
-    yield Entry("machine", "preset", parameters.preset)
+    yield FileEntry("machine", "name", "linear" if is_linear(parameters) else subject.plant.name)
+    yield FileEntry("machine", "preset", parameters.preset)
     for name, unit in units_of(parameters).items():
-        yield Entry("parameters", name, float(getattr(parameters, name)), unit)
+        yield FileEntry("parameters", name, float(getattr(parameters, name)), unit)
     for name, share in subject.box.items():
-        yield Entry("uncertainty", name, share, "1")
+        yield FileEntry("uncertainty", name, share, "1")
 
 
 def _sums(c: Controller) -> str:
@@ -230,31 +230,31 @@ def _sums(c: Controller) -> str:
     return " ".join(c.measurements[k].name for k in c.summed)
 
 
-def _law(subject: Subject) -> Iterator[Entry]:
+def _law(subject: Subject) -> Iterator[FileEntry]:
     c = subject.controller
-    yield Entry("law", "kind", kind_of(c))
-    yield Entry("law", "sample time", c.sample_time, "s")
-    yield Entry("law", "delay in the design model", float(c.delay), "1")
-    yield Entry("law", "lag of the current loops in the design model", "yes" if c.lagging else "no")
-    yield Entry("law", "integrals of errors", _sums(c) or "no")
-    yield Entry("law", "observed forces of disturbance", "yes" if c.observed else "no")
-    yield Entry("law", "commutation", "measured place" if c.commutation is None else "predicted place")
+    yield FileEntry("law", "kind", kind_of(c))
+    yield FileEntry("law", "sample time", c.sample_time, "s")
+    yield FileEntry("law", "delay in the design model", float(c.delay), "1")
+    yield FileEntry("law", "lag of the current loops in the design model", "yes" if c.lagging else "no")
+    yield FileEntry("law", "integrals of errors", _sums(c) or "no")
+    yield FileEntry("law", "observed forces of disturbance", "yes" if c.observed else "no")
+    yield FileEntry("law", "commutation", "measured place" if c.commutation is None else "predicted place")
     spec = subject.written_from
     if spec is not None and spec.kind == "LQG":
-        yield Entry("law", "discretization", spec.discretization)
+        yield FileEntry("law", "discretization", spec.discretization)
     for signal, pause in zip(c.measurements, c.pause, strict=False):
         if pause:
             name, unit = f"integral of {signal.name} waits above", f"{signal.unit}/s"
-            yield Entry("law", name, float(pause), unit, signal.name)
+            yield FileEntry("law", name, float(pause), unit, signal.name)
     for signal, error in zip(c.measurements, c.braking, strict=False):
         if error:
-            yield Entry("law", f"{signal.name} brakes from", float(error), signal.unit, signal.name)
+            yield FileEntry("law", f"{signal.name} brakes from", float(error), signal.unit, signal.name)
     for words, per, row in zip(
         ("reference", "speed", "acceleration"), ("", "/s", "/s^2"), c.references, strict=False
     ):
         for signal, limit in zip(c.measurements, row, strict=True):
             if limit:
-                yield Entry(
+                yield FileEntry(
                     "law",
                     f"largest {words} of {signal.name}",
                     float(limit),
@@ -262,11 +262,11 @@ def _law(subject: Subject) -> Iterator[Entry]:
                     signal.name,
                 )
     if c.current_loop is not None:
-        yield Entry("law", "current loop Kp", c.current_loop.Kp, "V/A")
-        yield Entry("law", "current loop Ki", c.current_loop.Ki, "V / (A s)")
+        yield FileEntry("law", "current loop Kp", c.current_loop.Kp, "V/A")
+        yield FileEntry("law", "current loop Ki", c.current_loop.Ki, "V / (A s)")
 
 
-def _weights(subject: Subject) -> Iterator[Entry]:
+def _weights(subject: Subject) -> Iterator[FileEntry]:
     c, plant = subject.controller, subject.plant
     law = None if subject.written_from is None else subject.written_from.law
     if isinstance(law, Pid):
@@ -278,7 +278,7 @@ def _weights(subject: Subject) -> Iterator[Entry]:
             for key, value in element.numbers.items():
                 if isinstance(value, float):
                     unit = re.sub(r"\((\w+)\)", r"\1", element.units[key]).replace(" / ", "/")
-                    yield Entry("elements of the law", f"{element.name} {key}", value, unit)
+                    yield FileEntry("elements of the law", f"{element.name} {key}", value, unit)
     elif isinstance(law, Weights):
         integrals = integral_signals(plant, law.coordinates)
         for table, states, weight, base in (
@@ -307,7 +307,7 @@ def _over_square(unit: str) -> str:
     return f"1/{unit}^2" if unit.isalpha() else f"1/({unit})^2"
 
 
-def _noise_entries(subject: Subject) -> Iterator[Entry]:
+def _noise_entries(subject: Subject) -> Iterator[FileEntry]:
     noise, cost, plant = subject.controller.noise, subject.controller.cost, subject.plant
     if noise is None or cost is None:
         return
@@ -319,23 +319,25 @@ def _noise_entries(subject: Subject) -> Iterator[Entry]:
     yield from _row("noise", "correlation ", plain, noise.correlation)
 
 
-def _gains(subject: Subject) -> Iterator[Entry]:
+def _gains(subject: Subject) -> Iterator[FileEntry]:
     for name in ("K", "Ki", "L"):
-        yield Entry("gains", f"norm of {name}", float(np.linalg.norm(getattr(subject.controller, name))), "1")
-    yield Entry("gains", "states of the law", float(len(subject.controller.states)), "1")
+        yield FileEntry(
+            "gains", f"norm of {name}", float(np.linalg.norm(getattr(subject.controller, name))), "1"
+        )
+    yield FileEntry("gains", "states of the law", float(len(subject.controller.states)), "1")
 
 
-def _limits(subject: Subject) -> Iterator[Entry]:
+def _limits(subject: Subject) -> Iterator[FileEntry]:
     c = subject.controller
     for signal, limit in zip(c.forces, c.limits.force, strict=True):
         if np.isfinite(limit):
-            yield Entry("limits", signal.name, float(limit), signal.unit, signal.name)
+            yield FileEntry("limits", signal.name, float(limit), signal.unit, signal.name)
 
 
-def _row(group: str, prefix: str, signals: Sequence[Signal], values: FloatArray) -> Iterator[Entry]:
+def _row(group: str, prefix: str, signals: Sequence[Signal], values: FloatArray) -> Iterator[FileEntry]:
     """An entry for each signal that has a value; none of an empty vector."""
     for signal, value in zip(signals, values, strict=False):
-        yield Entry(group, f"{prefix}{signal.name}", float(value), signal.unit, signal.name)
+        yield FileEntry(group, f"{prefix}{signal.name}", float(value), signal.unit, signal.name)
 
 
 # The top of a report: its key figures, and what the design is in words.
@@ -379,7 +381,7 @@ def _noise(a: Analysis) -> Iterator[KeyFigure]:
             largest[signal.unit] = max(largest.get(signal.unit, (0.0, "")), (value, signal.name))
         texts = []
         for unit, (value, _) in largest.items():
-            fine = FINE.get(unit, unit)
+            fine = FINE_UNITS.get(unit, unit)
             shown = "" if fine == "1" else f" {micro(fine)}"
             texts.append(f"{number(in_unit(value, fine), 3)}{shown}")
         names = ", ".join(name for _, name in largest.values())

@@ -14,7 +14,15 @@ from rich.text import Text
 
 from malta.errors import InputError
 from malta.merits import Merit, by_identifier, find_best
-from malta.report.page.analysis import GROUPS, Analysis, Entry, Subject, analyse, design_entries, display_unit
+from malta.report.page.analysis import (
+    GROUPS,
+    Analysis,
+    FileEntry,
+    Subject,
+    analyse,
+    design_entries,
+    display_unit,
+)
 from malta.report.tables import Paragraph, new_table
 from malta.report.verdict import Stair, VerdictLine, staircase, verdict_lines
 from malta.simulation.experiments import progress_of_part
@@ -25,25 +33,25 @@ if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
 
 
-LEAST, MOST = 2, 8  # designs
-NOTHING = "-"  # the text of a design that has no such entry or figure
+MIN_DESIGNS, MAX_DESIGNS = 2, 8  # designs
+NOTHING_TEXT = "-"  # the text of a design that has no such entry or figure
 ANY_MACHINE = ("machine", "law", "gains")  # groups of entries that machines have in common
 GAP = "\0"  # in the place of a signal's name
 
 
-class Difference(NamedTuple):
+class EntryDifference(NamedTuple):
     """An entry that is not the same in all designs; None where a design does not have it."""
 
     group: str
     key: str
     name: str
     unit: str  # for display
-    entries: tuple[Entry | None, ...]
+    entries: tuple[FileEntry | None, ...]
 
     @property
     def texts(self) -> tuple[str, ...]:
         """The value of each design; a dash where there is none."""
-        return tuple(NOTHING if entry is None else entry.text(self.unit) for entry in self.entries)
+        return tuple(NOTHING_TEXT if entry is None else entry.text(self.unit) for entry in self.entries)
 
     @property
     def heading(self) -> str:
@@ -51,7 +59,7 @@ class Difference(NamedTuple):
         return self.name if self.unit in ("", "1") else f"{self.name} [{self.unit}]"
 
 
-class Row(NamedTuple):
+class MeritRow(NamedTuple):
     """A figure of merit of all designs; None where a design does not have it."""
 
     group: str
@@ -63,10 +71,10 @@ class Row(NamedTuple):
     @property
     def texts(self) -> tuple[str, ...]:
         """The value of each design; a dash where there is none."""
-        return tuple(NOTHING if score is None else score.text for score in self.scores)
+        return tuple(NOTHING_TEXT if score is None else score.text for score in self.scores)
 
 
-class Line(NamedTuple):
+class TableLine(NamedTuple):
     """A line of a table of designs."""
 
     group: str
@@ -75,12 +83,12 @@ class Line(NamedTuple):
     best: tuple[bool, ...]
 
 
-def _join_signals(lines: Iterable[tuple[Line, str]]) -> list[Line]:
+def _join_signals(lines: Iterable[tuple[TableLine, str]]) -> list[TableLine]:
     """Lines, each with its signal: those that differ in the signal alone become one, with all signals in it.
 
     Example: "motion x1, rms" and "motion y1, rms" of the same values become "motion x1 y1, rms".
     """
-    found: list[Line] = []
+    found: list[TableLine] = []
     kept: dict[tuple[Any, ...], tuple[int, list[str]]] = {}  # form of a line -> its place, its signals
     for line, signal in lines:
         form = line._replace(heading=_without(line.heading, signal))
@@ -112,10 +120,10 @@ class Comparison:
         return f"Comparison({', '.join(self.names)})"
 
     @cached_property
-    def differences(self) -> tuple[Difference, ...]:
+    def differences(self) -> tuple[EntryDifference, ...]:
         """The entries that are not the same in all designs, in the order of the first design that has them."""
         found = [{entry.key: entry for entry in design_entries(a.subject)} for a in self.designs]
-        rows: list[Difference] = []
+        rows: list[EntryDifference] = []
         for key in dict.fromkeys(key for entries in found for key in entries):
             entries = tuple(of.get(key) for of in found)
             first = next(entry for entry in entries if entry is not None)
@@ -123,11 +131,11 @@ class Comparison:
                 continue
             if not all(first.equals(entry) for entry in entries):
                 unit = display_unit(first.unit, [entry.value for entry in entries if entry is not None])
-                rows.append(Difference(first.group, key, first.name, unit, entries))
+                rows.append(EntryDifference(first.group, key, first.name, unit, entries))
         return tuple(sorted(rows, key=lambda row: GROUPS.index(row.group)))
 
     @cached_property
-    def rows(self) -> tuple[Row, ...]:
+    def rows(self) -> tuple[MeritRow, ...]:
         """The figures of merit that make sense beside each other."""
         found = [by_identifier(a.figures) for a in self.designs]
         rows = []
@@ -138,7 +146,7 @@ class Comparison:
             if any(score.unit != first.unit for score in known) or not self._is_shown(first):
                 continue
             best = find_best(scores) if self._is_judged(first) else tuple(False for _ in scores)
-            rows.append(Row(first.meaning.group, key, first.heading, scores, best))
+            rows.append(MeritRow(first.meaning.group, key, first.heading, scores, best))
         order = list(dict.fromkeys(row.group for row in rows))
         return tuple(sorted(rows, key=lambda row: order.index(row.group)))
 
@@ -180,22 +188,22 @@ class Comparison:
         return self.one_machine and len({tuple(sorted(a.subject.box.items())) for a in self.designs}) == 1
 
     @property
-    def difference_lines(self) -> list[Line]:
+    def difference_lines(self) -> list[TableLine]:
         """The differences as lines of a table: signals with the same values share one."""
         return _join_signals(
             (
-                Line(row.group, row.heading, row.texts, (False,) * len(row.texts)),
+                TableLine(row.group, row.heading, row.texts, (False,) * len(row.texts)),
                 next(entry.signal for entry in row.entries if entry is not None),
             )
             for row in self.differences
         )
 
     @property
-    def figure_lines(self) -> list[Line]:
+    def figure_lines(self) -> list[TableLine]:
         """The figures of merit as lines of a table: signals with the same values share one."""
         return _join_signals(
             (
-                Line(row.group, row.heading, row.texts, row.best),
+                TableLine(row.group, row.heading, row.texts, row.best),
                 next(score.signal for score in row.scores if score is not None),
             )
             for row in self.rows
@@ -244,7 +252,7 @@ def compare(
     campaigns : summaries of the campaigns of each; (): none of any
     progress : takes the share of the work that is done
 
-    Raises InputError for fewer than LEAST or more than MOST designs, CheckError as `analyse`.
+    Raises InputError for fewer than MIN_DESIGNS or more than MAX_DESIGNS designs, CheckError as `analyse`.
     """
 
     require_count(len(subjects))
@@ -262,9 +270,9 @@ def compare(
 
 
 def require_count(count: int) -> None:
-    """Raise InputError for fewer than LEAST or more than MOST designs."""
-    if not LEAST <= count <= MOST:
-        raise InputError("compare", "gain files", str(count), f"{LEAST} to {MOST}")
+    """Raise InputError for fewer than MIN_DESIGNS or more than MAX_DESIGNS designs."""
+    if not MIN_DESIGNS <= count <= MAX_DESIGNS:
+        raise InputError("compare", "gain files", str(count), f"{MIN_DESIGNS} to {MAX_DESIGNS}")
 
 
 def names_of(subjects: Sequence[Subject]) -> tuple[str, ...]:
@@ -295,8 +303,8 @@ def _deeper(subject: Subject, depth: int) -> str:
 # The tables of a comparison for a terminal: what differs, and figures of merit with the better one marked.
 
 
-JOINT = "\N{NO-BREAK SPACE}"
-BEST = "*"  # behind the better value, beside bold letters
+JOINING_SPACE = "\N{NO-BREAK SPACE}"
+BEST_MARK = "*"  # behind the better value, beside bold letters
 LABELS = 34  # letters of the first column; longer labels are broken into lines
 NAME = 18  # letters of a design's name in a heading; longer names are broken
 EDGE = 2  # letters at both ends of a line
@@ -306,7 +314,7 @@ def comparison_tables(found: Comparison, width: int = 80) -> Group:
     """What differs in the designs, and their figures of merit, in blocks of designs that fit in `width` columns."""
     parts: list[Any] = []
     verdict = [
-        Line("", lines[0].label, _with_bars(lines, found.margins), tuple(False for _ in lines))
+        TableLine("", lines[0].label, _with_bars(lines, found.margins), tuple(False for _ in lines))
         for lines in zip(*found.verdicts, strict=True)
     ]
     parts += [
@@ -315,7 +323,7 @@ def comparison_tables(found: Comparison, width: int = 80) -> Group:
     parts.append(Paragraph(f"{found.judged_text}\n"))
     for title, lines in (
         ("What differs in the designs", found.difference_lines),
-        (f"Figures of merit ({BEST} and bold: better)", found.figure_lines),
+        (f"Figures of merit ({BEST_MARK} and bold: better)", found.figure_lines),
     ):
         for columns in _blocks(found.names, lines, width):
             parts.append(_table(title, found.names, lines, columns))
@@ -333,7 +341,7 @@ def _with_bars(lines: Sequence[VerdictLine], margins: Sequence[Stair]) -> tuple[
     )
 
 
-def _blocks(names: Sequence[str], lines: Sequence[Line], width: int) -> Iterator[list[int]]:
+def _blocks(names: Sequence[str], lines: Sequence[TableLine], width: int) -> Iterator[list[int]]:
     """Columns of designs that fit beside each other; none without lines."""
     block: list[int] = []
     room, sign = width - LABELS - EDGE, _sign_width(lines)
@@ -348,17 +356,17 @@ def _blocks(names: Sequence[str], lines: Sequence[Line], width: int) -> Iterator
         yield block
 
 
-def _sign_width(lines: Sequence[Line]) -> int:
+def _sign_width(lines: Sequence[TableLine]) -> int:
     """The letters behind a value that mark it as better."""
-    return len(BEST) + 1 if any(any(line.best) for line in lines) else 0
+    return len(BEST_MARK) + 1 if any(any(line.best) for line in lines) else 0
 
 
-def _table(title: str, names: Sequence[str], lines: Sequence[Line], columns: Sequence[int]) -> Table:
+def _table(title: str, names: Sequence[str], lines: Sequence[TableLine], columns: Sequence[int]) -> Table:
     """A table of some of the designs, with a line for each group, of the lines that one of them has a value in."""
     table = new_table(title, "", *(names[k] for k in columns))
-    group, blank = "", JOINT * _sign_width(lines)
+    group, blank = "", JOINING_SPACE * _sign_width(lines)
     for line in lines:
-        if all(line.texts[k] == NOTHING for k in columns):
+        if all(line.texts[k] == NOTHING_TEXT for k in columns):
             continue
         if line.group != group:
             if group:
@@ -366,7 +374,7 @@ def _table(title: str, names: Sequence[str], lines: Sequence[Line], columns: Seq
             group = line.group
             table.add_row(Text(group, style="italic"))
         cells = [
-            Text(f"{line.texts[k]}{JOINT}{BEST}", style="bold")
+            Text(f"{line.texts[k]}{JOINING_SPACE}{BEST_MARK}", style="bold")
             if line.best[k]
             else Text(line.texts[k] + blank)
             for k in columns

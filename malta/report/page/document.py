@@ -18,10 +18,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from malta.files import packaged, replace_files, require_suffix
+from malta.files import read_packaged, replace_files, require_suffix
 from malta.report.figures.drawing import BOUND_LINE, printable
 from malta.report.page.analysis import KeyFigure
-from malta.report.page.sections import Folded, Item, Picture, Section, Sheet, plain_sheet, polish
+from malta.report.page.sections import Folded, Illustration, Item, PageTable, Section, plain_sheet, polish
 from malta.report.tables.experiments import finding_cells
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from malta.arrays import FloatArray
-    from malta.identification.commission import Commissioning, Entry
+    from malta.identification.commission import Commissioning, JournalEntry
 
 
 # A figure as SVG that stands inside a page: colours by CSS variables, so that a dark page has light lines.
@@ -41,8 +41,8 @@ NAMESPACE = re.compile(r"^\{[^}]*\}")
 COLOUR = re.compile(r"#[0-9a-f]{6}\b")
 REFERENCE = re.compile(r"url\(#([^)]+)\)")
 NUMBER = re.compile(r"-?\d+\.\d{3,}")
-ALONG = ("time", "frequency")  # labels of axes along which one looks at curves
-MOST_OF_A_MARK = 8  # points: what has fewer is no curve
+ALONG_LABELS = ("time", "frequency")  # labels of axes along which one looks at curves
+MAX_MARK_POINTS = 8  # points: what has fewer is no curve
 FONT = re.compile(r"font-family: [^;]*;? ?")
 
 
@@ -95,7 +95,7 @@ def _mark_lines(figure: Figure) -> tuple[dict[str, tuple[int, str]], dict[str, s
     lines: dict[str, tuple[int, str]] = {}
     for k, axes in enumerate(figure.axes):
         for line in axes.lines:
-            if line.get_gid() == BOUND_LINE or np.size(line.get_xdata()) < MOST_OF_A_MARK:
+            if line.get_gid() == BOUND_LINE or np.size(line.get_xdata()) < MAX_MARK_POINTS:
                 continue
             name, label = f"line-{len(lines)}", str(line.get_label())
             line.set_gid(name)
@@ -130,7 +130,7 @@ def _panel(axes: Axes, size: FloatArray) -> dict[str, Any]:
             sides[name] |= {"linear": found.linthresh, "slope": found.linscale / (1 - 1 / found.base)}
     return {
         "left": wide * place.x0, "right": wide * place.x1, "top": tall * (1 - place.y1),
-        "bottom": tall * (1 - place.y0), "along": sides["x"]["label"].startswith(ALONG), **sides,
+        "bottom": tall * (1 - place.y0), "along": sides["x"]["label"].startswith(ALONG_LABELS), **sides,
     }  # fmt: skip
 
 
@@ -272,8 +272,8 @@ def _add_page(document: PdfPages, figure: Figure, caption: str) -> None:
 
 
 SUFFIXES = (".html", ".htm")
-BREAKS = ("margins", "job", "gains", "curves")  # anchors of sections that begin a printed page
-TALL = "900"  # px, of a page in a notebook
+PAGE_BREAKS = ("margins", "job", "gains", "curves")  # anchors of sections that begin a printed page
+PAGE_HEIGHT = "900"  # px, of a page in a notebook
 
 
 @dataclass(frozen=True, repr=False)
@@ -282,7 +282,7 @@ class Page:
 
     title: str
     html: str
-    pictures: tuple[tuple[str, Picture], ...] = ()  # each with its caption, for a PDF
+    pictures: tuple[tuple[str, Illustration], ...] = ()  # each with its caption, for a PDF
 
     def __repr__(self) -> str:
         return f"Page({self.title!r}, {len(self.html)} characters)"
@@ -290,7 +290,7 @@ class Page:
     def _repr_html_(self) -> str:
         """The page in a frame of its own, as notebooks show it."""
         source = html.escape(self.html, quote=True)
-        return f'<iframe srcdoc="{source}" width="100%" height="{TALL}" style="border: 0"></iframe>'
+        return f'<iframe srcdoc="{source}" width="100%" height="{PAGE_HEIGHT}" style="border: 0"></iframe>'
 
     @property
     def content(self) -> bytes:
@@ -325,7 +325,7 @@ def render(
     """
     from markupsafe import Markup  # here, as jinja2: only pages need them
 
-    pictures = [item for section in sections for item in section.items if isinstance(item, Picture)]
+    pictures = [item for section in sections for item in section.items if isinstance(item, Illustration)]
     drawn: dict[int, str] = {}
     styles: dict[str, str] = {}
     told = []
@@ -339,13 +339,13 @@ def render(
         {
             "anchor": section.anchor,
             "title": section.title,
-            "breaks": section.anchor in BREAKS,
+            "breaks": section.anchor in PAGE_BREAKS,
             "parts": [_part(item, drawn) for item in section.items],
         }
         for section in sections
     ]
     title = f"{front.heading}: {front.kind.lower()}"
-    policy, script = script_of(packaged("report/page/figures.js").decode())
+    policy, script = script_of(read_packaged("report/page/figures.js").decode())
     text = render_template(
         "page.html.jinja", title=title, kind=front.kind, heading=front.heading, about=front.about,
         figures=front.figures, foot=front.foot, verdict=Markup(front.verdict),
@@ -361,11 +361,11 @@ def _part(item: Item, drawn: dict[int, str]) -> dict[str, Any]:
 
     if isinstance(item, str):
         return {"kind": "text", "text": item}
-    if isinstance(item, Picture):
+    if isinstance(item, Illustration):
         return {"kind": "picture", "caption": item.caption, "svg": Markup(drawn[id(item)])}
     if isinstance(item, Folded):
         return {"kind": "folded", "summary": item.summary, "sheets": item.sheets, "narrow": item.narrow}
-    sheet: Sheet = item
+    sheet: PageTable = item
     return {"kind": "table", "sheet": sheet}
 
 
@@ -413,7 +413,7 @@ def script_of(text: str) -> tuple[str, str]:
 @cache
 def page_style() -> str:
     """The style of all pages."""
-    return packaged("report/page/style.css").decode()
+    return read_packaged("report/page/style.css").decode()
 
 
 # The page of a commissioning for the lab's binder: steps, findings with limits, logs, signature.
@@ -428,10 +428,10 @@ def binder_page(done: Commissioning) -> Page:
         KeyFigure("signature", done.signature[:16], "sha256 of the gain file, logs and results"),
     ]
     front = Front("Commissioning", done.gains, f"Machine {done.machine}", heads, "malta commission")
-    return render(front, [*map(_section, done.entries), _signed(done)])
+    return render(front, [*map(_section, done.entries), _signature_section(done)])
 
 
-def _section(entry: Entry) -> Section:
+def _section(entry: JournalEntry) -> Section:
     """A step: its question, its findings, and why it was refused."""
     state = "passed" if entry.passed else "FAILED"
     items = [] if not entry.refusal else [entry.refusal]
@@ -441,7 +441,7 @@ def _section(entry: Entry) -> Section:
     return Section(entry.name, f"{entry.question} {state}", (*items, *([sheet] if entry.findings else [])))
 
 
-def _signed(done: Commissioning) -> Section:
+def _signature_section(done: Commissioning) -> Section:
     """The files with their sha256, the signature, and lines for names."""
     rows = [(done.gains, done.sha256), *((e.log, e.sha256) for e in done.entries if e.sha256)]
     lines = ("Date, name: ______________________________", "Witness: ______________________________")

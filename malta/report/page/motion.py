@@ -18,7 +18,7 @@ import numpy as np
 
 from malta.display import micro, quantity
 from malta.errors import InputError
-from malta.files import packaged, read_file
+from malta.files import read_file, read_packaged
 from malta.model.equations import Body, rotation
 from malta.tables import read_npz
 
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from malta.simulation.trajectory import Trajectory
 
 FRAMES = 240  # of a run
-LARGEST = 4_500_000  # bytes of a page: runs of longer ones show fewer frames
+MAX_PAGE_BYTES = 4_500_000  # bytes of a page: runs of longer ones show fewer frames
 SIDES = 28  # of a cylinder
-SMALL = 0.01  # of the largest body: what moves less is magnified
+MAGNIFIED_SHARE = 0.01  # of the largest body: what moves less is magnified
 HEAD = 16.0  # of an arrow, pixels of the animated picture at twice its size
 ARROW = 0.2  # of the largest body: the arrow of the scale
-SHOWN = 0.12  # of the smallest side of a moving body: the largest magnified motion
+SHOWN_MOTION_SHARE = 0.12  # of the smallest side of a moving body: the largest magnified motion
 VIEW = (math.radians(-38), math.radians(24))  # turn about the upright axis, and height of the eye
 INKS: Mapping[str, tuple[int, int, int]] = {
     "paper": (255, 255, 255), "mover": (86, 143, 196), "still": (150, 150, 150), "text": (40, 44, 48),
@@ -61,7 +61,7 @@ class Arrow(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class Animation:
     """The bodies of a machine, and how they move in a run.
 
     title : of the run
@@ -108,7 +108,7 @@ def mesh_of(body: Body) -> Mesh:
     return Mesh(points, (tuple(range(SIDES - 1, -1, -1)), tuple(range(SIDES, 2 * SIDES)), *around))
 
 
-def read_motion(file: str | Path, plant: Plant, *, frames: int = FRAMES) -> Motion:
+def read_motion(file: str | Path, plant: Plant, *, frames: int = FRAMES) -> Animation:
     """Read how a machine moves from the file of a run, as `malta simulate --out` writes them.
 
     file : a .npz file
@@ -126,7 +126,7 @@ def read_motion(file: str | Path, plant: Plant, *, frames: int = FRAMES) -> Moti
     return _motion(Path(file).stem, ended, plant, series, signals, frames)
 
 
-def motion_of(run: Trajectory, title: str, *, frames: int = FRAMES) -> Motion:
+def motion_of(run: Trajectory, title: str, *, frames: int = FRAMES) -> Animation:
     """How a machine moves in a run.
 
     title : of the run, as "y1 stuck"
@@ -150,7 +150,7 @@ def _motion(
     series: tuple[FloatArray, FloatArray, FloatArray],
     signals: Mapping[str, FloatArray],
     frames: int,
-) -> Motion:
+) -> Animation:
     """Frames of a run, evenly over its time. Raises InputError for a machine without bodies.
 
     series : times, states and acting inputs
@@ -162,10 +162,10 @@ def _motion(
     states = dict(zip((s.name for s in plant.states), x[kept].T, strict=True))
     bodies = tuple(plant.bodies())
     poses = np.stack([_poses(body, states, len(kept)) for body in bodies])
-    small, factor = _magnified(bodies, poses)
+    small, factor = _magnify(bodies, poses)
     shown = {name: np.asarray(values[kept]) for name, values in signals.items()}
     arrows = _arrows(bodies, plant, force[kept])
-    return Motion(title, ended, t[kept], bodies, poses, _upright(plant), small, factor, shown, arrows)
+    return Animation(title, ended, t[kept], bodies, poses, _upright(plant), small, factor, shown, arrows)
 
 
 def _arrows(bodies: Sequence[Body], plant: Plant, force: FloatArray) -> tuple[Arrow, ...]:
@@ -179,7 +179,7 @@ def _arrows(bodies: Sequence[Body], plant: Plant, force: FloatArray) -> tuple[Ar
     )  # fmt: skip
 
 
-def arrow_size(found: Motion, unit: str) -> float:
+def arrow_size(found: Animation, unit: str) -> float:
     """The force or torque, SI, whose arrow is as long as the scale of the picture: 1, 2 or 5 times a power of ten.
 
     It is the largest of these below the largest of the run; 0 where nothing acts.
@@ -237,17 +237,17 @@ def _upright(plant: Plant) -> int:
     return int(np.argmax(size)) if max(size) > 0 else 2
 
 
-def _magnified(bodies: Sequence[Body], poses: FloatArray) -> tuple[FloatArray, float]:
+def _magnify(bodies: Sequence[Body], poses: FloatArray) -> tuple[FloatArray, float]:
     """Which coordinates of each body are magnified, and a factor of 1, 2 or 5 times a power of ten that shows them."""
     largest = max(max(body.size) for body in bodies)
     arm = np.array([[1, 1, 1, *[max(body.size) / 2] * 3] for body in bodies])
     reach = arm * np.abs(poses - poses.mean(axis=1, keepdims=True)).max(axis=1)
     moving = np.array([[bool(body.moves)] * 6 for body in bodies])
-    small = moving & (reach < SMALL * largest)
+    small = moving & (reach < MAGNIFIED_SHARE * largest)
     most = float((reach * small).max(initial=0.0))
     if most <= 0:
         return small, 1.0
-    shown = SHOWN * min(min(body.size) for body in bodies if body.moves) / most
+    shown = SHOWN_MOTION_SHARE * min(min(body.size) for body in bodies if body.moves) / most
     power = 10.0 ** math.floor(math.log10(max(shown, 1.0)))
     return small, max(step * power for step in (1, 2, 5) if step * power <= max(shown, 1.0))
 
@@ -266,13 +266,13 @@ def camera(up: int, turn: float, height: float) -> FloatArray:
     return np.vstack([right, np.cross(eye, right), eye])
 
 
-def magnify(found: Motion, k: int, body: int, factor: float) -> FloatArray:
+def magnify(found: Animation, k: int, body: int, factor: float) -> FloatArray:
     """The pose of a body in a frame, small motion about its mean times a factor."""
     pose, rest = found.poses[body, k], found.poses[body].mean(axis=0)
     return np.asarray(np.where(found.small[body], rest + factor * (pose - rest), pose))
 
 
-def motion_gif(found: Motion, *, size: tuple[int, int] = (520, 320), frames: int = 60) -> bytes:
+def motion_gif(found: Animation, *, size: tuple[int, int] = (520, 320), frames: int = 60) -> bytes:
     """Draw the motion as an animated picture, which repeats.
 
     size : pixels
@@ -293,7 +293,7 @@ def motion_gif(found: Motion, *, size: tuple[int, int] = (520, 320), frames: int
     return buffer.getvalue()
 
 
-def motion_page(found: Motion | Sequence[Motion], about: str = "") -> Page:
+def motion_page(found: Animation | Sequence[Animation], about: str = "") -> Page:
     """Write the motion as one page in HTML that needs no network: turned by dragging, with a scrubber.
 
     found : a run, or several of one machine, which the page chooses among by buttons
@@ -305,12 +305,12 @@ def motion_page(found: Motion | Sequence[Motion], about: str = "") -> Page:
 
     from malta.report.page.document import Page, json_in_page, page_style, render_template, script_of
 
-    runs = [found] if isinstance(found, Motion) else [*found]
+    runs = [found] if isinstance(found, Animation) else [*found]
     every = 1
-    while len(data := json_in_page(_page_data(runs, every))) > LARGEST and every < FRAMES:
+    while len(data := json_in_page(_page_data(runs, every))) > MAX_PAGE_BYTES and every < FRAMES:
         every *= 2
     title = runs[0].title if len(runs) == 1 else f"{len(runs)} runs"
-    policy, script = script_of(packaged("report/page/motion.js").decode())
+    policy, script = script_of(read_packaged("report/page/motion.js").decode())
     page = render_template(
         "motion.html.jinja", title=title, about=about, style=Markup(page_style()), script=Markup(script),
         policy=policy, data=Markup(data),
@@ -318,7 +318,7 @@ def motion_page(found: Motion | Sequence[Motion], about: str = "") -> Page:
     return Page(f"{title}: in motion", page)
 
 
-def _page_data(runs: Sequence[Motion], every: int) -> dict[str, Any]:
+def _page_data(runs: Sequence[Animation], every: int) -> dict[str, Any]:
     """What the page's script reads: the bodies once, and each run, of which every n-th frame is kept."""
     first = runs[0]
     upright = camera(first.up, 0.0, 0.0)
@@ -327,20 +327,20 @@ def _page_data(runs: Sequence[Motion], every: int) -> dict[str, Any]:
         "reach": max(float(np.linalg.norm(body.size)) for body in first.bodies),
         "arrow": ARROW * max(max(body.size) for body in first.bodies),
         "bodies": [
-            {"points": _rounded(mesh.points), "faces": mesh.faces, "moves": bool(body.moves)}
+            {"points": _digits(mesh.points), "faces": mesh.faces, "moves": bool(body.moves)}
             for body, mesh in ((body, mesh_of(body)) for body in first.bodies)
         ],
         "runs": [_run_data(run, every) for run in runs],
     }  # fmt: skip
 
 
-def _run_data(run: Motion, every: int) -> dict[str, Any]:
+def _run_data(run: Animation, every: int) -> dict[str, Any]:
     """A run for the page: what stands still has one pose."""
     shown = np.append(np.arange(0, len(run.t) - 1, every), len(run.t) - 1)
     return {
-        "name": micro(run.title), "ended": run.ended, "t": _rounded(run.t[shown]), "factor": run.factor,
+        "name": micro(run.title), "ended": run.ended, "t": _digits(run.t[shown]), "factor": run.factor,
         "bodies": [
-            {"poses": _rounded(poses[shown] if body.moves else poses[:1]), "mean": _rounded(poses.mean(axis=0)),
+            {"poses": _digits(poses[shown] if body.moves else poses[:1]), "mean": _digits(poses.mean(axis=0)),
              "small": small.tolist()}
             for body, poses, small in zip(run.bodies, run.poses, run.small, strict=True)
         ],
@@ -350,7 +350,7 @@ def _run_data(run: Motion, every: int) -> dict[str, Any]:
         ],
         "arrows": [
             {"name": one.name, "unit": one.unit, "body": one.body, "scale": arrow_size(run, one.unit),
-             "values": _rounded(one.values[shown])}
+             "values": _digits(one.values[shown])}
             for one in run.arrows
         ],
     }  # fmt: skip
@@ -360,17 +360,22 @@ def _in_fine_unit(name: str, values: FloatArray) -> dict[str, Any]:
     """A series in a unit in which its numbers are short: micrometres, or millimetres beyond a tenth of one."""
     unit, largest = name.partition("[")[2].rstrip("]"), float(np.abs(values).max(initial=0.0))
     factor, prefix = (1.0, "") if unit not in ("m", "rad") else (1e6, "µ") if largest < 1e-4 else (1e3, "m")
-    return {"unit": prefix + unit, "values": _rounded(factor * values)}
+    return {"unit": prefix + unit, "values": _digits(factor * values)}
 
 
-def _rounded(values: FloatArray) -> Any:
+def _digits(values: FloatArray) -> Any:
     """Numbers with six digits, as lists."""
     flat = [float(f"{value:.6g}") for value in np.ravel(values)]
     return np.reshape(flat, np.shape(values)).tolist()
 
 
 def _draw_frame(
-    found: Motion, k: int, meshes: Sequence[Mesh], view: FloatArray, ends: FloatArray, size: tuple[int, int]
+    found: Animation,
+    k: int,
+    meshes: Sequence[Mesh],
+    view: FloatArray,
+    ends: FloatArray,
+    size: tuple[int, int],
 ) -> Image.Image:
     """A frame at twice the size, made smaller: still bodies as edges, moving ones as faces, the time and a trace."""
     from matplotlib import get_data_path
@@ -428,7 +433,7 @@ def _draw_frame(
 
 
 def _draw_arrows(
-    pen: ImageDraw.ImageDraw, found: Motion, k: int, place: Callable[[FloatArray], FloatArray]
+    pen: ImageDraw.ImageDraw, found: Animation, k: int, place: Callable[[FloatArray], FloatArray]
 ) -> None:
     """Forces with one head, torques with two, from the middle of their bodies; place : metres -> pixels."""
     whole = ARROW * max(max(body.size) for body in found.bodies)
@@ -442,7 +447,7 @@ def _draw_arrows(
 
 
 def _draw_scale(
-    pen: ImageDraw.ImageDraw, found: Motion, end: FloatArray, scale: float, font: ImageFont.FreeTypeFont
+    pen: ImageDraw.ImageDraw, found: Animation, end: FloatArray, scale: float, font: ImageFont.FreeTypeFont
 ) -> None:
     """The arrow of the scale of forces up to an end, with its size before it. scale : pixels a metre"""
     size, length = arrow_size(found, "N"), scale * ARROW * max(max(body.size) for body in found.bodies)

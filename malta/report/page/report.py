@@ -8,10 +8,10 @@ from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from malta.model.machines import FINE
-from malta.report.figures.drawing import MORE, STYLES, draw_line, finish_axes, micro, new_figure
+from malta.model.machines import FINE_UNITS
+from malta.report.figures.drawing import MORE_STYLES, STYLES, draw_line, finish_axes, micro, new_figure
 from malta.report.page.document import Front, Page, render
-from malta.report.page.sections import Item, Picture, Section, Sheet, distinct_channels, polish
+from malta.report.page.sections import Illustration, Item, PageTable, Section, distinct_channels, polish
 from malta.report.verdict import SIGNS, stairs_html
 from malta.units import in_unit
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from malta.gains.schema import GainFile
     from malta.model.plant import Parameters
     from malta.report.page.analysis import Analysis, Subject
-    from malta.report.page.comparison import Comparison, Line
+    from malta.report.page.comparison import Comparison, TableLine
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 
@@ -177,25 +177,27 @@ def overlaid(found: Comparison) -> Iterator[Item]:
     panels = distinct_channels(loops)
     if stable and found.one_machine:
         shown = distinct_channels(stable)
-        yield Picture(
+        yield Illustration(
             partial(plots.sensitivity_curves, stable, channel=shown.channels),
             f"Sensitivity S and complementary sensitivity T, with the zones of ISO 14839-3.{shown.note}",
         )
     if found.one_machine:
-        yield Picture(
+        yield Illustration(
             partial(plots.nyquist, loops, channel=panels.channels),
             f"Nyquist plots of the loop at each sensor, the others closed.{panels.note}",
         )
     if stable:
-        yield Picture(partial(plots.sigma, stable), "Singular values of L, S and T with all sensors at once.")
+        yield Illustration(
+            partial(plots.sigma, stable), "Singular values of L, S and T with all sensors at once."
+        )
     if stable and found.one_machine and found.designs[0].plant.disturbances:
-        yield Picture(
+        yield Illustration(
             partial(plots.load_response, stable),
             "Deviation after a unit step of each load from outside, and compliance over frequency.",
         )
     flown = [(name, a) for name, a in named.items() if a.job is not None]
     if found.one_machine and len(flown) > 1:
-        yield Picture(
+        yield Illustration(
             lambda: _job_figure(flown),
             "The main job on the nonlinear machine: the leading output, its distance from the reference, and the "
             "leading command.",
@@ -211,8 +213,8 @@ def _job_figure(designs: Sequence[tuple[str, Analysis]]) -> Figure:
     k, m = plant.leading_output, plant.leading_input
     signal, force = plant.outputs[k], plant.inputs[m]
     shown = {"m": "mm", "rad": "mrad"}.get(signal.unit, signal.unit)
-    fine = FINE.get(signal.unit, signal.unit)
-    for (name, a), style in zip(designs, cycle((*STYLES, *MORE)), strict=False):
+    fine = FINE_UNITS.get(signal.unit, signal.unit)
+    for (name, a), style in zip(designs, cycle((*STYLES, *MORE_STYLES)), strict=False):
         assert a.job is not None
         run = a.job.run
         t = 1e3 * run.t
@@ -298,7 +300,7 @@ def _verdicts(found: Comparison) -> Iterator[Item]:
         rows.append((lines[0].label, *(polish(f"{SIGNS[line.state]} {line.value}") for line in lines)))
         marks.append(("", *(line.state for line in lines)))
     left = tuple(False for _ in found.names)
-    yield Sheet("", ("", *found.names), tuple(rows), (False, *left), tuple(marks))
+    yield PageTable("", ("", *found.names), tuple(rows), (False, *left), tuple(marks))
     yield found.judged_text
 
 
@@ -315,7 +317,7 @@ def _figures(found: Comparison) -> Iterator[Item]:
     yield from found.remarks
 
 
-def _sheet(names: Sequence[str], lines: Sequence[Line]) -> Sheet:
+def _sheet(names: Sequence[str], lines: Sequence[TableLine]) -> PageTable:
     """A table with a heading line for each group."""
     rows: list[tuple[str, ...]] = []
     marks: list[tuple[str, ...]] = []
@@ -328,4 +330,4 @@ def _sheet(names: Sequence[str], lines: Sequence[Line]) -> Sheet:
         cells = (f"{SIGN} {text}" if star else text for text, star in zip(texts, best, strict=True))
         rows.append((polish(heading), *map(polish, cells)))
         marks.append(("", *("best" if star else "" for star in best)))
-    return Sheet("", ("", *names), tuple(rows), (False, *(True for _ in names)), tuple(marks))
+    return PageTable("", ("", *names), tuple(rows), (False, *(True for _ in names)), tuple(marks))

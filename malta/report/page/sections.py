@@ -19,7 +19,7 @@ from malta.files import version
 from malta.loops.time_domain import budget_of
 from malta.merits import four_digits
 from malta.model.data import published_figures
-from malta.model.machines import FINE
+from malta.model.machines import FINE_UNITS
 from malta.model.plant import Signal
 from malta.report.figures.drawing import micro
 from malta.report.page.analysis import Analysis, design_entries, display_unit, summary_sentences
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 # Which channels of a loop need a panel of their own: mirror images have the same curves.
 
 
-ALIKE = 1e-3  # relative difference of curves that a plot does not show
+CURVE_TOLERANCE = 1e-3  # relative difference of curves that a plot does not show
 
 
 class Panels(NamedTuple):
@@ -89,7 +89,7 @@ def _are_alike(loops: Mapping[str, LoopCurves], one: str, other: str) -> bool:
             return False
         alone = curves.responses.alone("sensors")
         a, b = alone[:, known.index(one)], alone[:, known.index(other)]
-        if not np.allclose(a, b, rtol=ALIKE, atol=0.0, equal_nan=True):
+        if not np.allclose(a, b, rtol=CURVE_TOLERANCE, atol=0.0, equal_nan=True):
             return False
     return True
 
@@ -97,11 +97,11 @@ def _are_alike(loops: Mapping[str, LoopCurves], one: str, other: str) -> bool:
 # Tables of a page, from the same tables that the terminal shows.
 
 
-WIDE = 8  # columns of a matrix beside each other
+MATRIX_COLUMNS = 8  # columns of a matrix beside each other
 
 
 @dataclass(frozen=True)
-class Sheet:
+class PageTable:
     """A table of a page: cells as text, and for each column whether it is aligned to the right."""
 
     title: str
@@ -116,20 +116,20 @@ class Sheet:
         return self.marks[row][column] if self.marks else ""
 
 
-def sheets_of(parts: Any) -> list[Sheet]:
+def sheets_of(parts: Any) -> list[PageTable]:
     """The tables in what a terminal would print, in its order; texts between them become tables without rows."""
     if isinstance(parts, Table):
         return [_sheet(parts)]
     if isinstance(parts, Group):
         return [sheet for part in parts.renderables for sheet in sheets_of(part)]
     if isinstance(parts, str | Text):
-        return [Sheet(polish(str(parts)), (), (), ())] if str(parts).strip() else []
+        return [PageTable(polish(str(parts)), (), (), ())] if str(parts).strip() else []
     return [sheet for part in parts for sheet in sheets_of(part)] if isinstance(parts, Iterable) else []
 
 
-def _sheet(table: Table) -> Sheet:
+def _sheet(table: Table) -> PageTable:
     columns = [[polish(_text(cell)) for cell in column.cells] for column in table.columns]
-    return Sheet(
+    return PageTable(
         polish(_text(table.title or "")),
         tuple(polish(_text(column.header)) for column in table.columns),
         tuple(zip(*columns, strict=True)),
@@ -151,9 +151,9 @@ def polish(text: str) -> str:
     return micro(re.sub(r"(?<![\w.])-(?=\d)", "−", text))
 
 
-def plain_sheet(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Sheet:
+def plain_sheet(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> PageTable:
     """A table whose first column is of words, the others of numbers."""
-    return Sheet(
+    return PageTable(
         polish(title),
         tuple(map(polish, heads)),
         tuple(tuple(map(polish, row)) for row in rows),
@@ -163,12 +163,12 @@ def plain_sheet(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]])
 
 def matrix_sheets(
     title: str, M: FloatArray, rows: Sequence[Signal], columns: Sequence[Signal]
-) -> Iterator[Sheet]:
+) -> Iterator[PageTable]:
     """A matrix with the names and units of its rows and columns, in parts that a sheet of paper has room for."""
-    for first in range(0, len(columns), WIDE):
-        part = columns[first : first + WIDE]
+    for first in range(0, len(columns), MATRIX_COLUMNS):
+        part = columns[first : first + MATRIX_COLUMNS]
         heads = ["", *(_name(s) for s in part)]
-        values = M[:, first : first + WIDE].tolist()
+        values = M[:, first : first + MATRIX_COLUMNS].tolist()
         cells = ([_name(s), *(_entry(value) for value in row)] for s, row in zip(rows, values, strict=True))
         more = "" if len(part) == len(columns) else f", columns {first + 1} to {first + len(part)}"
         yield plain_sheet(f"{title}{more}", heads, cells)
@@ -182,13 +182,13 @@ def _entry(value: float) -> str:
     return f"{value:.6g}" if value else "0"
 
 
-NARROW = 3  # columns of a table
+TABLE_COLUMNS = 3  # columns of a table
 RANKS = {"fails": 0, "undecided": 1, "holds": 2}
-NEAR = 0.95  # of a bound: a requirement holds, but hardly
+NEAR_BOUND_SHARE = 0.95  # of a bound: a requirement holds, but hardly
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class Illustration:
     """A figure of a page: what draws it, and its caption."""
 
     draw: Callable[[], Figure]
@@ -200,15 +200,15 @@ class Folded:
     """Tables that a reader opens."""
 
     summary: str
-    sheets: tuple[Sheet, ...]
+    sheets: tuple[PageTable, ...]
 
     @property
     def narrow(self) -> bool:
         """Whether the tables have room beside each other."""
-        return all(len(sheet.heads) <= NARROW for sheet in self.sheets)
+        return all(len(sheet.heads) <= TABLE_COLUMNS for sheet in self.sheets)
 
 
-Item = Sheet | Picture | Folded | str  # a string is a paragraph
+Item = PageTable | Illustration | Folded | str  # a string is a paragraph
 
 
 @dataclass(frozen=True)
@@ -267,7 +267,7 @@ def _requirements(a: Analysis) -> Iterator[Item]:
     heads = ("", "requirement", "asked", "found", "of the limit", "from")
     sheet = plain_sheet("[specification] of the design file, measured with these gains", heads, rows)
     right = (False, False, True, True, True, False)
-    yield Sheet(sheet.title, sheet.heads, sheet.rows, right, tuple(marks))
+    yield PageTable(sheet.title, sheet.heads, sheet.rows, right, tuple(marks))
 
 
 def _light(one: Outcome) -> tuple[str, str]:
@@ -279,14 +279,14 @@ def _light(one: Outcome) -> tuple[str, str]:
     if not one.holds:
         return "bad", "✗ fails"
     # A test that is passed or failed has its bound as its figure.
-    return ("near", "✓ barely") if NEAR < one.ratio < 1 else ("good", "✓ holds")
+    return ("near", "✓ barely") if NEAR_BOUND_SHARE < one.ratio < 1 else ("good", "✓ holds")
 
 
 def _poles(a: Analysis) -> Iterator[Item]:
     from malta.report import plots
 
     loops = {a.subject.controller.name: a.curves}
-    yield Picture(
+    yield Illustration(
         lambda: plots.pzmap(loops),
         "Poles of the closed loop and of the machine, and zeros of the loop gain; of sampled systems ln(z) / Ts. "
         "The right side is the neighbourhood of the origin.",
@@ -302,7 +302,7 @@ def _margins(a: Analysis) -> Iterator[Item]:
         from malta.report.figures.margins import chain_figure
 
         if found.robust is not None:
-            yield Picture(
+            yield Illustration(
                 lambda: chain_figure(found),
                 "Margins stage by stage, from full state feedback to the machine's own loop, and the peak sensitivity "
                 "of each stage with the zones of ISO 14839-3.",
@@ -334,14 +334,14 @@ def _margin_map(a: Analysis) -> Iterator[Item]:
     shares = found.robust.sensitivity
     x, y, *_ = sorted(found.uncertainty, key=lambda name: -shares.get(name, 0.0))
     drawn = margin_map_of(a.plant, a.subject.controller, (x, y), found.uncertainty, margin=found.robust)
-    yield Picture(
+    yield Illustration(
         lambda: plots.margin_map(drawn, campaigns=a.campaigns),
         f"Margin map over {x} and {y}{drawn.beside_text and f', {drawn.beside_text}'}: every machine in the blue "
         "box is proven stable. The line is the boundary of stability by eigenvalues, which prove nothing.",
     )
 
 
-def _classical_sheet(found: LoopReport, classical: Classical) -> Sheet:
+def _classical_sheet(found: LoopReport, classical: Classical) -> PageTable:
     """Disk and delay margins of a machine without uncertain parameters."""
     rows = disk_rows(classical.disks, classical.delay, found.controller.sample_time, joined=True)
     return plain_sheet("Disk and delay margins of the sampled loop", DISKS, rows)
@@ -368,9 +368,11 @@ def _loop(a: Analysis) -> Iterator[Item]:
         (plots.gang_of_four, "Gang of four: what noise, references and forces do at each sensor."),
     ]
     for draw, caption in [sensitivity, *drawn] if a.report.stable else drawn[:2]:
-        yield Picture(partial(draw, loops, channel=panels.channels), f"{caption}{panels.note}")
+        yield Illustration(partial(draw, loops, channel=panels.channels), f"{caption}{panels.note}")
     if a.report.stable:
-        yield Picture(partial(plots.sigma, loops), "Singular values of L, S and T with all sensors at once.")
+        yield Illustration(
+            partial(plots.sigma, loops), "Singular values of L, S and T with all sensors at once."
+        )
     published = published_figures(a.plant.name)
     tables: list[Any] = [sensitivity_table(a.report), bandwidth_table(a.report, published)]
     yield from sheets_of(tables)
@@ -388,7 +390,7 @@ def _loads(a: Analysis) -> Iterator[Item]:
     from malta.report.figures.margins import recovery_figure
 
     c = a.subject.controller
-    yield Picture(
+    yield Illustration(
         lambda: recovery_figure(a.plant, c, a.report.recovery),
         "Deviation after a unit step of each load from outside, and compliance over frequency, of the output that "
         "the load moves furthest.",
@@ -409,7 +411,7 @@ def _job(a: Analysis) -> Iterator[Item]:
 
     job, published = a.job, published_figures(a.plant.name)
     yield f"{job.question} Fidelity {job.run.scenario.fidelity}: {job.outcome}."
-    yield Picture(
+    yield Illustration(
         lambda: experiment_figure(job, published),
         f"The machine's main job, {job.name}, on the nonlinear machine.",
     )
@@ -436,7 +438,7 @@ def _noise(a: Analysis) -> Iterator[Item]:
             continue
         rows = []
         for k, signal in enumerate(signals):
-            fine = FINE.get(signal.unit, signal.unit)
+            fine = FINE_UNITS.get(signal.unit, signal.unit)
             parts = (f"{100 * share:.0f} %" if share >= 0.005 else "" for share in shares[k])
             head = signal.name if fine == "1" else f"{signal.name} [{fine}]"
             rows.append([head, four_digits(in_unit(float(totals[k]), fine)), *parts])
@@ -462,7 +464,7 @@ def _campaigns(a: Analysis) -> Iterator[Item]:
             (worst_figure, "The worst runs of the campaign."),
         )
         for draw, caption in drawn:
-            yield Picture(partial(draw, found), caption)
+            yield Illustration(partial(draw, found), caption)
         yield from sheets_of(campaign_tables(found))
 
 
@@ -494,5 +496,7 @@ def _provenance(a: Analysis) -> Iterator[Item]:
         ["this page: Python", platform.python_version()],
     ]
     sheet = plain_sheet("Where the numbers come from", ("what", "which"), [row for row in rows if row[1]])
-    yield Sheet(sheet.title, sheet.heads, tuple((row[0], row[1]) for row in rows if row[1]), (False, False))
+    yield PageTable(
+        sheet.title, sheet.heads, tuple((row[0], row[1]) for row in rows if row[1]), (False, False)
+    )
     yield from (note for note in a.notes if "was not simulated" not in note)

@@ -14,7 +14,7 @@ from malta.report.figures.drawing import new_figure
 from malta.report.plots.panels import (
     FOOT,
     PLACES,
-    Sheet,
+    PlotSheet,
     add_legend,
     chosen_channels,
     decibels,
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from malta.loops.classical import ChannelMargins
     from malta.loops.linear_loops import Place
 
-ALONE = "one loop at a time, the others closed"
+ONE_LOOP = "one loop at a time, the others closed"
 RANGE = (-100.0, 120.0)  # dB, of a loop gain that is drawn
-LEAST = 6.0  # dB that an axis shows
-HALF = 170.0  # degrees, between neighbours: a pole on the axis
-ZERO = 0.1  # of the value beside it: a loop gain that counts as zero at the end of the grid
+MIN_RANGE_DB = 6.0  # dB that an axis shows
+MAX_PHASE_STEP = 170.0  # degrees, between neighbours: a pole on the axis
+ZERO_GAIN_SHARE = 0.1  # of the value beside it: a loop gain that counts as zero at the end of the grid
 Channel = str | Sequence[str] | None
 
 
@@ -75,7 +75,7 @@ def bode(
     """
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
-    title = f"{title_of(loops)}: Bode plot {PLACES[at]}", ALONE
+    title = f"{title_of(loops)}: Bode plot {PLACES[at]}", ONE_LOOP
     sheet = new_sheet(title, loops, len(chosen), axes, stacked=2, height=1.75)
     for (name, _), (upper, lower) in zip(chosen, sheet.panels, strict=True):
         lines, shown = [], []
@@ -106,12 +106,14 @@ def phase_of(w: FloatArray, gain: Any, margins: ChannelMargins) -> FloatArray:
     """
     steps = np.mod(np.degrees(np.diff(np.angle(gain))) + 180, 360) - 180
     phase = math.degrees(np.angle(gain[0])) + np.append(
-        0, np.cumsum(np.where(steps > HALF, steps - 360, steps))
+        0, np.cumsum(np.where(steps > MAX_PHASE_STEP, steps - 360, steps))
     )
     known = [c for c in margins.gain_crossings if c.frequency == margins.phase_frequency]
     crossing = known[0].frequency if known else float(w[len(w) // 2])
     at = float(np.interp(math.log(crossing), np.log(w), phase))
-    if abs(gain[-1]) < ZERO * abs(gain[-2]):  # a zero at the Nyquist frequency, where any phase is as good
+    if abs(gain[-1]) < ZERO_GAIN_SHARE * abs(
+        gain[-2]
+    ):  # a zero at the Nyquist frequency, where any phase is as good
         phase[-1] = phase[-2]
     return np.asarray(phase - 360 * round((at + 180) / 360))
 
@@ -144,7 +146,7 @@ def _draw_margins(
 def _limit_decibels(axes: Axes) -> None:
     """Limits within RANGE, and so wide that a constant value shows no rounding."""
     low, high = axes.get_ylim()
-    more = max(LEAST - (high - low), 0.0) / 2
+    more = max(MIN_RANGE_DB - (high - low), 0.0) / 2
     axes.set_ylim(max(low - more, RANGE[0]), min(high + more, RANGE[1]))
 
 
@@ -345,7 +347,7 @@ def _ratio(upper: str, lower: str) -> str:
     return f"{upper}/({lower})" if " " in lower else f"{upper}/{lower}"
 
 
-def _gang_sheet(loops: Mapping[str, LoopCurves], count: int, axes: Any) -> Sheet:
+def _gang_sheet(loops: Mapping[str, LoopCurves], count: int, axes: Any) -> PlotSheet:
     """Four panels in a row for each channel."""
     if axes is not None:
         return new_sheet(("", ""), loops, 4 * count, axes)
@@ -359,4 +361,4 @@ def _gang_sheet(loops: Mapping[str, LoopCurves], count: int, axes: Any) -> Sheet
     )  # fmt: skip
     add_legend(figure, loops, height)
     grid = figure.subplots(count, 4, squeeze=False)
-    return Sheet(figure, [(panel,) for panel in grid.ravel()])
+    return PlotSheet(figure, [(panel,) for panel in grid.ravel()])

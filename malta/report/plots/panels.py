@@ -12,7 +12,7 @@ import numpy as np
 from malta.display import quantity
 from malta.errors import InputError
 from malta.loops.curves import LoopCurves, loop_curves
-from malta.report.figures.drawing import BOUND, MORE, NOTE, STYLES, draw_grid, new_figure, number
+from malta.report.figures.drawing import BOUND_STYLE, MORE_STYLES, NOTE, STYLES, draw_grid, new_figure, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 LINE = 0.155  # inch, of text above a panel
 FOOT = 0.64  # inch, below a panel of frequency
-SECOND = 16.0  # points, from the numbers below an axis to the same in Hz
+SECOND_AXIS_OFFSET = 16.0  # points, from the numbers below an axis to the same in Hz
 DECADES = 3.0  # shown below the first crossing of unit gain
 MOST_LINES = 3  # loops whose margins are written above a panel
 PLACES: Mapping[str, str] = {"sensors": "at the sensors", "forces": "at the forces"}
-CLEAR: dict[str, Any] = {"facecolor": "#ffffff", "edgecolor": "none", "pad": 0.2}
-SMALL: dict[str, Any] = {"fontsize": 7.5, "va": "bottom", "bbox": CLEAR}
+CLEAR_BOX: dict[str, Any] = {"facecolor": "#ffffff", "edgecolor": "none", "pad": 0.2}
+SMALL_TEXT: dict[str, Any] = {"fontsize": 7.5, "va": "bottom", "bbox": CLEAR_BOX}
 
 
-class Sheet(NamedTuple):
+class PlotSheet(NamedTuple):
     """A figure and its panels, a tuple of them for each channel from top to bottom."""
 
     figure: Figure
@@ -55,7 +55,7 @@ def loops_of(source: Any, controller: Any = None) -> dict[str, LoopCurves]:
 
 def styles_of(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """A style for each loop, distinct without colour."""
-    styles = (*STYLES, *MORE)
+    styles = (*STYLES, *MORE_STYLES)
     return {name: styles[k % len(styles)] for k, name in enumerate(names)}
 
 
@@ -97,7 +97,7 @@ def new_sheet(
     stacked: int = 1,
     height: float = 2.6,
     ticks: bool = False,
-) -> Sheet:
+) -> PlotSheet:
     """A sheet of `count` channels, or the axes of the caller as one.
 
     title : and the line below it
@@ -115,7 +115,7 @@ def new_sheet(
             )
         rows = np.array(given, dtype=object).reshape(stacked, count)
         figure: Figure = given[0].figure
-        return Sheet(figure, [tuple(column) for column in rows.T])
+        return PlotSheet(figure, [tuple(column) for column in rows.T])
     columns = min(count, 3) if count != 4 else 2
     blocks = math.ceil(count / columns)
     lines = 1 + min(len(loops), MOST_LINES)
@@ -141,7 +141,7 @@ def new_sheet(
         for upper in [] if ticks else [first, *others][:-1]:
             upper.tick_params(labelbottom=False)
         panels.append((first, *others))
-    return Sheet(figure, panels)
+    return PlotSheet(figure, panels)
 
 
 def head_of(loops: Mapping[str, LoopCurves]) -> float:
@@ -190,7 +190,7 @@ def write_above(axes: Axes, title: str, lines: Sequence[tuple[str, str]]) -> Non
         up = 72 * LINE * (len(shown) - k) + 3
         axes.annotate(
             plain(text), (0, 1), xycoords="axes fraction", xytext=(0, up), textcoords="offset points",
-            color=colour, fontweight="bold" if k == 0 else "normal", annotation_clip=False, **SMALL,
+            color=colour, fontweight="bold" if k == 0 else "normal", annotation_clip=False, **SMALL_TEXT,
         )  # fmt: skip
 
 
@@ -248,12 +248,12 @@ def add_hertz(axes: Axes, side: Literal["bottom", "right"]) -> None:
     ways: Any = (lambda w: w / (2 * math.pi), lambda f: f * 2 * math.pi)
     if side == "bottom":
         hertz = axes.secondary_xaxis("bottom", functions=ways)
-        hertz.spines["bottom"].set(position=("outward", SECOND), visible=False)
+        hertz.spines["bottom"].set(position=("outward", SECOND_AXIS_OFFSET), visible=False)
         hertz.tick_params(which="both", length=0, labelsize=8, labelcolor=NOTE["color"])
         hertz.xaxis.set_minor_formatter(NullFormatter())
-        axes.xaxis.labelpad += SECOND - 2
+        axes.xaxis.labelpad += SECOND_AXIS_OFFSET - 2
         hertz.set_xlabel("[Hz]", fontsize=8, color=NOTE["color"], ha="right", va="top")
-        hertz.xaxis.set_label_coords(0, 0, axes.transAxes + _points(axes, -16, -SECOND - 4))
+        hertz.xaxis.set_label_coords(0, 0, axes.transAxes + _points(axes, -16, -SECOND_AXIS_OFFSET - 4))
     else:
         hertz = axes.secondary_yaxis("right", functions=ways)
         if axes.get_yscale() == "symlog":
@@ -300,7 +300,7 @@ def thin(style: Mapping[str, Any]) -> dict[str, Any]:
 
 def draw_level(axes: Axes, value: float) -> None:
     """A light line at a value of y."""
-    axes.axhline(value, **BOUND)
+    axes.axhline(value, **BOUND_STYLE)
 
 
 def note_style() -> dict[str, Any]:

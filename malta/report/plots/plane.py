@@ -15,7 +15,7 @@ from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.locus import DELAY, GAIN, RootLocus, root_locus as locus_of
 from malta.report.figures.drawing import new_figure, number
 from malta.report.plots.frequency import title_of
-from malta.report.plots.panels import Sheet, add_hertz, add_legend, head_of, loops_of, plain, styles_of
+from malta.report.plots.panels import PlotSheet, add_hertz, add_legend, head_of, loops_of, plain, styles_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 DAMPING = (0.2, 0.5, 0.8)  # rays of the grid
 MARKERS = ("x", "s", "D", "^", "v", "p", "h", "*")  # of the closed loops
-NEAR = 2.5  # times the highest crossing of unit gain: the panel of the slow poles
+NEAR_RANGE_FACTOR = 2.5  # times the highest crossing of unit gain: the panel of the slow poles
 STRIP = 1.6  # times the Nyquist frequency: sampled poles beyond are next to pure delay
 GREY = "#dcdcdc"
-WIDE = 30.0  # from the slowest pole to the reach of a panel: beyond, its axes are logarithmic
-SLOWEST = 1e-6  # of the reach: slower poles are at zero
+MAX_LINEAR_RANGE = 30.0  # from the slowest pole to the reach of a panel: beyond, its axes are logarithmic
+ZERO_POLE_SHARE = 1e-6  # of the reach: slower poles are at zero
 BEND = np.linspace(0.0, 1.0, 13)[:-1] ** 2  # shares of an interval about the point where two poles meet
 JUMP = 0.8  # of the strip: motions of an imaginary part that are jumps of ln(z)
-SAME = 1e-9  # of a pole: imaginary parts that are none
+REAL_POLE_TOLERANCE = 1e-9  # of a pole: imaginary parts that are none
 
 
 def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float | None = None) -> Figure:
@@ -72,8 +72,8 @@ def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float
     )
     for (panel,), size in zip(sheet.panels, reaches, strict=True):
         window = Window.about(everything, size)
-        slowest = np.abs(everything[np.abs(everything) > SLOWEST * size]).min(initial=size)
-        wide = panel is sheet.panels[-1][0] and slowest < size / WIDE
+        slowest = np.abs(everything[np.abs(everything) > ZERO_POLE_SHARE * size]).min(initial=size)
+        wide = panel is sheet.panels[-1][0] and slowest < size / MAX_LINEAR_RANGE
         _draw_plane(panel, window, times, linear=_round(slowest / 2) if wide else None)
         for k, (name, curves) in enumerate(loops.items()):
             look = {"color": styles[name]["color"], "marker": MARKERS[k % len(MARKERS)]}
@@ -96,7 +96,7 @@ def _whole(poles: ComplexArray, times: Sequence[float | None]) -> float:
 def _reach(loops: Mapping[str, LoopCurves]) -> float:
     """NEAR times the highest crossing of unit gain of the loops; infinite where none crosses."""
     crossings = [c.frequency for curves in loops.values() for m in curves.margins for c in m.gain_crossings]
-    return NEAR * max(crossings) if crossings else math.inf
+    return NEAR_RANGE_FACTOR * max(crossings) if crossings else math.inf
 
 
 def _reaches(poles: ComplexArray, times: Sequence[float | None], slow: float) -> list[float]:
@@ -129,21 +129,21 @@ class Window(NamedTuple):
 
 def _plane_sheet(
     title: tuple[str, str], loops: Mapping[str, LoopCurves], axes: Any, reaches: list[float]
-) -> tuple[Sheet, list[float]]:
+) -> tuple[PlotSheet, list[float]]:
     """A panel for each reach, or the axes of the caller for the last of them."""
     if axes is not None:
         given = list(np.ravel(np.asarray(axes, dtype=object)))
         if len(given) not in (1, 2):
             raise InputError("plot", "axes", str(len(given)), "two, or one for the slow poles")
         figure: Figure = given[0].figure
-        return Sheet(figure, [(panel,) for panel in given]), [*reaches, reaches[-1]][-len(given) :]
+        return PlotSheet(figure, [(panel,) for panel in given]), [*reaches, reaches[-1]][-len(given) :]
     width, height = 5.6 * len(reaches), 5.0 + head_of(loops)
     figure = new_figure(
         *title, size=(width, height), left=0.8 / width, right=1 - 0.55 / width,
         bottom=0.52 / height, top=1 - (head_of(loops) + 0.25) / height, wspace=0.2,
     )  # fmt: skip
     add_legend(figure, loops, height, MARKERS)
-    return Sheet(figure, [(panel,) for panel in np.ravel(figure.subplots(1, len(reaches)))]), reaches
+    return PlotSheet(figure, [(panel,) for panel in np.ravel(figure.subplots(1, len(reaches)))]), reaches
 
 
 def _draw_plane(
@@ -239,7 +239,7 @@ def _draw_poles(
             axes.plot(shown.real, shown.imag, **{**hollow, **own})
 
 
-def _explain(sheet: Sheet, marks: Sequence[tuple[str, str]]) -> None:
+def _explain(sheet: PlotSheet, marks: Sequence[tuple[str, str]]) -> None:
     """A legend of the markers above the last panel."""
     from matplotlib.lines import Line2D
 
@@ -327,7 +327,9 @@ def _draw_branches(axes: Axes, found: RootLocus, window: Window) -> None:
     """Every branch, through the points where pairs meet and part; poles at the edge of the strip are at both edges."""
     strip = math.inf if found.sample_time is None else math.pi / found.sample_time
     for line in branch_paths(found):
-        edge = np.where(np.abs(line.imag) > (1 - SAME) * strip, line.conj(), complex(np.nan, np.nan))
+        edge = np.where(
+            np.abs(line.imag) > (1 - REAL_POLE_TOLERANCE) * strip, line.conj(), complex(np.nan, np.nan)
+        )
         for path in (line, edge):
             if np.isfinite(path).any():
                 axes.plot(path.real, path.imag, color="#000000", linewidth=1.1, zorder=3)
@@ -356,8 +358,8 @@ def branch_paths(found: RootLocus) -> list[ComplexArray]:
     strip = math.inf if T is None else math.pi / T
     lines = [[complex(pole)] for pole in found.poles[0]]
     for before, after in pairwise(found.poles):
-        parting = {k: path[::-1] for k, path in _meeting(after, before, strip).items()}
-        between = _meeting(before, after, strip) | parting
+        parting = {k: path[::-1] for k, path in _meeting_points(after, before, strip).items()}
+        between = _meeting_points(before, after, strip) | parting
         for k, line in enumerate(lines):
             line += [*between.get(k, ()), complex(after[k])]
     paths = [np.array(line) for line in lines]
@@ -366,7 +368,7 @@ def branch_paths(found: RootLocus) -> list[ComplexArray]:
     return [_cut(path, strip) for path in paths if np.isfinite(path).any()]
 
 
-def _meeting(pairs: ComplexArray, real: ComplexArray, strip: float) -> dict[int, ComplexArray]:
+def _meeting_points(pairs: ComplexArray, real: ComplexArray, strip: float) -> dict[int, ComplexArray]:
     """Points from conjugate pairs to the real poles that they become, by branch; real: or on the edge of the strip."""
     edge, flat = (_is_flat(poles, strip) for poles in (real, pairs))
     on_edge = np.abs(real.imag) > strip / 2
@@ -394,7 +396,7 @@ def _meeting(pairs: ComplexArray, real: ComplexArray, strip: float) -> dict[int,
 def _is_flat(poles: ComplexArray, strip: float) -> NDArray[np.bool_]:
     """Whether poles are real, or those of sampled loops real and negative in z, up to rounding."""
     height = np.abs(poles.imag)
-    return (height <= SAME * np.abs(poles)) | (height >= (1 - SAME) * strip)
+    return (height <= REAL_POLE_TOLERANCE * np.abs(poles)) | (height >= (1 - REAL_POLE_TOLERANCE) * strip)
 
 
 def _cut(line: ComplexArray, strip: float) -> ComplexArray:

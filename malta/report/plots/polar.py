@@ -14,10 +14,10 @@ import numpy as np
 from malta.bound import at_least
 from malta.errors import InputError
 from malta.margins.margin_map import MarginMap, Others, margin_map_of
-from malta.report.figures.drawing import BOUND, LEGEND, NOTE, draw_grid, new_figure
-from malta.report.plots.frequency import ALONE, Channel, phase_of, title_of
+from malta.report.figures.drawing import BOUND_STYLE, LEGEND, NOTE, draw_grid, new_figure
+from malta.report.plots.frequency import ONE_LOOP, Channel, phase_of, title_of
 from malta.report.plots.panels import (
-    CLEAR,
+    CLEAR_BOX,
     PLACES,
     chosen_channels,
     decibels,
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from malta.loops.linear_loops import Place
 
 
-WIDEST = 4.0  # how far left of the origin a Nyquist plot reaches at most
+MAX_LEFT_REACH = 4.0  # how far left of the origin a Nyquist plot reaches at most
 M_CIRCLES = (12.0, 6.0, 3.0, 1.0, 0.0, -3.0, -6.0, -12.0)  # dB of |T|
 HEIGHTS = (-45.0, 60.0)  # dB, of a Nichols plot
 
@@ -75,7 +75,7 @@ def nyquist(
     """
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
-    title = f"{title_of(loops)}: Nyquist plot {PLACES[at]}", f"{ALONE}; N turns about −1, P unstable poles"
+    title = f"{title_of(loops)}: Nyquist plot {PLACES[at]}", f"{ONE_LOOP}; N turns about −1, P unstable poles"
     sheet = new_sheet(title, loops, len(chosen), axes, height=3.3)
     for (name, _), (panel,) in zip(chosen, sheet.panels, strict=True):
         found = list(loops_with_channel(loops, name, at))
@@ -102,14 +102,14 @@ def nyquist(
 
 
 def _window(found: list[ChannelMargins]) -> tuple[float, float, float]:
-    """Left and right end and half the height: the unit circle, and the places of the gain margins within WIDEST."""
+    """Left and right end and half the height: the unit circle, and gain margins within MAX_LEFT_REACH."""
     left = -1.9
     for margins in found:
         half = margins.disk.size / 2
         if half < 1:
-            left = min(left, max(-1.05 * (1 + half) / (1 - half), -WIDEST))
+            left = min(left, max(-1.05 * (1 + half) / (1 - half), -MAX_LEFT_REACH))
         places = [1 / k for k in margins.gain if 0 < k < math.inf]
-        left = min([left, *(-1.2 * place for place in places if place < WIDEST / 1.2)])
+        left = min([left, *(-1.2 * place for place in places if place < MAX_LEFT_REACH / 1.2)])
     right = 1.3
     return left, right, max(1.3, (right - left) / 2)
 
@@ -123,7 +123,7 @@ def _inside(gain: ComplexArray, window: tuple[float, float, float]) -> ComplexAr
 def _draw_circles(axes: Axes) -> None:
     """The unit circle, the axes and the critical point."""
     turn = np.exp(1j * np.linspace(0, 2 * np.pi, 200))
-    axes.plot(turn.real, turn.imag, **BOUND)
+    axes.plot(turn.real, turn.imag, **BOUND_STYLE)
     axes.axhline(0, color="#c8c8c8", linewidth=0.6)
     axes.axvline(0, color="#c8c8c8", linewidth=0.6)
     axes.plot(-1, 0, marker="+", markersize=10, markeredgewidth=1.8, color="#000000", zorder=5)
@@ -192,7 +192,7 @@ def nichols(
     """
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
-    title = f"{title_of(loops)}: Nichols chart {PLACES[at]}", f"{ALONE}; light: |T|"
+    title = f"{title_of(loops)}: Nichols chart {PLACES[at]}", f"{ONE_LOOP}; light: |T|"
     sheet = new_sheet(title, loops, len(chosen), axes, height=3.3)
     for (name, _), (panel,) in zip(chosen, sheet.panels, strict=True):
         lines, phases = [], []
@@ -269,7 +269,7 @@ def _name_circles(axes: Axes, low: float, high: float) -> None:
         "zorder": 1.5,
         "color": "#8a8a8a",
         "fontsize": 7,
-        "bbox": CLEAR,
+        "bbox": CLEAR_BOX,
     }
     for level in (6.0, 1.0):
         size = 10 ** (level / 20)
@@ -285,10 +285,10 @@ def _name_circles(axes: Axes, low: float, high: float) -> None:
         axes.annotate(f"{level:g} dB", (low, 20 * math.log10(x)), xytext=(2, 1), va="bottom", **where)
 
 
-UNSTABLE: dict[str, Any] = {"colors": ["#b0b0b0"], "zorder": 0}
-PROVEN: dict[str, Any] = {"facecolor": "#cfe3f5", "edgecolor": "#1f77b4", "linewidth": 1.6, "zorder": 2}
+UNSTABLE_STYLE: dict[str, Any] = {"colors": ["#b0b0b0"], "zorder": 0}
+PROVEN_STYLE: dict[str, Any] = {"facecolor": "#cfe3f5", "edgecolor": "#1f77b4", "linewidth": 1.6, "zorder": 2}
 BOX: dict[str, Any] = {"facecolor": "none", "edgecolor": "#000000", "linestyle": (0, (5, 2)), "zorder": 3}
-NOMINAL: dict[str, Any] = {
+NOMINAL_STYLE: dict[str, Any] = {
     "marker": "+",
     "markersize": 10,
     "color": "#000000",
@@ -395,12 +395,12 @@ def _draw_map(axes: Axes, found: MarginMap) -> list[Any]:
 
     X, Y, growth = found.x_values, found.y_values, found.growth
     if growth.max() > 0:
-        axes.contourf(X, Y, growth, levels=[0.0, math.inf], **UNSTABLE)
+        axes.contourf(X, Y, growth, levels=[0.0, math.inf], **UNSTABLE_STYLE)
         if growth.min() < 0:
             axes.contour(X, Y, growth, levels=[0.0], colors=["#000000"], linewidths=1.4, zorder=3)
     handles: list[Any] = []
     for share, look, label in (
-        (found.proven, PROVEN, f"proven, {at_least(found.proven).percent()}"),
+        (found.proven, PROVEN_STYLE, f"proven, {at_least(found.proven).percent()}"),
         (1.0, BOX, "box, 100 %"),
     ):
         if share and math.isfinite(share):
@@ -409,7 +409,7 @@ def _draw_map(axes: Axes, found: MarginMap) -> list[Any]:
             handles.append(Patch(label=label, **look))
     handles.append(Line2D([], [], color="#000000", linewidth=1.4, label="boundary by eigenvalues"))
     handles.append(Patch(facecolor="#b0b0b0", label="unstable"))
-    handles += axes.plot(*found.nominal, label="nominal", **NOMINAL)
+    handles += axes.plot(*found.nominal, label="nominal", **NOMINAL_STYLE)
     if found.witness is not None:
         moved = " (others moved too)" if found.beside and found.others == "box" else ""
         handles += axes.plot(*found.witness, label=f"lost{moved}", **WITNESS)

@@ -10,7 +10,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.loops.time_domain import StepFigures, loop_steps, step_figures
-from malta.model.machines import FINE
+from malta.model.machines import FINE_UNITS
 from malta.report.figures.drawing import draw_grid, micro, number
 from malta.report.plots.frequency import Channel, title_of
 from malta.report.plots.panels import (
@@ -37,10 +37,10 @@ if TYPE_CHECKING:
     from malta.loops.curves import LoopCurves
     from malta.synthesis.recovery import StepResponse
 
-SHOWN = 1.6  # times the longest settling time
-LONGEST = 60.0  # times the shortest rise or time to the peak
-FEW = 60  # samples in a window: each gets a dot
-APART = 20.0  # of the largest to the smallest peak of several lines: a logarithmic axis
+SHOWN_TIME_FACTOR = 1.6  # times the longest settling time
+MAX_TIME_FACTOR = 60.0  # times the shortest rise or time to the peak
+MAX_DOTTED_SAMPLES = 60  # samples in a window: each gets a dot
+MAX_LINEAR_RATIO = 20.0  # of the largest to the smallest peak of several lines: a logarithmic axis
 POINTS = 1500  # of a line
 TIMES = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6))
 
@@ -113,7 +113,9 @@ def _window(rows: Sequence[tuple[str, StepResponse, int, int]], figures: Sequenc
     settled = [f.settling for f in figures if math.isfinite(f.settling) and f.settling > 0]
     if settled:
         seen = min(max(f.peak_time, 0.0 if math.isnan(f.rise) else f.rise) for f in figures if f.settling > 0)
-        return min(SHOWN * max(settled), max(LONGEST * seen, SHOWN * min(settled)))
+        return min(
+            SHOWN_TIME_FACTOR * max(settled), max(MAX_TIME_FACTOR * seen, SHOWN_TIME_FACTOR * min(settled))
+        )
     return max(float(answer.t[min(len(answer.t) - 1, POINTS)]) for _, answer, *_ in rows)
 
 
@@ -138,7 +140,9 @@ def _draw_answer(
 def _with_dots(style: Mapping[str, Any], curves: LoopCurves, window: float) -> Mapping[str, Any]:
     """The style of a line, with a dot at each sample where a window has few."""
     T = curves.loop.sample_time
-    return style if T is None or window / T > FEW else {**style, "marker": ".", "markersize": 4}
+    return (
+        style if T is None or window / T > MAX_DOTTED_SAMPLES else {**style, "marker": ".", "markersize": 4}
+    )
 
 
 def _mark_step(
@@ -179,7 +183,7 @@ def _spread_apart(axes: Axes, peaks: Sequence[float]) -> None:
     from matplotlib.ticker import NullLocator, SymmetricalLogLocator
 
     sizes = [abs(peak) for peak in peaks if peak]
-    if len(sizes) < 2 or max(sizes) < APART * min(sizes):
+    if len(sizes) < 2 or max(sizes) < MAX_LINEAR_RATIO * min(sizes):
         return
     linear = 10.0 ** math.floor(math.log10(min(sizes) / 3))
     axes.set_yscale("symlog", linthresh=linear)
@@ -245,7 +249,7 @@ def load_response(
             shown.append(curves)
         figures = [step_figures(answer, k, column) for _, answer, k, column in rows]
         window = _window(rows, figures)
-        fine = FINE.get(units[0], units[0])
+        fine = FINE_UNITS.get(units[0], units[0])
         scale = 1 / unit_factor(fine, fine) if fine != units[0] else 1.0
         lines = []
         for (name, answer, k, column), found_figures, curves in zip(rows, figures, shown, strict=True):

@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 
 EDGES = 2  # columns of a terminal, left and right of a table
 GAPS = (3, 2)  # columns of a terminal between those of a table: if possible, and if need be
-WORDY = 30  # letters; cells that are longer are folded before a table is split
+MAX_CELL_LETTERS = 30  # letters; cells that are longer are folded before a table is split
 INDENT = "  "
 _NUMBER = r"(?<![\w.])[-+±]*\d[\d.,e+-]*j?"
 _UNIT = r"(?:%|[munkMµ]?(?:m|s|g|N|A|V|W|J|H|F|T|rad|Hz|Ohm|ohm)|deg|dB|samples|us)(?:[/^*][\w^]+)*(?![\w])"
-_WHOLE = re.compile(
+_WHOLE_CELL = re.compile(
     rf"{_NUMBER}(?: {_UNIT})+"  # 1 N m
     rf"|{_NUMBER} (?:\(x\d+\)|±[\d.]+)"  # a pole that is there twice; an interval
     r"|(?:[<>]=?|=|about|x) (?=[-+]?\d)"
     r"|\[[^\[\]]{1,24}\]"  # [N m]
 )
-_JOINT = "\N{NO-BREAK SPACE}"  # which textwrap does not break at
+_JOINING_SPACE = "\N{NO-BREAK SPACE}"  # which textwrap does not break at
 
 
 def glue(text: str) -> str:
@@ -50,8 +50,10 @@ def glue(text: str) -> str:
     >>> glue("at 1 N m or more").replace("\\N{NO-BREAK SPACE}", "_")
     'at 1_N_m or more'
     """
-    once = _WHOLE.sub(lambda found: found[0].replace(" ", _JOINT), text)
-    return _WHOLE.sub(lambda found: found[0].replace(" ", _JOINT), once)  # "<= 5 um" has two joints
+    once = _WHOLE_CELL.sub(lambda found: found[0].replace(" ", _JOINING_SPACE), text)
+    return _WHOLE_CELL.sub(
+        lambda found: found[0].replace(" ", _JOINING_SPACE), once
+    )  # "<= 5 um" has two joints
 
 
 def fold(text: str, width: int) -> list[str]:
@@ -67,7 +69,7 @@ def fold(text: str, width: int) -> list[str]:
         for part in text.split("\n")
         for line in textwrap.wrap(glue(part), max(width, 1), break_on_hyphens=False) or [""]
     ]
-    return [micro(line.replace(_JOINT, " ")) for line in lines]
+    return [micro(line.replace(_JOINING_SPACE, " ")) for line in lines]
 
 
 def longest_word(text: str) -> int:
@@ -120,7 +122,7 @@ def allot(columns: Sequence[Widths], room: int, *, cells: bool) -> list[int] | N
 
 def _short(column: Widths) -> int:
     """The width to which a column folds before others fold: that of its cells, or of lines of sentences."""
-    return column.body if column.body <= WORDY else max(column.least, WORDY)
+    return column.body if column.body <= MAX_CELL_LETTERS else max(column.least, MAX_CELL_LETTERS)
 
 
 def split(columns: Sequence[Widths], width: int) -> list[list[int]] | None:

@@ -49,7 +49,7 @@ def campaign_tables(
     """Tabulate how the runs of a campaign end, their figures of merit beside the published bounds, and the worst runs.
 
     found : the campaign, or its summary
-    published : figures of the machine's paper, from `malta.model.published`; None: none; a summary has its own
+    published : figures of the machine's paper, from `malta.model.read_published`; None: none; a summary has its own
     worst : number of the worst runs that are listed
     spec : the design whose [specification] bounds the runs as well; a summary has its own
 
@@ -71,9 +71,9 @@ def campaign_tables(
      completed      8       100.0      63.06 to 100.0
     <BLANKLINE>
     """
-    from malta.campaigns.summary import Bounds, as_summary
+    from malta.campaigns.summary import RunLimits, as_summary
 
-    summary = as_summary(found, Bounds(published, spec))
+    summary = as_summary(found, RunLimits(published, spec))
     tables: list[Table | Paragraph] = [*_missing_text(summary), _ends_table(summary)]
     if summary.rate.passed:
         tables.append(_findings_table(summary))

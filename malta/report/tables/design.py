@@ -13,13 +13,13 @@ from rich.text import Text
 from scipy import sparse
 
 from malta.bound import at_least, at_most
-from malta.checker.file import Claim, double, inside
+from malta.checker.file import StabilityClaim, double, inside
 from malta.display import RADIANS, frequency
 from malta.loops.time_domain import SHARE, Recovery, furthest
 from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, Outcome, zone
 from malta.model.data import published_value
 from malta.model.linearize import LinearModel
-from malta.model.machines import FINE
+from malta.model.machines import FINE_UNITS
 from malta.model.parameters import box_words
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
 from malta.report.tables import COLOURS, Paragraph, add_row, new_table
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from malta.model.plant import Plant
     from malta.simulation.experiments import Experiment
     from malta.synthesis.spec import Spec
-    from malta.tuning.tune import Tuned
+    from malta.tuning.tune import TuningResult
 
 
 def design_page(
@@ -45,7 +45,7 @@ def design_page(
     model : the machine's linear model
     margins : from `malta.verify`
     flown : the experiment that is the machine's main job, from `malta.experiment`
-    published : figures of the machine's paper, from `malta.model.published`; None: none
+    published : figures of the machine's paper, from `malta.model.read_published`; None: none
 
     Returns a rich Group, which `rich.print` prints.
 
@@ -101,14 +101,14 @@ def poles_table(model: LinearModel, published: Published | None) -> Table:
     A damped plant has no pairs of opposite poles: all its poles are listed.
 
     model : the machine's linear model
-    published : figures of the machine's paper, from `malta.model.published`; None: none
+    published : figures of the machine's paper, from `malta.model.read_published`; None: none
 
     Returns a rich Table, which `rich.print` prints.
 
     >>> import malta, rich
     >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
     >>> model = malta.linearize(plant, plant.at())
-    >>> printed = malta.model.published("data/tubular.toml")
+    >>> printed = malta.model.read_published("data/tubular.toml")
     >>> rich.print(malta.report.poles_table(model, printed))
     Open-loop poles [rad/s]
     <BLANKLINE>
@@ -179,7 +179,7 @@ def bandwidth_table(margins: LoopReport, published: Published | None) -> Table:
     """Tabulate the bandwidth by each definition; a paper may print one figure without saying which it is.
 
     margins : from `malta.verify`
-    published : figures of the machine's paper, from `malta.model.published`; None: none
+    published : figures of the machine's paper, from `malta.model.read_published`; None: none
 
     Returns a rich Table, which `rich.print` prints.
 
@@ -287,7 +287,7 @@ DIGITS = 7  # of the ends of an interval
 LOOPS = {"lag": "current loops, if any, as first-order lags", "pi": "the PI current loops of the gain file"}
 
 
-def claim_text(claim: Claim) -> str:
+def claim_text(claim: StabilityClaim) -> str:
     """The loop that a certificate names: machine, law, stage and sample time."""
     T = "continuous" if claim.sample_time is None else f"sampled every {double(claim.sample_time):g} s"
     if claim.origin is None:
@@ -301,12 +301,12 @@ def claim_text(claim: Claim) -> str:
     return text
 
 
-def claim_share(claim: Claim) -> str:
+def claim_share(claim: StabilityClaim) -> str:
     """The multiple of the uncertainty that is claimed, in percent, cut."""
     return at_least(double(claim.lower)).percent()
 
 
-def claim_table(claim: Claim) -> Table:
+def claim_table(claim: StabilityClaim) -> Table:
     """The box of a certificate: each parameter with its nominal value and its interval at the claim, cut inwards."""
     table = new_table(f"The box at {claim_share(claim)}", "parameter", "nominal", "from", "to", "unit")
     for p in claim.parameters:
@@ -360,7 +360,7 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
     table.columns[1].justify = "left"
     for recovered, d in furthest(found):
         load = ", ".join(f"{size:g} {units[name]} {name}" for name, size in recovered.load.items())
-        fine = FINE.get(d.unit, d.unit)
+        fine = FINE_UNITS.get(d.unit, d.unit)
         # Below a millionth of the largest nothing is left.
         left = (value if value > 1e-6 * d.largest else 0.0 for value in d.left)
         lengths = [number(in_unit(value, fine)) for value in (d.largest, *left)]
@@ -403,7 +403,7 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
     return table
 
 
-def _front_columns(tuned: Tuned) -> dict[str, tuple[str, float, str]]:
+def _front_columns(tuned: TuningResult) -> dict[str, tuple[str, float, str]]:
     """Columns of the front by figure: heading, factor from SI to the unit shown, unit."""
     names = dict.fromkeys(name for one in tuned.front for name in one.figures)
     columns = {"margin": ("margin, proven", 1.0, "%")}
@@ -417,7 +417,7 @@ def _front_columns(tuned: Tuned) -> dict[str, tuple[str, float, str]]:
     return columns
 
 
-def front_rows(tuned: Tuned) -> tuple[list[str], list[list[str]]]:
+def front_rows(tuned: TuningResult) -> tuple[list[str], list[list[str]]]:
     """The Pareto front as headings and cells: a row for each trial, the chosen one with a star."""
     columns = _front_columns(tuned)
     shown = [name for name in columns if any(name in one.figures for one in tuned.front)]
@@ -435,7 +435,7 @@ def _front_cell(name: str, value: float) -> str:
     return at_least(value).percent(unit="") if name == "margin" else f"{value:.4g}"
 
 
-def front_table(tuned: Tuned) -> Table:
+def front_table(tuned: TuningResult) -> Table:
     """Tabulate the Pareto front of margin, force noise and motion, in the order of margins.
 
     tuned : from `malta.tune`
@@ -444,12 +444,12 @@ def front_table(tuned: Tuned) -> Table:
 
     >>> import malta, rich
     >>> from malta.tuning.search import Trial
-    >>> from malta.tuning.tune import Tuned
+    >>> from malta.tuning.tune import TuningResult
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
     >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
     >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
-    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
+    >>> tuned = TuningResult(spec, front[1], (), front, trials=120)  # of malta.tune
     >>> rich.print(malta.report.front_table(tuned))
     What the margin costs (* chosen)
     <BLANKLINE>
@@ -466,7 +466,7 @@ def front_table(tuned: Tuned) -> Table:
     return table
 
 
-def front_markdown(tuned: Tuned) -> str:
+def front_markdown(tuned: TuningResult) -> str:
     """Write the Pareto front as a Markdown table.
 
     tuned : from `malta.tune`
@@ -475,12 +475,12 @@ def front_markdown(tuned: Tuned) -> str:
 
     >>> import malta
     >>> from malta.tuning.search import Trial
-    >>> from malta.tuning.tune import Tuned
+    >>> from malta.tuning.tune import TuningResult
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
     >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
     >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
-    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
+    >>> tuned = TuningResult(spec, front[1], (), front, trials=120)  # of malta.tune
     >>> print(malta.report.front_markdown(tuned))
     | margin, proven [%] | f [N rms] | y motion [um rms] |  |
     | ---: | ---: | ---: | ---: |

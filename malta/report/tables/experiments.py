@@ -32,7 +32,7 @@ from malta.simulation.experiments import Experiment, setting
 from malta.simulation.experiments.catalogue import experiments_of, options_of
 
 if TYPE_CHECKING:
-    from malta.identification.commission import Commissioning, Finding, Step
+    from malta.identification.commission import Check, Commissioning, StepFinding
     from malta.identification.excite import ExcitationPlan
     from malta.identification.identify import Identified
     from malta.identification.log import Log
@@ -66,7 +66,7 @@ def limits_text(e: Experiment) -> list[str]:
     return [f"met the {' and the '.join(names)}: {', '.join(cases)}" for names, cases in met.items() if names]
 
 
-CUT = "Interrupted: the figures below are of what was simulated until then; none is final.\n"
+INTERRUPTED_TEXT = "Interrupted: the figures below are of what was simulated until then; none is final.\n"
 
 
 def experiment_table(e: Experiment, published: Published | None = None) -> Group:
@@ -75,7 +75,7 @@ def experiment_table(e: Experiment, published: Published | None = None) -> Group
     Where the experiment has no figures of merit of its own, each case has a row.
 
     e : from `malta.experiment`
-    published : figures of the machine's paper, from `malta.model.published`; None: none
+    published : figures of the machine's paper, from `malta.model.read_published`; None: none
 
     Returns a rich Group of tables, which `rich.print` prints.
 
@@ -93,7 +93,7 @@ def experiment_table(e: Experiment, published: Published | None = None) -> Group
      y, left at the end [µm]   0.05314
     <BLANKLINE>
     """
-    tables: list[Table | Paragraph] = [Paragraph(CUT)] if e.cut else []
+    tables: list[Table | Paragraph] = [Paragraph(INTERRUPTED_TEXT)] if e.cut else []
     if len(e.cases) > 1 and e.merits is e.cases[0].merits:
         return Group(*tables, _cases_table(e, published))
     first = len(tables)
@@ -127,7 +127,7 @@ def _cases_table(e: Experiment, published: Published | None) -> Table:
     if any(merit.label not in labels for case in e.cases for merit in case.merits):
         return _list_of_merits(e)
     if len(labels) > COLUMNS:
-        return _transposed(e, fullest)
+        return _transpose(e, fullest)
     ended = any(not case.run.verdict.completed for case in e.cases)
     heads = ["verdict", "at [ms]"] if ended else []
     table = new_table(e.question, "case", *heads, *(merit.heading for merit in fullest))
@@ -150,7 +150,7 @@ def _cases_table(e: Experiment, published: Published | None) -> Table:
 COLUMNS = 6  # largest number of figures of merit beside each other
 
 
-def _transposed(e: Experiment, fullest: Sequence[Merit]) -> Table:
+def _transpose(e: Experiment, fullest: Sequence[Merit]) -> Table:
     """One column for each case."""
     table = new_table(e.question, "figure", *(case.label for case in e.cases))
     found = [{merit.label: merit_text(merit) for merit in case.merits} for case in e.cases]
@@ -368,7 +368,7 @@ def measurement_plan_table(plan: MeasurementPlan) -> Table:
     return table
 
 
-def checklist_table(steps: Sequence[Step]) -> Table:
+def checklist_table(steps: Sequence[Check]) -> Table:
     """The steps of a commissioning: what each asks, needs, aborts at and writes."""
     heads = ("step", "question", "needs", "aborts at", "writes")
     table = new_sheet("Checklist", [(head, "left") for head in heads])
@@ -392,7 +392,7 @@ def findings_table(done: Commissioning) -> Table:
     return table
 
 
-def finding_cells(one: Finding) -> tuple[str, str, str, str, str]:
+def finding_cells(one: StepFinding) -> tuple[str, str, str, str, str]:
     """Name, value, half of the interval, limits, and a word where they are not kept."""
     value, half, unit = one.found
     scale, shown = (1e6, "um") if unit == "m" else (1.0, unit)  # phases of waves are in rad
@@ -408,7 +408,7 @@ def finding_cells(one: Finding) -> tuple[str, str, str, str, str]:
 
 
 GAP = 2  # columns of a terminal between those of a line
-LEAST = 30  # letters of a claim that a line has room for: a terminal with fewer has fewer designs a line
+MIN_CLAIM_LETTERS = 30  # a terminal with less room for a claim has fewer designs a line
 
 
 MEANINGS = {
@@ -459,7 +459,7 @@ class ClaimLines:
         """The designs that stand beside each other."""
         blocks: list[list[int]] = [[]]
         for k in range(len(self.ledger.designs)):
-            if blocks[-1] and self._room([*blocks[-1], k], width) < LEAST:
+            if blocks[-1] and self._room([*blocks[-1], k], width) < MIN_CLAIM_LETTERS:
                 blocks.append([])
             blocks[-1].append(k)
         return blocks
@@ -504,9 +504,9 @@ def claims_table(ledger: Ledger, *, why: bool = False) -> ClaimLines:
     Returns what `rich.print` prints: a line for each claim, two or more for a long name, in the width of the terminal.
 
     >>> import malta, rich
-    >>> from malta.report.ledger import Claim, Ledger
+    >>> from malta.report.ledger import LedgerClaim, Ledger
     >>> verdict = "by construction; K_A"
-    >>> claim = Claim("pole of x [rad/s]", "±218.92", ("±218.92",), verdict, "input")
+    >>> claim = LedgerClaim("pole of x [rad/s]", "±218.92", ("±218.92",), verdict, "input")
     >>> ledger = Ledger("tubular", "the paper", ("table2",), (claim,))
     >>> rich.print(malta.report.claims_table(ledger, why=True))
     Published numbers and ours: tubular, the paper

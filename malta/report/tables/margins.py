@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from malta.report.figures.drawing import Published
     from malta.synthesis.spec import Spec
 
-PROVEN = ("proven", "lost at", "rad/s", "first to give")  # of a proof; no room for Hz
+PROVEN_HEADINGS = ("proven", "lost at", "rad/s", "first to give")  # of a proof; no room for Hz
 WAYS = ("down", "up")
-NEAREST = 3  # requirements that are named though they hold
+SHOWN_NEAR_LIMITS = 3  # requirements that are named though they hold
 
 
 def loop_tables(
@@ -41,7 +41,7 @@ def loop_tables(
     """Tabulate all that is known of a loop, as `malta verify` prints it.
 
     found : from `malta.verify`; without `stages` what is linear alone
-    published : figures of the machine's paper, from `malta.model.published`; None: none
+    published : figures of the machine's paper, from `malta.model.read_published`; None: none
     spec : the design file, whose requirements were judged; None: none
 
     Returns an iterator of what `rich.print` prints.
@@ -93,7 +93,7 @@ def _requirements(found: LoopReport, spec: Spec) -> Iterator[Table | Paragraph]:
     if failed:
         yield requirements_table(failed)
     held = sorted((one for one in asked if one.holds), key=lambda one: -one.ratio)
-    near = ", ".join(f"{one.name.replace('_', ' ')} {one.nearness}" for one in held[:NEAREST])
+    near = ", ".join(f"{one.name.replace('_', ' ')} {one.nearness}" for one in held[:SHOWN_NEAR_LIMITS])
     text = f"Requirements of {spec.path}: {len(held)} of {len(asked)} hold"
     if held:
         text += f"; nearest their limits {near}"
@@ -138,7 +138,7 @@ def chain_table(found: LoopReport) -> Table:
     table = new_table(
         "Where the margin goes: margin in multiples of the uncertainty box, 100 % is the box" if proven
         else "Peak sensitivity by stage",
-        "stage", *(PROVEN if proven else ()), "peak |S|", "zone", "of",
+        "stage", *(PROVEN_HEADINGS if proven else ()), "peak |S|", "zone", "of",
     )  # fmt: skip
     for link in found.chain:
         unstable = math.isnan(link.peak)
@@ -157,7 +157,7 @@ def chain_table(found: LoopReport) -> Table:
 
 
 def _proof_cells(margin: Margin) -> tuple[str, ...]:
-    """The cells of a margin under the headings PROVEN."""
+    """The cells of a margin under the headings PROVEN_HEADINGS."""
     return *_margin_cells(margin), _limiting_parameters(margin)
 
 
@@ -442,7 +442,7 @@ def places_table(found: LoopReport) -> Table:
     table = new_table(
         title,
         f"at [{'mm' if extent.stroke else extent.unit}]" if extent.course else "at",
-        *(PROVEN[:3] if proven else ()),
+        *(PROVEN_HEADINGS[:3] if proven else ()),
         "peak |S|",
         "zone",
         "disk, all",

@@ -1,7 +1,7 @@
 """Many machines at once: the same scenario and controller on plants that all differ, each with its own noise.
 
 With a C compiler, LANES machines share a SIMD register and the groups share the cores; each run leaves a digest only.
-Run i of a seed does not depend on the other runs of its batch; `replayed` gives its machine and scenario.
+Run i of a seed does not depend on the other runs of its batch; `replay_run` gives its machine and scenario.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from malta.model.plant import Plant
 from malta.simulation.engine.compiled import (
     LANES,
     Lanes,
-    Part,
     Shared,
+    TimeSpan,
     arrange_in_lanes,
     feedforward_table,
     foresee_samples,
@@ -49,7 +49,7 @@ from malta.simulation.engine.engines import BLOCK, EngineChoice, engine_text, ev
 from malta.simulation.inputs import Inputs, initial_values, inputs_of
 from malta.simulation.layout import electronics_of, flatten, layout_of, noise_scales, numbers_of, with_symbols
 from malta.simulation.period import initial_state, period_of
-from malta.simulation.readings import TOGETHER, advance_keys, keys, starts_of_parts
+from malta.simulation.readings import NOISE_SAMPLES_AT_ONCE, advance_keys, keys, starts_of_parts
 from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of, steps_of
 from malta.simulation.simulate import EngineOf, simulate
 from malta.simulation.trajectory import Trajectory, stroke_figures, trajectory_of
@@ -59,18 +59,18 @@ from malta.synthesis.controller import Controller
 
 
 WORK = 2_000_000  # substeps of the groups in one call of the engine, at most: a fraction of a second
-LOOK = 0.1  # s from one report of progress to the next
+PROGRESS_INTERVAL = 0.1  # s from one report of progress to the next
 
 
-class Work(NamedTuple):
+class LaneWork(NamedTuple):
     """The runs of a batch, ready for the compiled engine; the lanes' keys are those of the parts."""
 
     lanes: Lanes
     shared: Shared
-    parts: Sequence[Part]
+    parts: Sequence[TimeSpan]
 
 
-def run_groups(lib: Any, work: Work, workers: int, progress: Callable[[float], None] | None) -> None:
+def run_groups(lib: Any, work: LaneWork, workers: int, progress: Callable[[float], None] | None) -> None:
     """Simulate all groups of machines on several threads; the digests change in place."""
     lanes, shared, parts = work
     groups, done = len(lanes.states), list[int]()
@@ -94,7 +94,7 @@ def run_groups(lib: Any, work: Work, workers: int, progress: Callable[[float], N
         running = {pool.submit(run) for _ in range(min(workers, len(calls)))}
         try:
             while running:  # to wake up for every call takes time from the workers
-                ended, running = wait(running, LOOK, FIRST_EXCEPTION)
+                ended, running = wait(running, PROGRESS_INTERVAL, FIRST_EXCEPTION)
                 for thread in ended:
                     thread.result()
                 if progress is not None and done and calls:
@@ -185,7 +185,7 @@ def simulate_many(
     if settled:
         sensors = lanes.sigma.shape[1]
         parts = _split(parts, settled, sensors, partial(restart, first=digest, sizes=sizes))
-    run_groups(compiled[0], Work(lanes, shared, parts), workers or os.cpu_count() or 1, progress)
+    run_groups(compiled[0], LaneWork(lanes, shared, parts), workers or os.cpu_count() or 1, progress)
     ends = lanes.digests.swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
     return batch_of(ends, len(inputs.t), controller.sample_time, sizes, settled)
 
@@ -200,7 +200,9 @@ class Variation(NamedTuple):
     runs: int
 
 
-def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shared, Lanes, Sequence[Part]]:
+def _prepare(
+    simulation: Simulation, variation: Variation
+) -> tuple[Inputs, Shared, Lanes, Sequence[TimeSpan]]:
     """Inputs that all machines share, each machine's own numbers in lanes, still without digests, and the noise."""
     plant, controller, scenario, setup = simulation
     count, runs = steps_of(plant, controller, scenario), variation.runs
@@ -216,7 +218,7 @@ def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shar
     streams = np.moveaxis(keys(scenario.seed, indices).reshape(groups, LANES, -1), 2, 0)
     starts = starts_of_parts(len(inputs.t), len(streams))
     parts = [
-        Part(slice(start, end), np.ascontiguousarray(advance_keys(stream, start, noise.shape[1])))
+        TimeSpan(slice(start, end), np.ascontiguousarray(advance_keys(stream, start, noise.shape[1])))
         for start, end, stream in zip(starts, [*starts[1:], len(inputs.t)], streams, strict=True)
         if end > start
     ]
@@ -233,15 +235,18 @@ def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shar
 
 
 def _split(
-    parts: Sequence[Part], sample: int, sensors: int, then: Callable[[FloatArray], None]
-) -> list[Part]:
+    parts: Sequence[TimeSpan], sample: int, sensors: int, then: Callable[[FloatArray], None]
+) -> list[TimeSpan]:
     """The parts, of which one ends in front of `sample`, an even number, and is followed by `then`."""
-    split: list[Part] = []
+    split: list[TimeSpan] = []
     for part in parts:
         first, last = part.samples.start, part.samples.stop
         if first < sample < last:
             keys = np.ascontiguousarray(advance_keys(part.keys, sample - first, sensors))
-            split += [part._replace(samples=slice(first, sample), then=then), Part(slice(sample, last), keys)]
+            split += [
+                part._replace(samples=slice(first, sample), then=then),
+                TimeSpan(slice(sample, last), keys),
+            ]
         else:
             split.append(part._replace(then=then) if last == sample else part)
     return split
@@ -274,7 +279,7 @@ def record_run(
         {name: column[begin - first : begin - first + LANES] for name, column in columns.items()}
         for columns in (changes, sensor_errors or {})
     )
-    own_plant, own_scenario = replayed(plant, scenario, changes, index, first, sensor_errors)
+    own_plant, own_scenario = replay_run(plant, scenario, changes, index, first, sensor_errors)
     if noise is not None:
         noise = noise[begin - first : begin - first + LANES]
         own_scenario = replace(own_scenario, run=tuple(noise[index - begin].tolist()))
@@ -288,21 +293,23 @@ def record_run(
     inputs, shared, lanes, parts = _prepare(simulation, variation)
     width = sum(layout_of(plant, controller, simulation.setup).row.values())
     rows = np.empty((len(inputs.t), width))
-    last = np.zeros((1, TOGETHER * width, LANES))
+    last = np.zeros((1, NOISE_SAMPLES_AT_ONCE * width, LANES))
     sensors = len(noise_scales(plant, simulation.setup))
     for samples, streams, _ in parts:
-        for k in range(samples.start, samples.stop, TOGETHER):
-            given = inputs.given[k : min(k + TOGETHER, samples.stop)]
+        for k in range(samples.start, samples.stop, NOISE_SAMPLES_AT_ONCE):
+            given = inputs.given[k : min(k + NOISE_SAMPLES_AT_ONCE, samples.stop)]
             now = lanes._replace(keys=advance_keys(streams, k - samples.start, sensors), digests=last)
             run_many(compiled[0], slice(0, 1), now, shared._replace(given=given))
-            rows[k : k + len(given)] = last[0, :, index - begin].reshape(TOGETHER, width)[-len(given) :]
+            rows[k : k + len(given)] = last[0, :, index - begin].reshape(NOISE_SAMPLES_AT_ONCE, width)[
+                -len(given) :
+            ]
             if progress is not None and k % 1000 == 0:
                 progress(k / len(rows))
     own = Simulation(own_plant, controller, own_scenario, simulation.setup)
     return trajectory_of(own, inputs, rows, "compiled")
 
 
-def replayed(
+def replay_run(
     plant: Plant,
     scenario: Scenario,
     changes: Mapping[str, FloatArray],
@@ -327,7 +334,7 @@ def replayed(
     >>> hold = malta.Scenario("hold", 5e-3, malta.references.hold, noise=1.0)
     >>> masses = {"m": [0.3, 0.4]}
     >>> batch = malta.simulation.simulate_many(plant, controller, hold, masses, workers=1)
-    >>> machine, scenario = malta.simulation.replayed(plant, hold, masses, index=1)
+    >>> machine, scenario = malta.simulation.replay_run(plant, hold, masses, index=1)
     >>> run = malta.simulate(machine, controller, scenario)
     >>> bool(abs(run.v).max() > 0.999 * batch.force[1].max())
     True
@@ -507,7 +514,7 @@ def _simulate_one_by_one(
     changes, sensor_errors, starts, noise, runs = variation
     figures: dict[str, list[Any]] = {name: [] for name in Batch.__dataclass_fields__}
     for k in range(runs):
-        machine_k, scenario_k = replayed(plant, scenario, changes, k, sensor_errors=sensor_errors)
+        machine_k, scenario_k = replay_run(plant, scenario, changes, k, sensor_errors=sensor_errors)
         own = dict(scenario_k.start) | {name: float(column[k]) for name, column in starts.items()}
         scenario_k = replace(scenario_k, start=own, run=tuple(noise[k].tolist()))
         run = simulate(machine_k, controller, scenario_k, engine=engine)

@@ -39,7 +39,7 @@ from malta.files import scratch_folder
 # it or replace a folder on the way to it. A refusal is one sentence, printed once, and another folder serves instead.
 
 
-OTHERS = stat.S_IWGRP | stat.S_IWOTH
+FOREIGN_WRITE_MODE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def open_private(folder: Path) -> Path | None:
@@ -104,7 +104,7 @@ def _fault(status: os.stat_result, owners: tuple[int, ...], *, sticky: bool = Fa
     """
     if status.st_uid not in owners:
         return f"one of user {status.st_uid}"
-    if status.st_mode & OTHERS and not (sticky and status.st_mode & stat.S_ISVTX):
+    if status.st_mode & FOREIGN_WRITE_MODE and not (sticky and status.st_mode & stat.S_ISVTX):
         return f"mode {stat.S_IMODE(status.st_mode):04o}"
     return ""
 
@@ -120,9 +120,9 @@ FLAGS = (
     *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),
     "-fno-tree-slp-vectorize",  # which may compute a number twice, rounded in two ways: v != w then means nothing
 )
-GCC_ALONE = ("-fschedule-insns", "-fsched-pressure")  # clang does not know them
-OTHERWISE = {"-ffp-contract=fast": "-ffp-contract=off"}  # clang contracts one lane otherwise than many
-NATIVE = ("-march=native", "-mtune=generic")  # tuned for a compiler's guess of a processor, text is slower
+GCC_FLAGS = ("-fschedule-insns", "-fsched-pressure")  # clang does not know them
+CLANG_FLAGS = {"-ffp-contract=fast": "-ffp-contract=off"}  # clang contracts one lane otherwise than many
+TARGET = ("-march=native", "-mtune=generic")  # tuned for a compiler's guess of a processor, text is slower
 
 
 @cache
@@ -211,7 +211,7 @@ def library(
     if cc is None or version is None:
         return None
     flags = FLAGS if flags is None else flags
-    key = "\n".join([text, str(lanes), *flags, *NATIVE, *cc, version, _processor(), platform.platform()])
+    key = "\n".join([text, str(lanes), *flags, *TARGET, *cc, version, _processor(), platform.platform()])
     name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
     for wanted in (folder or cache_folder(), _temporary_folder(), None):
         try:
@@ -251,8 +251,8 @@ def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path, flags: tupl
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         c, so = Path(scratch) / "engine.c", Path(scratch) / "engine.so"
         c.write_text(text, encoding="utf-8")
-        common = [OTHERWISE.get(flag, flag) for flag in flags if flag not in GCC_ALONE]
-        for tried in ((*flags, *NATIVE), (*common, *NATIVE), common):
+        common = [CLANG_FLAGS.get(flag, flag) for flag in flags if flag not in GCC_FLAGS]
+        for tried in ((*flags, *TARGET), (*common, *TARGET), common):
             found = _answer([*cc, *tried, f"-DLANES={lanes}", str(c), "-o", str(so), "-lm"])
             if found is None:
                 return False
@@ -377,7 +377,7 @@ def foresee_samples(lib: ctypes.CDLL, lanes: Lanes, shared: Shared) -> FloatArra
     return numbers
 
 
-class Part(NamedTuple):
+class TimeSpan(NamedTuple):
     """A part of the time of all runs, which has noise of its own."""
 
     samples: slice
@@ -386,7 +386,7 @@ class Part(NamedTuple):
 
 
 def run_many(
-    lib: ctypes.CDLL, chosen: slice, lanes: Lanes, shared: Shared, parts: Sequence[Part] | None = None
+    lib: ctypes.CDLL, chosen: slice, lanes: Lanes, shared: Shared, parts: Sequence[TimeSpan] | None = None
 ) -> None:
     """Simulate the `chosen` groups of machines; their states and digests change in place.
 
@@ -400,7 +400,7 @@ def run_many(
     substeps, uniform = ctypes.c_long(shared.substeps), ctypes.c_long(shared.uniform)
     table = address_of(shared.table)
     ahead = foresee_samples(lib, lanes, shared) if shared.foreseen is None else shared.foreseen
-    for samples, keys, then in parts or [Part(slice(None), lanes.keys)]:
+    for samples, keys, then in parts or [TimeSpan(slice(None), lanes.keys)]:
         given = shared.given[samples]
         lib.run_many(
             groups,

@@ -14,10 +14,10 @@ from malta.arrays import FloatArray, readonly
 from malta.display import Description, display
 from malta.model.plant import Plant
 from malta.simulation.layout import flatten, layout_of, numbers_of
-from malta.simulation.readings import TOGETHER
+from malta.simulation.readings import NOISE_SAMPLES_AT_ONCE
 
 LEVELS = (0.1, 0.9)  # shares of a stroke between which its rise is measured
-LARGEST_FIGURE = 1e30  # of a run that was completed, SI
+MAX_FIGURE = 1e30  # of a run that was completed, SI
 
 
 @display
@@ -132,7 +132,7 @@ def restart(digests: FloatArray, first: FloatArray, sizes: Mapping[str, int]) ->
 def digest_function(shape: Any) -> ca.Function:
     """(digest, row, given, theta) -> digest after one more sample. The first contact ends its updates."""
     kept, row, given, arguments = _symbols(shape)
-    after = _flying(shape, kept, row, given, lambda now, before: ca.if_else(kept["alive"], now, before))
+    after = _digest(shape, kept, row, given, lambda now, before: ca.if_else(kept["alive"], now, before))
     most, used = (_largest_share(c) for c in (ca.fmax(kept["contact"], row["contact"]), row["contact"]))
     alive = kept["alive"]  # 0 after the first contact: nothing else changes then
     after |= {
@@ -167,7 +167,7 @@ def cruise_functions(shape: Any) -> tuple[ca.Function, ...]:
     if shape.setup.bearing:
         return ()
     kept, row, given, arguments = _symbols(shape)
-    after = _flying(shape, kept, row, given, lambda now, _: now) | {"samples": kept["samples"] + 1}
+    after = _digest(shape, kept, row, given, lambda now, _: now) | {"samples": kept["samples"] + 1}
     reached = ca.logic_and(kept["reached"] < 0, after["share"] >= ca.DM(LEVELS))
     events = ca.mmax(ca.vertcat(row["saturated"], reached))
     premise = ca.logic_and(ca.logic_and(kept["alive"], _largest_share(row["contact"]) < 1), events <= 0)
@@ -191,7 +191,7 @@ def _symbols(shape: Any) -> tuple[Any, ...]:
     return *parts, [*(ca.vertcat(*part.values()) for part in parts), theta]
 
 
-def _flying(shape: Any, kept: Any, row: Any, given: Any, alive: Callable[[Any, Any], Any]) -> dict[str, Any]:
+def _digest(shape: Any, kept: Any, row: Any, given: Any, alive: Callable[[Any, Any], Any]) -> dict[str, Any]:
     """What a sample changes in the digest of a run that flies.
 
     alive : (value after the sample, another) -> the first where no contact ended the run
@@ -219,7 +219,7 @@ def recorder_function(shape: Any) -> ca.Function:
     """A digest that consists of the last rows: as many as the engine draws noise for at once."""
     sizes = layout_of(shape.plant, shape.controller, shape.setup)
     width, given = sum(sizes.row.values()), sum(sizes.given.values())
-    kept, row = ca.SX.sym("kept", TOGETHER * width), ca.SX.sym("row", width)
+    kept, row = ca.SX.sym("kept", NOISE_SAMPLES_AT_ONCE * width), ca.SX.sym("row", width)
     theta = ca.SX.sym("theta", len(flatten(numbers_of(shape.plant, shape.controller, 1))))
     arguments = [kept, row, ca.SX.sym("given", given), theta]
     return ca.Function("digest", arguments, [ca.vertcat(kept[width:], row)])

@@ -15,14 +15,14 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.files import packaged
+from malta.files import read_packaged
 from malta.model.data import plant_of
 from malta.model.parameters import acting_names, shape_parameters, twins_of
 from malta.model.plant import Plant
 from malta.simulation.engine.compiled import address_of, feedforward_table, library
 from malta.simulation.engine.instructions import (
     MASKS,
-    NONE,
+    NO_COUNTS,
     Counts,
     Node,
     counts_of,
@@ -34,7 +34,7 @@ from malta.simulation.engine.instructions import (
     read_instructions,
 )
 from malta.simulation.engine.integration_state import with_working_state
-from malta.simulation.layout import SHARED, Setup, electronics_of, ending_columns, flatten, numbers_of
+from malta.simulation.layout import SHARED_NUMBERS, Setup, electronics_of, ending_columns, flatten, numbers_of
 from malta.simulation.period import Period, chain, columns_of, period_of, without_zeros
 from malta.synthesis.controller import Controller, gains_of
 
@@ -46,9 +46,9 @@ from malta.synthesis.controller import Controller, gains_of
 # in one piece. Each function has a second version for small tilts, which has no branches.
 
 
-WHOLE = 4000  # statements: a longer function is cut into parts
-PART = 300  # statements of a part at most
-IN_PLACE = ("digest", "cruise", "substep")  # an entry that stays as it is is not written
+MAX_WHOLE_STATEMENTS = 4000  # statements: a longer function is cut into parts
+MAX_PART_STATEMENTS = 300  # statements of a part at most
+UNCHANGED_ENTRIES = ("digest", "cruise", "substep")  # an entry that stays as it is is not written
 
 
 class Text(NamedTuple):
@@ -66,9 +66,9 @@ def source(p: Period, digest: ca.Function | None, cruise: Sequence[ca.Function] 
     digest : the function that updates a run's digest, see digest.py; None for an engine of one lane
     cruise : when a shorter update does the same, and that update
     """
-    texts, functions, counts = [], [], NONE
+    texts, functions, counts = [], [], NO_COUNTS
     given = {"sense": 1, "decide": 1, "substep": 2, "digest": 2, "cruises": 2, "cruise": 2}
-    common = [k for k, name in enumerate(p.theta) if name in SHARED]
+    common = [k for k, name in enumerate(p.theta) if name in SHARED_NUMBERS]
     motion = (p.substep,) if p.enter is None or p.leave is None else (p.enter, p.substep, p.leave)
     for f in (p.sense, p.decide, *motion, *([digest] if digest else []), *cruise):
         text = translate(f, [given[f.name()]] if f.name() in given else [], counts, common)
@@ -103,7 +103,7 @@ def source(p: Period, digest: ca.Function | None, cruise: Sequence[ca.Function] 
     prepare = _once("prepare(const real *theta, real *c, double *d)", [text.prepare for text in texts])
     ahead = _once("foresee(const double *d, const double *given, double *g)", [x.foresee for x in texts])
     numbers, noise, loop = (
-        packaged(f"simulation/engine/{name}.c").decode() for name in ("numbers", "noise", "engine")
+        read_packaged(f"simulation/engine/{name}.c").decode() for name in ("numbers", "noise", "engine")
     )
     noise = f"#if LANES > 1\n{noise}#endif\n"
     return "".join([defines, numbers, prepare, ahead, *functions, noise, loop])
@@ -153,7 +153,7 @@ class Names(NamedTuple):
 
 
 def translate(
-    f: ca.Function, shared: Sequence[int], first: Counts = NONE, common: Collection[int] = ()
+    f: ca.Function, shared: Sequence[int], first: Counts = NO_COUNTS, common: Collection[int] = ()
 ) -> Text:
     """C text of an SX function whose last argument is theta.
 
@@ -175,7 +175,7 @@ def translate(
     prepare = [line for k in fixed for line in names.lines(k)] + [names.keep(k) for k in fixed if k in place]
     bodies = [[line for k in members for line in names.lines(k)] for members in parts]
     results = [(f"r{i}[{j}]", names.text(k, at=len(parts) - 1)) for i, j, k in outputs]
-    if f.name() in IN_PLACE:
+    if f.name() in UNCHANGED_ENTRIES:
         results = [(to, value) for to, value in results if value != to.replace("r0", "a0")]
     bodies[-1] += [f"  const real o{n} = {found};" for n, (_, found) in enumerate(results)]
     bodies[-1] += [f"  {to} = o{n};" for n, (to, _) in enumerate(results)]
@@ -197,7 +197,7 @@ def _arguments(f: ca.Function, shared: Sequence[int]) -> list[tuple[str, str]]:
 
 def _cut_in_parts(statements: list[int]) -> list[list[int]]:
     """The statements of one function in parts of about the same length; one part for a short function."""
-    count = math.ceil(len(statements) / PART) if len(statements) > WHOLE else 1
+    count = math.ceil(len(statements) / MAX_PART_STATEMENTS) if len(statements) > MAX_WHOLE_STATEMENTS else 1
     edges = [len(statements) * k // count for k in range(count + 1)]
     return [statements[begin:end] for begin, end in pairwise(edges)]
 
@@ -309,7 +309,7 @@ def engine_of(
 
 
 @dataclass(frozen=True)
-class Shape:
+class LoopShape:
     """The shape of a plant and a controller. Two shapes are equal where the same compiled text serves both."""
 
     key: tuple[Any, ...]
@@ -318,7 +318,7 @@ class Shape:
     setup: Setup
 
 
-def shape_of(plant: Plant, c: Controller, setup: Setup) -> Shape:
+def shape_of(plant: Plant, c: Controller, setup: Setup) -> LoopShape:
     """The shape of a plant and a controller: all that their functions depend on, except numbers."""
     variant, par = plant.variant, plant.parameters
     kin = (variant.func, *sorted(variant.keywords.items())) if isinstance(variant, partial) else (variant,)
@@ -330,12 +330,12 @@ def shape_of(plant: Plant, c: Controller, setup: Setup) -> Shape:
     fixed = (*shape_parameters(par).items(), *acting_names(par))
     columns = columns_of(c)
     law = (c.tracks, None if c.schedule is None else c.schedule.output)
-    return Shape((type(par), kin, twins, fixed, patterns, columns, *law, c.parameters), plant, c, setup)
+    return LoopShape((type(par), kin, twins, fixed, patterns, columns, *law, c.parameters), plant, c, setup)
 
 
 @lru_cache(maxsize=32)
 def library_of(
-    shape: Shape, lanes: int = 1, digest: ca.Function | None = None, cruise: tuple[ca.Function, ...] = ()
+    shape: LoopShape, lanes: int = 1, digest: ca.Function | None = None, cruise: tuple[ca.Function, ...] = ()
 ) -> tuple[Any, Period] | None:
     """The library and the functions of a shape; None where it cannot be compiled.
 
@@ -349,13 +349,15 @@ def library_of(
 
 
 @lru_cache(maxsize=32)
-def engine_text(shape: Shape, digest: ca.Function | None = None, cruise: tuple[ca.Function, ...] = ()) -> str:
+def engine_text(
+    shape: LoopShape, digest: ca.Function | None = None, cruise: tuple[ca.Function, ...] = ()
+) -> str:
     """The C text of a shape's engine; digest and cruise as in `library_of`."""
     return source(compiled_period(shape), digest, cruise)
 
 
 @lru_cache(maxsize=32)
-def compiled_period(shape: Shape) -> Period:
+def compiled_period(shape: LoopShape) -> Period:
     """The functions of a control period as they are compiled: with numbers as arguments, without what drops out."""
     plant, c, setup = shape.plant, shape.controller, shape.setup
     p = period_of(plant, c, setup, numbers_of(plant, c, 1), constant=False)

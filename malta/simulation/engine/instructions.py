@@ -17,12 +17,12 @@ import casadi as ca
 
 from malta.errors import CheckError
 
-_BINARY = {"ADD": "+", "SUB": "-", "MUL": "*"}
+_BINARY_SIGNS = {"ADD": "+", "SUB": "-", "MUL": "*"}
 _TRUTH = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
-_EACH = ["sqrt", "floor", "ceil", "exp", "log", "tan", "tanh", "asin", "acos", "atan", "sinh", "cosh", "sign"]
+_MATH = ["sqrt", "floor", "ceil", "exp", "log", "tan", "tanh", "asin", "acos", "atan", "sinh", "cosh", "sign"]
 _FORMS = (
-    {f"OP_{name}": f"{{0}} {sign} {{1}}" for name, sign in _BINARY.items()}
-    | {f"OP_{name.upper()}": f"each_{name}({{0}})" for name in _EACH}
+    {f"OP_{name}": f"{{0}} {sign} {{1}}" for name, sign in _BINARY_SIGNS.items()}
+    | {f"OP_{name.upper()}": f"each_{name}({{0}})" for name in _MATH}
     | {f"OP_{name.upper()}": f"each_{name}({{0}}, {{1}})" for name in ("pow", "atan2", "hypot", "fmod")}
     | {
         "OP_ASSIGN": "{0}",
@@ -154,9 +154,9 @@ class _StraightLine:
             parts = self._fixed_factor(product)
             if self.nodes[factor].fixed and parts is not None:
                 return self._append("OP_MUL", self._append("OP_MUL", factor, parts[0]), parts[1])
-        return self._cancelled(one, other)
+        return self._cancel(one, other)
 
-    def _cancelled(self, one: int, other: int) -> int | None:
+    def _cancel(self, one: int, other: int) -> int | None:
         """A product without the pairs of a tilt's cosine and secant among its factors; None if there is no pair."""
         first, second = self._factors(one), self._factors(other)
         for k in first + second:
@@ -271,7 +271,7 @@ def needed_nodes(nodes: list[Node], roots: list[int]) -> list[int]:
 # g   once a sample for all lanes: depends on these and on the inputs of the sample, as K xi* + v_ff does
 
 
-PLAIN = ("OP_ADD", "OP_SUB", "OP_MUL", "OP_SQ", "OP_NEG", "OP_TWICE")  # same text for lanes
+PLAIN_OPERATIONS = ("OP_ADD", "OP_SUB", "OP_MUL", "OP_SQ", "OP_NEG", "OP_TWICE")  # same text for lanes
 
 
 class Counts(NamedTuple):
@@ -282,7 +282,7 @@ class Counts(NamedTuple):
     g: int = 0
 
 
-NONE = Counts()
+NO_COUNTS = Counts()
 
 
 def counts_of(place: dict[int, str]) -> Counts:
@@ -297,7 +297,7 @@ def find_common(nodes: list[Node], used: list[int]) -> set[int]:
     for k in used:
         node = nodes[k]
         known = all(nodes[a].fixed or not nodes[a].op or a in found for a in node.arguments)
-        if node.op in PLAIN and node.common and not node.fixed and known:
+        if node.op in PLAIN_OPERATIONS and node.common and not node.fixed and known:
             found.add(k)
     return found
 

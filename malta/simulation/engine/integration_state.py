@@ -19,7 +19,7 @@ import casadi as ca
 
 from malta.model.plant import Plant
 from malta.simulation.layout import (
-    Loop,
+    LoopPlan,
     Setup,
     electronics_of,
     layout_of,
@@ -40,7 +40,7 @@ from malta.synthesis.controller import Controller
 
 TERMS = 500  # of a polynomial; a longer one proves nothing
 _SUMS = {ca.OP_ADD: (1, 1), ca.OP_SUB: (1, -1), ca.OP_NEG: (-1,), ca.OP_TWICE: (2,)}
-_COMMUTING = (ca.OP_ADD, ca.OP_MUL)
+_COMMUTING_OPERATIONS = (ca.OP_ADD, ca.OP_MUL)
 
 Monomial = tuple[int, ...]
 Polynomial = dict[Monomial, Fraction]
@@ -70,7 +70,7 @@ class Identities:
                 key = ("symbol", mark)
             else:
                 parts = [self.number(e.dep(i)) for i in range(e.n_dep())]
-                key = (e.op(), *(sorted(parts) if e.op() in _COMMUTING else parts))
+                key = (e.op(), *(sorted(parts) if e.op() in _COMMUTING_OPERATIONS else parts))
             self._known[mark] = self._numbers.setdefault(key, len(self._numbers)), e
         return self._known[mark][0]
 
@@ -84,7 +84,7 @@ class Identities:
             for i, factor in enumerate(_SUMS[op]):
                 for monomial, value in self.polynomial(e.dep(i)).items():
                     total[monomial] = total.get(monomial, Fraction(0)) + factor * value
-            return _checked({monomial: value for monomial, value in total.items() if value})
+            return _check_length({monomial: value for monomial, value in total.items() if value})
         if op in (ca.OP_MUL, ca.OP_SQ):
             one, other = (self.polynomial(e.dep(i if op == ca.OP_MUL else 0)) for i in range(2))
             product: Polynomial = {}
@@ -92,7 +92,7 @@ class Identities:
                 for b, y in other.items():
                     both = tuple(sorted((*a, *b)))
                     product[both] = product.get(both, Fraction(0)) + x * y
-                    _checked(product)
+                    _check_length(product)
             return {monomial: value for monomial, value in product.items() if value}
         return {(self.number(e),): Fraction(1)}
 
@@ -104,7 +104,7 @@ class Identities:
             return False
 
 
-def _checked(p: Polynomial) -> Polynomial:
+def _check_length(p: Polynomial) -> Polynomial:
     if len(p) > TERMS:
         raise OverflowError
     return p
@@ -159,13 +159,13 @@ def linear_parts(e: Any, symbols: Any, fixed: Any) -> tuple[Any, Any, Any]:
     fixed : symbols that coefficients may depend on
     parts : the subexpressions, a column; names : a new symbol for each; rewritten : e in terms of the names
     """
-    walk = _Linear(symbols, fixed)
+    walk = _LinearTerms(symbols, fixed)
     rewritten = ca.vertcat(*(walk.rewritten(e[i]) for i in range(e.numel())))
     parts = list(walk.parts.values())
     return ca.vertcat(*(p for p, _ in parts)), ca.vertcat(*(n for _, n in parts)), rewritten
 
 
-class _Linear:
+class _LinearTerms:
     """Subexpressions by what they are: fixed, linear in the symbols, free of them, or mixed."""
 
     def __init__(self, symbols: Any, fixed: Any) -> None:
@@ -255,7 +255,7 @@ def with_working_state(p: Period, plant: Plant, c: Controller, s: Setup) -> Peri
     if s.fidelity != "force" or electronics_of(plant, s) is not None or not plant.second_order:
         return p
     plant, g, theta = with_symbols(plant, numbers_of(plant, c, 1))
-    loop, signals = Loop(plant, c, s, g), signals_of(layout_of(plant, c, s), ca.SX)
+    loop, signals = LoopPlan(plant, c, s, g), signals_of(layout_of(plant, c, s), ca.SX)
     machine, given = signals.machine, ca.vertcat(*signals.given.values())
     x, i, h = machine["x"], machine["i_coil"], g["substep"]
     rate = ca.cse(ca.densify(motion(loop, signals, x, plant.actuator.forces(x, i))))

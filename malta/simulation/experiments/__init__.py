@@ -25,7 +25,7 @@ from malta.merits import Merit as Merit, figure
 from malta.model.linearize import linearize
 from malta.model.machines import attribute_of
 from malta.model.plant import Plant
-from malta.simulation.inputs import LONGEST
+from malta.simulation.inputs import MAX_SAMPLES
 from malta.simulation.references import Reference
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
@@ -35,8 +35,8 @@ from malta.synthesis.controller import Controller
 Progress = Callable[[float], None]
 
 # Sensors as built, without systematic errors; and exact sensors.
-REAL: dict[str, Any] = {"noise": 1.0, "quantize": True, "sensor_errors": {}}
-QUIET: dict[str, Any] = {"noise": 0.0, "quantize": False, "sensor_errors": None}
+AS_BUILT: dict[str, Any] = {"noise": 1.0, "quantize": True, "sensor_errors": {}}
+NO_NOISE: dict[str, Any] = {"noise": 0.0, "quantize": False, "sensor_errors": None}
 
 
 class Case(NamedTuple):
@@ -148,7 +148,7 @@ def scenario_of(
     name: str, duration: float, reference: Callable[[Plant], Reference], options: Mapping[str, Any]
 ) -> Scenario:
     """The scenario of an experiment, with sensors as built unless the options differ."""
-    fields = REAL | {key: value for key, value in options.items() if key != "engine"}
+    fields = AS_BUILT | {key: value for key, value in options.items() if key != "engine"}
     return replace(Scenario(name, duration, reference), **fields)
 
 
@@ -168,12 +168,12 @@ def fly_all(
     progress: Progress | None,
     options: Mapping[str, Any],
 ) -> tuple[tuple[Case, ...], bool]:
-    """`fly` for runs with different machines and controllers. Raises InputError for more than LONGEST samples."""
+    """`fly` for runs with different machines and controllers. Raises InputError for more than MAX_SAMPLES samples."""
     cases: list[Case] = []
     samples = sum(one.scenario.samples(controller.sample_time) for _, controller, one in flights)
-    if samples > LONGEST:
+    if samples > MAX_SAMPLES:
         where, found = (flights[0][2].scenario.where, f"{len(flights)} of {samples:.4g} samples in all")
-        raise InputError(where, "runs", found, f"at most {LONGEST} samples")
+        raise InputError(where, "runs", found, f"at most {MAX_SAMPLES} samples")
     for n, (plant, controller, (label, scenario, merits)) in enumerate(flights):
         share = progress_of_part(progress, n, len(flights))
         try:

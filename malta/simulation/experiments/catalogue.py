@@ -40,9 +40,9 @@ from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.model.data import plant_of
 from malta.model.equilibrium import balance
-from malta.model.machines import FINE
+from malta.model.machines import FINE_UNITS
 from malta.model.parameters import units_of
-from malta.model.plant import Plant, Signal, placed
+from malta.model.plant import Plant, Signal, place_states
 from malta.simulation import references
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import (
@@ -77,11 +77,11 @@ from malta.synthesis.requirements import Payload
 
 
 SAMPLES = 2000  # of a run without a `time`
-BEFORE = 0.1  # share of the run before a step or a load
-BESIDE = (0.95, 1.05)  # of the way to a witness: inside the margin and beyond it
-LEAVES = 5.0  # times its push: a machine beyond the margin is shown until it has left so far
-LONGEST = 64_000  # samples of such a run
-HELD = 0.98  # of a witness at an end of the travel, where a stop is touched
+LEAD_SHARE = 0.1  # share of the run before a step or a load
+WITNESS_SHARES = (0.95, 1.05)  # of the way to a witness: inside the margin and beyond it
+LEAVING_FACTOR = 5.0  # times its push: a machine beyond the margin is shown until it has left so far
+MAX_SAMPLES = 64_000  # samples of such a run
+HELD_SHARE = 0.98  # of a witness at an end of the travel, where a stop is touched
 PUSH: Mapping[str, float] = {"m": 2e-5, "rad": 2e-5}  # where these begin
 CLEARANCE = 0.1  # of a step of default size, as a share of the clearance
 SIZE = 1e-5  # SI, of a step of a machine without contacts and without noise
@@ -110,7 +110,7 @@ def step_cases(
     duration, planned = _duration(controller, time), []
     for k in _choose(plant.outputs, output, "output"):
         signal, distance = plant.outputs[k], size or default_step(plant, k)
-        reference = partial(jump, output=k, size=distance, at=BEFORE * duration)
+        reference = partial(jump, output=k, size=distance, at=LEAD_SHARE * duration)
         scenario = scenario_of(
             "step", duration, reference, _with_exact_sensors(_with_fidelity(plant, options))
         )
@@ -135,7 +135,9 @@ def disturbance_cases(
         raise InputError(plant.name, "disturbances", "none", "a machine on which forces act from outside")
     duration, planned = _duration(controller, time), []
     for k in _choose(plant.disturbances, on, "on"):
-        push = partial(step_wrench, column=k, size=size, at=BEFORE * duration, width=len(plant.disturbances))
+        push = partial(
+            step_wrench, column=k, size=size, at=LEAD_SHARE * duration, width=len(plant.disturbances)
+        )
         given = _with_exact_sensors(_with_fidelity(plant, options)) | {"disturbance": push}
         scenario = scenario_of("disturbance", duration, references.hold, given)
         planned.append(PlannedRun(plant.disturbances[k].name, scenario, _load_merits))
@@ -159,7 +161,7 @@ def default_step(plant: Plant, output: int) -> float:
     probe = max(10 * plant.sensors.noise[output], SIZE)
     y[output] = probe
     if plant.contacts.names:
-        x = placed(plant, ca.DM(plant.position_of(ca.DM(y))))
+        x = place_states(plant, ca.DM(plant.position_of(ca.DM(y))))
         used = float(np.max(np.array(ca.DM(plant.contacts.contact(x)))))
         if used > 0:
             return probe * CLEARANCE / used
@@ -186,12 +188,12 @@ def witness_flights(plant: Plant, controller: Controller, witness: Mapping[str, 
 
     Example: `witness_flights(plant, controller, margin.witness)[1].run.verdict`
     """
-    samples, beyond = SAMPLES, _fly_beside(plant, controller, witness, BESIDE[1], SAMPLES)
-    while beyond.verdict.completed and not _leaves(beyond) and samples < LONGEST:
+    samples, beyond = SAMPLES, _fly_beside(plant, controller, witness, WITNESS_SHARES[1], SAMPLES)
+    while beyond.verdict.completed and not _leaves(beyond) and samples < MAX_SAMPLES:
         samples *= 2
-        beyond = _fly_beside(plant, controller, witness, BESIDE[1], samples)
-    inside = _fly_beside(plant, controller, witness, BESIDE[0], samples)
-    sides = zip(("inside", "beyond"), BESIDE, (inside, beyond), strict=True)
+        beyond = _fly_beside(plant, controller, witness, WITNESS_SHARES[1], samples)
+    inside = _fly_beside(plant, controller, witness, WITNESS_SHARES[0], samples)
+    sides = zip(("inside", "beyond"), WITNESS_SHARES, (inside, beyond), strict=True)
     return [Case(f"{side} the margin, at {100 * share:.0f} % of it", run, ()) for side, share, run in sides]
 
 
@@ -199,7 +201,9 @@ def _fly_beside(
     plant: Plant, controller: Controller, witness: Mapping[str, float], share: float, samples: int
 ) -> Trajectory:
     """A run of the machine at a share of the way from its own parameters to a witness."""
-    held = {signal.name: HELD * witness[signal.name] for signal in plant.outputs if signal.name in witness}
+    held = {
+        signal.name: HELD_SHARE * witness[signal.name] for signal in plant.outputs if signal.name in witness
+    }
     own: Any = plant.parameters
     ends = {name: value for name, value in witness.items() if hasattr(own, name)}
     there = plant_of(
@@ -230,7 +234,7 @@ def _constant(t: FloatArray, wrench: FloatArray) -> FloatArray:
 def _leaves(run: Trajectory) -> bool:
     """Whether the deviation at the end is many times that of the beginning."""
     off, tenth = np.abs(run.p - run.reference).max(axis=1), max(len(run.p) // 10, 1)
-    return bool(off[-tenth:].max() > LEAVES * off[0])
+    return bool(off[-tenth:].max() > LEAVING_FACTOR * off[0])
 
 
 def _duration(controller: Controller, time: float) -> float:
@@ -249,14 +253,14 @@ def _with_exact_sensors(options: Mapping[str, Any]) -> dict[str, Any]:
 def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
     error, merits = run.p - run.reference, []
     for k, s in enumerate(run.plant.outputs):
-        merits.append(Merit(f"{s.name}, rms", rms(error[:, k]), FINE.get(s.unit, s.unit)))
+        merits.append(Merit(f"{s.name}, rms", rms(error[:, k]), FINE_UNITS.get(s.unit, s.unit)))
     for k, s in enumerate(run.plant.inputs):
         merits.append(Merit(f"{s.name}, rms", float(run.v[:, k].std()), s.unit))
     return tuple(merits)
 
 
 def _step_merits(run: Trajectory, output: int, size: float) -> tuple[Merit, ...]:
-    first = int(BEFORE * len(run.t))
+    first = int(LEAD_SHARE * len(run.t))
     share = (run.p[first:, output] - run.reference[0, output]) / size
     t = run.t[first:] - run.t[first]
     outside = np.flatnonzero(np.abs(share - 1) > 0.02)
@@ -266,12 +270,12 @@ def _step_merits(run: Trajectory, output: int, size: float) -> tuple[Merit, ...]
     merits = [
         Merit("overshoot", max(0.0, float(share.max()) - 1), "percent"),
         Merit("within 2 % after", settled, "ms", key="settled"),
-        Merit("left at the end", abs(float(share[-1]) - 1) * abs(size), FINE.get(unit, unit)),
+        Merit("left at the end", abs(float(share[-1]) - 1) * abs(size), FINE_UNITS.get(unit, unit)),
     ]
     units = {s.unit for k, s in enumerate(run.plant.outputs) if k != output}
     if others.size and len(units) == 1:
         (other,) = units
-        merits.append(Merit("others move by", float(np.abs(others).max()), FINE.get(other, other)))
+        merits.append(Merit("others move by", float(np.abs(others).max()), FINE_UNITS.get(other, other)))
     return tuple(merits)
 
 
@@ -280,7 +284,7 @@ def _load_merits(run: Trajectory) -> tuple[Merit, ...]:
     error = np.abs(run.p - run.reference)
     k = int(error.max(axis=0).argmax())
     signal = run.plant.outputs[k]
-    fine = FINE.get(signal.unit, signal.unit)
+    fine = FINE_UNITS.get(signal.unit, signal.unit)
     return (
         Merit(f"{signal.name} moves by", float(error[:, k].max()), fine),
         Merit(f"{signal.name}, left at the end", float(error[-1, k]), fine),
@@ -303,11 +307,11 @@ EXPERIMENTS: Mapping[str, Callable[..., Experiment]] = {
 
 
 # Fields of a scenario that the experiment itself decides. All others are options, and so is the engine.
-MADE = {
+EXPERIMENT_FIELDS = {
     *("name", "reference", "start", "cold", "disturbance", "anticipated", "excitation"),
     *("faults", "correction", "changes"),
 }
-OPTIONS = {f.name for f in fields(Scenario)} - MADE | {"engine"}
+OPTIONS = {f.name for f in fields(Scenario)} - EXPERIMENT_FIELDS | {"engine"}
 
 
 def experiments_of(plant: Plant) -> Mapping[str, Callable[..., Experiment]]:
@@ -329,7 +333,7 @@ def main_job(plant: Plant) -> str:
     return next(iter(experiments_of(plant)))
 
 
-def settling(name: str, plant: Plant) -> dict[str, float]:
+def settling_option(name: str, plant: Plant) -> dict[str, float]:
     """The option with which yields of an experiment are counted: the machine's SETTLE before its main job."""
     seconds = float(setting(plant, "SETTLE", 0.0)) if name == main_job(plant) else 0.0
     return {"settle": seconds} if seconds else {}
@@ -427,14 +431,14 @@ def _check(name: str, plant: Plant, options: Mapping[str, Any]) -> None:
     for option, value in options.items():
         if option in OPTIONS and option not in mine:
             continue
-        expected = _expected(value, option_of(name, plant, option))
+        expected = _expected_kind(value, option_of(name, plant, option))
         if expected:
             raise InputError("simulate", f"{name}: {option}", repr(value), expected)
         if check is not None:
             check(name, option, value)
 
 
-def _expected(value: Any, default: Any) -> str:
+def _expected_kind(value: Any, default: Any) -> str:
     """The kind of value that an option with this default takes; "" where the value is of that kind."""
     if isinstance(default, bool):
         return "" if isinstance(value, bool) else "true or false"
@@ -460,8 +464,8 @@ def _is_number(value: Any) -> bool:
 
 PAYLOAD = "payload"  # name of the experiment
 PLACES_OF_REST = (-1.0, 0.0, 1.0)  # of the travel
-HEAVIEST = 1e6  # kg; what holds that is not limited by its forces
-UNREACHED = 2.0  # share of a limit, beyond it, where no command makes the forces
+MAX_PAYLOAD = 1e6  # kg; what holds that is not limited by its forces
+UNREACHED_SHARE = 2.0  # share of a limit, beyond it, where no command makes the forces
 FINENESS = 0.02  # of a mass: how finely the flight is bisected
 
 
@@ -492,7 +496,7 @@ def held_payload(plant: Plant) -> float:
         try:
             held = [balance(heavier, plant.state(at)).v for at in places]
         except CheckError:  # no command makes these forces
-            return UNREACHED
+            return UNREACHED_SHARE
         return float(np.abs(np.array(held) / limits).max())
 
     if share_used(0.0) >= 1:
@@ -502,7 +506,7 @@ def held_payload(plant: Plant) -> float:
     high = par.m
     while share_used(high) < 1:
         high *= 2
-        if high > HEAVIEST:
+        if high > MAX_PAYLOAD:
             return math.inf
     return float(brentq(lambda extra: share_used(extra) - 1, 0.0, high, xtol=1e-9))
 
@@ -515,7 +519,7 @@ def flown_payload(plant: Plant, controller: Controller, most: float) -> tuple[fl
     def carries(mass: float) -> bool:
         return experiment(PAYLOAD, plant, controller, masses=(mass,)).cases[0].run.verdict.completed
 
-    return largest_mass(carries, most if math.isfinite(most) else HEAVIEST)
+    return largest_mass(carries, most if math.isfinite(most) else MAX_PAYLOAD)
 
 
 def largest_mass(carries: Callable[[float], bool], most: float) -> tuple[float, float]:

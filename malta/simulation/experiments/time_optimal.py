@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
 ROUNDS = 8  # meshes, at most
-STILL = 5e-4  # share of T by which the last mesh may still change T
+MAX_LAST_CHANGE = 5e-4  # share of T by which the last mesh may still change T
 TOLERANCE = 1e-3  # of a state's range and of the current limit, between the nodes
 IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 500, "mu_strategy": "adaptive"}
 
@@ -280,7 +280,7 @@ def _solve_on_refined_meshes(
     x: FloatArray,
     T: float,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Nodes, x and T on the first mesh that changes T by less than STILL of it. CheckError after ROUNDS meshes."""
+    """Nodes, x and T on the first mesh that changes T by less than MAX_LAST_CHANGE. CheckError after ROUNDS meshes."""
     x, T = solve(s, x, T)
     for _ in range(ROUNDS - 1):
         # The same number of nodes: half of them spread over T, half over the changes of u.
@@ -290,7 +290,7 @@ def _solve_on_refined_meshes(
         guess = np.array([np.interp(finer, s, row) for row in x])
         s, T_before = finer, T
         x, T = solve(s, guess, T)
-        if abs(T - T_before) <= STILL * T:
+        if abs(T - T_before) <= MAX_LAST_CHANGE * T:
             return s, x, T
     raise CheckError(f"fastest stroke: T still changes after {ROUNDS} meshes")
 

@@ -48,7 +48,7 @@ from malta.machines.tubular.experiments.strokes import (
 from malta.simulation.experiments import Experiment, PlannedRun, experiment_of, merits_of_first
 
 if TYPE_CHECKING:
-    from malta.identification.commission import Step
+    from malta.identification.commission import Check
 
 EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "stroke": experiment_of("stroke", "Does it follow the stroke?", stroke_cases, merits_of_first),
@@ -76,7 +76,7 @@ CASES: dict[str, Callable[..., list[PlannedRun]]] = {
     "drive-limits": drive_limit_cases,
     "carrier": carrier_cases,
 }
-SHORTEST, LONGEST = 0.5, 60.0  # s, of one way of the slow stroke
+MIN_STROKE_TIME, MAX_STROKE_TIME = 0.5, 60.0  # s, of one way of the slow stroke
 MOST_POINTS = 201  # of a side of a map
 FINDINGS = ("payload", "disturbance", "faults", "carrier", "capture", "supervised-faults")
 ALONE = ("stroke", "hold", "tilt")
@@ -101,9 +101,12 @@ def check(name: str, option: str, value: Any) -> None:
     """Raise InputError for a number that is zero or not finite. Strokes and logs check their own options."""
     if option in ("distance", "rise", "profile", "during", "only", "log", "known"):
         return
-    if option == "way" and not SHORTEST <= value <= LONGEST:
+    if option == "way" and not MIN_STROKE_TIME <= value <= MAX_STROKE_TIME:
         raise InputError(
-            "simulate", f"{name}: way", f"{value:g} s", f"a time from {SHORTEST:g} to {LONGEST:g} s"
+            "simulate",
+            f"{name}: way",
+            f"{value:g} s",
+            f"a time from {MIN_STROKE_TIME:g} to {MAX_STROKE_TIME:g} s",
         )
     if option == "points" and not (isinstance(value, int) and 3 <= value <= MOST_POINTS):
         raise InputError(
@@ -138,7 +141,7 @@ def _is_published(scenario: str, options: Mapping[str, Any]) -> bool:
     return scenario == "stroke" and all(options.get(name, value) == value for name, value in asked.items())
 
 
-def commissioning_steps(box: Mapping[str, float]) -> tuple[Step, ...]:
+def commissioning_steps(box: Mapping[str, float]) -> tuple[Check, ...]:
     """The checklist of `malta commission`."""
     from malta.machines.tubular.bench import steps
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.firmware.supervisor import FLYING, State
+from malta.firmware.supervisor import IN_FLIGHT, State
 from malta.firmware.supervisor_text import NUMBERS, Flown, Requests, require_compiler, supervised_engine
 from malta.machines.tubular.experiments.faults import (
-    AT,
-    SOFT,
+    FAULT_TIME,
+    MAX_LANDING_SPEED,
     contact_of,
     contacts_of,
     fly_moments,
@@ -40,8 +40,8 @@ from malta.simulation.trajectory import Trajectory, Verdict
 from malta.synthesis.controller import Controller
 
 STROKE, LAND, END = 0.4, 0.5, 0.75  # s: middle of the stroke, request to land, end
-LASTING = 0.4  # s, of a run with a fault: room for a landing
-WITH = " (s)"  # in the label of a run with the supervisor
+FAULT_RUN_TIME = 0.4  # s, of a run with a fault: room for a landing
+SUFFIX = " (s)"  # in the label of a run with the supervisor
 
 
 def commissioning(
@@ -65,7 +65,7 @@ def commissioning(
     engine = supervised_engine(flights, Requests(land=LAND))
     planned = [PlannedRun("commissioning", scenario, lambda _: ())]
     (case,), cut = fly(plant, controller, planned, progress, options | {"engine": engine})
-    run = _judged(case.run, flights[0], from_rest=True)
+    run = _judge(case.run, flights[0], from_rest=True)
     case = Case("commissioning", run, _commissioning_merits(run, flights[0]))
     states = flights[0].states(run.t).astype(float)
     curves = {"state": states, "followed": flights[0].references(run.t)}
@@ -98,14 +98,14 @@ def supervised_faults(
                 "simulate", "supervised-faults: during", found, "all phases of a flight: without it"
             )
         return fly_moments(plant, controller, moments, only, progress, options)
-    wanted = planned_faults("supervised-faults", plant, controller, during, options, LASTING)
+    wanted = planned_faults("supervised-faults", plant, controller, during, options, FAULT_RUN_TIME)
     chosen = [one for one in wanted if only in ("all", *one.label.split())]
     if not chosen:
         words = " ".join(sorted({word for one in wanted for word in one.label.split()}))
         raise InputError("simulate", "supervised-faults: only", repr(only), f"all, or one of {words}")
     rest = tuple(outputs_at(plant, plant.at(**rest_on_bearing(plant)).x).tolist())
     flights: list[Flown] = []
-    engines: dict[str, Any] = {"": "auto", WITH: supervised_engine(flights, Requests(take_over=rest))}
+    engines: dict[str, Any] = {"": "auto", SUFFIX: supervised_engine(flights, Requests(take_over=rest))}
     cases: list[Case] = []
     curves: dict[str, FloatArray] = {}
     cut = False
@@ -114,8 +114,8 @@ def supervised_faults(
             share = progress_of_part(progress, 2 * n + k, 2 * len(chosen))
             (case,), cut = fly(plant, controller, [one], share, options | {"engine": engine})
             run, label = case.run, one.label + who
-            if who == WITH:
-                run = _judged(run, flights[-1], from_rest=False)
+            if who == SUFFIX:
+                run = _judge(run, flights[-1], from_rest=False)
                 curves[one.label] = flights[-1].states(run.t).astype(float)
             cases.append(Case(label, run, _fault_merits(run)))
             if cut:
@@ -141,17 +141,17 @@ def _require_own_engine(name: str, options: Mapping[str, Any]) -> None:
         raise InputError("simulate", f"{name}: engine", found, "auto: the C flies, with its supervisor")
 
 
-def _judged(run: Trajectory, flown: Flown, *, from_rest: bool) -> Trajectory:
+def _judge(run: Trajectory, flown: Flown, *, from_rest: bool) -> Trajectory:
     """The run with the verdict of a supervised flight: slow contact in a lift-off or at a landing's end is none."""
     if run.verdict.name in ("interrupted", "diverged", run.plant.contacts.names[-1]):
         return run
     states = flown.states(run.t)
     if from_rest and not (states == NUMBERS["OPERATE"]).any():
         return replace(run, verdict=Verdict("not lifted", float(run.t[-1])))
-    flying = np.isin(states, [NUMBERS[state] for state in FLYING if state != "LIFT"])
+    flying = np.isin(states, [NUMBERS[state] for state in IN_FLIGHT if state != "LIFT"])
     met, speeds = contacts_of(run)
     low = np.isin(states[met], [NUMBERS[state] for state in ("LIFT", "LANDING", "OFF")])
-    hard = met[~low | (speeds > SOFT)]
+    hard = met[~low | (speeds > MAX_LANDING_SPEED)]
     if not len(hard) or not flying.any():
         return replace(run, verdict=Verdict("completed", run.scenario.duration))
     k = hard[0]
@@ -171,7 +171,7 @@ def _commissioning_merits(run: Trajectory, flown: Flown) -> tuple[Merit, ...]:
         at = np.flatnonzero(states == NUMBERS[state])
         return float(run.t[at[0]]) if len(at) else math.nan
 
-    flying = np.isin(states, [NUMBERS[state] for state in FLYING])
+    flying = np.isin(states, [NUMBERS[state] for state in IN_FLIGHT])
     changed = np.flatnonzero(flying[1:] & flying[:-1] & (states[1:] != states[:-1])) + 1
     v = run.v
     jumps = np.abs(v[changed] - v[changed - 1]).max(initial=0.0)
@@ -196,16 +196,18 @@ def _fault_merits(run: Trajectory) -> tuple[Merit, ...]:
     others = [k for k in range(run.p.shape[1]) if k != run.plant.stroke_output]
     at, speed = contact_of(run)
     return (
-        Merit("largest deviation", float(np.abs(run.p[run.t >= AT][:, others]).max(initial=0.0)), "um"),
-        Merit("contact after", at - AT, "ms"),
+        Merit(
+            "largest deviation", float(np.abs(run.p[run.t >= FAULT_TIME][:, others]).max(initial=0.0)), "um"
+        ),
+        Merit("contact after", at - FAULT_TIME, "ms"),
         Merit("its speed", speed, "mm/s", key="contact_speed", better=""),
     )
 
 
 def _counts(cases: list[Case]) -> tuple[Merit, ...]:
     """Touchdowns without and with the supervisor, and landings."""
-    supervised = [case for case in cases if case.label.endswith(WITH)]
-    alone = [case for case in cases if not case.label.endswith(WITH)]
+    supervised = [case for case in cases if case.label.endswith(SUFFIX)]
+    alone = [case for case in cases if not case.label.endswith(SUFFIX)]
     down, still = (float(sum(not c.run.verdict.completed for c in part)) for part in (alone, supervised))
     landed = sum(case.run.verdict.completed and case.merits[2].value >= 0 for case in supervised)
     return (

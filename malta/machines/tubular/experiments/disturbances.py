@@ -14,7 +14,7 @@ from malta.machines.tubular.experiments.strokes import delayed_stroke
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
-    QUIET,
+    NO_NOISE,
     Experiment,
     Merit,
     PlannedRun,
@@ -68,20 +68,22 @@ def disturbance_cases(plant: Plant, _: Controller, **options: Any) -> list[Plann
     wanted: list[PlannedRun] = []
     for name, size, seen in (("F_x", 1.0, "x1"), ("F_z", 1.0, plant.stroke.name), ("T_y", 0.05, "x1")):
         push = partial(step_wrench, column=names.index(name), size=size, at=0.02, width=len(names))
-        scenario = scenario_of("disturbance", 0.4, references.hold, QUIET | {"disturbance": push} | options)
+        scenario = scenario_of(
+            "disturbance", 0.4, references.hold, NO_NOISE | {"disturbance": push} | options
+        )
         unit = plant.disturbances[names.index(name)].unit
         merits = partial(_step_merits, output=outputs.index(seen))
         wanted.append(PlannedRun(f"step of {size:g} {unit} {name}", scenario, merits))
     shake = partial(
         sine_wrench, column=names.index("F_y"), size=plant.stroke.mass, frequency=50.0, width=len(names)
     )
-    vibration = scenario_of("vibration", 0.3, references.hold, QUIET | {"disturbance": shake} | options)
+    vibration = scenario_of("vibration", 0.3, references.hold, NO_NOISE | {"disturbance": shake} | options)
     shaken = partial(_sine_merits, output=outputs.index("y1"), frequency=50.0)
     wanted.append(PlannedRun("housing shaken by 1 m/s2 at 50 Hz along y", vibration, shaken))
     for f in TONES:
         push = partial(sine_wrench, column=names.index("F_x"), size=TONE_FORCE, frequency=f, width=len(names))
         scenario = scenario_of(
-            "sine", 2 * max(0.1, 4 / f), references.hold, QUIET | {"disturbance": push} | options
+            "sine", 2 * max(0.1, 4 / f), references.hold, NO_NOISE | {"disturbance": push} | options
         )
         found = partial(_sine_merits, output=outputs.index("x1"), frequency=f)
         wanted.append(PlannedRun(f"{f:g} Hz", scenario, found))
@@ -113,8 +115,8 @@ def _sine_merits(run: Trajectory, output: int, frequency: float) -> tuple[Merit,
 # is known at the sample at which it acts, not before.
 
 
-BEGIN, AFTER = 0.02, 0.08  # s, before and after the carrier's move
-KNOWN = {"not fed forward": 0.0, "fed forward": 1.0, "90 % fed forward": 0.9}  # share of the acceleration
+BEGIN, TIME_AFTER = 0.02, 0.08  # s, before and after the carrier's move
+FED_SHARES = {"not fed forward": 0.0, "fed forward": 1.0, "90 % fed forward": 0.9}  # of the acceleration
 
 
 def carrier(
@@ -144,10 +146,10 @@ def carrier_cases(
     plant: Plant, _: Controller, *, carried: float, within: float, **options: Any
 ) -> list[PlannedRun]:
     """The runs of `carrier`: at rest, and during the published stroke."""
-    duration = BEGIN + within + AFTER
+    duration = BEGIN + within + TIME_AFTER
     wanted = []
     for place, reference in (("rest", references.hold), ("stroke", partial(delayed_stroke, wait=BEGIN))):
-        for label, share in KNOWN.items():
+        for label, share in FED_SHARES.items():
             acts = partial(inertial_wrench, plant=plant, carried=carried, within=within)
             own: dict[str, Any] = {"disturbance": acts}
             own |= {"anticipated": partial(acts, share=share)} if share else {}
@@ -192,19 +194,19 @@ def _merits(run: Trajectory) -> tuple[Merit, ...]:
 
 def hold_cases(_: Plant, controller: Controller, **options: Any) -> list[PlannedRun]:
     """Rest at the middle with sensor noise: statistics of the last 2000 measured samples, and the true motion."""
-    scenario = scenario_of("hold", (RESTING + 6000) * controller.sample_time, references.hold, options)
+    scenario = scenario_of("hold", (REST_SAMPLES + 6000) * controller.sample_time, references.hold, options)
     return [PlannedRun("hold", scenario, _rest_merits)]
 
 
 hold = experiment_of("hold", "How still does it stand?", hold_cases, merits_of_first)
 
 
-RESTING = 2000  # samples of the statistics, Table III
+REST_SAMPLES = 2000  # samples of the statistics, Table III
 
 
 def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
-    """Statistics of the last RESTING samples: measured, true, and of the bearing forces."""
-    plant, y, p, v = run.plant, run.y[-RESTING:], run.p[-RESTING:], run.v[-RESTING:]
+    """Statistics of the last REST_SAMPLES samples: measured, true, and of the bearing forces."""
+    plant, y, p, v = run.plant, run.y[-REST_SAMPLES:], run.p[-REST_SAMPLES:], run.v[-REST_SAMPLES:]
     names = [signal.name for signal in plant.outputs]
     bearings = [k for k in range(len(plant.inputs)) if k != plant.thrust_input]
     return (
@@ -235,7 +237,7 @@ def tilt_cases(
         PlannedRun(
             f"feedforward {kind}",
             scenario_of(
-                "tilt", 2 / frequency, reference, {"start": AT_REST} | options | {"feedforward": kind}
+                "tilt", 2 / frequency, reference, {"start": REST_STATE} | options | {"feedforward": kind}
             ),
             merits,
         )
@@ -243,7 +245,7 @@ def tilt_cases(
     ]
 
 
-AT_REST = dict.fromkeys(("x", "y", "alpha", "beta", "x_dot", "y_dot", "alpha_dot", "beta_dot"), 0.0)
+REST_STATE = dict.fromkeys(("x", "y", "alpha", "beta", "x_dot", "y_dot", "alpha_dot", "beta_dot"), 0.0)
 
 
 def _tilt_merits(run: Trajectory, settled: float) -> tuple[Merit, ...]:

@@ -51,7 +51,7 @@ from malta.synthesis.controller import Controller
 # Faults of sensors, samples, a phase and the DC link.
 
 
-AT = 0.05  # s, when faults strike
+FAULT_TIME = 0.05  # s, when faults strike
 
 
 def faults(
@@ -83,7 +83,7 @@ def planned_faults(
     hold."""
     if during not in ("stroke", "hold"):
         raise InputError("simulate", f"{name}: during", repr(during), "stroke or hold")
-    at, Ts = AT, controller.sample_time
+    at, Ts = FAULT_TIME, controller.sample_time
     eps = Ts / 4  # faults begin and end between samples
     # A logistic of slope k = 2 ln 9 / rise has its largest acceleration ln(2 + sqrt 3) / k before its middle.
     early = math.log(2 + math.sqrt(3)) * RISE / (2 * math.log(9))
@@ -140,7 +140,7 @@ def _fault_merits(run: Trajectory, at: float) -> tuple[Merit, ...]:
 # When and how fast the mover meets its touchdown bearings.
 
 
-SOFT = 0.05  # m/s: a landing that meets its bearing faster is a touchdown; a fall by 33 um, pulled by the magnets
+MAX_LANDING_SPEED = 0.05  # m/s: faster is a touchdown; a fall by 33 um, pulled by the magnets
 
 
 def contacts_of(run: Trajectory, since: float = 0.0) -> tuple[NDArray[np.intp], FloatArray]:
@@ -175,10 +175,10 @@ PHASES: dict[Phase, tuple[float, float, float, float]] = {
     "landing": (0.005, 0.205, 0.005, 0.26),
 }
 STROKE_CENTRE = 0.04  # s
-MOST = 1000  # moments of a class
+MAX_MOMENTS = 1000  # moments of a class
 
 
-class Kind(NamedTuple):
+class FaultKind(NamedTuple):
     """A class of faults: what it does to readings, requests and commands, or which faults of the simulation it is."""
 
     label: str
@@ -191,7 +191,7 @@ class Kind(NamedTuple):
 class Blow:
     """A fault at a moment."""
 
-    kind: Kind
+    kind: FaultKind
     phase: Phase
     at: float  # s
     sensor: int
@@ -245,30 +245,30 @@ def _shift(size: float) -> Callable[[Blow, Any, Any], None]:
     return change_reading("y", "sensor", lambda b, y: y + b.sign * b.scale * size)
 
 
-KINDS: tuple[Kind, ...] = (
-    Kind("sensor lost", change_reading("y", "sensor", lambda _, __: math.nan)),
-    Kind("sensor stuck", change_reading("y", "sensor", freeze)),
-    Kind("sensor biased by 20 um", _shift(20e-6)),
-    Kind("sensor jumps by 200 um", _shift(200e-6)),
-    Kind(
+KINDS: tuple[FaultKind, ...] = (
+    FaultKind("sensor lost", change_reading("y", "sensor", lambda _, __: math.nan)),
+    FaultKind("sensor stuck", change_reading("y", "sensor", freeze)),
+    FaultKind("sensor biased by 20 um", _shift(20e-6)),
+    FaultKind("sensor jumps by 200 um", _shift(200e-6)),
+    FaultKind(
         "sensor noisier by 10 um",
         change_reading("y", "sensor", lambda b, y: y + b.scale * 10e-6 * b.rng.normal()),
     ),
-    Kind("one current lost", change_reading("i_valid", "current", lambda _, __: 0.0)),
-    Kind("all currents lost", change_reading("i", "", lambda _, __: math.nan)),
-    Kind("one current frozen", change_reading("i", "current", freeze)),
-    Kind("one current reads 70 %", change_reading("i", "current", lambda _, i: 0.7 * i)),
-    Kind("link at 50 %", simulated=lambda b, _, __: (Fault("link sag", b.at, math.inf, size=0.5),)),
-    Kind("link reads 130 %", change_reading("link", "", lambda _, link: 1.3 * link)),
-    Kind("one phase open", simulated=_open),
-    Kind("a half-bridge stuck", command=_stick_gates),
-    Kind("safe torque off", _cut_torque, simulated=_open_all),
-    Kind("1 step missed", simulated=partial(_miss, steps=1)),
-    Kind("20 steps missed", simulated=partial(_miss, steps=20)),
+    FaultKind("one current lost", change_reading("i_valid", "current", lambda _, __: 0.0)),
+    FaultKind("all currents lost", change_reading("i", "", lambda _, __: math.nan)),
+    FaultKind("one current frozen", change_reading("i", "current", freeze)),
+    FaultKind("one current reads 70 %", change_reading("i", "current", lambda _, i: 0.7 * i)),
+    FaultKind("link at 50 %", simulated=lambda b, _, __: (Fault("link sag", b.at, math.inf, size=0.5),)),
+    FaultKind("link reads 130 %", change_reading("link", "", lambda _, link: 1.3 * link)),
+    FaultKind("one phase open", simulated=_open),
+    FaultKind("a half-bridge stuck", command=_stick_gates),
+    FaultKind("safe torque off", _cut_torque, simulated=_open_all),
+    FaultKind("1 step missed", simulated=partial(_miss, steps=1)),
+    FaultKind("20 steps missed", simulated=partial(_miss, steps=20)),
 )
 
 
-class Outcome(NamedTuple):
+class FaultOutcome(NamedTuple):
     """What came of a fault at a moment: a row of the experiment's curves."""
 
     phase: int  # index in PHASES
@@ -294,12 +294,12 @@ def fly_moments(
 
     only : "all", or a word in the labels of classes
 
-    Raises InputError for another one, for less than one moment or more than MOST, and for a fidelity without phases,
-    whose currents could not be lost.
+    Raises InputError for another one, for less than one moment or more than MAX_MOMENTS, and for a fidelity without
+    phases, whose currents could not be lost.
     """
-    kinds = _chosen(only, moments, options)
+    kinds = _choose_kinds(only, moments, options)
     healthy: dict[Phase, Flown] = {}
-    rows: dict[str, list[Outcome]] = {}
+    rows: dict[str, list[FaultOutcome]] = {}
     worst: dict[str, Trajectory] = {}
     cut = False
     try:
@@ -322,11 +322,11 @@ def fly_moments(
     return Experiment("supervised-faults", question, cases, totals_of(curves), curves, interrupted=cut)
 
 
-def _chosen(only: str, moments: int, options: Mapping[str, Any]) -> list[Kind]:
+def _choose_kinds(only: str, moments: int, options: Mapping[str, Any]) -> list[FaultKind]:
     """The classes that are asked for."""
-    if not isinstance(moments, int) or not 1 <= moments <= MOST:
+    if not isinstance(moments, int) or not 1 <= moments <= MAX_MOMENTS:
         raise InputError(
-            "simulate", "supervised-faults: moments", repr(moments), f"a whole number, 1 to {MOST}"
+            "simulate", "supervised-faults: moments", repr(moments), f"a whole number, 1 to {MAX_MOMENTS}"
         )
     if options.get("fidelity", "phase") != "phase":
         asked = repr(options["fidelity"])
@@ -340,15 +340,17 @@ def _chosen(only: str, moments: int, options: Mapping[str, Any]) -> list[Kind]:
     return found
 
 
-def draw_blows(plant: Plant, kinds: Sequence[Kind], moments: int, seed: int) -> Iterator[tuple[Kind, Blow]]:
+def draw_blows(
+    plant: Plant, kinds: Sequence[FaultKind], moments: int, seed: int
+) -> Iterator[tuple[FaultKind, Blow]]:
     """The faults of a campaign; those of a class do not depend on which others are flown, nor on how many."""
     for kind in kinds:
         rng = np.random.default_rng([seed, KINDS.index(kind)])
         for m in range(moments):
-            yield kind, _drawn(kind, m, plant, rng)
+            yield kind, _draw_fault(kind, m, plant, rng)
 
 
-def _drawn(kind: Kind, m: int, plant: Plant, rng: np.random.Generator) -> Blow:
+def _draw_fault(kind: FaultKind, m: int, plant: Plant, rng: np.random.Generator) -> Blow:
     """A fault at a random moment of the phase whose turn it is."""
     phase = list(PHASES)[m % len(PHASES)]
     begin, end, _, _ = PHASES[phase]
@@ -401,11 +403,11 @@ def _healthy(plant: Plant, c: Controller, phase: Phase, options: Mapping[str, An
     """The flight of a phase without a fault."""
     flights: list[Flown] = []
     engine = supervised_engine(flights, _requests(plant, phase))
-    _flown(plant, c, _scenario(plant, phase, (), options), engine, None)
+    _fly(plant, c, _scenario(plant, phase, (), options), engine, None)
     return flights[0]
 
 
-def _flown(
+def _fly(
     plant: Plant, c: Controller, scenario: Scenario, engine: Any, progress: Progress | None
 ) -> Trajectory:
     """A flight to its end. Raises KeyboardInterrupt where Ctrl-C ended it before."""
@@ -422,7 +424,7 @@ def _strike(
     healthy: Flown,
     options: Mapping[str, Any],
     progress: Progress | None,
-) -> tuple[Outcome, Trajectory]:
+) -> tuple[FaultOutcome, Trajectory]:
     """A fault with the supervisor and without it: what came of both, and the supervised run."""
     simulated = () if b.kind.simulated is None else b.kind.simulated(b, plant, c.sample_time)
     scenario = _scenario(plant, b.phase, simulated, options)
@@ -435,14 +437,14 @@ def _strike(
             if supervised
             else unsupervised_engine(healthy, faults)
         )
-        runs.append(_flown(plant, c, scenario, engine, progress_of_part(progress, n, 2)))
+        runs.append(_fly(plant, c, scenario, engine, progress_of_part(progress, n, 2)))
     ended = [NUMBERS["OFF"], NUMBERS["FAULT"]]
     t, states = np.array(flights[0].t), np.array(flights[0].state)
     off = t[np.isin(states, ended) & (t >= b.at)]
     speed_alone, speed = (float(np.nan_to_num(contact_of(run, b.at)[1])) for run in runs)
     current_alone, current = (float(np.abs(run.i[run.t >= b.at]).max(initial=0.0)) for run in runs)
     end = replace(runs[1], verdict=Verdict("completed", float(runs[1].t[-1])))  # a contact is a figure
-    outcome = Outcome(
+    outcome = FaultOutcome(
         phase=list(PHASES).index(b.phase),
         at=b.at,
         speed_alone=speed_alone,
@@ -451,19 +453,19 @@ def _strike(
         current=current,
         phase_current=float(np.abs(end.i_phase[end.t >= b.at]).max(initial=0.0)),
         safe=float(off[0]) - b.at if len(off) else math.nan,
-        monitor=_acted(flights[0], b.at),
+        monitor=_last_monitor(flights[0], b.at),
     )
     return outcome, end
 
 
-def _acted(flown: Flown, since: float) -> int:
+def _last_monitor(flown: Flown, since: float) -> int:
     """The last monitor that acted after a time, or -1: none, or one that had acted before."""
     before = [monitor for t, monitor in zip(flown.t, flown.monitor, strict=True) if t < since]
     last = flown.monitor[-1]
     return -1 if before and last == before[-1] else last
 
 
-def _merits(rows: Sequence[Outcome]) -> tuple[Merit, ...]:
+def _merits(rows: Sequence[FaultOutcome]) -> tuple[Merit, ...]:
     """The worst of a class."""
     off = [row.safe for row in rows if not math.isnan(row.safe)]
     return (
@@ -477,9 +479,9 @@ def _merits(rows: Sequence[Outcome]) -> tuple[Merit, ...]:
 
 def totals_of(curves: Mapping[str, FloatArray]) -> tuple[Merit, ...]:
     """Of all classes together."""
-    rows = [Outcome(*row) for found in curves.values() for row in found]
+    rows = [FaultOutcome(*row) for found in curves.values() for row in found]
     alone, supervised = (
-        float(sum(speed > SOFT for speed in speeds))
+        float(sum(speed > MAX_LANDING_SPEED for speed in speeds))
         for speeds in ([row.speed_alone for row in rows], [row.speed for row in rows])
     )
     return (

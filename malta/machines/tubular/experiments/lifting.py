@@ -19,7 +19,7 @@ from malta.model.plant import Plant, outputs_at
 from malta.simulation import references
 from malta.simulation.engine.batch import is_compiled, simulate_many
 from malta.simulation.experiments import (
-    QUIET,
+    NO_NOISE,
     Experiment,
     Merit,
     PlannedRun,
@@ -147,7 +147,10 @@ def payload(
     reference = partial(delayed_stroke, wait=WAIT)
     wanted = []
     for extra in masses:
-        own: dict[str, Any] = {"changes": ((PICKED, {"m": plant.stroke.mass + extra}),), "bearing": True}
+        own: dict[str, Any] = {
+            "changes": ((PICKING_TIME, {"m": plant.stroke.mass + extra}),),
+            "bearing": True,
+        }
         own |= {"anticipated": partial(payload_wrench, plant=plant, extra=extra)} if known else {}
         scenario = scenario_of("payload", WAIT + 0.15, reference, own | options)
         wanted.append(PlannedRun(f"{extra * 1e3:.0f} g", scenario, _payload_merits))
@@ -159,14 +162,14 @@ def payload(
     return Experiment("payload", "What can it pick and move?", cases, (merit,), interrupted=cut)
 
 
-PICKED, WAIT = 0.05, 0.5  # s: the mass is picked, the stroke begins
+PICKING_TIME, WAIT = 0.05, 0.5  # s: the mass is picked, the stroke begins
 
 
 def payload_wrench(t: FloatArray, plant: Plant, extra: float) -> FloatArray:
     """The load that a mass (kg) adds on the published stroke, from the pick on: F_y = -m g, F_z = -m z*''."""
     names = [s.name for s in plant.disturbances]
     par: Any = plant.parameters
-    wrench, picked = np.zeros((len(t), len(names))), np.asarray(t) >= PICKED
+    wrench, picked = np.zeros((len(t), len(names))), np.asarray(t) >= PICKING_TIME
     wrench[:, names.index("F_y")] = -extra * par.g * picked
     along = delayed_stroke(plant, WAIT)(np.asarray(t)).ddp[:, plant.stroke_output]
     wrench[:, names.index("F_z")] = -extra * along * picked
@@ -176,7 +179,7 @@ def payload_wrench(t: FloatArray, plant: Plant, extra: float) -> FloatArray:
 def _payload_merits(run: Trajectory) -> tuple[Merit, ...]:
     """Sag after the pick, and overshoot and errors of the stroke."""
     error, axis = np.abs(run.p - run.reference), run.plant.stroke_output
-    carrying, moving = (run.t >= PICKED) & (run.t < WAIT), run.t >= WAIT
+    carrying, moving = (run.t >= PICKING_TIME) & (run.t < WAIT), run.t >= WAIT
     radial = [k for k in range(error.shape[1]) if k != axis]
     start, end = run.reference[[0, -1], axis]
     beyond = (run.p[moving, axis] - end) / (end - start)
@@ -198,11 +201,14 @@ def _payload_merits(run: Trajectory) -> tuple[Merit, ...]:
 
 PLANES = (("x", "beta"), ("y", "alpha"), ("z", "x"))  # of the maps: across and up
 RAYS = {"x": ("x", 1), "y up": ("y", 1), "y down": ("y", -1), "beta": ("beta", 1)}
-LASTING = 0.15  # s of a run: some 30 time constants of the unstable modes
-BEYOND = 1.2  # half width of a map in multiples of what the force limit allows
-FINE, REFINED = 64, 2  # starts on a ray, and how often the interval in which it ends is divided by them
-RANDOM = 1024  # starts inside the clearance
-AT_ONCE = 0.7  # share of the work that the maps are
+RUN_TIME = 0.15  # s of a run: some 30 time constants of the unstable modes
+MAP_WIDTH = 1.2  # half width of a map in multiples of what the force limit allows
+RAY_STARTS, REFINEMENTS = (
+    64,
+    2,
+)  # starts on a ray, and how often the interval in which it ends is divided by them
+RANDOM_STARTS = 1024  # starts inside the clearance
+MAP_WORK_SHARE = 0.7  # share of the work that the maps are
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,13 +245,13 @@ def capture(
     par: Any = plant.parameters
     bounds = _bounds(plant)
     furthest = max(float(np.hypot(*(b * (1, par.l_S)).T).max()) for b in bounds.values())
-    wide = plant.variant(replace(par, r_max=2 * BEYOND * furthest))
-    scenario = scenario_of("capture", LASTING, references.hold, QUIET | options)
+    wide = plant.variant(replace(par, r_max=2 * MAP_WIDTH * furthest))
+    scenario = scenario_of("capture", RUN_TIME, references.hold, NO_NOISE | options)
     if not is_compiled(plant, controller, scenario):
         raise InputError("simulate", "capture", "no C compiler", "one: these are thousands of runs")
     free = _Released(wide, controller, scenario, par.r_max)
-    parts = _Parts(progress)
-    maps, axes = _maps(free, bounds, points, parts.until(AT_ONCE))
+    parts = _PartProgress(progress)
+    maps, axes = _maps(free, bounds, points, parts.until(MAP_WORK_SHARE))
     allowed = {
         name: reach(bounds[_plane_of(state)], _along(state, sign)) for name, (state, sign) in RAYS.items()
     }
@@ -261,7 +267,7 @@ def capture(
     return Experiment("capture", "From where does it return?", cases, merits, curves, interrupted=cut)
 
 
-class _Parts:
+class _PartProgress:
     """Progress of parts of the work, one after the other."""
 
     def __init__(self, progress: Progress | None) -> None:
@@ -308,7 +314,7 @@ def _maps(
     free: _Released, bounds: Mapping[tuple[str, str], FloatArray], points: int, progress: Progress | None
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
     """Whether the mover returns, on a grid in each plane, and the grids' axes."""
-    widest = {plane: BEYOND * np.abs(b).max(axis=0) for plane, b in bounds.items()}
+    widest = {plane: MAP_WIDTH * np.abs(b).max(axis=0) for plane, b in bounds.items()}
     reach_x = widest[PLANES[0]][0]
     widest[PLANES[2]] = np.array([0.99 * free.plant.stroke.travel, reach_x])
     axes = {
@@ -329,16 +335,16 @@ def _furthest_returning(
     free: _Released, allowed: Mapping[str, float], progress: Progress | None
 ) -> dict[str, float]:
     """The furthest start on each ray from which, and from all nearer ones, the mover returns, SI."""
-    low, high = np.zeros(len(RAYS)), np.full(len(RAYS), BEYOND)
-    parts = _Parts(progress)
-    for n in range(1, REFINED + 1):
-        shares = np.linspace(low, high, FINE, axis=1)
+    low, high = np.zeros(len(RAYS)), np.full(len(RAYS), MAP_WIDTH)
+    parts = _PartProgress(progress)
+    for n in range(1, REFINEMENTS + 1):
+        shares = np.linspace(low, high, RAY_STARTS, axis=1)
         starts = {name: np.zeros(shares.shape) for name in ("x", "y", "beta")}
         for k, (ray, (state, sign)) in enumerate(RAYS.items()):
             starts[state][k] = sign * allowed[ray] * shares[k]
         flat = {name: values.ravel() for name, values in starts.items()}
-        found = free.which_return(flat, parts.until(n / REFINED)).reshape(shares.shape)
-        first = np.where(found.all(axis=1), FINE - 1, np.argmin(found, axis=1))  # that does not return
+        found = free.which_return(flat, parts.until(n / REFINEMENTS)).reshape(shares.shape)
+        first = np.where(found.all(axis=1), RAY_STARTS - 1, np.argmin(found, axis=1))  # that does not return
         rows = np.arange(len(RAYS))
         low, high = shares[rows, np.maximum(first - 1, 0)], shares[rows, first]
     return {ray: float(share) * allowed[ray] for ray, share in zip(RAYS, low, strict=True)}
@@ -349,13 +355,13 @@ def _starts_inside(plant: Plant) -> dict[str, FloatArray]:
     from scipy.stats import qmc  # a third of a second to import, for this experiment alone
 
     par: Any = plant.parameters
-    u = np.asarray(qmc.Sobol(5, rng=0).random_base2(round(math.log2(RANDOM))))
+    u = np.asarray(qmc.Sobol(5, rng=0).random_base2(round(math.log2(RANDOM_STARTS))))
     radius, angle = 0.99 * par.r_max * np.sqrt(u[:, :2]), 2 * math.pi * u[:, 2:4]
     (x1, x2), (y1, y2) = (radius * np.cos(angle)).T, (radius * np.sin(angle)).T
     p = ca.DM(np.vstack([x1, y1, x2, y2, 0.99 * plant.stroke.travel * (2 * u[:, 4] - 1)]))
     names = [s.name for s in plant.states[:5]]
     symbol = ca.SX.sym("p", 5)
-    position = ca.Function("position", [symbol], [plant.position_of(symbol)]).map(RANDOM)
+    position = ca.Function("position", [symbol], [plant.position_of(symbol)]).map(RANDOM_STARTS)
     return dict(zip(names, np.array(position(p)), strict=True))
 
 
@@ -371,7 +377,9 @@ def _examples(
     )
     wanted = []
     for plant, label, start in starts:
-        scenario = scenario_of("capture", LASTING, references.hold, QUIET | {"start": start} | dict(options))
+        scenario = scenario_of(
+            "capture", RUN_TIME, references.hold, NO_NOISE | {"start": start} | dict(options)
+        )
         wanted.append((plant, free.controller, PlannedRun(label, scenario, _run_merits)))
     return wanted
 
@@ -379,18 +387,18 @@ def _examples(
 def _run_merits(run: Trajectory) -> tuple[Merit, ...]:
     """How far a released mover went, when it was back, and the largest bearing current."""
     off = np.abs(run.p[:, :4]).max(axis=1)
-    late = np.flatnonzero(off > BACK)
+    late = np.flatnonzero(off > BACK_DISTANCE)
     back = float(run.t[late[-1]]) if len(late) and late[-1] + 1 < len(run.t) else math.nan
     bearings = [k for k in range(len(run.plant.inputs)) if k != run.plant.thrust_input]
     current = np.abs(run.force[:, bearings] / np.array(run.plant.actuator.force_constant)[bearings]).max()
     return (
         Merit("furthest off centre", float(off.max()), "mm"),
-        Merit(f"within {BACK * 1e6:.0f} um after", back, "ms", key="settled"),
+        Merit(f"within {BACK_DISTANCE * 1e6:.0f} um after", back, "ms", key="settled"),
         Merit("largest bearing current", float(current), "A"),
     )
 
 
-BACK = 20e-6  # m, off centre: the mover is back
+BACK_DISTANCE = 20e-6  # m, off centre: the mover is back
 
 
 def _merits(found: Mapping[str, float], allowed: Mapping[str, float]) -> tuple[Merit, ...]:
@@ -414,7 +422,7 @@ def _merits(found: Mapping[str, float], allowed: Mapping[str, float]) -> tuple[M
 # from it.
 
 
-SLOW = 1.0  # rad/s: slower modes count as stable
+STABLE_RATE = 1.0  # rad/s: slower modes count as stable
 
 
 def recoverable(
@@ -451,7 +459,7 @@ def recoverable(
 def _unstable_modes(A: FloatArray, columns: list[int]) -> tuple[FloatArray, FloatArray]:
     """Poles and left eigenvectors (rows) of the unstable modes that positions of these columns move."""
     values, vectors = np.linalg.eig(A.T)
-    chosen = (values.real > SLOW) & (np.abs(vectors[columns]).max(axis=0) > 1e-9)
+    chosen = (values.real > STABLE_RATE) & (np.abs(vectors[columns]).max(axis=0) > 1e-9)
     return values[chosen].real, vectors[:, chosen].real.T
 
 

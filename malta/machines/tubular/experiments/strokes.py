@@ -20,7 +20,7 @@ from malta.merits import reported_merits
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
-    QUIET,
+    NO_NOISE,
     Case,
     Experiment,
     Merit,
@@ -177,7 +177,7 @@ def _limit_cases(
     fast = partial(best.reference, centre=duration / 2)
     wanted: list[PlannedRun] = []
     for label, reference, found in (("fastest", fast, best), ("sigmoid", logistic, sigmoid)):
-        scenario = scenario_of("drive-limits", duration, reference, QUIET | options)
+        scenario = scenario_of("drive-limits", duration, reference, NO_NOISE | options)
         wanted.append(PlannedRun(label, scenario, partial(_limit_merits, found=found)))
     return wanted
 
@@ -228,12 +228,12 @@ def induced_per_speed(plant: Plant) -> float:
 # sample.
 
 
-SLOW, OWN, RECORDED = "slow stroke", "own v0", "recorded v0"  # the cases of a machine
-COVERED = 0.98  # share of the travel, either way, that a log has to cover and the recorded table covers
-SWEPT = 0.99  # share of the travel that the slow stroke covers
+SLOW_STROKE, OWN_TABLE, RECORDED_TABLE = "slow stroke", "own v0", "recorded v0"  # the cases of a machine
+COVERED_SHARE = 0.98  # share of the travel, either way, that a log has to cover and the recorded table covers
+SWEPT_SHARE = 0.99  # share of the travel that the slow stroke covers
 POINTS = 4000  # means of neighbouring samples, at least, where a log has so many samples
 TURN = 0.05  # share of the travel: a shorter way back is noise
-LEAST = 2  # means in each interval of the grid, each way
+MIN_MEANS = 2  # means in each interval of the grid, each way
 INERTIA = 0.1  # N, largest inertial force of a stroke that counts as slow
 PLACES = 20  # parts of the travel with a mean speed each
 
@@ -275,9 +275,9 @@ class Recorded(NamedTuple):
 def slow_stroke(plant: Plant, way: float) -> Reference:
     """From one end of the travel to the other and back, a quintic of `way` seconds each.
 
-    The stroke begins and ends at -SWEPT of the travel; the other outputs stay at zero.
+    The stroke begins and ends at -SWEPT_SHARE of the travel; the other outputs stay at zero.
     """
-    reach, axis = SWEPT * plant.stroke.travel, plant.stroke_output
+    reach, axis = SWEPT_SHARE * plant.stroke.travel, plant.stroke_output
 
     def at(t: FloatArray) -> Motion:
         motion = [np.zeros((len(t), len(plant.outputs))) for _ in range(3)]
@@ -297,7 +297,7 @@ def record(log: ForceLog, plant: Plant) -> Recorded:
 
         recorded = record(forces_of(malta.identification.read_log("stand.csv"), plant), plant)
     """
-    reach = COVERED * plant.stroke.travel
+    reach = COVERED_SHARE * plant.stroke.travel
     low, high = float(log.z.min()), float(log.z.max())
     if low > -reach or high < reach:
         found = f"positions from {low * 1e3:.4g} to {high * 1e3:.4g} mm"
@@ -308,7 +308,7 @@ def record(log: ForceLog, plant: Plant) -> Recorded:
     z_grid = np.linspace(-reach, reach, 2 * half + 1)
     means = _average(log)
     _require_slow(means, plant)
-    rising = _rising(means.z, TURN * plant.stroke.travel)
+    rising = _is_rising(means.z, TURN * plant.stroke.travel)
     there, back = (
         _fit(means._replace(z=means.z[chosen], v=means.v[chosen]), z_grid, plant.stroke.name, way)
         for chosen, way in ((rising, "there"), (~rising, "back"))
@@ -338,7 +338,7 @@ def _average(log: ForceLog) -> ForceLog:
     return log._replace(t=t, z=z, v=v)
 
 
-def _rising(z: FloatArray, turn: float) -> NDArray[np.bool_]:
+def _is_rising(z: FloatArray, turn: float) -> NDArray[np.bool_]:
     """True on a way towards positive z; a way back that is shorter than `turn` counts as noise."""
     from scipy.signal import find_peaks  # a third of a second to import
 
@@ -355,7 +355,7 @@ def _require_slow(log: ForceLog, plant: Plant) -> None:
 
     The speed is the mean one in each of PLACES parts of the travel, so that noise does not show.
     """
-    edges = np.linspace(-COVERED * plant.stroke.travel, COVERED * plant.stroke.travel, PLACES + 1)
+    edges = np.linspace(-COVERED_SHARE * plant.stroke.travel, COVERED_SHARE * plant.stroke.travel, PLACES + 1)
     middle, speed = (log.z[1:] + log.z[:-1]) / 2, np.abs(np.diff(log.z) / np.diff(log.t))
     place = np.digitize(middle, edges)
     mean = np.array([speed[place == k].mean() for k in range(1, PLACES + 1) if (place == k).any()])
@@ -374,7 +374,7 @@ def _fit(log: ForceLog, z_grid: FloatArray, stroke: str, way: str) -> FloatArray
     z, v = log.z[inside], log.v[inside]
     k = np.clip(np.searchsorted(z_grid, z, side="right") - 1, 0, len(z_grid) - 2)
     counts = np.bincount(k, minlength=len(z_grid) - 1)
-    if counts.min() < LEAST:
+    if counts.min() < MIN_MEANS:
         found = f"no way {way} past {z_grid[int(counts.argmin())] * 1e3:.4g} mm"
         raise InputError(log.source, stroke, found, "a slow stroke there and back over the whole travel")
     b = (z - z_grid[k]) / (z_grid[k + 1] - z_grid[k])
@@ -386,7 +386,7 @@ def _fit(log: ForceLog, z_grid: FloatArray, stroke: str, way: str) -> FloatArray
     return np.asarray(solveh_banded(normal, np.column_stack(right), lower=True))
 
 
-class _Found(NamedTuple):
+class _StrokeCases(NamedTuple):
     """What one machine shows: its runs, and v0(z) where it could be recorded."""
 
     cases: tuple[Case, ...]
@@ -420,7 +420,7 @@ def record_v0(
 
         measured = forces_of(read_log(log), plant)
     machines = {"": plant} | dict(_displace(plant, phase_error))
-    found: dict[str, _Found] = {}
+    found: dict[str, _StrokeCases] = {}
     for n, (label, machine) in enumerate(machines.items()):
         share = progress_of_part(progress, n, len(machines))
         given = measured if not label else None
@@ -456,23 +456,25 @@ def _record_on(
     way: float,
     progress: Progress | None,
     options: dict[str, Any],
-) -> _Found:
+) -> _StrokeCases:
     """The slow stroke on one machine unless there is a log, and the published stroke without and with its record."""
     cases: tuple[Case, ...] = ()
     if log is None:
         reference = partial(slow_stroke, way=way)
-        sweep = PlannedRun(label + SLOW, scenario_of("record-v0", 2 * way, reference, options), _merits)
+        sweep = PlannedRun(
+            label + SLOW_STROKE, scenario_of("record-v0", 2 * way, reference, options), _merits
+        )
         cases, cut = fly_all([(plant, controller, sweep)], progress_of_part(progress, 0, 2), options)
         if cut:
-            return _Found(cases, None, True)
+            return _StrokeCases(cases, None, True)
     recorded = record(log, plant) if log is not None else _recorded_from(cases[0].run, required=not label)
     scenario = scenario_of("stroke", 0.2, partial(delayed_stroke, wait=0.0), options)
-    flights = [(plant, controller, PlannedRun(label + OWN, scenario, _merits))]
+    flights = [(plant, controller, PlannedRun(label + OWN_TABLE, scenario, _merits))]
     if recorded is not None:
         known = with_recorded(controller, recorded)
-        flights.append((plant, known, PlannedRun(label + RECORDED, scenario, _merits)))
+        flights.append((plant, known, PlannedRun(label + RECORDED_TABLE, scenario, _merits)))
     strokes, cut = fly_all(flights, progress_of_part(progress, 1, 2), options)
-    return _Found((*cases, *strokes), recorded, cut)
+    return _StrokeCases((*cases, *strokes), recorded, cut)
 
 
 def _recorded_from(run: Trajectory, *, required: bool) -> Recorded | None:

@@ -11,13 +11,13 @@ from malta.report.ledger import ZONE_NOTE, Row, bandwidth, case_merit, machine_s
 
 SOURCE = "S. Miric et al., IEEE Trans. Ind. Electron. 68(1), 2021"
 REPRODUCING = ("table2", "calibrated")
-FITTED = "calibrated"  # its error integrals are as fast as Fig. 16 asks
+FITTED_DESIGN = "calibrated"  # its error integrals are as fast as Fig. 16 asks
 
-PLAIN = "printed weights as plain SI are next to nothing beside (2 K_A)^2"
-UNDEFINED = "the paper gives no definition"
-NOISY = "covariance of the linear loop, from the sensors' noise and steps"
+PLAIN_SI_NOTE = "printed weights as plain SI are next to nothing beside (2 K_A)^2"
+DEFINITION_NOTE = "the paper gives no definition"
+COVARIANCE = "covariance of the linear loop, from the sensors' noise and steps"
 COGGING = "the axial loop yields to 0.5 N of cogging"
-SLOW = (
+SLOW_NOTE = (
     "weight and attraction that v0 does not know are the integrals' to carry, which take longer than the rest"
 )
 
@@ -51,7 +51,7 @@ POLES_AND_LQR: tuple[Row, ...] = (
         ours.stiffness_ratio,
         ours.IMPLIED_RATIO,
         note="implied by 300 %, and what the bases of `calibrated` were solved for",
-        why=PLAIN,
+        why=PLAIN_SI_NOTE,
         of_lqg=True,
         by_construction=ours.is_solved_for_ratio,
     ),
@@ -61,7 +61,7 @@ POLES_AND_LQR: tuple[Row, ...] = (
         ours.full_state_share,
         "position_controller.margin",
         note="proven for all of m, K_A, K_D, K_B at once; full state feedback; K1/k = 4 is 300 %",
-        why=PLAIN,
+        why=PLAIN_SI_NOTE,
         of_lqg=True,
         by_construction=ours.is_solved_for_ratio,
     ),
@@ -79,7 +79,7 @@ LOOPS: tuple[Row, ...] = (
             "{:.0f} rad/s",
             partial(bandwidth, definition),
             "position_controller.bandwidth",
-            why=UNDEFINED,
+            why=DEFINITION_NOTE,
         )
         for text, definition in (
             ("last −3 dB of σ_max(T)", "sigma_max_T"),
@@ -217,7 +217,7 @@ STROKE: tuple[Row, ...] = (
         why="m g of Table IV; and statics load module 2 more, not 1",
     ),
 )
-LEFT = "rms over 16 seeds; the sensors' noise is what this leaves beside steps and motion"
+REST_NOTE = "rms over 16 seeds; the sensors' noise is what this leaves beside steps and motion"
 REST: tuple[Row, ...] = (
     *(
         Row(
@@ -225,8 +225,8 @@ REST: tuple[Row, ...] = (
             "{:.2f} um",
             partial(ours.at_rest, "rests", f"measured {name}, std"),
             f"table_III.std.{name}",
-            note=LEFT,
-            why=LEFT,
+            note=REST_NOTE,
+            why=REST_NOTE,
             by_construction=True,
         )
         for name in ("x1", "y1", "x2", "y2", "z")
@@ -277,7 +277,7 @@ OTHER_EXPERIMENTS: tuple[Row, ...] = (
         "at most",
         note="the bases of the integrals of `calibrated` are fitted on it; ten times as slow (`calibrated_slow`) 12.3",
         why="integrals that take minutes leave a mover in the attraction K1 / (K1 - k) too far out",
-        by_construction=lambda e: e.spec.name == FITTED,
+        by_construction=lambda e: e.spec.name == FITTED_DESIGN,
     ),
     Row(
         "tilt: SP1 off its circle of 200 µm, law as printed",
@@ -329,7 +329,7 @@ OTHER_EXPERIMENTS: tuple[Row, ...] = (
         why="below the proven margin of the loop",
     ),
 )
-HERE = "at the operating point"
+OPERATING_POINT_NOTE = "at the operating point"
 # Of an LQG and a PID, which the paper calls unsuitable, as the axes are several.
 COMPARISON: tuple[Row, ...] = (
     Row(
@@ -338,10 +338,12 @@ COMPARISON: tuple[Row, ...] = (
         ours.axis_coupling,
         note="the worst of the travel; what PIDs of single axes, “unsuitable” for this machine, do not know",
     ),
-    Row("noise of bearing forces at rest, rms", "{:.2f} N", lambda e: ours.noise_forces(e)[0], note=NOISY),
-    Row("noise of the thrust at rest, rms", "{:.2f} N", lambda e: ours.noise_forces(e)[1], note=NOISY),
+    Row(
+        "noise of bearing forces at rest, rms", "{:.2f} N", lambda e: ours.noise_forces(e)[0], note=COVARIANCE
+    ),
+    Row("noise of the thrust at rest, rms", "{:.2f} N", lambda e: ours.noise_forces(e)[1], note=COVARIANCE),
     *(
-        Row(text, shown, partial(ours.load_deviation, load, after), note=HERE)
+        Row(text, shown, partial(ours.load_deviation, load, after), note=OPERATING_POINT_NOTE)
         for text, shown, load, after in (
             ("1 N at the centre of gravity moves a sensor by", "{:.1f} um", "centre of gravity", None),
             ("1 N at a bearing moves a sensor by", "{:.1f} um", "bearing", None),
@@ -349,13 +351,13 @@ COMPARISON: tuple[Row, ...] = (
         )
     ),
 )
-DRAWN = (
+DRAWN_NOTE = (
     f"m, K_A, K_D and K_B drawn at random, with noise, {SETTLE:g} s at rest first: {ours.MACHINES} machines, "
-    f"{ours.FEW} without a C compiler"
+    f"{ours.SAMPLE} without a C compiler"
 )
-ALSO = "the same machines"
-HALF = round(ours.FEWER * ours.MACHINES)
-AT_ONCE = f"v0 is that of the nominal machine, the integrals are empty: {HALF} machines"
+SAME_MACHINES_NOTE = "the same machines"
+HALF_MACHINES = round(ours.FEWER_SHARE * ours.MACHINES)
+NO_REST_NOTE = f"v0 is that of the nominal machine, the integrals are empty: {HALF_MACHINES} machines"
 
 
 def _share(text: str, kind: str, strokes: str, note: str) -> Row:
@@ -371,7 +373,7 @@ def _deviations(text: str, strokes: str, note: str) -> tuple[Row, Row]:
     bound = ("figure_13.radial_deviation", "at most")
     return (
         Row(f"{of}, median", "{:.2f} um", median, note=note),
-        Row(f"{of}, largest", "{:.2f} um", largest, *bound, note=note, why=SLOW),
+        Row(f"{of}, largest", "{:.2f} um", largest, *bound, note=note, why=SLOW_NOTE),
     )
 
 
@@ -380,13 +382,13 @@ YIELDS: tuple[Row, ...] = (
         ": stroke within the published bounds",
         "published",
         "strokes",
-        f"overshoot, axial error and radial deviation of Figs 12 and 13; {DRAWN}",
+        f"overshoot, axial error and radial deviation of Figs 12 and 13; {DRAWN_NOTE}",
     ),
     _share(
         f": the same, {ours.PUSH} times the inertia fed forward",
         "published",
         "pushed",
-        f"`inertia_feedforward = {ours.PUSH}`: the loop and its margin stay; {HALF} machines",
+        f"`inertia_feedforward = {ours.PUSH}`: the loop and its margin stay; {HALF_MACHINES} machines",
     ),
     _share(
         ": stroke within [specification]",
@@ -394,10 +396,10 @@ YIELDS: tuple[Row, ...] = (
         "strokes",
         "the tracking error and radial deviation that the design file asks of 5 % of K_D, for designs that ask",
     ),
-    _share(": stroke without touchdown", "completed", "strokes", ALSO),
-    *_deviations(": radial deviation in the stroke", "strokes", ALSO),
-    _share(", no rest before: stroke within the published bounds", "published", "unsettled", AT_ONCE),
-    *_deviations(", no rest before: radial deviation", "unsettled", AT_ONCE),
+    _share(": stroke without touchdown", "completed", "strokes", SAME_MACHINES_NOTE),
+    *_deviations(": radial deviation in the stroke", "strokes", SAME_MACHINES_NOTE),
+    _share(", no rest before: stroke within the published bounds", "published", "unsettled", NO_REST_NOTE),
+    *_deviations(", no rest before: radial deviation", "unsettled", NO_REST_NOTE),
 )
 NO_STIFFNESS = "loops of plain SI weights have next to no stiffness of their own"
 RULE_OF_THUMB: tuple[Row, ...] = tuple(
@@ -407,7 +409,7 @@ RULE_OF_THUMB: tuple[Row, ...] = tuple(
         partial(ours.bandwidth_over_pole, definition),
         "position_controller.bandwidth_over_pole",
         note="the paper's own: 400 over its 218.92 rad/s, below the 2 of its rule of thumb",
-        why=UNDEFINED,
+        why=DEFINITION_NOTE,
     )
     for definition, text in (
         ("sigma_max_T", "last −3 dB of σ_max(T)"),
@@ -430,14 +432,16 @@ BRAKE: tuple[Row, ...] = (
         note="“a lower value”: that of one control period until it is switched",
     ),
 )
-FUTURE = "released at rest, attraction linear; the paper leaves these “stability limits” to future work"
+FUTURE_WORK_NOTE = (
+    "released at rest, attraction linear; the paper leaves these “stability limits” to future work"
+)
 CAPTURE: tuple[Row, ...] = (
     *(
         Row(
             f"released aside, {text}: furthest that returns",
             f"{{:.2f}} {unit}",
-            partial(ours.captured, f"{ray}: furthest start that returns"),
-            note=FUTURE,
+            partial(ours.capture_merit, f"{ray}: furthest start that returns"),
+            note=FUTURE_WORK_NOTE,
         )
         for ray, text, unit in (
             ("x", "along x", "mm"),
@@ -448,13 +452,13 @@ CAPTURE: tuple[Row, ...] = (
     Row(
         "released downwards: share of what 5 A allow at best",
         "{:.1f} percent",
-        partial(ours.captured, "y down: their ratio"),
+        partial(ours.capture_merit, "y down: their ratio"),
         note="the bound of the unstable modes' integrals; the rise of the currents takes the rest",
     ),
     Row(
         "released anywhere inside the touchdown bearings: share that returns",
         "{:.1f} percent",
-        partial(ours.captured, "starts inside the clearance that return"),
+        partial(ours.capture_merit, "starts inside the clearance that return"),
         note="1024 starts, evenly spread over all five positions",
     ),
 )
@@ -471,13 +475,13 @@ MEANS: tuple[Row, ...] = tuple(
     )
     for name in ("x1", "y1", "x2", "y2", "z")
 )
-TWICE = f"{ours.LEARNERS} machines, noise, 0.3 s at rest first; computed"
-TAUGHT: tuple[Row, ...] = (
+TWO_STROKES_NOTE = f"{ours.LEARNERS} machines, noise, 0.3 s at rest first; computed"
+TAUGHT_ROWS: tuple[Row, ...] = (
     Row(
         "machines ±20 %: first stroke within the published bounds",
         "{:.1f} percent",
         partial(ours.taught_share, 0),
-        note=f"with the design's gain file: {TWICE}",
+        note=f"with the design's gain file: {TWO_STROKES_NOTE}",
     ),
     Row(
         "machines ±20 %: second stroke, after what the first has taught",
@@ -511,7 +515,9 @@ FIGURE_13: tuple[Row, ...] = (
     Row(
         "Fig. 13: deviation of x1, x2 with this line of thrust",
         "{:.1f} um",
-        lambda e: ours.radial_deviation(ours.solved_figure_13(e).moved["c_x"], ours.ACROSS, ours.WAIT["c_x"]),
+        lambda e: ours.radial_deviation(
+            ours.solved_figure_13(e).moved["c_x"], ours.RADIAL_OUTPUTS, ours.WAIT["c_x"]
+        ),
         "figure_13.radial_deviation",
         note="the line is solved from it",
     ),
@@ -524,7 +530,9 @@ FIGURE_13: tuple[Row, ...] = (
     Row(
         "Fig. 13: deviation of x1, x2 with these offsets",
         "{:.1f} um",
-        lambda e: ours.radial_deviation(ours.solved_figure_13(e).moved["d_i"], ours.ACROSS, ours.WAIT["d_i"]),
+        lambda e: ours.radial_deviation(
+            ours.solved_figure_13(e).moved["d_i"], ours.RADIAL_OUTPUTS, ours.WAIT["d_i"]
+        ),
         note="y1, y2 deviate by 20 µm",
     ),
 )
@@ -534,7 +542,7 @@ def rows() -> list[Row]:
     """All claims of the paper, in the order of the ledger."""
     return [
         *YIELDS,
-        *TAUGHT,
+        *TAUGHT_ROWS,
         *POLES_AND_LQR,
         *LOOPS,
         *RULE_OF_THUMB,

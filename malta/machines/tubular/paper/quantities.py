@@ -52,16 +52,16 @@ if TYPE_CHECKING:
 
 
 EXPERIMENT_NAMES = ("stroke", "hold", "tilt", "thermal")
-MACHINES, FEW = 1_000, 200  # of the yields, with and without a C compiler
-FEWER = 0.5  # share of them that fly without rest before, and with more feedforward
+MACHINES, SAMPLE = 1_000, 200  # of the yields, with and without a C compiler
+FEWER_SHARE = 0.5  # share of them that fly without rest before, and with more feedforward
 PUSH = 1.8  # of the inertia: what the heaviest machines with the weakest drive lack, within the error of the others
 SEEDS = 16  # of rests: the motion of a slow design moves by a fifth from one to the next
-NOISY, FLIGHTS = ("tilt", "thermal"), 5  # experiments whose figures are means over seeds; how many
+NOISY_RUNS, FLIGHTS = ("tilt", "thermal"), 5  # experiments whose figures are means over seeds; how many
 IMPLIED_RATIO = 4.0  # K1 / k at which the LQR stands the published 300 % of a 20 % box
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class TubularEvidence:
     """A design, its margins, its experiments and some more runs for the claims."""
 
     spec: Spec
@@ -79,10 +79,12 @@ class Evidence:
     pushed: Strokes  # of fewer, with PUSH times the inertia fed forward
     rests: Mapping[str, Chance]  # figures of merit of the hold: root mean squares over SEEDS
     noisy: Mapping[str, Chance]  # the same, with the current sensors' noise of Table II(a)
-    flights: Mapping[tuple[str, int], Chance]  # first figures of the cases of NOISY: means over FLIGHTS seeds
+    flights: Mapping[
+        tuple[str, int], Chance
+    ]  # first figures of the cases of NOISY_RUNS: means over FLIGHTS seeds
 
 
-def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
+def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> TubularEvidence:
     """Design a controller, prove its margins and run the experiments, and a stroke without cogging in v0(z)."""
     plant = spec.plant
     model, controller, margins, experiments = run_design(spec, EXPERIMENT_NAMES, progress)
@@ -90,9 +92,9 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
     v0[:, plant.thrust_input] = 0
     without = replace(controller, feedforward=replace(controller.feedforward, v0=v0))
     slow = simulate(plant, without, Scenario("stroke", 0.4, partial(delayed_stroke, wait=0.0)))
-    machines = MACHINES if compiler() else FEW
-    fewer = round(FEWER * machines)
-    return Evidence(
+    machines = MACHINES if compiler() else SAMPLE
+    fewer = round(FEWER_SHARE * machines)
+    return TubularEvidence(
         spec,
         model,
         controller,
@@ -118,7 +120,7 @@ def with_noise_of_currents(plant: Plant) -> Plant:
     return plant_of(replace(plant.parameters, s_i=noise))
 
 
-def current_reading(axis: str, modules: int, e: Evidence) -> float:
+def current_reading(axis: str, modules: int, e: TubularEvidence) -> float:
     """Variance of the force, N^2, that the readings of an axis of AXES stand for while a current is held.
 
     K^2 |row of (16)|^2 s_i^2 mean |S|^2: a sensor reads its noise and what the sampled current loop makes of it.
@@ -184,22 +186,22 @@ def rests_of_seeds(plant: Plant, controller: Controller, seeds: Sequence[int]) -
 def flights_of_seeds(
     plant: Plant, controller: Controller, seeds: Sequence[int]
 ) -> dict[tuple[str, int], Chance]:
-    """The first figure of each case of NOISY, by experiment and case: means over the seeds."""
+    """The first figure of each case of NOISY_RUNS, by experiment and case: means over the seeds."""
     found: dict[tuple[str, int], Chance] = {}
-    for name in NOISY:
+    for name in NOISY_RUNS:
         flown = [experiment(name, plant, controller, seed=seed).cases for seed in seeds]
         for case in range(len(flown[0])):
             found[name, case] = mean_of_seeds([cases[case].merits[0].value for cases in flown])
     return found
 
 
-def pole(name: str, e: Evidence) -> float:
+def pole(name: str, e: TubularEvidence) -> float:
     """Square root of a diagonal element of the stiffness, by its position's name, rad/s."""
     names = [s.name for s in e.model.plant.design_states]
     return math.sqrt(max(float(e.model.stiffness.diagonal()[names.index(name)]), 0.0))
 
 
-def pole_change(e: Evidence) -> float:
+def pole_change(e: TubularEvidence) -> float:
     """Relative change of the fastest open-loop pole from the middle to the end of the travel."""
     plant = e.model.plant
     middle, end = (
@@ -208,7 +210,7 @@ def pole_change(e: Evidence) -> float:
     return float(end / middle - 1)
 
 
-def stiffness_ratio(e: Evidence) -> float:
+def stiffness_ratio(e: TubularEvidence) -> float:
     """Stiffness of the LQR along x over that of the attraction; NaN for a PID."""
     if e.K is None:
         return math.nan
@@ -216,7 +218,7 @@ def stiffness_ratio(e: Evidence) -> float:
     return float((e.model.force_map @ e.K[:, :half])[0, 0] / e.model.stiffness[0, 0])
 
 
-def is_solved_for_ratio(e: Evidence) -> bool:
+def is_solved_for_ratio(e: TubularEvidence) -> bool:
     """Whether the bases of a design are those that `calibrate` solves for K1 / k = IMPLIED_RATIO."""
     if e.spec.kind != "LQG":
         return False
@@ -227,7 +229,7 @@ def is_solved_for_ratio(e: Evidence) -> bool:
     return bool(np.allclose(e.spec.weights.q_base[radial], solved[radial], rtol=1e-4))
 
 
-def full_state_share(e: Evidence) -> float:
+def full_state_share(e: TubularEvidence) -> float:
     """Proven margin of the LQR with all states measured, as a share of the design's uncertainty; NaN for a PID."""
     if e.K is None:
         return math.nan
@@ -236,7 +238,7 @@ def full_state_share(e: Evidence) -> float:
     return proven_share(robust_margin(system, law, e.spec.uncertainty))
 
 
-def slowest_radial(e: Evidence) -> float:
+def slowest_radial(e: TubularEvidence) -> float:
     """The slowest pole of the regulator with integrals in which x1 takes part, rad/s; NaN for a PID."""
     if e.K is None:
         return math.nan
@@ -246,14 +248,14 @@ def slowest_radial(e: Evidence) -> float:
     return float((np.log(values[part]) / e.controller.sample_time).real.max())
 
 
-def axial_deviation(e: Evidence) -> Deviation:
+def axial_deviation(e: TubularEvidence) -> Deviation:
     """What a constant 1 N along z from outside does to z: the sampled loop under its loads, at the operating point."""
     plant = e.model.plant
     (pushed,) = recovery(plant, e.controller, {"axial": {"F_z": 1.0}})
     return pushed.outputs[plant.stroke_output]
 
 
-def current_loop_margin(e: Evidence) -> tuple[float, float]:
+def current_loop_margin(e: TubularEvidence) -> tuple[float, float]:
     """Crossover, rad/s, and phase margin, rad, of the current loop with the gain file's Kp and Ki."""
     loop, actuator = e.controller.current_loop, e.model.plant.actuator
     if loop is None:
@@ -267,13 +269,13 @@ def current_loop_margin(e: Evidence) -> tuple[float, float]:
     return crossover, math.pi + float(np.angle(gain(crossover)))
 
 
-def link_rise(e: Evidence) -> float:
+def link_rise(e: TubularEvidence) -> float:
     """Rise of the DC link's voltage, V, when the mover is braked from the published speed."""
     par: Any = e.spec.parameters
     return float(link_voltage(par.V_dc, par.C_dc, par.m * e.braked**2 / 2) - par.V_dc)
 
 
-def yield_share(kind: str, strokes: str, e: Evidence) -> Chance:
+def yield_share(kind: str, strokes: str, e: TubularEvidence) -> Chance:
     """A share of the machines that differ, by a field of Yields; NaN without bounds.
 
     strokes : "strokes", "unsettled" or "pushed"
@@ -282,30 +284,30 @@ def yield_share(kind: str, strokes: str, e: Evidence) -> Chance:
     return Chance(math.nan, math.nan) if found is None else Chance(found.share, (found.high - found.low) / 2)
 
 
-def machine_deviation(which: str, strokes: str, e: Evidence) -> float:
+def machine_deviation(which: str, strokes: str, e: TubularEvidence) -> float:
     """A radial deviation of machines that differ, m; `which` and `strokes` are fields of Strokes and of Evidence."""
     found: float = getattr(getattr(e, strokes), which)
     return found
 
 
-def published_stroke(e: Evidence) -> StrokeFigures:
+def published_stroke(e: TubularEvidence) -> StrokeFigures:
     """Figures of the stroke of Fig. 12."""
     return stroke_figures(e.experiments["stroke"].run)
 
 
-def stroke_across(e: Evidence) -> float:
+def stroke_across(e: TubularEvidence) -> float:
     """Largest deviation of x1 and x2 during the stroke, m."""
     return max(published_stroke(e).radial[name] for name in ("x1", "x2"))
 
 
-def stroke_speed(e: Evidence) -> float:
+def stroke_speed(e: TubularEvidence) -> float:
     """Largest axial speed during the stroke, m/s."""
     plant = e.model.plant
     rate = len(plant.states) // 2 + plant.stroke_state
     return float(np.abs(e.experiments["stroke"].run.x[:, rate]).max())
 
 
-def cogging_share(e: Evidence) -> float:
+def cogging_share(e: TubularEvidence) -> float:
     """The cogging of two like modules 2 l_B apart over twice one's, of period L_p: |cos(2 pi l_B / L_p)|."""
     par: Any = e.spec.parameters
     return abs(math.cos(2 * math.pi * par.l_B / par.L_p))
@@ -316,7 +318,7 @@ def carried_weight(run: Trajectory) -> float:
     return float(run.v[-1, 1] + run.v[-1, 3])
 
 
-def precise_payload(known: bool, e: Evidence) -> float:
+def precise_payload(known: bool, e: TubularEvidence) -> float:
     """The largest payload, kg, with which the stroke keeps the bounds of Figs 12 and 13, by bisection.
 
     known : the controller feeds its weight and inertia forward
@@ -336,31 +338,31 @@ def precise_payload(known: bool, e: Evidence) -> float:
     return largest_mass(kept, held_payload(plant))[0]
 
 
-def carried_payload(e: Evidence) -> float:
+def carried_payload(e: TubularEvidence) -> float:
     """The largest payload, kg, that is picked, carried and moved without touchdown, by bisection."""
     plant = e.model.plant
     return flown_payload(plant, e.controller, held_payload(plant))[0]
 
 
-def true_radial(e: Evidence) -> Chance:
+def true_radial(e: TubularEvidence) -> Chance:
     """Largest rms of the true radial motion at rest, m."""
     return max(e.rests[f"true {name}, rms"] for name in ("x1", "y1", "x2", "y2"))
 
 
-def at_rest(rests: str, label: str, e: Evidence) -> Chance:
+def at_rest(rests: str, label: str, e: TubularEvidence) -> Chance:
     """A figure of merit of the hold by its label, m; `rests` is the field of Evidence, with or without noise."""
     found: Chance = getattr(e, rests)[label]
     return found
 
 
-def noise_forces(e: Evidence) -> tuple[float, float]:
+def noise_forces(e: TubularEvidence) -> tuple[float, float]:
     """Rms of the worst commanded bearing force and of the thrust at rest, N: covariance of the linear loop."""
     plant = e.model.plant
     force = noise_of(loop_of_model(e.model, e.controller).sampled, plant).force
     return float(np.delete(force, plant.thrust_input).max()), float(force[plant.thrust_input])
 
 
-def load_deviation(name: str, after: float | None, e: Evidence) -> float:
+def load_deviation(name: str, after: float | None, e: TubularEvidence) -> float:
     """How far a load of LOADS moves an output, m: at most, or from `after` (s) on; at the operating point."""
     plant, par = e.model.plant, e.spec.parameters
     load = {key: size(par) for key, size in LOADS[name].items()}
@@ -375,7 +377,7 @@ LOADS: dict[str, dict[str, Callable[[Any], float]]] = {
 }
 
 
-def axis_coupling(e: Evidence) -> float:
+def axis_coupling(e: TubularEvidence) -> float:
     """What a bearing's force does to the other bearing's sensor, over what the other's own does; worst of the travel.
 
     Accelerations C B of the linear model, without attraction: both are the larger, the faster the motion.
@@ -390,23 +392,23 @@ def axis_coupling(e: Evidence) -> float:
     return worst
 
 
-def bandwidth_over_pole(definition: str, e: Evidence) -> float:
+def bandwidth_over_pole(definition: str, e: TubularEvidence) -> float:
     """The bandwidth by one of the definitions in BANDWIDTHS over the largest unstable pole of the design model."""
     return bandwidth(definition, e) / float(e.model.sys.poles().real.max())
 
 
-def braking_power(e: Evidence) -> float:
+def braking_power(e: TubularEvidence) -> float:
     """Mechanical power, W, at the published speed and the force limit of the thrust; no losses, as in the paper."""
     actuator = e.model.plant.actuator
     return actuator.force_limit[e.model.plant.thrust_input] * e.braked
 
 
-def braking_resistance(e: Evidence) -> float:
+def braking_resistance(e: TubularEvidence) -> float:
     """The largest resistance, ohm, that takes the braking power at the link voltage after the published rise."""
     return (e.spec.plant.drive.link_voltage + link_rise(e)) ** 2 / braking_power(e)
 
 
-def capacitance_beside_brake(e: Evidence) -> float:
+def capacitance_beside_brake(e: TubularEvidence) -> float:
     """The capacitance, F, in which the energy of one control period makes the published rise.
 
     C ((V + rise)^2 - V^2) / 2 = P Ts: the resistor is switched on at the sample after the link rises above V.
@@ -416,7 +418,7 @@ def capacitance_beside_brake(e: Evidence) -> float:
 
 
 @lru_cache(maxsize=8)  # several rows need it; records of evidence compare by identity
-def _captured(e: Evidence) -> dict[str, float]:
+def _capture_merits(e: TubularEvidence) -> dict[str, float]:
     """Figures of merit of the experiment capture, SI, with the smallest maps; none without a C compiler."""
     if compiler() is None:
         return {}
@@ -424,9 +426,9 @@ def _captured(e: Evidence) -> dict[str, float]:
     return {merit.label: merit.value for merit in found.merits}
 
 
-def captured(label: str, e: Evidence) -> float:
+def capture_merit(label: str, e: TubularEvidence) -> float:
     """A figure of merit of the experiment capture, SI; NaN without a C compiler."""
-    return _captured(e).get(label, math.nan)
+    return _capture_merits(e).get(label, math.nan)
 
 
 # Fig. 13 by a machine that is not ideal: what is carried at z = 5 mm, and what moves x1 and x2.
@@ -447,7 +449,7 @@ def captured(label: str, e: Evidence) -> float:
 # beside the axis: at rest the mover rolls until it hangs, as in plant.py.
 
 
-ACROSS = (0, 2)  # x1 and x2
+RADIAL_OUTPUTS = (0, 2)  # x1 and x2
 FIRST_TRY = {"d_i": 10e-3, "c_x": 0.1e-3}  # A, m: deviations grow in proportion
 WAIT = {"d_i": 0.5, "c_x": 0.0}  # s before the stroke: integrals take off an offset, and an unbalance rolls
 
@@ -495,7 +497,7 @@ def figure_13(controller: Controller, carried: float, deviation: float) -> Figur
 
 
 @lru_cache(maxsize=8)  # several rows need it; records of evidence compare by identity
-def solved_figure_13(e: Evidence) -> Figure13:
+def solved_figure_13(e: TubularEvidence) -> Figure13:
     """Fig. 13 solved for under a design's controller."""
     weight, deviation = (
         published_value(e.published, f"figure_13.{name}") for name in ("weight", "radial_deviation")
@@ -510,7 +512,7 @@ LEARNERS = 30  # machines that fly both strokes
 
 
 @lru_cache(maxsize=8)  # two rows need it; records of evidence compare by identity
-def _taught(e: Evidence) -> tuple[Rate, Rate]:
+def _teach(e: TubularEvidence) -> tuple[Rate, Rate]:
     """The machines whose first and whose second stroke keep the published bounds; what does not fly on teaches none."""
     plan = main_plan(e.controller, e.spec, LEARNERS)
     kept = [0, 0]
@@ -526,7 +528,7 @@ def _taught(e: Evidence) -> tuple[Rate, Rate]:
     return rate(kept[0], LEARNERS), rate(kept[1], LEARNERS)
 
 
-def _within_published(run: Trajectory, e: Evidence) -> bool:
+def _within_published(run: Trajectory, e: TubularEvidence) -> bool:
     """Whether a stroke was completed within the bounds of Figs 12 and 13."""
     if not run.verdict.completed:
         return False
@@ -534,7 +536,7 @@ def _within_published(run: Trajectory, e: Evidence) -> bool:
     return all(m.value <= published_value(e.published, m.published) for m in bounded)
 
 
-def taught_share(stroke: int, e: Evidence) -> Chance:
+def taught_share(stroke: int, e: TubularEvidence) -> Chance:
     """The share of LEARNERS machines whose stroke of this number, 0 or 1, keeps the published bounds."""
-    found = _taught(e)[stroke]
+    found = _teach(e)[stroke]
     return Chance(found.share, (found.high - found.low) / 2)
