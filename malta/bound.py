@@ -1,4 +1,7 @@
-"""The text of a bound: what is proven is rounded down, where a loop is lost is rounded up, with the same digits."""
+"""The text of a proven margin, or of any bound: what is proven is rounded down, where a loop is lost is rounded up.
+
+Both have the same digits.
+"""
 
 from __future__ import annotations
 

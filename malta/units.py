@@ -1,4 +1,4 @@
-"""Units: quantities converted to SI when they are read, and back to a unit of choice when they are shown."""
+"""Units: quantities, as a mass in g, converted to SI, as kg, when they are read, and back when they are shown."""
 
 from __future__ import annotations
 

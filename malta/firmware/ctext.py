@@ -1,4 +1,4 @@
-"""Programs as C99: one operation a statement, so that no compiler may contract or reorder what the bits depend on."""
+"""Exported C99: names of its identifiers, and one operation a statement, so that no compiler changes the bits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The loop of a machine: machine x law x operating point x parameters, from which everything linear is derived."""
+"""The loop of a machine, from which everything linear follows, first of all whether it is stable: by its poles.
+
+A loop is a machine x a law x an operating point x parameters.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loop of a machine and a controller, sampled; and the machine's loop with uncertain parameters.
+"""The loop of a machine and a controller as a proof has it: sampled, with its delay, current loops and late sensors.
 
 P is the machine from forces to measurements under a zero-order hold, exactly; F is the control law from measurements
 to forces (v = F y), as in the block diagram of synthesis/controller.py. At the sensors

@@ -1,4 +1,4 @@
-"""The sensors of a plant: their errors, noise and steps, and how late they read.
+"""The sensors that a plant declares: how late they read, and the sizes of their errors and steps.
 
 Sensors that read late have a first-order lag of each output, and a dead time of all of them:
 

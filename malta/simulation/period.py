@@ -1,4 +1,6 @@
-"""One control period of machine and controller as CasADi functions. Every engine runs these functions.
+"""One control period as it is simulated: sensors, control law, delay of its commands, current loops, machine.
+
+Every engine runs these CasADi functions:
 
     given, noise --> [ sense ] --> y --> [ decide ] --> commands held --> [ substep ] x n --> machine
                         ^                 ^  |  ^                                                |

@@ -1,4 +1,4 @@
-"""Readings of the position sensors: their errors, their lag and their dead time, noise and resolution.
+"""Readings of the sensors in a simulation: errors, lag, dead time, noise and resolution, added to true outputs.
 
     x --> [ errors ] --> [ lag ] --> [ dead time ] --+--> [ resolution ] --> y
                                                 noise-+

@@ -1,4 +1,4 @@
-"""The controller: everything that a digital implementation needs, and its control law, stated once.
+"""The control law, stated once, with its anti-windup; the controller, which is all that a digital implementation needs.
 
                      v_ff, v0(z)
                          |            w

@@ -1,4 +1,4 @@
-"""Design files: design/NAME.toml -> read_design() -> Spec.
+"""Design files: design/NAME.toml -> read_design() -> Spec, with the uncertainty box that its gain file bears.
 
 Wherever numbers are expected, `{ published = "table_II.state" }` stands for what the machine's paper prints under that
 name in data/published/. What `malta tune` is to reach and what it may vary stand in [specification] and [search], and

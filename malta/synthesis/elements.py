@@ -1,4 +1,4 @@
-"""The tunable parts of a control law: named elements with parameters, whose matrices are those of CasADi."""
+"""Tunable elements of a control law, and how to add one: named, with parameters, matrices in CasADi."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The control law as a linear system: from measurements and references at rest to forces."""
+"""The controller as a linear law: a system from measurements and references at rest to forces."""
 
 from __future__ import annotations
 

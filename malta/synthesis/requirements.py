@@ -1,4 +1,4 @@
-"""What a design can be asked to reach: the keys of [specification].
+"""Requirements: what a design can be asked to reach in [specification], and how each one is judged.
 
 A requirement is one record: its key in the file, its unit, the side that it bounds from, how it is measured on a
 finished design, and how a search estimates it in milliseconds. GENERIC_REQUIREMENTS holds what every machine can be

@@ -1,4 +1,4 @@
-"""`malta.verify`: all that is known of a loop, as one record, with the requirements of its design file judged."""
+"""`malta.verify`, in its order: what is linear, the proven margin, stage by stage if asked, the requirements."""
 
 from __future__ import annotations
 

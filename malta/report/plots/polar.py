@@ -1,4 +1,4 @@
-"""Plots in a plane: Nyquist and Nichols of the loop gain with the margins drawn in, and the margin map.
+"""Nyquist and Nichols plots of the loop gain with the margins drawn in, and the margin map.
 
 The margin map shows the proven box in the plane of two parameters, and the boundary of stability.
 """
