@@ -16,30 +16,6 @@ FILLERS = {
     *("where", "is", "the", "of", "a", "that", "does", "it", "in", "who", "do", "i", "how", "what", "which"),
     *("order", "are", "by", "and", "its", "one"),
 }
-    [
-        "where",
-        "is",
-        "the",
-        "of",
-        "a",
-        "that",
-        "does",
-        "it",
-        "in",
-        "who",
-        "do",
-        "i",
-        "how",
-        "what",
-        "which",
-        "order",
-        "are",
-        "by",
-        "and",
-        "its",
-        "one",
-    ]
-)
 
 
 def stems(text: str) -> set[str]:
