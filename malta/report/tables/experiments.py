@@ -506,7 +506,8 @@ def claims_table(ledger: Ledger, *, why: bool = False) -> ClaimLines:
     >>> import malta, rich
     >>> from malta.report.ledger import LedgerClaim, Ledger
     >>> verdict = "by construction; K_A"
-    >>> claim = LedgerClaim("pole of x [rad/s]", "±218.92", ("±218.92",), verdict, "input")
+    >>> ours = ("±218.92",)
+    >>> claim = LedgerClaim("pole of x [rad/s]", "±218.92", ours, verdict, "input")
     >>> ledger = Ledger("tubular", "the paper", ("table2",), (claim,))
     >>> rich.print(malta.report.claims_table(ledger, why=True))
     Published numbers and ours: tubular, the paper
