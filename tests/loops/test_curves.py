@@ -128,6 +128,24 @@ def test_the_gain_margin_of_a_sampled_loop_may_lie_at_the_nyquist_frequency() ->
     assert found.gain_frequency[1] == pytest.approx(math.pi / 0.01)
 
 
+@pytest.mark.parametrize(
+    ("L", "stable"), [(([1], [1, 0]), False), (([0.1], [1, 1]), False)], ids=["closed", "open"]
+)
+def test_a_pole_at_the_nyquist_frequency_is_no_error(L: Any, stable: bool) -> None:
+    """1 / z has its closed loop's pole at z = -1; 0.1 / (z + 1) its own there, and that of the closed loop beyond."""
+    curves = loop_curves(control.tf(*L, 0.1))
+    (found,) = curves.margins
+    assert curves.stable == found.stable == stable
+    assert math.isnan(found.delay)
+
+
+def test_a_loop_without_states_has_its_margins() -> None:
+    """L = -1/2: S = 2, unstable from twice the gain on."""
+    (found,) = loop_curves(control.ss([], [], [], [[-0.5]])).margins
+    assert (found.gain, found.peak_sensitivity) == ((0.0, 2.0), 2.0)
+    assert found.disk.size == pytest.approx(2 / 3, rel=1e-12)
+
+
 def winding(L: Any) -> int:
     """Counterclockwise turns of L(jw) about -1 on a dense grid; L has no poles on the axis."""
     w = np.geomspace(1e-4, 1e5, 40_000)
