@@ -287,7 +287,6 @@ TOUCHES: Sequence[dict[str, Any]] = (
     {"facecolor": "#202020", "hatch": "xx"},
 )
 BINS = 40  # of a distribution
-LINE_START = 1e-3  # where the lines of the worst runs begin, in the fine unit of their deviation
 
 
 def distributions_figure(found: Campaign | Summary, published: Published | None = None) -> Figure:
