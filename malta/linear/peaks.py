@@ -26,7 +26,7 @@ from malta.linear.sampling import eigenvalues
 from malta.linear.system import System
 
 RISE = 1e-7  # relative, above the largest gain that was found, at which a search ends
-BESIDE = 1e-7  # relative: how far from a pole on it the plane's end is looked at
+NYQUIST_GAP = 1e-7  # relative: how far from a pole on it the plane's end is looked at
 JOINS = 1e-15  # of the largest entries of its row and column: smaller ones are rounding
 NEAR_AXIS = 1e-4  # |Re| of an eigenvalue over its size, up to which it may lie on the imaginary axis
 EIGENVALUE_DISTANCE = 1e-10  # relative: eigenvalues of that distance are one, of jw and of -jw
@@ -61,7 +61,7 @@ def in_plane(system: System, sample_time: float | None) -> System:
     """A system in differences, (x+ - x) / T = A x + B u, in the s of Tustin's rule; a continuous one as it is.
 
     s = R (z - 1) / T with R = (1 + A T/2)^-1, which keeps the digits of slow poles. A pole z = -1 has no place
-    there: it is seen beside, at BESIDE of the sample time less.
+    there: it is seen beside, at NYQUIST_GAP of the sample time less.
     """
     if sample_time is None or not len(system.A):
         return system
@@ -70,7 +70,7 @@ def in_plane(system: System, sample_time: float | None) -> System:
     try:
         R = np.linalg.inv(one + half * A)
     except np.linalg.LinAlgError:
-        half *= 1 - BESIDE
+        half *= 1 - NYQUIST_GAP
         R = np.linalg.inv(one + half * A)
     into = R @ B
     return System(R @ A, R @ into, C, D - half * C @ into)
