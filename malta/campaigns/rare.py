@@ -220,7 +220,8 @@ def repeated_subset_simulation(
     each = samples // REPETITIONS
     if each < MIN_LEVEL_RUNS:
         expected = (
-            f"at least {REPETITIONS * MIN_LEVEL_RUNS}: {REPETITIONS} times {MIN_LEVEL_RUNS} in each level"
+            f"at least {REPETITIONS * MIN_LEVEL_RUNS}: "
+            f"{REPETITIONS} repetitions of {MIN_LEVEL_RUNS} in each level"
         )
         raise InputError("rare event", "samples", str(samples), expected)
     found: list[Subset] = []
