@@ -220,11 +220,13 @@ def fall_frequencies(system: System, level: float, asked: Sequence[Fall]) -> lis
     0 where one never reaches the level, infinite where it never falls below.
     """
 
+    parts = [part_of(system, own, own) for own in joined_channels(system, range(len(system.C)))]
+
     def sizes(w: FloatArray) -> FloatArray:
-        found = np.linalg.svd(response_at(system, w), compute_uv=False)
+        each = [np.linalg.svd(response_at(part, w), compute_uv=False) for part in parts]
+        found = -np.sort(-np.concatenate(each, axis=1), axis=1)
         return np.asarray(np.log(np.maximum(found, MIN_SINGULAR_VALUE) / level))
 
-    parts = [part_of(system, own, own) for own in joined_channels(system, range(len(system.C)))]
     c = np.sort(np.concatenate([level_frequencies(part, level) for part in parts]))
     c = c[c > 0]
     w = np.concatenate([c[:1] / 2, np.sqrt(c[1:] * c[:-1]), 2 * c[-1:]]) if len(c) else np.ones(1)
