@@ -181,7 +181,8 @@ def disk_margin(loop: Nominal, kind: Kind) -> Disk:
 
     With the loop's positive feedback Q, factors (1 + d/2) / (1 - d/2) keep it stable while |d| < 1 / mu(M),
     M = (1 - Q)^-1 - 1/2 (Seiler, Packard, Gahinet 2020). For several channels mu is bounded above by a balanced
-    D M D^-1, so the margin is a lower bound; for one channel it is exact.
+    D M D^-1, at each frequency the lower of its own balance and that of the peak, so the margin is a lower bound; for
+    one channel it is exact.
     """
     chosen = {"forces": [*loop.inputs], "sensors": [*loop.sensors]}
     channels = chosen.get(kind, [*loop.sensors, *loop.inputs])
@@ -225,8 +226,8 @@ def last_crossover(loop: Nominal) -> float:
 def _largest_mu(M: System) -> Peak:
     """The largest balanced norm over frequency, and where: of one channel exact, else by levels at fixed scales.
 
-    Where a balanced norm exceeds a level, so does the norm with the scales of any other frequency, up to the rounding
-    of the balance: between frequencies at which that norm is the level nothing is missed.
+    The norm with the scales of one frequency bounds mu at all of them: where it is below the largest that was found,
+    nothing is missed.
     """
     if len(M.D) == 1:
         return peak_gain(M)

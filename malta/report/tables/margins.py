@@ -238,7 +238,7 @@ def disk_table(found: LoopReport) -> Table:
      ────────────────────────────────────────────────────────────────────────
      forces                 0.810   0.42 .. 2.36         ±44.1   66.57 (10.6)
      sensors                0.810   0.42 .. 2.36         ±44.1   66.57 (10.6)
-     forces and sensors     0.400   0.67 .. 1.50         ±22.6   314.4 (50.0)
+     forces and sensors     0.401   0.67 .. 1.50         ±22.6   295.3 (47.0)
      y alone                0.810   0.42 .. 2.36         ±44.1   66.57 (10.6)
      delay at y alone     2719 µs   13.6 samples
     <BLANKLINE>
@@ -426,7 +426,7 @@ def places_table(found: LoopReport) -> Table:
                                             peak        disk,
      at            proven   lost at  rad/s   |S|  zone    all         delay
      ──────────────────────────────────────────────────────────────────────
-     its values  390.69 %  390.70 %   1047  1.57     A  0.400      2719 µs,
+     its values  390.69 %  390.70 %   1047  1.57     A  0.401      2719 µs,
                                                                13.6 samples
     <BLANKLINE>
     """
