@@ -264,10 +264,14 @@ def sensitivity_curves(
             text = "UNSTABLE"
             if margins.stable:
                 top = int(np.argmax(np.abs(T[:, k, k])))
-                mark(upper, margins.peak_frequency, margins.peak_sensitivity, style)
+                at_peak = margins.peak_frequency  # 0 or infinite where |S| has no top between
+                mark(
+                    upper, float(np.clip(at_peak, curves.w[0], curves.w[-1])), margins.peak_sensitivity, style
+                )
                 mark(lower, curves.w[top], abs(T[top, k, k]), style)
                 peak = margins.peak_sensitivity
-                text = f"max|S| {peak:.2f} (zone {zone(peak)}) at {rate_text(margins.peak_frequency)}"
+                text = f"max|S| {peak:.2f} (zone {zone(peak)}) at "
+                text += rate_text(at_peak) if at_peak < np.inf else "infinite frequency"
                 text += f", max|T| {abs(T[top, k, k]):.2f}"
             lines.append((text, style["color"]))
             shown.append(curves)
