@@ -36,6 +36,7 @@ GENERIC_PLACE = 0.7390851332  # of a mean frequency: a place on the axis that is
 ASIDE = np.exp(
     np.multiply.outer([-0.3, 0.3], 4.0 ** -np.arange(7)).ravel()
 )  # factors by which a top is looked for
+FLAT_SHARE = 1e-4  # of a peak, up to which the curve about it is a parabola
 ROOT_DISTANCE = 1e-6  # of a candidate's frequency: how far from it a root is looked for first
 STEPS = 60  # of a root by bisection and secants at most
 ROOT = 1e-13  # relative width of the interval at which a root is known
@@ -205,6 +206,20 @@ def _to_top(system: System, peak: Peak) -> Peak:
             break
         best, where = float(sizes[k]), float(w[k])
     return Peak(best, where)
+
+
+def smooth_peak(system: System) -> float:
+    """The largest gain of a stable system of one input and output, as a search wants it: it changes smoothly.
+
+    It is the top of the widest parabola that hardly falls, through the peak that was found and gains beside it.
+    """
+    top, where = peak_gain(system)
+    if not 0 < where < math.inf:
+        return top
+    left, right = np.split(gains_at(system.balanced, where * ASIDE), 2)
+    bend, fall = 2 * top - left - right, top - np.minimum(left, right)
+    k = np.flatnonzero((bend > 0) & (fall < FLAT_SHARE * top))
+    return top + float((left[k[0]] - right[k[0]]) ** 2 / (8 * bend[k[0]])) if len(k) else top
 
 
 class Fall(NamedTuple):

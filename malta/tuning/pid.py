@@ -28,7 +28,7 @@ from scipy import optimize, sparse
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.matrices import system_matrix
-from malta.linear.peaks import peak_gain
+from malta.linear.peaks import smooth_peak
 from malta.linear.sampling import sample, sample_noise
 from malta.loops.classical import last_crossover, tracked_band
 from malta.loops.loop import loop_of_model
@@ -262,7 +262,7 @@ def loop_figures(spec: Spec, part: PidPart, loop: SampledLoop) -> dict[str, floa
     motion = np.sqrt(np.diag(loop.Cd @ covariance(closed, W)[:n, :n] @ loop.Cd.T))
     found |= {f"noise_motion {name}": value for name, value in zip(names, motion.tolist(), strict=True)}
     cut = loop.cut
-    found |= {f"peak_sensitivity {name}": peak_gain(cut.sensitivity(i)).value for i, name in enumerate(names)}
+    found |= {f"peak_sensitivity {name}": smooth_peak(cut.sensitivity(i)) for i, name in enumerate(names)}
     if "bandwidth" in spec.specification:
         found["bandwidth"] = min(tracked_band(cut)[0], last_crossover(cut))
     return found

@@ -143,6 +143,7 @@ import casadi as ca
 from malta.model.parameters import si
 from malta.model.actuator import Actuator
 from malta.model.plant import Plant, Signal
+from malta.model.sensors import Sensors
 from malta.synthesis.requirements import Figure, Requirement
 
 
@@ -161,7 +162,7 @@ def plant(par):
         name="floater", parameters=par,
         states=(Signal("y", "m"), Signal("y_dot", "m/s")), inputs=(Signal("F", "N"),), outputs=(Signal("y", "m"),),
         f=f, h=lambda x, u: x[0], actuator=Actuator((Signal("i", "A"),), (10.0,), 5.0),
-        variant=plant, noise=(1e-6,),
+        variant=plant, sensors=Sensors(noise=(1e-6,)),
     )
 
 
