@@ -24,7 +24,7 @@ from malta.arrays import ComplexArray, FloatArray, readonly
 from malta.display import display
 from malta.errors import CheckError
 from malta.linear.matrices import system_matrix
-from malta.linear.peaks import in_plane
+from malta.linear.peaks import in_plane, response_at
 from malta.linear.sampling import add_lags, delay_inputs, eigenvalues, sample
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
@@ -178,13 +178,14 @@ class SampledLoop:
     def systems(self) -> tuple[System, System]:
         """P and F in differences, (x+ - x) / T: slow poles keep their digits."""
         c, T = self.control, self.sample_time
-        P = System(
-            (self.Ad - np.eye(len(self.Ad))) / T,
-            self.Bd / T,
-            self.Cd,
-            np.zeros((len(self.Cd), self.Bd.shape[1])),
-        )
-        return P, System((c.A - np.eye(len(c.A))) / T, c.B_y / T, c.C, c.D_y)
+        none = np.zeros((len(self.Cd), self.Bd.shape[1]))
+        machine, law = System(self.Ad, self.Bd, self.Cd, none, dt=T), System(c.A, c.B_y, c.C, c.D_y, dt=T)
+        return machine.differences, law.differences
+
+    @cached_property
+    def spectral_radius(self) -> float:
+        """The largest |z| of the closed loop; stable below 1."""
+        return float(np.abs(eigenvalues(self.closed)).max())
 
     @property
     def resonances(self) -> FloatArray:
@@ -196,8 +197,7 @@ class SampledLoop:
     @cached_property
     def cut(self) -> Nominal:
         """The loop cut at its sensors: what peaks and crossings are read from."""
-        stable = bool(np.abs(eigenvalues(self.closed)).max() < 1)
-        return Nominal(*self.systems, stable, self.sample_time)
+        return Nominal(*self.systems, self.spectral_radius < 1, self.sample_time)
 
     @cached_property
     def _responses(self) -> tuple[Callable[[ComplexArray], ComplexArray], ...]:
@@ -222,23 +222,13 @@ class SampledLoop:
         k, T = len(self.control.A), self.sample_time
         push = np.concatenate([self.pushed @ load, np.zeros(k)])[:, None]
         C = np.hstack([self.outputs, np.zeros((len(self.Cd), k))])
-        A = self.closed
-        system = System((A - np.eye(len(A))) / T, push / T, C, np.zeros((len(C), 1)))
-        return in_plane(system, T).balanced
+        closed = System(self.closed, push, C, np.zeros((len(C), 1)), dt=T)
+        return in_plane(closed.differences, T).balanced
 
     def compliance(self, w: FloatArray, load: FloatArray) -> ComplexArray:
         """True outputs per load at frequencies w, rad/s, of a load that is constant throughout each sample: k x p."""
-        assert self.pushed is not None
-        z = np.exp(1j * np.asarray(w) * self.sample_time)[:, None, None]
-        law, into = self.control, np.hstack([self.Bd, self.pushed @ load[:, None]])
-        P = np.linalg.solve(z * np.eye(len(self.Ad)) - self.Ad, into)
-        P, true = self.Cd @ P, self.outputs @ P
-        F = law.C @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B_y) + law.D_y
-        m = self.Bd.shape[1]
-        read = np.linalg.solve(np.eye(len(self.Cd)) - P[..., :m] @ F, P[..., m:])
-        if self.true is None:
-            return np.asarray(read[..., 0])
-        return np.asarray((true[..., m:] + true[..., :m] @ F @ read)[..., 0])
+        half = self.sample_time / 2
+        return response_at(self.under_load(load), np.tan(np.asarray(w) * half) / half)[..., 0]
 
 
 def sampled_loop(
@@ -498,12 +488,8 @@ def loaded_loop(
         B, law = into, law._replace(C=law.C[:m], D_y=law.D_y[:m])
     else:
         B = np.hstack([into, left])
-    T = loop.sample_time
-
-    # In differences: slow poles lie close to 1, where z - A has lost their digits.
-    P = System((loop.Ad - np.eye(len(loop.Ad))) / T, B / T, loop.Cd, np.zeros((len(loop.Cd), B.shape[1])))
-    F = System((law.A - np.eye(len(law.A))) / T, law.B_y / T, law.C, law.D_y)
-    return Nominal(P, F, bool(np.abs(eigenvalues(loop.closed)).max() < 1), T, m)
+    P, F = SampledLoop(loop.Ad, B, loop.Cd, law, loop.sample_time).systems
+    return Nominal(P, F, loop.spectral_radius < 1, loop.sample_time, m)
 
 
 def _on_top(rows: FloatArray, of: FloatArray) -> FloatArray:

@@ -125,7 +125,7 @@ def machine_report(model: LinearModel, controller: Controller) -> LoopReport:
 
 def stage_of(name: str, stage: SampledLoop, sensors: list[str]) -> StagePeak:
     """The peak sensitivities and the spectral radius of a loop; the peaks of an unstable one are NaN."""
-    radius = float(np.abs(eigenvalues(stage.closed)).max())
+    radius = stage.spectral_radius
     if radius >= 1:
         return StagePeak(name, dict.fromkeys([*sensors, "sigma_max"], np.nan), np.nan, radius)
 

@@ -26,10 +26,9 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.linear.peaks import largest_gain
 from malta.linear.sampling import add_lags, delay_inputs, sample
-from malta.linear.system import System
 from malta.loops.classical import Nominal, last_crossover, tracked_band
 from malta.loops.parametric_plants import of_plant
-from malta.loops.sampled_loops import disturbance_map, push_through
+from malta.loops.sampled_loops import SampledLoop, disturbance_map, push_through
 from malta.loops.time_domain import covariance, noise_variance
 from malta.loops.windings import (
     WindingModel,
@@ -513,9 +512,8 @@ def _response(
 
     Of several groups, the loop gain's last crossing is that of the widest: it binds a group that stands alone.
     """
-    M, k = group.nominal, len(law.A)
-    P = System((M.Ad - np.eye(len(M.Ad))) / Ts, M.Bd / Ts, M.Cd, np.zeros((len(M.Cd), M.Bd.shape[1])))
-    cut = Nominal(P, System((law.A - np.eye(k)) / Ts, law.B_y / Ts, law.C, law.D_y), True, Ts)
+    machine = SampledLoop(group.nominal.Ad, group.nominal.Bd, group.nominal.Cd, law, Ts)
+    cut = Nominal(*machine.systems, True, Ts)
     n = len(group.states)
     half = n // 2
     stiffness = group.model.B[half:] @ gain_at_rest(g.K, n, known) - group.model.A[half:, :half]
