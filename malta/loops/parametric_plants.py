@@ -98,7 +98,7 @@ def of_plant(
         command = command_of(chain, p, acting, np.array(nominal, dtype=float), wanted)
         v, why = command.values, why or command.why
         conditions += command.conditions
-        if loaded:
+        if loaded and not why:
             machine = in_symbols(plant, symbols)
             conditions += limits_at_rest(machine, believed or plant, rest.function(p[own], z)[0], v)
         A, B, C, E = of(p[own], z, v)[:4]

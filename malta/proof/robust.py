@@ -288,7 +288,7 @@ def robust_margin(
     '5.00 5.00 2.00'
     """
     effort = ProofEffort(tolerance, time, budget, progress)
-    over = {} if over is None else over
+    over = by_name("robust_margin", "over", {} if over is None else over, '{"k": (1, 2)}')
     named, law, ranges = _either_form(system, compensator, ranges, over)
     box = box_of(named.names, named.nominal, named.limits, ranges, named.spread(over))
     return margin_of(problem_of(named, law), within_branches(box, named), effort)

@@ -87,7 +87,7 @@ SENSORS = ["x1", "y1", "x2", "y2", "z"]
 def _sampled(name: str, z: float = 0.0) -> tuple[UncertainSystem, Compensator]:
     c = gains.read(f"design/gains/{name}.json")
     plant = plant_of(c.parameters)
-    return uncertain(plant, list(BOX), at={"z": z}), machine_law(plant, c, "lag")
+    return uncertain(plant, list(BOX), at={"z": z}, loaded=False), machine_law(plant, c, "lag")
 
 
 @pytest.mark.parametrize("name", CHAINED)
