@@ -267,7 +267,8 @@ def schema(
     from malta import schemas
     from malta.cli.documents.published import ALL_SCHEMAS, schema_of
     from malta.files import json_text
-    from malta.model.data import plant_of, read
+    from malta.model.data import read
+    from malta.model.plants import plant_of
 
     if name is None:
         print("\n".join(ALL_SCHEMAS))

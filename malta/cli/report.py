@@ -155,7 +155,8 @@ def campaigns_of(
         return []
     from malta.campaigns.run import status
     from malta.campaigns.summary import RunLimits
-    from malta.model.data import plant_of, published_figures
+    from malta.model.plants import plant_of
+    from malta.model.published import published_figures
 
     bounds = RunLimits(published_figures(plant_of(controller.parameters).name), spec)
     found = []
@@ -322,7 +323,7 @@ def _require_kinds(
 
 def _read_machines(files: Sequence[Path], machine: Path | None, change: list[str] | None) -> Machines:
     """Machines and controllers by the names of the designs; designs of one name get those of their files."""
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
 
     controllers = [read_controller(file, machine) for file in files]
     names = [c.name for c in controllers]

@@ -192,7 +192,7 @@ def round_gains(c: Controller) -> Controller:
 def rounded_margin(c: Controller, uncertainty: dict[str, float]) -> Margin | None:
     """The margin of the sampled loop with rounded coefficients, proven over the travel; None without uncertainty."""
     from malta.margins.travel import travel_margin
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
 
     if not uncertainty:
         return None

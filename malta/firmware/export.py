@@ -57,8 +57,8 @@ from malta.firmware.supervisor import MONITORS, STATES, TIMES, ReferenceLimits, 
 from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
 from malta.firmware.vectors import SAMPLES, Vector, record_vectors, trial_context, watch_lines
 from malta.gains.file import content_of, read
-from malta.model.data import plant_of
 from malta.model.parameters import box_words
+from malta.model.plants import plant_of
 from malta.simulation.layout import Fidelity
 from malta.synthesis.controller import Controller
 

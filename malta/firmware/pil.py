@@ -29,7 +29,7 @@ from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.vectors import SAMPLES, Vector, record_vectors
 from malta.gains.file import content_of, read
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.simulation.layout import Fidelity
 
 # A serial line: its port, and frames on it with a checksum, which are asked for again when they are lost.

@@ -13,11 +13,11 @@ from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors, require_known
 from malta.files import require_plain_name
 from malta.gains.schema import GainFile, LinearTable, PlantTable
-from malta.model.data import parameters_record, plant_of
 from malta.model.linear import LinearSystem, linear_machine
-from malta.model.machines import machine
+from malta.model.machines import machine, parameters_record
 from malta.model.parameters import later_parameters, units_of
 from malta.model.plant import Parameters, Plant, Signal, outputs_at
+from malta.model.plants import plant_of
 from malta.model.signals import Coordinates
 from malta.synthesis.controller import (
     Commutation,

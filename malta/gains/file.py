@@ -45,9 +45,9 @@ from malta.gains.contents import LINEAR_MACHINE_NAME, build_controller, linear_t
 from malta.gains.encodings import SUFFIXES as SUFFIXES, content_sha256, decode, encode
 from malta.gains.schema import GainFile
 from malta.loops.own_model import unstable_gain
-from malta.model.data import plant_of
 from malta.model.linear import is_linear
 from malta.model.parameters import units_of, values_of
+from malta.model.plants import plant_of
 from malta.synthesis.controller import Controller
 from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule
 from malta.tables import validate

@@ -32,7 +32,8 @@ from malta.loops.classical import Nominal
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.model.plant import Plant, Signal
 from malta.processes import on_one_thread
-from malta.synthesis.controller import Controller, LinearLaw, linear_law
+from malta.synthesis.controller import Controller
+from malta.synthesis.law import LinearLaw, linear_law
 from malta.synthesis.law_system import reference_names, set_point
 
 # The loop of a machine and a controller as systems of python-control: to plot, to simulate, to compute with.

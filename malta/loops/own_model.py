@@ -9,8 +9,8 @@ import numpy as np
 from malta.arrays import ComplexArray
 from malta.linear.sampling import add_integrals, eigenvalues
 from malta.loops.loop import loop_of_model
-from malta.model.data import plant_of
 from malta.model.linearize import linearize
+from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 

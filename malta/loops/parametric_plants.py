@@ -22,8 +22,9 @@ from malta.linear.rational import Ratio, Symbolic, TooLarge, symbolic as rationa
 from malta.linear.systems import from_source
 from malta.linear.uncertain import UncertainSystem
 from malta.loops.windings import WindingModel, with_windings
+from malta.model.currents import is_commutated
 from malta.model.equilibrium import with_command
-from malta.model.linearize import is_commutated, jacobians, linearize
+from malta.model.linearize import jacobians, linearize
 from malta.model.parameters import shape_parameters, twins_of, units_of
 from malta.model.plant import Plant, position_in, symbolic
 from malta.model.sensors import Sensors, with_lags

@@ -21,10 +21,10 @@ from malta.loops.parametric_plants import MAX_MODEL_OPERATIONS, model_of
 from malta.loops.sampled_loops import LAST_STAGE, loaded_loop, machine_law, machine_system
 from malta.loops.windings import CurrentLoops
 from malta.margins.scheduled_loops import loops_between_places
-from malta.model.data import plant_of
-from malta.model.linearize import is_commutated
+from malta.model.currents import is_commutated
 from malta.model.parameters import units_of
 from malta.model.plant import off_stroke, outputs_at, position_at
+from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
@@ -41,7 +41,7 @@ from malta.proof.robust import (
 )
 from malta.proof.weak_coupling import HeldLoop
 from malta.proof.weak_coupling.held_currents import held_machine
-from malta.synthesis.schedule import point_at
+from malta.synthesis.law import point_at
 from malta.work import MORE_WORK, Budget, WorkUp, count_work, in_rounds
 
 if TYPE_CHECKING:

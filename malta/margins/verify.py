@@ -53,10 +53,10 @@ from malta.margins.travel import (
     smallest_margin,
     travel_margin,
 )
-from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.model.parameters import units_of
 from malta.model.plant import Plant, position_at
+from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.robust import robust_margin

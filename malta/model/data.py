@@ -10,26 +10,19 @@ here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import MISSING, fields, is_dataclass
-from decimal import Decimal
-from functools import lru_cache
+from dataclasses import MISSING, fields
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Literal, NamedTuple, cast
+from typing import Annotated, Any, Literal
 
 from pydantic import Field as Checked, StrictStr
 
-from malta.arguments import is_number
-from malta.errors import CheckError, InputError
-from malta.files import file_exists, locate, shipped_path
-from malta.model.checks import check_numbers, line_of
-from malta.model.equilibrium import check_values, is_checked, register
-from malta.model.machines import file_of, machine, machine_names, module_of, name_of
+from malta.errors import InputError
+from malta.files import locate
+from malta.model.machines import machine, machine_names, parameters_record
 from malta.model.parameters import check_range
-from malta.model.plant import Parameters, Plant
 from malta.tables import Finite, Quantity, Record, entry, load_toml, validate
-from malta.units import to_si, unit_factor
+from malta.units import to_si
 
 
 class Sourced(Quantity):
@@ -131,162 +124,3 @@ def machine_beside(name: str, data_file: Path) -> ModuleType:
         raise InputError(
             data_file, "machine", repr(name), f"one of {known}, or the file of its module, as rotor.py"
         ) from error
-
-
-def parameters_record(module: ModuleType, where: str | Path) -> type[Parameters]:
-    """The class Parameters of a machine's module.
-
-    Raises InputError unless it is a dataclass whose fields have units and one of which is `preset`.
-    """
-    record: Any = getattr(module, "Parameters")  # noqa: B009  a user's module
-    if not (is_dataclass(record) and isinstance(record, type)):
-        raise InputError(
-            where, f"{module.__name__.rpartition('.')[2]}.Parameters", repr(record), "a frozen dataclass"
-        )
-    if not any("unit" in f.metadata for f in fields(record)):
-        raise InputError(
-            where, "Parameters", "no field with a unit", 'some, as `m: float = si("kg", above=0)`'
-        )
-    if "preset" not in {f.name for f in fields(record)}:
-        raise InputError(where, "Parameters", "no field preset", '`preset: str = "custom"`')
-    return cast("type[Parameters]", record)
-
-
-def plant_of(parameters: Parameters) -> Plant:
-    """Build the plant with these parameters, by the function `plant` of the module that defines their class.
-
-    parameters : a machine's Parameters record, SI
-
-    Returns a Plant; equal records of parameters have the same one.
-
-    Raises InputError when the module has no such function, and when the fields of its plant do not fit each other.
-
-    >>> import malta
-    >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
-    >>> plant.name, len(plant.states), [s.name for s in plant.outputs]
-    ('tubular', 12, ['x1', 'y1', 'x2', 'y2', 'z'])
-    """
-    return _plant_of(parameters)
-
-
-@lru_cache(maxsize=64)  # records are immutable, and building a plant is slow
-def _plant_of(parameters: Any) -> Plant:
-    module = module_of(parameters)
-    build: Callable[[Any], Plant] | None = getattr(module, "plant", None)
-    if build is None:
-        raise InputError(module.__name__, "plant", "nothing", "a function of Parameters -> Plant beside them")
-    name = name_of(module)
-    try:
-        plant = build(parameters)
-    except (InputError, CheckError):
-        raise
-    except Exception as error:  # a user's function may raise anything
-        found = f"{type(error).__name__}: {error}{(line := line_of(error)) and f', at {line}'}"
-        raise InputError(f"{name}.py", "plant", found, "a function that makes a Plant") from error
-    if not isinstance(plant, Plant):
-        raise InputError(
-            f"{name}.py", "plant", f"a function that returns {plant!r}", "one that returns a Plant"
-        )
-    if file_of(name) is not None and plant.name != name:
-        raise InputError(f"{name}.py", "plant: name", repr(plant.name), f"{name!r}, as the file is called")
-    checked = is_checked(plant, build)
-    if not checked:
-        check_numbers(plant)
-    register(plant, build)
-    if checked:
-        check_values(plant)
-    return plant
-
-
-# The figures that a machine's paper prints, from published.toml files, each with its unit.
-
-
-def read_published(machine_file: str | Path) -> dict[str, Any]:
-    """Read the figures that a machine's paper prints: published/NAME.toml or published.toml beside its data file.
-
-    machine_file : the machine's data file, as data/tubular.toml
-
-    Returns the tables of the file; a quantity is {"value": ..., "unit": ...}, in the paper's own unit.
-
-    Raises InputError when neither file exists.
-
-    >>> import malta
-    >>> printed = malta.model.read_published("data/tubular.toml")
-    >>> printed["table_I"]["poles"]["x"], printed["table_I"]["unit"]
-    (218.92, 'rad/s')
-    """
-    return load_toml(_published_file(Path(machine_file)))
-
-
-def published_beside(machine_file: str | Path) -> dict[str, Any] | None:
-    """Read the published figures beside a data file; None when there is no such file."""
-    file = _published_file(locate(machine_file))
-    return load_toml(file) if file_exists(file) else None
-
-
-def published_figures(machine: str) -> dict[str, Any] | None:
-    """Read the published figures of a machine by its name, from malta's data or beside the user's own machine file."""
-    file = file_of(machine)
-    return published_beside(
-        shipped_path("data", f"{machine}.toml") if file is None else file.with_suffix(".toml")
-    )
-
-
-def _published_file(data_file: Path) -> Path:
-    data_file = locate(data_file)
-    alone = data_file.parent / "published.toml"
-    of_its_name = data_file.parent / "published" / data_file.name
-    return alone if file_exists(alone) and not file_exists(of_its_name) else of_its_name
-
-
-MOST_DIGITS = 20  # of a published figure behind its point
-
-
-class PublishedFigure(NamedTuple):
-    """A figure as a paper prints it."""
-
-    value: float  # SI
-    half: float = 0.0  # SI, half a unit of its last printed digit
-    about: bool = False  # whether the paper says "about", "around" or "approximately"
-
-
-def published_figure(content: Mapping[str, Any], key: str) -> PublishedFigure:
-    """A published quantity by its dotted key: `{ value, unit }`, or a number in a table with a unit; SI units.
-
-    Its digits are those of the file; `digits` beside it, or in a table above it, counts decimals that end in zeros.
-    `about = true` marks what the paper calls about, around or approximately so much.
-
-    Raises InputError when the key is missing, the entry is no finite number, or its unit or digits are none.
-    """
-    where, unit, digits, about = "data/published", None, None, False
-    entry: Any = content
-    for part in key.split("."):
-        if not isinstance(entry, Mapping) or part not in entry:
-            raise InputError(where, key, "nothing", "what the paper prints")
-        unit, digits = entry.get("unit", unit), entry.get("digits", digits)
-        entry = entry[part]
-    if isinstance(entry, Mapping):
-        digits, about = entry.get("digits", digits), entry.get("about", False)
-        unit, entry = entry.get("unit"), entry.get("value")
-    if not is_number(entry) or not isinstance(unit, str):
-        raise InputError(where, key, f"{entry!r} in {unit}", "a number with a unit")
-    if digits is not None and (type(digits) is not int or abs(digits) > MOST_DIGITS):
-        raise InputError(where, f"{key}.digits", repr(digits), f"decimals, at most {MOST_DIGITS}")
-    factor = unit_factor(unit, f"{key}.unit")
-    half = half_of_last_digit(repr(entry)) if digits is None else 0.5 * 10.0**-digits
-    return PublishedFigure(float(entry) * factor, half * factor, about is True)
-
-
-def half_of_last_digit(text: str) -> float:
-    """Half a unit of the last digit of a number as it is written.
-
-    >>> half_of_last_digit("25.67"), half_of_last_digit("205"), half_of_last_digit("2.62e-05")
-    (0.005, 0.5, 5e-08)
-    """
-    exponent = Decimal(text).as_tuple().exponent
-    return float(Decimal(5).scaleb(int(exponent) - 1))
-
-
-def published_value(content: Mapping[str, Any], key: str) -> float:
-    """The value of `published_figure`."""
-    return published_figure(content, key).value

@@ -34,10 +34,10 @@ from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.matrices import system_matrix
 from malta.model.actuator import Actuator
-from malta.model.data import plant_of
 from malta.model.machines import machine_names
 from malta.model.parameters import check_parameters, si, symbolic_names
 from malta.model.plant import Parameters, Plant, Signal
+from malta.model.plants import plant_of
 from malta.model.sensors import Sensors
 
 MAX_FORMULA_LENGTH = 4000  # characters of a formula

@@ -21,12 +21,14 @@ from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.model.actuator import Actuator
 from malta.model.contacts import Contacts
-from malta.model.equations import Body
 from malta.model.flat_fields import GROUPS, refuse_flat, refuse_reading
 from malta.model.parameters import Parameters as Parameters
 from malta.model.sensors import Sensors, split_dead_time
 from malta.model.signals import DEFAULT, CasadiFn, Drive, InverseCheck, Signal as Signal
 from malta.model.stroke import Stroke
+
+if TYPE_CHECKING:
+    from malta.model.rigid_body import Body
 
 
 @display
@@ -262,7 +264,7 @@ class Plant:
         ball: `currents` is not the inverse of `forces` along q
           q in -0.002 .. 0.002 m: at -0.002 the currents of f = -3.6 N make -11.02 N, 103 % of its limit apart
         """
-        from malta.model.linearize import check_inverse  # which linearizes plants
+        from malta.model.currents import check_inverse  # which imports plants
 
         return check_inverse(self)
 

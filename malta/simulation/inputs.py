@@ -18,8 +18,8 @@ from scipy.special import erf
 
 from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
-from malta.model.data import plant_of
 from malta.model.plant import Plant, off_stroke, outputs_at, place_states, position_in
+from malta.model.plants import plant_of
 from malta.simulation import references
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.layout import electronics_of, layout_of, noise_scales
@@ -27,8 +27,7 @@ from malta.simulation.period import state_reference
 from malta.simulation.readings import keys, normals, normals_of_parts
 from malta.simulation.references import Motion
 from malta.simulation.scenario import FeedforwardChoice, Scenario, Simulation
-from malta.synthesis.controller import Controller
-from malta.synthesis.feedforward import holding_gain
+from malta.synthesis.controller import Controller, holding_gain
 
 STARTS = 3  # random phases for each axis
 NORMS = (4, 8, 32)  # of the signal that are minimized

@@ -16,8 +16,8 @@ from malta.arrays import FloatArray, readonly
 from malta.display import Curves, Description, display, quantity
 from malta.files import replace_files
 from malta.merits import Merit, merit_field, reported_merits
-from malta.model.machines import FINE_UNITS
 from malta.model.plant import Plant, Signal
+from malta.model.signal_groups import FINE_UNITS
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.inputs import Inputs
 from malta.simulation.layout import columns_of_row, electronics_of

@@ -10,9 +10,10 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.linear.system import System
-from malta.model.data import plant_of
 from malta.model.plant import outputs_at
-from malta.synthesis.controller import Controller, linear_law
+from malta.model.plants import plant_of
+from malta.synthesis.controller import Controller
+from malta.synthesis.law import linear_law
 
 
 def law_system(c: Controller) -> Any:

@@ -33,7 +33,7 @@ from malta.firmware.supervisor_text import NUMBERS, compile_supervised
 from malta.firmware.vectors import record_vectors
 from malta.margins.tuned_gains import GainBox
 from malta.simulation.engine.compiled import compiler
-from malta.synthesis.controller import gains_of
+from malta.synthesis.law import gains_of
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

@@ -37,15 +37,16 @@ from malta.machines.halbach.open_loop import (
 )
 from malta.machines.halbach.paper import HalbachEvidence, open_loop_dip, rise_of_dip
 from malta.machines.halbach.plant import Parameters
-from malta.model.data import published_value
 from malta.model.plant import Plant
+from malta.model.published import published_value
 from malta.report.ledger import ledger
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.experiments.catalogue import cases_of, experiment
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-from malta.synthesis.controller import Controller, linear_law
+from malta.synthesis.controller import Controller
 from malta.synthesis.filters import sampled_model
+from malta.synthesis.law import linear_law
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

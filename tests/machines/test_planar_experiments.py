@@ -27,12 +27,12 @@ from malta.machines.planar import (
     plant as planar,
 )
 from malta.margins.loop_report import LoopReport
-from malta.model.data import published_value, read_published
+from malta.model.published import published_value, read_published
 from malta.report.figures import experiment_figure
 from malta.report.ledger import ledger
 from malta.simulation.experiments import Experiment
 from malta.simulation.experiments.catalogue import cases_of, experiments_of
-from malta.synthesis.controller import law, linear_law
+from malta.synthesis.law import law, linear_law
 from malta.synthesis.synthesize import braking_errors
 
 if TYPE_CHECKING:

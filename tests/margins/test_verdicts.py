@@ -24,7 +24,7 @@ from malta.app.worker import outcome_document
 from malta.display import number
 from malta.gains.file import read
 from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, Outcome
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.proof.margin import NOT_PROVEN
 from malta.report.page.analysis import key_figures
 from malta.report.tables.design import requirements_table

@@ -14,7 +14,7 @@ import malta
 from malta.linear.sampling import eigenvalues, sample, sample_noise
 from malta.loops.own_model import controller_poles
 from malta.loops.sampled_loops import sampled_loop
-from malta.synthesis.controller import law, linear_law
+from malta.synthesis.law import law, linear_law
 
 if TYPE_CHECKING:
     from conftest import Design

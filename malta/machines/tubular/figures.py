@@ -18,7 +18,7 @@ from malta.machines.tubular.experiment_figures import (
     supervised_faults_figure,
 )
 from malta.machines.tubular.experiments.disturbances import REST_SAMPLES
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.report.figures.drawing import (
     BOUND_STYLE,
     CROSS,

@@ -8,7 +8,7 @@ from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from malta.model.machines import FINE_UNITS
+from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import MORE_STYLES, STYLES, draw_line, finish_axes, micro, new_figure
 from malta.report.page.document import Front, Page, render
 from malta.report.page.sections import Illustration, Item, PageTable, Section, distinct_channels, polish

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.model.data import plant_of
 from malta.model.parameters import is_default, shape_parameters, twins_of, units_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.simulation.engine.compiled import (
     LANES,
     Lanes,
