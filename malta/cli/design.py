@@ -122,7 +122,7 @@ def _run_design(
     over a gain file then.
     """
     from malta import gains, report
-    from malta.gains.file import require_stable
+    from malta.gains.writing import require_stable
     from malta.margins.verify import linear_report
     from malta.model.linearize import linearize
     from malta.model.published import published_beside
@@ -206,13 +206,14 @@ def _simulate_gain_file(
     """
 
     from malta import gains
+    from malta.gains.stable import read_stable
     from malta.simulation.experiments.catalogue import experiment
 
     with tempfile.TemporaryDirectory() as scratch:
         trial = Path(scratch) / f"{spec.name}.json"
         gains.write(controller, margins, trial)
         try:
-            written = gains.read(trial)
+            written = read_stable(trial)
         except InputError as error:  # of numbers in the design: the user knows of no other file
             raise InputError(file, error.field, error.found, error.expected) from error
         result = experiment(job, spec.plant, written)

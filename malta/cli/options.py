@@ -428,11 +428,12 @@ def read_controller(gains: Path, machine_file: Path | None) -> Controller:
     Raises InputError as `malta.machine` and `gains.read`; an unknown machine is named with the option that tells it.
     """
     from malta import gains as gain_files
+    from malta.gains.stable import require_held
     from malta.model.machines import machine
 
     if machine_file is not None:
         machine(machine_file)
-    return gain_files.read(gains)
+    return require_held(gain_files.read(gains), gains)
 
 
 def verify_and_write(controller: Controller, gains: Path, folder: Path) -> list[Path]:

@@ -84,7 +84,7 @@ def report(
     \b
     Example:  malta report design/gains/robust.json --out build/robust.html --pdf
     """
-    from malta.gains.file import require_stable
+    from malta.gains.writing import require_stable
     from malta.report.page.document import SUFFIXES, pdf_of
     from malta.report.page.report import report_work
 
@@ -533,7 +533,7 @@ def compare(
     \b
     Example:  malta compare design/gains/table2.json design/gains/robust.json
     """
-    from malta.gains.file import require_stable
+    from malta.gains.writing import require_stable
     from malta.report.page.comparison import compare as compare_subjects, comparison_tables, require_count
     from malta.report.page.document import SUFFIXES
 

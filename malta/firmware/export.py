@@ -56,7 +56,8 @@ from malta.firmware.step import programs_of
 from malta.firmware.supervisor import MONITORS, STATES, TIMES, ReferenceLimits, monitors_of, reference_limits
 from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
 from malta.firmware.vectors import SAMPLES, Vector, record_vectors, trial_context, watch_lines
-from malta.gains.file import content_of, read
+from malta.gains.file import content_of
+from malta.gains.stable import read_stable
 from malta.model.parameters import box_words
 from malta.model.plants import plant_of
 from malta.simulation.layout import Fidelity
@@ -519,7 +520,7 @@ def export_c(
     path = locate(gains)
     if clock is not None:
         positive("export", "clock", clock, below=MAX_CLOCK_RATE)
-    target = replace(_target(read(path), precision, until), tunable=tunable, excited=excitation)
+    target = replace(_target(read_stable(path), precision, until), tunable=tunable, excited=excitation)
     if log is not None:
         target = replace(target, logged=positive("export", "log", log))
         ring_of(target, "")  # raises before anything is proven
@@ -571,7 +572,7 @@ def export_fmu(
     True
     """
     path = locate(gains)
-    target = replace(_target(read(path), "double", until), tunable=tunable and part != "machine")
+    target = replace(_target(read_stable(path), "double", until), tunable=tunable and part != "machine")
     fmu = build_fmu(target, content_of(path)[0].sha256, part=part, fmi=fmi, platforms=platforms)
     replace_files({Path(out): fmu.content})
     return fmu.note

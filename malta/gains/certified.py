@@ -31,7 +31,9 @@ from malta.errors import CheckError, InputError, shorten
 from malta.files import locate
 from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import content_sha256
-from malta.gains.file import UNCOMPARED_TABLES, content_of, read
+from malta.gains.file import content_of
+from malta.gains.stable import read_stable
+from malta.gains.writing import UNCOMPARED_TABLES
 from malta.linear.expressions import NotAnalytic, exact
 from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.windings import CurrentLoops, chosen_loops
@@ -109,7 +111,7 @@ def disagreement(
     Raises InputError for a file of another kind, for one without uncertain parameters, and for unknown ones.
     """
     claim, path = document.claim, locate(Path(gains))
-    controller, content = read(path), content_of(path)[1]
+    controller, content = read_stable(path), content_of(path)[1]
     plant = plant_of(controller.parameters)
     ranges = uncertain
     if ranges is None:

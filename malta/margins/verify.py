@@ -30,7 +30,6 @@ from malta.loops.classical import (
     worst_of,
 )
 from malta.loops.loop import loop_of_model
-from malta.loops.own_model import controller_poles
 from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import (
     LAST_STAGE,
@@ -63,6 +62,7 @@ from malta.proof.robust import robust_margin
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import gain_at_rest
 from malta.synthesis.lqg import integrals_of, kalman, lqi, lqr, weights_of
+from malta.synthesis.separation import controller_poles
 from malta.work import Budget, count_work
 
 

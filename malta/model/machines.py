@@ -20,9 +20,9 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import module_from_spec, spec_from_file_location
@@ -31,8 +31,9 @@ from pkgutil import iter_modules
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
-from malta.errors import InputError
+from malta.errors import CheckError, InputError
 from malta.files import file_exists, read_file
+from malta.model.faults import line_of
 from malta.model.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -113,6 +114,30 @@ def module_of(parameters: Any) -> ModuleType:
         if error.name not in (f"{folder}.plant", folder):  # a module that `plant` imports
             raise
         return own
+
+
+@lru_cache(maxsize=64)  # records are immutable, and building a plant is slow
+def build_plant(parameters: Any) -> Plant:
+    """The plant that the function `plant` of a record's module makes, one for equal records; `plant_of` checks it."""
+    module = module_of(parameters)
+    build: Callable[[Any], Plant] | None = getattr(module, "plant", None)
+    if build is None:
+        raise InputError(module.__name__, "plant", "nothing", "a function of Parameters -> Plant beside them")
+    name = name_of(module)
+    try:
+        plant = build(parameters)
+    except (InputError, CheckError):
+        raise
+    except Exception as error:  # a user's function may raise anything
+        found = f"{type(error).__name__}: {error}{(line := line_of(error)) and f', at {line}'}"
+        raise InputError(f"{name}.py", "plant", found, "a function that makes a Plant") from error
+    if not hasattr(plant, "design_states"):
+        raise InputError(
+            f"{name}.py", "plant", f"a function that returns {plant!r}", "one that returns a Plant"
+        )
+    if file_of(name) is not None and plant.name != name:
+        raise InputError(f"{name}.py", "plant: name", repr(plant.name), f"{name!r}, as the file is called")
+    return plant
 
 
 def machine_names() -> list[str]:

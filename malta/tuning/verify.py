@@ -11,7 +11,8 @@ from typing import Any
 
 from malta.errors import CheckError, InputError
 from malta.files import locate
-from malta.gains.file import content_of, read
+from malta.gains.file import content_of
+from malta.gains.stable import read_stable
 from malta.loops.loop import Loop, loop_of_model
 from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.time_domain import bounded_deviation, noise_of, worst_along
@@ -240,7 +241,7 @@ def verify(
     if isinstance(loop, str | Path):
         stages = True if stages is None else stages
         uncertainty = content_of(locate(loop))[0].uncertainty if uncertainty is None else uncertainty
-        loop = read(loop)
+        loop = read_stable(loop)
     model, controller = _model_and_controller(loop, controller)
     if not stages:
         box = uncertainty if proof else None

@@ -12,9 +12,9 @@ from filterpy.kalman import KalmanFilter
 
 import malta
 from malta.linear.sampling import eigenvalues, sample, sample_noise
-from malta.loops.own_model import controller_poles
 from malta.loops.sampled_loops import sampled_loop
 from malta.synthesis.law import law, linear_law
+from malta.synthesis.separation import controller_poles
 
 if TYPE_CHECKING:
     from conftest import Design

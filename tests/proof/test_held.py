@@ -16,7 +16,7 @@ import malta
 from malta import gains
 from malta.linear.sampling import sample
 from malta.linear.uncertain import UncertainSystem, closed_loop, responses
-from malta.loops.own_model import controller_poles, unstable_gain
+from malta.loops.own_model import unstable_gain
 from malta.loops.parametric_plants import uncertain
 from malta.loops.sampled_loops import machine_loop, machine_system, sampled_law, sampled_loop
 from malta.loops.windings import left_out
@@ -33,6 +33,7 @@ from malta.synthesis.filters import between_samples, sampled_model
 from malta.synthesis.law import linear_law
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
+from malta.synthesis.separation import controller_poles
 from malta.synthesis.spec import Pid, Weights
 
 ROOT = Path(__file__).parents[2]

@@ -15,7 +15,7 @@ from conftest import ROOT, refusal
 import malta
 from malta import gains
 from malta.gains.encodings import content_sha256
-from malta.gains.file import document
+from malta.gains.writing import document
 from malta.loops.sampled_loops import machine_law, machine_loop
 from malta.machines.planar import motions
 from malta.model.parameters import fingerprint

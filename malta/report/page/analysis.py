@@ -17,7 +17,7 @@ from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.sampled_loops import LAST_STAGE
 from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, LoopReport
 from malta.merits import Merit, in_groups
-from malta.model.linear import is_linear
+from malta.model.linear.parameters import is_linear
 from malta.model.parameters import units_of
 from malta.model.plant import Parameters, Plant, Signal
 from malta.model.plants import plant_of

@@ -104,14 +104,15 @@ def subject_of(
 ) -> Subject:
     """Read what a page is about. Raises InputError as `malta.gains.read`."""
     from malta.files import locate
-    from malta.gains.file import content_of, read
+    from malta.gains.file import content_of
+    from malta.gains.stable import read_stable
     from malta.report.page.analysis import Subject
 
     if not isinstance(gains, str | Path):
         box = dict(uncertainty or {})
         return Subject(gains, parameters or gains.parameters, box, spec, "", changes)
     path = locate(gains)
-    controller = read(path)
+    controller = read_stable(path)
     file, _ = content_of(path)
     box = file.uncertainty if uncertainty is None else dict(uncertainty)
     return Subject(
