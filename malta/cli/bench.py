@@ -161,7 +161,7 @@ def _measure(
 
 def _print_measurement(found: Measurement, files: list[Path]) -> None:
     """The tables, and in words what was compared with what."""
-    from malta.model.parameters import box_words
+    from malta.model.boxes import box_words
     from malta.report.tables.experiments import measured_tables
 
     console = make_console()

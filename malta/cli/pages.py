@@ -240,7 +240,7 @@ def claims(
 
 def _is_meant(spec: Spec) -> bool:
     """Whether a design is meant to reproduce the paper on its machine."""
-    from malta.model.machines import require_part
+    from malta.model.parts import require_part
 
     return spec.name in getattr(require_part("claims", spec.plant.name), "REPRODUCING", (spec.name,))
 

@@ -27,7 +27,8 @@ from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.firmware.signals import Target, place_of_readings, reading_ranges, used_clearances
 from malta.linear.sampling import eigenvalues, sample
-from malta.model.plant import Plant, place_states
+from malta.model.places import place_states
+from malta.model.plant import Plant
 from malta.synthesis.controller import Controller, noise_input
 from malta.synthesis.riccati import dare
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray
@@ -18,6 +17,7 @@ from malta.model.faults import fault_of
 from malta.model.linear.parameters import linear_parameters
 from malta.model.machines import build_plant, machine, parameters_record
 from malta.model.parameters import Parameters, later_parameters, units_of
+from malta.model.places import outputs_at
 from malta.model.signals import Coordinates, Signal
 from malta.synthesis.controller import (
     Commutation,
@@ -194,7 +194,7 @@ def _schedule(file: GainFile, arrays: Arrays, layout: _Layout, path: str | Path)
         made = Schedule(file.schedule.variable, output, places, **stacked)
     x = np.zeros(len(plant.states))
     x[list(plant.controlled)] = arrays["operating_point"]["x"]
-    here = made.at(float(_of_machine(plant, "h", lambda: ca.DM(plant.h(ca.DM(x), 0)))[output]))
+    here = made.at(float(_of_machine(plant, "h", lambda: outputs_at(plant, x))[output]))
     for key, M in (arrays["model"] | arrays["gains"]).items():
         if key in here and not np.abs(M - here[key]).max() <= MATRIX_TOLERANCE * np.abs(M).max(initial=0.0):
             raise InputError(

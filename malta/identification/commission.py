@@ -33,7 +33,7 @@ from malta.identification.strokes import stroke_of
 from malta.identification.windings import identify_windings
 from malta.loops.classical import disk_sizes
 from malta.loops.loop import Loop, loop
-from malta.model.machines import attribute_of
+from malta.model.parts import attribute_of
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
 from malta.simulation import references

@@ -22,7 +22,8 @@ from malta.identification.response import (
     well_found,
 )
 from malta.model.equilibrium import trim
-from malta.model.plant import OperatingPoint, Plant, outputs_at
+from malta.model.places import outputs_at
+from malta.model.plant import OperatingPoint, Plant
 from malta.simulation.inputs import Multisine, interleaved_multisine
 
 if TYPE_CHECKING:

@@ -27,17 +27,8 @@ from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario, Simulation, simulation_of
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller
-from malta.synthesis.law import (
-    command_forces,
-    estimate_states,
-    filter_reading,
-    freeze_moving,
-    frozen_axes,
-    gains_of,
-    interpolate,
-    look_ahead,
-    sum_errors,
-)
+from malta.synthesis.law import command_forces, freeze_moving, frozen_axes, gains_of, interpolate, look_ahead
+from malta.synthesis.linear_law import estimate_states, filter_reading, sum_errors
 
 COMMAND_TOLERANCE = 1e-6  # of a force's limit, which files of nine digits keep too
 SETTLED_SHARE = 0.5  # of a log, after which the start of the filter is forgotten

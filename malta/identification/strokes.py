@@ -37,7 +37,7 @@ from malta.identification.learn import learn
 from malta.identification.log import Log, log_of, require_same_law, sample_excitation
 from malta.identification.replay import reference_motion
 from malta.loops.loop import Loop, loop
-from malta.model.machines import attribute_of
+from malta.model.parts import attribute_of
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
 from malta.simulation.scenario import Scenario

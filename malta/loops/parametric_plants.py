@@ -26,7 +26,8 @@ from malta.model.currents import is_commutated
 from malta.model.equilibrium import with_command
 from malta.model.linearize import jacobians, linearize
 from malta.model.parameters import shape_parameters, twins_of, units_of
-from malta.model.plant import Plant, position_in, symbolic
+from malta.model.places import position_in
+from malta.model.plant import Plant, symbolic
 from malta.model.sensors import Sensors, with_lags
 from malta.work import check_clock
 

@@ -31,7 +31,8 @@ from malta.linear.system import System
 from malta.loops.linear_loops import LinearLoop
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.loops.sampled_loops import SampledLoop
-from malta.model.plant import Plant, position_in
+from malta.model.places import position_in
+from malta.model.plant import Plant
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.recovery import RecoveryBound, StepResponse, step_response

@@ -29,13 +29,14 @@ from malta.linear.sampling import delay_inputs, sample
 from malta.linear.uncertain import Compensator
 from malta.model.currents import is_commutated
 from malta.model.linearize import linearize
-from malta.model.plant import OperatingPoint, Plant, outputs_at
+from malta.model.places import outputs_at
+from malta.model.plant import OperatingPoint, Plant
 from malta.model.plants import plant_of
 from malta.model.traced import trace
 
 if TYPE_CHECKING:
     from malta.synthesis.controller import Controller, CurrentLoop
-    from malta.synthesis.law import LinearLaw
+    from malta.synthesis.linear_law import LinearLaw
 
 
 CurrentLoops = Literal["lag", "pi"]

@@ -23,7 +23,7 @@ from malta.loops.windings import CurrentLoops
 from malta.margins.scheduled_loops import loops_between_places
 from malta.model.currents import is_commutated
 from malta.model.parameters import units_of
-from malta.model.plant import off_stroke, outputs_at, position_at
+from malta.model.places import off_stroke, outputs_at, position_at
 from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of

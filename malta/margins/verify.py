@@ -54,7 +54,8 @@ from malta.margins.travel import (
 )
 from malta.model.linearize import LinearModel, linearize
 from malta.model.parameters import units_of
-from malta.model.plant import Plant, position_at
+from malta.model.places import position_at
+from malta.model.plant import Plant
 from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges

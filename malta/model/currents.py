@@ -13,8 +13,8 @@ import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray
+from malta.model.inverse import InverseCheck, Mismatch
 from malta.model.plant import Plant
-from malta.model.signals import InverseCheck, Mismatch
 
 PLACES = 21  # along a state, from one end to the other
 SHARES = (-0.5, -0.1, 0.0, 0.1, 0.5)  # of the limits, commanded beside the preload

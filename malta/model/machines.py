@@ -6,10 +6,6 @@ A machine is a Python module with `Parameters` and `plant(par) -> Plant`. It com
   - a file that the user names: `machine = "rotor.py"` in a data file, `--machine rotor.py`, or in Python
     `malta.machine("rotor.py")`.
 A gain file names a machine, never a path, so reading one never runs code that the user did not name.
-
-Optional parts are found beside the model: EXPERIMENTS, FIGURES, CLAIMS, REQUIREMENTS, WORDS and other names are those
-of the module itself, or of the modules `experiments`, `figures`, `claims`, `requirements` beside it; claims may stand
-in `paper`, a module or a folder, with what they are computed from.
 """
 
 from __future__ import annotations
@@ -29,7 +25,7 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from pkgutil import iter_modules
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, read_file
@@ -48,7 +44,6 @@ class _File(NamedTuple):
 
 
 GROUP = "malta.machines"
-Part = Literal["experiments", "figures", "claims", "requirements"]
 FILES = "malta_machine_files"  # in sys.modules, the machines that come from files are modules of this package
 _files: dict[str, _File] = {}  # machines that the user named by their files, by the files' stems
 
@@ -150,62 +145,6 @@ def file_of(name: str) -> Path | None:
     return _files[name].path if name in _files else None
 
 
-def sources_of(name: str) -> dict[str, str]:
-    """The texts of the modules of a machine that was loaded from a file, by module name; empty for others."""
-    if name not in _files:
-        return {}
-    own = _files[name].module
-    modules = {key: module for key, module in sys.modules.items() if key == own or key.startswith(own + ".")}
-    paths = {key: getattr(module, "__file__", None) for key, module in modules.items()}
-    return {key: Path(path).read_text(encoding="utf-8") for key, path in paths.items() if path}
-
-
-def load_sources(name: str, sources: Mapping[str, str]) -> ModuleType:
-    """Load a machine from the texts of its modules, as `sources_of` returns them, on a computer without its files."""
-    own = min(sources, key=len)
-    if own in sys.modules:
-        return sys.modules[own]
-    folder = Path(tempfile.mkdtemp(prefix="malta-machine-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    for key, text in sources.items():
-        stem = name if key == own else key.rpartition(".")[2]
-        (folder / f"{stem}.py").write_text(text, encoding="utf-8")
-    path = folder / f"{name}.py"
-    return _load(path, _File(path.resolve(), own))  # under the name that records from elsewhere bear
-
-
-def part_of(part: Part, name: str) -> ModuleType | None:
-    """The module of a machine's optional part; None without such a part or machine."""
-    if name not in _files and name not in _installed_machines():
-        return None
-    module = machine(name)
-    folder = module.__name__ if hasattr(module, "__path__") else module.__name__.rpartition(".")[0]
-    for target in (*([f"{folder}.paper"] if part == "claims" else []), f"{folder}.{part}"):
-        try:
-            return import_module(target)
-        except ModuleNotFoundError as error:
-            if error.name not in (target, folder):  # a module that the part imports
-                raise
-    return None
-
-
-def attribute_of(plant: Plant, part: Part, name: str, default: Any = None) -> Any:
-    """The value of an optional name, from the module of the plant or of the part; else `default`."""
-    model = module_of(plant.parameters)
-    if hasattr(model, name):
-        return getattr(model, name)
-    return getattr(part_of(part, plant.name), name, default)
-
-
-def require_part(part: Part, name: str) -> ModuleType:
-    """The module of a machine's part. Raises InputError when the machine has none."""
-    module = part_of(part, name)
-    if module is None:
-        known = ", ".join(other for other in machine_names() if part_of(part, other) is not None)
-        raise InputError(part, "machine", repr(name), f"one of {known}, or another that has {part}")
-    return module
-
-
 @cache
 def _installed_machines() -> dict[str, str]:
     """The machines of installed packages, malta's own also without its metadata: names and modules."""
@@ -296,3 +235,27 @@ def parameters_record(module: ModuleType, where: str | Path) -> type[Parameters]
     if "preset" not in {f.name for f in fields(record)}:
         raise InputError(where, "Parameters", "no field preset", '`preset: str = "custom"`')
     return cast("type[Parameters]", record)
+
+
+def sources_of(name: str) -> dict[str, str]:
+    """The texts of the modules of a machine that was loaded from a file, by module name; empty for others."""
+    if name not in _files:
+        return {}
+    own = _files[name].module
+    modules = {key: module for key, module in sys.modules.items() if key == own or key.startswith(own + ".")}
+    paths = {key: getattr(module, "__file__", None) for key, module in modules.items()}
+    return {key: Path(path).read_text(encoding="utf-8") for key, path in paths.items() if path}
+
+
+def load_sources(name: str, sources: Mapping[str, str]) -> ModuleType:
+    """Load a machine from the texts of its modules, as `sources_of` returns them, on a computer without its files."""
+    own = min(sources, key=len)
+    if own in sys.modules:
+        return sys.modules[own]
+    folder = Path(tempfile.mkdtemp(prefix="malta-machine-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    for key, text in sources.items():
+        stem = name if key == own else key.rpartition(".")[2]
+        (folder / f"{stem}.py").write_text(text, encoding="utf-8")
+    path = folder / f"{name}.py"
+    return _load(path, _File(path.resolve(), own))  # under the name that records from elsewhere bear

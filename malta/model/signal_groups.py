@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from malta.model.machines import attribute_of
+from malta.model.parts import attribute_of
 from malta.model.plant import Plant, Signal
 
 FINE_UNITS: Mapping[str, str] = {"m": "um", "rad": "urad"}  # units of deviations

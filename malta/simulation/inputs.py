@@ -18,7 +18,8 @@ from scipy.special import erf
 
 from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
-from malta.model.plant import Plant, off_stroke, outputs_at, place_states, position_in
+from malta.model.places import off_stroke, outputs_at, place_states, position_in
+from malta.model.plant import Plant
 from malta.model.plants import plant_of
 from malta.simulation import references
 from malta.simulation.engine.engines import evaluate

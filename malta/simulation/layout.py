@@ -18,9 +18,9 @@ import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray
+from malta.model.drive import Electronics
 from malta.model.parameters import acting_names, twins_of
 from malta.model.plant import Plant, symbolic
-from malta.model.signals import Electronics
 from malta.synthesis.controller import Controller, CurrentLoop
 from malta.synthesis.law import gains_of
 from malta.synthesis.schedule import SCHEDULED_MATRICES

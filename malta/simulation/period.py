@@ -50,16 +50,8 @@ from malta.simulation.layout import (
 )
 from malta.simulation.readings import initial_readings, measurement, step_readings
 from malta.synthesis.controller import Controller
-from malta.synthesis.law import (
-    command_forces,
-    estimate_states,
-    filter_reading,
-    freeze_moving,
-    frozen_axes,
-    interpolate,
-    look_ahead,
-    sum_errors,
-)
+from malta.synthesis.law import command_forces, freeze_moving, frozen_axes, interpolate, look_ahead
+from malta.synthesis.linear_law import estimate_states, filter_reading, sum_errors
 
 # Motion of the machine between two samples: one step of the classical Runge–Kutta method under held commands.
 

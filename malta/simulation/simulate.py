@@ -32,7 +32,8 @@ from malta.errors import InputError
 from malta.linear.sampling import sample
 from malta.model.currents import is_commutated
 from malta.model.parameters import shape_parameters, units_of
-from malta.model.plant import Plant, place_states
+from malta.model.places import place_states
+from malta.model.plant import Plant
 from malta.model.plants import plant_of
 from malta.simulation import references
 from malta.simulation.engine.engines import Engine, EngineChoice, engine_of, evaluate, substeps_until

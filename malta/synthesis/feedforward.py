@@ -15,7 +15,8 @@ from malta.linear.sampling import sample
 from malta.model.actuator import Actuator
 from malta.model.equilibrium import holding_commands, load_balance
 from malta.model.linearize import LinearModel
-from malta.model.plant import Plant, off_stroke
+from malta.model.places import off_stroke
+from malta.model.plant import Plant
 from malta.synthesis.controller import Commutation, Controller, CurrentLoop, Feedforward, Limits, holding_gain
 from malta.synthesis.filters import between_samples
 

@@ -2,42 +2,31 @@
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache, reduce
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
-from malta.arrays import FloatArray, readonly
+from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.model.equations import note
-from malta.model.plant import OperatingPoint, Plant, outputs_at
-from malta.synthesis.controller import Controller, Tracks, summed_columns
+from malta.model.places import outputs_at
+from malta.synthesis.controller import Controller, Tracks
+from malta.synthesis.linear_law import (
+    braking_axes,
+    estimate_states,
+    filter_reading,
+    predict_states,
+    sum_errors,
+    wanted_forces,
+)
 from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule
 
 if TYPE_CHECKING:
-    from malta.synthesis.filters import Gains
-
-# How a sum takes what is added to it: plainly here, with what rounding loses in firmware of single precision.
-Add = Callable[[Any, Any], Any]
-
-
-class LinearLaw(NamedTuple):
-    """The law without saturation: s+ = A s + B_y y + B_r r, v = C s + D_y y + D_r r.
-
-    s = (xi_pred, e), without sums that are not fed back, and of a law of errors without the last error, which is new at
-    every sample; r = (p*, xi*, v_ff, v0).
-    """
-
-    A: FloatArray
-    B_y: FloatArray
-    B_r: FloatArray
-    C: FloatArray
-    D_y: FloatArray
-    D_r: FloatArray
+    from malta.model.plant import OperatingPoint, Plant
 
 
 def gains_of(c: Controller) -> dict[str, ca.DM]:
@@ -57,30 +46,10 @@ def gains_of(c: Controller) -> dict[str, ca.DM]:
     return matrices | {"lead": ca.DM(lead), "ahead": ca.sparsify(ca.DM(lead * c.commutation.pull))}
 
 
-def filter_reading(tracks: Tracks, y: Any, p_ref: Any) -> Any:
-    """The reading that step 2 takes: y, or y - p* in a law of errors."""
-    return y - p_ref if tracks == "errors" else y
-
-
-def sum_errors(g: Mapping[str, Any], e: Any, frozen: Any, y: Any, p_ref: Any, add: Add = operator.add) -> Any:
-    """Step 1: e, the sums of errors at this sample. add: how a sum takes what is added to it, see Add."""
-    if "braking" in g:
-        far = {k: ca.fabs(p_ref[k] - y[k]) > g["braking"][k] for k in _braking_axes(g)}
-        frozen = ca.vertcat(
-            *(ca.if_else(far[k], 1, frozen[k]) if k in far else frozen[k] for k in range(y.numel()))
-        )
-    return add(e, g["control_time"] * (1 - frozen) * (p_ref - y))
-
-
-def _braking_axes(g: Mapping[str, Any]) -> list[int]:
-    """The axes that brake."""
-    return [k for k in range(g["braking"].numel()) if g["braking"].sparsity().has_nz(k, 0)]
-
-
 def _braking_force(g: Mapping[str, Any], off: Any) -> Any:
     """What braking takes off the forces for errors xi* - xi_hat: exactly 0 within the errors from which axes brake."""
     found: Any = 0
-    for k in _braking_axes(g):
+    for k in braking_axes(g):
         b = g["braking"][k]
         size = ca.fmax(ca.fabs(off[k]), b)
         found = found + g["K"][:, k] * ((ca.sqrt(b * (2 * size - b)) / size - 1) * off[k])
@@ -92,34 +61,18 @@ def _braking_force(g: Mapping[str, Any], off: Any) -> Any:
     return found
 
 
-def estimate_states(
-    g: Mapping[str, Any], xi_pred: Any, y: Any, C: Any = None, add: Add = operator.add
-) -> Any:
-    """Step 2, the filter: xi_hat. C: in place of Cd where it is scheduled; add: see Add."""
-    return add(xi_pred, g["L"] @ (y - (g["Cd"] if C is None else C) @ xi_pred))
-
-
 def command_forces(
     g: Mapping[str, Any], xi_hat: Any, e: Any, xi_ref: Any, v_ff: Any, v0: Any
 ) -> tuple[Any, Any, Any]:
     """Steps 3, 4 and 6: (xi_pred, forces that saturate, v) from the estimate and the sums of errors."""
-    wanted = _wanted_forces(g, xi_hat, e, xi_ref, v_ff, v0)
+    wanted = wanted_forces(g, xi_hat, e, xi_ref, v_ff, v0)
     if "braking" in g:
         wanted = wanted + _braking_force(g, xi_ref - xi_hat)
     note("law", "w = K (xi_ref - xi_hat) + Ki e + v_ff + v0", w=wanted)
     v = ca.fmax(ca.fmin(wanted, g["force_limit"]), -g["force_limit"])
     saturated = v != wanted
     note("limit_forces", "v = w within +-limits.force; saturated: v is not w", v=v, saturated=saturated)
-    return _predict_states(g, xi_hat, v, v0), saturated, v
-
-
-def _wanted_forces(g: Mapping[str, Any], xi_hat: Any, e: Any, xi_ref: Any, v_ff: Any, v0: Any) -> Any:
-    # The first sum is the same for all machines under one reference: engines compute it once a sample.
-    return (g["K"] @ xi_ref + v_ff) + (g["Ki"] @ e - g["K"] @ xi_hat) + v0
-
-
-def _predict_states(g: Mapping[str, Any], xi_hat: Any, v: Any, v0: Any) -> Any:
-    return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0)
+    return predict_states(g, xi_hat, v, v0), saturated, v
 
 
 def frozen_axes(g: Mapping[str, Any], saturated: Any) -> Any:
@@ -193,65 +146,6 @@ def law_at(c: Controller, plant: Plant, x: FloatArray) -> Controller:
 def _fix_schedule(c: Controller, r: float) -> Controller:
     assert c.schedule is not None
     return replace(c, **c.schedule.at(r), schedule=None)
-
-
-@lru_cache(maxsize=8)  # every loop of a controller asks for it; records compare by identity
-def linear_law(c: Controller) -> LinearLaw:
-    """The control law linearized where no axis saturates or brakes: exact, from the steps that `law` is made of.
-
-    Of a schedule it is the law at the operating point; `law_at` has those at other references.
-    """
-    gains = {name: getattr(c, name) for name in SCHEDULED_MATRICES}
-    found = _without_limits(gains, c.sample_time, c.tracks, c.summed)
-    k = len(c.states) - len(c.measurements)
-    kept = any(M[k:].any() for M in (found.A, found.B_y, found.B_r))
-    if c.tracks == "errors" and not kept:  # the last errors are new at every sample
-        found = found._replace(A=found.A[:k, :k], B_y=found.B_y[:k], B_r=found.B_r[:k], C=found.C[:, :k])
-    return LinearLaw(*map(readonly, found))
-
-
-def linear_law_of(g: Gains, Ts: float) -> LinearLaw:
-    """The same of gains alone, for a search that tries thousands: without references, so r is empty."""
-    return _without_limits(g._asdict(), Ts, "states", summed_columns(g.Ki), references=False)
-
-
-def _without_limits(
-    gains: Mapping[str, FloatArray],
-    Ts: float,
-    tracks: Tracks,
-    summed: tuple[int, ...],
-    *,
-    references: bool = True,
-) -> LinearLaw:
-    """The law of one sample, whose steps are linear without limits: what it makes of unit vectors are its matrices."""
-    (n, m), p = gains["Bd"].shape, len(gains["Cd"])
-    g = {name: ca.sparsify(ca.DM(M)) for name, M in gains.items()} | {"control_time": Ts}
-    ends = np.cumsum([n, p, p, p, n, m, m]).tolist()
-    units = ca.DM.eye(ends[-1])[:, : ends[-1] if references else ends[2]]
-    xi_pred, e, y, p_ref, *given = ca.vertsplit(units, [0, *ends])
-    xi_hat = estimate_states(g, xi_pred, filter_reading(tracks, y, p_ref))
-    e_next = sum_errors(g, e, 0.0, y, p_ref)
-    v = _wanted_forces(g, xi_hat, e_next, *given)
-    s_next = ca.vertcat(_predict_states(g, xi_hat, v, given[-1]), e_next[list(summed), :])
-    s = [*range(n), *(n + k for k in summed)]
-    columns = (s, slice(ends[1], ends[2]), slice(ends[2], None))
-    return LinearLaw(*(np.array(M)[:, of] for M in (s_next, v) for of in columns))
-
-
-def with_slope(law: LinearLaw, slope: FloatArray) -> LinearLaw:
-    """The same law with forces v0 that follow the reading: slope is dv0/dy, m x p."""
-    columns = slice(-len(slope), None)  # of v0 in r
-    return law._replace(B_y=law.B_y + law.B_r[:, columns] @ slope, D_y=law.D_y + law.D_r[:, columns] @ slope)
-
-
-def with_readings(law: LinearLaw) -> LinearLaw:
-    """The same law with the reading itself as further outputs: what currents are commutated for."""
-    p, n, r = law.B_y.shape[1], len(law.A), law.D_r.shape[1]
-    return law._replace(
-        C=np.vstack([law.C, np.zeros((p, n))]),
-        D_y=np.vstack([law.D_y, np.eye(p)]),
-        D_r=np.vstack([law.D_r, np.zeros((p, r))]),
-    )
 
 
 def interpolate(g: Mapping[str, Any], schedule: Schedule | None, p_ref: Any) -> Mapping[str, Any]:

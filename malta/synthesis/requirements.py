@@ -23,7 +23,7 @@ import numpy as np
 from scipy import special
 
 from malta.arrays import ComplexArray, FloatArray
-from malta.model.machines import attribute_of
+from malta.model.parts import attribute_of
 from malta.model.plant import Parameters, Plant, Signal
 from malta.synthesis.spec import Law as Law, Spec
 

@@ -12,7 +12,7 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import outputs_at
+from malta.model.places import outputs_at
 from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller

@@ -37,10 +37,10 @@ from malta.loops.time_domain import covariance
 from malta.loops.windings import emf_slope, estimated_rows, windings_of, with_estimated_emf
 from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import position_at, position_in
+from malta.model.places import position_at, position_in
 from malta.model.plants import plant_of
 from malta.synthesis.controller import Controller
-from malta.synthesis.law import linear_law_of, with_readings
+from malta.synthesis.linear_law import linear_law_of, with_readings
 from malta.synthesis.pid import PidAxisSet, axes_of, law_of_outputs, pid_gains
 from malta.synthesis.requirements import ratio_of
 from malta.synthesis.spec import Loads, Pid, Spec, pid_signals

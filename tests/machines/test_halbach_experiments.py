@@ -46,7 +46,7 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import sampled_model
-from malta.synthesis.law import linear_law
+from malta.synthesis.linear_law import linear_law
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

@@ -17,7 +17,7 @@ from malta import report
 from malta.campaigns.result import bounds_of
 from malta.margins.travel import NO_EXTENT
 from malta.model import machines
-from malta.model.machines import part_of, require_part
+from malta.model.parts import part_of, require_part
 from malta.model.plant import Signal
 from malta.model.signal_groups import inputs_of, lateral_outputs, outputs_of, stroke_unit
 from malta.report import figures

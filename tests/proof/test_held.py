@@ -30,7 +30,7 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import between_samples, sampled_model
-from malta.synthesis.law import linear_law
+from malta.synthesis.linear_law import linear_law
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
 from malta.synthesis.separation import controller_poles

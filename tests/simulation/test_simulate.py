@@ -22,7 +22,7 @@ from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
 from malta.simulation.scenario import Scenario
 from malta.simulation.trajectory import Verdict, bearing_verdict, save, stroke_figures
-from malta.synthesis.law import linear_law
+from malta.synthesis.linear_law import linear_law
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -23,7 +23,7 @@ from malta.loops.time_domain import noise_of, noise_variance
 from malta.machines.tubular.requirements import DRIVE
 from malta.margins.loop_report import BANDWIDTHS, Outcome
 from malta.simulation.experiments.catalogue import experiment
-from malta.synthesis.law import linear_law, linear_law_of
+from malta.synthesis.linear_law import linear_law, linear_law_of
 from malta.synthesis.requirements import requirements_for
 from malta.tuning import tune as lqg
 from malta.tuning.groups import figures_of

@@ -16,7 +16,7 @@ from malta.loops.loop import loop_along
 from malta.loops.sampled_loops import SampledLoop
 from malta.loops.time_domain import Deviation, Recovery, furthest, load_vector, recovery
 from malta.margins.loop_report import ZONES, LoopReport
-from malta.model.parameters import box_words
+from malta.model.boxes import box_words
 from malta.report.figures.drawing import (
     BOUND_STYLE,
     DOT,

@@ -40,7 +40,8 @@ from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.model.equilibrium import balance
 from malta.model.parameters import units_of
-from malta.model.plant import Plant, Signal, place_states
+from malta.model.places import place_states
+from malta.model.plant import Plant, Signal
 from malta.model.plants import plant_of
 from malta.model.signal_groups import FINE_UNITS
 from malta.simulation import references

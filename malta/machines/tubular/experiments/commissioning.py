@@ -24,7 +24,8 @@ from malta.machines.tubular.experiments.faults import (
 )
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE
-from malta.model.plant import Plant, outputs_at
+from malta.model.places import outputs_at
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     Case,

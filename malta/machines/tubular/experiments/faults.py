@@ -31,7 +31,8 @@ from malta.firmware.supervisor_text import (
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE, delayed_stroke
 from malta.model.equilibrium import trim
-from malta.model.plant import Plant, outputs_at
+from malta.model.places import outputs_at
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     Case,
