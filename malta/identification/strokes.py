@@ -40,9 +40,10 @@ from malta.loops.loop import Loop, loop
 from malta.model.parts import attribute_of
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
+from malta.simulation.flown_strokes import stroke_figures
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-from malta.simulation.trajectory import Trajectory, stroke_figures
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
 FORCE = 0.8  # of what the model says is missing, that the next stroke is sent at most

@@ -24,7 +24,7 @@ from malta.margins.loop_report import Outcome
 from malta.report import ledger as claims
 from malta.report.ledger import Row
 from malta.simulation.experiments.catalogue import experiment
-from malta.simulation.trajectory import stroke_figures
+from malta.simulation.flown_strokes import stroke_figures
 from malta.synthesis.law import law
 from malta.synthesis.pid import axes_of, pid
 from malta.synthesis.spec import Pid

@@ -53,8 +53,9 @@ from malta.report.figures.drawing import (
     runs_of,
     square_axes,
 )
+from malta.simulation.flown_strokes import stroke_figures
 from malta.simulation.references import hold
-from malta.simulation.trajectory import Trajectory, stroke_figures
+from malta.simulation.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

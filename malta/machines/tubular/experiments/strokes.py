@@ -32,9 +32,10 @@ from malta.simulation.experiments import (
     rms,
     scenario_of,
 )
+from malta.simulation.flown_strokes import stroke_figures
 from malta.simulation.references import QUINTIC_DURATION, Motion, Profile, Reference, quintic
 from malta.simulation.scenario import Scenario
-from malta.simulation.trajectory import Trajectory, stroke_figures
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import V0_STEP, V0_STEPS
 

@@ -38,9 +38,10 @@ from malta.simulation.current_control import link_voltage, open_loop_gain
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.experiments import Experiment, Progress
 from malta.simulation.experiments.catalogue import experiment, flown_payload, held_payload, largest_mass
+from malta.simulation.flown_strokes import StrokeFigures, stroke_figures
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-from malta.simulation.trajectory import StrokeFigures, Trajectory, stroke_figures
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import static_feedforward
 from malta.synthesis.lqg import lqr
