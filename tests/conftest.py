@@ -28,7 +28,7 @@ from malta.files import replace_files
 from malta.firmware import cost
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.machines.tubular import plant as tubular
-from malta.model.published import read_published
+from malta.model.data import read_published
 from malta.proof import robust
 from malta.proof.blocks import gain
 from malta.proof.problem import OfLoop, OfSeveral, Problem

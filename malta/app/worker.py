@@ -208,8 +208,6 @@ def _document(search: TuningRequest, spec: Spec, trial: Trial, problem: PictureS
 
 
 TASKS = {"tune": candidates, "front": front}
-
-
 Message = Mapping[str, Any]
 Newer = Callable[[], bool]
 

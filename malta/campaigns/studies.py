@@ -33,7 +33,7 @@ from malta.campaigns.result import Rate, rate
 from malta.campaigns.store import simulate_machines
 from malta.display import Description, display
 from malta.errors import InputError
-from malta.model.boxes import differences
+from malta.model.parameters import differences
 from malta.simulation.experiments import Progress, progress_of_part
 
 NOISE = "noise"  # the name of its factor

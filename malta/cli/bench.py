@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from malta.identification.measure import Measurement
     from malta.synthesis.controller import Controller
 
-
 PLAN = "Plan"  # a panel of the help
 
 
@@ -143,8 +142,8 @@ def _measure(
     from malta.identification.data_file import read_identified
     from malta.identification.log_files import read_log
     from malta.identification.measure import measure as measure_loop
+    from malta.model.data import published_figures
     from malta.model.plants import plant_of
-    from malta.model.published import published_figures
 
     read = [read_log(log) for log in logs]
     if identified is None:
@@ -161,7 +160,7 @@ def _measure(
 
 def _print_measurement(found: Measurement, files: list[Path]) -> None:
     """The tables, and in words what was compared with what."""
-    from malta.model.boxes import box_words
+    from malta.model.parameters import box_words
     from malta.report.tables.experiments import measured_tables
 
     console = make_console()

@@ -124,8 +124,8 @@ def _run_design(
     from malta import gains, report
     from malta.gains.writing import require_stable
     from malta.margins.verify import linear_report
+    from malta.model.data import published_beside
     from malta.model.linearize import linearize
-    from malta.model.published import published_beside
     from malta.simulation.experiments.catalogue import main_job
     from malta.synthesis.synthesize import synthesize
 

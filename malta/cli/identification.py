@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from malta.proof.blocks.gain import Gain
     from malta.synthesis.controller import Controller
 
-
 LogFile = Annotated[Path, typer.Argument(metavar="LOG", help="A log: .csv, .npz, .mat, .parquet or .dump.")]
 
 

@@ -256,7 +256,7 @@ def _compute_each(groups: Sequence[Sequence[Spec]], progress: Callable[[float], 
 
     A campaign or an experiment that is cut short hands over what it has, of which a paper's figures cannot be made.
     """
-    from malta.model.published import read_published
+    from malta.model.data import read_published
     from malta.report.ledger import ledger
     from malta.simulation.experiments import progress_of_part
 

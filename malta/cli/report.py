@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 
-
 CAMPAIGNS = Path("build", "campaigns")  # where `malta campaign` keeps its folders
 
 
@@ -155,8 +154,8 @@ def campaigns_of(
         return []
     from malta.campaigns.run import status
     from malta.campaigns.summary import RunLimits
+    from malta.model.data import published_figures
     from malta.model.plants import plant_of
-    from malta.model.published import published_figures
 
     bounds = RunLimits(published_figures(plant_of(controller.parameters).name), spec)
     found = []

@@ -58,7 +58,7 @@ from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
 from malta.firmware.vectors import SAMPLES, Vector, record_vectors, trial_context, watch_lines
 from malta.gains.file import content_of
 from malta.gains.stable import read_stable
-from malta.model.boxes import box_words
+from malta.model.parameters import box_words
 from malta.model.plants import plant_of
 from malta.simulation.layout import Fidelity
 from malta.synthesis.controller import Controller

@@ -24,7 +24,6 @@ from malta.synthesis.controller import Controller
 if TYPE_CHECKING:
     from malta.margins.tuned_gains import GainBox
 
-
 SUM_SHARE = 0.1  # share that a state changes by in a sample without anything added, at most: it is then a sum
 UNLIMITED_RANGE = 1e6  # of an output without a known range: beyond, single precision has no room
 

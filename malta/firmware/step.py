@@ -223,8 +223,6 @@ def strokes() -> list[Staged]:
 
 
 _SHARE = ("share", "rate", "acceleration")
-
-
 Vectors = dict[str, Any]
 Step = Callable[[Vectors, Mapping[str, Any], Mapping[str, Any]], tuple[Vectors, Vectors]]
 

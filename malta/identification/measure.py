@@ -35,8 +35,7 @@ from malta.identification.spectra import (
 from malta.loops.classical import Disk, disk_sizes
 from malta.loops.loop import Loop, loop
 from malta.margins.loop_report import zone
-from malta.model.boxes import box_words
-from malta.model.parameters import units_of
+from malta.model.parameters import box_words, units_of
 from malta.model.plants import plant_of
 from malta.synthesis.controller import Controller
 

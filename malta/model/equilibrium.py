@@ -22,8 +22,6 @@ from malta.model.plant import OperatingPoint, Plant
 from malta.model.traced import Traced, trace
 
 Equations = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-
-
 STEPS = 60
 HALVINGS = 30
 MIN_DECREASE = 1e-4  # of what a step of its length promises

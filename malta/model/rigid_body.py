@@ -67,8 +67,6 @@ class Trig(NamedTuple):
 
 
 EXACT_TRIG = Trig(ca.sin, ca.cos)
-
-
 SMALL_ANGLE_TRIG = Trig(lambda angle: angle, lambda _: 1)
 
 

@@ -60,8 +60,6 @@ class _Family(NamedTuple):
 
 
 _families: WeakKeyDictionary[Plant, _Family] = WeakKeyDictionary()  # plants compare by identity
-
-
 _checked: deque[_Family] = deque(maxlen=64)
 
 

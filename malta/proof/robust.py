@@ -53,8 +53,6 @@ MAX_LAURENT_STATES = 16  # states
 ROUNDING = 1e-11  # relative size of what rounding may leave of terms that cancel
 MIN_SINGULAR = 1e-6  # singular value of independent vectors of size one, at least
 MAX_TERM_SHARE = 0.8  # share of the terms from which on another basis is worth it
-
-
 _KNOWN_PROGRAMS: WeakKeyDictionary[MatrixProgram, MatrixProgram | None] = WeakKeyDictionary()
 
 

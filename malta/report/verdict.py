@@ -20,7 +20,7 @@ from rich.text import Text
 from malta.bound import at_least, at_most
 from malta.display import micro, number
 from malta.margins.loop_report import LoopReport, Outcome, zone
-from malta.model.boxes import box_words
+from malta.model.parameters import box_words
 from malta.report.tables import fold
 
 if TYPE_CHECKING:

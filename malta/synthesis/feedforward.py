@@ -21,8 +21,6 @@ from malta.synthesis.controller import Commutation, Controller, CurrentLoop, Fee
 from malta.synthesis.filters import between_samples
 
 V0_STEP = 0.25e-3  # m, longest step of the grid of v0(z)
-
-
 V0_STEPS = 16  # at least, either way
 
 

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 
 import malta
 from malta.machines.tubular import plant as tubular
-from malta.model.boxes import differences
+from malta.model.parameters import differences
 from malta.model.rigid_body import cardan_rates, rotation
 
 if TYPE_CHECKING:

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from malta.margins.loop_report import LoopReport
     from malta.simulation.experiments import Experiment
 
-
 Manifest = dict[str, Any]
 
 

@@ -16,7 +16,7 @@ from malta.loops.loop import loop_along
 from malta.loops.sampled_loops import SampledLoop
 from malta.loops.time_domain import Deviation, Recovery, furthest, load_vector, recovery
 from malta.margins.loop_report import ZONES, LoopReport
-from malta.model.boxes import box_words
+from malta.model.parameters import box_words
 from malta.report.figures.drawing import (
     BOUND_STYLE,
     DOT,
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
     from malta.synthesis.recovery import StepResponse
     from malta.tuning.tune import TuningResult
-
 
 LOOKS: tuple[dict[str, Any], dict[str, Any]] = ({"color": "#c9c9c9"}, {"color": "#5a5a5a"})  # stages, machine
 WITNESS: dict[str, Any] = {"color": "#c1440e", "linewidth": 1.6}

@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from malta.loops.windings import CurrentLoops
     from malta.synthesis.controller import Controller
 
-
 Share = Callable[[float], None]  # takes the share of the work that is done, 0 to 1
 
 

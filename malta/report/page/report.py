@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 
-
 WORK = 0.75  # share of the work that is done when all is computed; the rest is drawing
 
 

@@ -18,8 +18,8 @@ from malta.arrays import FloatArray
 from malta.files import version
 from malta.loops.time_domain import budget_of
 from malta.merits import four_digits
+from malta.model.data import published_figures
 from malta.model.plant import Signal
-from malta.model.published import published_figures
 from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import micro
 from malta.report.page.analysis import Analysis, design_entries, display_unit, summary_sentences

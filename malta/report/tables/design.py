@@ -17,9 +17,9 @@ from malta.checker.file import StabilityClaim, double, inside
 from malta.display import RADIANS, frequency
 from malta.loops.time_domain import SHARE, Recovery, furthest
 from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, Outcome, zone
-from malta.model.boxes import box_words
+from malta.model.data import published_value
 from malta.model.linearize import LinearModel
-from malta.model.published import published_value
+from malta.model.parameters import box_words
 from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
 from malta.report.tables import COLOURS, Paragraph, add_row, new_table

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from malta.identification.log import Log
     from malta.simulation.experiments.time_optimal import FastestStroke, SigmoidStroke
 
-
 SETTLE = 0.3  # s at rest before the strokes of yields, as on the bench
 DISTANCE, RISE = 10e-3, 16.2e-3  # m, s from 10 to 90 %: the published stroke, Fig. 12
 
