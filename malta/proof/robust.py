@@ -288,8 +288,8 @@ def robust_margin(
     effort = ProofEffort(tolerance, time, budget, progress)
     over = {} if over is None else over
     named, law, ranges = _either_form(system, compensator, ranges, over)
-    box = box_of(named.names, named.nominal, named.limits, ranges, over)
-    return margin_of(problem_of(named, law), within_branches(box, named.positive), effort)
+    box = box_of(named.names, named.nominal, named.limits, ranges, named.spread(over))
+    return margin_of(problem_of(named, law), within_branches(box, named), effort)
 
 
 def _either_form(
@@ -337,7 +337,7 @@ def common_margin(
     outside = {} if over is None else over
     box = box_of(first.names, first.nominal, first.limits, ranges, outside, caller="margin")
     for system, _ in loops:
-        box = within_branches(box, system.positive)
+        box = within_branches(box, system)
     return margin_of(OfSeveral(tuple(problem_of(*loop) for loop in loops)), box, effort)
 
 
@@ -368,11 +368,11 @@ def margin_at(
     nominal = system.nominal.copy()
     for name, value in at.items():
         nominal[system.names.index(name)] = value
-    box = within_branches(box_of(system.names, nominal, system.limits, ranges, {}), system.positive)
+    box = within_branches(box_of(system.names, nominal, system.limits, ranges, {}), system)
     problem = problem_of(system, compensator)
     if wider is not None and wider.lower and wider.witness is not None:
         reach = wider.lower * (1 + (tolerance or TOLERANCE))
-        witness = np.array([at.get(name, wider.witness[name]) for name in box.names])
+        witness = np.array([at[name] if name in at else wider.witness[name] for name in box.names])
         t, frequency, p = loss_beside(problem, box, witness, wider.lower, min(reach, box.limit))
         if p is not None and t >= wider.lower:
             named = dict(zip(box.names, p.tolist(), strict=True))

@@ -90,8 +90,8 @@ class Feedforward:
         return np.array([np.interp(z, self.z_grid, column) for column in self.v0.T])
 
     def slope(self, z: float) -> FloatArray:
-        """dv0/dz, N/m, m forces, across the grid interval about z; zero beyond the grid."""
-        if not self.z_grid[0] < z < self.z_grid[-1]:
+        """dv0/dz, N/m, m forces, across the grid interval about z, at its ends the last one; zero beyond the grid."""
+        if len(self.z_grid) < 2 or not self.z_grid[0] <= z <= self.z_grid[-1]:
             return np.zeros(self.v0.shape[1])
         k = min(int(np.searchsorted(self.z_grid, z, side="right")), len(self.z_grid) - 1)
         return np.asarray((self.v0[k] - self.v0[k - 1]) / (self.z_grid[k] - self.z_grid[k - 1]))

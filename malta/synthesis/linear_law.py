@@ -122,11 +122,22 @@ def with_slope(law: LinearLaw, slope: FloatArray) -> LinearLaw:
     return law._replace(B_y=law.B_y + law.B_r[:, columns] @ slope, D_y=law.D_y + law.D_r[:, columns] @ slope)
 
 
-def with_readings(law: LinearLaw) -> LinearLaw:
-    """The same law with the reading itself as further outputs: what currents are commutated for."""
-    p, n, r = law.B_y.shape[1], len(law.A), law.D_r.shape[1]
+def with_forces_read(law: LinearLaw, forces: tuple[int, ...], count: int) -> LinearLaw:
+    """The same law, which adds further readings to v0 of some of its `count` forces."""
+    columns = [law.B_r.shape[1] - count + k for k in forces]  # of v0 in r
+    return law._replace(
+        B_y=np.hstack([law.B_y, law.B_r[:, columns]]), D_y=np.hstack([law.D_y, law.D_r[:, columns]])
+    )
+
+
+def with_readings(law: LinearLaw, readings: int | None = None) -> LinearLaw:
+    """The same law with the reading itself as further outputs: what currents are commutated for.
+
+    readings : how many of its inputs are readings of positions, the first; None: all
+    """
+    p, n, r = readings or law.B_y.shape[1], len(law.A), law.D_r.shape[1]
     return law._replace(
         C=np.vstack([law.C, np.zeros((p, n))]),
-        D_y=np.vstack([law.D_y, np.eye(p)]),
+        D_y=np.vstack([law.D_y, np.eye(p, law.D_y.shape[1])]),
         D_r=np.vstack([law.D_r, np.zeros((p, r))]),
     )
