@@ -30,7 +30,8 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     )
     from malta.campaigns.run import campaign as campaign
     from malta.errors import CheckError as CheckError, InputError as InputError
-    from malta.firmware.export import export_c as export_c, export_fmu as export_fmu
+    from malta.firmware.export import export_c as export_c
+    from malta.firmware.export_fmu import export_fmu as export_fmu
     from malta.identification.excite import excite as excite
     from malta.identification.identify import identify as identify
     from malta.identification.learn import learn as learn
@@ -87,7 +88,8 @@ _NAMES = {
     " structured synthesis",
     "malta.campaigns.run": "campaign",
     "malta.errors": "CheckError InputError",
-    "malta.firmware.export": "export_c export_fmu",
+    "malta.firmware.export": "export_c",
+    "malta.firmware.export_fmu": "export_fmu",
     "malta.identification.excite": "excite",
     "malta.identification.identify": "identify",
     "malta.identification.learn": "learn",

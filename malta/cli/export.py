@@ -94,7 +94,8 @@ def export(
     Example:  malta export design/gains/robust.json --precision float
               malta export design/gains/robust.json --to fmu --part loop --fmi 3
     """
-    from malta.firmware.export import export_c, export_fmu
+    from malta.firmware.export import export_c
+    from malta.firmware.export_fmu import export_fmu
 
     _require_known(to, precision, until, part, fmi, platforms, clock)
     for option, given in (("--excitation", excitation), ("--log", log)):

@@ -19,8 +19,9 @@ from malta.loops.time_domain import bounded_deviation, noise_of, worst_along
 from malta.loops.windings import CurrentLoops
 from malta.margins.loop_report import BANDWIDTHS, LoopReport, Outcome
 from malta.margins.scheduled_loops import schedule_rate
-from malta.margins.travel import LoopAlong, worst_sensitivities
+from malta.margins.travel import LoopAlong
 from malta.margins.verify import linear_report, staged_report
+from malta.margins.worst_case import worst_sensitivities
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import Parameters, Plant
 from malta.model.plants import plant_of

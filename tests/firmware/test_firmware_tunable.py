@@ -29,7 +29,8 @@ from malta.firmware.period_functions import decide
 from malta.firmware.program import Precision
 from malta.firmware.signals import Target
 from malta.firmware.sources import sources
-from malta.firmware.supervisor_text import NUMBERS, compile_supervised
+from malta.firmware.supervised_flight import compile_supervised
+from malta.firmware.supervisor_text import NUMBERS
 from malta.firmware.vectors import record_vectors
 from malta.margins.tuned_gains import GainBox
 from malta.simulation.engine.compiled import compiler

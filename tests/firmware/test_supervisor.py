@@ -23,6 +23,7 @@ from malta.firmware.flight import call, compile_controller, new_state, view
 from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.sources import phase_currents, sources
+from malta.firmware.supervised_flight import compile_supervised
 from malta.firmware.supervisor import (
     ENDLESS_SAMPLES,
     IN_FLIGHT,
@@ -43,7 +44,6 @@ from malta.firmware.supervisor import (
 from malta.firmware.supervisor_text import (
     _NUMBERS,
     NUMBERS,
-    compile_supervised,
     monitor_lines,
     supervisor_members,
     supervisor_sources,

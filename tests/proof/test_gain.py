@@ -14,7 +14,8 @@ import malta
 from malta import gains
 from malta.errors import InputError
 from malta.linear.uncertain import responses
-from malta.margins.travel import travel_loops, worst_sensitivities
+from malta.margins.travel import travel_loops
+from malta.margins.worst_case import worst_sensitivities
 from malta.model.plants import plant_of
 from malta.proof.blocks import Block, gain, weight_of
 from malta.proof.blocks.gain import BlockLoop
