@@ -378,7 +378,7 @@ def _tune_structure(spec: Spec, target: Path, *, as_json: bool) -> None:
     """Tune the elements of a law, write the design file that is found, and judge it."""
     from malta import report
     from malta.structured.design import structured_text, tune_design
-    from malta.tuning.verify import judge
+    from malta.tuning.judging import judge
 
     with progress_on(f"tuning {spec.name}") as work:
         found = tune_design(spec, note=work.note)
@@ -402,7 +402,7 @@ def _tune_structure(spec: Spec, target: Path, *, as_json: bool) -> None:
 def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:
     """Print what the design as it stands reaches; raise CheckError when that is not all it is asked for."""
     from malta import report
-    from malta.tuning.verify import judge
+    from malta.tuning.judging import judge
 
     with progress_on(f"judging {spec.name}"):
         requirements = judge(spec)
