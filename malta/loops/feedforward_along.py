@@ -112,39 +112,37 @@ def along_stroke(system: UncertainSystem, plant: Plant, slopes: SlopesAlong | No
         readings = len(plant.outputs)
         more: Any = (slopes.s(z) + p[len(system.names) :]) @ C[plant.stroke_output, :]
         C = ca.vertcat(C[:readings, :], more, C[readings:, :])
-    found = _without_waves(ca.Function("matrices", [p], ca.cse([A, B, C, *rest])), system.names.index(stroke))
+    above = [] if system.positive is None else [system.positive(own)]
+    found = _without_waves(
+        ca.Function("whole", [p], ca.cse([A, B, C, *rest, *above])), system.names.index(stroke)
+    )
     names = tuple(f"{stroke}_{k + 1}" for k in range(found.waves.size1_out(0)))
     if not (names or count):
         return system
     ends = _hull(found.waves, plant.stroke.travel)
-    errors = (
-        {}
-        if slopes is None
-        else {n: (-e, e) for n, e in zip(slopes.names, slopes.error.tolist(), strict=True)}
-    )
+    e = {} if slopes is None else dict(zip(slopes.names, slopes.error.tolist(), strict=True))
+    intervals = {name: (-x, x) for name, x in e.items()} | dict(zip(names, ends, strict=True))
 
     def values(at: float) -> FloatArray:
         return np.concatenate([[] if slopes is None else slopes.at(at), np.array(found.waves(at)).ravel()])
 
-    derived = Derived(stroke, values, errors | dict(zip(names, ends, strict=True)))
-    q = ca.SX.sym("p", p.numel() + len(names))
-    positive = system.positive and ca.Function("positive", [q], [system.positive(q[: len(system.names)])])
     position = float(system.nominal[system.names.index(stroke)])
     return replace(
         system,
-        names=(*system.names, *derived.intervals),
+        names=(*system.names, *intervals),
         nominal=readonly(np.concatenate([system.nominal, values(position)])),
-        matrices=found.matrices,
-        limits=(*system.limits, *[(-math.inf, math.inf)] * len(derived.intervals)),
-        positive=positive,
-        derived=derived,
+        matrices=ca.Function("matrices", [found.p], found.parts[: 3 + len(rest)]),
+        limits=(*system.limits, *[(-math.inf, math.inf)] * len(intervals)),
+        positive=ca.Function("positive", [found.p], found.parts[3 + len(rest) :]) if above else None,
+        derived=Derived(stroke, values, intervals),
     )
 
 
 class _Waves(NamedTuple):
-    """Matrices as a function of p and of what were foreign operations of z alone, and these by z."""
+    """Matrices in symbols p and in those of what were foreign operations of z alone, and these by z."""
 
-    matrices: ca.Function
+    p: Any
+    parts: list[Any]
     waves: ca.Function
 
 
@@ -174,7 +172,7 @@ def _without_waves(matrices: ca.Function, index: int) -> _Waves:
     for part, entries in zip(parts, made.run(ca.vertsplit(q), SYMBOLS), strict=True):
         for i, j, x in entries:
             part[i, j] = x
-    return _Waves(ca.Function("matrices", [q], parts), ca.Function("waves", [z], [ca.vertcat(*waves)]))
+    return _Waves(q, parts, ca.Function("waves", [z], [ca.vertcat(*waves)]))
 
 
 PIECES = 64  # of the travel, over which a function of the position is enclosed
