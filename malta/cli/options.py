@@ -125,8 +125,9 @@ def read_shares(
     Raises InputError for two shares for all, and as `read_assignments` does.
     """
     from malta.campaigns.plan import box_of
-    from malta.model.data import plant_of, published_figures
+    from malta.model.data import published_figures
     from malta.model.parameters import differences, units_of
+    from malta.model.plants import plant_of
 
     named = [text for text in texts or () if "=" in text]
     general = [text for text in texts or () if "=" not in text]
@@ -250,7 +251,7 @@ def scenarios(ctx: Any, incomplete: str) -> list[str]:
     found: list[str] = []
     with suppress(Exception):
         from malta import gains
-        from malta.model.data import plant_of
+        from malta.model.plants import plant_of
         from malta.simulation.experiments.catalogue import experiments_of
 
         plant = plant_of(gains.read(_typed_gains(ctx)).parameters)
@@ -427,11 +428,12 @@ def read_controller(gains: Path, machine_file: Path | None) -> Controller:
     Raises InputError as `malta.machine` and `gains.read`; an unknown machine is named with the option that tells it.
     """
     from malta import gains as gain_files
+    from malta.gains.stable import require_held
     from malta.model.machines import machine
 
     if machine_file is not None:
         machine(machine_file)
-    return gain_files.read(gains)
+    return require_held(gain_files.read(gains), gains)
 
 
 def verify_and_write(controller: Controller, gains: Path, folder: Path) -> list[Path]:
@@ -518,8 +520,8 @@ def change_machine(parameters: Parameters, changes: list[str] | None) -> Paramet
     """
     from dataclasses import replace
 
-    from malta.model.data import plant_of
     from malta.model.parameters import units_of
+    from malta.model.plants import plant_of
 
     values = read_assignments("--set", changes, units_of(parameters))
     try:

@@ -25,9 +25,9 @@ from malta.loops.feedforward_along import slopes_along
 from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.windings import chosen_loops, current_control, force_modes, windings_of
 from malta.margins.travel import travel_loops
-from malta.model.data import plant_of
-from malta.model.linearize import is_commutated
+from malta.model.currents import is_commutated
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.proof.box import box_of
 from malta.proof.groups import groups, loop_of

@@ -34,8 +34,8 @@ from malta.checker.loop import (
 )
 from malta.errors import CheckError, InputError
 from malta.files import replace_files, version
+from malta.linear.compensators import compensator_of
 from malta.linear.expressions import FIELD, MatrixProgram, exact, program as expressions_of
-from malta.linear.systems import compensator_of
 from malta.proof.box import Box, below, box_of
 from malta.proof.exclusion import Growth, advance, start
 from malta.proof.groups import E, UncertainLoop, loop_of

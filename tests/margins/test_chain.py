@@ -35,8 +35,8 @@ from malta.loops.sampled_loops import LAST_STAGE, loaded_loop, machine_law, mach
 from malta.margins.loop_report import LoopReport
 from malta.margins.travel import place_margin
 from malta.margins.verify import MACHINE_STAGE, SAMPLED_STAGE, compensators, linear_report, staged_report
-from malta.model.data import plant_of
 from malta.model.linearize import linearize
+from malta.model.plants import plant_of
 from malta.proof.blocks.gain import Gain
 from malta.proof.robust import robust_margin
 from malta.report.figures.margins import chain_figure

@@ -14,8 +14,9 @@ import malta
 from malta import gains
 from malta.errors import InputError
 from malta.linear.uncertain import responses
-from malta.margins.travel import travel_loops, worst_sensitivities
-from malta.model.data import plant_of
+from malta.margins.travel import travel_loops
+from malta.margins.worst_case import worst_sensitivities
+from malta.model.plants import plant_of
 from malta.proof.blocks import Block, gain, weight_of
 from malta.proof.blocks.gain import BlockLoop
 from malta.proof.blocks.transfer import GainPeak, LoopSignals, frequencies, patterns, transfer

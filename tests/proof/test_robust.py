@@ -21,7 +21,7 @@ from malta.loops.parametric_plants import uncertain
 from malta.loops.sampled_loops import machine_law, machine_system
 from malta.margins.travel import travel_margin
 from malta.margins.verify import compensators
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.proof import Budget
 from malta.proof.robust import robust_margin
 
