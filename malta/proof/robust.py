@@ -24,7 +24,7 @@ import numpy as np
 from flint import arb, fmpq, fmpq_mat
 from scipy import linalg
 
-from malta.arguments import describe, is_pair, positive
+from malta.arguments import by_name, describe, is_pair, positive
 from malta.errors import InputError
 from malta.linear.compensators import compensator_of
 from malta.linear.expressions import MatrixProgram, NotAnalytic, exact
