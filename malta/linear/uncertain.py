@@ -83,7 +83,10 @@ class UncertainSystem:
     derived: Derived | None = None
 
     def spread(self, over: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-        """The intervals `over`, with those of the parameters that follow one of them."""
+        """The intervals of some parameters, with those of the parameters that follow one of them.
+
+        over : intervals by name, SI
+        """
         more = self.derived.intervals if self.derived is not None and self.derived.of in over else {}
         return {**more, **over}
 

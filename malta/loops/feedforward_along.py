@@ -138,7 +138,7 @@ def along_stroke(system: UncertainSystem, plant: Plant, slopes: SlopesAlong | No
     )
 
 
-class _Waves(NamedTuple):
+class _StrokeFunctions(NamedTuple):
     """Matrices in symbols p and in those of what were foreign operations of z alone, and these by z."""
 
     p: Any
@@ -146,7 +146,7 @@ class _Waves(NamedTuple):
     waves: ca.Function
 
 
-def _without_waves(matrices: ca.Function, index: int) -> _Waves:
+def _without_waves(matrices: ca.Function, index: int) -> _StrokeFunctions:
     """The function with the foreign operations of one parameter alone as further inputs.
 
     index : of the parameter z among the inputs
@@ -172,7 +172,7 @@ def _without_waves(matrices: ca.Function, index: int) -> _Waves:
     for part, entries in zip(parts, made.run(ca.vertsplit(q), SYMBOLS), strict=True):
         for i, j, x in entries:
             part[i, j] = x
-    return _Waves(q, parts, ca.Function("waves", [z], [ca.vertcat(*waves)]))
+    return _StrokeFunctions(q, parts, ca.Function("waves", [z], [ca.vertcat(*waves)]))
 
 
 PIECES = 64  # of the travel, over which a function of the position is enclosed

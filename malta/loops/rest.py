@@ -247,11 +247,11 @@ def _exact(rows: Any, unknowns: Unknowns) -> Formula | None:
     while left:
         own = r[left]
         rows = _simplify(ca.substitute([rows], [r], [values])[0], ca.vertcat(p, own))
-        equations = _Equations.of(rows, p, own)
+        equations = _RestEquations.of(rows, p, own)
         if equations is None:
             return None
         if equations.affine:
-            for k, value in zip(left, equations.solved(), strict=True):
+            for k, value in zip(left, equations.solve(), strict=True):
                 values[k] = value
             return Formula(values, tuple(conditions))
         pair = equations.single()
@@ -265,7 +265,7 @@ def _exact(rows: Any, unknowns: Unknowns) -> Formula | None:
     return Formula(values, tuple(conditions))
 
 
-class _Equations(NamedTuple):
+class _RestEquations(NamedTuple):
     """Equations in some unknowns, as polynomials in p, the unknowns and foreign operations of p."""
 
     s: Symbolic
@@ -275,7 +275,7 @@ class _Equations(NamedTuple):
     size: int  # how many
 
     @classmethod
-    def of(cls, rows: Any, p: Any, r: Any) -> _Equations | None:
+    def of(cls, rows: Any, p: Any, r: Any) -> _RestEquations | None:
         """The equations; None where they are long, or a foreign operation has an unknown."""
         both = ca.vertcat(p, r)
         s = _rational(rows, both)
@@ -303,7 +303,7 @@ class _Equations(NamedTuple):
         most = (sum(e) for top in self.tops for e in self.powers(top))
         return len(self.tops) == self.size and all(e <= 1 for e in most)
 
-    def solved(self) -> list[Any]:
+    def solve(self) -> list[Any]:
         """The unknowns of affine equations."""
         matrix, right = {}, {}
         for i, top in enumerate(self.tops):

@@ -285,7 +285,7 @@ def _margin_along(
     found = common_margin(along, ranges, over, budget=budget, progress=progress)
     if len(along) == 1:
         return at_a_place(
-            *along[0], box_of(*_named(along[0][0]), ranges, over, caller="travel_margin"), found
+            *along[0], box_of(*_box_fields(along[0][0]), ranges, over, caller="travel_margin"), found
         )
     here = f"at {len(along)} places of the travel, {NOT_BETWEEN_TEXT}"
     return replace(found, reason=f"{here}; {found.reason}" if found.reason else here)
@@ -336,7 +336,9 @@ def at_a_place(system: UncertainSystem, law: Compensator, box: Box, found: Margi
     )  # fmt: skip
 
 
-def _named(system: UncertainSystem) -> tuple[tuple[str, ...], FloatArray, tuple[tuple[float, float], ...]]:
+def _box_fields(
+    system: UncertainSystem,
+) -> tuple[tuple[str, ...], FloatArray, tuple[tuple[float, float], ...]]:
     """What a box needs of a system."""
     return system.names, system.nominal, system.limits
 

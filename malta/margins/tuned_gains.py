@@ -13,6 +13,7 @@ law does what was left to be done with v(i). At k = 1 the loop is the machine's 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import casadi as ca
@@ -139,6 +140,7 @@ def tuned_loop(plant: Plant, c: Controller, system: UncertainSystem) -> tuple[Un
     if len(k.emf[0]):
         emf[0][:, : k.emf[0].shape[1]], emf[1][:] = k.emf
     (C_n, C_1), (D_n, D_1), law_B = np.split(law.C, 2), np.split(law.D[:, :p], 2), law.B[:, :p]
+    B_q = np.vstack([law.B[:, p:], slope * S])
     # v0 that follows the position is read behind the outputs, see feedforward_along.py
     slopes = slopes_along(plant, c) if plant.stroke.name in system.names else None
     if slopes is not None:
@@ -148,7 +150,6 @@ def tuned_loop(plant: Plant, c: Controller, system: UncertainSystem) -> tuple[Un
     # as with_current_control: inputs y and phi, further states I, outputs w
     A = system_matrix(law.A, None, slope * S @ C_1, one)
     B = system_matrix(law_B, np.zeros((n, m)), slope * S @ D_1, -slope * one)
-    B_q = np.vstack([law.B[:, p:], slope * S])
     C = np.hstack([gain * S @ C_1 + emf[0], one]) / R
     D = np.hstack([gain * S @ D_1 + emf[1], -gain * one]) / R
     C_n, D_n = np.hstack([C_n, np.zeros((m, m))]), np.hstack([D_n, np.zeros((m, m))])
@@ -168,4 +169,8 @@ def tuned_loop(plant: Plant, c: Controller, system: UncertainSystem) -> tuple[Un
     limits = (*system.limits, (1 - 1.01 * MAX_SCATTER, 1 + 1.01 * MAX_SCATTER))
     names, nominal = (*system.names, FACTOR), np.append(system.nominal, 1.0)
     whole = ca.Function("matrices", [parameters], matrices)
-    return UncertainSystem(names, nominal, whole, limits, approximate=system.approximate), behind
+    above = [] if system.positive is None else [system.positive(parameters[:-1])]
+    positive = ca.Function("positive", [parameters], above) if above else None
+    return replace(
+        system, names=names, nominal=nominal, matrices=whole, limits=limits, positive=positive
+    ), behind

@@ -184,7 +184,7 @@ def _checked_sides(caller: str, name: str, value: Any, nominal: float) -> tuple[
 
 PARTS = 256  # parts of a box on which conditions are looked at
 BISECTIONS = 30  # of the box in which they hold
-BEYOND = 1e-3  # of a box: how far beyond its end a condition is looked for that fails there
+BEYOND_SHARE = 1e-3  # of a box: how far beyond its end a condition is looked for that fails there
 MOST_CORNERS = 12  # parameters of whose corners all are looked at
 
 
@@ -210,7 +210,7 @@ def within_branches(box: Box, system: UncertainSystem) -> Box:
 
 def _end_at(box: Box, system: UncertainSystem, t: float) -> str:
     """What happens at the end t of a box, in words, with the parameters of the corner where it does."""
-    failing = _failing_corner(box, system, t * (1 + BEYOND))
+    failing = _failing_corner(box, system, t * (1 + BEYOND_SHARE))
     if failing is None or not system.ends or system.ends[failing[0]] == DOMAIN_END_TEXT:
         return DOMAIN_END_TEXT
     row, corner = failing

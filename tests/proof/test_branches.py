@@ -140,7 +140,7 @@ def test_a_certificate_says_where_its_branch_ends(tmp_path: Path) -> None:
     path = malta.proof.write_certificate(tmp_path / "c.json", [(system, LAW)], box, None, m)
     assert check(path).ok
     (loop,) = read(path).loops
-    assert len(loop.conditions.above) == 1
+    assert len(loop.conditions.above) == 4  # guards of the matrices and of their slopes
     require_conditions(loop.conditions, [(fmpq(51, 1000), fmpq(1, 10))])
     with pytest.raises(Refused, match="not shown to have a rest"):
         require_conditions(loop.conditions, [(fmpq(49, 1000), fmpq(1, 10))])

@@ -11,7 +11,7 @@ from exported import controller
 
 import malta
 from malta.linear.uncertain import closed_loop, instability
-from malta.loops.sampled_loops import machine_law
+from malta.loops.sampled_loops import machine_system
 from malta.margins.travel import travel_loops
 from malta.margins.tuned_gains import MAX_SCATTER, GainBox, gain_box, tuned_loop
 from malta.proof.groups import groups, loop_of
@@ -38,7 +38,7 @@ def test_the_tuned_loop_has_the_poles_of_a_controller_with_these_gains(name: str
     system = along[0][0]
     tuned, law = tuned_loop(plant, c, system)
     p = np.append(1.1 * system.nominal, factor)
-    other = machine_law(plant, scaled(c, [factor] * 5), point=plant.at())
+    _, other = machine_system(plant, scaled(c, [factor] * 5), (*BOX, "z"), {})
     wanted = np.linalg.eigvals(closed_loop(system, other, p[:-1])[0])
     found = np.linalg.eigvals(closed_loop(tuned, law, p)[0])
     apart = [np.abs(found - pole).min() / max(abs(pole), 1.0) for pole in wanted]
@@ -84,7 +84,9 @@ def test_gains_of_a_pid_may_scatter_while_the_loop_stays_stable() -> None:
         factors = np.ones(5)
         for axis, value in zip(found.axes, share, strict=True):
             factors[list(axis)] += value
-        law = machine_law(plant, scaled(c, factors), point=plant.at())
-        p = system.nominal * (1 + 0.2 * np.sign(rng.uniform(-1, 1, len(system.nominal))))
-        p[list(system.names).index("z")] = rng.uniform(-plant.stroke.travel, plant.stroke.travel)
+        _, law = machine_system(plant, scaled(c, factors), (*BOX, "z"), {})
+        p, z = system.nominal.copy(), float(rng.uniform(-plant.stroke.travel, plant.stroke.travel))
+        p[: len(BOX)] *= 1 + 0.2 * np.sign(rng.uniform(-1, 1, len(BOX)))
+        assert system.derived is not None
+        p[len(BOX) :] = [z, *system.derived.values(z)]
         assert instability(system, law, p[None])[0] < 0
