@@ -3,7 +3,8 @@
 Its tables and entries, with meaning, unit and shape of each, stand in schema.py, and malta.schemas makes a JSON schema
 of them. Version 1; 2 with what is below.
 
-n = n0 + m d where the design models a delay of d samples: the mechanical states first, then stored forces; m more where
+n = n0 + m d where the design models a delay of d samples: the mechanical states first, then stored forces; m more of a
+fraction of a sample beyond, law.fraction, which version 1 has not; m more where
 the filter observes forces of disturbance. The control law is stated in synthesis/controller.py. A PID controller has
 the same law, with a diagonal Ki where each output has its own input (synthesis/pid.py); its cost, its noise and its
 poles of regulator and filter are null. current_loop is null where currents follow their commands at once,
@@ -86,6 +87,7 @@ def document(controller: Controller, margins: LoopReport) -> dict[str, Any]:
     ahead = c.commutation is not None
     law: dict[str, Any] = {"tracks": c.tracks} | ({"coordinates": "positions"} if in_positions else {})
     law |= {key: getattr(c, key) for key in ("pause", "braking", "references") if getattr(c, key).size}
+    law |= {"fraction": c.fraction} if c.fraction else {}
     extended = linear or ahead or c.tracks == "errors" or c.schedule is not None or bool(c.lagging)
     extended = extended or len(law) > 1 or not c.feedforward.rate.size or bool(c.feedforward.position.size)
     tables: dict[str, Any] = {

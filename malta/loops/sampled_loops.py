@@ -25,7 +25,7 @@ from malta.display import display
 from malta.errors import CheckError
 from malta.linear.matrices import system_matrix
 from malta.linear.peaks import in_plane, response_at
-from malta.linear.sampling import add_lags, delay_inputs, eigenvalues, sample
+from malta.linear.sampling import add_lags, eigenvalues, sample
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal
@@ -66,7 +66,7 @@ class ReadingUse(NamedTuple):
 
 def sampled_law(
     controller: Controller,
-    delay: int,
+    delay: float,
     lag: float,
     control: CurrentControl | None = None,
     *,
@@ -235,7 +235,7 @@ def sampled_loop(
     model: LinearModel,
     controller: Controller,
     *,
-    delay: int = 0,
+    delay: float = 0,
     current_loops: CurrentLoops | None = None,
     feedforward: bool = False,
     sensors: bool = False,
@@ -272,7 +272,7 @@ def sampled_loop(
         continuous = A
         if current_loops == "lag" and math.isfinite(plant.actuator.crossover):
             A, B = add_lags(A, B, plant.actuator.crossover)
-        Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
+        Ad, Bd = sample(A, B, controller.sample_time, delay)
     Cd, true = _pad(C, len(Ad)), None if true is None else _pad(true, len(Ad))
     if late:
         Ad, Bd, Cd = _stored_readings(Ad, Bd, Cd, late)
@@ -297,7 +297,7 @@ def _between_samples(
 
 @lru_cache(maxsize=4)  # a loop has it twice, with and without forecast voltages; records compare by identity
 def _sample_windings(
-    model: LinearModel, controller: Controller, delay: int, sensors: bool
+    model: LinearModel, controller: Controller, delay: float, sensors: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, CurrentControl]:
     """The machine with its windings between samples; sampled behind its current controllers; and these.
 

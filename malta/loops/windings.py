@@ -240,7 +240,7 @@ def sample_driven(
     loop: CurrentLoop,
     R: float,
     Ts: float,
-    delay: int,
+    delay: float,
     share: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """The machine behind its current controllers, sampled: from forces v, and then from voltages M^+ emf(x_hat).
@@ -253,7 +253,7 @@ def sample_driven(
     """
     A, B, phi = machine
     m = B.shape[1]
-    Ad, Bd = delay_inputs(*sample(A, B, Ts), delay)
+    Ad, Bd = sample(A, B, Ts, delay)
     read = np.zeros((m, len(Ad)))
     read[:, : len(A)] = -(loop.Kp + loop.Ki * Ts) / R * phi
     if share is not None:

@@ -36,6 +36,7 @@ from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
 from malta.linear.expressions import BALLS, MatrixProgram, NotAnalytic, program
 from malta.linear.matrices import system_matrix
+from malta.linear.sampling import split_delay
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.parametric_plants import of_plant
 from malta.loops.windings import CurrentLoops, chosen_loops
@@ -264,7 +265,10 @@ def loops_between_places(
         return "current controllers on windings"
     if not variable.isidentifier() or keyword.iskeyword(variable) or variable in units_of(plant.parameters):
         return f"{variable!r} is no name for one more parameter"
-    delay = plant.actuator.delay(controller.sample_time) + whole_samples(plant, controller.sample_time)
+    whole, part = split_delay(plant.actuator.delay(controller.sample_time))
+    if part:
+        return f"a dead time of {whole + part:g} samples, which are not whole"
+    delay = whole + whole_samples(plant, controller.sample_time)
     found = []
     for a, b in schedule.cells:
         there = plant_along(plant, variable, (a + b) / 2)

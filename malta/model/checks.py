@@ -42,6 +42,11 @@ def check_signals(plant: Plant) -> None:
     times = [time for time in late if isinstance(time, int | float)]
     if not all(0 <= time < math.inf for time in times):
         raise InputError(plant.name, "sensors", f"lags and dead time {times} s", "times of 0 s or more")
+    times = [plant.actuator.dead_time, plant.actuator.computation_time]
+    given = [time for time in times if isinstance(time, int | float)]
+    if not all(0 <= time < math.inf for time in given) or (len(given) == len(times) and all(given)):
+        found = f"dead time and computation time {times} s"
+        raise InputError(plant.name, "actuator", found, "one time above 0 s, or none")
     both = [name for name in names["outputs"] if name in names["states"]]
     if plant.stroke.name not in ("", *both):
         expected = "an output that is a state of the same name" + (f", as {' '.join(both)}" if both else "")

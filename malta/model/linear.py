@@ -192,9 +192,10 @@ class LinearSystem:
     terms: tuple[tuple[str, tuple[Rows, Rows, Rows]], ...]  # by parameter: its factors in A, B, C
     limit: tuple[float, ...]  # m, of each input, its unit; inf: none
     noise: tuple[float, ...]  # p, rms of a sample, the unit of each output
-    dead_time: float  # s, from measurement to force
+    dead_time: float  # s, from measurement to force, half a sample of hold included
     formulas: tuple[tuple[str, str], ...] = ()  # added to an entry: ("A_2_1", "-b / J")
     limits: tuple[tuple[str, float, float], ...] = ()  # of parameters: name, above, below; inf: none
+    computation_time: float = 0.0  # s, from a sample to its new force
 
 
 class Details(TypedDict, total=False):
@@ -211,6 +212,7 @@ class Details(TypedDict, total=False):
     limit: float | Sequence[float]
     noise: float | Sequence[float]
     dead_time: float
+    computation_time: float
 
 
 def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Details]) -> Plant:
@@ -234,7 +236,7 @@ def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Detai
     limits : of parameters, (above, below), exclusive
     limit : of the inputs, one number for all or one for each; default: infinite
     noise : of the sensors, rms of a sample, one number for all or one for each; default: 0
-    dead_time : s, from measurement to force; default: 0
+    dead_time, computation_time : s, as an `Actuator` has them: one of the two; default: 0
 
     Returns a Plant.
 
@@ -278,9 +280,10 @@ def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Detai
         _numbers("dead_time", details.get("dead_time", 0.0), 1)[0],
         _formulas(formulas, nominal, matrices),
         _limits(details.get("limits", {}), nominal),
+        _numbers("computation_time", details.get("computation_time", 0.0), 1)[0],
     )
-    if not math.isfinite(sum(system.noise) + system.dead_time):
-        raise InputError(CALLER, "noise, dead_time", "infinity", "finite numbers")
+    if not math.isfinite(sum(system.noise) + system.dead_time + system.computation_time):
+        raise InputError(CALLER, "noise, dead_time, computation_time", "infinity", "finite numbers")
     if len({math.isinf(limit) for limit in system.limit}) > 1:
         raise InputError(CALLER, "limit", str(system.limit), "one for each of the inputs, or none")
     return plant_of(record_of(system, nominal, details.get("name", "linear")))
@@ -355,6 +358,7 @@ def plant(par: Any) -> Plant:
             current_limit=math.inf,
             force_limit=s.limit,
             dead_time=s.dead_time,
+            computation_time=s.computation_time,
             limited=lambda i: i,
         ),
         sensors=Sensors(noise=s.noise),

@@ -19,6 +19,7 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.matrices import system_matrix
+from malta.linear.sampling import split_delay, whole_or_not
 from malta.model.signals import DEFAULT, CasadiFn, Signal
 
 
@@ -79,18 +80,19 @@ class Sensors:
 MOST_DELAY = 100  # samples: each one has states of its own in the loop and in what is compiled
 
 
-def require_short(where: str, name: str, samples: int) -> int:
+def require_short(where: str, name: str, samples: float) -> float:
     """The same number of samples of delay. Raises InputError for more than MOST_DELAY."""
     if samples > MOST_DELAY:
-        raise InputError(where, name, f"{samples} samples", f"at most {MOST_DELAY}")
+        raise InputError(where, name, f"{samples:g} samples", f"at most {MOST_DELAY}")
     return samples
 
 
 def split_dead_time(dead_time: float, Ts: float) -> tuple[int, float]:
     """Whole samples of a dead time, and the rest of it, s. Raises InputError for more than MOST_DELAY samples."""
-    whole = require_short("machine", "dead time of its sensors", int(dead_time / Ts + 1e-9))
-    rest = dead_time - whole * Ts
-    return whole, rest if rest > 1e-9 * Ts else 0.0
+    whole, part = split_delay(
+        require_short("machine", "dead time of its sensors", whole_or_not(dead_time / Ts))
+    )
+    return whole, part * Ts
 
 
 def with_lags(sensors: Sensors, A: Any, B: Any, C: Any) -> tuple[Any, Any, Any]:
