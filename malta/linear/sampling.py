@@ -53,6 +53,24 @@ def sample(A: FloatArray, B: FloatArray, Ts: float, delay: float = 0) -> tuple[F
     return delay_inputs(E[..., :n, :n], E[..., :n, n:], delay, newest)
 
 
+def sample_within(
+    A: FloatArray, B: FloatArray, Ts: float, delay: float, time: float
+) -> tuple[FloatArray, FloatArray]:
+    """x some time after a sample, of the states of `sample` and of its inputs.
+
+    time : s, at most Ts
+    """
+    (n, m), (_, part), size = B.shape, split_delay(delay), len(A) + B.shape[1] * stored_blocks(delay)
+    reached, driven = sample(A, B, time)
+    newer = sample(A, B, time - part * Ts)[1] if time > part * Ts else np.zeros_like(B)
+    found = np.zeros((n, size + m))
+    found[:, :n], found[:, n : n + m] = reached, driven
+    if part:
+        found[:, n : n + m] -= newer
+        found[:, n + m : n + 2 * m] = newer
+    return found[:, :size], found[:, size:]
+
+
 def delay_inputs(
     Ad: FloatArray, Bd: FloatArray, delay: float, newest: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:

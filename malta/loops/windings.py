@@ -25,7 +25,7 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError
 from malta.linear.matrices import system_matrix
-from malta.linear.sampling import delay_inputs, sample
+from malta.linear.sampling import delay_inputs, sample, sample_within
 from malta.linear.uncertain import Compensator
 from malta.model.data import plant_of
 from malta.model.equilibrium import trace
@@ -235,6 +235,30 @@ def forecast_as_forces(law: LinearLaw, k: CurrentControl, Ts: float) -> LinearLa
     )
 
 
+class Caught(NamedTuple):
+    """Readings C x of a continuous machine that are taken some time (s) after each sample."""
+
+    C: FloatArray
+    time: float
+
+    def pushed(self, A: FloatArray, B_w: FloatArray) -> FloatArray:
+        """What x' = A x + B_w w leaves in them, w beginning with the sample."""
+        return np.asarray(self.C @ sample(A, B_w, self.time)[1])
+
+
+def with_caught(
+    machine: tuple[FloatArray, FloatArray],
+    sampled: tuple[FloatArray, FloatArray],
+    Ts: float,
+    delay: float,
+    caught: Caught,
+) -> tuple[FloatArray, FloatArray]:
+    """A and B of the sampled machine with the readings that were caught in the last sample as further states."""
+    x, u = sample_within(*machine, Ts, delay, caught.time)
+    C = np.hstack([caught.C, np.zeros((len(caught.C), len(x) - caught.C.shape[1]))])
+    return system_matrix(sampled[0], None, C @ x, np.zeros((len(C),) * 2)), np.vstack([sampled[1], C @ u])
+
+
 def sample_driven(
     machine: tuple[FloatArray, FloatArray, FloatArray],
     loop: CurrentLoop,
@@ -242,18 +266,22 @@ def sample_driven(
     Ts: float,
     delay: float,
     share: FloatArray | None = None,
+    caught: Caught | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """The machine behind its current controllers, sampled: from forces v, and then from voltages M^+ emf(x_hat).
 
     machine : A, B of w, and the matrix of phi of the continuous machine with its windings
     R : ohm, R_0
     share : of w in the last state, the link's voltage, which a duty cycle counts in; None: that is no state
+    caught : readings that are taken within a sample; None: none are
 
-    States are those of the machine, of w under way, and the integrals I.
+    States are those of the machine, of w under way, readings that were caught, and the integrals I.
     """
     A, B, phi = machine
     m = B.shape[1]
     Ad, Bd = sample(A, B, Ts, delay)
+    if caught is not None:
+        Ad, Bd = with_caught((A, B), (Ad, Bd), Ts, delay, caught)
     read = np.zeros((m, len(Ad)))
     read[:, : len(A)] = -(loop.Kp + loop.Ki * Ts) / R * phi
     if share is not None:

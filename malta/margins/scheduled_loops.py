@@ -42,7 +42,7 @@ from malta.loops.parametric_plants import of_plant
 from malta.loops.windings import CurrentLoops, chosen_loops
 from malta.model.data import plant_of
 from malta.model.parameters import si, units_of
-from malta.model.plant import Plant, whole_samples
+from malta.model.plant import Plant
 from malta.processes import on_one_thread
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.rates import (
@@ -265,10 +265,10 @@ def loops_between_places(
         return "current controllers on windings"
     if not variable.isidentifier() or keyword.iskeyword(variable) or variable in units_of(plant.parameters):
         return f"{variable!r} is no name for one more parameter"
-    whole, part = split_delay(plant.actuator.delay(controller.sample_time))
+    late = plant.sensors.dead_time / controller.sample_time
+    delay, part = split_delay(plant.actuator.delay(controller.sample_time) + late)
     if part:
-        return f"a dead time of {whole + part:g} samples, which are not whole"
-    delay = whole + whole_samples(plant, controller.sample_time)
+        return f"a delay of {delay + part:g} samples, which are not whole"
     found = []
     for a, b in schedule.cells:
         there = plant_along(plant, variable, (a + b) / 2)

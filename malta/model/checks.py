@@ -193,6 +193,9 @@ def _fault_with_symbols(plant: Plant, names: Sequence[str]) -> str:
         machine = plant.variant(symbolic(plant.parameters, symbols))
     except Exception:  # a user's function may raise anything
         return "plant"
+    for field in ("dead_time", "computation_time"):  # of which the number of states depends
+        if isinstance(getattr(machine.actuator, field), ca.SX):
+            return f"actuator.{field}"
     x, u, w = ca.DM(plant.at().x), ca.DM.zeros(len(plant.inputs)), ca.DM.zeros(len(plant.disturbances))
     y, i = ca.DM(plant.h(x, u)), ca.DM.zeros(len(plant.actuator.coils))
     at = {

@@ -4,8 +4,8 @@ Sensors that read late have a first-order lag of each output, and a dead time of
 
     lag s' = p - s,     y(t) = s(t - dead_time)
 
-Noise and resolution come after the lag. Simulations have both. Linear loops have the lag exactly, as further states of
-the machine, and the dead time where it is whole samples: a delay of all readings is one of all forces.
+Noise and resolution come after the lag. Simulations and linear loops have both exactly: the lag by further states of
+the machine, the dead time by readings that are stored. In a proof, a delay of all readings is one of all forces.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ class Sensors:
 
         lag s' = p - s,     y(t) = s(t - dead_time)
 
-    Simulations take any dead time, linear loops and proofs whole samples of it; the lags are exact in all of them. The
-    design model knows neither: a `delay` of the design and the margin proven of the machine's loop account for them.
+    Lags and dead time are exact in simulations, linear loops and proofs; only proofs that have PI current loops, which
+    read currents at once, take whole samples of dead time alone. The design model knows neither: a `delay` of the
+    design and the margin proven of the machine's loop account for them.
 
     lag : s, of each output; 0.0: none; default: zero. A parameter of the machine may be among them, and vary in proofs.
     dead_time : s

@@ -7,7 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, StrictBool, StrictFloat, StrictInt, StrictStr, create_model
+from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, create_model
 
 from malta.errors import InputError
 from malta.model.signals import Coordinates
@@ -189,7 +189,7 @@ class Range(Record):
     unit: StrictStr = entry("unit of low and high", default="1")
 
 
-Delay = Annotated[StrictInt | StrictFloat, Field(ge=0, le=10)]
+Delay = Annotated[Finite, Field(ge=0, le=10)]
 
 
 class SearchTable(Record):
