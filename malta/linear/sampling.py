@@ -11,7 +11,7 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError
 from malta.linear.matrices import system_matrix
 
-WHOLE = 1e-9  # samples, or share of a delay, that rounding takes from whole samples
+WHOLE_TOLERANCE = 1e-9  # samples, or share of a delay, that rounding takes from whole samples
 MAX_EXPONENTIAL_ENTRY = 1e8  # entry of a matrix whose exponential is taken
 
 
@@ -25,7 +25,7 @@ def eigenvalues(M: FloatArray) -> ComplexArray:
 def split_delay(delay: float) -> tuple[int, float]:
     """Whole samples of a delay, and the fraction of one that is left; what is within 1e-9 of whole samples is whole."""
     nearest = round(delay)
-    if abs(delay - nearest) <= WHOLE * max(1.0, abs(delay)):
+    if abs(delay - nearest) <= WHOLE_TOLERANCE * max(1.0, abs(delay)):
         return nearest, 0.0
     return math.floor(delay), delay - math.floor(delay)
 

@@ -402,7 +402,7 @@ def push_through(
     whole = np.vstack([pushed, np.zeros((size - len(pushed), B_w.shape[1]))])
     if caught is not None:
         first, readings = caught
-        whole[first : first + len(readings.C)] = readings.pushed(A, B_w)
+        whole[first : first + len(readings.C)] = readings.add_push(A, B_w)
     return whole
 
 

@@ -241,7 +241,7 @@ class Caught(NamedTuple):
     C: FloatArray
     time: float
 
-    def pushed(self, A: FloatArray, B_w: FloatArray) -> FloatArray:
+    def add_push(self, A: FloatArray, B_w: FloatArray) -> FloatArray:
         """What x' = A x + B_w w leaves in them, w beginning with the sample."""
         return np.asarray(self.C @ sample(A, B_w, self.time)[1])
 

@@ -84,7 +84,7 @@ MOST_DELAY = 100  # samples: each one has states of its own in the loop and in w
 def require_short(where: str, name: str, samples: float) -> float:
     """The same number of samples of delay. Raises InputError for more than MOST_DELAY."""
     if samples > MOST_DELAY:
-        raise InputError(where, name, f"{samples:g} samples", f"at most {MOST_DELAY}")
+        raise InputError(where, name, f"{samples:.10g} samples", f"at most {MOST_DELAY}")
     return samples
 
 

@@ -24,7 +24,6 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors, require_known
 from malta.files import locate
-from malta.linear.sampling import whole_or_not
 from malta.model.data import plant_of, read, read_published
 from malta.model.parameters import units_of
 from malta.model.plant import Parameters, Plant, Signal
@@ -146,7 +145,7 @@ def spec_of(
         operating_point=_operating_point(content.operating_point, plant, path),
         sample_time=_sample_time(content, path),
         discretization=content.discretization,
-        delay=whole_or_not(content.delay),
+        delay=content.delay,
         current_loop_delay=content.current_loop_delay,
         current_lag=content.current_lag,
         position_feedforward=content.position_feedforward,
@@ -473,10 +472,7 @@ def _search(table: SearchTable | None, raw: Mapping[str, Any], spec: Spec) -> di
         raise InputError(path, "search.delay", str(table.delay), "none, as a PID has no model of a delay")
     if any(table.delay) and spec.discretization == "backward-euler":
         raise InputError(path, "search.delay", str(table.delay), "0 with backward-euler, which has no delay")
-    return {
-        "search": tuple(variables),
-        "delays": tuple(dict.fromkeys(map(whole_or_not, table.delay))) or (spec.delay,),
-    }
+    return {"search": tuple(variables), "delays": tuple(dict.fromkeys(table.delay)) or (spec.delay,)}
 
 
 def _stands(entry: str, raw: Mapping[str, Any]) -> bool:

@@ -240,10 +240,7 @@ def test_verify_takes_lag_and_dead_time_but_proves_whole_samples_with_pi_loops(r
     assert said.code == 0, said.err
     prompt = json.loads(Path(GAINS).read_text(encoding="utf-8"))["verification"]["peak_sensitivity"]["x1"]
     assert json.loads(said.out)["peak_sensitivity"]["machine"]["x1"] > 1.01 * prompt
-    said = run("verify", GAINS, "--set", "T_s=10us", "--no-proof", "--json")
-    assert said.code == 0, said.err
-    assert 1.001 * prompt < json.loads(said.out)["peak_sensitivity"]["machine"]["x1"] < 1.05 * prompt
-    said = run("verify", GAINS, "--set", "T_s=10us")
+    said = run("verify", GAINS, "--set", "T_s=10us", "--no-proof")
     assert said.code == 2
     assert "sensors.dead_time: found 10 us" in one_sentence(said.err)
     assert run("simulate", GAINS, "--set", "T_s=10us", "--json").code == 0
