@@ -86,7 +86,7 @@ def test_the_split_hold_is_the_sample_cut_into_steps(delay: float, lag: float | 
         np.testing.assert_allclose(sampled.response(np.exp(1j * w * Ts)), G, rtol=1e-8, atol=1e-12)
 
 
-def body(**times: float) -> Plant:
+def body(**times: Any) -> Plant:
     return malta.linear_machine(
         [[0, 1], [0, 0]], [[0], [10]], [[1, 0]], name="body", states=["x [m]", "x_dot [m/s]"], inputs=["f [N]"],
         outputs=["x [m]"], nominal={"k": 2e4}, terms={"k": [[[0, 0], [1, 0]]]}, noise=1e-7, limit=40.0, **times,
@@ -183,7 +183,7 @@ def test_margins_move_evenly_and_are_those_of_eigenvalues(lag: float | None, tmp
     assert slope[3] == pytest.approx(slope[4], rel=0.02)
 
 
-def stiff(**times: float) -> Plant:
+def stiff(**times: Any) -> Plant:
     return malta.linear_machine(
         [[0, 1], [2e4, 0]], [[0], [10]], [[1, 0]], name="stiff", states=["x [m]", "x_dot [m/s]"],
         inputs=["f [N]"], outputs=["x [m]"], limit=400.0, **times,
@@ -198,7 +198,8 @@ def test_a_law_that_knows_the_delay_flies_as_the_sample_cut_into_steps(delay: fl
     """Its estimate of what it does not know is exact without noise; simulated, compiled and not, and by exported C."""
     machine = stiff(computation_time=delay * Ts)
     c = malta.lqg(malta.linearize(machine, machine.at()), WEIGHTS, Ts, delay=machine.actuator.delay(Ts))
-    assert (c.delay, c.stored) == (pytest.approx(delay), stored_blocks(delay))
+    assert c.delay == pytest.approx(delay)
+    assert c.stored == stored_blocks(delay)
     hold = malta.Scenario(
         "hold", 0.05, malta.references.hold, start={"x": 1e-4}, fidelity="force", substeps=20
     )
