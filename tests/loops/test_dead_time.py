@@ -53,11 +53,13 @@ def dense(
     return whole[:, :size], whole[:, size:], np.hstack([C, np.zeros((len(C), size - C.shape[1]))])
 
 
-def drawn(seed: int, lag: float | None, delay: float) -> tuple[Any, tuple[FloatArray, ...], Compensator]:
+def drawn(
+    seed: int, lag: float | None, delay: float
+) -> tuple[Any, tuple[FloatArray, FloatArray, FloatArray], Compensator]:
     rng = np.random.default_rng(seed)
     n, m, p, k = rng.integers(1, 5, 4)
     A, B, C = rng.normal(size=(n, n)) / Ts / 2, rng.normal(size=(n, m)) / Ts, rng.normal(size=(p, n))
-    F = [rng.normal(size=shape) / 3 for shape in ((k, k), (k, p), (m, k), (m, p))]
+    F: Any = [rng.normal(size=shape) / 3 for shape in ((k, k), (k, p), (m, k), (m, p))]
     system = malta.uncertain(lambda q: (q * A, B, C), {"q": 1.0})
     return system, (A, B, C), Compensator(*F, sample_time=Ts, delay=delay, lag=lag)
 
@@ -79,10 +81,11 @@ def test_the_split_hold_is_the_sample_cut_into_steps(delay: float, lag: float | 
             assert abs(np.trace(one) - np.trace(two)) < 1e-12 * size
     w = np.array([3.0, 300.0, 3000.0])
     P, _ = open_systems(system, law, system.nominal)
-    G = P.response(np.expm1(1j * w * Ts) / Ts)
+    G = P.response(np.asarray(np.expm1(1j * w * Ts) / Ts, dtype=complex))
     np.testing.assert_allclose(responses(system, law, system.nominal, w).G_y, G, rtol=1e-9, atol=1e-12)
     if lag is None:
-        sampled = System(*plant, np.zeros((len(plant[2]), plant[1].shape[1]))).sampled(Ts, delay * Ts)
+        A, B, C = plant
+        sampled = System(A, B, C, np.zeros((len(C), B.shape[1]))).sampled(Ts, delay * Ts)
         np.testing.assert_allclose(sampled.response(np.exp(1j * w * Ts)), G, rtol=1e-8, atol=1e-12)
 
 
