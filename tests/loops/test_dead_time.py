@@ -61,7 +61,7 @@ def drawn(
     A, B, C = rng.normal(size=(n, n)) / Ts / 2, rng.normal(size=(n, m)) / Ts, rng.normal(size=(p, n))
     F: Any = [rng.normal(size=shape) / 3 for shape in ((k, k), (k, p), (m, k), (m, p))]
     system = malta.uncertain(lambda q: (q * A, B, C), {"q": 1.0})
-    return system, (A, B, C), Compensator(*F, sample_time=Ts, delay=delay, lag=lag)
+    return system, (A, B, C), Compensator(F[0], F[1], F[2], F[3], sample_time=Ts, delay=delay, lag=lag)
 
 
 @pytest.mark.parametrize("lag", [None, 2e3])
