@@ -90,9 +90,9 @@ def _acting_now(loop: LoopPlan, signals: Symbols, held: Any) -> tuple[LoopPlan, 
     older = ca.fmax(1, ca.fmin(steps - 1, ca.floor(f * steps + 0.5)))
     h_older = f * Ts / older
     first = signals.machine["clock"] < f * Ts - h_older / 2
-    h = ca.if_else(first, h_older, (1 - f) * Ts / (steps - older))
-    size = held.numel() // 2
-    return loop._replace(numbers={**loop.numbers, "substep": h}), ca.if_else(first, held[:size], held[size:])
+    h_newer = (1 - f) * Ts / (steps - older)
+    size, lengths = held.numel() // 2, {"substep": ca.if_else(first, h_older, h_newer), "last_substep": h_newer}
+    return loop._replace(numbers={**loop.numbers, **lengths}), ca.if_else(first, held[:size], held[size:])
 
 
 def motion(loop: LoopPlan, signals: Symbols, x: Any, inputs: Any) -> Any:

@@ -58,8 +58,7 @@ def step_readings(loop: LoopPlan, machine: Mapping[str, Any], x: Any) -> dict[st
     s, h = loop.setup, loop.numbers["substep"]
     states: dict[str, Any] = {}
     if "clock" in machine:
-        time = machine["clock"] + h
-        states["clock"] = ca.if_else(time > loop.numbers["control_time"] - h / 2, 0, time)
+        states["clock"] = ca.if_else(_ends_sample(loop, machine), 0, machine["clock"] + h)
     if not s.lagging and s.late is None:
         return states
     before, after = signals(loop, machine["x"]), signals(loop, x)
@@ -92,6 +91,13 @@ def _lag_outputs(s: Any, before: Any, after: Any, lags: tuple[Any, ...], h: Any)
     return ca.vertcat(*found)
 
 
+def _ends_sample(loop: LoopPlan, machine: Mapping[str, Any]) -> Any:
+    """Whether a step is the last one of its sample."""
+    h = loop.numbers["substep"]
+    last = loop.numbers.get("last_substep", h)
+    return machine["clock"] + h > loop.numbers["control_time"] - last / 2
+
+
 def _late(loop: LoopPlan, machine: Mapping[str, Any], before: Any, after: Any) -> dict[str, Any]:
     """The blocks of late readings after a step in which the readings went from `before` to `after`."""
     plant, _, s, g = loop
@@ -102,7 +108,7 @@ def _late(loop: LoopPlan, machine: Mapping[str, Any], before: Any, after: Any) -
     caught = ca.logic_and(share > CLOCK_ROUNDING, share < 1 + CLOCK_ROUNDING)
     blocks = machine["late"]
     last = ca.if_else(caught, before + share * (after - before), blocks[-p:])
-    ends = machine["clock"] + h > Ts - h / 2
+    ends = _ends_sample(loop, machine)
     moved = ca.vertcat(blocks[p:-p], last)
     return {"late": ca.vertcat(ca.if_else(ends, moved, blocks[:-p]), last)}
 
