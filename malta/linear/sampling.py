@@ -56,19 +56,12 @@ def sample(A: FloatArray, B: FloatArray, Ts: float, delay: float = 0) -> tuple[F
 def sample_within(
     A: FloatArray, B: FloatArray, Ts: float, delay: float, time: float
 ) -> tuple[FloatArray, FloatArray]:
-    """x some time after a sample, of the states of `sample` and of its inputs.
-
-    time : s, at most Ts
-    """
-    (n, m), (_, part), size = B.shape, split_delay(delay), len(A) + B.shape[1] * stored_blocks(delay)
-    reached, driven = sample(A, B, time)
-    newer = sample(A, B, time - part * Ts)[1] if time > part * Ts else np.zeros_like(B)
-    found = np.zeros((n, size + m))
-    found[:, :n], found[:, n : n + m] = reached, driven
-    if part:
-        found[:, n : n + m] -= newer
-        found[:, n + m : n + 2 * m] = newer
-    return found[:, :size], found[:, size:]
+    """x at a time after a sample, s, at most Ts: of the states of `sample` and of its inputs."""
+    n, m = B.shape
+    found = np.zeros((n, n + m * (stored_blocks(delay) + 1)))
+    of_states, of_inputs = sample(A, B, time, min(1.0, split_delay(delay)[1] * Ts / time))
+    found[:, : of_states.shape[1] + m] = np.hstack([of_states[:n], of_inputs[:n]])
+    return found[:, :-m], found[:, -m:]
 
 
 def delay_inputs(
@@ -76,10 +69,7 @@ def delay_inputs(
 ) -> tuple[FloatArray, FloatArray]:
     """The sampled system whose inputs act `delay` samples late; stored inputs follow x, the oldest first.
 
-    A delay of d samples and a fraction f: x+ = Ad x + (Bd - newest) u_(d+1) + newest u_d (Franklin, Powell, Workman,
-    Digital Control of Dynamic Systems, 3rd ed., 4.3.4).
-
-    newest : the integral of e^(A s) B over the last 1 - f of a sample, needed with a fraction
+    newest : with a fraction f, the integral N of e^(A s) B over 1 - f of a sample: x+ = Ad x + (Bd - N) u_d+1 + N u_d
     """
     (n, m), (whole, part) = Bd.shape[-2:], split_delay(delay)
     stored = m * stored_blocks(delay)

@@ -42,7 +42,6 @@ from malta.loops.windings import (
     link_at_rest,
     sample_driven,
     windings_of,
-    with_caught,
     with_current_control,
     with_estimated_emf,
     with_windings,
@@ -276,10 +275,8 @@ def sampled_loop(
         continuous = A
         if current_loops == "lag" and math.isfinite(plant.actuator.crossover):
             A, B = add_lags(A, B, plant.actuator.crossover)
-        Ad, Bd = sample(A, B, controller.sample_time, delay)
-        if caught is not None:
-            caught = caught._replace(C=_pad(C, len(A)))
-            Ad, Bd = with_caught((A, B), (Ad, Bd), controller.sample_time, delay, caught)
+        Ts = controller.sample_time
+        Ad, Bd = sample(A, B, Ts, delay) if caught is None else caught.add_to((A, B), Ts, delay)
     Cd, true = _pad(C, len(Ad)), None if true is None else _pad(true, len(Ad))
     first = len(Ad) - len(C) - (len(controller.forces) if current_loops == "pi" else 0)
     if caught is not None:
@@ -401,8 +398,8 @@ def push_through(
     _, pushed = sample(A, B_w, Ts)
     whole = np.vstack([pushed, np.zeros((size - len(pushed), B_w.shape[1]))])
     if caught is not None:
-        first, readings = caught
-        whole[first : first + len(readings.C)] = readings.add_push(A, B_w)
+        first, (C, time) = caught
+        whole[first : first + len(C)] = C @ sample(A, B_w, time)[1]
     return whole
 
 
@@ -435,9 +432,8 @@ def machine_law(
     """
     a = plant.actuator
     delay = a.delay(controller.sample_time)
-    if (
-        chosen_loops(plant, controller, current_loops) == "lag"
-    ):  # a delay of all readings is one of all forces
+    if chosen_loops(plant, controller, current_loops) == "lag":
+        # A delay of all readings is one of all forces.
         late = plant.sensors.dead_time / controller.sample_time
         return sampled_law(controller, whole_or_not(delay + late), a.crossover, use=use)
     late = whole_samples(plant, controller.sample_time)

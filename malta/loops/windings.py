@@ -236,27 +236,18 @@ def forecast_as_forces(law: LinearLaw, k: CurrentControl, Ts: float) -> LinearLa
 
 
 class Caught(NamedTuple):
-    """Readings C x of a continuous machine that are taken some time (s) after each sample."""
+    """Readings C x that are taken some time (s) after each sample; of the sampled machine they are states."""
 
     C: FloatArray
     time: float
 
-    def add_push(self, A: FloatArray, B_w: FloatArray) -> FloatArray:
-        """What x' = A x + B_w w leaves in them, w beginning with the sample."""
-        return np.asarray(self.C @ sample(A, B_w, self.time)[1])
-
-
-def with_caught(
-    machine: tuple[FloatArray, FloatArray],
-    sampled: tuple[FloatArray, FloatArray],
-    Ts: float,
-    delay: float,
-    caught: Caught,
-) -> tuple[FloatArray, FloatArray]:
-    """A and B of the sampled machine with the readings that were caught in the last sample as further states."""
-    x, u = sample_within(*machine, Ts, delay, caught.time)
-    C = np.hstack([caught.C, np.zeros((len(caught.C), len(x) - caught.C.shape[1]))])
-    return system_matrix(sampled[0], None, C @ x, np.zeros((len(C),) * 2)), np.vstack([sampled[1], C @ u])
+    def add_to(
+        self, machine: tuple[FloatArray, FloatArray], Ts: float, delay: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """A and B of a machine, sampled, with what was caught in the last sample behind its states."""
+        (Ad, Bd), (x, u) = sample(*machine, Ts, delay), sample_within(*machine, Ts, delay, self.time)
+        C = np.hstack([self.C, np.zeros((len(self.C), len(x) - self.C.shape[1]))])
+        return system_matrix(Ad, None, C @ x, np.zeros((len(C),) * 2)), np.vstack([Bd, C @ u])
 
 
 def sample_driven(
@@ -279,9 +270,7 @@ def sample_driven(
     """
     A, B, phi = machine
     m = B.shape[1]
-    Ad, Bd = sample(A, B, Ts, delay)
-    if caught is not None:
-        Ad, Bd = with_caught((A, B), (Ad, Bd), Ts, delay, caught)
+    Ad, Bd = sample(A, B, Ts, delay) if caught is None else caught.add_to((A, B), Ts, delay)
     read = np.zeros((m, len(Ad)))
     read[:, : len(A)] = -(loop.Kp + loop.Ki * Ts) / R * phi
     if share is not None:

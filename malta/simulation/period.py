@@ -91,7 +91,10 @@ def _acting_now(loop: LoopPlan, signals: Symbols, held: Any) -> tuple[LoopPlan, 
     h_older = f * Ts / older
     first = signals.machine["clock"] < f * Ts - h_older / 2
     h_newer = (1 - f) * Ts / (steps - older)
-    size, lengths = held.numel() // 2, {"substep": ca.if_else(first, h_older, h_newer), "last_substep": h_newer}
+    size, lengths = (
+        held.numel() // 2,
+        {"substep": ca.if_else(first, h_older, h_newer), "last_substep": h_newer},
+    )
     return loop._replace(numbers={**loop.numbers, **lengths}), ca.if_else(first, held[:size], held[size:])
 
 

@@ -355,14 +355,9 @@ class Rows:
     @property
     def size(self) -> int:
         """The number of rows of the pencil."""
-        law, m = self.loop.law, len(self.inputs)
+        late = len(self.inputs) * split_delay(self.loop.law.delay)[0]
         lifted = self.loop.sampled and len(self.group.states) <= MAX_LIFTED_STATES
-        return (
-            self.driven * (2 if lifted else 1)
-            + len(self.group.own)
-            + m * split_delay(law.delay)[0]
-            + len(self.reads)
-        )
+        return self.driven * (2 if lifted else 1) + len(self.group.own) + late + len(self.reads)
 
     @property
     def driven(self) -> int:
