@@ -90,9 +90,8 @@ def require_short(where: str, name: str, samples: float) -> float:
 
 def split_dead_time(dead_time: float, Ts: float) -> tuple[int, float]:
     """Whole samples of a dead time, and the rest of it, s. Raises InputError for more than MOST_DELAY samples."""
-    whole, part = split_delay(
-        require_short("machine", "dead time of its sensors", whole_or_not(dead_time / Ts))
-    )
+    samples = require_short("machine", "dead time of its sensors", whole_or_not(dead_time / Ts))
+    whole, part = split_delay(samples)
     return whole, part * Ts
 
 

@@ -56,9 +56,7 @@ class Setup:
     late: int | None = None  # sensors with a dead time, of so many whole samples and a rest; None: without
     current_sensors: bool = False  # the current controllers read sensors with noise, offsets and steps
     electronics: Any = None  # options of the machine's own electronics
-    fraction: float = (
-        0.0  # of a sample, for which the oldest command under way acts, and then the next; 0: all of it
-    )
+    fraction: float = 0.0  # of a sample, for which the oldest command under way acts, then the next
 
 
 class Layout(NamedTuple):

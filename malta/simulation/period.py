@@ -90,11 +90,8 @@ def _acting_now(loop: LoopPlan, signals: Symbols, held: Any) -> tuple[LoopPlan, 
     older = ca.fmax(1, ca.fmin(steps - 1, ca.floor(f * steps + 0.5)))
     h_older = f * Ts / older
     first = signals.machine["clock"] < f * Ts - h_older / 2
-    h_newer = (1 - f) * Ts / (steps - older)
-    size, lengths = (
-        held.numel() // 2,
-        {"substep": ca.if_else(first, h_older, h_newer), "last_substep": h_newer},
-    )
+    h_newer, size = (1 - f) * Ts / (steps - older), held.numel() // 2
+    lengths = {"substep": ca.if_else(first, h_older, h_newer), "last_substep": h_newer}
     return loop._replace(numbers={**loop.numbers, **lengths}), ca.if_else(first, held[:size], held[size:])
 
 
