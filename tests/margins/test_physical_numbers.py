@@ -256,3 +256,15 @@ def test_each_number_moves_figures_and_flights_in_proportion(which: str) -> None
         assert not found
         idle |= set() if acts else {name}
     assert idle == IDLE[which]
+
+
+@pytest.mark.slow
+def test_each_number_moves_the_proven_margin_in_proportion() -> None:
+    """To what the search leaves between the bounds, a thousandth."""
+    plant, c = machine_of("ball/ball")
+    box = {"m": 0.05, "C": 0.05}
+    before = malta.robust_margin(malta.loop(plant, c), box)
+    for name in set(physical(plant)) - IDLE["ball/ball"]:
+        for move in (-MOVE, MOVE):
+            after = malta.robust_margin(malta.loop(moved(plant, name, move), c), box)
+            assert after.lower == pytest.approx(before.lower, rel=20 * MOVE), name
