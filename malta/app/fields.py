@@ -178,7 +178,8 @@ def _sampling_fields(files: Files) -> Iterator[PageField]:
     defaults = {name: f.default for name, f in DesignFile.model_fields.items()}
     if lqg:
         delay = float(content.get("delay", 0))
-        yield PageField("delay", group, "delay in the design model", delay, "samples", "integer", 0, 10)
+        kind: Kind = "integer" if delay.is_integer() else "linear"
+        yield PageField("delay", group, "delay in the design model", delay, "samples", kind, 0, 10)
         choices = get_args(Discretization)
         yield PageField(
             "discretization",

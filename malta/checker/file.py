@@ -152,11 +152,17 @@ class StatedLoop:
     law: tuple[list[list[Any]], ...]  # A, B, C, D
     sample_time: Any
     discrete: bool
-    delay: int
+    delay: Any
     lag: Any
     conditions: StatedConditions
     units: tuple[int, ...]  # log2 of sizes of the states, in which small couplings are bounded
     groups: tuple[StatedGroup, ...]
+
+    @property
+    def split(self) -> tuple[int, Any]:
+        """Whole samples of the delay, and the fraction of one beyond."""
+        whole = int(self.delay.floor())
+        return whole, self.delay - whole
 
     @property
     def held(self) -> bool:
@@ -333,12 +339,15 @@ def loop(f: DocumentValue, inputs: int) -> StatedLoop:
     discrete = f["discrete"].truth()
     if discrete and (T is None or lag is not None):
         raise f["discrete"].wrong("false, or a sample time and no lag")
+    delay = f["delay"].number(0, 20 if T is not None else 0)
+    if discrete and delay.q != 1:
+        raise f["delay"].wrong("whole samples of a system in discrete time")
     groups = tuple(group(g, n, k, inputs) for g in f["groups"].items(0, n + k))
     units = tuple(x.whole(-300, 300) for x in f["units"].items(n + k))
     return StatedLoop(
         n, steps, tuple(matrices),
         tuple(law[key].matrix(*at) for key, at in (("A", (k, k)), ("B", (k, p)), ("C", (m, k)), ("D", (m, p)))),
-        T, discrete, f["delay"].whole(0, 20 if T is not None else 0), lag, StatedConditions(made, above), units, groups,
+        T, discrete, delay, lag, StatedConditions(made, above), units, groups,
     )  # fmt: skip
 
 

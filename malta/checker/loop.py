@@ -182,7 +182,8 @@ class CheckedPolynomial:
             name: {(row[i], j): self.q[i] * r for (i, j), r in inside[name].items()} for name in "KF"
         }
         n, r = len(group.states), len(q)
-        w = n + r * (loop.delay + (loop.lag is not None))
+        whole, part = loop.split
+        w = n + r * (whole + (part != 0) + (loop.lag is not None))
         self.shape, self.count = (w, r, len(group.own)), w + len(group.own) + 1
         self.units = {a: loop.units[i] for a, i in enumerate(group.states)}
         self.units |= {w + r + a: loop.units[loop.states + i] for a, i in enumerate(group.own)}
@@ -249,18 +250,28 @@ class CheckedPolynomial:
         return [[x - one * (i == j) for j, x in enumerate(row)] for i, row in enumerate(dense(k, k, L))]
 
     def _windings(self, table: Table, *, bounds: bool) -> tuple[Rows, Rows]:
-        """Phi and Gamma: of x, then a lag of each force, then forces under way, of which the latest enters last."""
+        """Phi and Gamma: of x, then a lag of each force, then forces under way, of which the latest enters last.
+
+        Of a fraction of a sample of delay, forces under way act for it, and newer ones for the rest of the sample.
+        """
         loop, n, r = self.loop, len(self.group.states), len(self.q)
         a, b = dense(n, n, table), dense(n, r, {(i, k): arb(1) for k, i in enumerate(self.q)})
         if loop.lag is not None:
             a, b = blocks([a, b], [dense(r, n), eye(r, -loop.lag)]), blocks([dense(n, r)], [eye(r, loop.lag)])
+        whole, part = loop.split
+        newest = dense(len(a), r)
         if loop.held and a:
-            a, b = hold(a, b, arb(loop.sample_time), bounds)
+            T = arb(loop.sample_time)
+            if part:
+                newest = hold(a, b, T * (1 - part), bounds)[1]
+            a, b = hold(a, b, T, bounds)
         elif loop.discrete:
             a = [[x - (i == j) for j, x in enumerate(row)] for i, row in enumerate(a)]
-        for _ in range(loop.delay):
-            w = len(a)
-            a, b = blocks([a, b], [dense(r, w), eye(r, -1)]), blocks([dense(w, r)], [eye(r, 1)])
+        for k in range(whole + (part != 0)):
+            w, here = len(a), newest if k == 0 else dense(len(a), r)
+            if not bounds:  # of entries: either part is below that of the whole sample
+                b = [[x - y for x, y in zip(*rows, strict=True)] for rows in zip(b, here, strict=True)]
+            a, b = blocks([a, b], [dense(r, w), eye(r, -1)]), blocks([here], [eye(r, 1)])
         return a, b
 
 

@@ -50,7 +50,7 @@ SCENARIO_FIELDS: Mapping[str, GeneralOption] = {
         "fixed", "current controllers fixed, or turning with the force, as printed"
     ),
     "real_pwm": GeneralOption(False, "in phase: duty cycles in steps, dead time of the half-bridges"),
-    "delay": GeneralOption(0, "samples between measurement and command"),
+    "delay": GeneralOption(0.0, "samples between measurement and command"),
     "substeps": GeneralOption(0, "Runge-Kutta steps a sample; the error is estimated"),
 }
 LENGTHS = {"distance": "m", "rise": "s", "settle": "s"}  # units of options that many machines have

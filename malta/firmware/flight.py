@@ -388,10 +388,8 @@ def _fly(
         held_state[places["under_way"]] = queue[len(command) :]
         end = substeps_until(first + k + 1, substeps)
         jitter = fast[done - begin_substep : end - begin_substep].ravel()
-        motion = f.machine.motion(end - done)
-        held_state[machine] = evaluate(motion, held_state[machine], queue[: len(command)], row, jitter)[
-            0
-        ].ravel()
+        motion, acting = f.machine.motion(end - done), queue[: len(command) * (2 if f.setup.fraction else 1)]
+        held_state[machine] = evaluate(motion, held_state[machine], acting, row, jitter)[0].ravel()
         done = end
     rows = evaluate(f.machine.record.map(len(given)), states, given, reads, commands)[0]
     return held_state, rows

@@ -32,6 +32,7 @@ from malta.simulation import references
 from malta.simulation.layout import (
     Layout,
     Setup,
+    held_size,
     layout_of,
     noise_scales,
     numbers_of,
@@ -268,7 +269,7 @@ def _shift(m: FirmwareMachine) -> ca.Function:
     xi_pred, offset = ca.SX.sym("xi_pred", len(c.states)), ca.SX.sym("offset", len(plant.states))
     after = ca.SX(xi_pred)
     if c.tracks == "states":
-        n, forces, known = len(plant.controlled), len(c.forces), c.lagging + c.delay
+        n, forces, known = len(plant.controlled), len(c.forces), c.lagging + c.stored
         moved = offset[list(plant.controlled)]
         after[:n] += moved
         if known:
@@ -316,6 +317,7 @@ def _context(m: FirmwareMachine, programs: Mapping[str, Program], name: str) -> 
         "state": m.state_size,
         "states": len(plant.states),
         "held": command.size,
+        "acting": held_size(plant, m.setup),
         "delay": m.setup.delay,
         "wrench": sum(f.size for f in wrench_fields(m)),
         "forces": len(c.forces),

@@ -26,6 +26,7 @@ from malta.model.places import place_states
 from malta.simulation.current_control import control_currents
 from malta.simulation.layout import LoopPlan, Symbols, electronics_of, numbers_of
 from malta.simulation.period import law_reference, limited_currents, state_reference
+from malta.synthesis.controller import lag_shares
 from malta.synthesis.law import command_forces, freeze_moving, frozen_axes, interpolate, look_ahead
 from malta.synthesis.linear_law import estimate_states, filter_reading, sum_errors
 
@@ -258,14 +259,14 @@ def recall(t: Target, memory: Any, v_ff: Any, p: Any, dp: Any) -> tuple[Any, Any
     zeros = ca.SX.zeros(m * c.observed)
     if memory is None:
         return zeros, None
-    lagging, d = c.lagging, c.delay
+    lagging, d = c.lagging, c.stored
     edges = (0, m * lagging, m * (lagging + d), memory.numel())
     lag, stored, forward = (memory[a:b, 0] for a, b in pairwise(edges))  # columns, where they are empty too
     after: list[Any] = []
     if lagging:
-        decay = float(c.Ad[len(c.A), len(c.A)])
-        acting = forward[:m, 0] if d else v_ff
-        after.append((1 - decay) * acting + decay * lag)
+        decay, queue = float(c.Ad[len(c.A), len(c.A)]), ca.vertcat(forward, v_ff)
+        taken = [share * queue[m * (d - age) : m * (d - age + 1), 0] for age, share in lag_shares(c)]
+        after.append(sum(taken[1:], taken[0]) + decay * lag)
     if d:
         n = len(c.A)
         newest = n + m * (lagging + d - 1)
@@ -375,12 +376,14 @@ def _state_on_reference(t: Target, reference: dict[str, Any], v0: Any) -> dict[s
     if c.tracks == "states":
         v_ff = feedforward(t, p, dp, reference["ddp"])
         if "memory" in state:
-            m, ahead = len(c.forces), c.lagging + c.delay
+            m, ahead = len(c.forces), c.lagging + c.stored
             trial = ca.SX.zeros(state["memory"].numel())
             _, after = recall(t, trial, v_ff, p, dp)
-            newest = after[m * (ahead - 1) : m * ahead, 0] if c.delay else v_ff
+            newest = after[m * (ahead - 1) : m * ahead, 0] if c.stored else v_ff
             state["memory"] = ca.vertcat(
-                *([v_ff] if c.lagging else []), *[newest] * c.delay, *([v_ff] * c.delay if c.lagging else [])
+                *([v_ff] if c.lagging else []),
+                *[newest] * c.stored,
+                *([v_ff] * c.stored if c.lagging else []),
             )
         v_past, _ = recall(t, state.get("memory"), v_ff, p, dp)
         if "memory" in state:

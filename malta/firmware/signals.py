@@ -140,8 +140,8 @@ class Target:
             fields.append(CField("e_rest", errors, "what rounding took from the sums of errors"))
             if self.summing_states:
                 fields.append(CField("xi_rest", c.states, "the same, of states that sum up"))
-        if c.tracks == "states" and (c.lagging or c.delay):
-            ages = range(c.delay, 0, -1)
+        if c.tracks == "states" and (c.lagging or c.stored):
+            ages = range(c.stored, 0, -1)
             stored = [Signal(f"{s.name}*[k-{age}]", s.unit) for age in ages for s in m]
             lag = [Signal(f"{s.name}*[i]", s.unit) for s in m] if c.lagging else []
             forward = (

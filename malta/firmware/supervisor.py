@@ -160,7 +160,7 @@ def prediction_correction(t: Target) -> ca.Function:
     xi = ca.SX.sym("xi_hat", len(c.states))
     n, m = len(c.A), len(c.forces)
     x = place_states(plant, xi[: len(plant.controlled)])
-    u = xi[n : n + m] if c.lagging + c.delay else ca.SX.zeros(m)
+    u = xi[n : n + m] if c.lagging + c.stored else ca.SX.zeros(m)
     held, outside = ca.DM(plant.at().u), ca.SX.zeros(len(plant.disturbances))
     rate = plant.f(x, held + u, outside) - plant.f(
         ca.DM.zeros(len(plant.states)), held, ca.DM.zeros(outside.shape)

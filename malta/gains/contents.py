@@ -75,6 +75,7 @@ def _linear_parameters(plant: PlantTable, given: LinearTable, path: str | Path) 
             limit=math.inf if given.limit is None else given.limit,
             noise=given.noise,
             dead_time=given.dead_time,
+            computation_time=given.computation_time,
         )
 
 
@@ -172,9 +173,18 @@ def build_controller(file: GainFile, path: str | Path) -> Controller:
         if file.commutation is None
         else Commutation(file.commutation.lead, **arrays["commutation"]),
         schedule=_schedule(file, arrays, layout, path),
+        fraction=_fraction(file, layout, path),
     )
     with relocate_errors(path, "law.{}"):  # the record does not know the file
         return Controller(**fields)
+
+
+def _fraction(file: GainFile, layout: _Layout, path: str | Path) -> float:
+    """The fraction of a sample of delay. Raises InputError for one of a law without stored forces."""
+    fraction = 0.0 if file.law is None else file.law.fraction
+    if fraction and not set(layout.states) & set(stored_forces(layout.plant.inputs, 1)):
+        raise InputError(path, "law.fraction", f"{fraction:g}", "0, as no forces are stored")
+    return fraction
 
 
 def _schedule(file: GainFile, arrays: Arrays, layout: _Layout, path: str | Path) -> Schedule | None:

@@ -3,7 +3,8 @@
 Its tables and entries, with meaning, unit and shape of each, stand in schema.py, and malta.schemas makes a JSON schema
 of them. Version 1; 2 with what is below.
 
-n = n0 + m d where the design models a delay of d samples: the mechanical states first, then stored forces; m more where
+n = n0 + m d where the design models a delay of d samples: the mechanical states first, then stored forces; m more of a
+fraction of a sample beyond, law.fraction, which version 1 has not; m more where
 the filter observes forces of disturbance. The control law is stated in synthesis/controller.py. A PID controller has
 the same law, with a diagonal Ki where each output has its own input (synthesis/pid.py); its cost, its noise and its
 poles of regulator and filter are null. current_loop is null where currents follow their commands at once,

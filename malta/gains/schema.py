@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, StrictInt, StrictStr
+from pydantic import BeforeValidator, Field, StrictInt, StrictStr
 
 from malta.model.signals import Coordinates
 from malta.synthesis.controller import Tracks
@@ -83,7 +83,8 @@ class LinearTable(Record):
     parameter_limits: dict[StrictStr, ParameterLimits] | None = entry("limits of parameters", default=None)
     limit: Vector | None = entry("limits of the outputs", "m", shape="p")
     noise: Vector = entry("noise of one sample of each output, rms, SI", shape="p")
-    dead_time: Finite = entry("from a command to its force", "s")
+    dead_time: Finite = entry("from a reading to its force, half a sample of hold included", "s")
+    computation_time: Finite = entry("from a reading to its new force", "s", default=0.0)
 
 
 class PlantTable(Record):
@@ -119,6 +120,9 @@ class Law(Record):
         "SI",
         shape="3 x p",
         default=None,
+    )
+    fraction: Annotated[Finite, Field(ge=0, lt=1)] = entry(
+        "of a sample, for which the oldest stored force acts; 0: for all of it", "samples", default=0.0
     )
 
 

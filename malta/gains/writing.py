@@ -58,6 +58,7 @@ def document(controller: Controller, margins: LoopReport) -> dict[str, Any]:
     ahead = c.commutation is not None
     law: dict[str, Any] = {"tracks": c.tracks} | ({"coordinates": "positions"} if in_positions else {})
     law |= {key: getattr(c, key) for key in ("pause", "braking", "references") if getattr(c, key).size}
+    law |= {"fraction": c.fraction} if c.fraction else {}
     extended = linear or ahead or c.tracks == "errors" or c.schedule is not None or bool(c.lagging)
     extended = extended or len(law) > 1 or not c.feedforward.rate.size or bool(c.feedforward.position.size)
     tables: dict[str, Any] = {
@@ -333,6 +334,7 @@ def linear_table(parameters: Any) -> dict[str, Any]:
         "limit": np.array(s.limit) if np.isfinite(s.limit).all() else None,
         "noise": np.array(s.noise),
         "dead_time": s.dead_time,
+        **({"computation_time": s.computation_time} if s.computation_time else {}),
     }
 
 

@@ -13,11 +13,13 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
+from malta.linear.sampling import split_delay, stored_blocks
 from malta.model.plant import Plant, Signal
 from malta.simulation.current_control import reading_errors
 from malta.simulation.inputs import initial_values
 from malta.simulation.layout import LoopPlan
 from malta.simulation.multisine import Multisine
+from malta.simulation.scenario import delay_of
 from malta.simulation.simulate import prepare
 from malta.simulation.trajectory import Trajectory
 
@@ -261,17 +263,23 @@ def _lagging_currents(run: Trajectory) -> FloatArray:
     Until the first command arrives, those flow with which the run began.
     """
     actuator, Ts = run.plant.actuator, run.controller.sample_time
-    delay = actuator.delay(Ts) if run.scenario.delay is None else run.scenario.delay
+    delay = delay_of(run.plant, run.controller, run.scenario)
     ready = prepare(run.plant, run.controller, run.scenario)
     first = (
         run.current[:1] if run.scenario.settle else initial_values(ready.simulation, ready.inputs.given[0])[2]
     )
-    held = np.vstack([np.tile(first, (delay, 1)), run.current])[: len(run.current)]
+    held, newer = (
+        np.vstack([np.tile(first, (k, 1)), run.current])[: len(run.current)]
+        for k in (stored_blocks(delay), split_delay(delay)[0])
+    )
     if not np.isfinite(actuator.crossover):
         return np.asarray(held)
     from scipy.signal import lfilter  # half a second to import
 
     decay = float(np.exp(-actuator.crossover * Ts))
+    if part := split_delay(delay)[1]:  # the newer ones have the rest of the sample
+        share = -np.expm1(-actuator.crossover * (1 - part) * Ts) / (1 - decay)
+        held = held + share * (newer - held)
     before = np.reshape(first, (1, -1))
     return np.asarray(lfilter([0, 1 - decay], [1, -decay], held, axis=0, zi=before)[0])
 

@@ -190,7 +190,8 @@ def identify_windings(controller: Controller, log: Log) -> Windings:
         for bins in (s.lines, s.between.ravel())
     )
     actuator = plant.actuator
-    believed = actuator.R, actuator.L, actuator.dead_time
+    computed = actuator.computation_time
+    believed = actuator.R, actuator.L, computed + log.sample_time / 2 if computed else actuator.dead_time
     theta = np.array([actuator.R, actuator.L, actuator.delay(log.sample_time)], dtype=float)
     for _ in range(ROUNDS):
         theta, covariance, chi2, dof = _search(lines, between, theta)

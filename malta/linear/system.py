@@ -21,7 +21,7 @@ from malta.arguments import describe
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.linear.matrices import balanced_units
-from malta.linear.sampling import delay_inputs, eigenvalues, sample
+from malta.linear.sampling import eigenvalues, sample
 
 MIN_SCHUR_FREQUENCIES = 32  # frequencies from which on a Schur form is worth its time
 SLOW_FREQUENCY = 1e-6  # of the norm of A: below, the Schur form has lost digits of slow poles
@@ -206,8 +206,7 @@ class System:
     def sampled(self, Ts: float, delay: float = 0.0) -> System:
         """The system under a zero-order hold every Ts seconds, its inputs `delay` seconds late: exact.
 
-        A delay of d whole samples and a rest r stores d + 1 inputs; the oldest acts for the first r of a sample
-        (Van Loan, IEEE Trans. Autom. Control 23(3), 1978).
+        A delay of d samples and a fraction of one stores d + 1 inputs; the oldest acts for that fraction of a sample.
         """
         A, B, C, D = self
         if self.dt is not None:
@@ -216,22 +215,10 @@ class System:
             raise InputError("sampled", "Ts", describe(Ts), "a sample time above 0 s")
         if not (np.isfinite(delay) and delay >= 0):
             raise InputError("sampled", "delay", describe(delay), "a time of 0 s or more")
-        whole, rest = divmod(round(delay / Ts, 9), 1.0)
-        rest *= Ts
-        if not rest:
-            Ad, Bd = delay_inputs(*sample(A, B, Ts), int(whole))
-            late = np.hstack([C, D, np.zeros((len(D), D.shape[1] * (int(whole) - 1)))]) if whole else C
-            return System(Ad, Bd, late, 0 * D if whole else D, None, Ts, (), self.inputs, self.outputs)
-        (A_new, B_new), (A_rest, B_old) = sample(A, B, Ts - rest), sample(A, B, rest)
-        m, stored = D.shape[1], D.shape[1] * (int(whole) + 1)
-        Ad, Bd = delay_inputs(A_new @ A_rest, A_new @ B_old, int(whole) + 1)
-        n = len(A)
-        if whole:
-            Ad[:n, n + m : n + 2 * m] = B_new
-        else:
-            Bd[:n] = B_new
-        C = np.hstack([C, D, np.zeros((len(D), stored - m))])
-        return System(Ad, Bd, C, 0 * D, None, Ts, (), self.inputs, self.outputs)
+        Ad, Bd = sample(A, B, Ts, delay / Ts)
+        late = np.hstack([C, D, np.zeros((len(D), len(Ad)))])[:, : len(Ad)]
+        through = D if len(Ad) == len(A) else 0 * D
+        return System(Ad, Bd, late, through, None, Ts, (), self.inputs, self.outputs)
 
 
 def _pick(wanted: Sequence[int | str], known: tuple[str, ...], field: str) -> list[int]:

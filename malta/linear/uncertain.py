@@ -18,7 +18,7 @@ from scipy import sparse
 from malta.arguments import number
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError, require_known
-from malta.linear.sampling import add_lags, delay_inputs, sample
+from malta.linear.sampling import add_lags, delay_inputs, sample, split_delay
 from malta.linear.system import System
 
 DOMAIN_END_TEXT = "a root or a branch of the model ends"
@@ -155,7 +155,7 @@ class UncertainSystem:
 class Compensator:
     """A linear law u = F y: x+ = A x + B y, u = C x + D y, with positive feedback; x' for x+ in continuous time.
 
-    Between u and the plant stand a delay of whole samples, a zero-order hold when sampled, and a first-order lag
+    Between u and the plant stand a delay, a zero-order hold when sampled, and a first-order lag
     w_c / (s + w_c) when `lag` is given. The last states are plain integrals.
 
     A : n x n
@@ -164,7 +164,7 @@ class Compensator:
     D : m x p
     integrals : number of the last states that are plain integrals
     sample_time : s; None: continuous
-    delay : samples between u and the plant
+    delay : samples between u and the plant, also a fraction of one before a continuous plant
     lag : w_c, rad/s; None: no lag
 
     >>> import malta
@@ -182,7 +182,7 @@ class Compensator:
     D: FloatArray
     integrals: int = 0
     sample_time: float | None = None
-    delay: int = 0
+    delay: float = 0
     lag: float | None = None
 
 
@@ -214,17 +214,33 @@ def _close(
     if c.sample_time is not None:
         n, T = A.shape[-1], c.sample_time
         _, Phi = sample(A, np.eye(n), T)  # (e^AT - 1) / T = A Phi / T
-        A, B = delay_inputs(A @ Phi / T, Phi @ B / T, c.delay)
-        stored = np.arange(n, A.shape[-1])  # delay_inputs gives the next values of these
-        if len(stored):
-            A[..., n:, :], B = A[..., n:, :] / T, B / T
-        A[..., stored, stored] -= 1 / T
+        A, B = _store_inputs(A @ Phi / T, Phi @ B / T, _newest(A, B, c), c)
     n = A.shape[-1]
     whole = np.zeros((len(A), n + len(F_A), n + len(F_A)))
     whole[:, :n, :n], whole[:, :n, n:], whole[:, n:, n:] = A, B @ F_C, F_A
     whole[:, :n, :outputs] += B @ F_D @ C
     whole[:, n:, :outputs] = F_B @ C
     return whole
+
+
+def _newest(A: FloatArray, B: FloatArray, c: Compensator) -> FloatArray | None:
+    """What inputs leave in the last 1 - f of a sample, in differences, f the fraction of delay; None without one."""
+    T, part = c.sample_time, split_delay(c.delay)[1]
+    return None if T is None or not part else sample(A, B, (1 - part) * T)[1] / T
+
+
+def _store_inputs(
+    A: FloatArray, B: FloatArray, newest: FloatArray | None, c: Compensator
+) -> tuple[FloatArray, FloatArray]:
+    """A system in differences behind the delay of a sampled compensator; stored inputs follow x, the oldest first."""
+    n, T = A.shape[-1], float(c.sample_time or 0)
+    A, B = delay_inputs(A, B, c.delay, newest)
+    stored = np.arange(n, A.shape[-1])  # delay_inputs gives the next values of these
+    if len(stored):
+        B = B / T if newest is None else np.concatenate([B[..., :n, :], B[..., n:, :] / T], axis=-2)
+        A[..., n:, :] = A[..., n:, :] / T
+    A[..., stored, stored] -= 1 / T
+    return A, B
 
 
 def _poles(
@@ -310,9 +326,13 @@ def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: Float
     G(s) = C (s E - A)^-1 B + D behind a lag w_c / (s + w_c); of a sampled loop the exact discrete system under a
     zero-order hold at z = e^(j w T), times z^-delay. Differences (z - 1) / T keep the digits of slow modes.
     """
-    A, B, C, D = _plant(system, law, np.asarray(p, dtype=float).tobytes())
+    A, B, C, D, newest = _plant(system, law, np.asarray(p, dtype=float).tobytes())
     s, turned, F = _law(law, np.asarray(w, dtype=float).tobytes())
     m, q = len(law.D), C.shape[1] - len(law.D)
+    if newest is not None and law.sample_time is not None:
+        # What was commanded a sample before acts for the fraction of the delay.
+        older = np.exp(-1j * np.asarray(w, dtype=float) * law.sample_time)[:, None, None]
+        B, D = newest + (B - newest) * older, D * older
     G = (C @ _resolvent(s, A, B) + D) * turned[:, None, None]
     return ResponseMatrices(G[:, :q, :m], G[:, :q, m:], G[:, q:, :m], F)
 
@@ -335,27 +355,24 @@ def _resolvent(s: ComplexArray, A: FloatArray, B: FloatArray) -> ComplexArray:
 def open_systems(system: UncertainSystem, law: Compensator, p: FloatArray) -> tuple[System, System]:
     """y = P u, with lag, hold and delay, and u = F y at one row of parameters; in differences when sampled."""
     m, T = len(law.D), law.sample_time
-    A, B, C, D = (M[0] for M in _plant(system, law, np.asarray(p, dtype=float).tobytes()))
+    *plant, newest = _plant(system, law, np.asarray(p, dtype=float).tobytes())
+    A, B, C, D = (M[0] for M in plant)
     q, n = len(C) - m, len(A)
     B, C, D = B[:, :m], C[:q], D[:q, :m]
     if T is not None and law.delay:
-        stored = m * law.delay  # commands, the oldest first
-        whole, into, out = np.zeros((n + stored,) * 2), np.zeros((n + stored, m)), np.zeros((q, n + stored))
-        whole[:n, :n], whole[:n, n : n + m] = A, B
-        whole[n:, n:] = (np.eye(stored, k=m) - np.eye(stored)) / T
-        into[-m:], out[:, :n], out[:, n : n + m] = np.eye(m) / T, C, D
-        A, B, C, D = whole, into, out, np.zeros((q, m))
+        A, B = _store_inputs(A, B, None if newest is None else newest[0, :, :m], law)
+        C, D = np.hstack([C, D, np.zeros((q, len(A) - n - m))]), np.zeros((q, m))
     return System(A, B, C, D), System(*difference_form(law), law.C, law.D)
 
 
-Sides = tuple["FloatArray", "FloatArray", "FloatArray", "FloatArray"]
+Sides = tuple["FloatArray", "FloatArray", "FloatArray", "FloatArray", "FloatArray | None"]
 
 
 @lru_cache(maxsize=4)  # an ascent moves p or w and returns; records compare by identity
 def _plant(system: UncertainSystem, law: Compensator, p: bytes) -> Sides:
     """A, B, C and D from commands and from forces on the plant to sensors and forces; in differences when sampled.
 
-    They are stacks, for each row of parameters.
+    They are stacks, for each row of parameters. With a fraction of a sample of delay, what `_newest` says follows.
     """
     names = len(system.names)
     A, B, C, D = system.explicit(np.frombuffer(p).reshape(-1, names) if names else np.zeros((1, 0)))
@@ -370,21 +387,21 @@ def _plant(system: UncertainSystem, law: Compensator, p: bytes) -> Sides:
         out[:, :q, n:], out[:, q:, n:] = D, np.eye(m)
     T = law.sample_time
     if T is None:
-        return A, into, out, through
+        return A, into, out, through, None
     if system.sample_time is not None:
-        return (A - np.eye(A.shape[-1])) / T, into / T, out, through
+        return (A - np.eye(A.shape[-1])) / T, into / T, out, through, None
     _, Phi = sample(A, np.eye(A.shape[-1]), T)  # (e^AT - 1) / T = A Phi / T
-    return A @ Phi / T, Phi @ into / T, out, through
+    return A @ Phi / T, Phi @ into / T, out, through, _newest(A, into, law)
 
 
 @lru_cache(maxsize=4)
 def _law(law: Compensator, w: bytes) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """s, or (z - 1) / T when sampled; z^-delay; and F: at frequencies w."""
+    """s, or (z - 1) / T when sampled; z^-d of d whole samples; and F: at frequencies w."""
     T = law.sample_time
     s: ComplexArray = 1j * np.frombuffer(w)
     turned = np.ones_like(s)
     if T is not None:
-        turned, s = np.exp(-s * T * law.delay), np.expm1(s * T) / T
+        turned, s = np.exp(-s * T * split_delay(law.delay)[0]), np.expm1(s * T) / T
     F_A, F_B = difference_form(law)
     F = law.C @ _resolvent(s, F_A[None], F_B[None]) + law.D
     return s, turned, np.asarray(F, dtype=complex)

@@ -348,15 +348,15 @@ def _commanded_system(c: Controller, law: LinearLaw) -> tuple[System, tuple[Floa
     T, R, p, m = c.sample_time, set_point(c), len(c.measurements), len(c.forces)
     A, B_y, C = (law.A - np.eye(len(law.A))) / T, law.B_y / T, law.C
     first = p + len(c.A) + m * c.lagging  # of the stored forces in r, the oldest first
-    stored = R[first : first + m * c.delay].copy()
+    stored = R[first : first + m * c.stored].copy()
     if not stored.any():
         return System(A, B_y, C, law.D_y), (law.B_r @ R / T, law.D_r @ R)
-    R[first : first + m * c.delay] = 0
-    rows = np.arange(m * c.delay).reshape(c.delay, m)[::-1]  # of the newest, one sample old, first
-    of_stored = slice(first, first + m * c.delay)
+    R[first : first + m * c.stored] = 0
+    rows = np.arange(m * c.stored).reshape(c.stored, m)[::-1]  # of the newest, one sample old, first
+    of_stored = slice(first, first + m * c.stored)
     B_old = np.hstack([law.B_r[:, of_stored][:, r] @ stored[r] for r in rows]) / T
     D_old = np.hstack([law.D_r[:, of_stored][:, r] @ stored[r] for r in rows])
-    size = p * c.delay
+    size = p * c.stored
     shift = (np.eye(size, k=-p) - np.eye(size)) / T
     whole = system_matrix(A, B_old, None, shift)
     newest = np.vstack([np.eye(p), np.zeros((size - p, p))]) / T

@@ -83,7 +83,7 @@ class Loop:
         found = machine_loop(self.model, self.controller, self.current_loops)
         assert found.continuous is not None
         pushed = push_through(
-            found.continuous, disturbance_map(self.model), self.controller.sample_time, len(found.Ad)
+            found.continuous, disturbance_map(self.model), self.sample_time, len(found.Ad), found.caught
         )
         return replace(found, pushed=pushed)
 

@@ -150,6 +150,8 @@ def _sensors_in(plant: Plant, symbols: Mapping[str, Any]) -> Sensors:
     if not plant.sensors.late and all(getattr(plant.parameters, name) for name in symbols):
         return plant.sensors  # no uncertain parameter is a lag of 0 s
     sensors = in_symbols(plant, symbols).sensors
+    if isinstance(sensors.dead_time, ca.SX):
+        raise InputError("uncertain", "sensors.dead_time", "an uncertain time", "a number; lags may vary")
     if sensors.lagging != plant.sensors.lagging:
         raise InputError(
             "uncertain", "sensors", "an uncertain lag of 0 s", "one above 0 s, set in the machine"

@@ -25,13 +25,14 @@ from malta.display import display
 from malta.errors import CheckError
 from malta.linear.matrices import system_matrix
 from malta.linear.peaks import in_plane, response_at
-from malta.linear.sampling import add_lags, delay_inputs, eigenvalues, sample
+from malta.linear.sampling import add_lags, eigenvalues, sample, whole_or_not
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal
 from malta.loops.feedforward_along import along_stroke, slopes_along
 from malta.loops.parametric_plants import held_gain, of_plant
 from malta.loops.windings import (
+    Caught,
     CurrentControl,
     CurrentLoops,
     axis_map,
@@ -52,7 +53,7 @@ from malta.model.linearize import LinearModel, linearize
 from malta.model.places import off_stroke, position_at, position_in
 from malta.model.plant import OperatingPoint, Plant, whole_samples
 from malta.model.plants import plant_of
-from malta.model.sensors import with_lags
+from malta.model.sensors import split_dead_time, with_lags
 from malta.model.traced import trace
 from malta.synthesis.controller import Controller
 from malta.synthesis.law import law_at
@@ -73,7 +74,7 @@ class ReadingUse(NamedTuple):
 
 def sampled_law(
     controller: Controller,
-    delay: int,
+    delay: float,
     lag: float,
     control: CurrentControl | None = None,
     *,
@@ -164,6 +165,7 @@ class SampledLoop:
     true: FloatArray | None = None  # outputs of the states, where sensors read them late; None: Cd
     continuous: FloatArray | None = None  # of the first states, between samples
     pushed: FloatArray | None = None  # what unit disturbances leave in the states in one sample, n x w
+    caught: tuple[int, Caught] | None = None  # readings within a sample, and the first of their states
 
     @property
     def outputs(self) -> FloatArray:
@@ -244,7 +246,7 @@ def sampled_loop(
     model: LinearModel,
     controller: Controller,
     *,
-    delay: int = 0,
+    delay: float = 0,
     current_loops: CurrentLoops | None = None,
     feedforward: bool = False,
     sensors: bool = False,
@@ -262,13 +264,14 @@ def sampled_loop(
     """
     controller = law_at(controller, model.plant, model.operating_point.x)
     model, law = commanded_model(model, controller), linear_law(controller)
-    plant, late = model.plant, 0
+    plant, late, caught = model.plant, 0, None
     A, B, C, true = _between_samples(model, sensors=sensors)
     if sensors:
-        late = whole_samples(plant, controller.sample_time)
+        late, rest = split_dead_time(plant.sensors.dead_time, controller.sample_time)
+        caught = Caught(C, controller.sample_time - rest) if rest else None
     if feedforward:
-        at = position_at(plant, model.operating_point.x)
-        law = with_slope(law, feedforward_slope(plant, controller, at))
+        here = position_at(plant, model.operating_point.x)
+        law = with_slope(law, feedforward_slope(plant, controller, here))
     if current_loops == "pi":
         continuous, Ad, Bd, control = _sample_windings(model, controller, delay, sensors)
         if forces_alone or not len(control.emf[0]):
@@ -282,14 +285,19 @@ def sampled_loop(
         continuous = A
         if current_loops == "lag" and math.isfinite(plant.actuator.crossover):
             A, B = add_lags(A, B, plant.actuator.crossover)
-        Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
+        Ts = controller.sample_time
+        Ad, Bd = sample(A, B, Ts, delay) if caught is None else caught.add_to((A, B), Ts, delay)
     Cd, true = _pad(C, len(Ad)), None if true is None else _pad(true, len(Ad))
+    first = len(Ad) - len(C) - (len(controller.forces) if current_loops == "pi" else 0)
+    if caught is not None:
+        Cd = np.eye(len(Ad))[first : first + len(C)]
     if late:
         Ad, Bd, Cd = _stored_readings(Ad, Bd, Cd, late)
         true = None if true is None else _pad(true, len(Ad))
     if model.E.any():
         law = with_readings(law)
-    return SampledLoop(Ad, Bd, Cd, law, controller.sample_time, true, continuous)
+    at = None if caught is None else (first, caught._replace(C=_pad(C, len(continuous))))
+    return SampledLoop(Ad, Bd, Cd, law, controller.sample_time, true, continuous, caught=at)
 
 
 def _between_samples(
@@ -307,7 +315,7 @@ def _between_samples(
 
 @lru_cache(maxsize=4)  # a loop has it twice, with and without forecast voltages; records compare by identity
 def _sample_windings(
-    model: LinearModel, controller: Controller, delay: int, sensors: bool
+    model: LinearModel, controller: Controller, delay: float, sensors: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, CurrentControl]:
     """The machine with its windings between samples; sampled behind its current controllers; and these.
 
@@ -325,7 +333,9 @@ def _sample_windings(
     if link is not None:
         A = system_matrix(A, B @ link.share[:, None], (link.by_phi @ phi)[None], np.array([[link.rate]]))
         B, phi, share = np.vstack([B, link.by_w[None]]), _pad(phi, len(A)), link.share
-    Ad, Bd = sample_driven((A, B, phi), control.loop, windings.R, Ts, delay, share)
+    rest = split_dead_time(plant.sensors.dead_time, Ts)[1] if sensors else 0.0
+    caught = Caught(_pad(C[:-m], len(A)), Ts - rest) if rest else None
+    Ad, Bd = sample_driven((A, B, phi), control.loop, windings.R, Ts, delay, share, caught)
     return readonly(A), readonly(Ad), readonly(Bd), control
 
 
@@ -357,8 +367,7 @@ def machine_loop(
     current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; or "lag"
     forces_alone : see `sampled_loop`
 
-    Raises CheckError when no input holds the machine at the model's operating point, and InputError for a dead time of
-    its sensors that is not whole samples.
+    Raises CheckError when no input holds the machine at the model's operating point.
     """
     plant = model.plant
     x = model.operating_point.x
@@ -388,10 +397,20 @@ def _disturbances(plant: Plant, _believed: None, loaded: bool) -> tuple[list[Any
     return [x, u], [ca.substitute([slope], [w], [kind.zeros(w.numel())])[0]]
 
 
-def push_through(A: FloatArray, B_w: FloatArray, Ts: float, size: int) -> FloatArray:
-    """What x' = A x + B_w w leaves in `size` states in one sample; states behind those of B_w take nothing from w."""
-    _, pushed = sample(A, np.vstack([B_w, np.zeros((len(A) - len(B_w), B_w.shape[1]))]), Ts)
-    return np.vstack([pushed, np.zeros((size - len(pushed), B_w.shape[1]))])
+def push_through(
+    A: FloatArray, B_w: FloatArray, Ts: float, size: int, caught: tuple[int, Caught] | None = None
+) -> FloatArray:
+    """What x' = A x + B_w w leaves in `size` states in one sample; states behind those of B_w take nothing from w.
+
+    caught : readings within the sample, and the first of their states
+    """
+    B_w = np.vstack([B_w, np.zeros((len(A) - len(B_w), B_w.shape[1]))])
+    _, pushed = sample(A, B_w, Ts)
+    whole = np.vstack([pushed, np.zeros((size - len(pushed), B_w.shape[1]))])
+    if caught is not None:
+        first, (C, time) = caught
+        whole[first : first + len(C)] = C @ sample(A, B_w, time)[1]
+    return whole
 
 
 @lru_cache(maxsize=8)  # every stage needs it; records compare by identity, so no entry is stale
@@ -418,12 +437,16 @@ def machine_law(
     use : of the reading besides the law
     point : where the windings are at rest; None: at the centre
 
-    Raises InputError for other current loops, and for a dead time of the sensors that is not whole samples.
+    Raises InputError for other current loops, and beside PI current loops for a dead time of the sensors that is not
+    whole samples.
     """
-    a, late = plant.actuator, whole_samples(plant, controller.sample_time)
+    a = plant.actuator
     delay = a.delay(controller.sample_time)
     if chosen_loops(plant, controller, current_loops) == "lag":
-        return sampled_law(controller, delay + late, a.crossover, use=use)
+        # A delay of all readings is one of all forces.
+        late = plant.sensors.dead_time / controller.sample_time
+        return sampled_law(controller, whole_or_not(delay + late), a.crossover, use=use)
+    late = whole_samples(plant, controller.sample_time)
     believed = plant_of(controller.parameters)
     point = plant.at() if point is None else point
     windings = windings_of(plant, believed, point, force_modes(believed))

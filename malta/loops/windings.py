@@ -25,7 +25,7 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError, InputError
 from malta.linear.matrices import system_matrix
-from malta.linear.sampling import delay_inputs, sample
+from malta.linear.sampling import delay_inputs, sample, sample_within
 from malta.linear.uncertain import Compensator
 from malta.model.currents import is_commutated
 from malta.model.linearize import linearize
@@ -239,25 +239,42 @@ def forecast_as_forces(law: LinearLaw, k: CurrentControl, Ts: float) -> LinearLa
     )
 
 
+class Caught(NamedTuple):
+    """Readings C x that are taken some time (s) after each sample; of the sampled machine they are states."""
+
+    C: FloatArray
+    time: float
+
+    def add_to(
+        self, machine: tuple[FloatArray, FloatArray], Ts: float, delay: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """A and B of a machine, sampled, with what was caught in the last sample behind its states."""
+        (Ad, Bd), (x, u) = sample(*machine, Ts, delay), sample_within(*machine, Ts, delay, self.time)
+        C = np.hstack([self.C, np.zeros((len(self.C), len(x) - self.C.shape[1]))])
+        return system_matrix(Ad, None, C @ x, np.zeros((len(C),) * 2)), np.vstack([Bd, C @ u])
+
+
 def sample_driven(
     machine: tuple[FloatArray, FloatArray, FloatArray],
     loop: CurrentLoop,
     R: float,
     Ts: float,
-    delay: int,
+    delay: float,
     share: FloatArray | None = None,
+    caught: Caught | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """The machine behind its current controllers, sampled: from forces v, and then from voltages M^+ emf(x_hat).
 
     machine : A, B of w, and the matrix of phi of the continuous machine with its windings
     R : ohm, R_0
     share : of w in the last state, the link's voltage, which a duty cycle counts in; None: that is no state
+    caught : readings that are taken within a sample; None: none are
 
-    States are those of the machine, of w under way, and the integrals I.
+    States are those of the machine, of w under way, readings that were caught, and the integrals I.
     """
     A, B, phi = machine
     m = B.shape[1]
-    Ad, Bd = delay_inputs(*sample(A, B, Ts), delay)
+    Ad, Bd = sample(A, B, Ts, delay) if caught is None else caught.add_to((A, B), Ts, delay)
     read = np.zeros((m, len(Ad)))
     read[:, : len(A)] = -(loop.Kp + loop.Ki * Ts) / R * phi
     if share is not None:

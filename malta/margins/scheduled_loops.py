@@ -36,11 +36,12 @@ from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
 from malta.linear.expressions import BALLS, MatrixProgram, NotAnalytic, program
 from malta.linear.matrices import system_matrix
+from malta.linear.sampling import split_delay
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.parametric_plants import of_plant
 from malta.loops.windings import CurrentLoops, chosen_loops
 from malta.model.parameters import si, units_of
-from malta.model.plant import Plant, whole_samples
+from malta.model.plant import Plant
 from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.proof.polynomial.enclosure import precision
@@ -264,7 +265,10 @@ def loops_between_places(
         return "current controllers on windings"
     if not variable.isidentifier() or keyword.iskeyword(variable) or variable in units_of(plant.parameters):
         return f"{variable!r} is no name for one more parameter"
-    delay = plant.actuator.delay(controller.sample_time) + whole_samples(plant, controller.sample_time)
+    late = plant.sensors.dead_time / controller.sample_time
+    delay, part = split_delay(plant.actuator.delay(controller.sample_time) + late)
+    if part:
+        return f"a delay of {delay + part:g} samples, which are not whole"
     found = []
     for a, b in schedule.cells:
         there = plant_along(plant, variable, (a + b) / 2)

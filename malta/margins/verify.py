@@ -155,7 +155,7 @@ def _natural_frequencies(model: LinearModel, controller: Controller) -> dict[str
         return {}
     K = controller.K[:, :n]
     if controller.lagging:
-        K = gain_at_rest(controller.K, len(controller.A), controller.lagging + controller.delay)
+        K = gain_at_rest(controller.K, len(controller.A), controller.lagging + controller.stored)
     closed = model.force_map @ K - model.stiffness
     w_n = np.sqrt(np.maximum(eigenvalues(closed).real, 0))
     return {"w_n_max": float(w_n.max()), "w_n_min": float(w_n.min())}

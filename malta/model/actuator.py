@@ -10,6 +10,7 @@ from typing import Any
 
 import casadi as ca
 
+from malta.linear.sampling import whole_or_not
 from malta.model.drive import Drive, Electronics
 from malta.model.sensors import require_short
 from malta.model.signals import DEFAULT, CasadiFn, Signal
@@ -37,7 +38,9 @@ class Actuator:
     phase_margin : rad, of the current loops
     sample_time : s, of the current loops
     loop_delay : s, dead time of the current loops
-    dead_time : s, from measurement to force
+    dead_time : s, from measurement to force on average, the half sample of the hold included; 0: computation takes no
+        time. A hold cannot have less than half a sample, so a shorter time counts as half a sample.
+    computation_time : s, from a sample to the beginning of its new force; to be given in place of `dead_time`
     currents : (y, inputs) -> coil currents, A; default: by the force constants
     forces : (x, coil currents) -> inputs; default: by the force constants
     limited : coil currents -> coil currents within their limits; default: each within `current_limit`
@@ -48,8 +51,8 @@ class Actuator:
     >>> import malta
     >>> current = malta.model.Signal("i", "A")
     >>> coil = malta.model.Actuator((current,), (38.0,), current_limit=3, dead_time=1e-4)
-    >>> coil.force_limit, coil.delay(Ts=50e-6)  # N; samples
-    ((114.0,), 2)
+    >>> coil.force_limit, coil.delay(Ts=50e-6), coil.delay(Ts=40e-6)  # N; samples
+    ((114.0,), 1.5, 2)
     """
 
     coils: tuple[Signal, ...]
@@ -64,6 +67,7 @@ class Actuator:
     sample_time: float = 0.0
     loop_delay: float = 0.0
     dead_time: float = 0.0
+    computation_time: float = 0.0
     currents: CasadiFn = DEFAULT
     forces: CasadiFn = DEFAULT
     limited: CasadiFn = DEFAULT
@@ -85,14 +89,17 @@ class Actuator:
         if given is DEFAULT or getattr(given, "func", None) is function:
             object.__setattr__(self, name, partial(function, own))
 
-    def delay(self, Ts: float) -> int:
-        """Whole samples of delay from measurement to force: the dead time minus the half sample of the hold.
+    def delay(self, Ts: float) -> float:
+        """Samples from a measurement to its new force: the computation time, or the dead time less half a sample.
+
+        An int for whole samples, which what is within 1e-9 of them counts as.
 
         Ts : sample time, s
 
         Raises InputError for more than MOST_DELAY.
         """
-        return require_short("machine", "dead time", max(0, round(self.dead_time / Ts - 0.5)))
+        held = max(0.0, self.dead_time / Ts - 0.5)
+        return require_short("machine", "dead time", whole_or_not(self.computation_time / Ts + held))
 
 
 def _currents_by(constants: tuple[Any, ...], _: Any, v: Any) -> Any:

@@ -37,6 +37,11 @@ def check_signals(plant: Plant) -> None:
     times = [time for time in late if isinstance(time, int | float)]
     if not all(0 <= time < math.inf for time in times):
         raise InputError(plant.name, "sensors", f"lags and dead time {times} s", "times of 0 s or more")
+    times = [plant.actuator.dead_time, plant.actuator.computation_time]
+    given = [time for time in times if isinstance(time, int | float)]
+    if not all(0 <= time < math.inf for time in given) or (len(given) == len(times) and all(given)):
+        found = f"dead time and computation time {times} s"
+        raise InputError(plant.name, "actuator", found, "one time above 0 s, or none")
     both = [name for name in names["outputs"] if name in names["states"]]
     if plant.stroke.name not in ("", *both):
         expected = "an output that is a state of the same name" + (f", as {' '.join(both)}" if both else "")
@@ -154,6 +159,9 @@ def _fault_with_symbols(plant: Plant, names: Sequence[str]) -> str:
         machine = plant.variant(symbolic(plant.parameters, symbols))
     except Exception:  # a user's function may raise anything
         return "plant"
+    for field in ("dead_time", "computation_time"):  # of which the number of states depends
+        if isinstance(getattr(machine.actuator, field), ca.SX):
+            return f"actuator.{field}"
     x, u, w = ca.DM(plant.at().x), ca.DM.zeros(len(plant.inputs)), ca.DM.zeros(len(plant.disturbances))
     y, i = ca.DM(plant.h(x, u)), ca.DM.zeros(len(plant.actuator.coils))
     at = {

@@ -343,15 +343,15 @@ def outputs_themselves(y: Any) -> Any:
 
 
 def whole_samples(plant: Plant, Ts: float) -> int:
-    """The dead time of a plant's sensors in samples, as a linear loop has it.
+    """The dead time of a plant's sensors in samples, as a proof with PI current loops has it.
 
     Raises InputError for a dead time that is not a whole number of samples.
     """
     whole, rest = split_dead_time(plant.sensors.dead_time, Ts)
     if rest:
-        found = f"{plant.sensors.dead_time * 1e6:g} us of dead time of its sensors"
-        expected = f"whole samples of {Ts * 1e6:g} us in a linear loop; simulations take any"
-        raise InputError(plant.name, "sensors", found, expected)
+        found = f"{plant.sensors.dead_time * 1e6:g} us"
+        expected = f"whole samples of {Ts * 1e6:g} us in a proof with PI current loops; all else takes any"
+        raise InputError(plant.name, "sensors.dead_time", found, expected)
     return whole
 
 

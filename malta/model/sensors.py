@@ -4,8 +4,8 @@ Sensors that read late have a first-order lag of each output, and a dead time of
 
     lag s' = p - s,     y(t) = s(t - dead_time)
 
-Noise and resolution come after the lag. Simulations have both. Linear loops have the lag exactly, as further states of
-the machine, and the dead time where it is whole samples: a delay of all readings is one of all forces.
+Noise and resolution come after the lag. Simulations and linear loops have both exactly: the lag by further states of
+the machine, the dead time by readings that are stored. In a proof, a delay of all readings is one of all forces.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.matrices import system_matrix
+from malta.linear.sampling import split_delay, whole_or_not
 from malta.model.signals import DEFAULT, CasadiFn, Signal
 
 
@@ -28,8 +29,9 @@ class Sensors:
 
         lag s' = p - s,     y(t) = s(t - dead_time)
 
-    Simulations take any dead time, linear loops and proofs whole samples of it; the lags are exact in all of them. The
-    design model knows neither: a `delay` of the design and the margin proven of the machine's loop account for them.
+    Lags and dead time are exact in simulations, linear loops and proofs; only proofs that have PI current loops, which
+    read currents at once, take whole samples of dead time alone. The design model knows neither: a `delay` of the
+    design and the margin proven of the machine's loop account for them.
 
     lag : s, of each output; 0.0: none; default: zero. A parameter of the machine may be among them, and vary in proofs.
     dead_time : s
@@ -79,18 +81,18 @@ class Sensors:
 MOST_DELAY = 100  # samples: each one has states of its own in the loop and in what is compiled
 
 
-def require_short(where: str, name: str, samples: int) -> int:
+def require_short(where: str, name: str, samples: float) -> float:
     """The same number of samples of delay. Raises InputError for more than MOST_DELAY."""
     if samples > MOST_DELAY:
-        raise InputError(where, name, f"{samples} samples", f"at most {MOST_DELAY}")
+        raise InputError(where, name, f"{samples:.10g} samples", f"at most {MOST_DELAY}")
     return samples
 
 
 def split_dead_time(dead_time: float, Ts: float) -> tuple[int, float]:
     """Whole samples of a dead time, and the rest of it, s. Raises InputError for more than MOST_DELAY samples."""
-    whole = require_short("machine", "dead time of its sensors", int(dead_time / Ts + 1e-9))
-    rest = dead_time - whole * Ts
-    return whole, rest if rest > 1e-9 * Ts else 0.0
+    samples = require_short("machine", "dead time of its sensors", whole_or_not(dead_time / Ts))
+    whole, part = split_delay(samples)
+    return whole, part * Ts
 
 
 def with_lags(sensors: Sensors, A: Any, B: Any, C: Any) -> tuple[Any, Any, Any]:

@@ -36,6 +36,7 @@ from malta.errors import CheckError, InputError
 from malta.files import replace_files, version
 from malta.linear.compensators import compensator_of
 from malta.linear.expressions import FIELD, MatrixProgram, exact, program as expressions_of
+from malta.linear.sampling import split_delay
 from malta.proof.box import Box, below, box_of
 from malta.proof.exclusion import Growth, advance, start
 from malta.proof.groups import E, UncertainLoop, loop_of
@@ -355,6 +356,7 @@ def _description(loop: UncertainLoop) -> dict[str, Any]:
         raise InputError("certificate", "system", " ".join(foreign) or "a power", "+ - * / and whole powers")
     matrices = "ABCE" if loop.descriptor else "ABC"
     T = law.sample_time if loop.system.sample_time is None else loop.system.sample_time
+    whole = split_delay(law.delay)[0]
     return {
         "shape": [n, program.shapes[1][1], program.shapes[2][0]],
         "steps": _steps(program),
@@ -368,7 +370,7 @@ def _description(loop: UncertainLoop) -> dict[str, Any]:
         },
         "sample_time": None if T is None else float(T).hex(),
         "discrete": loop.system.sample_time is not None,
-        "delay": law.delay,
+        "delay": law.delay if law.delay == whole else float(law.delay).hex(),
         "lag": None if law.lag is None else float(law.lag).hex(),
     }
 

@@ -7,6 +7,7 @@ Only couplings that are zero as exact expressions split the loop; small ones do 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -21,6 +22,7 @@ from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.expressions import MatrixProgram, NotAnalytic, exact, program
 from malta.linear.rational import Ratio, Symbolic, TooLarge, symbolic
+from malta.linear.sampling import split_delay
 from malta.linear.uncertain import Compensator, StateGroup, UncertainSystem
 
 A, B, C, D, E = range(5)
@@ -92,6 +94,9 @@ def loop_of(system: UncertainSystem, law: Compensator) -> UncertainLoop:
         raise InputError("uncertain", "A", "no states but algebraic ones", "at least one state in the loop")
     if system.sample_time is not None and law.lag is not None:
         raise InputError("compensator", "lag", "a continuous lag", "none before a system in discrete time")
+    if not (0 <= law.delay < math.inf) or (split_delay(law.delay)[1] and system.sample_time is not None):
+        expected = "0 or more; whole samples before a system in discrete time"
+        raise InputError("compensator", "delay", f"{law.delay:g} samples", expected)
     if law.sample_time is None and law.delay:
         raise InputError("compensator", "delay", "samples of delay without a sample time", "0")
     if system.sample_time is not None and law.sample_time != system.sample_time:

@@ -32,6 +32,7 @@ from malta.bound import at_least
 from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
 from malta.linear.expressions import NotAnalytic
+from malta.linear.sampling import split_delay
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.processes import on_one_thread
 from malta.proof.polynomial.enclosure import precision
@@ -229,6 +230,8 @@ def _loop_of(system: UncertainSystem, law: Compensator, name: str) -> _Loop:
         raise InputError(
             CALLER, "compensator", "another loop", "a continuous system under a sampled law without a lag"
         )
+    if split_delay(law.delay)[1]:
+        raise InputError(CALLER, "compensator.delay", f"{law.delay:g} samples", "whole samples")
     p = ca.SX(ca.DM(system.nominal))
     p[system.names.index(name)] = q = ca.SX.sym("q")
     made = [ca.SX(M) for M in system.matrices.call([p])]
@@ -246,7 +249,7 @@ def _loop_of(system: UncertainSystem, law: Compensator, name: str) -> _Loop:
         _, (t, _) = linalg.matrix_balance(
             middle(plain.at(float(system.nominal[system.names.index(name)]))), permute=False, separate=True
         )
-    n, own = len(A), len(A) + law.delay * B.shape[1]
+    n, own = len(A), len(A) + split_delay(law.delay)[0] * B.shape[1]
     x, u, s = t[:n], 2.0 ** np.round(np.log2(t[n:own]).mean()) if own > n else 1.0, t[own:]
     # Powers of two: exact.
     law = replace(law, A=law.A * s / s[:, None], B=law.B / s[:, None], C=law.C * s / u, D=law.D / u)
@@ -255,7 +258,7 @@ def _loop_of(system: UncertainSystem, law: Compensator, name: str) -> _Loop:
 
 def _close_loop(A: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray, law: Compensator) -> _Loop:
     """States: those of the plant, stored inputs from the oldest, those of the law."""
-    (n, m), k, d = B.shape, len(law.A), law.delay
+    (n, m), k, d = B.shape, len(law.A), split_delay(law.delay)[0]
     size, own = n + m * d + k, n + m * d
     out = [[arb(0)] * size for _ in range(m)]  # of the law
     _put(out, 0, 0, ball(law.D) * ball(C))

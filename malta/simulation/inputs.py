@@ -24,7 +24,7 @@ from malta.simulation.period import state_reference
 from malta.simulation.readings import keys, normals, normals_of_parts
 from malta.simulation.references import Motion
 from malta.simulation.scenario import FeedforwardChoice, Scenario, Simulation
-from malta.synthesis.controller import Controller, holding_gain
+from malta.synthesis.controller import Controller, holding_gain, lag_shares
 
 # Forces that counter a disturbance known in advance, as the acceleration of a carrier under the machine.
 
@@ -129,14 +129,14 @@ def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> 
 def past_forces(c: Controller, motion: references.Motion, v_ff: FloatArray) -> FloatArray:
     """References of the states that hold forces, k x such states: lagging forces, stored forces, disturbances."""
     stored = v_ff
-    if c.delay:
+    if c.stored:
         n, m = len(c.A), len(c.forces)
-        newest = n + m * (c.lagging + c.delay - 1)
+        newest = n + m * (c.lagging + c.stored - 1)
         states = evaluate(state_reference(plant_of(c.parameters)).map(len(v_ff)), motion.p, motion.dp)[0]
         stored = v_ff + _in_order(c.Ad[newest : newest + m, :n], states)
         if c.commutation is not None:
             stored += _in_order(c.commutation.lead * c.commutation.pull, motion.dp)
-    past = [np.vstack([np.repeat(stored[:1], age, axis=0), stored[:-age]]) for age in range(c.delay, 0, -1)]
+    past = [_earlier(stored, age) for age in range(c.stored, 0, -1)]
     if c.lagging:
         past.insert(0, lagging_references(c, v_ff))
     if c.observed:
@@ -147,11 +147,16 @@ def past_forces(c: Controller, motion: references.Motion, v_ff: FloatArray) -> F
 def lagging_references(c: Controller, v_ff: FloatArray) -> FloatArray:
     """The forces behind the lag of the design model while v_ff is commanded, k x m; at rest before the first sample."""
     decay = _decay(c)
-    acting = np.vstack([np.repeat(v_ff[:1], c.delay, axis=0), v_ff])[: len(v_ff) - 1]
-    given = np.vstack([v_ff[:1], (1 - decay) * acting])
+    taken = [share * _earlier(v_ff, age)[:-1] for age, share in lag_shares(c)]
+    given = np.vstack([v_ff[:1], sum(taken[1:], taken[0])])
     # One by one, as in the exported C: a solver of LAPACK rounds as the kernels of BLAS do.
     columns = (accumulate(column, lambda last, now: now + decay * last) for column in given.T.tolist())
     return np.array([list(column) for column in columns]).T
+
+
+def _earlier(v: FloatArray, samples: int) -> FloatArray:
+    """The rows of some samples before; the first one before the beginning."""
+    return np.vstack([np.repeat(v[:1], samples, axis=0), v])[: len(v)]
 
 
 def _decay(c: Controller) -> float:
@@ -161,7 +166,7 @@ def _decay(c: Controller) -> float:
 
 def samples_of_memory(c: Controller) -> int:
     """Samples after which a command no longer shows in the references of the states."""
-    return c.delay + (math.ceil(math.log(1e-12) / math.log(_decay(c))) if c.lagging else 0)
+    return c.stored + (math.ceil(math.log(1e-12) / math.log(_decay(c))) if c.lagging else 0)
 
 
 def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardChoice = "own") -> FloatArray:
@@ -285,7 +290,7 @@ def initial_values(run: Simulation, first: FloatArray) -> tuple[FloatArray, ...]
         held, hold = c.feedforward.at(position_in(plant, x)), c.feedforward.position
         if hold.size:
             held = held + hold @ moving[: hold.shape[1]]
-        n, m, known = len(design), len(held), c.lagging + c.delay
+        n, m, known = len(design), len(held), c.lagging + c.stored
         if known:  # the forces of the samples before, with currents commutated for this position
             newest = n + m * (known - 1)
             pull = c.Ad[newest : newest + m, :n] @ (xi_pred[:n] - moving)

@@ -41,7 +41,7 @@ class Setup:
     """The choices that decide which functions are simulated; everything else is a number."""
 
     fidelity: Fidelity
-    delay: int  # samples between measurement and command
+    delay: int  # samples whose commands are under way between measurement and command
     quantize: bool = False  # sensors with a resolution
     disturbed: bool = False  # an external wrench acts
     bearing: bool = False  # touchdown bearings push back
@@ -57,6 +57,7 @@ class Setup:
     late: int | None = None  # sensors with a dead time, of so many whole samples and a rest; None: without
     current_sensors: bool = False  # the current controllers read sensors with noise, offsets and steps
     electronics: Any = None  # options of the machine's own electronics
+    fraction: float = 0.0  # of a sample, for which the oldest command under way acts, then the next
 
 
 class Layout(NamedTuple):
@@ -98,7 +99,8 @@ def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
     elif s.fidelity != "force":
         electric_state = {"i": axes, "link": 1} if s.fidelity == "dq" else {"i_phase": phases, "link": 1}
     electric_state |= {"lagged": p} if s.lagging else {}
-    electric_state |= {} if s.late is None else {"late": p * (s.late + 2), "clock": 1}
+    electric_state |= {} if s.late is None else {"late": p * (s.late + 2)}
+    electric_state |= {"clock": 1} if s.late is not None or s.fraction else {}
     held = command_size(plant, s)
     controller = {"xi_pred": n, "e": p, "frozen": p}
     if driven:
@@ -234,9 +236,14 @@ def _symbolic_parameters(plant: Plant, g: Mapping[str, Any]) -> Any:
 
 
 def command_size(plant: Plant, s: Setup) -> int:
-    """How many numbers are held between samples: currents, voltages, duty cycles, or those of the electronics."""
+    """How many numbers a sample commands: currents, voltages, duty cycles, or set points of the electronics."""
     fast = electronics_of(plant, s)
     if fast is not None:
         return len(fast.set_points)
     axes, phases = _winding_counts(plant)
     return {"force": len(plant.actuator.coils), "dq": axes, "phase": phases}[s.fidelity]
+
+
+def held_size(plant: Plant, s: Setup) -> int:
+    """How many numbers act until the next sample: a command, or two of which the second one begins within it."""
+    return command_size(plant, s) * (2 if s.fraction else 1)

@@ -18,8 +18,9 @@ The state is (machine, controller). Its entries depend on the fidelity, the mode
     machine     x; then coil currents | axis currents, link voltage | phase currents, link voltage or electronics
     controller  xi_pred, e, frozen; PI integrals and their limits; last y and held commands (faults); commands under way
 
-The one sample of delay stands between the control law and the coils in `force`, and between the current
-controllers and the windings in `dq` and `phase`, as on the machine, where computation takes this time.
+The delay stands between the control law and the coils in `force`, and between the current controllers and the
+windings in `dq` and `phase`, as on the machine, where computation takes this time. Of a fraction of a sample, commands
+begin to act within it.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ from malta.simulation.layout import (
     LoopPlan,
     Setup,
     Symbols,
-    command_size,
     electronics_of,
+    held_size,
     layout_of,
     read_currents,
     signals_of,
@@ -62,10 +63,28 @@ SENSORS = ("lagged", "late", "clock")  # states of the machine that belong to it
 
 def advance(loop: LoopPlan, signals: Symbols, held: Any, jitter: Any) -> Any:
     """The machine's state after one Runge–Kutta step under held commands, or after one period of its electronics."""
+    if loop.setup.fraction:
+        loop, held = _acting_now(loop, signals, held)
     own = {name: value for name, value in signals.machine.items() if name not in SENSORS}
     moved = _move(loop, signals._replace(machine=own), held, jitter)
     after = step_readings(loop, signals.machine, moved[: len(loop.plant.states)])
     return ca.vertcat(moved, *(after[name] for name in signals.machine if name in SENSORS))
+
+
+def _acting_now(loop: LoopPlan, signals: Symbols, held: Any) -> tuple[LoopPlan, Any]:
+    """The commands that act in a step, and the loop with the length of the step.
+
+    Some steps fill the fraction of the sample for which the older commands act, the others its rest: of the steps of
+    an undivided sample each part has its share, at least one.
+    """
+    Ts, f = loop.numbers["control_time"], loop.setup.fraction
+    steps = ca.floor(Ts / loop.numbers["substep"] + 0.5)
+    older = ca.fmax(1, ca.fmin(steps - 1, ca.floor(f * steps + 0.5)))
+    h_older = f * Ts / older
+    first = signals.machine["clock"] < f * Ts - h_older / 2
+    h_newer, size = (1 - f) * Ts / (steps - older), held.numel() // 2
+    lengths = {"substep": ca.if_else(first, h_older, h_newer), "last_substep": h_newer}
+    return loop._replace(numbers={**loop.numbers, **lengths}), ca.if_else(first, held[:size], held[size:])
 
 
 def motion(loop: LoopPlan, signals: Symbols, x: Any, inputs: Any) -> Any:
@@ -217,7 +236,7 @@ def period_of(
     around = ca.vertcat(*given.values())
     outputs = len(plant.outputs)
     noise = ca.SX.sym("noise", outputs + read_currents(plant, s))
-    held = ca.SX.sym("held", command_size(plant, s))
+    held = ca.SX.sym("held", held_size(plant, s))
     fast = electronics_of(plant, s)
     jitter = ca.SX.sym("jitter", 0 if fast is None else fast.noises)
 
@@ -396,7 +415,7 @@ def _control_law(
     queue = ca.vertcat(controller["under_way"], command)
     size = command.numel()
     after["under_way"] = queue[size:, 0]  # a column, also where no entry is left
-    return after, queue[:size], row
+    return after, queue[: held_size(plant, s)], row
 
 
 def limited_currents(plant: Plant, wanted: Any, limit: Any) -> Any:

@@ -8,7 +8,7 @@ Lag and dead time have states beside those of the machine:
     lagged  behind the lag of each output
     late    blocks of all outputs: the reading of the next sample, those of whole samples under way, and the one that is
             caught within a sample, at the rest of the dead time before its end
-    clock   time since the last sample, s
+    clock   time since the last sample, s; also where commands begin to act within a sample
 """
 
 from __future__ import annotations
@@ -56,13 +56,16 @@ def measurement(loop: LoopPlan, machine: Mapping[str, Any], noise: Any) -> Any:
 def step_readings(loop: LoopPlan, machine: Mapping[str, Any], x: Any) -> dict[str, Any]:
     """The states of the sensors after a step that took the machine to x."""
     s, h = loop.setup, loop.numbers["substep"]
-    if not s.lagging and s.late is None:
-        return {}
-    before, after = signals(loop, machine["x"]), signals(loop, x)
     states: dict[str, Any] = {}
+    if "clock" in machine:
+        states["clock"] = ca.if_else(_ends_sample(loop, machine), 0, machine["clock"] + h)
+    if not s.lagging and s.late is None:
+        return states
+    before, after = signals(loop, machine["x"]), signals(loop, x)
     if s.lagging:
         after = _lag_outputs(machine["lagged"], before, after, loop.plant.sensors.lag, h)
-        before, states = machine["lagged"], {"lagged": after}
+        before = machine["lagged"]
+        states["lagged"] = after
     if s.late is not None:
         states |= _late(loop, machine, before, after)
     return states
@@ -88,23 +91,26 @@ def _lag_outputs(s: Any, before: Any, after: Any, lags: tuple[Any, ...], h: Any)
     return ca.vertcat(*found)
 
 
+def _ends_sample(loop: LoopPlan, machine: Mapping[str, Any]) -> Any:
+    """Whether a step is the last one of its sample."""
+    h = loop.numbers["substep"]
+    last = loop.numbers.get("last_substep", h)
+    return machine["clock"] + h > loop.numbers["control_time"] - last / 2
+
+
 def _late(loop: LoopPlan, machine: Mapping[str, Any], before: Any, after: Any) -> dict[str, Any]:
-    """The blocks of late readings and the clock after a step in which the readings went from `before` to `after`."""
+    """The blocks of late readings after a step in which the readings went from `before` to `after`."""
     plant, _, s, g = loop
     assert s.late is not None
     Ts, h, p = g["control_time"], g["substep"], after.numel()
     rest = plant.sensors.dead_time - s.late * Ts
-    clock = machine["clock"] + h
     share = (Ts - rest - machine["clock"]) / h  # of this step, until the reading is caught
     caught = ca.logic_and(share > CLOCK_ROUNDING, share < 1 + CLOCK_ROUNDING)
     blocks = machine["late"]
     last = ca.if_else(caught, before + share * (after - before), blocks[-p:])
-    ends = clock > Ts - h / 2
+    ends = _ends_sample(loop, machine)
     moved = ca.vertcat(blocks[p:-p], last)
-    return {
-        "late": ca.vertcat(ca.if_else(ends, moved, blocks[:-p]), last),
-        "clock": ca.if_else(ends, 0, clock),
-    }
+    return {"late": ca.vertcat(ca.if_else(ends, moved, blocks[:-p]), last)}
 
 
 def _is_zero(step: Any) -> bool:

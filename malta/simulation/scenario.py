@@ -13,6 +13,7 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.display import display
 from malta.errors import InputError
+from malta.linear.sampling import split_delay, stored_blocks
 from malta.model.parameters import replace_fields, units_of
 from malta.model.plant import Plant
 from malta.model.sensors import require_short, split_dead_time
@@ -87,8 +88,8 @@ class Scenario:
     sensor_errors : errors by name, SI; those that are left out are 0; None: y = p exactly
     seed : of the noise
     run : index in a campaign: the noise depends on seed and run only. Several: equal parts of the time have theirs.
-    delay : samples between measurement and force; None: the machine's own
-    substeps : Runge-Kutta steps in a sample; None: as many as the machine needs
+    delay : samples between measurement and force, also a fraction; None: the machine's own
+    substeps : Runge-Kutta steps in a sample, at least 2 where commands begin in it; None: as many as the machine needs
     fidelity : how forces arise: "force" (at once), "dq" (current loops in axes) or "phase" (duty cycles of the phases)
     real_pwm : duty cycles with a resolution, dead time (fidelity phase)
     bearing_axes : of the current controllers: "fixed", or "turning" with the mover
@@ -126,7 +127,7 @@ class Scenario:
     sensor_errors: Mapping[str, float] | None = None
     seed: int = 0
     run: int | tuple[int, ...] = 0
-    delay: int | None = None
+    delay: float | None = None
     substeps: int | None = None
     fidelity: Fidelity = "dq"
     real_pwm: bool = False
@@ -167,7 +168,7 @@ class Scenario:
             ("settle", 0, False),
             ("noise", 0, False),
             ("substeps", 1, True),
-            ("delay", 0, True),
+            ("delay", 0, False),
             ("seed", 0, True),
             ("run", 0, True),
         ):
@@ -342,11 +343,14 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         found = "sensors with a dead time beside electronics of their own pace"
         raise InputError(s.where, "fidelity", found, "force, or sensors without dead time")
     late = split_dead_time(dead_time, c.sample_time)[0] if dead_time else None
-    delay = plant.actuator.delay(c.sample_time) if s.delay is None else s.delay
-    require_short(s.where, "delay", delay)
+    delay = delay_of(plant, c, s)
+    if own and split_delay(delay)[1]:
+        found = f"{delay:g} samples of delay beside electronics of their own pace"
+        raise InputError(s.where, "fidelity", found, "force, or whole samples of dead time")
     return Setup(
         fidelity=s.fidelity,
-        delay=delay,
+        delay=stored_blocks(delay),
+        fraction=split_delay(delay)[1],
         quantize=s.quantize,
         disturbed=s.disturbance is not None,
         bearing=s.bearing,
@@ -363,6 +367,12 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         current_sensors=driven and any(machine.drive.sensors is not None for machine in machines),
         electronics=s.electronics,
     )
+
+
+def delay_of(plant: Plant, c: Controller, s: Scenario) -> float:
+    """Samples between measurement and force. Raises InputError for more than MOST_DELAY."""
+    delay = plant.actuator.delay(c.sample_time) if s.delay is None else s.delay
+    return require_short(s.where, "delay", delay)
 
 
 def machines_of(plant: Plant, s: Scenario) -> list[Plant]:
@@ -392,7 +402,7 @@ def steps_of(plant: Plant, c: Controller, s: Scenario) -> int:
     Raises InputError for more than MOST_SUBSTEPS.
     """
     if s.substeps is not None:
-        return s.substeps
+        return max(2, s.substeps) if split_delay(delay_of(plant, c, s))[1] else s.substeps
     lag = c.sample_time * plant.actuator.crossover
     few = _require_few(lag, s, "time constants of the current loops in a sample") if math.isfinite(lag) else 0
     return max(4, math.ceil(few))

@@ -114,7 +114,7 @@ def observer(simulation: Simulation, substeps: int) -> Observer:
             acting = force(under_way, sent)
             under_way = c.Ad[n:, n:] @ under_way + c.Bd[n:] @ sent
             loads.append(v0)
-            filter_.x, filter_.F = predict(filter_.x, acting, loads.pop(0) if len(loads) > c.delay else v0)
+            filter_.x, filter_.F = predict(filter_.x, acting, loads.pop(0) if len(loads) > c.stored else v0)
             filter_.P = filter_.F @ filter_.P @ filter_.F.T + filter_.Q
         return state, np.concatenate(rows)
 
@@ -194,16 +194,16 @@ def _linear_prediction(c: Controller) -> Callable[..., tuple[FloatArray, FloatAr
 def _constant_force_map(c: Controller) -> FloatArray:
     """What forces that are constant over a sample add to the mechanical states: n x m."""
     n, m = len(c.A), len(c.forces)
-    if c.lagging:
+    if c.lagging or c.fraction:
         return sample(c.A, c.B, c.sample_time)[1]
-    return c.Ad[:n, n : n + m] if c.delay else c.Bd[:n]
+    return c.Ad[:n, n : n + m] if c.stored else c.Bd[:n]
 
 
 def _acting_force(c: Controller) -> Callable[[FloatArray, FloatArray], FloatArray]:
-    """(forces under way, force sent) -> forces over the next sample; of lagging forces a constant equivalent."""
+    """(forces under way, force sent) -> forces over the next sample; where these change, a constant equivalent."""
     n, m = len(c.A), len(c.forces)
-    if not c.lagging:
-        return lambda under_way, sent: under_way[:m] if c.delay else sent
+    if not (c.lagging or c.fraction):
+        return lambda under_way, sent: under_way[:m] if c.stored else sent
     back = np.linalg.pinv(_constant_force_map(c))
     A, B = back @ c.Ad[:n, n:], back @ c.Bd[:n]
     return lambda under_way, sent: A @ under_way + B @ sent

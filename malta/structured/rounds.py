@@ -23,7 +23,7 @@ import numpy as np
 
 from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
-from malta.linear.sampling import add_lags, delay_inputs, sample
+from malta.linear.sampling import add_lags, delay_inputs, sample, split_delay
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.loop import loop
@@ -66,7 +66,7 @@ class UncertainModel:
 
     system: UncertainSystem
     sample_time: float | None
-    delay: int
+    delay: float
     lag: float | None
 
     @property
@@ -80,8 +80,8 @@ class UncertainModel:
         if self.lag is not None:
             A, B = add_lags(A, B, self.lag)
         if T is not None and s.sample_time is None:
-            A, B = sample(A, B, T)
-        if T is not None:
+            A, B = sample(A, B, T, self.delay)
+        elif T is not None:
             A, B = delay_inputs(A, B, self.delay)
         C = np.hstack([C, np.zeros((len(C), len(A) - C.shape[1]))])
         inputs, outputs = [f"u{k}" for k in range(B.shape[1])], [f"y{k}" for k in range(len(C))]
@@ -173,13 +173,15 @@ def _name(values: Values) -> str:
 
 
 def target_of(
-    plant: Any, sample_time: float | None, delay: int, lag: float | None, places: Sequence[Values] | None
+    plant: Any, sample_time: float | None, delay: float, lag: float | None, places: Sequence[Values] | None
 ) -> Systems | UncertainModel | PlacedMachine:
     """What a law is tuned for. Raises InputError for anything else, and for options that it does not have."""
     if isinstance(plant, UncertainSystem):
         T = plant.sample_time if sample_time is None else sample_time
         if plant.sample_time is not None and plant.sample_time != T:
             raise InputError(CALLER, "sample_time", f"{T} s", f"{plant.sample_time} s, that of the system")
+        if split_delay(delay)[1] and plant.sample_time is not None:
+            raise InputError(CALLER, "delay", f"{delay:g} samples", "whole samples of a sampled system")
         if T is None and delay:
             raise InputError(CALLER, "delay", f"{delay} samples", "none without a sample time")
         return UncertainModel(plant, T, delay, lag)
@@ -312,7 +314,7 @@ def tune(
     margin: float | None = None,
     over_box: bool = False,
     sample_time: float | None = None,
-    delay: int = 0,
+    delay: float = 0,
     lag: float | None = None,
     places: Sequence[Values] | None = None,
     starts: int = 3,

@@ -21,7 +21,8 @@ as limits of the force allow, and not in proportion to the distance. Within b th
 
 The mechanical states stand first in xi. Where the design models the lag of the current loops, the forces that act at
 the sample follow: v - v0 behind first-order lags. Where it models a delay of d samples, forces of the last d samples
-follow, the oldest first: v - v0, and what currents commutated for an old reading make beside it. The reference of both
+follow, the oldest first: v - v0, and what currents commutated for an old reading make beside it. Of a `fraction` of a
+sample beyond, one sample more is stored: Ad and Bd say how long each force acts. The reference of both
 is what was commanded then, lagging. Last come constant forces of disturbance, where the filter observes them, with
 zero for a reference. Where a disturbance is known in advance, the forces that cancel it are added to v0(z).
 
@@ -205,6 +206,7 @@ class Controller:
     commutation : place for which currents are commutated; None: the reading y
     schedule : matrices at places of the reference of an output; Ad, Bd, Cd, K, Ki and L are those at the operating
         point; None: one set of matrices
+    fraction : of a sample, for which the oldest of the stored forces acts, and the next one after it; 0: for all of it
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
@@ -242,6 +244,7 @@ class Controller:
     tracks: Tracks = field(default="states", metadata={"later": True})
     commutation: Commutation | None = field(default=None, metadata={"later": True})
     schedule: Schedule | None = field(default=None, metadata={"later": True})
+    fraction: float = field(default=0.0, metadata={"later": True})
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -260,14 +263,19 @@ class Controller:
     def __repr__(self) -> str:
         return (
             f"Controller({self.name!r}, preset {self.parameters.preset!r}, {len(self.states)} states, "
-            f"{len(self.forces)} forces, {1e-3 / self.sample_time:g} kHz, delay {self.delay}"
+            f"{len(self.forces)} forces, {1e-3 / self.sample_time:g} kHz, delay {self.delay:g}"
             f"{', current lag' if self.lagging else ''}"
             f"{f', scheduled over {self.schedule.variable}' if self.schedule else ''})"
         )
 
-    @cached_property
-    def delay(self) -> int:
+    @property
+    def delay(self) -> float:
         """Samples of delay in the design model; 0 of a law of errors, which says nothing of its model."""
+        return self.stored - 1 + self.fraction if self.fraction else self.stored
+
+    @cached_property
+    def stored(self) -> int:
+        """The samples whose forces are among the states."""
         if self.tracks == "errors":
             return 0
         return (len(self.Ad) - len(self.A)) // len(self.forces) - self.lagging - self.observed
@@ -301,6 +309,16 @@ class Controller:
         return law_system(self)
 
 
+def lag_shares(c: Controller) -> list[tuple[int, float]]:
+    """How much of commands a lagging force takes on in a sample, with their age in samples: of one, or of two."""
+    n, m = len(c.A), len(c.forces)
+    whole = 1 - float(c.Ad[n, n])
+    if not c.fraction:
+        return [(c.stored, whole)]
+    newer = float(c.Ad[n, n + 2 * m] if c.stored > 1 else c.Bd[n, 0])
+    return [(c.stored, whole - newer), (c.stored - 1, newer)]
+
+
 def summed_columns(Ki: FloatArray) -> tuple[int, ...]:
     """The columns of Ki that are not zero."""
     return tuple(np.flatnonzero(Ki.any(axis=0)).tolist())
@@ -311,9 +329,9 @@ def is_own_state(row: FloatArray, k: int) -> bool:
     return k < len(row) // 2 and bool(np.array_equal(row, np.eye(len(row))[k]))
 
 
-def stored_forces(inputs: tuple[Signal, ...], delay: int) -> tuple[Signal, ...]:
-    """The states that hold the forces of the last `delay` samples, the oldest first."""
-    return tuple(Signal(f"{s.name}[k-{age}]", s.unit) for age in range(delay, 0, -1) for s in inputs)
+def stored_forces(inputs: tuple[Signal, ...], samples: int) -> tuple[Signal, ...]:
+    """The states that hold the forces of the last samples, the oldest first."""
+    return tuple(Signal(f"{s.name}[k-{age}]", s.unit) for age in range(samples, 0, -1) for s in inputs)
 
 
 def lagging_forces(inputs: tuple[Signal, ...]) -> tuple[Signal, ...]:

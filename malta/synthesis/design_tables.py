@@ -7,9 +7,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, create_model
+from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, StrictStr, create_model
 
 from malta.errors import InputError
+from malta.linear.sampling import whole_or_not
 from malta.model.signals import Coordinates
 from malta.synthesis.recovery import RecoveryTable
 from malta.synthesis.requirements import Requirement
@@ -189,7 +190,7 @@ class Range(Record):
     unit: StrictStr = entry("unit of low and high", default="1")
 
 
-Delay = Annotated[StrictInt, Field(ge=0, le=10)]
+Delay = Annotated[Finite, Field(ge=0, le=10), AfterValidator(whole_or_not)]
 
 
 class SearchTable(Record):

@@ -11,7 +11,7 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
-from malta.linear.sampling import sample
+from malta.linear.sampling import sample, split_delay
 from malta.model.actuator import Actuator
 from malta.model.equilibrium import holding_commands, load_balance
 from malta.model.linearize import LinearModel
@@ -25,7 +25,12 @@ V0_STEPS = 16  # at least, either way
 
 
 def machine_part(
-    model: LinearModel, Ts: float, delay: int, *, current_loop_delay: bool, position_feedforward: bool = False
+    model: LinearModel,
+    Ts: float,
+    delay: float,
+    *,
+    current_loop_delay: bool,
+    position_feedforward: bool = False,
 ) -> dict[str, Any]:
     """What of a controller its machine decides, not its law.
 
@@ -86,7 +91,7 @@ def pi_current_loop(actuator: Actuator, delay: float = 0.0) -> tuple[float, floa
     return Kp, Ki
 
 
-def feedforward(model: LinearModel, Ts: float, delay: int = 0, lead: float = 0.0) -> Feedforward:
+def feedforward(model: LinearModel, Ts: float, delay: float = 0, lead: float = 0.0) -> Feedforward:
     """v0 along the travel, inertias, and what a steady ramp takes where held currents pull back.
 
     With x = (q, w) at a sample, q going on by Ts P^-1 p*', and currents that are `delay` samples old, which were
@@ -100,7 +105,10 @@ def feedforward(model: LinearModel, Ts: float, delay: int = 0, lead: float = 0.0
     still = between_samples(model)
     Ad, Bd = sample(still.A, model.B, Ts)
     back = np.linalg.inv(model.C[:, :half])
-    moved = np.vstack([Ts * back, np.zeros_like(back)]) + Bd @ still.H * (Ts * delay - lead)
+    whole, part = split_delay(delay)
+    moved = np.vstack([Ts * back, np.zeros_like(back)]) + Bd @ still.H * (Ts * whole - lead)
+    if part:  # for which currents act that are a sample older
+        moved += (Bd - sample(still.A, model.B, (1 - part) * Ts)[1]) @ still.H * Ts
     unknown = np.hstack([Ad[:, half:] - np.eye(2 * half)[:, half:], Bd])
     found = np.linalg.solve(unknown, moved)
     return replace(static, speed=found[half:], rate=found[:half] - back)

@@ -21,7 +21,7 @@ from scipy import linalg
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.matrices import system_matrix
-from malta.linear.sampling import add_lags, delay_inputs, sample, sample_noise
+from malta.linear.sampling import add_lags, sample, sample_noise, split_delay, stored_blocks
 from malta.linear.system import System
 from malta.processes import on_one_thread
 from malta.synthesis.controller import noise_input
@@ -75,15 +75,15 @@ def gain_at_rest(K: FloatArray, n: int, known: int) -> FloatArray:
     return np.asarray(np.linalg.solve(np.eye(m) + under_way, K[:, : n // 2]))
 
 
-def sampled_model(model: Linear, Ts: float, delay: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
+def sampled_model(model: Linear, Ts: float, delay: float = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Ad, Bd, Cd under held currents, with the forces of the last `delay` samples as states."""
     still = between_samples(model)
-    Ad, Bd = delay_inputs(*sample(still.A, model.B, Ts), delay)
+    Ad, Bd = sample(still.A, model.B, Ts, delay)
     n, pull = len(model.A), still.H @ model.C
-    if delay:
+    if split_delay(delay)[0]:
         Ad[-len(pull) :, :n] = pull
     else:
-        Ad = Ad + Bd @ pull
+        Ad[:, :n] = Ad[:, :n] + Bd @ pull
     return Ad, Bd, np.hstack([model.C, np.zeros((len(model.C), len(Ad) - n))])
 
 
@@ -136,7 +136,7 @@ def intensities(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray
 
 
 def sampled_filter(
-    model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool, solver: Solver = "scipy"
+    model: Linear, weights: Weights, Ts: float, delay: float, *, integrated: bool, solver: Solver = "scipy"
 ) -> FloatArray:
     """Filter-form Kalman gain. The stored forces are known, so their rows are zero; disturbances stand last.
 
@@ -147,7 +147,7 @@ def sampled_filter(
     n, m, p = len(model.A), model.B.shape[1], len(model.C)
     noisy = sampled_noise(model, weights, Ts, delay, integrated=integrated)
     L = filter_gain(noisy, covariance(noisy, solver))
-    return np.vstack([L[:n], np.zeros((delay * m, p)), L[n:]])
+    return np.vstack([L[:n], np.zeros((stored_blocks(delay) * m, p)), L[n:]])
 
 
 class Noisy(NamedTuple):
@@ -182,7 +182,7 @@ def _with_reading(noisy: Noisy) -> FloatArray:
     return noisy.R + noisy.H @ noisy.M + noisy.M.T @ noisy.H.T
 
 
-def sampled_noise(model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool) -> Noisy:
+def sampled_noise(model: Linear, weights: Weights, Ts: float, delay: float, *, integrated: bool) -> Noisy:
     """What a sampled filter knows of the machine; disturbances stand last, stored forces are known and left out.
 
     The noise of a reading is in the currents that are commutated for it, too; beside what it does through the law that
@@ -202,8 +202,9 @@ def sampled_noise(model: Linear, weights: Weights, Ts: float, delay: int, *, int
     S = np.zeros((n, p))
     if weights.correlation.any():
         S = Gd @ _cross_covariance(model, weights)
-    if not delay:
-        Ad = Ad + Bd @ still.H @ C
+    whole, part = split_delay(delay)
+    if not whole:  # of the last reading, which acts for what its delay leaves of the sample
+        Ad = Ad + (sample(still.A, model.B, (1 - part) * Ts)[1] if part else Bd) @ still.H @ C
     if weights.drift_variance.size:
         drift = np.diag(weights.drift_variance)
         if weights.coordinates == "positions":  # forces that make these accelerations

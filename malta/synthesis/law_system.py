@@ -61,10 +61,10 @@ def set_point(c: Controller) -> FloatArray:
         v_ff, mechanical = R[p + n : p + n + m], len(c.A)
         if c.feedforward.position.size:
             v_ff[:] = c.feedforward.position @ X
-        known = c.lagging + c.delay
+        known = c.lagging + c.stored
         past = R[p + mechanical : p + mechanical + m * known].reshape(known, m, p)
         past[:] = v_ff
-        if c.delay:
+        if c.stored:
             newest = mechanical + m * (known - 1)
             past[c.lagging :] += c.Ad[newest : newest + m, : len(X)] @ X
     return R

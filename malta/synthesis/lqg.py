@@ -25,6 +25,7 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from numbers import Real
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -34,7 +35,15 @@ from scipy import linalg
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.linear.matrices import system_matrix
-from malta.linear.sampling import add_integrals, eigenvalues, sample, sample_cost
+from malta.linear.sampling import (
+    add_integrals,
+    eigenvalues,
+    sample,
+    sample_cost,
+    split_delay,
+    stored_blocks,
+    whole_or_not,
+)
 from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, Cost, Noise, disturbances, lagging_forces, stored_forces
@@ -260,7 +269,7 @@ def gains(
     weights: Weights,
     Ts: float,
     discretization: Discretization,
-    delay: int = 0,
+    delay: float = 0,
     lag: float | None = None,
     solver: Solver = "scipy",
 ) -> Gains:
@@ -275,7 +284,7 @@ def gains(
     if discretization == "backward-euler":
         return Gains(*_backward_euler(model, weights, Ts, solver))
     integrated, n, m = discretization == "sampled-data", len(model.A), model.B.shape[1]
-    driven, cost, known = model, weights, delay  # blocks of forces that are known, as what was commanded is
+    driven, cost, known = model, weights, delay  # samples of forces that are known, as what was commanded is
     if lag is not None:
         driven, known = with_lags(model, lag), delay + 1
         free = np.zeros(m)
@@ -289,7 +298,7 @@ def gains(
         pushed[:n] = sample(between_samples(model).A, model.B, Ts)[1]
         Ad = system_matrix(Ad, pushed, None, np.eye(m))
         Bd, Cd = np.vstack([Bd, np.zeros((m, m))]), np.hstack([Cd, np.zeros((p, m))])
-        K = np.hstack([K, np.eye(m) + K[:, n:].reshape(m, known, m).sum(axis=1)])
+        K = np.hstack([K, np.eye(m) + K[:, n:].reshape(m, stored_blocks(known), m).sum(axis=1)])
     return Gains(Ad, Bd, Cd, K, Ki, L)
 
 
@@ -300,7 +309,7 @@ def lqg(
     weights: Weights,
     Ts: float,
     discretization: Discretization = "sampled-data",
-    delay: int = 0,
+    delay: float = 0,
     *,
     name: str = "lqg",
     current_loop_delay: bool = True,
@@ -315,7 +324,7 @@ def lqg(
     Ts : sample time, s
     discretization : "sampled-data" (cost and noise integrated over the sample, Van Loan), "zoh" (taken once a sample)
         or "backward-euler" (continuous gains)
-    delay : samples between measurement and force in the design model (not with backward-euler)
+    delay : samples between measurement and force in the design model, also a fraction (not with backward-euler)
     name : of the design
     current_loop_delay : design the current loop with the machine's dead time
     current_lag : forces are states of the design model, first-order lags at the current loops' crossover behind v
@@ -343,8 +352,9 @@ def lqg(
         raise InputError(
             "lqg", "model", "a model at its trim", "one at plant.at(...): v0(z) cancels the loads"
         )
-    if not isinstance(delay, int):
-        raise InputError("lqg", "delay", repr(delay), "a whole number of samples")
+    if isinstance(delay, bool) or not isinstance(delay, Real) or not math.isfinite(delay):
+        raise InputError("lqg", "delay", repr(delay), "a number of samples")
+    delay = whole_or_not(float(delay))
     if discretization not in get_args(Discretization):
         raise InputError(
             "lqg", "discretization", repr(discretization), "one of " + ", ".join(get_args(Discretization))
@@ -380,7 +390,8 @@ def lqg(
         ),
         **found._asdict(),
         name=name,
-        states=plant.design_states + lagging + stored_forces(plant.inputs, delay) + observed,
+        states=plant.design_states + lagging + stored_forces(plant.inputs, stored_blocks(delay)) + observed,
+        fraction=split_delay(delay)[1],
         cost=Cost(
             weights.q / weights.q_base**2,
             weights.r / weights.r_base**2,
@@ -486,7 +497,7 @@ def _sampled_regulator(
     weights: Weights,
     integrals: Integrals,
     Ts: float,
-    delay: int,
+    delay: float,
     *,
     integrated: bool,
     solver: Solver,
@@ -496,19 +507,24 @@ def _sampled_regulator(
     Its own weight R Ts may be charged when it is commanded, which shifts a sum and changes no optimum. What is left
     beside the oldest stored force, Van Loan's integral with R = 0, is positive semidefinite. What acts is v + H y.
     """
-    n, m, p, d = len(model.A), model.B.shape[1], len(model.C), delay
-    still, commanded = between_samples(model), weights.R * Ts
-    if integrated:
+    n, m, p, blocks = len(model.A), model.B.shape[1], len(model.C), stored_blocks(delay)
+    still, commanded, (whole, part) = between_samples(model), weights.R * Ts, split_delay(delay)
+    if integrated and part:
+        Q, N, R = _split_cost(still.A, model.B, weights.Q, Ts, part)
+        R = R + commanded
+    elif integrated:
         Q, N, R = sample_cost(still.A, model.B, weights.Q, weights.R, Ts)
     else:
         Q, N, R = weights.Q * Ts, np.zeros((n, m)), commanded
-    Ad, Bd, Cd = sampled_model(model, Ts, d)
-    if d:
-        rest = m * (d - 1)
+        if part:
+            Q, N = linalg.block_diag(Q, np.zeros((m, m))), np.zeros((n + m, m))
+    Ad, Bd, Cd = sampled_model(model, Ts, delay)
+    if whole:
+        rest = m * (whole - 1)
         Q = linalg.block_diag(system_matrix(Q, N, N.T, R - commanded), np.zeros((rest, rest)))
-        N, R = np.zeros((n + m * d, m)), commanded
+        N, R = np.zeros((n + m * blocks, m)), commanded
     else:
-        pull, acting = still.H @ model.C, R - commanded
+        pull, acting = np.hstack([still.H @ model.C, np.zeros((m, m * blocks))]), R - commanded
         Q = Q + N @ pull + pull.T @ N.T + pull.T @ acting @ pull
         N = N + pull.T @ acting
     Ki, (summed, Q_i) = np.zeros((m, p)), integrals
@@ -517,8 +533,22 @@ def _sampled_regulator(
     A, B = add_integrals(Ad, Bd, Cd[summed], Ts)
     N = np.vstack([N, np.zeros((len(summed), m))])
     gain = dare(A, B, linalg.block_diag(Q, Q_i * Ts), R, N, "sampled LQI", solver=solver).K
-    Ki[:, summed] = -gain[:, n + m * d :]
-    return gain[:, : n + m * d], Ki
+    Ki[:, summed] = -gain[:, n + m * blocks :]
+    return gain[:, : n + m * blocks], Ki
+
+
+def _split_cost(
+    A: FloatArray, B: FloatArray, Q: FloatArray, Ts: float, part: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The integral of x'Qx over a sample in which a stored input acts for its first part, and a newer one after it.
+
+    Q, N and R of x~'Q x~ + 2 x~'N u + u'R u, x~ = (x, stored input).
+    """
+    free = np.zeros((B.shape[1],) * 2)
+    first, last = (sample_cost(A, B, Q, free, t) for t in (part * Ts, (1 - part) * Ts))
+    reached = np.hstack(sample(A, B, part * Ts))  # x when the newer one begins, of (x, stored)
+    before = system_matrix(first[0], first[1], first[1].T, first[2])
+    return before + reached.T @ last[0] @ reached, reached.T @ last[1], last[2]
 
 
 def check_sizes(model: Linear, weights: Weights) -> None:

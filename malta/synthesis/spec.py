@@ -307,7 +307,7 @@ class Spec:
     operating_point: Mapping[str, float]
     sample_time: float
     discretization: Discretization
-    delay: int
+    delay: float
     current_loop_delay: bool
     law: Weights | Pid | StructuredLaw
     uncertainty: Mapping[str, float]
@@ -322,7 +322,7 @@ class Spec:
     specification: Mapping[str, float] = dataclass_field(default_factory=dict)
     recovery: Mapping[str, RecoveryBound] = dataclass_field(default_factory=dict)
     search: tuple[Variable, ...] = ()
-    delays: tuple[int, ...] = ()
+    delays: tuple[float, ...] = ()
     schedule: tuple[str, tuple[float, ...]] | None = None
 
     @property
@@ -456,7 +456,7 @@ class Spec:
         rows = [("machine", f"{self.plant.name}, preset {self.parameters.preset!r}")]
         kind = {"structure": "given structure"}.get(self.kind, self.kind)
         kind += f", {self.discretization}" if self.kind == "LQG" else ""
-        rows.append(("law", f"{kind}, every {quantity(self.sample_time, 's')}, delay {self.delay}"))
+        rows.append(("law", f"{kind}, every {quantity(self.sample_time, 's')}, delay {self.delay:g}"))
         if self.schedule is not None:
             rows.append(("schedule", f"{len(self.schedule[1])} places of {self.schedule[0]}"))
         rows.append(("uncertainty", box_words(self.uncertainty, self.parameters) or "none"))

@@ -25,7 +25,7 @@ from scipy import sparse
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
 from malta.linear.peaks import largest_gain
-from malta.linear.sampling import add_lags, delay_inputs, sample
+from malta.linear.sampling import add_lags, sample
 from malta.loops.classical import Nominal, last_crossover, tracked_band
 from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import SampledLoop, disturbance_map, push_through
@@ -388,7 +388,7 @@ def _sample(spec: Spec, driven: Driven | None, part: MachinePart, forecast: Floa
     else:
         if math.isfinite(actuator.crossover):
             A, B = add_lags(A, B, actuator.crossover)
-        Ad, Bd = delay_inputs(*sample(A, B, Ts), delay)
+        Ad, Bd = sample(A, B, Ts, delay)
     return SampledMachine(Ad, Bd, np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))]))
 
 
@@ -414,7 +414,7 @@ def _corners(
     return SampledMachine(*(M.swapaxes(0, 1) for M in stacked))
 
 
-def figures_of(spec: Spec, group: TuningGroup, weights: Weights, delay: int) -> dict[str, float]:
+def figures_of(spec: Spec, group: TuningGroup, weights: Weights, delay: float) -> dict[str, float]:
     """Compute the linear figures of a group in a trial, by requirement; none where its loop is unstable.
 
     Beside the margin stands that of every corner, "margin 3": a search that sees one alone runs into the next.

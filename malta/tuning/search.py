@@ -38,7 +38,7 @@ class Trial(NamedTuple):
     """Numbers that were tried, in the units of the search's variables, and the linear figures that they give."""
 
     values: tuple[float, ...]
-    delay: int
+    delay: float
     figures: Mapping[str, float]
 
 
@@ -159,7 +159,7 @@ class TrialSearch:
         self,
         spec: Spec,
         variables: tuple[int, ...],
-        delay: int,
+        delay: float,
         journal: Journal,
         compute: Callable[[Spec], dict[str, float]],
         among: tuple[int, ...] = (),

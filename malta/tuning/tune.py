@@ -224,7 +224,7 @@ def _differ(a: Weights, b: Weights) -> bool:
     return any((getattr(a, name) != getattr(b, name)).any() for name in names)
 
 
-def cluster_search(spec: Spec, cluster: _Cluster, delay: int, journal: Journal) -> TrialSearch:
+def cluster_search(spec: Spec, cluster: _Cluster, delay: float, journal: Journal) -> TrialSearch:
     """The trials of one cluster with one delay."""
     at_least = at_least_of(spec.plant)
 
@@ -303,7 +303,7 @@ def search_weights(
     """
     clusters = clusters_of(spec)
     journal.expect(_count_trials(clusters, spec, effort), progress)
-    found: dict[int, list[tuple[TrialSearch, FloatArray]]] = {}
+    found: dict[float, list[tuple[TrialSearch, FloatArray]]] = {}
     for delay in spec.delays:
         found[delay] = []
         for search in (cluster_search(spec, cluster, delay, journal) for cluster in clusters):

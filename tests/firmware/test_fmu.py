@@ -224,6 +224,24 @@ def test_single_precision_flies_as_the_exported_c(instance: Callable[..., Unit])
     assert fly(loop, flown, motion) < 1e-9
 
 
+@pytest.mark.parametrize("T_d", [61e-6, pytest.param(90e-6, marks=pytest.mark.slow)])
+def test_commands_begin_to_act_within_a_sample(T_d: float, instance: Callable[..., Unit]) -> None:
+    """Of 0.72 and 1.3 samples of computation; a machine alone takes the commands of the run."""
+    c = target("robust").controller
+    par: Any = c.parameters
+    t = Target(replace(c, parameters=replace(par, T_d=T_d)), "double", "dq")
+    s = scenario(t)
+    run = malta.simulate(t.believed, t.controller, s)
+    usual = malta.simulate(target("robust").believed, c, s)
+    motion = s.reference(t.believed)(run.t)
+    loop = instance(t, "loop", 2)
+    loop.begin()
+    loop.refer(motion, 0)
+    loop.start()
+    assert fly(loop, run, motion) < 1e-12
+    assert np.abs(run.p - usual.p[: len(run.p)]).max() > 1e-9
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("fidelity", ["phase", "dq"])
 def test_sensors_with_lag_dead_time_and_offsets_are_part_of_the_machine(

@@ -116,12 +116,14 @@ def test_the_loops_of_the_examples_are_the_derivatives_of_their_flights(
         check_proven_loop(spec.plant, c, names, nominal * (1 + 0.2 * share), 0.0)
 
 
-def bench_loop(name: str, delay: int, lag: float, wrong: float) -> tuple[Plant, Controller, dict[str, float]]:
+def bench_loop(
+    name: str, delay: float, lag: float, wrong: float
+) -> tuple[Plant, Controller, dict[str, float]]:
     """A bench off its middle and an LQG that believes in other magnets: C times `wrong`."""
     make, par, at = MACHINES[name]
     Ts = 2e-4
     par = replace(
-        par, kind="three coils" if name == "three coils" else par.kind, lag=lag, dead_time=delay * Ts
+        par, kind="three coils" if name == "three coils" else par.kind, lag=lag, dead_time=(delay + 0.5) * Ts
     )
     believed = make(replace(par, C=par.C * wrong, g0=par.g0 * (2 - wrong)))
     p = len(believed.outputs)
@@ -132,11 +134,12 @@ def bench_loop(name: str, delay: int, lag: float, wrong: float) -> tuple[Plant, 
 
 
 @pytest.mark.parametrize(
-    ("delay", "lag", "wrong"), [(0, 0.0, 1.0), (1, 2e-4, 1.0), (2, 0.0, 1.15), (1, 1e-4, 0.9)]
+    ("delay", "lag", "wrong"),
+    [(0, 0.0, 1.0), (1, 2e-4, 1.0), (2, 0.0, 1.15), (1.3, 1e-4, 0.9), (0.999, 0.0, 0.9)],
 )
 @pytest.mark.parametrize("name", MACHINES)
 def test_the_loop_of_any_magnet_is_the_derivative_of_its_flight(
-    name: str, delay: int, lag: float, wrong: float
+    name: str, delay: float, lag: float, wrong: float
 ) -> None:
     """Nonlinear forces, currents that are no inverse, coils to spare, sensors with a lag, a controller that errs."""
     plant, c, at = bench_loop(name, delay, lag, wrong)

@@ -235,12 +235,12 @@ def test_a_search_refuses_sensors_that_read_late() -> None:
 
 
 @pytest.mark.slow
-def test_verify_takes_the_lag_and_refuses_parts_of_a_sample(run: Run) -> None:
+def test_verify_takes_lag_and_dead_time_but_proves_whole_samples_with_pi_loops(run: Run) -> None:
     said = run("verify", GAINS, "--set", "tau_s=0.2ms", "--no-proof", "--json")
     assert said.code == 0, said.err
     prompt = json.loads(Path(GAINS).read_text(encoding="utf-8"))["verification"]["peak_sensitivity"]["x1"]
     assert json.loads(said.out)["peak_sensitivity"]["machine"]["x1"] > 1.01 * prompt
     said = run("verify", GAINS, "--set", "T_s=10us", "--no-proof")
     assert said.code == 2
-    assert "10 us of dead time" in one_sentence(said.err)
+    assert "sensors.dead_time: found 10 us" in one_sentence(said.err)
     assert run("simulate", GAINS, "--set", "T_s=10us", "--json").code == 0

@@ -287,7 +287,8 @@ ONE: dict[str, Any] = {"A": [[1.0]], "B": [[1.0]], "C": [[1.0]]}
         (
             {"nose": 1},
             "nose: found an unknown detail, expected one of "
-            "name states inputs outputs nominal terms formulas limits limit noise dead_time (did you mean 'noise'?)",
+            "name states inputs outputs nominal terms formulas limits limit noise dead_time computation_time "
+            "(did you mean 'noise'?)",
         ),
     ],
 )

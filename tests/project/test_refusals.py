@@ -127,8 +127,8 @@ def test_a_design_whose_machine_has_no_possible_name_is_refused(tmp_path: Path, 
     ("arguments", "found"),
     [
         (["simulate", TABLE2, "--option", "delay=1000000000"], "delay: found 1000000000 samples"),
-        (["simulate", TABLE2, "--set", "T_d=1"], "machine: dead time: found 20000 samples"),
-        (["verify", TABLE2, "--set", "T_d=1", "--no-proof"], "machine: dead time: found 20000 samples"),
+        (["simulate", TABLE2, "--set", "T_d=1"], "machine: dead time: found 19999.5 samples"),
+        (["verify", TABLE2, "--set", "T_d=1", "--no-proof"], "machine: dead time: found 19999.5 samples"),
         (["verify", TABLE2, "--set", "T_s=1", "--no-proof"], "dead time of its sensors: found 20000 samples"),
         (["simulate", TABLE2, "--set", "w_cc=1e300"], "time constants of the current loops in a sample"),
         (

@@ -283,7 +283,7 @@ FAULTS = {  # old text, new text; field, found, expected
     "discretization": (SAMPLED, '"tustin" ', "discretization", "'tustin'", "'backward-euler', 'zoh'"),
     "delay of -1": (DELAY, "delay = -1 ", "delay", "-1", "greater than or equal to 0"),
     "delay of 11": (DELAY, "delay = 11 ", "delay", "11", "less than or equal to 10"),
-    "broken delay": (DELAY, "delay = 1.5 ", "delay", "1.5", "integer"),
+    "delay in words": (DELAY, 'delay = "1" ', "delay", "'1'", "number"),
     "word for a switch": ("= true", '= "yes"', "current_loop_delay", "'yes'", "boolean"),
     "sample time of 0": (TS, "sample_time = { value = 0,", "sample_time", "0 s", "more than 0 s"),
     "backwards": (TS, "sample_time = { value = -50,", "sample_time", "-5e-05 s", "more than 0 s"),

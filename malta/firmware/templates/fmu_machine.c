@@ -45,11 +45,16 @@ void {{ name }}_start({{ name }}_state *s, const {{ name }}_real par[{{ paramete
 
 void {{ name }}_step({{ name }}_state *s, const {{ name }}_real par[{{ parameters }}], const {{ name }}_real command[{{ held }}]{% if wrench %}, const {{ name }}_real w[{{ wrench }}]{% endif %}{% if delay %}, int32_t late{% endif %}) {
   {{ name }}_real until;
-  {{ name }}_real acting[{{ held }}];
+  {{ name }}_real acting[{{ acting }}];
   int32_t k;
   for (k = 0; k < {{ held }}; k++) {
     acting[k] = {% if delay %}(late != 0) ? s->under_way[k] : {% endif %}command[k];
   }
+{% if acting > held %}
+  for (k = 0; k < {{ held }}; k++) { /* from a fraction of the sample on */
+    acting[{{ held }} + k] = {% if delay > 1 %}(late != 0) ? s->under_way[{{ held }} + k] : {% endif %}command[k];
+  }
+{% endif %}
 {% if delay %}
   for (k = 0; k < {{ (delay - 1) * held }}; k++) {
     s->under_way[k] = s->under_way[k + {{ held }}];

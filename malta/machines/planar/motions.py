@@ -261,7 +261,7 @@ def delay(
     return Experiment("delay", "Does the filter have to know of the delay?", cases, (), interrupted=cut)
 
 
-def scale_speed(controller: Controller, speed: float, delay: int) -> Controller:
+def scale_speed(controller: Controller, speed: float, delay: float) -> Controller:
     """The LQG of the same cost and noise, `speed` times as fast, with `delay` samples in its design model.
 
     Natural frequencies of a double integrator go with the fourth root of q / r, those of its filter with the fourth

@@ -125,7 +125,7 @@ def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Detai
     limits : of parameters, (above, below), exclusive
     limit : of the inputs, one number for all or one for each; default: infinite
     noise : of the sensors, rms of a sample, one number for all or one for each; default: 0
-    dead_time : s, from measurement to force; default: 0
+    dead_time, computation_time : s, as an `Actuator` has them: one of the two; default: 0
 
     Returns a Plant.
 
@@ -183,6 +183,7 @@ def plant(par: Any) -> Plant:
             current_limit=math.inf,
             force_limit=s.limit,
             dead_time=s.dead_time,
+            computation_time=s.computation_time,
             limited=lambda i: i,
         ),
         sensors=Sensors(noise=s.noise),

@@ -38,9 +38,10 @@ class LinearSystem:
     terms: tuple[tuple[str, tuple[Rows, Rows, Rows]], ...]  # by parameter: its factors in A, B, C
     limit: tuple[float, ...]  # m, of each input, its unit; inf: none
     noise: tuple[float, ...]  # p, rms of a sample, the unit of each output
-    dead_time: float  # s, from measurement to force
+    dead_time: float  # s, from measurement to force, half a sample of hold included
     formulas: tuple[tuple[str, str], ...] = ()  # added to an entry: ("A_2_1", "-b / J")
     limits: tuple[tuple[str, float, float], ...] = ()  # of parameters: name, above, below; inf: none
+    computation_time: float = 0.0  # s, from a sample to its new force
 
 
 class Details(TypedDict, total=False):
@@ -57,6 +58,7 @@ class Details(TypedDict, total=False):
     limit: float | Sequence[float]
     noise: float | Sequence[float]
     dead_time: float
+    computation_time: float
 
 
 def linear_parameters(A: Any, B: Any, C: Any, **details: Unpack[Details]) -> Parameters:
@@ -85,9 +87,10 @@ def linear_parameters(A: Any, B: Any, C: Any, **details: Unpack[Details]) -> Par
         _numbers("dead_time", details.get("dead_time", 0.0), 1)[0],
         _formulas(formulas, nominal, matrices),
         _limits(details.get("limits", {}), nominal),
+        _numbers("computation_time", details.get("computation_time", 0.0), 1)[0],
     )
-    if not math.isfinite(sum(system.noise) + system.dead_time):
-        raise InputError(CALLER, "noise, dead_time", "infinity", "finite numbers")
+    if not math.isfinite(sum(system.noise) + system.dead_time + system.computation_time):
+        raise InputError(CALLER, "noise, dead_time, computation_time", "infinity", "finite numbers")
     if len({math.isinf(limit) for limit in system.limit}) > 1:
         raise InputError(CALLER, "limit", str(system.limit), "one for each of the inputs, or none")
     return record_of(system, nominal, details.get("name", "linear"))

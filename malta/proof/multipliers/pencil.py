@@ -21,6 +21,7 @@ from scipy import linalg
 
 from malta.arrays import FloatArray
 from malta.linear.rational import TooLarge
+from malta.linear.sampling import split_delay
 from malta.linear.uncertain import StateGroup
 from malta.proof.groups import C, UncertainLoop
 from malta.proof.polynomial.characteristic import clear_denominators
@@ -354,9 +355,9 @@ class Rows:
     @property
     def size(self) -> int:
         """The number of rows of the pencil."""
-        law, m = self.loop.law, len(self.inputs)
+        late = len(self.inputs) * split_delay(self.loop.law.delay)[0]
         lifted = self.loop.sampled and len(self.group.states) <= MAX_LIFTED_STATES
-        return self.driven * (2 if lifted else 1) + len(self.group.own) + m * law.delay + len(self.reads)
+        return self.driven * (2 if lifted else 1) + len(self.group.own) + late + len(self.reads)
 
     @property
     def driven(self) -> int:
@@ -445,7 +446,7 @@ class Rows:
 
     def _join(self, plant: tuple[BoxTerms, ...], below: BoxTerms, c: FloatArray, r: FloatArray) -> Pencil:
         """The whole pencil; its columns are x with lags, the compensator's states, stored inputs, y, and x_k of c."""
-        law, own, late = self.loop.law, list(self.group.own), self.loop.law.delay
+        law, own, late = self.loop.law, list(self.group.own), split_delay(self.loop.law.delay)[0]
         n, k, m, y = len(plant[0].middle), len(own), len(self.inputs), len(self.reads)
         dens = plant[4:]
         edges = np.cumsum([0, n, k, m * late, y, *[n] * len(dens)]).tolist()

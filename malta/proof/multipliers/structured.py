@@ -19,6 +19,7 @@ import numpy as np
 from scipy import linalg
 
 from malta.linear.rational import TooLarge
+from malta.linear.sampling import split_delay
 from malta.proof.groups import UncertainLoop, groups
 from malta.proof.multipliers import BlockSizes, Branch, Multiplier, excludes_zero, multiplier, response
 from malta.proof.multipliers.pencil import TERMS, Pencil, Rows
@@ -416,6 +417,7 @@ def _rows_of(loop: UncertainLoop | None) -> list[Rows] | None:
         or loop.symbolic is None
         or not loop.program.rational
         or (loop.descriptor and loop.sampled)
+        or split_delay(loop.law.delay)[1]  # the pencil has one hold a sample
     ):
         return None
     try:

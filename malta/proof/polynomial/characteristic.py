@@ -21,6 +21,7 @@ from flint import acb, acb_mat, arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from malta.linear.expressions import BALLS, EXACT_ARITHMETIC, POINTS, MatrixProgram, NotAnalytic, finite
 from malta.linear.rational import Ratio, Symbolic, over_common_denominator, value
+from malta.linear.sampling import split_delay
 from malta.linear.uncertain import StateGroup
 from malta.proof.groups import A, B, C, D, E, UncertainLoop, divide_by_descriptor, rational
 from malta.proof.polynomial.closed_loop import (
@@ -353,7 +354,9 @@ class Characteristic:
         acting = self.minors.rows if self.minors is not None else self._acting
         lags = len(acting) if law.lag is not None else 0
         if self.discrete:  # |z - a| <= 2 of a lag, |z| = 1 of stored inputs
-            degree += lags + law.delay * (self.minors.order if self.minors is not None else len(acting))
+            whole, part = split_delay(law.delay)
+            degree += lags + len(acting) * (part > 0)
+            degree += whole * (self.minors.order if self.minors is not None else len(acting))
             scale = self._row_factors(sides)
             total = [c * 2**lags * scale for c in total] + [arb(0)] * (degree + 1 - len(total))
             return [pair(c) for c in map_bounds(total)]

@@ -15,6 +15,7 @@ from scipy import linalg, sparse
 from malta.arrays import FloatArray
 from malta.linear.expressions import BALLS, NotAnalytic, exact, finite
 from malta.linear.rational import Ratio, Symbolic, value
+from malta.linear.sampling import split_delay
 from malta.linear.uncertain import StateGroup
 from malta.proof.groups import (
     A,
@@ -74,18 +75,26 @@ def driven_group(
         through = rows * through
         b = dense(matrix, n, len(picked), ((k, j, 1) for j, k in enumerate(picked)))
     a, b, c, d = drive(loop, matrix, a, b, c, d)
-    a, b, c, d = add_delay(matrix, a, b, c, d, law.delay)
+    a, b, c, d = add_delay(matrix, a, b, c, d, split_delay(law.delay)[0])
     f_b = rational(law.B[list(g.own)])
     return DrivenGroup(matrix, a, b, c, d, law_matrix(loop, g), f_b, out, through, factor)
 
 
 def drive(loop: UncertainLoop, matrix: Any, a: Any, b: Any, c: Any, d: Any) -> tuple[Any, Any, Any, Any]:
-    """A system with the loop's lag, held and sampled; in differences x+ - x where it is discrete."""
+    """A system with the loop's lag, held and sampled, a fraction of a sample of its delay included.
+
+    In differences x+ - x where it is discrete.
+    """
     law = loop.law
     if law.lag is not None:
         a, b, c, d = add_lag(matrix, a, b, c, d, arb(law.lag) if loop.sampled else exact(law.lag))
     if loop.sampled:
-        a, b = hold(matrix, a, b, arb(law.sample_time))
+        T, (_, part) = arb(law.sample_time), split_delay(law.delay)
+        newest = hold(matrix, a, b, (1 - arb(part)) * T)[1] if part else None
+        a, b = hold(matrix, a, b, T)
+        if newest is not None:  # inputs stored for a sample act for the fraction, new ones for the rest of it
+            a, old, c, d = add_delay(matrix, a, b - newest, c, d, 1)
+            b = old + _stack(matrix, [[newest], [zeros(matrix, b.ncols(), b.ncols())]])
     elif law.sample_time is not None:
         a = a - _identity(matrix, a.nrows())
     return a, b, c, d
@@ -278,9 +287,9 @@ def majorant_matrix(
         picked = [x[i] for i in g.inputs]
         out, through, b = b[picked] @ out, b[picked] @ through, np.eye(n)[:, picked]
     a, b, c, d = driven_bounds(loop, (a, b, c, d), diagonal)
-    if law.delay:
+    if whole := split_delay(law.delay)[0]:
         n, r = len(a), b.shape[1]
-        stored = r * law.delay
+        stored = r * whole
         big = np.zeros((n + stored, n + stored))
         big[:n, :n], big[:n, n : n + r] = a, b
         big[n:, n:] = np.eye(stored) + np.eye(stored, k=r)
@@ -312,7 +321,7 @@ def driven_bounds(loop: UncertainLoop, abcd: Bounds, diagonal: FloatArray) -> Bo
     if loop.sampled:
         assert law.sample_time is not None
         a, V = hold_bounds(a, diagonal, law.sample_time)
-        b = V @ b
+        b = V @ b  # of either part of a split sample, too
         if rate is not None:  # V bounds both parts of the held input, the state of the lag and the rest
             rate = float(-np.expm1(-rate * law.sample_time)) * (1 + 1e-12)
             b_late = np.vstack([b, rate * np.eye(r)])
@@ -320,10 +329,13 @@ def driven_bounds(loop: UncertainLoop, abcd: Bounds, diagonal: FloatArray) -> Bo
         b_late = np.vstack([np.zeros_like(b), rate * np.eye(r)])
     elif law.sample_time is not None:
         a = a + np.eye(len(a))
-    if rate is None:
-        return a, b, c, d
-    a = np.block([[a, b], [np.zeros((r, len(a))), rate * np.eye(r)]])
-    return a, b_late, np.hstack([c, np.zeros((p, r)) if d is None else d]), None
+    if rate is not None:
+        a = np.block([[a, b], [np.zeros((r, len(a))), rate * np.eye(r)]])
+        b, c, d = b_late, np.hstack([c, np.zeros((p, r)) if d is None else d]), None
+    if loop.sampled and split_delay(law.delay)[1]:
+        a = np.block([[a, b], [np.zeros((r, len(a))), np.eye(r)]])
+        b, c, d = np.vstack([b, np.eye(r)]), np.hstack([c, np.zeros((p, r)) if d is None else d]), None
+    return a, b, c, d
 
 
 # Upper bounds of the coefficients of det(g + A) from bounds of |A| alone.

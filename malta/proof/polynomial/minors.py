@@ -3,7 +3,7 @@
     d_P d_F det(I - F P) = sum_k (-1)^k sum_(S, R, T) pi_SR  beta_RT  kappa_TS        |S| = |R| = |T| = k
 
 P = X B, X from forces on the rows R of the state equations to the outputs S; pi_SR = d_P det X[S, R] and
-kappa_TS = d_F det F[T, S] are polynomials, beta_RT = det B[R, T] numbers. A delay of d samples is z^-d of P.
+kappa_TS = d_F det F[T, S] are polynomials, beta_RT = det B[R, T] numbers. A delay of d whole samples is z^-d of P.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from scipy import sparse
 from malta.arrays import FloatArray
 from malta.linear.expressions import MatrixProgram, NotAnalytic, exact
 from malta.linear.rational import Ratio, Symbolic
+from malta.linear.sampling import split_delay
 from malta.linear.uncertain import StateGroup
 from malta.proof.groups import A, B, C, E, UncertainLoop, rational
 from malta.proof.polynomial.closed_loop import (
@@ -178,7 +179,9 @@ class Minors:
     def late(self) -> tuple[Any, ...]:
         """z^(d (K - k)) for k = 0 .. K."""
         z = fmpq_poly([1, 1])
-        return tuple(z ** (self.loop.law.delay * (self.order - k)) for k in range(self.order + 1))
+        return tuple(
+            z ** (split_delay(self.loop.law.delay)[0] * (self.order - k)) for k in range(self.order + 1)
+        )
 
     @cached_property
     def balls(self) -> tuple[dict[Pair, Any], dict[Pair, Any]]:
@@ -266,11 +269,9 @@ class Minors:
 
     @property
     def degree(self) -> int:
-        law = self.loop.law
-        return (
-            len(self.group.states) + len(self.group.own)
-            + (len(self.rows) if law.lag is not None else 0) + self.order * law.delay
-        )  # fmt: skip
+        law, (whole, part) = self.loop.law, split_delay(self.loop.law.delay)
+        driven = len(self.rows) * ((law.lag is not None) + (part > 0))
+        return len(self.group.states) + len(self.group.own) + driven + self.order * whole
 
     def sizes(self, entries: list[list[tuple[int, int, Any]]]) -> Sizes:
         """Bounds of the system's minors from balls of the entries.
@@ -345,7 +346,7 @@ class Minors:
     @property
     def _kind(self) -> tuple[Any, ...]:
         law = self.loop.law
-        return law.sample_time, law.lag, self.loop.sampled
+        return law.sample_time, law.lag, self.loop.sampled, split_delay(law.delay)[1]
 
 
 @lru_cache(maxsize=64)  # laws change, the system stays

@@ -441,8 +441,8 @@ def summary_sentences(a: Analysis) -> list[str]:
     return sentences
 
 
-def _count(number_of: int, what: str) -> str:
-    return f"{number_of} {what}{'' if number_of == 1 else 's'}"
+def _count(number_of: float, what: str) -> str:
+    return f"{number_of:g} {what}{'' if number_of == 1 else 's'}"
 
 
 def _list_in_words(parts: Sequence[str]) -> str:

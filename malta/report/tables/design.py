@@ -62,7 +62,7 @@ def design_page(
     ball: LQG with integral action
     ball, preset data, sampled-data, 5 kHz, delay 1 in the design model
     """
-    made = f"{spec.discretization}, {_rate_text(spec.sample_time)}, delay {spec.delay} in the design model"
+    made = f"{spec.discretization}, {_rate_text(spec.sample_time)}, delay {spec.delay:g} in the design model"
     made += ", with the lag of the current loops" if spec.current_lag else ""
     if spec.pid is not None:
         made = f"PID, {_rate_text(spec.sample_time)}"

@@ -248,11 +248,13 @@ class Coordinates(NamedTuple):
 
 
 def with_working_state(p: Period, plant: Plant, c: Controller, s: Setup) -> Period:
-    """The same control period with a working state; unchanged for other fidelities than `force`.
+    """The same control period with a working state; unchanged for other fidelities than `force`, and where commands
+    begin to act within a sample.
 
     p : with the numbers as the argument theta
     """
-    if s.fidelity != "force" or electronics_of(plant, s) is not None or not plant.second_order:
+    own = s.fidelity != "force" or electronics_of(plant, s) is not None
+    if own or s.fraction or not plant.second_order:
         return p
     plant, g, theta = with_symbols(plant, numbers_of(plant, c, 1))
     loop, signals = LoopPlan(plant, c, s, g), signals_of(layout_of(plant, c, s), ca.SX)
