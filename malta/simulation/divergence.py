@@ -94,7 +94,7 @@ def _scales(run: Simulation, inputs: Inputs) -> FloatArray:
 
 
 def _largest(forces: Any) -> FloatArray:
-    return np.abs(np.asarray(forces, dtype=float)).max(axis=0)
+    return np.asarray(np.abs(np.asarray(forces, dtype=float)).max(axis=0))
 
 
 @lru_cache(maxsize=16)

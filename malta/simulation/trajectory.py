@@ -63,7 +63,7 @@ def judge(
     ended : rows end with the first in which a contact ends the run, as the compiled engine's do
     used : from `rooms_in`; None: contacts bound all outputs
     """
-    away = np.zeros(len(rows), dtype=bool) if used is None else (used >= 1).any(axis=1)
+    away = np.zeros(len(rows), dtype=bool) if used is None else np.atleast_1d((used >= 1).any(axis=1))
     columns, last = columns_of_row(run.plant, run.controller, run.setup)["contact"], rows[-1].tolist()
     if all(map(math.isfinite, last)):  # a state that is no number stays none
         largest = max(last[columns], default=0.0) if ended else rows[:, columns].max(initial=0.0)

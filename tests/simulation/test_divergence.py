@@ -8,9 +8,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import malta
+from malta.arrays import FloatArray
 from malta.model import Actuator, Plant, Sensors, Signal
 from malta.model.stroke import Stroke
 from malta.simulation.divergence import free_outputs
@@ -33,7 +33,7 @@ def _spring(**details: Any) -> tuple[Plant, Any]:
 
 
 def _other(p: Plant, k: float) -> Plant:
-    return malta.plant_of(replace(p.parameters, k=k))  # type: ignore[call-arg]
+    return malta.plant_of(replace(p.parameters, k=k))
 
 
 @pytest.mark.parametrize("engine", ["auto", "virtual machine"])
@@ -56,7 +56,7 @@ def test_every_lane_of_a_campaign_knows(kind: str) -> None:
     """Unstable machines are not completed; stable ones beside them keep their digits; replays end alike."""
     p, c = _spring()
     scenario = replace(cases_of(kind, p, c)[0].scenario, noise=1.0)
-    k: NDArray[np.float64] = np.array([SOFT, STIFF, SOFT, 2 * STIFF])
+    k: FloatArray = np.array([SOFT, STIFF, SOFT, 2 * STIFF])
     assert [malta.loop(_other(p, one), c).stable for one in k] == [True, False, True, False]
     batch = simulate_many(p, c, scenario, {"k": k})
     assert [verdicts(p)[int(n)] for n in batch.verdict] == ["completed", "diverged", "completed", "diverged"]
@@ -91,7 +91,7 @@ def test_travel_ends_a_run_that_no_contact_ends() -> None:
     scenario = malta.Scenario("far", 0.1, lambda _: malta.references.hold(p), fidelity="force")
     assert free_outputs(travelling) == (0,)
 
-    def push(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    def push(t: FloatArray) -> FloatArray:
         return np.full((len(t), 1), 10.0)
 
     pushed = replace(scenario, disturbance=push)
