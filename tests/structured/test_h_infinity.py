@@ -11,7 +11,7 @@ import pytest
 
 import malta
 from malta import structured
-from malta.structured import riccati
+from malta.structured.riccati import _stable_graph
 
 DOUBLE = [[0.0]], [[1.0, 0.0, 1.0]], [[1.0], [0.0], [1.0]], [[0, 0, 0], [0, 0, 1], [0, 1, 0]]
 
@@ -155,13 +155,13 @@ def test_the_sign_function_has_the_solution_of_the_schur_form(
     n = int(rng.integers(2, 12))
     A, B, C = rng.normal(size=(n, n)), rng.normal(size=(n, 2)), rng.normal(size=(2, n))
     H = np.vstack([np.hstack([A, -B @ B.T]), np.hstack([-C.T @ C, -A.T])])
-    X = riccati._stable_graph(H)
+    X = _stable_graph(H)
 
     def refuse(*_: object, **__: object) -> None:
         raise np.linalg.LinAlgError("Leading eigenvalues do not satisfy sort condition.")
 
-    monkeypatch.setattr(riccati.linalg, "schur", refuse)
-    other = riccati._stable_graph(H)
+    monkeypatch.setattr("malta.structured.riccati.linalg.schur", refuse)
+    other = _stable_graph(H)
     assert X is not None
     assert other is not None
     assert np.abs(X - other).max() < 1e3 * np.finfo(float).eps * np.linalg.cond(H) * np.abs(X).max()
