@@ -39,6 +39,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.loops.parametric_plants import uncertain as uncertain
     from malta.model.data import plant_of as plant_of, read as read
     from malta.model.equilibrium import trim as trim
+    from malta.model.inspection import inspect as inspect
     from malta.model.linear import linear_machine as linear_machine
     from malta.model.linearize import linearize as linearize
     from malta.model.machines import machine as machine
@@ -95,6 +96,7 @@ _NAMES = {
     "malta.loops.parametric_plants": "uncertain",
     "malta.model.data": "plant_of read",
     "malta.model.equilibrium": "trim",
+    "malta.model.inspection": "inspect",
     "malta.model.linear": "linear_machine",
     "malta.model.linearize": "linearize",
     "malta.model.machines": "machine",

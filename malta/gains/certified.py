@@ -210,6 +210,8 @@ def _of_other_loops(
         places, _ = travel_loops(plant, controller, names, stage)
         if tuple(p.name for p in claim.parameters) != places[0][0].names:
             return f"its parameters are not {' '.join(places[0][0].names)}, as in the loop of {gains}"
+        if why := places[0][0].approximate:
+            return f"nothing is proven of the loop of {gains} ({why})"
         wanted = loops_of(places)
     except (InputError, CheckError, NotAnalytic) as error:
         return f"no such loop can be made of {gains} ({error})"

@@ -23,6 +23,7 @@ from malta.linear.systems import from_source
 from malta.linear.uncertain import UncertainSystem
 from malta.loops.windings import WindingModel, with_windings
 from malta.model.equilibrium import with_command
+from malta.model.inspection import unproven
 from malta.model.linearize import is_commutated, jacobians, linearize
 from malta.model.parameters import shape_parameters, twins_of, units_of
 from malta.model.plant import Plant, position_in, symbolic
@@ -261,6 +262,7 @@ def of_plant(
     matrices = ca.Function("matrices", [p], [A, B, C])
     if short is None:
         matrices, positive = without_branches(matrices, nominal)
+    why = unproven(plant, tuple(x0.tolist())) or why
     return UncertainSystem(
         tuple(names), readonly(nominal), matrices, limits=limits, approximate=why, positive=positive
     )

@@ -25,6 +25,7 @@ from malta.errors import CheckError, InputError
 from malta.files import file_exists, locate, shipped_path
 from malta.model.checks import check_numbers, line_of
 from malta.model.equilibrium import check_values, is_checked, register
+from malta.model.inspection import require_readings
 from malta.model.machines import file_of, machine, machine_names, module_of, name_of
 from malta.model.parameters import check_range
 from malta.model.plant import Parameters, Plant
@@ -195,6 +196,7 @@ def _plant_of(parameters: Any) -> Plant:
     register(plant, build)
     if checked:
         check_values(plant)
+    require_readings(plant)
     return plant
 
 

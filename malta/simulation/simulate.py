@@ -31,6 +31,7 @@ from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.sampling import sample
 from malta.model.data import plant_of
+from malta.model.inspection import require_readings
 from malta.model.linearize import is_commutated
 from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant, place_states
@@ -374,6 +375,7 @@ def simulate(
         raise InputError("simulate", "controller", f"gains of a {believed.name}", f"gains of a {plant.name}")
     if not callable(engine) and engine not in get_args(EngineChoice):
         raise InputError("simulate", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
+    require_readings(plant)
     ready = prepare(plant, controller, scenario)
     simulation, inputs = ready.simulation, ready.inputs
     parts: list[FloatArray] = []

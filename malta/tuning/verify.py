@@ -22,6 +22,7 @@ from malta.margins.scheduled_loops import schedule_rate
 from malta.margins.travel import LoopAlong, worst_sensitivities
 from malta.margins.verify import linear_report, staged_report
 from malta.model.data import plant_of
+from malta.model.inspection import unproven
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import Parameters, Plant
 from malta.proof.margin import Progress, Ranges
@@ -215,8 +216,9 @@ def verify(
 
     Returns a LoopReport, which prints as a short table; its `figures` lists all figures of merit with their meaning.
 
-    Raises InputError for unknown parameters, and for what is no loop; CheckError when numbers overflow or no input
-    holds the machine. An unstable loop raises nothing: it is not `stable`, and its peak sensitivities are NaN.
+    Raises InputError for unknown parameters, and for what is no loop; CheckError when numbers overflow, no input holds
+    the machine, or its linear model at rest is not the machine's (`malta.inspect`). An unstable loop raises nothing: it
+    is not `stable`, and its peak sensitivities are NaN.
 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
@@ -248,6 +250,8 @@ def verify(
         sides: Mapping[str, Any] = uncertainty
         uncertainty = {name: tuple(side) if is_pair(side) else side for name, side in sides.items()}
     model, controller = _model_and_controller(loop, controller)
+    if why := unproven(model.plant, tuple(model.operating_point.x.tolist())):
+        raise CheckError(f"{model.plant.name}: its linear model is not the machine's: {why}")
     if not stages:
         box = uncertainty if proof else None
         return linear_report(model, controller, box, current_loops, time=time)
