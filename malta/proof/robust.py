@@ -519,9 +519,27 @@ def margin_of(problem: Problem, box: Box, effort: ProofEffort) -> Margin:
         found, ended = in_rounds(effort.limits, ask, rank_of)
     except KeyboardInterrupt as stop:
         raise Interrupted(_interrupted_margin(problem, box, standing, clock.monotonic() - begun)) from stop
+    idle = _idle(problem, box)
+    if found.lower and idle and len(idle) == int((box.down + box.up > 0).sum()):
+        return replace(
+            found, lower=None, upper=math.inf, certificate=(), reason=f"{IDLE_TEXT} {' '.join(idle)}"
+        )
     is_open = bool(found.reason) and found.reason not in (UNSTABLE_TEXT, problem.traits.approximate)
     reason = ended.explain(found.reason) if is_open else found.reason
-    return replace(found, seconds=clock.monotonic() - begun, work=ended.work, reason=reason)
+    return replace(found, seconds=clock.monotonic() - begun, work=ended.work, reason=reason, idle=idle)
+
+
+IDLE_TEXT = "the loop does not depend on"
+
+
+def _idle(problem: Problem, box: Box) -> tuple[str, ...]:
+    """The parameters of a box that grow and on which no matrix of the problem's loops depends."""
+    loops = [loop for loop in problem.loops if loop is not None]
+    if len(loops) < len(problem.loops) or not loops:
+        return ()
+    acting = frozenset[int]().union(*(own for loop in loops for own in loop.program.depends))
+    grows = box.down + box.up > 0
+    return tuple(name for k, name in enumerate(box.names) if grows[k] and k not in acting)
 
 
 def rank_of(found: Margin) -> float:
