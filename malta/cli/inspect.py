@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 def inspect(
     file: Annotated[
-        Path, typer.Argument(metavar="MACHINE", help="A machine: its module, data, a design or a gain file.")
+        Path,
+        typer.Argument(metavar="FILE", help="A machine's module, its data file, a design or a gain file."),
     ],
     machine_file: MachineFile = None,
     as_json: AsJson = False,

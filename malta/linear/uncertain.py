@@ -321,7 +321,7 @@ def open_systems(system: UncertainSystem, law: Compensator, p: FloatArray) -> tu
     return System(A, B, C, D), System(*difference_form(law), law.C, law.D)
 
 
-BESIDE = 1e-9  # of the way to the nominal parameters
+NUDGE = 1e-9  # of the way to the nominal parameters
 Sides = tuple["FloatArray", "FloatArray", "FloatArray", "FloatArray"]
 
 
@@ -336,7 +336,7 @@ def _plant(system: UncertainSystem, law: Compensator, p: bytes) -> Sides:
     try:
         A, B, C, D = system.explicit(places)
     except np.linalg.LinAlgError:  # a search meets a singular E, as at an end of its box: beside it
-        A, B, C, D = system.explicit(places + BESIDE * (system.nominal - places))
+        A, B, C, D = system.explicit(places + NUDGE * (system.nominal - places))
     rows, n, m = B.shape
     k, q = n if law.lag is None else n + m, C.shape[1]
     into, out, through = (np.zeros((rows, *shape)) for shape in ((k, 2 * m), (q + m, k), (q + m, 2 * m)))

@@ -25,7 +25,7 @@ from malta.model.signals import Signal
 from malta.units import is_unit_of
 
 KINK = 1e-3  # of a slope, by which those of both sides differ
-LEAST = 1e-6  # of the largest change of a row: smaller ones are rounding
+MIN_SHARE = 1e-6  # of the largest change of a row: smaller ones are rounding
 SIZES = (2.0, 1.0, 0.5, 0.25)  # of the steps to each side
 NOISES, ROOM_SHARE = 3.0, 1e-5  # steps: of the noise of a reading, of the room to the first contact
 RATE = 100.0  # 1/s, from the step of a position to that of its rate
@@ -33,7 +33,7 @@ PLACES, HALVINGS = 64, 12  # cells from rest to each end of a state, and how oft
 ROUNDING = 1e-9
 
 
-class Row(NamedTuple):
+class Observation(NamedTuple):
     """What was found of a part of a machine, what to have there, and whether nothing is proven because of it."""
 
     part: str
@@ -60,7 +60,7 @@ class Inspection:
     """
 
     machine: str
-    rows: tuple[Row, ...]
+    rows: tuple[Observation, ...]
     switches: tuple[str, ...]
 
     @property
@@ -90,7 +90,7 @@ def inspect(plant: Plant) -> Inspection:
     >>> import malta
     >>> malta.inspect(malta.read_design("examples/ball/design/ball.toml").plant)
     Machine 'ball': 1 to look at
-      actuator.currents  not the inverse of `forces` along q, by 103 % of the limit...
+      actuator.currents  not the inverse of `forces` along q, by 103 % of the lim...
       switch             q: none from -0.002 to 0.002 m
     """
     rows = [*_sensor_rows(plant), *_kink_rows(plant, plant.at().x), *_uncontrolled_rows(plant, plant.at().x)]
@@ -102,7 +102,8 @@ def inspect(plant: Plant) -> Inspection:
 def unproven(plant: Plant, at: tuple[float, ...]) -> str:
     """Why nothing is proven of a plant's linear model at the states `at`, in a sentence; "": it is the machine's."""
     x = np.array(at)
-    rows = (*_sensor_rows(plant), *_kink_rows(plant, x), *_uncontrolled_rows(plant, x))
+    with np.errstate(all="ignore"):  # of parameters beyond what can be computed, which linearization says
+        rows = (*_sensor_rows(plant), *_kink_rows(plant, x), *_uncontrolled_rows(plant, x))
     return next((str(row) for row in rows if row.unproven), "")
 
 
@@ -113,11 +114,11 @@ def require_readings(plant: Plant) -> None:
         raise InputError(plant.name, row.part, row.found, row.change)
 
 
-def _sensor_rows(plant: Plant) -> list[Row]:
+def _sensor_rows(plant: Plant) -> list[Observation]:
     """Readings that follow u at once, that are not 0 at 0, and positions that readings do not give back."""
     if has_feedthrough(plant):
         return [
-            Row(
+            Observation(
                 "h",
                 "y follows u at once",
                 "h(x) of states alone; a current that a sensor sees is a state",
@@ -133,10 +134,10 @@ def _sensor_rows(plant: Plant) -> list[Row]:
     if not (np.isfinite(at_rest).all() and np.isfinite(y).all()):
         return []
     for k, signal in enumerate(plant.outputs):
-        if abs(at_rest[k]) > LEAST * max(abs(y - at_rest).max(), abs(at_rest[k])) and at_rest[k]:
+        if abs(at_rest[k]) > MIN_SHARE * max(abs(y - at_rest).max(), abs(at_rest[k])) and at_rest[k]:
             offset = f"{at_rest[k]:.4g} {signal.unit}"
             found.append(
-                Row(
+                Observation(
                     "h",
                     f"h(0) is {offset} of {signal.name}",
                     "subtract it in h: laws take y = 0 at x = 0",
@@ -149,11 +150,11 @@ def _sensor_rows(plant: Plant) -> list[Row]:
     again = _read(plant, x)[0]  # of a state at rest
     twice = _read(plant, _place(plant, again))[0]
     off = np.abs(twice - again)
-    if (off > LEAST * np.abs(again).max()).any():
+    if (off > MIN_SHARE * np.abs(again).max()).any():
         k = int(off.argmax())
         signal = plant.outputs[k]
         words = f"h(position_of(y)) is {twice[k]:.4g} where {signal.name} is {again[k]:.4g} {signal.unit}"
-        found.append(Row("position_of", words, "the inverse of h at rest", True))
+        found.append(Observation("position_of", words, "the inverse of h at rest", True))
     return found
 
 
@@ -236,7 +237,7 @@ def _points(plant: Plant, x: FloatArray) -> list[tuple[bool, Any]]:
     return found
 
 
-def _kink_rows(plant: Plant, x: FloatArray) -> list[Row]:
+def _kink_rows(plant: Plant, x: FloatArray) -> list[Observation]:
     """A row for the first kink at rest."""
     for loaded, point in _points(plant, x):
         kink = _kink(plant, point, loaded)
@@ -245,7 +246,7 @@ def _kink_rows(plant: Plant, x: FloatArray) -> list[Row]:
                 ", ".join(f"{s.name} = {v:g}" for s, v in zip(plant.states, x, strict=True) if v) or "rest"
             )
             return [
-                Row(
+                Observation(
                     "f" if not loaded else "load",
                     f"a kink at {where}, {kink}",
                     "one slope there, or rest beside the switch",
@@ -276,12 +277,16 @@ def _kink(plant: Plant, point: Any, loaded: bool) -> Kink | None:
     coarse, fine = (np.tensordot(weights, jump[k : k + 3], 1) for k in (0, 1))
     size = np.maximum(np.abs(right[-1]), np.abs(left[-1]))
     ratio = np.divide(fine, coarse, out=np.zeros_like(fine), where=coarse != 0)
-    is_kink = (
-        (np.abs(fine) > KINK * size) & (np.abs(fine) > LEAST * size.max(axis=0)) & (ratio > 0.3) & (ratio < 3)
+    steep = [np.diff(side, axis=0) for side in (right, left)]  # of a jump or a root they grow as steps shrink
+    grows = np.any(
+        [(d[2] * d[1] > 0) & (d[1] * d[0] > 0) & (np.abs(d[2]) > np.abs(d[0])) for d in steep], axis=0
     )
+    growth = np.maximum(np.abs(steep[0][2]), np.abs(steep[1][2])) * grows
+    least = np.maximum(KINK * size, MIN_SHARE * size.max(axis=0))
+    is_kink = (np.abs(fine) > least) & (ratio > 0.3) & (ratio < 3) | (growth > least)
     if not is_kink.any():
         return None
-    sharp = np.where(is_kink, np.abs(fine) / np.maximum(size, 1e-300), 0)
+    sharp = np.where(is_kink, np.maximum(np.abs(fine), growth) / np.maximum(size, 1e-300), 0)
     sharp[len(moving) :] *= KINK**2  # one signal is named rather than several
     d, k = np.unravel_index(int(sharp.argmax()), fine.shape)
     names = [s.name for s in (*plant.states, *plant.outputs, *plant.inputs)]
@@ -380,7 +385,7 @@ def _switch_towards(plant: Plant, at: tuple[bool, Any], k: int, end: float) -> l
     return []
 
 
-def _uncontrolled_rows(plant: Plant, x: FloatArray) -> list[Row]:
+def _uncontrolled_rows(plant: Plant, x: FloatArray) -> list[Observation]:
     """States that were left out, that the motion or an input reaches, and that act back on the motion."""
     keep = list(plant.controlled)
     out = [k for k in range(len(plant.states)) if k not in keep]
@@ -396,7 +401,7 @@ def _uncontrolled_rows(plant: Plant, x: FloatArray) -> list[Row]:
         if back.any():
             name = plant.states[out[int(back.argmax())]].name
             return [
-                Row(
+                Observation(
                     "uncontrolled",
                     f"{name} is moved by what is controlled and acts back on it",
                     f"{name} among the controlled states",
@@ -406,7 +411,7 @@ def _uncontrolled_rows(plant: Plant, x: FloatArray) -> list[Row]:
     return []
 
 
-def _inverse_rows(plant: Plant) -> list[Row]:
+def _inverse_rows(plant: Plant) -> list[Observation]:
     """Currents that do not make the forces that are commanded."""
     if plant.actuator.tabulated:
         return []
@@ -415,10 +420,10 @@ def _inverse_rows(plant: Plant) -> list[Row]:
     if check.exact:
         return []
     words = f"not the inverse of `forces` along {worst.state.name}, by {100 * worst.share:.3g} % of the limit"
-    return [Row("actuator.currents", words, "right where that is meant; `Plant.check` says where")]
+    return [Observation("actuator.currents", words, "right where that is meant; `Plant.check` says where")]
 
 
-def _unit_rows(plant: Plant) -> list[Row]:
+def _unit_rows(plant: Plant) -> list[Observation]:
     """Units that malta does not know, and rates whose unit is not that of their position per second."""
     groups = {
         "states": plant.states,
@@ -430,7 +435,7 @@ def _unit_rows(plant: Plant) -> list[Row]:
         s.unit: (group, s.name) for group, of in groups.items() for s in of if not is_unit_of(s.unit, s.unit)
     }
     found = [
-        Row(group, f"malta does not know the unit {unit!r} of {name}", "a unit as N m or rad/s")
+        Observation(group, f"malta does not know the unit {unit!r} of {name}", "a unit as N m or rad/s")
         for unit, (group, name) in strange.items()
     ]
     if plant.second_order:
@@ -438,7 +443,7 @@ def _unit_rows(plant: Plant) -> list[Row]:
         for q, rate in zip(plant.states[:half], plant.states[half:], strict=True):
             if q.unit != "1" and not is_unit_of(rate.unit, f"{q.unit}/s"):
                 found.append(
-                    Row(
+                    Observation(
                         "states",
                         f"{rate.name} in {rate.unit}, the rate of {q.name} in {q.unit}",
                         f"{q.unit}/s",
@@ -452,7 +457,7 @@ def _unit_rows(plant: Plant) -> list[Row]:
         if len(only) == 1 and abs(abs(row[only[0]]) - 1) < ROUNDING and y.unit != plant.states[only[0]].unit:
             s = plant.states[only[0]]
             found.append(
-                Row(
+                Observation(
                     "outputs",
                     f"{y.name} in {y.unit} shows {s.name} in {s.unit} one to one",
                     "one of the two units",
@@ -461,9 +466,9 @@ def _unit_rows(plant: Plant) -> list[Row]:
     return found
 
 
-def _idle_rows(plant: Plant) -> list[Row]:
+def _idle_rows(plant: Plant) -> list[Observation]:
     """Arguments and parameters on which nothing of the machine depends."""
-    found, own = list[Row](), units_of(plant.parameters)
+    found, own = list[Observation](), units_of(plant.parameters)
     known = plant.actuator.electronics is None  # which may use any, in functions that only simulations call
     before = _fingerprint(plant) if known else ()
     for field in fields(plant.parameters) if known else ():
@@ -477,7 +482,7 @@ def _idle_rows(plant: Plant) -> list[Row]:
                 continue
             if after == before:
                 found.append(
-                    Row(
+                    Observation(
                         "parameters",
                         f"{field.name} changes nothing of the machine",
                         "leave it out, or let it act",
@@ -487,7 +492,7 @@ def _idle_rows(plant: Plant) -> list[Row]:
     return found + _idle_arguments(plant)
 
 
-def _idle_arguments(plant: Plant) -> list[Row]:
+def _idle_arguments(plant: Plant) -> list[Observation]:
     """Inputs, disturbances, coils and states of which nothing depends."""
     x, u, w, i = _symbols(plant)
     rate = ca.vertcat(plant.f(x, u, w))
@@ -506,7 +511,7 @@ def _idle_arguments(plant: Plant) -> list[Row]:
             if ca.vertcat(one).numel() and isinstance(one, ca.SX | ca.MX):
                 acts |= np.array(ca.which_depends(ca.vertcat(one), symbol, 1, False), dtype=bool)
         found += [
-            Row(part, f"nothing depends on {s.name}", "leave it out, or let it act")
+            Observation(part, f"nothing depends on {s.name}", "leave it out, or let it act")
             for s, acting in zip(signals, acts, strict=True)
             if not acting
         ]

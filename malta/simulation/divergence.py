@@ -57,6 +57,8 @@ def rooms_of(run: Simulation, inputs: Inputs) -> FloatArray:
 def used_rooms(plant: Plant, p: Any, p_ref: Any, rooms: Any) -> Any:
     """The shares of their rooms that outputs take, 1 and more: diverged. Columns of CasADi, or rows of numpy."""
     free = list(free_outputs(plant))
+    if not free and not isinstance(p, np.ndarray):
+        return ca.SX(0, 1)
     if isinstance(p, np.ndarray):
         used = [np.abs(p[:, free] - p_ref[:, free]), np.abs(p[:, [plant.leading_output] * strokes(plant)])]
         return np.hstack(used) * rooms
