@@ -6,6 +6,7 @@ This folder shares no code with the search that found the margin, and trusts no 
 becomes unstable over a connected box only where its characteristic polynomial a(s; p) has a zero s = jw, w = infinity
 among them. So for every loop and every group of states (`loop`)
 
+0. the machine has the rest whose matrices these are, within its limits, on all of box(lower),
 1. the nominal loop is stable, by Routh's scheme,
 2. the cells of the certificate tile all frequencies x box(lower), 1 / w for the high ones,
 3. the coefficients a_k, as functions of the parameters v (p or 1 / p) over a part of the box, are enclosed by
@@ -25,12 +26,13 @@ from typing import Any
 
 from flint import acb, arb, arb_mat, arb_poly, ctx, fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 
-from .file import AxisEnclosure, Document, StabilityClaim, StatedPart, double, inside, read
-from .loop import CheckedPolynomial, Refused, split
+from .file import AxisEnclosure, Document, StabilityClaim, StatedConditions, StatedPart, double, inside, read
+from .loop import STEPS, CheckedPolynomial, Refused, split
 
 BITS = 256  # of the coefficients; cells need fewer
 CELL_BITS = 160
 MOST_NODES = 12_500
+MOST_CONDITION_PARTS = 4096  # of the box, on which conditions are looked at
 
 Box = Sequence[tuple[Any, Any]]
 
@@ -98,6 +100,9 @@ def _proofs(document: Document, until: float) -> tuple[list[str], list[str]]:
         for k, loop in enumerate(document.loops):
             name = where = f"loop {k + 1}" if len(document.loops) > 1 else "loop"
             try:
+                require_conditions(
+                    loop.conditions, [p.sides(document.claim.lower) for p in document.claim.parameters]
+                )
                 for n, polynomial in enumerate(split(loop, until)):
                     where = f"{name}, group {n + 1}"
                     lines.append(f"{where}: {proven(document.claim, polynomial, until)}")
@@ -106,6 +111,35 @@ def _proofs(document: Document, until: float) -> tuple[list[str], list[str]]:
     finally:
         ctx.prec = before
     return lines, failures
+
+
+def require_conditions(conditions: StatedConditions, box: Box) -> None:
+    """Refuse a loop whose conditions are not above zero on the box, cut into parts where that is needed."""
+    ctx.prec = CELL_BITS
+    todo, count = [list(box)], 0
+    while todo and conditions.above:
+        own = todo.pop()
+        cells: list[Any] = []
+        for name, target, on, value in conditions.steps:
+            if name in ("input", "const"):
+                low, high = own[target] if name == "input" else (value, value)
+                cells.append(arb((low + high) / 2, arb((high - low) / 2)))
+            else:
+                cells.append(
+                    cells[on[0]] ** int(value.p)
+                    if name == "constpow"
+                    else STEPS[name](*(cells[i] for i in on))
+                )
+        if all(cells[k] > 0 for k in conditions.above):
+            continue
+        count += 1
+        widths = [(b - a) / max(abs(a), abs(b)) if b > a else fmpq(0) for a, b in own]
+        axis = widths.index(max(widths))
+        if count > MOST_CONDITION_PARTS or not widths[axis]:
+            raise Refused("the machine is not shown to have a rest within its limits on the box")
+        low, high = own[axis]
+        for half in ((low, (low + high) / 2), ((low + high) / 2, high)):
+            todo.append([*own[:axis], half, *own[axis + 1 :]])
 
 
 def proven(claim: StabilityClaim, f: CheckedPolynomial, until: float) -> str:

@@ -15,7 +15,8 @@ from typing import Any
 
 from flint import fmpq
 
-FORMAT, VERSION = "malta margin certificate", 2
+FORMAT, VERSION = "malta margin certificate", 3
+OLD_VERSIONS = (1, 2)  # 1 named no machine and no travel, 2 left out what loads the machine
 MAX_BYTES = 4_000_000  # bytes of a certificate
 STAGES = ("lag", "pi")  # of current loops: first-order lags, or the sampled PI controllers of the gain file
 MAX_NAME_LENGTH = 100  # characters of a name
@@ -130,18 +131,30 @@ class StatedGroup:
         return (*self.states, *(n + i for i in self.own))
 
 
+Steps = tuple[tuple[str, int, tuple[int, ...], Any], ...]
+
+
+@dataclass(frozen=True)
+class StatedConditions:
+    """Steps of p, and those of them that are above zero where the matrices are those of the machine."""
+
+    steps: Steps
+    above: tuple[int, ...]
+
+
 @dataclass(frozen=True)
 class StatedLoop:
     """E x' = A x + B u (x+ where discrete), y = C x, u = F y after hold, delay (samples) and lag (rad/s)."""
 
     states: int
-    steps: tuple[tuple[str, int, tuple[int, ...], Any], ...]
+    steps: Steps
     entries: tuple[tuple[tuple[int, int, int], ...], ...]  # of A, B, C, E: row, column, step; E diagonal or I
     law: tuple[list[list[Any]], ...]  # A, B, C, D
     sample_time: Any
     discrete: bool
     delay: int
     lag: Any
+    conditions: StatedConditions
     units: tuple[int, ...]  # log2 of sizes of the states, in which small couplings are bounded
     groups: tuple[StatedGroup, ...]
 
@@ -292,6 +305,10 @@ def step(f: DocumentValue, k: int, inputs: int) -> tuple[str, int, tuple[int, ..
     return name.value, target.whole(0, inputs - 1 if name.value == "input" else 0), operands, value
 
 
+def program(f: DocumentValue, inputs: int) -> Steps:
+    return tuple(step(x, k, inputs) for k, x in enumerate(f.items(0, 20_000)))
+
+
 def entries(f: DocumentValue, rows: int, columns: int, steps: int) -> tuple[tuple[int, int, int], ...]:
     found = {}
     for row in f.items(0, rows * columns):
@@ -302,7 +319,9 @@ def entries(f: DocumentValue, rows: int, columns: int, steps: int) -> tuple[tupl
 
 def loop(f: DocumentValue, inputs: int) -> StatedLoop:
     n, m, p = (x.whole(1, 60) for x in f["shape"].items(3))
-    steps = tuple(step(x, k, inputs) for k, x in enumerate(f["steps"].items(0, 20_000)))
+    steps = program(f["steps"], inputs)
+    made = program(f["conditions"]["steps"], inputs)
+    above = tuple(x.whole(0, len(made) - 1) for x in f["conditions"]["above"].items(0, 1000))
     shapes = {"A": (n, n), "B": (n, m), "C": (p, n)} | ({"E": (n, n)} if "E" in f.value else {})
     matrices = [entries(f[key], *shape, len(steps)) for key, shape in shapes.items()]
     matrices += [()] * (4 - len(matrices))
@@ -319,7 +338,7 @@ def loop(f: DocumentValue, inputs: int) -> StatedLoop:
     return StatedLoop(
         n, steps, tuple(matrices),
         tuple(law[key].matrix(*at) for key, at in (("A", (k, k)), ("B", (k, p)), ("C", (m, k)), ("D", (m, p)))),
-        T, discrete, f["delay"].whole(0, 20 if T is not None else 0), lag, units, groups,
+        T, discrete, f["delay"].whole(0, 20 if T is not None else 0), lag, StatedConditions(made, above), units, groups,
     )  # fmt: skip
 
 
@@ -372,6 +391,11 @@ def content_of(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise Unreadable(path, "", f"no JSON ({str(error)[:80]})", "a certificate") from error
     f = DocumentValue(path, "", content)
+    if f["format"].value == FORMAT and f["version"].value in OLD_VERSIONS:
+        found = f"{f['version'].value}, of a machine without its loads"
+        raise Unreadable(
+            path, "version", found, f"{VERSION}: `malta verify GAINS --certificate` writes it anew"
+        )
     if f["format"].value != FORMAT or f["version"].value != VERSION:
         raise f["version"].wrong(f"{FORMAT}, version {VERSION}")
     assert isinstance(content, dict)

@@ -7,7 +7,7 @@ Boxes are compared as exact numbers, loops to the last digit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -33,6 +33,7 @@ from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import content_sha256
 from malta.gains.file import UNCOMPARED_TABLES, content_of, read
 from malta.linear.expressions import NotAnalytic, exact
+from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.windings import CurrentLoops, chosen_loops
 from malta.margins.travel import ENDS, extent_of, travel_loops
@@ -40,7 +41,7 @@ from malta.model.data import plant_of, published_figures
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
 from malta.proof.box import box_of, sides_of
-from malta.proof.certificate import LoopOrigin, loops_of, refused_as_input
+from malta.proof.certificate import DERIVED_UNIT, LoopOrigin, loops_of, refused_as_input
 from malta.proof.margin import Ranges
 from malta.synthesis.controller import Controller
 
@@ -119,12 +120,32 @@ def disagreement(
         return f"it is of matrices alone and names no machine, expected that of {gains}"
     stage = cast("CurrentLoops", claim.origin.current_loops)
     own = origin_of(path, plant, controller, LAST_STAGE, len(document.loops))
+    if different := _of_another(claim, own, controller, str(gains)):
+        return different
+    places = _loops_of(claim, plant, controller, stage)
+    if isinstance(places, str):
+        return f"no such loop can be made of {gains} ({places})"
+    system = places[0][0]
     return (
-        _of_another(claim, own, controller, str(gains))
-        or _of_other_values(claim, plant, own.units, str(gains))
-        or _less(claim, plant, ranges, own, str(gains))
-        or _of_other_loops(document, plant, controller, stage, str(gains))
+        _of_other_values(claim, plant, own, system, str(gains))
+        or _less(claim, plant, ranges, own, system, str(gains))
+        or _of_other_loops(document, places, str(gains))
     )
+
+
+def _loops_of(
+    claim: StabilityClaim, plant: Plant, controller: Controller, stage: CurrentLoops
+) -> list[tuple[UncertainSystem, Compensator]] | str:
+    """The loops of the gain file in the parameters of the claim; or why there are none."""
+    still = {p.name for p in claim.parameters if not (p.down or p.up)}
+    along = {plant.stroke.name, *(name for name in plant.over if name in still)}
+    names = tuple(
+        p.name for p in claim.parameters if p.name in units_of(plant.parameters) and p.name not in along
+    )
+    try:
+        return travel_loops(plant, controller, names, stage)[0]
+    except (InputError, CheckError, NotAnalytic) as error:
+        return str(error)
 
 
 def _of_another(claim: StabilityClaim, own: LoopOrigin, controller: Controller, gains: str) -> str:
@@ -155,62 +176,64 @@ def _places_text(places: StatedPlaces | None) -> str:
     return f"{places.name} = {', '.join(repr(double(x)) for x in places.at)} {places.unit}"
 
 
-def _of_other_values(claim: StabilityClaim, plant: Plant, units: Mapping[str, str], gains: str) -> str:
-    """Whether each parameter is one of the machine, in its unit and about its value."""
+def _of_other_values(
+    claim: StabilityClaim, plant: Plant, own: LoopOrigin, system: UncertainSystem, gains: str
+) -> str:
+    """Whether each parameter is one of the loop, in its unit and about its value."""
+    units = _units_in(own, system)
     for p in claim.parameters:
         if p.name not in units or (p.name == plant.stroke.name and claim.places is not None):
             return f"{p.name} is no parameter of the loop of {gains}"
         if p.unit != units[p.name]:
             return f"the unit of {p.name} is {p.unit}, that of {gains} is {units[p.name]}"
-        nominal = _nominal(plant, p.name)
+        nominal = _nominal(plant, system, p.name)
         if p.nominal != exact(nominal):
             return f"the nominal {p.name} is {double(p.nominal)!r} {p.unit}, that of {gains} is {nominal!r}"
     return ""
 
 
-def _less(claim: StabilityClaim, plant: Plant, ranges: Ranges, own: LoopOrigin, gains: str) -> str:
+def _less(
+    claim: StabilityClaim, plant: Plant, ranges: Ranges, own: LoopOrigin, system: UncertainSystem, gains: str
+) -> str:
     """Whether the box at `lower` covers the uncertainty that many times, and the travel."""
     names = tuple(name for name in units_of(plant.parameters))
     extent = extent_of(plant, ranges)
-    nominal = np.array([_nominal(plant, name) for name in names])
+    nominal = np.array([_nominal(plant, system, name) for name in names])
     box_of(names, nominal, (), ranges, extent.over, caller="check")  # which says what is wrong with a range
     given: dict[str, StatedParameter] = {p.name: p for p in claim.parameters}
-    intervals = dict(extent.over) if own.places else extent.intervals
+    intervals = system.spread(dict(extent.over) if own.places else extent.intervals)
+    units = _units_in(own, system)
     for name, value in (*ranges.items(), *intervals.items()):
-        low, high = sides_of(_nominal(plant, name), value)
+        low, high = sides_of(_nominal(plant, system, name), value)
         at = f"at {at_least(double(claim.lower)).percent()} of the uncertainty"
         if name not in intervals:
-            middle = exact(_nominal(plant, name))
+            middle = exact(_nominal(plant, system, name))
             low, high = middle - claim.lower * (middle - low), middle + claim.lower * (high - middle)
         if name not in given:
             return (
-                f"{name} is not among its parameters, and {gains} has it from {_ends(low, high, own, name)}"
+                f"{name} is not among its parameters, and {gains} has it from {_ends(low, high, units[name])}"
             )
         first, last = given[name].sides(claim.lower)
         if not (first <= low and high <= last):
             what = "travel" if name == plant.stroke.name else "box"
-            found, wanted = _ends(first, last, own, name), _ends(low, high, own, name)
+            found, wanted = _ends(first, last, units[name]), _ends(low, high, units[name])
             return f"its {what} is too small: {name} from {found} {at}, that of {gains} from {wanted}"
     return ""
 
 
-def _ends(low: Any, high: Any, own: LoopOrigin, name: str) -> str:
-    return f"{double(low):.7g} to {double(high):.7g} {own.units[name]}".removesuffix(" 1")
+def _ends(low: Any, high: Any, unit: str) -> str:
+    return f"{double(low):.7g} to {double(high):.7g} {unit}".removesuffix(" 1")
 
 
 def _of_other_loops(
-    document: Document, plant: Plant, controller: Controller, stage: CurrentLoops, gains: str
+    document: Document, places: Sequence[tuple[UncertainSystem, Compensator]], gains: str
 ) -> str:
     """Whether the loops are those that the gain file's law closes on its machine, to the last digit."""
-    claim = document.claim
-    still = {p.name for p in claim.parameters if not (p.down or p.up)}
-    along = {plant.stroke.name, *(name for name in plant.over if name in still)}
-    names = tuple(p.name for p in claim.parameters if p.name not in along)
+    names = tuple(p.name for p in document.claim.parameters)
+    if names != places[0][0].names:
+        return f"its parameters are not {' '.join(places[0][0].names)}, as in the loop of {gains}"
     try:
-        places, _ = travel_loops(plant, controller, names, stage)
-        if tuple(p.name for p in claim.parameters) != places[0][0].names:
-            return f"its parameters are not {' '.join(places[0][0].names)}, as in the loop of {gains}"
-        if why := places[0][0].approximate:
+        if why := next((system.approximate for system, _ in places if system.approximate), ""):
             return f"nothing is proven of the loop of {gains} ({why})"
         wanted = loops_of(places)
     except (InputError, CheckError, NotAnalytic) as error:
@@ -224,6 +247,14 @@ def _bare(loop: StatedLoop) -> StatedLoop:
     return replace(loop, units=(), groups=())
 
 
-def _nominal(plant: Plant, name: str) -> float:
-    """The value of a parameter of the machine, SI; 0 for the position along the travel."""
-    return 0.0 if name == plant.stroke.name else float(getattr(plant.parameters, name))
+def _units_in(own: LoopOrigin, system: UncertainSystem) -> dict[str, str]:
+    """The units of the parameters of a loop."""
+    derived = () if system.derived is None else system.derived.intervals
+    return {**own.units, **dict.fromkeys(derived, DERIVED_UNIT)}
+
+
+def _nominal(plant: Plant, system: UncertainSystem, name: str) -> float:
+    """The value of a parameter of the loop, SI; else of one of the machine."""
+    if name in system.names:
+        return float(system.nominal[system.names.index(name)])
+    return float(getattr(plant.parameters, name))

@@ -6,7 +6,7 @@ u = H F y                                 a control law F, and the lag, hold and
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -20,6 +20,8 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError, require_known
 from malta.linear.sampling import add_lags, delay_inputs, sample
 from malta.linear.system import System
+
+DOMAIN_END_TEXT = "a root or a branch of the model ends"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,19 @@ class StateGroup:
 
 
 @dataclass(frozen=True, eq=False)
+class Derived:
+    """Parameters that are functions of another one, whose values a proof takes apart: any within their intervals."""
+
+    of: str  # the parameter that they follow
+    values: Callable[[float], FloatArray]
+    intervals: Mapping[str, tuple[float, float]]  # by name, over the whole range of that parameter
+
+    def at(self, value: float) -> dict[str, float]:
+        """Their values by name."""
+        return dict(zip(self.intervals, self.values(value).tolist(), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
 class UncertainSystem:
     """A linear system in parameters by name: E(p) x' = A(p) x + B(p) u, y = C(p) x + D(p) u.
 
@@ -45,6 +60,8 @@ class UncertainSystem:
     sample_time : s, of a discrete system, with x+ in place of x'; None: continuous
     approximate : why the matrices are no exact functions, so that nothing is proven of them; "": they are
     positive : a casadi.Function p -> values that are above zero wherever `matrices` hold; None: they hold everywhere
+    ends : what happens where each of these is not, in words
+    derived : the last parameters, where these follow another one
 
     >>> import malta
     >>> def motor(J, b):
@@ -62,6 +79,13 @@ class UncertainSystem:
     sample_time: float | None = None
     approximate: str = ""
     positive: ca.Function | None = None
+    ends: tuple[str, ...] = ()
+    derived: Derived | None = None
+
+    def spread(self, over: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+        """The intervals `over`, with those of the parameters that follow one of them."""
+        more = self.derived.intervals if self.derived is not None and self.derived.of in over else {}
+        return {**more, **over}
 
     def at(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """A, B and C at k rows of parameters: arrays of k matrices each.

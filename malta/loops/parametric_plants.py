@@ -18,170 +18,18 @@ from malta.errors import InputError, require_known
 from malta.linear import rational
 from malta.linear.branches import without_branches
 from malta.linear.expressions import NotAnalytic, program
-from malta.linear.rational import Ratio, Symbolic, TooLarge, symbolic as rational_functions
+from malta.linear.rational import Ratio, TooLarge
 from malta.linear.systems import from_source
-from malta.linear.uncertain import UncertainSystem
+from malta.linear.uncertain import DOMAIN_END_TEXT, UncertainSystem
+from malta.loops.rest import Condition, Formula, command_of, limits_at_rest, rest_of
 from malta.loops.windings import WindingModel, with_windings
-from malta.model.equilibrium import with_command
+from malta.model.equilibrium import balance, with_command
 from malta.model.inspection import unproven
 from malta.model.linearize import is_commutated, jacobians, linearize
 from malta.model.parameters import shape_parameters, twins_of, units_of
-from malta.model.plant import Plant, position_in, symbolic
+from malta.model.plant import Plant, position_at, position_in, symbolic
 from malta.model.sensors import Sensors, with_lags
 from malta.work import check_clock
-
-# The command at which a machine's preload acts, as a function of its parameters.
-#
-#     forces(x, currents(h(x), v)) = preload(x)
-#
-# defines v implicitly. A proof needs it exactly: a model at another command is a model of another machine. It is exact
-#
-#   * where a command of the preload, or of zero, makes the preload, as in most machines,
-#   * where the forces are affine in v, as those of a commutation with other parameters,
-#   * where, with squares of roots resolved, each is a polynomial of degree 2 in a command of its own, or all are
-#     affine.
-#
-# Elsewhere v comes from a fixed number of Newton steps, which is good enough to search for unstable machines and not
-# for a proof: an operation that no enclosure knows keeps every proof away from such a model.
-
-
-MAX_FORCE_OPERATIONS = 5_000  # operations up to which the forces are expanded
-NEWTON_STEPS = 8
-COMMAND_TOLERANCE = 1e-6  # of the command, between its formula and the nominal one
-INEXACT_COMMAND = "the command that makes the preload is no formula of the parameters"
-
-
-class CommandExpression(NamedTuple):
-    """The command as an expression; `why` says why it is not exact, "" where it is."""
-
-    v: Any
-    why: str = ""
-
-
-def is_affine(made: Any, v: Any) -> bool:
-    """Whether an expression is affine in v, by its structure."""
-    return not any(ca.which_depends(ca.vec(made), v, 2, False))
-
-
-def command_of(
-    chain: ca.Function, p: Any, acting: Any, nominal: FloatArray, wanted: FloatArray
-) -> CommandExpression:
-    """Find v with chain(p, v) = acting as a function of p.
-
-    chain : (p, v) -> inputs that the currents of v make
-    acting : the inputs that shall act, an expression of p
-    nominal : values of p
-    wanted : v at these, which chooses between the solutions
-    """
-    q = ca.SX.sym("v", chain.size1_in(1))
-    made = chain(p, q)
-    left = _simplify(acting - chain(p, acting), p)
-    none = ca.SX.zeros(q.numel())
-    for v, rest in ((acting, left), (none, _simplify(acting - chain(p, none), p))):
-        if rest.is_zero() and _is_near(v, p, nominal, wanted):
-            return CommandExpression(v)
-    if is_affine(made, q):
-        slope, start = ca.substitute([ca.jacobian(made, q), made], [q], [none])
-        return CommandExpression(acting + ca.solve(slope, acting - start - slope @ acting))
-    both = ca.Function("both", [ca.vertcat(p, q)], [ca.densify(made - acting), ca.densify(left)])
-    if both.n_instructions() <= MAX_FORCE_OPERATIONS:
-        try:
-            v = _exact_command(rational_functions(program(both)), p, acting, wanted, nominal)
-        except (TooLarge, NotAnalytic, ZeroDivisionError):
-            v = None
-        if v is not None and _is_near(v, p, nominal, wanted):
-            return CommandExpression(v)
-    return CommandExpression(_newton(chain, p, acting, wanted), INEXACT_COMMAND)
-
-
-def _simplify(expression: Any, p: Any) -> Any:
-    """The expression built again from its common subexpressions, where equal terms cancel."""
-    return ca.SX(ca.Function("left", [p], [ca.cse(ca.densify(expression))])(p))
-
-
-def _is_near(v: Any, p: Any, nominal: FloatArray, wanted: FloatArray) -> bool:
-    found = np.array(ca.Function("v", [p], [ca.densify(v)])(nominal)).ravel()
-    return bool(np.abs(found - wanted).max() <= COMMAND_TOLERANCE * np.abs(wanted).max())
-
-
-def _newton(chain: ca.Function, p: Any, acting: Any, wanted: FloatArray) -> Any:
-    """Steps of Newton's method from the nominal command. No enclosure knows copysign(v, v) = v: nothing is proven."""
-    q = ca.SX.sym("v", len(wanted))
-    made = chain(p, q)
-    step = ca.Function("step", [p, q], [q - ca.solve(ca.jacobian(made, q), made - acting)])
-    v = ca.SX(ca.DM(wanted))
-    for _ in range(NEWTON_STEPS):
-        v = step(p, v)
-        v = ca.copysign(v, v)
-    return v
-
-
-def _exact_command(s: Symbolic, p: Any, acting: Any, wanted: FloatArray, nominal: FloatArray) -> Any | None:
-    """The command from the exact rational equations; None where they have no such form."""
-    equations, left = s.entries
-    m, first = len(wanted), p.numel()
-    zero = Ratio(s.context.constant(0))
-    if all(_resolve_roots(s, r).is_zero() for r in left.values()):
-        return acting
-    polynomials = [_resolve_roots(s, equations.get((i, 0), zero)).num for i in range(m)]
-    if any(any(monomial[s.inputs :]) for n in polynomials for monomial in n.monoms()):
-        return None  # a sine, or a root that no square resolves
-    powers = [
-        [tuple(int(e) for e in monomial[first : first + m]) for monomial in n.monoms()] for n in polynomials
-    ]
-    if all(sum(e) <= 1 for one in powers for e in one):
-        matrix, right = {}, {}
-        for i, n in enumerate(polynomials):
-            for power, c in _coefficients(s, n, first, m).items():
-                if sum(power):
-                    matrix[i, power.index(1)] = c
-                else:
-                    right[i] = -c
-        return ca.vertcat(*(rational.expression(r, p) for r in rational.solution(s, matrix, right, m)))
-    own = [all(not any(e[:i] + e[i + 1 :]) and e[i] <= 2 for e in one) for i, one in enumerate(powers)]
-    if not all(own):
-        return None
-    roots = []
-    for i, n in enumerate(polynomials):
-        by_power = {power[i]: c for power, c in _coefficients(s, n, first, m).items()}
-        terms = [rational.expression(by_power[k], p) if k in by_power else ca.SX(0) for k in range(3)]
-        roots.append(_root(terms, p, nominal, float(wanted[i])))
-    return ca.vertcat(*roots)
-
-
-def _root(terms: list[Any], p: Any, nominal: FloatArray, wanted: float) -> Any:
-    """The root of c + b v + a v^2 that is the wanted one at the nominal values, as a formula.
-
-    It is continuous in p while its root is real and its divisor is not zero, and so stays on its branch.
-    """
-    c, b, a = terms
-    if a.is_zero():
-        return -c / b
-    values = ca.Function("terms", [p], [b])
-    sign = 1.0 if float(values(nominal)) >= 0 else -1.0
-    far = -(b + sign * ca.sqrt(b**2 - 4 * a * c)) / 2
-    near_root, far_root = c / far, far / a
-    both = [float(ca.Function("root", [p], [r])(nominal)) for r in (near_root, far_root)]
-    return near_root if abs(both[0] - wanted) <= abs(both[1] - wanted) else far_root
-
-
-def _coefficients(s: Symbolic, polynomial: Any, first: int, m: int) -> dict[tuple[int, ...], Ratio]:
-    """The coefficients of powers of v in a polynomial of (p, v)."""
-    parts: dict[tuple[int, ...], dict[Any, Any]] = {}
-    for monomial, c in polynomial.to_dict().items():
-        power = tuple(int(e) for e in monomial[first : first + m])
-        rest = tuple(0 if first <= k < first + m else e for k, e in enumerate(monomial))
-        parts.setdefault(power, {})[rest] = c
-    return {power: Ratio(s.context.from_dict(terms)) for power, terms in parts.items()}
-
-
-def _resolve_roots(s: Symbolic, r: Ratio) -> Ratio:
-    """The ratio with squares of roots replaced by what the roots are of."""
-    steps = [s.program.steps[step] for step in s.atoms]
-    is_root = (name == "sqrt" or (name == "constpow" and power == 0.5) for name, _, _, power in steps)
-    roots = {s.inputs + k: s.arguments[k] for k, root in enumerate(is_root) if root}
-    return rational.replace_squares(s, r, roots)
-
 
 MAX_MODEL_OPERATIONS = 20_000  # operations up to which a model is expanded
 
@@ -196,8 +44,12 @@ def of_plant(
     held: FloatArray | None = None,
     late: bool = False,
     windings: WindingModel | None = None,
+    loaded: bool = True,
 ) -> UncertainSystem:
-    """The design model of a plant at a position, in parameters by name, where its preload acts at every value of them.
+    """The linear model of a plant at rest at a position under its loads, in parameters by name.
+
+    At every value of them states, inputs and commands are those that hold the machine there (see rest.py): what the
+    position leaves open is solved for. The system ends where a current, a force or the balance itself comes to its end.
 
     names : parameters; the stroke itself may be one of them, with the position as its nominal value
     at : the states that are not zero, SI
@@ -207,9 +59,10 @@ def of_plant(
         is a further input when the parameters change its gain
     late : whether the outputs are read behind the lags of the plant's sensors, as further states
     windings : these are states, too: inputs are their voltages, and their currents are further outputs (windings.py)
+    loaded : False: the design model, in which the preload acts in place of the loads
 
     The inputs are commanded forces: the controller commutates with its own parameters, and the currents produce forces
-    with the plant's parameters. The command at which the preload acts is a function of the parameters (see below);
+    with the plant's parameters. What holds the machine is a function of the parameters;
     where it is none that a proof could use, the system says so (`approximate`).
 
     Raises InputError for unknown names and for parameters that set the size of the model.
@@ -222,28 +75,33 @@ def of_plant(
     x0 = plant.at(**(at or {})).x
     position = position_in(plant, x0)
     own_states = tuple((name, x) for name, x in (at or {}).items() if name != plant.stroke.name)
-    of = model_of(
-        plant, believed or plant, tuple(name for name in names if name != plant.stroke.name), own_states
-    )
+    along = tuple(name for name in names if name != plant.stroke.name)
+    of = model_of(plant, believed or plant, along, own_states, loaded)
+    rest = rest_model(plant, along, own_states, loaded)
     check_clock()
     p = ca.SX.sym("p", len(names))
     own = [k for k, name in enumerate(names) if name != plant.stroke.name]
     symbols = {names[k]: p[k] for k in own}
     z = p[names.index(plant.stroke.name)] if plant.stroke.name in names else position
     nominal = [position if name == plant.stroke.name else getattr(par, name) for name in names]
-    short, positive, why = None, None, ""
+    short, why, conditions = None, rest.why, _conditions_of(rest, p[own], z)
     if is_commutated(plant) or not program(of).rational:
         short = _expanded_matrices(of, p, z, np.array(nominal, dtype=float), held)
     check_clock()
     if short is not None:
         A, B, C, above = short
-        positive = ca.Function("positive", [p], [above]) if above.numel() else None
+        conditions += [Condition(one, DOMAIN_END_TEXT) for one in ca.vertsplit(above)]
     else:
         acting = of(p[own], z, ca.DM.zeros(len(plant.inputs)))[-1]
         q = ca.SX.sym("v", len(plant.inputs))
         chain = ca.Function("chain", [p, q], [of(p[own], z, q)[4]])
-        wanted = with_command(plant, plant.at(**(at or {})), believed).v
-        v, why = command_of(chain, p, acting, np.array(nominal, dtype=float), np.asarray(wanted))
+        wanted = _command_at(plant, x0, believed, loaded)
+        command = command_of(chain, p, acting, np.array(nominal, dtype=float), wanted)
+        v, why = command.values, why or command.why
+        conditions += command.conditions
+        if loaded:
+            machine = in_symbols(plant, symbols)
+            conditions += limits_at_rest(machine, believed or plant, rest.function(p[own], z)[0], v)
         A, B, C, E = of(p[own], z, v)[:4]
         if held is not None:
             A, left = A - E @ C, E - B @ ca.DM(held)
@@ -251,21 +109,37 @@ def of_plant(
     if late:
         A, B, C = with_lags(_sensors_in(plant, symbols), A, B, C)
     if windings is not None:
-        point = ca.SX(x0)
-        if plant.has_stroke:
-            point[plant.stroke_state] = z
-        A, B, C = with_windings(in_symbols(plant, symbols), windings, point, A, B, C)
+        x = rest.function(p[own], z)[0]
+        A, B, C = with_windings(in_symbols(plant, symbols), windings, x, A, B, C)
     if states:
         C = ca.vertcat(C, ca.DM.eye(len(plant.controlled)))
     bounds = {f.name: limits_of(f.metadata) for f in fields(par)}
     limits = tuple(bounds.get(name, (-math.inf, math.inf)) for name in names)
     matrices = ca.Function("matrices", [p], [A, B, C])
     if short is None:
-        matrices, positive = without_branches(matrices, nominal)
+        matrices, above = without_branches(matrices, nominal)
+        branches = [] if above is None else ca.vertsplit(above(p))
+        conditions += [Condition(one, DOMAIN_END_TEXT) for one in branches]
+    positive = (
+        ca.Function("positive", [p], [ca.vertcat(*(c.above for c in conditions))]) if conditions else None
+    )
     why = unproven(plant, tuple(x0.tolist())) or why
     return UncertainSystem(
-        tuple(names), readonly(nominal), matrices, limits=limits, approximate=why, positive=positive
-    )
+        tuple(names), readonly(nominal), matrices,
+        limits=limits, approximate=why, positive=positive, ends=tuple(c.ends for c in conditions),
+    )  # fmt: skip
+
+
+def _command_at(plant: Plant, x: FloatArray, believed: Plant | None, loaded: bool) -> FloatArray:
+    """The command at rest at nominal parameters. Raises CheckError where none holds the machine."""
+    point = balance(plant, x) if loaded else plant.at(**position_at(plant, x))
+    return np.asarray(with_command(plant, point, believed).v)
+
+
+def _conditions_of(rest: RestModel, p: Any, z: Any) -> list[Condition]:
+    """What is above zero where the machine has its rest."""
+    above = rest.function(p, z)[2]
+    return [Condition(one, ends) for one, ends in zip(ca.vertsplit(above), rest.ends, strict=True)]
 
 
 def _sensors_in(plant: Plant, symbols: Mapping[str, Any]) -> Sensors:
@@ -356,30 +230,64 @@ def in_symbols(plant: Plant, symbols: Mapping[str, Any]) -> Plant:
     return machine
 
 
+class RestModel(NamedTuple):
+    """Rest as a function of parameters and of the position along the stroke."""
+
+    function: ca.Function  # (p, z) -> states, inputs that act, and what is above zero where there is a rest
+    ends: tuple[str, ...]  # what happens where it is not
+    why: str  # why it is not exact; "": it is
+
+
+@lru_cache(maxsize=16)  # plants compare by identity, and are built once for their parameters
+def rest_model(
+    plant: Plant, names: tuple[str, ...], at: tuple[tuple[str, float], ...] = (), loaded: bool = True
+) -> RestModel:
+    """Where the machine rests under its loads; of the design model, at the states `at` with its preload."""
+    p, z = ca.SX.sym("p", len(names)), ca.SX.sym("z")
+    machine = in_symbols(plant, dict(zip(names, ca.vertsplit(p), strict=True)) if names else {})
+    x = ca.SX(plant.state(dict(at)))
+    if plant.has_stroke:
+        x[plant.stroke_state] = z
+    if loaded:
+        nominal = np.array([*(getattr(plant.parameters, name) for name in names), 0.0])
+        rest = balance(plant, plant.state(dict(at)))
+        x, found = rest_of(plant, machine, x, ca.vertcat(p, z), nominal, rest)
+    else:
+        found = Formula(ca.SX(machine.preload(x)))
+    above = ca.vertcat(*(c.above for c in found.conditions))
+    parts = [x, found.values, above]
+    function = ca.Function("rest", [p, z], ca.cse([ca.densify(ca.SX(part)) for part in parts]))
+    return RestModel(function, tuple(c.ends for c in found.conditions), found.why)
+
+
 @lru_cache(maxsize=16)  # plants compare by identity, and are built once for their parameters
 def model_of(
-    plant: Plant, believed: Plant, names: tuple[str, ...], at: tuple[tuple[str, float], ...] = ()
+    plant: Plant,
+    believed: Plant,
+    names: tuple[str, ...],
+    at: tuple[tuple[str, float], ...] = (),
+    loaded: bool = True,
 ) -> ca.Function:
-    """The design model as a CasADi function of parameters, position along the stroke and commands v.
+    """The linear model as a CasADi function of parameters, position along the stroke and commands v.
 
     at : the other states that are not zero
+    loaded : whether the loads act; without them it is the design model, which has the preload in their place
 
-    Its outputs are those of `jacobians` on the controlled states (A, B, C, E, forces, their ratio) and the preload.
+    Its outputs are those of `jacobians` on the controlled states (A, B, C, E, forces, their ratio), at rest, and the
+    inputs that act there.
     """
     p, z, v = ca.SX.sym("p", len(names)), ca.SX.sym("z"), ca.SX.sym("v", len(plant.inputs))
     own = dict(zip(names, ca.vertsplit(p), strict=True)) if names else {}
     machine = in_symbols(plant, own)
     x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
-    point = ca.SX(plant.state(dict(at)))
-    if plant.has_stroke:
-        point[plant.stroke_state] = z
-    preload = ca.SX(machine.preload(point))
+    point, acting, _ = rest_model(plant, names, at, loaded).function(p, z)
     check_clock()
-    found = jacobians(machine, believed, x, u, v, ca.SX.zeros(len(plant.disturbances)))
+    w = machine.load(x) if loaded else ca.SX.zeros(len(plant.disturbances))
+    found = jacobians(machine, believed, x, u, v, w)
     check_clock()
-    A, B, C, E, made, ratio = ca.substitute(list(found), [x, u], [point, preload])
+    A, B, C, E, made, ratio = ca.substitute(list(found), [x, u], [point, acting])
     keep = list(plant.controlled)
-    parts = [A[keep, keep], B[keep, :], C[:, keep], E[keep, :], made, ratio, preload]
+    parts = [A[keep, keep], B[keep, :], C[:, keep], E[keep, :], made, ratio, acting]
     return ca.Function("model", [p, z, v], ca.cse([ca.densify(part) for part in parts]))
 
 

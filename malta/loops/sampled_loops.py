@@ -29,6 +29,7 @@ from malta.linear.sampling import add_lags, delay_inputs, eigenvalues, sample
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal
+from malta.loops.feedforward_along import along_stroke, slopes_along
 from malta.loops.parametric_plants import held_gain, of_plant
 from malta.loops.windings import (
     CurrentControl,
@@ -48,9 +49,17 @@ from malta.loops.windings import (
 from malta.model.data import plant_of
 from malta.model.equilibrium import trace, trim
 from malta.model.linearize import LinearModel, is_commutated, linearize
-from malta.model.plant import OperatingPoint, Plant, off_stroke, position_in, whole_samples
+from malta.model.plant import OperatingPoint, Plant, off_stroke, position_at, position_in, whole_samples
 from malta.model.sensors import with_lags
-from malta.synthesis.controller import Controller, LinearLaw, law_at, linear_law, with_readings, with_slope
+from malta.synthesis.controller import (
+    Controller,
+    LinearLaw,
+    law_at,
+    linear_law,
+    with_forces_read,
+    with_readings,
+    with_slope,
+)
 from malta.synthesis.recovery import StepResponse, step_response
 
 # The control law of a gain file as the machine runs it, as the compensator of a proof: hold, delay, current loops.
@@ -62,6 +71,7 @@ class ReadingUse(NamedTuple):
     held: FloatArray | None = None  # the gain H of held currents: v + H y acts
     handed: bool = False  # whether y is a further input of the system
     slope: FloatArray | None = None  # dv0/dy, m x p: v0 follows the reading; None: it stands still
+    moved: tuple[int, ...] = ()  # forces whose v0 is read behind the outputs, see feedforward_along.py
 
 
 def sampled_law(
@@ -80,9 +90,11 @@ def sampled_law(
     late : samples by which these and the law read y late, where there is a `control`
     """
     law, T = linear_law(controller), controller.sample_time
-    held, handed, slope = use or ReadingUse()
+    held, handed, slope, moved = use or ReadingUse()
     if slope is not None:
         law = with_slope(law, slope)
+    if moved:
+        law = with_forces_read(law, moved, len(controller.forces))
     if control is not None:
         law = with_estimated_emf(law, control.emf)
     n, m = len(controller.states), len(controller.forces)
@@ -101,9 +113,9 @@ def sampled_law(
         summed = _integrals_last(law, m)
         law, p = (law, 0) if summed is None else (summed, m)
     if held is not None:
-        law = law._replace(D_y=law.D_y + held)
+        law = law._replace(D_y=law.D_y + _pad(held, law.D_y.shape[1]))
     if handed:
-        law = with_readings(law)
+        law = with_readings(law, len(controller.measurements))
     c = Compensator(
         law.A, law.B_y, law.C, law.D_y,
         integrals=p, sample_time=T, delay=delay, lag=lag if math.isfinite(lag) else None,
@@ -258,7 +270,8 @@ def sampled_loop(
     if sensors:
         late = whole_samples(plant, controller.sample_time)
     if feedforward:
-        law = with_slope(law, feedforward_slope(model, controller))
+        at = position_at(plant, model.operating_point.x)
+        law = with_slope(law, feedforward_slope(plant, controller, at))
     if current_loops == "pi":
         continuous, Ad, Bd, control = _sample_windings(model, controller, delay, sensors)
         if forces_alone or not len(control.emf[0]):
@@ -428,13 +441,21 @@ def machine_system(
     at: Mapping[str, float],
     current_loops: CurrentLoops = LAST_STAGE,
 ) -> tuple[UncertainSystem, Compensator]:
-    """The machine at the states `at` in parameters by name, and its control law: the arguments of robust_margin."""
+    """The machine at rest under its loads at the states `at`, in parameters by name, and its control law.
+
+    These are the arguments of robust_margin. Raises CheckError where nothing holds the nominal machine there.
+    """
     controller = law_at(controller, plant, plant.at(**at).x)
     believed = plant_of(controller.parameters)
     driven = chosen_loops(plant, controller, current_loops) == "pi"
     system, H = _commanded_system(plant, believed, tuple(names), tuple(at.items()), driven)
     handed = H is not None and system.matrices.size2_out(1) > len(H)
-    use = ReadingUse(H, handed)
+    if plant.stroke.name in names:
+        slopes = slopes_along(plant, controller)
+        system = along_stroke(system, plant, slopes)
+        use = ReadingUse(H, handed, moved=() if slopes is None else slopes.forces)
+    else:
+        use = ReadingUse(H, handed, feedforward_slope(plant, controller, at))
     return system, machine_law(plant, controller, current_loops, use=use, point=plant.at(**at))
 
 
@@ -497,12 +518,11 @@ def _on_top(rows: FloatArray, of: FloatArray) -> FloatArray:
     return np.vstack([rows, np.zeros((len(of) - len(rows), of.shape[1]))])
 
 
-def feedforward_slope(model: LinearModel, controller: Controller) -> FloatArray:
-    """dv0/dy at a model's position, m x p: v0(z) follows the reading of the stroke."""
-    plant = model.plant
-    slope = np.zeros((len(controller.forces), len(model.C)))
+def feedforward_slope(plant: Plant, controller: Controller, at: Mapping[str, float]) -> FloatArray:
+    """dv0/dy at the states `at`, m x p: v0(z) follows the reading of the stroke."""
+    slope = np.zeros((len(controller.forces), len(plant.outputs)))
     if plant.has_stroke:
-        position = float(model.operating_point.x[plant.stroke_state])
+        position = at.get(plant.stroke.name, 0.0)
         slope[:, plant.stroke_output] = controller.feedforward.slope(position)
     return slope
 

@@ -204,8 +204,9 @@ def with_windings(plant: Plant, k: WindingModel, x: Any, A: Any, B: Any, C: Any)
 
 
 def with_estimated_emf(law: LinearLaw, emf: tuple[FloatArray, FloatArray]) -> LinearLaw:
-    """The law with M^+ emf(x_hat) as further outputs: rows of its first states and of y."""
+    """The law with M^+ emf(x_hat) as further outputs: rows of its first states and of its first inputs y."""
     C, D = emf
+    D = np.hstack([D, np.zeros((len(D), law.D_y.shape[1] - D.shape[1]))])
     C = np.hstack([C, np.zeros((len(C), len(law.A) - C.shape[1]))]) if len(C) else np.zeros((0, len(law.A)))
     D = D if len(D) else np.zeros((0, law.D_y.shape[1]))
     return law._replace(

@@ -7,15 +7,18 @@ axis is proven alone and the coupling of the axes is bounded (malta.proof.weak_c
 
 from __future__ import annotations
 
+import math
 import time as clock
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 from malta.errors import InputError
 from malta.linear.expressions import NotAnalytic
-from malta.linear.uncertain import Compensator, UncertainSystem
+from malta.linear.uncertain import Compensator, UncertainSystem, instability
 from malta.loops.classical import Nominal
 from malta.loops.parametric_plants import MAX_MODEL_OPERATIONS, model_of
 from malta.loops.sampled_loops import LAST_STAGE, loaded_loop, machine_law, machine_system
@@ -47,6 +50,7 @@ from malta.work import MORE_WORK, Budget, WorkUp, count_work, in_rounds
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from malta.arrays import FloatArray
     from malta.model.plant import Plant
     from malta.proof.blocks.gain import Gain
     from malta.synthesis.controller import Controller
@@ -140,6 +144,11 @@ class LoopAlong:
     def whole_extent(self) -> Extent:
         """The intervals of the machine and of its law, whose schedule is the course."""
         return extent_of(self.plant, self.names, self.controller)
+
+    @property
+    def intervals(self) -> dict[str, Interval]:
+        """The intervals of `extent`, and of the parameters that follow the position."""
+        return self.loops[0][0].spread(self.extent.intervals)
 
     @property
     def loops(self) -> list[tuple[UncertainSystem, Compensator]]:
@@ -277,9 +286,61 @@ def _margin_along(
             return found
     found = common_margin(along, ranges, over, budget=budget, progress=progress)
     if len(along) == 1:
-        return found
+        return at_a_place(
+            *along[0], box_of(*_named(along[0][0]), ranges, over, caller="travel_margin"), found
+        )
     here = f"at {len(along)} places of the travel, {NOT_BETWEEN_TEXT}"
     return replace(found, reason=f"{here}; {found.reason}" if found.reason else here)
+
+
+SCANNED = 129  # places of the travel at which a witness is looked for
+JUST_BEYOND = 1e-3  # of its distance, at which a witness is unstable
+REACHES = 24  # of boxes beyond a witness that no place has, up to the limit of the search
+NOWHERE_TEXT = "what is unstable has values that no position has together"
+
+
+def at_a_place(system: UncertainSystem, law: Compensator, box: Box, found: Margin) -> Margin:
+    """The margin with a witness at a position, whose derived parameters are those that follow it.
+
+    Where no position along its direction is unstable, the witness goes: what is proven stands.
+    """
+    derived = system.derived
+    if derived is None or found.witness is None:
+        return found
+    own = [name for name in box.names if name not in derived.intervals]
+    witness, index = np.array([found.witness[name] for name in box.names]), box.names.index(derived.of)
+    places = np.repeat(witness[None], SCANNED, axis=0)
+    first, end = box.over[index].tolist()
+    places[:, index] = np.linspace(first, end, SCANNED)
+    places[:, -len(derived.intervals) :] = [derived.values(z) for z in places[:, index].tolist()]
+
+    def unstable(t: float) -> Any:
+        rows = places if found.upper == 0 else box.stretch(places, t / found.upper)
+        values = instability(system, law, rows)
+        return rows[int(values.argmax())] if values.max() >= 0 else None
+
+    beyond = (
+        np.geomspace(found.upper * (1 + JUST_BEYOND), max(box.limit, 2e-9), REACHES).tolist()
+        if found.upper
+        else [0.0]
+    )
+    for t in [t for t in beyond if t <= box.limit]:
+        if (p := unstable(t)) is not None:
+            upper = found.upper if t == beyond[0] else t
+            named = {name: x for name, x in zip(box.names, p.tolist(), strict=True) if name in own}
+            moved = {name: x - c for (name, x), c in zip(named.items(), box.nominal.tolist(), strict=False)}
+            shares = {name: x for name, x in found.sensitivity.items() if name in own}
+            return replace(found, upper=upper, witness=named, moved=moved, sensitivity=shares)
+    reason = "; ".join(filter(None, (found.reason, NOWHERE_TEXT)))
+    return replace(
+        found, upper=math.inf, frequency=None, witness=None, moved={}, sensitivity={}, reason=reason,
+        searched=box.searched,
+    )  # fmt: skip
+
+
+def _named(system: UncertainSystem) -> tuple[tuple[str, ...], FloatArray, tuple[tuple[float, float], ...]]:
+    """What a box needs of a system."""
+    return system.names, system.nominal, system.limits
 
 
 CELLS = 0.7  # of the work, for the proofs between the places of a schedule
@@ -328,7 +389,7 @@ def travel_loops(
     Of a schedule these are the loops at its places.
     """
     whole = LoopAlong(plant, controller, names, current_loops)
-    return whole.loops, whole.extent.intervals if len(whole.loops) == 1 else dict(whole.extent.over)
+    return whole.loops, whole.intervals if len(whole.loops) == 1 else dict(whole.extent.over)
 
 
 @lru_cache(maxsize=8)  # several margins need the same loops; records compare by identity
@@ -405,7 +466,8 @@ def place_margin(
     if not plant.has_stroke or controller.schedule is not None:
         return robust_margin(*whole.at(position), ranges)
     if len(whole.loops) == 1:
-        there = {plant.stroke.name: position}
+        derived = whole.loops[0][0].derived
+        there = {plant.stroke.name: position} | (derived.at(position) if derived is not None else {})
         return margin_at(*whole.loops[0], ranges, there, tolerance=TOLERANCE, wider=travel)
     loop = whole.at(position)
     if (problem := margin_anywhere(whole, position)) is not None:

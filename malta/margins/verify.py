@@ -364,7 +364,9 @@ def _links(q: _Question) -> tuple[ChainStage, ...]:
             loop = stage.loop.under_load(position)
             margin = stage.margin_at(position) if q.proof else NOT_PROVEN
         else:
-            system = of_plant(q.plant, list(q.uncertainty), states=states, at=at, believed=believed)
+            system = of_plant(
+                q.plant, list(q.uncertainty), states=states, at=at, believed=believed, loaded=False
+            )
             margin = robust_margin(system, law, q.uncertainty, time=q.time) if q.proof else NOT_PROVEN
             loop = nominal_loop(system, law)
         where: Literal["forces", "sensors"] = "forces" if states else "sensors"

@@ -405,6 +405,11 @@ def _rates_of(plant: Plant, x: Any, u: Any, w: Any) -> Any:
     return rate
 
 
+def rates_at_rest(plant: Plant, x: Any, u: Any) -> Any:
+    """f(x, u, load(x)) with zeros for accelerations that no input holds: zero at rest."""
+    return _rates_of(plant, x, u, plant.load(x))
+
+
 def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> FloatArray:
     """The inputs that hold the machine at rest, or that cancel its loads alone; one row for each row of states."""
     left = trace(_rates_left, plant, None, loads_alone)
@@ -421,7 +426,7 @@ def _rates_left(plant: Plant, _believed: None, loads_alone: bool) -> tuple[list[
     """(x, u) -> rates at rest under the loads, or what the loads alone make of them, and their slope by u."""
     m, w = len(plant.inputs), len(plant.disturbances)
     x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", m)
-    rate = _rates_of(plant, x, u, plant.load(x))
+    rate = rates_at_rest(plant, x, u)
     if loads_alone:
         rate -= _rates_of(plant, x, ca.SX.zeros(m), ca.SX.zeros(w))
     return [x, u], [rate, ca.jacobian(rate, u)]

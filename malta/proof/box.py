@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from malta.arguments import MAX_SIZE, by_name, describe, is_number, is_pair
@@ -20,8 +19,10 @@ from malta.arrays import FloatArray
 from malta.errors import InputError, require_known
 from malta.linear.branches import INTERVALS, Interval
 from malta.linear.expressions import MatrixProgram, NotAnalytic, exact, program
+from malta.linear.uncertain import DOMAIN_END_TEXT, UncertainSystem
 
 SEARCH_LIMIT = 1e2  # search limit, in multiples of the modelled box
+MOST_PLACES = 256  # nominal places of intervals that do not grow
 EDGE = 1e-4  # relative distance of the search from the limits of parameters
 
 
@@ -76,11 +77,13 @@ class Box:
 
     def nominal_places(self) -> FloatArray:
         """The nominal values at the ends and the middle of the intervals that do not grow; rows, nominal first."""
-        sides = (
+        sides = [
             np.unique([c, low, (low + high) / 2, high])
             for c, (low, high) in zip(self.nominal, self.over, strict=True)
-        )
-        places = np.array(list(itertools.islice(itertools.product(*sides), 4096)))
+        ]
+        if math.prod(map(len, sides)) > MOST_PLACES:
+            sides = [side[[0, -1]] if len(side) > 1 else side for side in sides]
+        places = np.array([self.nominal, *itertools.islice(itertools.product(*sides), MOST_PLACES)])
         order = np.argsort(np.abs(places - self.nominal).sum(axis=1), kind="stable")
         return np.asarray(places[order])
 
@@ -177,28 +180,60 @@ def _checked_sides(caller: str, name: str, value: Any, nominal: float) -> tuple[
     return low, high
 
 
-# The box of a model with branches ends where its conditions (malta/linear/branches.py) are no longer proven.
+# The box of a model with branches, or of a machine that must have a rest, ends where its conditions
+# (malta/linear/branches.py, malta/loops/rest.py) are no longer proven.
 
 
 PARTS = 256  # parts of a box on which conditions are looked at
 BISECTIONS = 30  # of the box in which they hold
-DOMAIN_END_TEXT = "a root or a branch of the model ends"
+BEYOND = 1e-3  # of a box: how far beyond its end a condition is looked for that fails there
+MOST_CORNERS = 12  # parameters of whose corners all are looked at
 
 
-def within_branches(box: Box, positive: ca.Function | None) -> Box:
-    """The box, ended where the conditions of a model (p -> values above zero) are no longer proven."""
-    if positive is None:
+def within_branches(box: Box, system: UncertainSystem) -> Box:
+    """The box, ended where the conditions of a model (`positive`, p -> values above zero) are no longer proven."""
+    if system.positive is None:
         return box
-    conditions, limit = program(positive), box.limit
+    conditions, limit = program(system.positive), box.limit
     low, high = 0.0, limit
-    if _hold(conditions, box.sides(high)):
+
+    def hold(t: float) -> bool:
+        return _failing_corner(box, system, t) is None and _hold(conditions, box.sides(t))
+
+    if hold(high):
         return box
-    if not _hold(conditions, box.sides(0.0)):
-        return replace(box, most=0.0, ends=DOMAIN_END_TEXT)
+    if not hold(0.0):
+        return replace(box, most=0.0, ends=_end_at(box, system, 0.0))
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        low, high = (middle, high) if _hold(conditions, box.sides(middle)) else (low, middle)
-    return replace(box, most=low, ends=DOMAIN_END_TEXT)
+        low, high = (middle, high) if hold(middle) else (low, middle)
+    return replace(box, most=low, ends=_end_at(box, system, low))
+
+
+def _end_at(box: Box, system: UncertainSystem, t: float) -> str:
+    """What happens at the end t of a box, in words, with the parameters of the corner where it does."""
+    failing = _failing_corner(box, system, t * (1 + BEYOND))
+    if failing is None or not system.ends or system.ends[failing[0]] == DOMAIN_END_TEXT:
+        return DOMAIN_END_TEXT
+    row, corner = failing
+    grown = [f"{box.names[k]} = {corner[k]:.4g}" for k in np.flatnonzero(corner != box.nominal)]
+    return f"{system.ends[row]} ({', '.join(grown)})" if grown else system.ends[row]
+
+
+def _failing_corner(box: Box, system: UncertainSystem, t: float) -> tuple[int, FloatArray] | None:
+    """A condition that fails at a corner of box(t), and this corner; None where none is found."""
+    assert system.positive is not None
+    moving = (box.down + box.up > 0) | (box.over[:, 0] < box.over[:, 1])
+    used = np.isin(np.arange(len(box.names)), system.positive.jac_sparsity(0, 0).get_triplet()[1])
+    moves = np.flatnonzero(moving & used)[:MOST_CORNERS]
+    corners = np.repeat(box.nominal[None], 2 ** len(moves), axis=0)
+    corners[:, moves] = list(itertools.product(*box.near_sides(t)[moves]))
+    values = np.array(system.positive.map(len(corners))(corners.T))
+    values = np.where(np.isfinite(values), values, -np.inf)
+    if not (values <= 0).any():
+        return None
+    row = int((values <= 0).any(axis=1).argmax())
+    return row, corners[int(values[row].argmin())]
 
 
 def _hold(conditions: MatrixProgram, sides: FloatArray) -> bool:

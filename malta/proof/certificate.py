@@ -33,7 +33,7 @@ from malta.checker.loop import (
 )
 from malta.errors import CheckError, InputError
 from malta.files import replace_files, version
-from malta.linear.expressions import FIELD, exact
+from malta.linear.expressions import FIELD, MatrixProgram, exact, program as expressions_of
 from malta.linear.systems import compensator_of
 from malta.proof.box import Box, below, box_of
 from malta.proof.exclusion import Growth, advance, start
@@ -175,6 +175,9 @@ RADII = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, *(2.0**k for k in (4, 5, 6, 8, 10, 14, 20
 Places = Sequence[tuple["UncertainSystem", "Compensator"]]
 
 
+DERIVED_UNIT = "1"  # of parameters that follow the position
+
+
 @dataclass(frozen=True)
 class LoopOrigin:
     """The machine and the law that loops are of, as the claim names them."""
@@ -226,9 +229,6 @@ def certificate_of(
     """The certificate of a margin as a JSON document."""
     if margin.lower is None:
         raise CheckError(f"no certificate: nothing is proven ({margin.reason})")
-    if any(system.positive is not None for system, _ in places):
-        found = "a model that holds on one branch of its currents alone"
-        raise InputError("certificate", "places", found, "a model without branches and roots")
     system = places[0][0]
     box = box_of(system.names, system.nominal, system.limits, ranges, over or {})
     lower, proven = _prove(places, box, margin.lower)
@@ -241,7 +241,7 @@ def certificate_of(
             "lower": lower,
             **_origin(origin),
             "sample_time": None if T is None else float.fromhex(T),
-            "parameters": _parameters(box, lower, origin.units if origin else {}),
+            "parameters": _parameters(box, lower, origin),
         },
         "loops": proven,
     }
@@ -263,18 +263,21 @@ def _origin(origin: LoopOrigin | None) -> dict[str, Any]:
     }
 
 
-def _parameters(box: Box, lower: float, units: Mapping[str, str]) -> list[dict[str, Any]]:
+def _parameters(box: Box, lower: float, origin: LoopOrigin | None) -> list[dict[str, Any]]:
     """The box of a claim: of each parameter what it is at first, how it grows, and where it is at `lower`."""
     ends = _ends(box, lower)
-    return [
-        {
-            "name": name, "unit": units.get(name), "nominal": nominal, "down": down, "up": up, "over": over,
-            "interval": list(checked_file.inside(*sides)),
-        }
-        for name, nominal, down, up, over, sides in zip(
-            box.names, *(x.tolist() for x in (box.nominal, box.down, box.up)), _over(box), ends, strict=True
-        )
-    ]  # fmt: skip
+    rows = (x.tolist() for x in (box.nominal, box.down, box.up))
+    made = []
+    for name, nominal, down, up, over, sides in zip(box.names, *rows, _over(box), ends, strict=True):
+        unit = origin and origin.units.get(name, DERIVED_UNIT)
+        interval = list(checked_file.inside(*sides))
+        made.append(
+            {
+                "name": name, "unit": unit, "nominal": nominal, "down": down, "up": up, "over": over,
+                "interval": interval,
+            }
+        )  # fmt: skip
+    return made
 
 
 def _over(box: Box) -> list[list[float]]:
@@ -339,19 +342,25 @@ def _law(system: UncertainSystem, law: Any) -> Compensator:
 def _description(loop: UncertainLoop) -> dict[str, Any]:
     """The description of a loop in a certificate, without its groups."""
     law, program = loop.law, loop.program
-    n = loop.states
+    n, positive = loop.states, loop.system.positive
+    conditions = None if positive is None else expressions_of(positive)
     if loop.direct:
         raise InputError("certificate", "system", "a matrix D", "outputs y = C x alone")
     if loop.descriptor and sorted((i, j) for i, j, _ in program.entries[E]) != [(i, i) for i in range(n)]:
         raise InputError("certificate", "system", "a matrix E that couples states", "a diagonal E, or none")
-    if not program.rational:
+    if not (program.rational and (conditions is None or conditions.rational)):
+        program = program if conditions is None or not program.rational else conditions
         foreign = sorted({name for name, *_ in program.steps} - {*FIELD, "const", "input", "constpow"})
         raise InputError("certificate", "system", " ".join(foreign) or "a power", "+ - * / and whole powers")
     matrices = "ABCE" if loop.descriptor else "ABC"
     T = law.sample_time if loop.system.sample_time is None else loop.system.sample_time
     return {
         "shape": [n, program.shapes[1][1], program.shapes[2][0]],
-        "steps": [[name, target, list(on), float(value).hex()] for name, target, on, value in program.steps],
+        "steps": _steps(program),
+        "conditions": {
+            "steps": [] if conditions is None else _steps(conditions),
+            "above": [] if conditions is None else [k for _, _, k in conditions.entries[0]],
+        },
         **{key: [list(e) for e in program.entries[i]] for i, key in enumerate("ABCDE") if key in matrices},
         "compensator": {
             key: [[float(x).hex() for x in row] for row in getattr(law, key).tolist()] for key in "ABCD"
@@ -361,6 +370,10 @@ def _description(loop: UncertainLoop) -> dict[str, Any]:
         "delay": law.delay,
         "lag": None if law.lag is None else float(law.lag).hex(),
     }
+
+
+def _steps(program: MatrixProgram) -> list[list[Any]]:
+    return [[name, target, list(on), float(value).hex()] for name, target, on, value in program.steps]
 
 
 def _loop(system: UncertainSystem, law: Any, box: Box, lower: float) -> dict[str, Any]:

@@ -225,6 +225,7 @@ class _Connection:
     sample_time: float | None
     approximate: str
     positive: tuple[Any, ...]
+    ends: tuple[str, ...]
     parts: tuple[System, ...]
 
     @classmethod
@@ -256,6 +257,7 @@ class _Connection:
             times.pop(),
             "; ".join(dict.fromkeys(one.approximate for one in uncertain if one.approximate)),
             tuple(one.positive(_own(one, symbols)) for one in uncertain if one.positive is not None),
+            tuple(text for one in uncertain for text in one.ends),
             tuple(_parts(one, symbols) for one in systems),
         )  # fmt: skip
 
@@ -274,6 +276,7 @@ class _Connection:
             self.sample_time,
             self.approximate,
             positive,
+            self.ends,
         )
 
 

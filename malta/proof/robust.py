@@ -290,8 +290,8 @@ def robust_margin(
     effort = ProofEffort(tolerance, time, budget, progress)
     over = {} if over is None else over
     named, law, ranges = _either_form(system, compensator, ranges, over)
-    box = box_of(named.names, named.nominal, named.limits, ranges, over)
-    return margin_of(problem_of(named, law), within_branches(box, named.positive), effort)
+    box = box_of(named.names, named.nominal, named.limits, ranges, named.spread(over))
+    return margin_of(problem_of(named, law), within_branches(box, named), effort)
 
 
 def _either_form(
@@ -339,7 +339,7 @@ def common_margin(
     outside = {} if over is None else over
     box = box_of(first.names, first.nominal, first.limits, ranges, outside, caller="margin")
     for system, _ in loops:
-        box = within_branches(box, system.positive)
+        box = within_branches(box, system)
     return margin_of(OfSeveral(tuple(problem_of(*loop) for loop in loops)), box, effort)
 
 
@@ -370,11 +370,11 @@ def margin_at(
     nominal = system.nominal.copy()
     for name, value in at.items():
         nominal[system.names.index(name)] = value
-    box = within_branches(box_of(system.names, nominal, system.limits, ranges, {}), system.positive)
+    box = within_branches(box_of(system.names, nominal, system.limits, ranges, {}), system)
     problem = problem_of(system, compensator)
     if wider is not None and wider.lower and wider.witness is not None:
         reach = wider.lower * (1 + (tolerance or TOLERANCE))
-        witness = np.array([at.get(name, wider.witness[name]) for name in box.names])
+        witness = np.array([at[name] if name in at else wider.witness[name] for name in box.names])
         t, frequency, p = loss_beside(problem, box, witness, wider.lower, min(reach, box.limit))
         if p is not None and t >= wider.lower:
             named = dict(zip(box.names, p.tolist(), strict=True))
@@ -533,11 +533,13 @@ IDLE_TEXT = "the loop does not depend on"
 
 
 def _idle(problem: Problem, box: Box) -> tuple[str, ...]:
-    """The parameters of a box that grow and on which no matrix of the problem's loops depends."""
+    """The parameters of a box that grow, and on which neither a matrix nor a condition of the problem's loops depends."""
     loops = [loop for loop in problem.loops if loop is not None]
     if len(loops) < len(problem.loops) or not loops:
         return ()
-    acting = frozenset[int]().union(*(own for loop in loops for own in loop.program.depends))
+    models = [loop.program for loop in loops]
+    models += [program(loop.system.positive) for loop in loops if loop.system.positive is not None]
+    acting = frozenset[int]().union(*(own for model in models for own in model.depends))
     grows = box.down + box.up > 0
     return tuple(name for k, name in enumerate(box.names) if grows[k] and k not in acting)
 

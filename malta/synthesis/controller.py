@@ -100,8 +100,8 @@ class Feedforward:
         return np.array([np.interp(z, self.z_grid, column) for column in self.v0.T])
 
     def slope(self, z: float) -> FloatArray:
-        """dv0/dz, N/m, m forces, across the grid interval about z; zero beyond the grid."""
-        if not self.z_grid[0] < z < self.z_grid[-1]:
+        """dv0/dz, N/m, m forces, across the grid interval about z, at its ends the last one; zero beyond the grid."""
+        if len(self.z_grid) < 2 or not self.z_grid[0] <= z <= self.z_grid[-1]:
             return np.zeros(self.v0.shape[1])
         k = min(int(np.searchsorted(self.z_grid, z, side="right")), len(self.z_grid) - 1)
         return np.asarray((self.v0[k] - self.v0[k - 1]) / (self.z_grid[k] - self.z_grid[k - 1]))
@@ -555,11 +555,22 @@ def with_slope(law: LinearLaw, slope: FloatArray) -> LinearLaw:
     return law._replace(B_y=law.B_y + law.B_r[:, columns] @ slope, D_y=law.D_y + law.D_r[:, columns] @ slope)
 
 
-def with_readings(law: LinearLaw) -> LinearLaw:
-    """The same law with the reading itself as further outputs: what currents are commutated for."""
-    p, n, r = law.B_y.shape[1], len(law.A), law.D_r.shape[1]
+def with_forces_read(law: LinearLaw, forces: tuple[int, ...], count: int) -> LinearLaw:
+    """The same law, which adds further readings to v0 of some of its `count` forces."""
+    columns = [law.B_r.shape[1] - count + k for k in forces]  # of v0 in r
+    return law._replace(
+        B_y=np.hstack([law.B_y, law.B_r[:, columns]]), D_y=np.hstack([law.D_y, law.D_r[:, columns]])
+    )
+
+
+def with_readings(law: LinearLaw, readings: int | None = None) -> LinearLaw:
+    """The same law with the reading itself as further outputs: what currents are commutated for.
+
+    readings : how many of its inputs are readings of positions, the first; None: all
+    """
+    p, n, r = readings or law.B_y.shape[1], len(law.A), law.D_r.shape[1]
     return law._replace(
         C=np.vstack([law.C, np.zeros((p, n))]),
-        D_y=np.vstack([law.D_y, np.eye(p)]),
+        D_y=np.vstack([law.D_y, np.eye(p, law.D_y.shape[1])]),
         D_r=np.vstack([law.D_r, np.zeros((p, r))]),
     )

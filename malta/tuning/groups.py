@@ -211,7 +211,11 @@ def groups_of(spec: Spec) -> list[TuningGroup]:
     proven = "margin" in spec.specification
     driven = _driven_windings(spec)
     windings = None if driven is None else driven.windings
-    systems = [of_plant(plant, names, at=place, windings=windings) for place in positions] if proven else []
+    systems = (
+        [of_plant(plant, names, at=place, windings=windings, loaded=False) for place in positions]
+        if proven
+        else []
+    )
     trims = _loaded_places(spec)
     held = _with_windings(spec, driven, MachinePart(loaded.A, loaded.B, model.C))
     found = []

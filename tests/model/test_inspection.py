@@ -35,7 +35,7 @@ def plant(
     par: Any = PAR,
     *,
     force: Callable[[Any, Any, Any], Any] = lambda par, q, i: i + par.k * q,
-    read: Callable[[Any, Any], Any] = lambda x, u: x[0],
+    read: Callable[[Any, Any], Any] = lambda x, _: x[0],
     **fields: Any,
 ) -> Plant:
     """A mass of 0.1 kg on one axis, pushed away by a spring of 1 N/mm."""
@@ -125,7 +125,7 @@ def test_a_sensor_that_sees_its_coil_is_refused(h: float) -> None:
 def test_readings_that_are_no_positions_are_refused(
     gain: float, offset: float, inverse: bool, words: str
 ) -> None:
-    own = {"position_of": lambda y: (y - offset) / gain} if inverse else {}
+    own: dict[str, Any] = {"position_of": lambda y: (y - offset) / gain} if inverse else {}
     assert words in refused(plant(read=lambda x, _: gain * x[0] + offset, **own))
 
 

@@ -249,7 +249,7 @@ def question_of(
     law = law_of(system, compensator, caller)
     none = {} if over is None else over
     box = box_of(system.names, system.nominal, system.limits, ranges, none, empty=True, caller=caller)
-    box = within_branches(box, system.positive)
+    box = within_branches(box, system)
     if not box.most > 0:
         raise InputError(caller, "over", f"intervals within which {box.ends}", "narrower ones")
     return law, box

@@ -234,7 +234,9 @@ def full_state_share(e: TubularEvidence) -> float:
     if e.K is None:
         return math.nan
     law, states = compensators(e.model.plant, e.controller)["LQR"]
-    system = of_plant(e.model.plant, list(e.spec.uncertainty), at=e.spec.operating_point, states=states)
+    system = of_plant(
+        e.model.plant, list(e.spec.uncertainty), at=e.spec.operating_point, states=states, loaded=False
+    )
     return proven_share(robust_margin(system, law, e.spec.uncertainty))
 
 
