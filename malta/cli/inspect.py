@@ -76,8 +76,8 @@ def _plant_of(file: Path, machine_file: Path | None) -> Plant:
 
 def note_machine(plant: Plant) -> None:
     """Say once for each source of a machine's own file what makes nothing proven of it, on standard error."""
-    from malta.model.inspection import unproven
     from malta.model.machines import sources_of
+    from malta.model.soundness import unproven
     from malta.simulation.engine.compiled import cache_folder, open_private
 
     sources = sources_of(plant.name)

@@ -24,11 +24,11 @@ from malta.linear.uncertain import DOMAIN_END_TEXT, UncertainSystem
 from malta.loops.rest import Condition, Formula, command_of, limits_at_rest, rest_of
 from malta.loops.windings import WindingModel, with_windings
 from malta.model.equilibrium import balance, with_command
-from malta.model.inspection import unproven
 from malta.model.linearize import is_commutated, jacobians, linearize
 from malta.model.parameters import shape_parameters, twins_of, units_of
 from malta.model.plant import Plant, position_at, position_in, symbolic
 from malta.model.sensors import Sensors, with_lags
+from malta.model.soundness import unproven
 from malta.work import check_clock
 
 MAX_MODEL_OPERATIONS = 20_000  # operations up to which a model is expanded

@@ -25,10 +25,10 @@ from malta.errors import CheckError, InputError
 from malta.files import file_exists, locate, shipped_path
 from malta.model.checks import check_numbers, line_of
 from malta.model.equilibrium import check_values, is_checked, register
-from malta.model.inspection import require_readings
 from malta.model.machines import file_of, machine, machine_names, module_of, name_of
 from malta.model.parameters import check_range
 from malta.model.plant import Parameters, Plant
+from malta.model.soundness import require_readings
 from malta.tables import Finite, Quantity, Record, entry, load_toml, validate
 from malta.units import to_si, unit_factor
 

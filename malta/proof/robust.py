@@ -533,7 +533,7 @@ IDLE_TEXT = "the loop does not depend on"
 
 
 def _idle(problem: Problem, box: Box) -> tuple[str, ...]:
-    """The parameters of a box that grow, and on which neither a matrix nor a condition of the problem's loops depends."""
+    """The parameters of a box that grow and on which neither matrices nor conditions of the loops depend."""
     loops = [loop for loop in problem.loops if loop is not None]
     if len(loops) < len(problem.loops) or not loops:
         return ()

@@ -31,10 +31,10 @@ from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.sampling import sample
 from malta.model.data import plant_of
-from malta.model.inspection import require_readings
 from malta.model.linearize import is_commutated
 from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant, place_states
+from malta.model.soundness import require_readings
 from malta.simulation import references
 from malta.simulation.divergence import rooms_in, rooms_of
 from malta.simulation.engine.engines import Engine, EngineChoice, engine_of, evaluate, substeps_until

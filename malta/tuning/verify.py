@@ -22,9 +22,9 @@ from malta.margins.scheduled_loops import schedule_rate
 from malta.margins.travel import LoopAlong, worst_sensitivities
 from malta.margins.verify import linear_report, staged_report
 from malta.model.data import plant_of
-from malta.model.inspection import unproven
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import Parameters, Plant
+from malta.model.soundness import unproven
 from malta.proof.margin import Progress, Ranges
 from malta.simulation.experiments import Experiment
 from malta.simulation.experiments.catalogue import experiment, payload

@@ -15,7 +15,7 @@ from conftest import ROOT, Run
 import malta
 from malta.loops.parametric_plants import of_plant
 from malta.model import Actuator, Contacts, Plant, Sensors, Signal, check_parameters, si
-from malta.model.inspection import unproven
+from malta.model.soundness import unproven
 
 
 @dataclass(frozen=True)
