@@ -28,7 +28,8 @@ from malta.firmware.signals import Target
 from malta.firmware.sources import sources
 from malta.firmware.step import look_up, programs_of, started_state, step_function
 from malta.firmware.vectors import record_vectors
-from malta.synthesis.controller import command_forces, estimate_states, gains_of
+from malta.synthesis.law import command_forces, gains_of
+from malta.synthesis.linear_law import estimate_states
 
 ROOT = Path(__file__).parents[1]
 HERE, A9, M4F = PROCESSORS

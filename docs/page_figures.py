@@ -456,7 +456,8 @@ def flexible_rotor(name: str) -> Figure:
     """A figure of examples/flexible_rotor."""
     from importlib import import_module
 
-    from malta.model.data import plant_of, read
+    from malta.model.data import read
+    from malta.model.plants import plant_of
 
     folder = Path(__file__).parents[1] / "examples" / "flexible_rotor"
     machine = malta.machine(folder / "flexible_rotor.py")

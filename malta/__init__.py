@@ -30,19 +30,21 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     )
     from malta.campaigns.run import campaign as campaign
     from malta.errors import CheckError as CheckError, InputError as InputError
-    from malta.firmware.export import export_c as export_c, export_fmu as export_fmu
+    from malta.firmware.export import export_c as export_c
+    from malta.firmware.export_fmu import export_fmu as export_fmu
     from malta.identification.excite import excite as excite
     from malta.identification.identify import identify as identify
     from malta.identification.learn import learn as learn
     from malta.identification.measure import measure as measure
     from malta.loops.loop import loop as loop
     from malta.loops.parametric_plants import uncertain as uncertain
-    from malta.model.data import plant_of as plant_of, read as read
+    from malta.model.data import read as read
     from malta.model.equilibrium import trim as trim
     from malta.model.inspection import inspect as inspect
-    from malta.model.linear import linear_machine as linear_machine
+    from malta.model.linear.machine import linear_machine as linear_machine
     from malta.model.linearize import linearize as linearize
     from malta.model.machines import machine as machine
+    from malta.model.plants import plant_of as plant_of
     from malta.proof.blocks.gain import dynamic_margin as dynamic_margin, worst_case_gain as worst_case_gain
     from malta.proof.robust import robust_margin as robust_margin
     from malta.report.ledger import ledger as ledger
@@ -87,19 +89,21 @@ _NAMES = {
     " structured synthesis",
     "malta.campaigns.run": "campaign",
     "malta.errors": "CheckError InputError",
-    "malta.firmware.export": "export_c export_fmu",
+    "malta.firmware.export": "export_c",
+    "malta.firmware.export_fmu": "export_fmu",
     "malta.identification.excite": "excite",
     "malta.identification.identify": "identify",
     "malta.identification.learn": "learn",
     "malta.identification.measure": "measure",
     "malta.loops.loop": "loop",
     "malta.loops.parametric_plants": "uncertain",
-    "malta.model.data": "plant_of read",
+    "malta.model.data": "read",
     "malta.model.equilibrium": "trim",
     "malta.model.inspection": "inspect",
-    "malta.model.linear": "linear_machine",
+    "malta.model.linear.machine": "linear_machine",
     "malta.model.linearize": "linearize",
     "malta.model.machines": "machine",
+    "malta.model.plants": "plant_of",
     "malta.proof.blocks.gain": "dynamic_margin worst_case_gain",
     "malta.proof.robust": "robust_margin",
     "malta.report.ledger": "ledger",

@@ -23,7 +23,7 @@ from malta.linear.reduction import minimal
 from malta.linear.system import System
 from malta.structured.loops import to_plane
 from malta.structured.riccati import split_integrals, truncate
-from malta.synthesis.controller import linear_law
+from malta.synthesis.linear_law import linear_law
 from malta.synthesis.structure import sample_law
 
 # The project's root, wherever Jupyter was started.

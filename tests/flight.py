@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -19,18 +18,6 @@ if TYPE_CHECKING:
     from malta.model.plant import Plant
     from malta.simulation.layout import Fidelity
     from malta.synthesis.controller import Controller
-
-LOADS = {"g": 0.0, "F_c": 0.0}  # of the parameters, those without which nothing pulls
-
-
-def without_loads(plant: Plant, c: Controller) -> tuple[Plant, Controller]:
-    """The machine without weight and cogging, and its controller without v0; unchanged where a preload carries it."""
-    if np.array(ca.DM(plant.preload(ca.DM(plant.at().x)))).any():
-        return plant, c
-    par: Any = plant.parameters
-    lighter = replace(par, **{name: value for name, value in LOADS.items() if hasattr(par, name)})
-    table = replace(c.feedforward, v0=0 * c.feedforward.v0)
-    return malta.plant_of(lighter), replace(c, feedforward=table)
 
 
 def default_of(plant: Plant) -> Fidelity:

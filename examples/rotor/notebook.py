@@ -15,7 +15,8 @@ import numpy as np
 
 import malta
 from malta.margins.loop_report import ZONES
-from malta.model.machines import attribute_of, machine
+from malta.model.machines import machine
+from malta.model.parts import attribute_of
 
 # The folder of the machine, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), Path.cwd() / "examples" / "rotor") if (p / "rotor.py").is_file()))

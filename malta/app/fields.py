@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, Protocol, TypeGuard, get_args
 
 from malta.errors import InputError
-from malta.model.linearize import is_commutated
+from malta.model.currents import is_commutated
 from malta.synthesis.design_tables import DesignFile
 from malta.synthesis.spec import Discretization, Place, Spec
 from malta.units import to_si

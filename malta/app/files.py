@@ -23,7 +23,8 @@ from malta.app.fields import MACHINE, PageField, check_value, fields_of
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, replace_files
 from malta.gains import SUFFIXES
-from malta.model.parameters import check_range, fingerprint as record_fingerprint
+from malta.model.fingerprint import fingerprint as record_fingerprint
+from malta.model.parameters import check_range
 from malta.model.plant import Parameters
 from malta.processes import environment, python_module
 from malta.synthesis.design_file import resolve_published, spec_of

@@ -15,8 +15,8 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.loops.sampled_loops import SampledLoop
-from malta.model.data import plant_of
-from malta.model.plant import outputs_at
+from malta.model.places import outputs_at
+from malta.model.plants import plant_of
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.inputs import feedforward, motion_of, past_forces
 from malta.simulation.period import state_reference

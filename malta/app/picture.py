@@ -28,9 +28,9 @@ from malta.margins.margin_map import margin_map_of, plane_of
 from malta.margins.travel import travel_loops
 from malta.margins.verify import machine_report
 from malta.merits import Merit, figure
-from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import Plant, Signal
+from malta.model.plants import plant_of
 from malta.proof.loss import RayBound, ray_bound
 from malta.simulation.experiments import PlannedRun
 from malta.simulation.experiments.catalogue import cases_of, main_job, series_of, step_cases

@@ -32,9 +32,8 @@ from malta.app.followers import Worker, describe_error
 from malta.app.picture import View, poles_document, run_names, solve
 from malta.app.pull import Handle, Pull, compare_numbers, pull_to
 from malta.errors import InputError, shorten
-from malta.synthesis.requirements import requirements_for
+from malta.synthesis.requirements import base_of, requirements_for
 from malta.synthesis.spec import Spec
-from malta.tuning.search import base_of
 
 PAUSE_BEFORE_PROOF = 0.25  # s, after the last move until its proof begins
 LONGEST_WAIT = 20.0  # s, of a question for news

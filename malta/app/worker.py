@@ -40,10 +40,10 @@ from malta.margins.loop_report import Outcome
 from malta.margins.travel import travel_loops, travel_margin
 from malta.proof.loss import ray_bound
 from malta.simulation.simulate import simulate
-from malta.synthesis.requirements import judge_figure, proven_margin, ratio_of, requirements_for
+from malta.synthesis.requirements import base_of, judge_figure, proven_margin, ratio_of, requirements_for
 from malta.synthesis.spec import Spec, Variable
 from malta.tuning.pid import BOUND_COST, MIN_BOUND_RATIO, ROOM, load_error, name_of, search_gains
-from malta.tuning.search import Effort, Journal, Progress, Trial, apply_trial, at_least_of, base_of
+from malta.tuning.search import Effort, Journal, Progress, Trial, apply_trial, at_least_of
 from malta.tuning.tune import cluster_search, clusters_of, frugal_trials, search_weights
 from malta.tuning.verify import SynthesizedDesign, outcomes_of
 from malta.work import count_work
@@ -208,8 +208,6 @@ def _document(search: TuningRequest, spec: Spec, trial: Trial, problem: PictureS
 
 
 TASKS = {"tune": candidates, "front": front}
-
-
 Message = Mapping[str, Any]
 Newer = Callable[[], bool]
 

@@ -24,7 +24,7 @@ from malta.campaigns.store import simulate_machines
 from malta.campaigns.summary import NO_BOUNDS, RunLimits
 from malta.display import display
 from malta.errors import InputError
-from malta.model.machines import outputs_of
+from malta.model.signal_groups import outputs_of
 from malta.simulation.engine.digest import Batch
 from malta.units import in_unit
 

@@ -28,10 +28,12 @@ from malta.files import read_file, version
 from malta.firmware.program import Precision
 from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import decode
-from malta.model.data import plant_of
-from malta.model.machines import module_of, part_of
-from malta.model.parameters import differences, fingerprint, shape_parameters, twins_of, units_of, values_of
+from malta.model.fingerprint import fingerprint
+from malta.model.machines import module_of
+from malta.model.parameters import differences, shape_parameters, twins_of, units_of, values_of
+from malta.model.parts import part_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.simulation.engine.batch import functions_text
 from malta.simulation.experiments import PlannedRun
 from malta.simulation.experiments.catalogue import cases_of

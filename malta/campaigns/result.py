@@ -18,8 +18,8 @@ from malta.campaigns.store import RunBlock, figure_shapes
 from malta.display import Description, display
 from malta.merits import Merit
 from malta.model.data import published_value
-from malta.model.machines import inputs_of, outputs_of, stroke_unit
 from malta.model.parameters import differences, units_of
+from malta.model.signal_groups import inputs_of, outputs_of, stroke_unit
 from malta.simulation.engine.digest import Batch, verdicts
 from malta.simulation.experiments import setting
 from malta.synthesis.spec import Spec

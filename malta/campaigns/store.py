@@ -38,7 +38,7 @@ from malta.campaigns.plan import (
 from malta.errors import InputError
 from malta.files import file_exists, read_file, remove_leftovers, replace_files, writer
 from malta.firmware.flight import engine_of_c
-from malta.model.parameters import fingerprint
+from malta.model.fingerprint import fingerprint
 from malta.simulation.engine.batch import is_compiled, simulate_many
 from malta.simulation.engine.compiled import MOST_LANES
 from malta.simulation.engine.digest import MAX_FIGURE, Batch, verdicts

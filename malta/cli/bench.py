@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from malta.identification.measure import Measurement
     from malta.synthesis.controller import Controller
 
-
 PLAN = "Plan"  # a panel of the help
 
 
@@ -143,7 +142,8 @@ def _measure(
     from malta.identification.data_file import read_identified
     from malta.identification.log_files import read_log
     from malta.identification.measure import measure as measure_loop
-    from malta.model.data import plant_of, published_figures
+    from malta.model.data import published_figures
+    from malta.model.plants import plant_of
 
     read = [read_log(log) for log in logs]
     if identified is None:
@@ -188,7 +188,7 @@ def _plan(
     """Print what will be flown, how, and what it will tell."""
     from malta.identification.measure import plan_measurement
     from malta.loops.loop import loop
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
     from malta.report.tables.experiments import excitation_tables, measurement_plan_table
 
     plant = plant_of(controller.parameters)
@@ -254,7 +254,7 @@ def commission(
         noise_of_design,
         steps_of,
     )
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
     from malta.report.page.document import binder_page, binder_text
 
     controller = read_controller(gains, machine)

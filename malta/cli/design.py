@@ -122,7 +122,7 @@ def _run_design(
     over a gain file then.
     """
     from malta import gains, report
-    from malta.gains.file import require_stable
+    from malta.gains.writing import require_stable
     from malta.margins.verify import linear_report
     from malta.model.data import published_beside
     from malta.model.linearize import linearize
@@ -206,13 +206,14 @@ def _simulate_gain_file(
     """
 
     from malta import gains
+    from malta.gains.stable import read_stable
     from malta.simulation.experiments.catalogue import experiment
 
     with tempfile.TemporaryDirectory() as scratch:
         trial = Path(scratch) / f"{spec.name}.json"
         gains.write(controller, margins, trial)
         try:
-            written = gains.read(trial)
+            written = read_stable(trial)
         except InputError as error:  # of numbers in the design: the user knows of no other file
             raise InputError(file, error.field, error.found, error.expected) from error
         result = experiment(job, spec.plant, written)
@@ -377,7 +378,7 @@ def _tune_structure(spec: Spec, target: Path, *, as_json: bool) -> None:
     """Tune the elements of a law, write the design file that is found, and judge it."""
     from malta import report
     from malta.structured.design import structured_text, tune_design
-    from malta.tuning.verify import judge
+    from malta.tuning.judging import judge
 
     with progress_on(f"tuning {spec.name}") as work:
         found = tune_design(spec, note=work.note)
@@ -401,7 +402,7 @@ def _tune_structure(spec: Spec, target: Path, *, as_json: bool) -> None:
 def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:
     """Print what the design as it stands reaches; raise CheckError when that is not all it is asked for."""
     from malta import report
-    from malta.tuning.verify import judge
+    from malta.tuning.judging import judge
 
     with progress_on(f"judging {spec.name}"):
         requirements = judge(spec)

@@ -94,7 +94,8 @@ def export(
     Example:  malta export design/gains/robust.json --precision float
               malta export design/gains/robust.json --to fmu --part loop --fmi 3
     """
-    from malta.firmware.export import export_c, export_fmu
+    from malta.firmware.export import export_c
+    from malta.firmware.export_fmu import export_fmu
 
     _require_known(to, precision, until, part, fmi, platforms, clock)
     for option, given in (("--excitation", excitation), ("--log", log)):
@@ -267,7 +268,8 @@ def schema(
     from malta import schemas
     from malta.cli.documents.published import ALL_SCHEMAS, schema_of
     from malta.files import json_text
-    from malta.model.data import plant_of, read
+    from malta.model.data import read
+    from malta.model.plants import plant_of
 
     if name is None:
         print("\n".join(ALL_SCHEMAS))

@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from malta.proof.blocks.gain import Gain
     from malta.synthesis.controller import Controller
 
-
 LogFile = Annotated[Path, typer.Argument(metavar="LOG", help="A log: .csv, .npz, .mat, .parquet or .dump.")]
 
 
@@ -100,7 +99,7 @@ def identify(
     from malta.identification.log_files import read_log
     from malta.identification.response import units_of_model
     from malta.identification.windings import identify_windings
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
     from malta.report.tables.experiments import drive_table, identified_table, in_time_table, quality_table
 
     require_suffixes((out, (".toml",)))
@@ -214,7 +213,7 @@ def excite(
     from malta.identification.excite import excite as plan_excitation
     from malta.identification.log_files import SUFFIXES
     from malta.loops.loop import loop
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
     from malta.report.tables.experiments import excitation_tables
 
     require_suffixes((out, (".csv",)), (log, SUFFIXES))
@@ -431,7 +430,7 @@ def _learn_from(
     from malta.identification.learn import learn as learn_thrust
     from malta.identification.log_files import read_log
     from malta.identification.strokes import first_thrust, next_stroke
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
 
     require_suffixes((following, (".csv",)))
     *earlier, log = logs
@@ -481,7 +480,7 @@ def _learn_v0(gains: Path, controller: Controller, log: Path, out: Path | None, 
     """Learn v0(z) of the thrust from the log of a slow stroke."""
     from malta.identification.learn import learn_v0
     from malta.identification.log_files import read_log
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
 
     found = learn_v0(controller, read_log(log))
     files = [] if out is None else verify_and_write(found.controller, gains, out)
@@ -513,7 +512,7 @@ def _learn_strokes(
     """Fly strokes on the simulated machine, each taught by those before."""
     from malta.identification.convergence import contraction
     from malta.identification.strokes import learn_strokes
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
     from malta.report.tables.experiments import strokes_table
 
     plant = plant_of(change_machine(controller.parameters, change))
@@ -575,7 +574,7 @@ def replay(gains: GainFile, log: LogFile, machine: MachineFile = None, as_json: 
     from malta.identification.dump import replay_dump
     from malta.identification.log_files import read_log
     from malta.identification.replay import replay_law
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
     from malta.report.tables.experiments import replay_table
 
     controller = read_controller(gains, machine)

@@ -57,8 +57,9 @@ def inspect(
 
 def _plant_of(file: Path, machine_file: Path | None) -> Plant:
     """The machine of a module, whose data file stands beside it, of a data file, a design or a gain file."""
-    from malta.model.data import plant_of, read
+    from malta.model.data import read
     from malta.model.machines import machine
+    from malta.model.plants import plant_of
     from malta.synthesis.design_file import read_design
 
     if machine_file is not None:

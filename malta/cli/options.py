@@ -125,8 +125,9 @@ def read_shares(
     Raises InputError for two shares for all, and as `read_assignments` does.
     """
     from malta.campaigns.plan import box_of
-    from malta.model.data import plant_of, published_figures
+    from malta.model.data import published_figures
     from malta.model.parameters import differences, units_of
+    from malta.model.plants import plant_of
 
     named = [text for text in texts or () if "=" in text]
     general = [text for text in texts or () if "=" not in text]
@@ -250,7 +251,7 @@ def scenarios(ctx: Any, incomplete: str) -> list[str]:
     found: list[str] = []
     with suppress(Exception):
         from malta import gains
-        from malta.model.data import plant_of
+        from malta.model.plants import plant_of
         from malta.simulation.experiments.catalogue import experiments_of
 
         plant = plant_of(gains.read(_typed_gains(ctx)).parameters)
@@ -428,12 +429,13 @@ def read_controller(gains: Path, machine_file: Path | None) -> Controller:
     """
     from malta import gains as gain_files
     from malta.cli.inspect import note_machine
-    from malta.model.data import plant_of
+    from malta.gains.stable import require_held
     from malta.model.machines import machine
+    from malta.model.plants import plant_of
 
     if machine_file is not None:
         machine(machine_file)
-    controller = gain_files.read(gains)
+    controller = require_held(gain_files.read(gains), gains)
     note_machine(plant_of(controller.parameters))
     return controller
 
@@ -524,8 +526,8 @@ def change_machine(parameters: Parameters, changes: list[str] | None) -> Paramet
     """
     from dataclasses import replace
 
-    from malta.model.data import plant_of
     from malta.model.parameters import units_of
+    from malta.model.plants import plant_of
 
     values = read_assignments("--set", changes, units_of(parameters))
     try:

@@ -148,7 +148,7 @@ def motion(
                malta motion design/gains/robust.json --scenario faults --witness
     """
     from malta.gains.file import content_of
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
     from malta.report.page.motion import motion_gif, motion_of, motion_page, read_motion
     from malta.simulation.experiments.catalogue import experiment, witness_flights
 
@@ -240,7 +240,7 @@ def claims(
 
 def _is_meant(spec: Spec) -> bool:
     """Whether a design is meant to reproduce the paper on its machine."""
-    from malta.model.machines import require_part
+    from malta.model.parts import require_part
 
     return spec.name in getattr(require_part("claims", spec.plant.name), "REPRODUCING", (spec.name,))
 

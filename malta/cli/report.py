@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 
-
 CAMPAIGNS = Path("build", "campaigns")  # where `malta campaign` keeps its folders
 
 
@@ -84,7 +83,7 @@ def report(
     \b
     Example:  malta report design/gains/robust.json --out build/robust.html --pdf
     """
-    from malta.gains.file import require_stable
+    from malta.gains.writing import require_stable
     from malta.report.page.document import SUFFIXES, pdf_of
     from malta.report.page.report import report_work
 
@@ -155,7 +154,8 @@ def campaigns_of(
         return []
     from malta.campaigns.run import status
     from malta.campaigns.summary import RunLimits
-    from malta.model.data import plant_of, published_figures
+    from malta.model.data import published_figures
+    from malta.model.plants import plant_of
 
     bounds = RunLimits(published_figures(plant_of(controller.parameters).name), spec)
     found = []
@@ -322,7 +322,7 @@ def _require_kinds(
 
 def _read_machines(files: Sequence[Path], machine: Path | None, change: list[str] | None) -> Machines:
     """Machines and controllers by the names of the designs; designs of one name get those of their files."""
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
 
     controllers = [read_controller(file, machine) for file in files]
     names = [c.name for c in controllers]
@@ -532,7 +532,7 @@ def compare(
     \b
     Example:  malta compare design/gains/table2.json design/gains/robust.json
     """
-    from malta.gains.file import require_stable
+    from malta.gains.writing import require_stable
     from malta.report.page.comparison import compare as compare_subjects, comparison_tables, require_count
     from malta.report.page.document import SUFFIXES
 

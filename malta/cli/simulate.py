@@ -169,7 +169,8 @@ def simulate(
     \b
     Example:  malta simulate design/gains/calibrated.json --set m=0.56 --out build
     """
-    from malta.model.data import plant_of, published_figures
+    from malta.model.data import published_figures
+    from malta.model.plants import plant_of
     from malta.simulation.experiments.catalogue import experiment, main_job
 
     controller = read_controller(gains, machine)
@@ -324,7 +325,7 @@ def _print_tables(
 
 def _conclude(gains: Path, simulation: SimulatedScenario, engine: str) -> None:
     """Note a missing compiler; exit with code 130 after Ctrl-C, raise CheckError when a run ended early."""
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
 
     result = simulation.experiment
     runs = [

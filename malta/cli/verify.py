@@ -99,8 +99,9 @@ def verify(
     Example:  malta verify design/gains/calibrated.json --set m=0.56
     """
     from malta.cli.report import campaigns_of
-    from malta.gains.file import require_stable
-    from malta.model.data import plant_of, published_figures
+    from malta.gains.writing import require_stable
+    from malta.model.data import published_figures
+    from malta.model.plants import plant_of
     from malta.tuning.verify import verify as verify_loop
 
     controller = read_controller(gains, machine)

@@ -22,7 +22,7 @@ from malta.firmware.ctext import c_number, c_numbers
 from malta.firmware.signals import CField, Target
 from malta.firmware.supervisor import Monitor, monitors_of, reference_limits
 from malta.model.plant import Signal
-from malta.synthesis.controller import gains_of
+from malta.synthesis.law import gains_of
 from malta.units import unit_factor
 
 SCATTER = 0.1  # share of each gain by which it may differ, either way

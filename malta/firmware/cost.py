@@ -27,7 +27,7 @@ from malta.firmware.sources import ring_sources, sources
 from malta.firmware.step import programs_of, started_state, step_function, zero_reference
 from malta.firmware.supervisor_text import supervisor_sources
 from malta.firmware.vectors import readings_of
-from malta.model.plant import position_in
+from malta.model.places import position_in
 from malta.simulation import references
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
@@ -192,7 +192,7 @@ def round_gains(c: Controller) -> Controller:
 def rounded_margin(c: Controller, uncertainty: dict[str, float]) -> Margin | None:
     """The margin of the sampled loop with rounded coefficients, proven over the travel; None without uncertainty."""
     from malta.margins.travel import travel_margin
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
 
     if not uncertainty:
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -37,7 +37,6 @@ from malta.firmware.cost import (
     smallest_error,
 )
 from malta.firmware.ctext import c_name, c_number
-from malta.firmware.fmu import Part, build_fmu
 from malta.firmware.period_functions import LINK_RANGE
 from malta.firmware.program import Precision
 from malta.firmware.signals import CField, Target, fidelity_of, reading_ranges
@@ -56,9 +55,10 @@ from malta.firmware.step import programs_of
 from malta.firmware.supervisor import MONITORS, STATES, TIMES, ReferenceLimits, monitors_of, reference_limits
 from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
 from malta.firmware.vectors import SAMPLES, Vector, record_vectors, trial_context, watch_lines
-from malta.gains.file import content_of, read
-from malta.model.data import plant_of
+from malta.gains.file import content_of
+from malta.gains.stable import read_stable
 from malta.model.parameters import box_words
+from malta.model.plants import plant_of
 from malta.simulation.layout import Fidelity
 from malta.synthesis.controller import Controller
 
@@ -519,7 +519,7 @@ def export_c(
     path = locate(gains)
     if clock is not None:
         positive("export", "clock", clock, below=MAX_CLOCK_RATE)
-    target = replace(_target(read(path), precision, until), tunable=tunable, excited=excitation)
+    target = replace(target_of(read_stable(path), precision, until), tunable=tunable, excited=excitation)
     if log is not None:
         target = replace(target, logged=positive("export", "log", log))
         ring_of(target, "")  # raises before anything is proven
@@ -537,47 +537,7 @@ def export_c(
     return list(files)
 
 
-def export_fmu(
-    gains: str | Path,
-    out: str | Path,
-    *,
-    part: Part = "controller",
-    fmi: int = 2,
-    until: Until | None = None,
-    platforms: Sequence[str] | None = None,
-    tunable: bool = False,
-) -> str:
-    """Write a part of a gain file's loop as an FMU, for co-simulation.
-
-    gains : the gain file
-    out : the file
-    part : "controller", "supervised" (with its supervisor), "machine" or "loop" (controller and machine)
-    fmi : version of the interface, 2 or 3
-    until : how far down the controller goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
-    platforms : what it has binaries of, by the names of FMI 2 or 3, as "win64" or "aarch64-linux", or "all",
-        compiled by ziglang (the extra malta[platforms]); None: this computer
-    tunable : the controller's gains, limits, references and monitors are parameters of the FMU
-
-    Returns "", or a sentence that says why the FMU has sources but no binary.
-
-    Raises InputError for another part, version or platform, without ziglang where it is asked for, and for
-    duty cycles of a machine without windings; CheckError where ziglang fails.
-
-    >>> import malta
-    >>> from zipfile import ZipFile
-    >>> gains = "design/gains/calibrated.json"
-    >>> note = malta.export_fmu(gains, "build/calibrated.fmu", fmi=3)
-    >>> "modelDescription.xml" in ZipFile("build/calibrated.fmu").namelist()
-    True
-    """
-    path = locate(gains)
-    target = replace(_target(read(path), "double", until), tunable=tunable and part != "machine")
-    fmu = build_fmu(target, content_of(path)[0].sha256, part=part, fmi=fmi, platforms=platforms)
-    replace_files({Path(out): fmu.content})
-    return fmu.note
-
-
-def _target(c: Controller, precision: Precision, until: Until | None) -> Target:
+def target_of(c: Controller, precision: Precision, until: Until | None) -> Target:
     """What is exported. Raises InputError for what a machine does not have."""
     if until not in (None, *get_args(Until)):
         raise InputError("export", "until", repr(until), "one of " + ", ".join(get_args(Until)))

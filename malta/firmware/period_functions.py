@@ -22,20 +22,12 @@ from malta.firmware.calibration import law_arguments, law_symbols
 from malta.firmware.program import as_written
 from malta.firmware.signals import CField, Target, reading_ranges
 from malta.model.equations import note, recorded_equations, recorded_look_ups
-from malta.model.plant import place_states
+from malta.model.places import place_states
 from malta.simulation.current_control import control_currents
 from malta.simulation.layout import LoopPlan, Symbols, electronics_of, numbers_of
 from malta.simulation.period import law_reference, limited_currents, state_reference
-from malta.synthesis.controller import (
-    command_forces,
-    estimate_states,
-    filter_reading,
-    freeze_moving,
-    frozen_axes,
-    look_ahead,
-    sum_errors,
-)
-from malta.synthesis.schedule import interpolate
+from malta.synthesis.law import command_forces, freeze_moving, frozen_axes, interpolate, look_ahead
+from malta.synthesis.linear_law import estimate_states, filter_reading, sum_errors
 
 ASTRAY_FACTOR = 1e3  # times the reach of a reading: supervisors call a filter astray long before
 LINK_RANGE = (0.05, 4.0)  # readings of the link's voltage that are believed, in multiples of the nominal one

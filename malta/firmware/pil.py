@@ -28,8 +28,9 @@ from malta.files import locate
 from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.vectors import SAMPLES, Vector, record_vectors
-from malta.gains.file import content_of, read
-from malta.model.data import plant_of
+from malta.gains.file import content_of
+from malta.gains.stable import read_stable
+from malta.model.plants import plant_of
 from malta.simulation.layout import Fidelity
 
 # A serial line: its port, and frames on it with a checksum, which are asked for again when they are lost.
@@ -359,7 +360,7 @@ def _target_of(line: SerialLine, path: Path, sha256: str) -> Target:
         raise InputError(
             line.where, "", "a self-test that fails", "C that is compiled as the export's Makefile does"
         )
-    c = read(path)
+    c = read_stable(path)
     depth: Fidelity = fidelity_of(plant_of(c.parameters)) if h.commands else "force"
     t = Target(c, "double" if h.real_bytes == 8 else "float", depth)
     read_at_once = sum(f.size for f in (*t.reference_fields, *t.input_fields))

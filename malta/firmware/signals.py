@@ -14,15 +14,15 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.errors import InputError
 from malta.firmware.program import TYPES, Precision
-from malta.model.data import plant_of
 from malta.model.equations import LookUp, recorded_look_ups
-from malta.model.plant import Plant, Signal, place_states
+from malta.model.places import place_states
+from malta.model.plant import Plant, Signal
+from malta.model.plants import plant_of
 from malta.simulation.layout import Fidelity, Setup, electronics_of, fidelities
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
     from malta.margins.tuned_gains import GainBox
-
 
 SUM_SHARE = 0.1  # share that a state changes by in a sample without anything added, at most: it is then a sum
 UNLIMITED_RANGE = 1e6  # of an output without a known range: beyond, single precision has no room

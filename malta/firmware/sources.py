@@ -33,7 +33,8 @@ from malta.firmware.program import TYPES, Precision, Program, build_program, low
 from malta.firmware.signals import CField, Target, place_of_readings
 from malta.firmware.step import programs_of
 from malta.firmware.supervisor import JUMP, MOST_RATE, bounds_of, reference_limits
-from malta.model.plant import Signal, place_states
+from malta.model.places import place_states
+from malta.model.plant import Signal
 from malta.simulation.period import state_reference
 
 if TYPE_CHECKING:

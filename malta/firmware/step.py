@@ -32,13 +32,8 @@ from malta.model.equations import interpolate, note, recorded_equations
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.period import state_reference
-from malta.synthesis.controller import (
-    command_forces,
-    estimate_states,
-    filter_reading,
-    freeze_moving,
-    sum_errors,
-)
+from malta.synthesis.law import command_forces, freeze_moving
+from malta.synthesis.linear_law import estimate_states, filter_reading, sum_errors
 
 # The pieces of a control period that are usable alone, and all functions of an export together.
 #
@@ -228,8 +223,6 @@ def strokes() -> list[Staged]:
 
 
 _SHARE = ("share", "rate", "acceleration")
-
-
 Vectors = dict[str, Any]
 Step = Callable[[Vectors, Mapping[str, Any], Mapping[str, Any]], tuple[Vectors, Vectors]]
 

@@ -27,9 +27,9 @@ from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.firmware.signals import Target, place_of_readings, reading_ranges, used_clearances
 from malta.linear.sampling import eigenvalues, sample
-from malta.model.plant import Plant, place_states
-from malta.synthesis.controller import Controller
-from malta.synthesis.filters import noise_input
+from malta.model.places import place_states
+from malta.model.plant import Plant
+from malta.synthesis.controller import Controller, noise_input
 from malta.synthesis.riccati import dare
 
 # Of the process noise's variance, for a filter that does without a sensor. For none at all the Kalman filter is the one

@@ -31,15 +31,18 @@ from malta.errors import CheckError, InputError, shorten
 from malta.files import locate
 from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import content_sha256
-from malta.gains.file import UNCOMPARED_TABLES, content_of, read
+from malta.gains.file import content_of
+from malta.gains.stable import read_stable
+from malta.gains.writing import UNCOMPARED_TABLES
 from malta.linear.expressions import NotAnalytic, exact
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.windings import CurrentLoops, chosen_loops
 from malta.margins.travel import ENDS, extent_of, travel_loops
-from malta.model.data import plant_of, published_figures
+from malta.model.data import published_figures
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.proof.box import box_of, sides_of
 from malta.proof.certificate import DERIVED_UNIT, LoopOrigin, loops_of, refused_as_input
 from malta.proof.margin import Ranges
@@ -109,7 +112,7 @@ def disagreement(
     Raises InputError for a file of another kind, for one without uncertain parameters, and for unknown ones.
     """
     claim, path = document.claim, locate(Path(gains))
-    controller, content = read(path), content_of(path)[1]
+    controller, content = read_stable(path), content_of(path)[1]
     plant = plant_of(controller.parameters)
     ranges = uncertain
     if ranges is None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -13,12 +13,12 @@ from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors, require_known
 from malta.files import require_plain_name
 from malta.gains.schema import GainFile, LinearTable, PlantTable
-from malta.model.data import parameters_record, plant_of
-from malta.model.linear import LinearSystem, linear_machine
-from malta.model.machines import machine
-from malta.model.parameters import later_parameters, units_of
-from malta.model.plant import Parameters, Plant, Signal, outputs_at
-from malta.model.signals import Coordinates
+from malta.model.faults import fault_of
+from malta.model.linear.parameters import linear_parameters
+from malta.model.machines import build_plant, machine, parameters_record
+from malta.model.parameters import Parameters, later_parameters, units_of
+from malta.model.places import outputs_at
+from malta.model.signals import Coordinates, Signal
 from malta.synthesis.controller import (
     Commutation,
     Controller,
@@ -33,6 +33,9 @@ from malta.synthesis.controller import (
 )
 from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule
 
+if TYPE_CHECKING:
+    from malta.model.plant import Plant
+
 # The table of a machine from plain matrices in a gain file, from and to its parameters.
 
 
@@ -40,41 +43,7 @@ MATRIX_TOLERANCE = 1e-9  # of the largest entry: matrices that are the same but 
 LINEAR_MACHINE_NAME = "linear"  # the name of all such machines; their own names are their presets
 
 
-def signal_tables(record: Any, *keys: str) -> dict[str, Any]:
-    """Signals of a record, a table for each."""
-    return {key: [s._asdict() for s in getattr(record, key)] for key in keys}
-
-
-def linear_table(parameters: Any) -> dict[str, Any]:
-    """The table plant.linear of such a machine's parameters."""
-    s: LinearSystem = parameters.system
-    matrices, terms = (
-        [dict(zip("ABC", (np.array(M) for M in one), strict=True)) for one in several]
-        for several in ([s.matrices], [found for _, found in s.terms])
-    )
-    later = {
-        "formulas": dict(s.formulas),
-        "parameter_limits": {
-            name: {"above": _finite_or_none(above), "below": _finite_or_none(below)}
-            for name, above, below in s.limits
-        },
-    }
-    return {
-        **signal_tables(s, "states", "inputs", "outputs"),
-        "matrices": matrices[0],
-        "terms": dict(zip([name for name, _ in s.terms], terms, strict=True)),
-        **{key: table for key, table in later.items() if table},
-        "limit": np.array(s.limit) if np.isfinite(s.limit).all() else None,
-        "noise": np.array(s.noise),
-        "dead_time": s.dead_time,
-    }
-
-
-def _finite_or_none(x: float) -> float | None:
-    return x if math.isfinite(x) else None
-
-
-def linear_parameters(plant: PlantTable, given: LinearTable, path: str | Path) -> Parameters:
+def _linear_parameters(plant: PlantTable, given: LinearTable, path: str | Path) -> Parameters:
     """The parameters of a machine from plain matrices."""
     if plant.name != LINEAR_MACHINE_NAME:
         raise InputError(
@@ -89,7 +58,7 @@ def linear_parameters(plant: PlantTable, given: LinearTable, path: str | Path) -
         key: [Signal(s.name, s.unit) for s in getattr(given, key)] for key in ("states", "inputs", "outputs")
     }
     with relocate_errors(path, "plant.linear.{}"):
-        return linear_machine(
+        return linear_parameters(
             **given.matrices.model_dump(),
             **cast("Any", signals),
             name=plant.preset,
@@ -106,7 +75,7 @@ def linear_parameters(plant: PlantTable, given: LinearTable, path: str | Path) -
             limit=math.inf if given.limit is None else given.limit,
             noise=given.noise,
             dead_time=given.dead_time,
-        ).parameters
+        )
 
 
 class _Layout(NamedTuple):
@@ -137,7 +106,7 @@ class _Layout(NamedTuple):
             "feedforward": {
                 "inertia": (m,),
                 "speed": (m, p),
-                "rate": (plant.coordinates, p),
+                "rate": (_of_machine(plant, "f", lambda: plant.coordinates), p),
                 "z_grid": (g,),
                 "v0": (g, m),
                 "position": (m, half) if self.holding else (0, 0),
@@ -223,8 +192,9 @@ def _schedule(file: GainFile, arrays: Arrays, layout: _Layout, path: str | Path)
     stacked = {key: given[key].reshape(len(places), -1, given[key].shape[1]) for key in SCHEDULED_MATRICES}
     with relocate_errors(path, "schedule.places"):
         made = Schedule(file.schedule.variable, output, places, **stacked)
-    x = plant.point(arrays["operating_point"]["x"]).x
-    here = made.at(float(outputs_at(plant, x)[output]))
+    x = np.zeros(len(plant.states))
+    x[list(plant.controlled)] = arrays["operating_point"]["x"]
+    here = made.at(float(_of_machine(plant, "h", lambda: outputs_at(plant, x))[output]))
     for key, M in (arrays["model"] | arrays["gains"]).items():
         if key in here and not np.abs(M - here[key]).max() <= MATRIX_TOLERANCE * np.abs(M).max(initial=0.0):
             raise InputError(
@@ -252,7 +222,7 @@ def _tracks_errors(file: GainFile) -> bool:
 def _layout(file: GainFile, par: Parameters, path: str | Path) -> _Layout:
     """The signals of a file, compared with those of its machine; the states of a law of errors are its own."""
     try:
-        plant = plant_of(par)
+        plant = build_plant(par)
     except CheckError as error:
         raise InputError(path, "plant.parameters", str(error), "a machine that can be controlled") from error
     states, forces, measurements = (
@@ -278,13 +248,21 @@ def _layout(file: GainFile, par: Parameters, path: str | Path) -> _Layout:
     return _Layout(plant, states, observed, grid, coordinates, correlated, holding, places)
 
 
+def _of_machine(plant: Plant, name: str, evaluate: Callable[[], Any]) -> Any:
+    """What a function of the machine gives. Raises InputError, with its line, for one that fails."""
+    try:
+        return evaluate()
+    except Exception as error:  # a user's function may raise anything
+        raise fault_of(error, plant.name, name) from error
+
+
 def _require_positions(file: GainFile, plant: Plant, path: str | Path) -> None:
     """InputError for positions' coordinates of a machine without, of a law without a cost; correlations need them."""
     if file.law is None or file.law.coordinates != "positions":
         raise InputError(path, "noise.correlation", "some", 'none without law.coordinates "positions"')
     if file.cost is None:
         raise InputError(path, "law.coordinates", "positions", "signals where cost is null")
-    if not plant.second_order:
+    if not _of_machine(plant, "f", lambda: plant.second_order):
         raise InputError(path, "law.coordinates", "positions", f"signals of the {plant.name}")
 
 
@@ -383,7 +361,7 @@ def _endless(file: GainFile, key: str) -> bool:
 def _parameters(plant: PlantTable, path: str | Path) -> Parameters:
     """The machine's record of the parameters in a file, whose names and units have to be the machine's."""
     if plant.linear is not None:
-        return linear_parameters(plant, plant.linear, path)
+        return _linear_parameters(plant, plant.linear, path)
     try:
         record = parameters_record(machine(plant.name), path)
     except InputError as error:

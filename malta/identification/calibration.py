@@ -19,7 +19,8 @@ from scipy.stats import t as student
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.model.equilibrium import trim
-from malta.model.plant import Plant, outputs_at
+from malta.model.places import outputs_at
+from malta.model.plant import Plant
 
 if TYPE_CHECKING:
     from malta.identification.log import Log

@@ -33,9 +33,9 @@ from malta.identification.strokes import stroke_of
 from malta.identification.windings import identify_windings
 from malta.loops.classical import disk_sizes
 from malta.loops.loop import Loop, loop
-from malta.model.data import plant_of
-from malta.model.machines import attribute_of
+from malta.model.parts import attribute_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.simulation import references
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate

@@ -42,7 +42,7 @@ from malta.linear.interconnection import gain as of_gain, series
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem, closed_loop
 from malta.loops.loop import loop
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.proof.blocks.gain import Gain, worst_case_gain
 from malta.proof.box import box_of
 from malta.proof.groups import loop_of

@@ -22,8 +22,9 @@ from malta.identification.response import (
     well_found,
 )
 from malta.model.equilibrium import trim
-from malta.model.plant import OperatingPoint, Plant, outputs_at
-from malta.simulation.inputs import Multisine, interleaved_multisine
+from malta.model.places import outputs_at
+from malta.model.plant import OperatingPoint, Plant
+from malta.simulation.multisine import Multisine, interleaved_multisine
 
 if TYPE_CHECKING:
     from malta.loops.loop import Loop

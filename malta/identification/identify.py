@@ -53,8 +53,8 @@ from malta.identification.spectra import (
     whole,
     windowed_covariances,
 )
-from malta.model.data import plant_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.synthesis.controller import Controller
 
 IntArray = NDArray[np.integer[Any]]

@@ -18,9 +18,9 @@ from malta.errors import CheckError, InputError
 from malta.identification.log import Log, log_of, reference_spline, require_currents, require_same_law
 from malta.identification.replay import reference_motion
 from malta.loops.loop import loop
-from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate

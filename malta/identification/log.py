@@ -15,8 +15,9 @@ from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.model.plant import Plant, Signal
 from malta.simulation.current_control import reading_errors
-from malta.simulation.inputs import Multisine, initial_values
+from malta.simulation.inputs import initial_values
 from malta.simulation.layout import LoopPlan
+from malta.simulation.multisine import Multisine
 from malta.simulation.simulate import prepare
 from malta.simulation.trajectory import Trajectory
 

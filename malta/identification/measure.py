@@ -35,8 +35,8 @@ from malta.identification.spectra import (
 from malta.loops.classical import Disk, disk_sizes
 from malta.loops.loop import Loop, loop
 from malta.margins.loop_report import zone
-from malta.model.data import plant_of
 from malta.model.parameters import box_words, units_of
+from malta.model.plants import plant_of
 from malta.synthesis.controller import Controller
 
 LAW_TOLERANCE = 0.02  # of a command at the lines, by which the law of the gain file may miss it

@@ -18,7 +18,8 @@ from malta.identification.calibration import Interval95, at_rest
 from malta.identification.log import Log, require_currents
 from malta.identification.response import axes_of
 from malta.model.equilibrium import trim
-from malta.model.plant import Plant, outputs_at
+from malta.model.places import outputs_at
+from malta.model.plant import Plant
 
 SAMPLES = 20_000  # of a simulated log: they tell a standard deviation to 1 %
 

@@ -16,9 +16,9 @@ from malta.errors import CheckError, InputError
 from malta.identification.log import Log, in_order, reference_spline, require_same_law, sample_excitation
 from malta.identification.response import acting_parameters
 from malta.identification.spectra import MAX_PARAMETER_CHANGE, sentence_of
-from malta.model.data import plant_of
 from malta.model.parameters import twins_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.simulation.engine.engines import Loop, loop_of
 from malta.simulation.inputs import Inputs, initial_values, sample_inputs
 from malta.simulation.layout import layout_of
@@ -26,18 +26,9 @@ from malta.simulation.period import law_reference
 from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario, Simulation, simulation_of
 from malta.simulation.simulate import simulate
-from malta.synthesis.controller import (
-    Controller,
-    command_forces,
-    estimate_states,
-    filter_reading,
-    freeze_moving,
-    frozen_axes,
-    gains_of,
-    look_ahead,
-    sum_errors,
-)
-from malta.synthesis.schedule import interpolate
+from malta.synthesis.controller import Controller
+from malta.synthesis.law import command_forces, freeze_moving, frozen_axes, gains_of, interpolate, look_ahead
+from malta.synthesis.linear_law import estimate_states, filter_reading, sum_errors
 
 COMMAND_TOLERANCE = 1e-6  # of a force's limit, which files of nine digits keep too
 SETTLED_SHARE = 0.5  # of a log, after which the start of the filter is forgotten

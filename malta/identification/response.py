@@ -20,9 +20,9 @@ from scipy.linalg import expm
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import InputError
-from malta.model.data import plant_of
 from malta.model.parameters import symbolic_names, twins_of
 from malta.model.plant import Plant, symbolic
+from malta.model.plants import plant_of
 from malta.model.sensors import with_lags
 from malta.simulation.engine.engines import evaluate
 

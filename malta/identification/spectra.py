@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
     IntArray = NDArray[np.integer[Any]]
 
-
 SIGMA = 1.959963984540054  # half of a 95 % interval
 NEIGHBOURS = 16  # bins between lines, nearest to a line, that tell the noise there
 MIN_LINE_SHARE = 1e-6  # of the largest line of an excitation: what is above is a line

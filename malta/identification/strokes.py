@@ -37,12 +37,13 @@ from malta.identification.learn import learn
 from malta.identification.log import Log, log_of, require_same_law, sample_excitation
 from malta.identification.replay import reference_motion
 from malta.loops.loop import Loop, loop
-from malta.model.data import plant_of
-from malta.model.machines import attribute_of
+from malta.model.parts import attribute_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
+from malta.simulation.flown_strokes import stroke_figures
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-from malta.simulation.trajectory import Trajectory, stroke_figures
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
 FORCE = 0.8  # of what the model says is missing, that the next stroke is sent at most

@@ -37,8 +37,9 @@ from malta.identification.spectra import (
     spectrum_of,
     whole,
 )
-from malta.model.data import plant_of
-from malta.model.plant import Plant, place_states
+from malta.model.places import place_states
+from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.simulation.current_control import open_loop_gain
 from malta.simulation.engine.engines import evaluate
 from malta.synthesis.controller import Controller

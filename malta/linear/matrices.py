@@ -6,6 +6,9 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from scipy import linalg
+
+from malta.arrays import FloatArray
 
 
 def system_matrix(A: Any, B: Any = None, C: Any = None, D: Any = None) -> Any:
@@ -34,3 +37,12 @@ def system_matrix(A: Any, B: Any = None, C: Any = None, D: Any = None) -> Any:
         if M is not None:
             whole[..., at[0] : at[0] + M.shape[-2], at[1] : at[1] + M.shape[-1]] = M
     return whole
+
+
+def balanced_units(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
+    """Powers of two t for states x = t xi, in which A t / t', B / t' and C t have rows and columns of like size."""
+    n, size = len(A), len(A) + max(B.shape[1], len(C))
+    whole = np.zeros((size, size))
+    whole[: n + len(C), : n + B.shape[1]] = system_matrix(A, B, C)
+    _, (units, _) = linalg.matrix_balance(whole, permute=False, separate=True)
+    return np.asarray(units[:n])

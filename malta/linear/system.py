@@ -20,7 +20,7 @@ from scipy import linalg, sparse
 from malta.arguments import describe
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
-from malta.linear.matrices import system_matrix
+from malta.linear.matrices import balanced_units
 from malta.linear.sampling import delay_inputs, eigenvalues, sample
 
 MIN_SCHUR_FREQUENCIES = 32  # frequencies from which on a Schur form is worth its time
@@ -239,15 +239,6 @@ def _pick(wanted: Sequence[int | str], known: tuple[str, ...], field: str) -> li
     if missing:
         raise InputError("System", field, repr(missing[0]), "one of " + " ".join(known))
     return [known.index(one) if isinstance(one, str) else one for one in wanted]
-
-
-def balanced_units(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
-    """Powers of two t for states x = t xi, in which A t / t', B / t' and C t have rows and columns of like size."""
-    n, size = len(A), len(A) + max(B.shape[1], len(C))
-    whole = np.zeros((size, size))
-    whole[: n + len(C), : n + B.shape[1]] = system_matrix(A, B, C)
-    _, (units, _) = linalg.matrix_balance(whole, permute=False, separate=True)
-    return np.asarray(units[:n])
 
 
 def _scale(

@@ -28,8 +28,8 @@ from malta.linear.branches import INTERVALS, SYMBOLS, Interval
 from malta.linear.expressions import FIELD, MatrixProgram, NotAnalytic, program
 from malta.linear.uncertain import Derived, UncertainSystem
 from malta.loops.parametric_plants import rest_model
-from malta.model.data import plant_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.synthesis.controller import Controller, Feedforward
 
 

@@ -25,15 +25,16 @@ from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.linear.conversion import from_control
 from malta.linear.interconnection import append, connect, gain
-from malta.linear.matrices import system_matrix
+from malta.linear.matrices import balanced_units, system_matrix
 from malta.linear.sampling import eigenvalues
-from malta.linear.system import System, balanced_units
+from malta.linear.system import System
 from malta.loops.classical import Nominal
 from malta.loops.loop import Loop, loop_along, loop_from
 from malta.model.plant import Plant, Signal
 from malta.processes import on_one_thread
-from malta.synthesis.controller import Controller, LinearLaw, linear_law
+from malta.synthesis.controller import Controller
 from malta.synthesis.law_system import reference_names, set_point
+from malta.synthesis.linear_law import LinearLaw, linear_law
 
 # The loop of a machine and a controller as systems of python-control: to plot, to simulate, to compute with.
 #

@@ -21,9 +21,9 @@ from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError, require_known
 from malta.linear.sampling import eigenvalues
 from malta.loops.linear_loops import LinearLoop, Place, linear_loop
-from malta.model.data import plant_of
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 

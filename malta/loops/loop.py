@@ -31,11 +31,13 @@ from malta.loops.sampled_loops import (
     push_through,
 )
 from malta.loops.windings import CurrentLoops, chosen_loops, left_out
-from malta.model.equilibrium import with_parameters
 from malta.model.linearize import LinearModel
 from malta.model.parameters import units_of
-from malta.model.plant import Plant, position_at
-from malta.synthesis.controller import Controller, law_at
+from malta.model.places import position_at
+from malta.model.plant import Plant
+from malta.model.traced import with_parameters
+from malta.synthesis.controller import Controller
+from malta.synthesis.law import law_at
 
 
 @display

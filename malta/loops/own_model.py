@@ -1,32 +1,14 @@
-"""What a controller believes of its machine: the poles of regulator and filter on the model that it was designed on."""
+"""Whether the gains of a controller hold what it believes in: its own model, or the machine that it names."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import numpy as np
-
-from malta.arrays import ComplexArray
-from malta.linear.sampling import add_integrals, eigenvalues
+from malta.linear.sampling import eigenvalues
 from malta.loops.loop import loop_of_model
-from malta.model.data import plant_of
 from malta.model.linearize import linearize
+from malta.model.plants import plant_of
 from malta.processes import on_one_thread
+from malta.synthesis import separation
 from malta.synthesis.controller import Controller
-
-
-def controller_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
-    """Eigenvalues in z of regulator and filter on the controller's own model (separation principle).
-
-    The regulator has no poles for observed disturbance forces, which only the filter estimates.
-    """
-    k = len(c.Ad) - c.observed * len(c.forces)
-    A, B, K = c.Ad[:k, :k], c.Bd[:k], c.K[:, :k]
-    if c.integrating:
-        summed = list(c.summed)
-        A, B = add_integrals(A, B, c.Cd[summed, :k], c.sample_time)
-        K = np.hstack([K, -c.Ki[:, summed]])
-    return eigenvalues(A - B @ K), eigenvalues((np.eye(len(c.Ad)) - c.L @ c.Cd) @ c.Ad)
 
 
 @on_one_thread
@@ -36,17 +18,12 @@ def unstable_gain(c: Controller) -> tuple[str, float] | None:
     An LQG is judged by its regulator and its filter. A PID or a law of errors has no model and is judged on the machine
     that it names.
     """
-    if c.schedule is not None:
-        fixed = (replace(c, **matrices, schedule=None) for matrices in map(c.schedule.at, c.schedule.places))
-        return next((found for found in map(unstable_gain, fixed) if found is not None), None)
-    if c.cost is None:
-        plant = plant_of(c.parameters)
-        model = linearize(plant, plant.point(c.operating_point[0]))
-        found = {"K": eigenvalues(loop_of_model(model, c).matrix)}
-    else:
-        found = dict(zip("KL", controller_poles(c), strict=True))
-    for name, poles in found.items():
-        radius = float(np.abs(poles).max())
-        if not radius < 1:
-            return name, radius
+    if c.cost is not None:
+        return separation.unstable_gain(c)
+    plant = plant_of(c.parameters)
+    model = linearize(plant, plant.point(c.operating_point[0]))
+    for law in separation.fixed_laws(c):
+        found = separation.unstable_pole({"K": eigenvalues(loop_of_model(model, law).matrix)})
+        if found is not None:
+            return found
     return None

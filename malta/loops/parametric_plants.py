@@ -23,10 +23,12 @@ from malta.linear.systems import from_source
 from malta.linear.uncertain import DOMAIN_END_TEXT, UncertainSystem
 from malta.loops.rest import Condition, Formula, command_of, limits_at_rest, rest_of
 from malta.loops.windings import WindingModel, with_windings
+from malta.model.currents import is_commutated
 from malta.model.equilibrium import balance, with_command
-from malta.model.linearize import is_commutated, jacobians, linearize
+from malta.model.linearize import jacobians, linearize
 from malta.model.parameters import shape_parameters, twins_of, units_of
-from malta.model.plant import Plant, position_at, position_in, symbolic
+from malta.model.places import position_at, position_in
+from malta.model.plant import Plant, symbolic
 from malta.model.sensors import Sensors, with_lags
 from malta.model.soundness import unproven
 from malta.work import check_clock
@@ -99,7 +101,7 @@ def of_plant(
         command = command_of(chain, p, acting, np.array(nominal, dtype=float), wanted)
         v, why = command.values, why or command.why
         conditions += command.conditions
-        if loaded:
+        if loaded and not why:
             machine = in_symbols(plant, symbols)
             conditions += limits_at_rest(machine, believed or plant, rest.function(p[own], z)[0], v)
         A, B, C, E = of(p[own], z, v)[:4]

@@ -242,7 +242,7 @@ def _newton(rows: Any, unknowns: Unknowns) -> Any:
 
 def _exact(rows: Any, unknowns: Unknowns) -> Formula | None:
     """The unknowns from exact rational equations: all that are affine at once, else one by one; None where neither."""
-    r, near, p, nominal = unknowns
+    r, near, p, _ = unknowns
     left, conditions, values = list(range(r.numel())), list[Condition](), ca.SX(r)
     while left:
         own = r[left]
@@ -258,9 +258,8 @@ def _exact(rows: Any, unknowns: Unknowns) -> Formula | None:
         if pair is None:
             return None
         i, j = pair
-        value, condition = _root(*equations.quadratic(i, j), p, nominal, float(near[left[j]]))
-        values[left[j]] = value
-        conditions += [condition] if condition is not None else []
+        values[left[j]], found = equations.root(i, j, unknowns, float(near[left[j]]))
+        conditions += found
         keep = [k for k in range(rows.numel()) if k != i]
         rows, left = rows[keep], [k for k in left if k != left[j]]
     return Formula(values, tuple(conditions))
@@ -325,14 +324,48 @@ class _Equations(NamedTuple):
                 return i, used.pop()
         return None
 
-    def quadratic(self, i: int, j: int) -> tuple[Any, Any, Any, Any]:
-        """c, b, a of c + b r + a r^2, and the discriminant b^2 - 4 a c, in which squares of roots are resolved."""
+    def root(self, i: int, j: int, unknowns: Unknowns, near: float) -> tuple[Any, list[Condition]]:
+        """The root of equation i, c + b r + a r^2, that is near at the nominal values; and where there is one.
+
+        It is continuous in p while its root is real and its divisor is not zero, and so stays on its branch.
+        """
         zero = Ratio(self.s.context.constant(0))
         by_power = {power[j]: c for power, c in self._coefficients(self.tops[i]).items()}
         c, b, a = (by_power.get(k, zero) for k in range(3))
-        four = self.s.constant(4.0)
-        terms = (c, b, a, _resolve_roots(self.s, b * b - four * a * c))
-        return tuple(rational.expression(t, self.variables) if not t.is_zero() else ca.SX(0) for t in terms)
+        if a.is_zero():
+            return self._expression(-c / b), []
+        square, conditions = self._square_root(
+            _resolve_roots(self.s, b * b - self.s.constant(4.0) * a * c), unknowns
+        )
+        c, b, a = map(self._expression, (c, b, a))
+        sign = 1.0 if float(ca.Function("b", [unknowns.p], [b])(unknowns.nominal)) >= 0 else -1.0
+        far = -(b + sign * square) / 2
+        roots = c / far, far / a
+        off = [abs(float(ca.Function("r", [unknowns.p], [r])(unknowns.nominal)) - near) for r in roots]
+        return roots[int(off[1] < off[0])], conditions
+
+    def _square_root(self, r: Ratio, unknowns: Unknowns) -> tuple[Any, list[Condition]]:
+        """sqrt(r), with powers of variables before the root: in balls C^2 + m C reaches below zero before C does."""
+        top, below = r.num, r.den if r.den is not None else self.s.constant(1.0).num
+        before, powers = ca.SX(1), [min(e) for e in zip(*(m for m in top.monoms()), strict=True)]
+        powers_below = [min(e) for e in zip(*(m for m in below.monoms()), strict=True)]
+        for k, (e, d) in enumerate(zip(powers, powers_below, strict=True)):
+            x, power = self.variables[k], int(e) - int(d)
+            if power:
+                positive = float(ca.Function("x", [unknowns.p], [x])(unknowns.nominal)) > 0
+                size = x if positive else -x
+                before *= size ** (power // 2) * (ca.sqrt(size) if power % 2 else 1)
+        top, below = (
+            self.s.context.from_dict(
+                {tuple(e - c for e, c in zip(m, least, strict=True)): x for m, x in part.to_dict().items()}
+            )
+            for part, least in ((top, powers), (below, powers_below))
+        )
+        rest = self._expression(Ratio(top) / Ratio(below))
+        return before * ca.sqrt(rest), [] if rest.is_constant() else [Condition(rest)]
+
+    def _expression(self, r: Ratio) -> Any:
+        return ca.SX(0) if r.is_zero() else rational.expression(r, self.variables)
 
     def _coefficients(self, polynomial: Any) -> dict[tuple[int, ...], Ratio]:
         """The coefficients of powers of the unknowns."""
@@ -343,23 +376,6 @@ class _Equations(NamedTuple):
             rest = tuple(0 if first <= k < end else e for k, e in enumerate(monomial))
             parts.setdefault(power, {})[rest] = c
         return {power: Ratio(self.s.context.from_dict(terms)) for power, terms in parts.items()}
-
-
-def _root(
-    c: Any, b: Any, a: Any, discriminant: Any, p: Any, nominal: FloatArray, near: float
-) -> tuple[Any, Condition | None]:
-    """The root of c + b r + a r^2 that is near at the nominal values, as a formula; and where there is one.
-
-    It is continuous in p while its root is real and its divisor is not zero, and so stays on its branch.
-    """
-    if a.is_zero():
-        return -c / b, None
-    sign = 1.0 if float(ca.Function("b", [p], [b])(nominal)) >= 0 else -1.0
-    far = -(b + sign * ca.sqrt(discriminant)) / 2
-    near_root, far_root = c / far, far / a
-    both = [float(ca.Function("root", [p], [r])(nominal)) for r in (near_root, far_root)]
-    root = near_root if abs(both[0] - near) <= abs(both[1] - near) else far_root
-    return root, None if discriminant.is_constant() else Condition(discriminant)
 
 
 def _resolve_roots(s: Symbolic, r: Ratio) -> Ratio:

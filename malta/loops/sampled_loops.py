@@ -46,20 +46,17 @@ from malta.loops.windings import (
     with_estimated_emf,
     with_windings,
 )
-from malta.model.data import plant_of
-from malta.model.equilibrium import trace, trim
-from malta.model.linearize import LinearModel, is_commutated, linearize
-from malta.model.plant import OperatingPoint, Plant, off_stroke, position_at, position_in, whole_samples
+from malta.model.currents import is_commutated
+from malta.model.equilibrium import trim
+from malta.model.linearize import LinearModel, linearize
+from malta.model.places import off_stroke, position_at, position_in
+from malta.model.plant import OperatingPoint, Plant, whole_samples
+from malta.model.plants import plant_of
 from malta.model.sensors import with_lags
-from malta.synthesis.controller import (
-    Controller,
-    LinearLaw,
-    law_at,
-    linear_law,
-    with_forces_read,
-    with_readings,
-    with_slope,
-)
+from malta.model.traced import trace
+from malta.synthesis.controller import Controller
+from malta.synthesis.law import law_at
+from malta.synthesis.linear_law import LinearLaw, linear_law, with_forces_read, with_readings, with_slope
 from malta.synthesis.recovery import StepResponse, step_response
 
 # The control law of a gain file as the machine runs it, as the compensator of a proof: hold, delay, current loops.

@@ -27,13 +27,16 @@ from malta.errors import CheckError, InputError
 from malta.linear.matrices import system_matrix
 from malta.linear.sampling import delay_inputs, sample
 from malta.linear.uncertain import Compensator
-from malta.model.data import plant_of
-from malta.model.equilibrium import trace
-from malta.model.linearize import is_commutated, linearize
-from malta.model.plant import OperatingPoint, Plant, outputs_at
+from malta.model.currents import is_commutated
+from malta.model.linearize import linearize
+from malta.model.places import outputs_at
+from malta.model.plant import OperatingPoint, Plant
+from malta.model.plants import plant_of
+from malta.model.traced import trace
 
 if TYPE_CHECKING:
-    from malta.synthesis.controller import Controller, CurrentLoop, LinearLaw
+    from malta.synthesis.controller import Controller, CurrentLoop
+    from malta.synthesis.linear_law import LinearLaw
 
 
 CurrentLoops = Literal["lag", "pi"]

@@ -18,8 +18,8 @@ from malta.loops.time_domain import Recovery, furthest, noise_of, recovery
 from malta.loops.windings import CurrentLoops, left_out
 from malta.margins.travel import NO_EXTENT, NOT_BETWEEN_TEXT, Extent
 from malta.merits import ROOTS, Merit, figure, in_groups
-from malta.model.machines import FINE_UNITS
 from malta.model.parameters import box_words
+from malta.model.signal_groups import FINE_UNITS
 from malta.proof.margin import NOT_PROVEN, Margin
 from malta.synthesis.requirements import Figure, NoiseRms, Payload, Verdict, judge_figure, ratio_of
 

@@ -39,9 +39,9 @@ from malta.linear.matrices import system_matrix
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.parametric_plants import of_plant
 from malta.loops.windings import CurrentLoops, chosen_loops
-from malta.model.data import plant_of
 from malta.model.parameters import si, units_of
 from malta.model.plant import Plant, whole_samples
+from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.proof.polynomial.enclosure import precision
 from malta.proof.rates import (

@@ -12,11 +12,10 @@ import time as clock
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.errors import InputError
 from malta.linear.expressions import NotAnalytic
 from malta.linear.uncertain import Compensator, UncertainSystem, instability
 from malta.loops.classical import Nominal
@@ -24,10 +23,10 @@ from malta.loops.parametric_plants import MAX_MODEL_OPERATIONS, model_of
 from malta.loops.sampled_loops import LAST_STAGE, loaded_loop, machine_law, machine_system
 from malta.loops.windings import CurrentLoops
 from malta.margins.scheduled_loops import loops_between_places
-from malta.model.data import plant_of
-from malta.model.linearize import is_commutated
+from malta.model.currents import is_commutated
 from malta.model.parameters import units_of
-from malta.model.plant import off_stroke, outputs_at, position_at
+from malta.model.places import off_stroke, outputs_at, position_at
+from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
@@ -44,7 +43,7 @@ from malta.proof.robust import (
 )
 from malta.proof.weak_coupling import HeldLoop
 from malta.proof.weak_coupling.held_currents import held_machine
-from malta.synthesis.schedule import point_at
+from malta.synthesis.law import point_at
 from malta.work import MORE_WORK, Budget, WorkUp, count_work, in_rounds
 
 if TYPE_CHECKING:
@@ -52,7 +51,6 @@ if TYPE_CHECKING:
 
     from malta.arrays import FloatArray
     from malta.model.plant import Plant
-    from malta.proof.blocks.gain import Gain
     from malta.synthesis.controller import Controller
 
 
@@ -477,38 +475,6 @@ def place_margin(
             return found
     with count_work(PLACE_WORK):
         return robust_margin(*loop, ranges)
-
-
-@on_one_thread
-def worst_sensitivities(
-    plant: Plant,
-    controller: Controller,
-    ranges: Ranges,
-    current_loops: CurrentLoops = LAST_STAGE,
-    *,
-    at: Literal["sensors", "forces"] = "sensors",
-    time: float | None = None,
-) -> dict[str, Gain]:
-    """The largest |S| of each sensor, the other loops closed, over the modelled box, the travel and `plant.over`.
-
-    at : the sensors, or the forces in their place
-
-    The others are those of travel_margin. Without a proof along the travel, it covers the middle and the end alone.
-    """
-    if controller.schedule is not None:
-        raise InputError("worst_case", controller.name, "a scheduled law", "a law of one set of matrices")
-    from malta.proof.blocks.gain import (
-        worst_case_gain,  # with all that dynamics take, which a design does not ask for
-    )
-
-    along, over = travel_loops(plant, controller, tuple(ranges), current_loops)
-    found = {}
-    for k, signal in enumerate(plant.outputs if at == "sensors" else plant.inputs):
-        each = [worst_case_gain(*loop, ranges, over, at=at, channel=k, time=time) for loop in along]
-        worst = max(each, key=lambda gain: gain.lower)
-        proven = [gain.upper for gain in each if gain.upper is not None]
-        found[signal.name] = replace(worst, upper=max(proven) if len(proven) == len(each) else None)
-    return found
 
 
 @lru_cache(maxsize=32)

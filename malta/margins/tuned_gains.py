@@ -21,18 +21,19 @@ import numpy as np
 from malta.linear.matrices import system_matrix
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
+from malta.loops.feedforward_along import slopes_along
 from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.windings import chosen_loops, current_control, force_modes, windings_of
 from malta.margins.travel import travel_loops
-from malta.model.data import plant_of
-from malta.model.linearize import is_commutated
+from malta.model.currents import is_commutated
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.proof.box import box_of
 from malta.proof.groups import groups, loop_of
 from malta.proof.margin import Ranges
 from malta.proof.robust import robust_margin
-from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller, linear_law, with_forces_read
 from malta.work import Budget
 
 FACTOR = "gain factor"  # the name of the further parameter
@@ -137,6 +138,12 @@ def tuned_loop(plant: Plant, c: Controller, system: UncertainSystem) -> tuple[Un
     if len(k.emf[0]):
         emf[0][:, : k.emf[0].shape[1]], emf[1][:] = k.emf
     (C_n, C_1), (D_n, D_1), law_B = np.split(law.C, 2), np.split(law.D[:, :p], 2), law.B[:, :p]
+    # v0 that follows the position is read behind the outputs, see feedforward_along.py
+    slopes = slopes_along(plant, c) if plant.stroke.name in system.names else None
+    if slopes is not None:
+        read, still = with_forces_read(linear_law(c), slopes.forces, m), np.zeros((m, len(slopes.forces)))
+        law_B, D_1 = np.hstack([law_B, read.B_y[:, p:]]), np.hstack([D_1, read.D_y[:, p:]])
+        D_n, emf, p = np.hstack([D_n, still]), (emf[0], np.hstack([emf[1], still])), p + len(slopes.forces)
     # as with_current_control: inputs y and phi, further states I, outputs w
     A = system_matrix(law.A, None, slope * S @ C_1, one)
     B = system_matrix(law_B, np.zeros((n, m)), slope * S @ D_1, -slope * one)

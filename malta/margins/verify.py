@@ -30,7 +30,6 @@ from malta.loops.classical import (
     worst_of,
 )
 from malta.loops.loop import loop_of_model
-from malta.loops.own_model import controller_poles
 from malta.loops.parametric_plants import of_plant
 from malta.loops.sampled_loops import (
     LAST_STAGE,
@@ -53,16 +52,18 @@ from malta.margins.travel import (
     smallest_margin,
     travel_margin,
 )
-from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.model.parameters import units_of
-from malta.model.plant import Plant, position_at
+from malta.model.places import position_at
+from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.robust import robust_margin
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import gain_at_rest
 from malta.synthesis.lqg import integrals_of, kalman, lqi, lqr, weights_of
+from malta.synthesis.separation import controller_poles
 from malta.work import Budget, count_work
 
 

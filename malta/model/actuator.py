@@ -10,8 +10,9 @@ from typing import Any
 
 import casadi as ca
 
+from malta.model.drive import Drive, Electronics
 from malta.model.sensors import require_short
-from malta.model.signals import DEFAULT, CasadiFn, Drive, Electronics, Signal
+from malta.model.signals import DEFAULT, CasadiFn, Signal
 
 
 @dataclass(frozen=True, eq=False)

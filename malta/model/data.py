@@ -10,25 +10,20 @@ here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from collections.abc import Mapping
+from dataclasses import MISSING, fields
 from decimal import Decimal
-from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Literal, NamedTuple, cast
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field as Checked, StrictStr
 
 from malta.arguments import is_number
-from malta.errors import CheckError, InputError
+from malta.errors import InputError
 from malta.files import file_exists, locate, shipped_path
-from malta.model.checks import check_numbers, line_of
-from malta.model.equilibrium import check_values, is_checked, register
-from malta.model.machines import file_of, machine, machine_names, module_of, name_of
+from malta.model.machines import file_of, machine, machine_names, parameters_record
 from malta.model.parameters import check_range
-from malta.model.plant import Parameters, Plant
-from malta.model.soundness import require_readings
 from malta.tables import Finite, Quantity, Record, entry, load_toml, validate
 from malta.units import to_si, unit_factor
 
@@ -132,72 +127,6 @@ def machine_beside(name: str, data_file: Path) -> ModuleType:
         raise InputError(
             data_file, "machine", repr(name), f"one of {known}, or the file of its module, as rotor.py"
         ) from error
-
-
-def parameters_record(module: ModuleType, where: str | Path) -> type[Parameters]:
-    """The class Parameters of a machine's module.
-
-    Raises InputError unless it is a dataclass whose fields have units and one of which is `preset`.
-    """
-    record: Any = getattr(module, "Parameters")  # noqa: B009  a user's module
-    if not (is_dataclass(record) and isinstance(record, type)):
-        raise InputError(
-            where, f"{module.__name__.rpartition('.')[2]}.Parameters", repr(record), "a frozen dataclass"
-        )
-    if not any("unit" in f.metadata for f in fields(record)):
-        raise InputError(
-            where, "Parameters", "no field with a unit", 'some, as `m: float = si("kg", above=0)`'
-        )
-    if "preset" not in {f.name for f in fields(record)}:
-        raise InputError(where, "Parameters", "no field preset", '`preset: str = "custom"`')
-    return cast("type[Parameters]", record)
-
-
-def plant_of(parameters: Parameters) -> Plant:
-    """Build the plant with these parameters, by the function `plant` of the module that defines their class.
-
-    parameters : a machine's Parameters record, SI
-
-    Returns a Plant; equal records of parameters have the same one.
-
-    Raises InputError when the module has no such function, and when the fields of its plant do not fit each other.
-
-    >>> import malta
-    >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
-    >>> plant.name, len(plant.states), [s.name for s in plant.outputs]
-    ('tubular', 12, ['x1', 'y1', 'x2', 'y2', 'z'])
-    """
-    return _plant_of(parameters)
-
-
-@lru_cache(maxsize=64)  # records are immutable, and building a plant is slow
-def _plant_of(parameters: Any) -> Plant:
-    module = module_of(parameters)
-    build: Callable[[Any], Plant] | None = getattr(module, "plant", None)
-    if build is None:
-        raise InputError(module.__name__, "plant", "nothing", "a function of Parameters -> Plant beside them")
-    name = name_of(module)
-    try:
-        plant = build(parameters)
-    except (InputError, CheckError):
-        raise
-    except Exception as error:  # a user's function may raise anything
-        found = f"{type(error).__name__}: {error}{(line := line_of(error)) and f', at {line}'}"
-        raise InputError(f"{name}.py", "plant", found, "a function that makes a Plant") from error
-    if not isinstance(plant, Plant):
-        raise InputError(
-            f"{name}.py", "plant", f"a function that returns {plant!r}", "one that returns a Plant"
-        )
-    if file_of(name) is not None and plant.name != name:
-        raise InputError(f"{name}.py", "plant: name", repr(plant.name), f"{name!r}, as the file is called")
-    checked = is_checked(plant, build)
-    if not checked:
-        check_numbers(plant)
-    register(plant, build)
-    if checked:
-        check_values(plant)
-    require_readings(plant)
-    return plant
 
 
 # The figures that a machine's paper prints, from published.toml files, each with its unit.

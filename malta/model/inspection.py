@@ -11,8 +11,7 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.display import Description, display
 from malta.errors import CheckError, InputError
-from malta.model.equilibrium import trace
-from malta.model.linearize import _clearance, _limits
+from malta.model.currents import _clearance, _limits
 from malta.model.parameters import units_of
 from malta.model.plant import Plant, has_feedthrough
 from malta.model.soundness import (
@@ -29,6 +28,7 @@ from malta.model.soundness import (
     symbols_of,
     uncontrolled_rows,
 )
+from malta.model.traced import trace
 from malta.units import is_unit_of
 
 PLACES, HALVINGS = 64, 12  # cells from rest to each end of a state, and how often one of them is halved

@@ -6,12 +6,6 @@ A machine is a Python module with `Parameters` and `plant(par) -> Plant`. It com
   - a file that the user names: `machine = "rotor.py"` in a data file, `--machine rotor.py`, or in Python
     `malta.machine("rotor.py")`.
 A gain file names a machine, never a path, so reading one never runs code that the user did not name.
-
-Optional parts are found beside the model: EXPERIMENTS, FIGURES, CLAIMS, REQUIREMENTS, WORDS and other names are those
-of the module itself, or of the modules `experiments`, `figures`, `claims`, `requirements` beside it; claims may stand
-in `paper`, a module or a folder, with what they are computed from.
-
-Groups of a machine's signals for figures and tables: one unit each, named by the WORDS of its experiments.
 """
 
 from __future__ import annotations
@@ -22,21 +16,24 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache, lru_cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from pkgutil import iter_modules
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-from malta.errors import InputError
+from malta.errors import CheckError, InputError
 from malta.files import file_exists, read_file
+from malta.model.faults import line_of
+from malta.model.parameters import Parameters
 
 if TYPE_CHECKING:
-    from malta.model.plant import Plant, Signal
+    from malta.model.plant import Plant
 
 
 class _File(NamedTuple):
@@ -47,7 +44,6 @@ class _File(NamedTuple):
 
 
 GROUP = "malta.machines"
-Part = Literal["experiments", "figures", "claims", "requirements"]
 FILES = "malta_machine_files"  # in sys.modules, the machines that come from files are modules of this package
 _files: dict[str, _File] = {}  # machines that the user named by their files, by the files' stems
 
@@ -115,6 +111,30 @@ def module_of(parameters: Any) -> ModuleType:
         return own
 
 
+@lru_cache(maxsize=64)  # records are immutable, and building a plant is slow
+def build_plant(parameters: Any) -> Plant:
+    """The plant that the function `plant` of a record's module makes, one for equal records; `plant_of` checks it."""
+    module = module_of(parameters)
+    build: Callable[[Any], Plant] | None = getattr(module, "plant", None)
+    if build is None:
+        raise InputError(module.__name__, "plant", "nothing", "a function of Parameters -> Plant beside them")
+    name = name_of(module)
+    try:
+        plant = build(parameters)
+    except (InputError, CheckError):
+        raise
+    except Exception as error:  # a user's function may raise anything
+        found = f"{type(error).__name__}: {error}{(line := line_of(error)) and f', at {line}'}"
+        raise InputError(f"{name}.py", "plant", found, "a function that makes a Plant") from error
+    if not hasattr(plant, "design_states"):
+        raise InputError(
+            f"{name}.py", "plant", f"a function that returns {plant!r}", "one that returns a Plant"
+        )
+    if file_of(name) is not None and plant.name != name:
+        raise InputError(f"{name}.py", "plant: name", repr(plant.name), f"{name!r}, as the file is called")
+    return plant
+
+
 def machine_names() -> list[str]:
     """The names of all machines: of installed packages and of files loaded so far."""
     return sorted({*_installed_machines(), *_files})
@@ -123,62 +143,6 @@ def machine_names() -> list[str]:
 def file_of(name: str) -> Path | None:
     """The file of a machine that was loaded from a file; None for others."""
     return _files[name].path if name in _files else None
-
-
-def sources_of(name: str) -> dict[str, str]:
-    """The texts of the modules of a machine that was loaded from a file, by module name; empty for others."""
-    if name not in _files:
-        return {}
-    own = _files[name].module
-    modules = {key: module for key, module in sys.modules.items() if key == own or key.startswith(own + ".")}
-    paths = {key: getattr(module, "__file__", None) for key, module in modules.items()}
-    return {key: Path(path).read_text(encoding="utf-8") for key, path in paths.items() if path}
-
-
-def load_sources(name: str, sources: Mapping[str, str]) -> ModuleType:
-    """Load a machine from the texts of its modules, as `sources_of` returns them, on a computer without its files."""
-    own = min(sources, key=len)
-    if own in sys.modules:
-        return sys.modules[own]
-    folder = Path(tempfile.mkdtemp(prefix="malta-machine-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    for key, text in sources.items():
-        stem = name if key == own else key.rpartition(".")[2]
-        (folder / f"{stem}.py").write_text(text, encoding="utf-8")
-    path = folder / f"{name}.py"
-    return _load(path, _File(path.resolve(), own))  # under the name that records from elsewhere bear
-
-
-def part_of(part: Part, name: str) -> ModuleType | None:
-    """The module of a machine's optional part; None without such a part or machine."""
-    if name not in _files and name not in _installed_machines():
-        return None
-    module = machine(name)
-    folder = module.__name__ if hasattr(module, "__path__") else module.__name__.rpartition(".")[0]
-    for target in (*([f"{folder}.paper"] if part == "claims" else []), f"{folder}.{part}"):
-        try:
-            return import_module(target)
-        except ModuleNotFoundError as error:
-            if error.name not in (target, folder):  # a module that the part imports
-                raise
-    return None
-
-
-def attribute_of(plant: Plant, part: Part, name: str, default: Any = None) -> Any:
-    """The value of an optional name, from the module of the plant or of the part; else `default`."""
-    model = module_of(plant.parameters)
-    if hasattr(model, name):
-        return getattr(model, name)
-    return getattr(part_of(part, plant.name), name, default)
-
-
-def require_part(part: Part, name: str) -> ModuleType:
-    """The module of a machine's part. Raises InputError when the machine has none."""
-    module = part_of(part, name)
-    if module is None:
-        known = ", ".join(other for other in machine_names() if part_of(part, other) is not None)
-        raise InputError(part, "machine", repr(name), f"one of {known}, or another that has {part}")
-    return module
 
 
 @cache
@@ -254,76 +218,44 @@ def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {line}{at}"
 
 
-FINE_UNITS: Mapping[str, str] = {"m": "um", "rad": "urad"}  # units of deviations
-KINDS: Mapping[str, str] = {"N": "force", "N m": "torque"}
+def parameters_record(module: ModuleType, where: str | Path) -> type[Parameters]:
+    """The class Parameters of a machine's module.
+
+    Raises InputError unless it is a dataclass whose fields have units and one of which is `preset`.
+    """
+    record: Any = getattr(module, "Parameters")  # noqa: B009  a user's module
+    if not (is_dataclass(record) and isinstance(record, type)):
+        raise InputError(
+            where, f"{module.__name__.rpartition('.')[2]}.Parameters", repr(record), "a frozen dataclass"
+        )
+    if not any("unit" in f.metadata for f in fields(record)):
+        raise InputError(
+            where, "Parameters", "no field with a unit", 'some, as `m: float = si("kg", above=0)`'
+        )
+    if "preset" not in {f.name for f in fields(record)}:
+        raise InputError(where, "Parameters", "no field preset", '`preset: str = "custom"`')
+    return cast("type[Parameters]", record)
 
 
-class SignalGroup(NamedTuple):
-    """Signals of one unit that a figure shows together."""
-
-    name: str
-    unit: str  # SI
-    columns: tuple[int, ...]
-
-    @property
-    def fine(self) -> str:
-        """The unit of deviations."""
-        return FINE_UNITS.get(self.unit, self.unit)
+def sources_of(name: str) -> dict[str, str]:
+    """The texts of the modules of a machine that was loaded from a file, by module name; empty for others."""
+    if name not in _files:
+        return {}
+    own = _files[name].module
+    modules = {key: module for key, module in sys.modules.items() if key == own or key.startswith(own + ".")}
+    paths = {key: getattr(module, "__file__", None) for key, module in modules.items()}
+    return {key: Path(path).read_text(encoding="utf-8") for key, path in paths.items() if path}
 
 
-def outputs_of(plant: Plant) -> tuple[SignalGroup, ...]:
-    """The machine's outputs: the stroke, if it has one, then the others by their units."""
-    return _groups(plant, plant.outputs, plant.stroke_output if plant.has_stroke else None, "stroke")
-
-
-def inputs_of(plant: Plant) -> tuple[SignalGroup, ...]:
-    """The machine's inputs: the thrust, if it has a stroke, then the others by their units."""
-    return _groups(plant, plant.inputs, plant.thrust_input if plant.has_stroke else None, "thrust")
-
-
-class AxisUnits(NamedTuple):
-    """Units of an output over the input of its axis, and of the input over the output."""
-
-    compliance: str
-    stiffness: str
-    micro: bool  # whether the output is meant in millionths
-
-
-def axis_units(output: str, force: str) -> AxisUnits:
-    """The units of an axis; motions by forces and torques in millionths, all others in the units of the signals."""
-    known = {"m": ("um/N", "N/um"), "rad": ("urad/(N m)", "N m/urad")}
-    if output in known and force in KINDS:
-        return AxisUnits(*known[output], micro=True)
-    return AxisUnits(_per(output, force), _per(force, output), micro=False)
-
-
-def _per(unit: str, other: str) -> str:
-    """One unit over another."""
-    if other == "1":
-        return unit
-    whole = any(sign in other for sign in " /")
-    return "1" if unit == other else f"{unit}/({other})" if whole else f"{unit}/{other}"
-
-
-def lateral_outputs(plant: Plant) -> tuple[SignalGroup, ...]:
-    """The outputs across the stroke; of a machine with one output this output."""
-    found = outputs_of(plant)
-    return (found[1:] or found) if plant.has_stroke else found
-
-
-def stroke_unit(plant: Plant) -> str:
-    """The unit of deviations along the stroke."""
-    unit: str = attribute_of(plant, "experiments", "STROKE_UNIT", outputs_of(plant)[0].fine)
-    return unit
-
-
-def _groups(plant: Plant, signals: Sequence[Signal], first: int | None, role: str) -> tuple[SignalGroup, ...]:
-    words: Mapping[str, str] = attribute_of(plant, "experiments", "WORDS", {})
-    found = []
-    if first is not None:
-        found.append(SignalGroup(words.get(role, signals[first].name), signals[first].unit, (first,)))
-    others = [k for k in range(len(signals)) if k != first]
-    for unit in dict.fromkeys(signals[k].unit for k in others):
-        columns = tuple(k for k in others if signals[k].unit == unit)
-        found.append(SignalGroup(words.get(unit, " ".join(signals[k].name for k in columns)), unit, columns))
-    return tuple(found)
+def load_sources(name: str, sources: Mapping[str, str]) -> ModuleType:
+    """Load a machine from the texts of its modules, as `sources_of` returns them, on a computer without its files."""
+    own = min(sources, key=len)
+    if own in sys.modules:
+        return sys.modules[own]
+    folder = Path(tempfile.mkdtemp(prefix="malta-machine-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    for key, text in sources.items():
+        stem = name if key == own else key.rpartition(".")[2]
+        (folder / f"{stem}.py").write_text(text, encoding="utf-8")
+    path = folder / f"{name}.py"
+    return _load(path, _File(path.resolve(), own))  # under the name that records from elsewhere bear

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, Field, field, fields, is_dataclass, replace
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, field, fields, replace
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
-
-import numpy as np
 
 from malta.arguments import is_number
 from malta.display import quantity
@@ -127,47 +124,6 @@ def acting_names(record: Parameters) -> list[str]:
     return [name for name in symbolic_names(record) if name in given]
 
 
-def differences(record: type[Parameters] | Parameters) -> dict[str, str]:
-    """The SI units of the parameters that scatter about 0, by name: those of either sign with the default 0.
-
-    Such a parameter is a difference or an offset. How far it varies is given in its own unit, not as a share of 0.
-    """
-    units = {}
-    for f in fields(record):
-        if "unit" in f.metadata and f.default is not MISSING and f.default == 0:
-            above, least = f.metadata["above"], f.metadata["at_least"]
-            if all(limit is None or limit < 0 for limit in (above, least)):
-                units[f.name] = f.metadata["unit"]
-    return units
-
-
-def box_words(box: Mapping[str, Any], parameters: Parameters | None = None) -> str:
-    """An uncertainty in words: parameters with their half ranges, those of one half range together; "" of none.
-
-    box : shares of the parameters; of differences and offsets half ranges in SI; or intervals (low, high), SI
-    parameters : of the machine, which tell the two apart; None: all are shares
-
-    >>> box_words({"m": 0.2, "K_A": 0.2, "R": 0.05})
-    'm K_A ±20 %, R ±5 %'
-    """
-    units = {} if parameters is None else differences(parameters)
-    known = {} if parameters is None else units_of(parameters)
-    together: dict[str, list[str]] = {}
-    for name, half in box.items():
-        size = (
-            f"±{quantity(half, units[name])}"
-            if name in units
-            else f"±{100 * half:.4g} %"
-            if is_number(half)
-            else ""
-        )
-        if not size:
-            unit = known.get(name, "1")
-            size = f"{half[0]:.4g} to {half[1]:.4g}{'' if unit == '1' else f' {unit}'}"
-        together.setdefault(size, []).append(name)
-    return ", ".join(f"{' '.join(names)} {size}" for size, names in together.items())
-
-
 def check_parameters(record: Parameters, where: str | Path = "parameters") -> None:
     """Check every physical field of a record: call it in `__post_init__` of a machine's Parameters.
 
@@ -225,50 +181,36 @@ def replace_fields(record: Record, where: str, fields: Mapping[str, Any]) -> Rec
     return replace(record, **fields)
 
 
-def fingerprint(record: Any) -> str:
-    """sha256 of every number, name and tuple in a record: equal for a gain file's .json, .npz and .mat.
+def differences(record: type[Parameters] | Parameters) -> dict[str, str]:
+    """The SI units of the parameters that scatter about 0, by name: those of either sign with the default 0.
 
-    Each part is hashed with its kind and its size, so that two records of different structure never give the same
-    bytes: ((1, 2), (3,)) and ((1,), (2, 3)) differ.
+    Such a parameter is a difference or an offset. How far it varies is given in its own unit, not as a share of 0.
     """
-    marks = hashlib.sha256()
-    for part in _parts(record):
-        marks.update(part)
-    return marks.hexdigest()
+    units = {}
+    for f in fields(record):
+        if "unit" in f.metadata and f.default is not MISSING and f.default == 0:
+            above, least = f.metadata["above"], f.metadata["at_least"]
+            if all(limit is None or limit < 0 for limit in (above, least)):
+                units[f.name] = f.metadata["unit"]
+    return units
 
 
-def _parts(value: Any) -> Iterator[bytes]:
-    """The bytes of a value: its kind, its size, then its content."""
-    if isinstance(value, np.ndarray | np.generic | float | int):
-        yield f"number {np.shape(value)}:".encode()
-        # Files do not store the sign of a zero: + 0.0 drops it.
-        yield (np.asarray(value, dtype="<f8") + 0.0).tobytes()
-    elif is_dataclass(value):
-        # A field that came later is left out at its default: older gain files do not mention it.
-        kept = [
-            f.name
-            for f in fields(value)
-            if not (f.metadata.get("later") and _is_usual(f, getattr(value, f.name)))
-        ]
-        yield f"record {len(kept)}:".encode()
-        for name in kept:
-            yield from _parts(name)
-            yield from _parts(getattr(value, name))
-    elif isinstance(value, Mapping):
-        yield f"table {len(value)}:".encode()
-        for name in sorted(value):
-            yield from _parts(name)
-            yield from _parts(value[name])
-    elif isinstance(value, tuple | list):
-        yield f"list {len(value)}:".encode()
-        for entry in value:
-            yield from _parts(entry)
-    else:
-        text = repr(value).encode()
-        yield f"text {len(text)}:".encode() + text
+def box_words(box: Mapping[str, Any], parameters: Parameters | None = None) -> str:
+    """An uncertainty in words: parameters with their half ranges, those of one half range together; "" of none.
 
+    box : shares of the parameters; of differences and offsets half ranges in SI; or intervals (low, high), SI
+    parameters : of the machine, which tell the two apart; None: all are shares
 
-def _is_usual(f: Field[Any], value: Any) -> bool:
-    """Whether a field has its default."""
-    usual: Any = f.default if f.default_factory is MISSING else f.default_factory()
-    return np.array_equal(value, usual) if isinstance(value, np.ndarray) else bool(value == usual)
+    >>> box_words({"m": 0.2, "K_A": 0.2, "R": 0.05})
+    'm K_A ±20 %, R ±5 %'
+    """
+    units = {} if parameters is None else differences(parameters)
+    known = {} if parameters is None else units_of(parameters)
+    together: dict[str, list[str]] = {}
+    for name, half in box.items():
+        if not is_number(half):
+            size = f"{half[0]:.4g} to {half[1]:.4g} {known.get(name, '1')}".removesuffix(" 1")
+        else:
+            size = f"±{quantity(half, units[name]) if name in units else f'{100 * half:.4g} %'}"
+        together.setdefault(size, []).append(name)
+    return ", ".join(f"{' '.join(names)} {size}" for size, names in together.items())

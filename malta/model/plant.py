@@ -21,12 +21,16 @@ from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.model.actuator import Actuator
 from malta.model.contacts import Contacts
-from malta.model.equations import Body
+from malta.model.drive import Drive
 from malta.model.flat_fields import GROUPS, refuse_flat, refuse_reading
+from malta.model.inverse import InverseCheck
 from malta.model.parameters import Parameters as Parameters
 from malta.model.sensors import Sensors, split_dead_time
-from malta.model.signals import DEFAULT, CasadiFn, Drive, InverseCheck, Signal as Signal
+from malta.model.signals import DEFAULT, CasadiFn, Signal as Signal
 from malta.model.stroke import Stroke
+
+if TYPE_CHECKING:
+    from malta.model.rigid_body import Body
 
 
 @display
@@ -262,7 +266,7 @@ class Plant:
         ball: `currents` is not the inverse of `forces` along q
           q in -0.002 .. 0.002 m: at -0.002 the currents of f = -3.6 N make -11.02 N, 103 % of its limit apart
         """
-        from malta.model.linearize import check_inverse  # which linearizes plants
+        from malta.model.currents import check_inverse  # which imports plants
 
         return check_inverse(self)
 
@@ -357,34 +361,6 @@ def whole_samples(plant: Plant, Ts: float) -> int:
         expected = f"whole samples of {Ts * 1e6:g} us in a linear loop; simulations take any"
         raise InputError(plant.name, "sensors", found, expected)
     return whole
-
-
-def place_states(plant: Plant, design: Any) -> Any:
-    """All states as an expression: these first ones of the design model, the others zero. design : a CasADi column"""
-    x = type(design).zeros(len(plant.states))
-    x[list(plant.controlled[: design.numel()])] = design
-    return x
-
-
-def position_in(plant: Plant, x: ArrayLike) -> float:
-    """The position along the stroke in a state; 0 for a machine without a stroke."""
-    return float(np.asarray(x)[plant.stroke_state]) if plant.has_stroke else 0.0
-
-
-def position_at(plant: Plant, x: ArrayLike) -> dict[str, float]:
-    """The position along the stroke by name, an argument of `plant.at`, and the other states that are not zero."""
-    return ({plant.stroke.name: position_in(plant, x)} if plant.has_stroke else {}) | off_stroke(plant, x)
-
-
-def outputs_at(plant: Plant, x: ArrayLike) -> FloatArray:
-    """The outputs at rest at the states x, without sensors' errors."""
-    return np.array(ca.DM(plant.h(ca.DM(np.asarray(x, dtype=float)), 0)), dtype=float).ravel()
-
-
-def off_stroke(plant: Plant, x: ArrayLike) -> dict[str, float]:
-    """The states by name that are not zero, without the stroke."""
-    pairs = zip(plant.states, np.asarray(x).tolist(), strict=True)
-    return {s.name: value for s, value in pairs if value and s.name != plant.stroke.name}
 
 
 @display

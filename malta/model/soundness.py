@@ -18,9 +18,11 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
-from malta.model.equilibrium import balance, trace, with_command
-from malta.model.linearize import _derivatives, _limits
+from malta.model.currents import _limits
+from malta.model.equilibrium import balance, with_command
+from malta.model.linearize import _derivatives
 from malta.model.plant import Plant, has_feedthrough
+from malta.model.traced import trace
 
 KINK = 1e-3  # of a slope, by which those of both sides differ
 MIN_SHARE = 1e-6  # of the largest change of a row: smaller ones are rounding

@@ -32,8 +32,9 @@ if TYPE_CHECKING:
         series as series,
     )
     from malta.proof.margin import Margin as Margin
+    from malta.proof.polynomial_margin import margin_of_polynomial as margin_of_polynomial
     from malta.proof.rates import RateBound as RateBound, prove_rate as prove_rate
-    from malta.proof.robust import Interrupted as Interrupted, margin_of_polynomial as margin_of_polynomial
+    from malta.proof.robust import Interrupted as Interrupted
     from malta.work import Budget as Budget
 
 _NAMES = {
@@ -43,8 +44,9 @@ _NAMES = {
     "malta.proof.certificate": "write_certificate",
     "malta.proof.connections": "append feedback interconnect parallel random_systems series",
     "malta.proof.margin": "Margin",
+    "malta.proof.polynomial_margin": "margin_of_polynomial",
     "malta.proof.rates": "RateBound prove_rate",
-    "malta.proof.robust": "Interrupted margin_of_polynomial",
+    "malta.proof.robust": "Interrupted",
     "malta.work": "Budget",
 }
 __all__, __getattr__, __dir__ = contents(__name__, _NAMES, {"varying": "malta.proof.prove_rate"})

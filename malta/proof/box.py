@@ -83,7 +83,8 @@ class Box:
         ]
         if math.prod(map(len, sides)) > MOST_PLACES:
             sides = [side[[0, -1]] if len(side) > 1 else side for side in sides]
-        places = np.array([self.nominal, *itertools.islice(itertools.product(*sides), MOST_PLACES)])
+        rows = itertools.islice(itertools.product(*sides), MOST_PLACES)
+        places = np.unique([tuple(self.nominal.tolist()), *rows], axis=0)
         order = np.argsort(np.abs(places - self.nominal).sum(axis=1), kind="stable")
         return np.asarray(places[order])
 

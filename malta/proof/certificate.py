@@ -6,6 +6,7 @@ claim is a little below the lower bound of the margin: the largest of a few shar
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,8 +34,8 @@ from malta.checker.loop import (
 )
 from malta.errors import CheckError, InputError
 from malta.files import replace_files, version
+from malta.linear.compensators import compensator_of
 from malta.linear.expressions import FIELD, MatrixProgram, exact, program as expressions_of
-from malta.linear.systems import compensator_of
 from malta.proof.box import Box, below, box_of
 from malta.proof.exclusion import Growth, advance, start
 from malta.proof.groups import E, UncertainLoop, loop_of
@@ -447,7 +448,11 @@ def _enclose(f: CheckedPolynomial, v: list[tuple[Any, Any]], box: Box, lower: fl
     Raises Refused when it cannot be enclosed, CheckError when zero is not excluded.
     """
     ctx.prec = BITS
-    size = [height(x) for x in f.at([arb((a + b) / 2) for a, b in v])]
+    middle = [[(a + b) / 2] for a, b in v]
+    corners = itertools.product(*([a, b] if i in f.used and a < b else [a] for i, (a, b) in enumerate(v)))
+    places = [f.at([arb(x) for x in place]) for place in (*itertools.product(*middle), *corners)]
+    # of each coefficient the largest: one that cancels in the middle asks for no more digits than its neighbours
+    size = [max(map(height, each)) for each in zip(*places, strict=True)]
     axes = [_axis(f, v, i, size) for i in range(len(v))]
     values, left = interpolate(f, v, axes)
     heights = np.array([height(x) for x in values]).reshape(f.count, *(axis.degree + 1 for axis in axes))

@@ -21,8 +21,8 @@ from malta.arguments import describe
 from malta.arrays import readonly
 from malta.errors import InputError
 from malta.linear import interconnection
+from malta.linear.compensators import compensator_of
 from malta.linear.system import System
-from malta.linear.systems import compensator_of
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.proof.box import box_of
 

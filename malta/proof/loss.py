@@ -29,8 +29,6 @@ STEP = 1e-6  # of a range, for slopes of the worst root
 LOSS_ACCURACY = 2.0**-40  # of a step of the grid, to which a loss is narrowed down
 ROUNDS = 6  # from corner to corner
 CALL = 2e-4  # work of a call for poles, beside that of each row
-
-
 CORNERS = 64  # of a box that are looked at before its families are made
 
 

@@ -24,18 +24,18 @@ import numpy as np
 from flint import arb, fmpq, fmpq_mat
 from scipy import linalg
 
-from malta.arguments import by_name, describe, interval, is_pair, number, positive
+from malta.arguments import by_name, describe, is_pair, positive
 from malta.errors import InputError
+from malta.linear.compensators import compensator_of
 from malta.linear.expressions import MatrixProgram, NotAnalytic, exact, program
 from malta.linear.rational import Ratio, Symbolic, product
-from malta.linear.systems import compensator_of, polynomial_of
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of, within_branches
 from malta.proof.groups import A, B, C, E, UncertainLoop, loop_of
 from malta.proof.loss import first_loss, loss_beside
 from malta.proof.margin import Margin, Progress, Ranges
-from malta.proof.problem import CoefficientPolynomial, OfLoop, OfSeveral, Problem, is_nominal_stable
+from malta.proof.problem import OfLoop, OfSeveral, Problem, is_nominal_stable
 from malta.proof.question import Question, Standing
 from malta.proof.search import search
 from malta.work import GROWTH, MORE_WORK, Budget, in_rounds, is_past
@@ -53,8 +53,6 @@ MAX_LAURENT_STATES = 16  # states
 ROUNDING = 1e-11  # relative size of what rounding may leave of terms that cancel
 MIN_SINGULAR = 1e-6  # singular value of independent vectors of size one, at least
 MAX_TERM_SHARE = 0.8  # share of the terms from which on another basis is worth it
-
-
 _KNOWN_PROGRAMS: WeakKeyDictionary[MatrixProgram, MatrixProgram | None] = WeakKeyDictionary()
 
 
@@ -288,7 +286,7 @@ def robust_margin(
     '5.00 5.00 2.00'
     """
     effort = ProofEffort(tolerance, time, budget, progress)
-    over = {} if over is None else over
+    over = by_name("robust_margin", "over", {} if over is None else over, '{"k": (1, 2)}')
     named, law, ranges = _either_form(system, compensator, ranges, over)
     box = box_of(named.names, named.nominal, named.limits, ranges, named.spread(over))
     return margin_of(problem_of(named, law), within_branches(box, named), effort)
@@ -398,72 +396,6 @@ def law_of(system: UncertainSystem, compensator: Any, caller: str = "robust_marg
 def problem_of(system: UncertainSystem, law: Compensator) -> OfLoop:
     """The closed loop as a problem, which remembers its polynomials."""
     return OfLoop(in_plain_basis(loop_of(system, law)))
-
-
-@on_one_thread
-def margin_of_polynomial(
-    coefficients: Any,
-    box: Ranges,
-    nominal: Mapping[str, float] | None = None,
-    *,
-    over: Mapping[str, tuple[float, float]] | None = None,
-    discrete: bool = False,
-    tolerance: float | None = None,
-    time: float | None = None,
-    progress: Progress | None = None,
-) -> Margin:
-    """Prove the margin of a characteristic polynomial whose coefficients depend on parameters.
-
-    coefficients : a function of the parameters by name (or of one array p), or a casadi.Function: the coefficients,
-        highest power first
-    box : intervals (low, high) by name, or shares of the nominal value
-    nominal : values by name; the middle of the interval for a parameter without one
-    over : intervals that do not grow with t, in SI
-    discrete : whether stable roots lie in the unit disc, in place of the left half plane
-    tolerance : relative distance between the proven bound and the witness; None: 9e-4, and less where that is cheap
-    time, progress : as of `malta.robust_margin`
-
-    Returns a Margin.
-
-    Raises InputError as `malta.robust_margin` does.
-
-    >>> import malta
-    >>> def cubic(k):  # stable while k < 8
-    ...     return [1, 3, 3, 1 + k]
-    >>> found = malta.proof.margin_of_polynomial(cubic, {"k": (1, 2)}, {"k": 1})
-    >>> f"{found.lower:.2f}, {found.upper:.2f}"
-    '7.00, 7.00'
-    """
-    caller = "margin_of_polynomial"
-    effort = ProofEffort(tolerance, time, None, progress, caller)
-    outside = by_name(caller, "over", {} if over is None else over, '{"k": (1, 2)}')
-    values = _middles({**by_name(caller, "box", box, '{"k": (1, 2)}'), **outside}, nominal)
-    names = tuple(values)
-    function = polynomial_of(coefficients, names)
-    problem = CoefficientPolynomial(program(function), names, discrete)
-    where = box_of(names, np.array(list(values.values())), (), box, outside, caller=caller)
-    return margin_of(problem, where, effort)
-
-
-def _middles(ranges: Mapping[str, Any], nominal: Any) -> dict[str, float]:
-    """The nominal values of a polynomial's parameters: as given, else the middle of the interval."""
-    caller = "margin_of_polynomial"
-    given = by_name(caller, "nominal", {} if nominal is None else nominal, '{"k": 1.5}')
-    for name in given:
-        if name not in ranges:
-            raise InputError(caller, name, "a nominal value without a range", "a range in box")
-    if not ranges:
-        raise InputError(caller, "box", "no parameters", "at least one uncertain parameter")
-    values = {}
-    for name, value in ranges.items():
-        if name in given:
-            values[name] = number(caller, name, given[name])
-        elif is_pair(value):
-            low, high = interval(caller, name, value)
-            values[name] = low / 2 + high / 2
-        else:
-            raise InputError(caller, name, "a share without a nominal value", "nominal={...}")
-    return values
 
 
 class Interrupted(KeyboardInterrupt):

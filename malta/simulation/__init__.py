@@ -16,17 +16,19 @@ if TYPE_CHECKING:
     from malta.simulation.engine.digest import Batch as Batch
     from malta.simulation.experiments import Experiment as Experiment
     from malta.simulation.experiments.time_optimal import fastest_stroke as fastest_stroke
-    from malta.simulation.inputs import Multisine as Multisine
+    from malta.simulation.flown_strokes import stroke_figures as stroke_figures
+    from malta.simulation.multisine import Multisine as Multisine
     from malta.simulation.scenario import Fault as Fault
-    from malta.simulation.trajectory import Trajectory as Trajectory, stroke_figures as stroke_figures
+    from malta.simulation.trajectory import Trajectory as Trajectory
 
 _NAMES = {
     "malta.simulation.engine.batch": "replay_run simulate_many",
     "malta.simulation.engine.digest": "Batch",
     "malta.simulation.experiments": "Experiment",
     "malta.simulation.experiments.time_optimal": "fastest_stroke",
-    "malta.simulation.inputs": "Multisine",
+    "malta.simulation.flown_strokes": "stroke_figures",
+    "malta.simulation.multisine": "Multisine",
     "malta.simulation.scenario": "Fault",
-    "malta.simulation.trajectory": "Trajectory stroke_figures",
+    "malta.simulation.trajectory": "Trajectory",
 }
 __all__, __getattr__, __dir__ = contents(__name__, _NAMES, {"replayed": "malta.simulation.replay_run"})

@@ -12,12 +12,12 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.model.actuator import Actuator
-from malta.model.data import plant_of
+from malta.model.drive import Drive
 from malta.model.equations import note
-from malta.model.plant import place_states
-from malta.model.signals import Drive
+from malta.model.places import place_states
+from malta.model.plants import plant_of
 from malta.simulation.layout import LoopPlan, Setup, Symbols
-from malta.synthesis.controller import Add
+from malta.synthesis.linear_law import Add
 
 # Half-bridges on a DC link: voltages and duty cycles within their limits, star points, the link voltage.
 

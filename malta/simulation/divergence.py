@@ -16,8 +16,8 @@ import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray
-from malta.model.data import plant_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.simulation.inputs import Inputs, initial_values
 from malta.simulation.layout import columns_of_row
 from malta.simulation.scenario import Simulation

@@ -18,10 +18,11 @@ import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray
+from malta.model.drive import Electronics
 from malta.model.parameters import acting_names, twins_of
 from malta.model.plant import Plant, symbolic
-from malta.model.signals import Electronics
-from malta.synthesis.controller import Controller, CurrentLoop, gains_of
+from malta.synthesis.controller import Controller, CurrentLoop
+from malta.synthesis.law import gains_of
 from malta.synthesis.schedule import SCHEDULED_MATRICES
 
 # Names of numbers_of that all machines of a batch share: those of the controller and of its samples.

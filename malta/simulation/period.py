@@ -32,8 +32,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from malta.model.data import plant_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.simulation import current_control
 from malta.simulation.current_control import control_currents, keep_if_missed, reading_errors
 from malta.simulation.layout import (
@@ -49,17 +49,9 @@ from malta.simulation.layout import (
     with_symbols,
 )
 from malta.simulation.readings import initial_readings, measurement, step_readings
-from malta.synthesis.controller import (
-    Controller,
-    command_forces,
-    estimate_states,
-    filter_reading,
-    freeze_moving,
-    frozen_axes,
-    look_ahead,
-    sum_errors,
-)
-from malta.synthesis.schedule import interpolate
+from malta.synthesis.controller import Controller
+from malta.synthesis.law import command_forces, freeze_moving, frozen_axes, interpolate, look_ahead
+from malta.synthesis.linear_law import estimate_states, filter_reading, sum_errors
 
 # Motion of the machine between two samples: one step of the classical Runge–Kutta method under held commands.
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.model.machines import attribute_of
+from malta.model.parts import attribute_of
 from malta.model.plant import Plant
 
 Profile = Literal["logistic", "quintic"]

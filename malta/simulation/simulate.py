@@ -30,10 +30,11 @@ from scipy.linalg import LinAlgWarning
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.linear.sampling import sample
-from malta.model.data import plant_of
-from malta.model.linearize import is_commutated
+from malta.model.currents import is_commutated
 from malta.model.parameters import shape_parameters, units_of
-from malta.model.plant import Plant, place_states
+from malta.model.places import place_states
+from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.model.soundness import require_readings
 from malta.simulation import references
 from malta.simulation.divergence import rooms_in, rooms_of
@@ -59,8 +60,7 @@ from malta.simulation.scenario import (
     substeps_of,
 )
 from malta.simulation.trajectory import Trajectory, Verdict, columns_of, judge, label_rows
-from malta.synthesis.controller import Controller, Noise
-from malta.synthesis.filters import noise_input
+from malta.synthesis.controller import Controller, Noise, noise_input
 
 Observer = Callable[[Engine, Plant, FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 

@@ -29,7 +29,8 @@ from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.loop import loop
 from malta.loops.sampled_loops import LAST_STAGE, SampledLoop, sampled_loop
 from malta.loops.windings import chosen_loops
-from malta.margins.travel import travel_margin, worst_sensitivities
+from malta.margins.travel import travel_margin
+from malta.margins.worst_case import worst_sensitivities
 from malta.model.linearize import linearize
 from malta.model.parameters import units_of
 from malta.model.plant import Plant

@@ -15,13 +15,12 @@ from malta.linear.sampling import sample
 from malta.model.actuator import Actuator
 from malta.model.equilibrium import holding_commands, load_balance
 from malta.model.linearize import LinearModel
-from malta.model.plant import Plant, off_stroke
-from malta.synthesis.controller import Commutation, Controller, CurrentLoop, Feedforward, Limits
+from malta.model.places import off_stroke
+from malta.model.plant import Plant
+from malta.synthesis.controller import Commutation, Controller, CurrentLoop, Feedforward, Limits, holding_gain
 from malta.synthesis.filters import between_samples
 
 V0_STEP = 0.25e-3  # m, longest step of the grid of v0(z)
-
-
 V0_STEPS = 16  # at least, either way
 
 
@@ -85,12 +84,6 @@ def pi_current_loop(actuator: Actuator, delay: float = 0.0) -> tuple[float, floa
             f"at {w:.0f} rad/s with {delay * 1e6:.0f} us of delay"
         )
     return Kp, Ki
-
-
-def holding_gain(A: FloatArray, B: FloatArray) -> FloatArray:
-    """Forces that hold q'' = k q + G v at rest at a position: -G^-1 k, m x n / 2, N/m."""
-    half = len(A) // 2
-    return np.asarray(-np.linalg.lstsq(B[half:], A[half:, :half], rcond=None)[0])
 
 
 def feedforward(model: LinearModel, Ts: float, delay: int = 0, lead: float = 0.0) -> Feedforward:

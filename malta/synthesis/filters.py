@@ -23,8 +23,8 @@ from malta.errors import InputError
 from malta.linear.matrices import system_matrix
 from malta.linear.sampling import add_lags, delay_inputs, sample, sample_noise
 from malta.linear.system import System
-from malta.model.signals import Coordinates
 from malta.processes import on_one_thread
+from malta.synthesis.controller import noise_input
 from malta.synthesis.riccati import Solver, care, dare
 from malta.synthesis.spec import Weights
 
@@ -213,12 +213,6 @@ def sampled_noise(model: Linear, weights: Weights, Ts: float, delay: int, *, int
         W = np.asarray(linalg.block_diag(W, drift))
         C, S = np.hstack([C, np.zeros((p, m))]), np.vstack([S, np.zeros((m, p))])
     return Noisy(Ad, C, W, V, S)
-
-
-def noise_input(B: FloatArray, coordinates: Coordinates) -> FloatArray:
-    """G of x' = A x + B v + G w: the map of the inputs, or of accelerations of the positions, n x n / 2."""
-    half = len(B) // 2
-    return B if coordinates == "signals" else np.vstack([np.zeros((half, half)), np.eye(half)])
 
 
 def positions_from(model: Linear) -> FloatArray:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from malta.arrays import FloatArray
-from malta.linear.system import System
-from malta.model.data import plant_of
-from malta.model.plant import outputs_at
-from malta.synthesis.controller import Controller, linear_law
+from malta.linear.matrices import balanced_units
+from malta.model.machines import build_plant
+from malta.model.places import outputs_at
+from malta.synthesis.controller import Controller
+from malta.synthesis.linear_law import linear_law
 
 
 def law_system(c: Controller) -> Any:
@@ -23,14 +23,18 @@ def law_system(c: Controller) -> Any:
     the loop gain at the sensors is -P F.
     States: those of the controller, then its sums of errors, in balanced units.
     """
+    import control  # imports matplotlib and takes a second: only where it is used
+
     law, R = linear_law(c), set_point(c)
     sums = [f"{s.name}[i]" for s in c.measurements]
     inputs = [*(s.name for s in c.measurements), *reference_names(c)]
     forces = [s.name for s in c.forces]
     B, D = np.hstack([law.B_y, law.B_r @ R]), np.hstack([law.D_y, law.D_r @ R])
-    states = tuple([*(s.name for s in c.states), *sums][: len(law.A)])
-    made = System(law.A, B, law.C, D, None, c.sample_time, (), tuple(inputs), tuple(forces))
-    return replace(made.balanced, states=states).to_control(c.name)
+    states = [*(s.name for s in c.states), *sums][: len(law.A)]
+    t = balanced_units(law.A, B, law.C)
+    names = {"states": states} if len(t) else {}
+    matrices = (law.A * t / t[:, None], B / t[:, None], law.C * t, D)
+    return control.ss(*matrices, c.sample_time, name=c.name, inputs=inputs, outputs=forces, **names)
 
 
 def reference_names(c: Controller) -> list[str]:
@@ -48,7 +52,7 @@ def set_point(c: Controller) -> FloatArray:
     R = np.zeros((p + n + 2 * m, p))
     R[:p] = np.eye(p)
     if c.tracks == "states":
-        plant = plant_of(c.parameters)
+        plant = build_plant(c.parameters)
         y = ca.SX.sym("y", p)
         q = ca.densify(ca.jacobian(plant.position_of(y), y))
         here = outputs_at(plant, plant.point(c.operating_point[0]).x)

@@ -23,8 +23,9 @@ import numpy as np
 from scipy import special
 
 from malta.arrays import ComplexArray, FloatArray
-from malta.model.machines import attribute_of
+from malta.model.parts import attribute_of
 from malta.model.plant import Parameters, Plant, Signal
+from malta.synthesis.controller import Controller
 from malta.synthesis.spec import Law as Law, Spec
 
 if TYPE_CHECKING:
@@ -410,3 +411,8 @@ class Payload(NamedTuple):
     held: float  # by the forces at rest; inf: its weight loads no input
     carried: float  # the largest that was flown; NaN: the machine has no experiment of it
     dropped: float  # the smallest that was dropped; inf: none
+
+
+def base_of(figure: str) -> str:
+    """Return the requirement that a figure belongs to: "noise_motion" of "noise_motion x"."""
+    return figure.partition(" ")[0]

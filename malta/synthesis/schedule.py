@@ -9,7 +9,6 @@ of M. A machine far off its reference has the law of its reference.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -20,8 +19,6 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.display import display
 from malta.errors import InputError
-from malta.model.equations import note
-from malta.model.plant import OperatingPoint, Plant, outputs_at
 
 SCHEDULED_MATRICES = ("Ad", "Bd", "Cd", "K", "Ki", "L")
 
@@ -87,35 +84,3 @@ class Schedule:
             found[name] = ca.sparsify(ca.DM(matrices[0]))
             found[f"{name}_steps"] = ca.sparsify(ca.DM(np.hstack([*np.diff(matrices, axis=0)])))
         return found
-
-
-def interpolate(g: Mapping[str, Any], schedule: Schedule | None, p_ref: Any) -> Mapping[str, Any]:
-    """The numbers of a law at a reference p*: as they are, or with the matrices that its schedule has there.
-
-    g : numbers by name, constants or symbols, see controller.gains_of
-    """
-    if schedule is None:
-        return g
-    r, p = p_ref[schedule.output], g["places"]
-    shares = [ca.fmax(ca.fmin((r - p[k]) / (p[k + 1] - p[k]), 1), 0) for k in range(len(schedule.cells))]
-    meaning = f"shares: how far the reference of {schedule.variable} is from each place to the next, 0 to 1"
-    note("schedule", meaning, shares=ca.vertcat(*shares))
-    found = dict(g)
-    for name in SCHEDULED_MATRICES:
-        M = found[name]
-        for share, step in zip(shares, ca.horzsplit(found.pop(f"{name}_steps"), M.shape[1]), strict=True):
-            if step.nnz():  # what is equal at two places costs nothing
-                M = M + share * step
-        found[name] = M
-    return found
-
-
-def point_at(plant: Plant, x: FloatArray, variable: str, place: float) -> OperatingPoint:
-    """The operating point at rest where an output is at a place, and the other outputs are as at the states x."""
-    names = [s.name for s in plant.outputs]
-    if variable not in names:
-        raise InputError(plant.name, "schedule.variable", repr(variable), "an output: " + " ".join(names))
-    y = outputs_at(plant, x)
-    y[names.index(variable)] = place
-    q = np.array(ca.DM(plant.position_of(ca.DM(y))), dtype=float).ravel()
-    return plant.point(np.concatenate([q, np.zeros(len(plant.controlled) - len(q))]))

@@ -20,9 +20,10 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
-from malta.model.data import plant_of
-from malta.model.parameters import box_words, fingerprint, replace_fields
+from malta.model.fingerprint import fingerprint
+from malta.model.parameters import box_words, replace_fields
 from malta.model.plant import Parameters, Plant, Signal
+from malta.model.plants import plant_of
 from malta.model.signals import Coordinates
 from malta.units import to_si
 

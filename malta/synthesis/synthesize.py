@@ -11,16 +11,17 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError, relocate_errors
-from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import outputs_at
+from malta.model.places import outputs_at
+from malta.model.plants import plant_of
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import commutate_ahead
+from malta.synthesis.law import point_at
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
 from malta.synthesis.riccati import Solver
-from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule, point_at
+from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule
 from malta.synthesis.spec import Spec
 from malta.synthesis.structure import structured_controller
 

@@ -41,10 +41,12 @@ from malta.loops.windings import (
 )
 from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import Plant, position_in
-from malta.synthesis.controller import CurrentLoop, LinearLaw, linear_law_of
-from malta.synthesis.feedforward import current_loop_of, holding_gain, static_feedforward
+from malta.model.places import position_in
+from malta.model.plant import Plant
+from malta.synthesis.controller import CurrentLoop, holding_gain
+from malta.synthesis.feedforward import current_loop_of, static_feedforward
 from malta.synthesis.filters import Gains, gain_at_rest
+from malta.synthesis.linear_law import LinearLaw, linear_law_of
 from malta.synthesis.lqg import gains
 from malta.synthesis.recovery import StepResponse, step_response
 from malta.synthesis.requirements import NoiseRms, Requirement, TrialFigures, requirements_for

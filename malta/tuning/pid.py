@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -26,24 +25,16 @@ import numpy as np
 from scipy import optimize, sparse
 
 from malta.arrays import FloatArray
-from malta.errors import InputError
 from malta.linear.matrices import system_matrix
-from malta.linear.peaks import smooth_peak
-from malta.linear.sampling import sample, sample_noise
-from malta.loops.classical import last_crossover, tracked_band
-from malta.loops.loop import loop_of_model
 from malta.loops.sampled_loops import SampledLoop
-from malta.loops.time_domain import covariance
-from malta.loops.windings import emf_slope, estimated_rows, windings_of, with_estimated_emf
-from malta.model.data import plant_of
-from malta.model.equilibrium import trim
-from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import position_at, position_in
-from malta.synthesis.controller import Controller, linear_law_of, with_readings
+from malta.loops.windings import estimated_rows, with_estimated_emf
+from malta.model.linearize import linearize
+from malta.synthesis.linear_law import linear_law_of, with_readings
 from malta.synthesis.pid import PidAxisSet, axes_of, law_of_outputs, pid_gains
-from malta.synthesis.requirements import ratio_of
-from malta.synthesis.spec import Loads, Pid, Spec, pid_signals
+from malta.synthesis.requirements import base_of, ratio_of
+from malta.synthesis.spec import Pid, Spec, pid_signals
 from malta.tuning.groups import TuningGroup, figures_of_gains, groups_of
+from malta.tuning.pid_loop import PidPart, loads_of, loop_figures, whole_machine
 from malta.tuning.search import (
     UNSTABLE_RATIO,
     Effort,
@@ -53,7 +44,6 @@ from malta.tuning.search import (
     TrialSearch,
     apply_trial,
     at_least_of,
-    base_of,
     combine,
     distance_outside,
     merge,
@@ -140,54 +130,6 @@ ROOM = 1e-5  # below a bound, for what a part's grid and rounding may hide of th
 RADII = ((0.05, 1e-3), (0.01, 1e-4))  # of COBYQA's trust region at first and last, in the unit cube
 
 
-@dataclass(frozen=True, eq=False)
-class PidPart:
-    """Some outputs with the forces of the same index, the sampled states behind them, and what acts from outside."""
-
-    outputs: tuple[int, ...]  # k of them
-    Ad: FloatArray  # n x n
-    # n x k forces, then the k readings that currents are commutated for, where they are held, or k voltages that the
-    # law forecasts
-    Bd: FloatArray
-    Cd: FloatArray
-    slope: FloatArray  # of v0(z), k x k
-    push: FloatArray  # n x k, what constant forces leave in the states after a sample
-    shaken: FloatArray  # n x n, covariance that the noise of forces leaves there
-    forecast: FloatArray  # k x 2 k, of voltages by positions and rates of the outputs; empty: none
-
-
-def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> PidPart:
-    """Describe all of a machine as one part, with what the loads leave in its states."""
-    machine, plant, Ts = loop_of_model(model, controller).sampled, model.plant, controller.sample_time
-    x = model.operating_point.x
-    loaded = linearize(plant, trim(plant, **position_at(plant, x)))
-    assert machine.continuous is not None
-    A, n = machine.continuous, len(machine.continuous)
-    B = np.vstack([loaded.B, np.zeros((n - len(loaded.B), loaded.B.shape[1]))])
-    push, shaken = np.zeros((len(machine.Ad), B.shape[1])), np.zeros_like(machine.Ad)
-    push[:n] = sample(A, B, Ts)[1]
-    shaken[:n, :n] = sample_noise(A, B * (np.square(loads.force_noise) * Ts) @ B.T, Ts)
-    slope = np.zeros((B.shape[1], len(machine.Cd)))
-    if plant.has_stroke:
-        slope[:, plant.stroke_output] = controller.feedforward.slope(position_in(plant, x))
-    return PidPart(
-        tuple(range(len(machine.Cd))), machine.Ad, machine.Bd, machine.Cd, slope, push, shaken,
-        _forecast(model, controller, machine),
-    )  # fmt: skip
-
-
-def _forecast(model: LinearModel, controller: Controller, machine: SampledLoop) -> FloatArray:
-    """Voltages that the law forecasts, of positions and rates of the outputs, m x 2 m; empty where there are none."""
-    m, half = len(controller.forces), model.plant.coordinates
-    if model.E.any() or machine.Bd.shape[1] == m:
-        return np.zeros((0, 0))
-    believed, x = plant_of(controller.parameters), model.operating_point
-    axes = windings_of(model.plant, believed, x, np.eye(m)).axes
-    back = np.linalg.inv(model.C[:, :half])
-    slope = axes @ emf_slope(believed, x.x)[:, list(believed.controlled)]
-    return np.hstack([slope[:, :half] @ back, slope[:, half:] @ back])
-
-
 def parts_of(whole: PidPart) -> list[PidPart]:
     """Split a machine into parts that nothing joins to each other."""
     n, m = len(whole.Ad), len(whole.Cd)
@@ -237,42 +179,6 @@ def close_loop(part: PidPart, terms: Pid, Ts: float, axes: PidAxisSet | None = N
     elif part.Bd.shape[1] > k:
         linear = with_readings(linear)
     return SampledLoop(part.Ad, part.Bd, part.Cd, linear, Ts)
-
-
-def loop_figures(spec: Spec, part: PidPart, loop: SampledLoop) -> dict[str, float]:
-    """Compute the figures of a part's loop, by name and output; none where the loop is unstable."""
-    closed, c, n, Ts = loop.closed, loop.control, len(part.Ad), loop.sample_time
-    if not np.isfinite(closed).all():
-        return {}
-    poles = np.linalg.eigvals(closed)
-    if not np.abs(poles).max() < 1:
-        return {}
-    own, names = list(part.outputs), [spec.plant.outputs[o].name for o in part.outputs]
-    loads = loads_of(spec)
-    found = {}
-    pushed = np.vstack([part.push * np.array(loads.load)[own], np.zeros((len(c.A), len(own)))])
-    for name, row, x in zip(
-        names, loop.Cd, np.linalg.solve(np.eye(len(closed)) - closed, pushed).T, strict=True
-    ):
-        X = covariance(closed, np.outer(x, x))  # it starts at -x from where it ends
-        found[f"load_error {name}"] = math.sqrt(Ts * float(row @ X[:n, :n] @ row))
-    noise = np.vstack([loop.Bd @ c.D_y, c.B_y])
-    W = noise * np.square(np.array(loads.sensor_noise)[own]) @ noise.T
-    W[:n, :n] += part.shaken
-    motion = np.sqrt(np.diag(loop.Cd @ covariance(closed, W)[:n, :n] @ loop.Cd.T))
-    found |= {f"noise_motion {name}": value for name, value in zip(names, motion.tolist(), strict=True)}
-    cut = loop.cut
-    found |= {f"peak_sensitivity {name}": smooth_peak(cut.sensitivity(i)) for i, name in enumerate(names)}
-    if "bandwidth" in spec.specification:
-        found["bandwidth"] = min(tracked_band(cut)[0], last_crossover(cut))
-    return found
-
-
-def loads_of(spec: Spec) -> Loads:
-    """Return the loads that a PID is judged by. Raises InputError for a design file without [cost]."""
-    if spec.loads is None:
-        raise InputError(spec.path, "cost", "nothing", "a table of the loads whose errors a PID makes small")
-    return spec.loads
 
 
 def _ratios(spec: Spec, figures: Mapping[str, float]) -> list[float]:

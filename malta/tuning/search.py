@@ -25,7 +25,7 @@ from malta.files import file_exists, read_file, replace_files
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import Plant
 from malta.synthesis.controller import Controller
-from malta.synthesis.requirements import requirements_for
+from malta.synthesis.requirements import base_of, requirements_for
 from malta.synthesis.spec import Spec
 from malta.synthesis.synthesize import synthesize
 
@@ -64,11 +64,6 @@ def model_and_controller(spec: Spec) -> tuple[LinearModel, Controller]:
 def at_least_of(plant: Plant) -> frozenset[str]:
     """Name the requirements that bound from below."""
     return frozenset(name for name, r in requirements_for(plant).items() if r.at_least)
-
-
-def base_of(figure: str) -> str:
-    """Return the requirement that a figure belongs to: "noise_motion" of "noise_motion x"."""
-    return figure.partition(" ")[0]
 
 
 def merge(parts: Sequence[Mapping[str, float]], at_least: Collection[str]) -> dict[str, float]:

@@ -33,10 +33,11 @@ from malta.margins.loop_report import Outcome
 from malta.margins.travel import travel_margin
 from malta.model.parameters import describe
 from malta.model.plant import Plant
-from malta.synthesis.requirements import Trade, ratio_of, requirements_for
+from malta.synthesis.requirements import Trade, base_of, ratio_of, requirements_for
 from malta.synthesis.spec import Spec, Weights
 from malta.tuning import groups, pid
 from malta.tuning.groups import STEP, TuningGroup, figures_of, groups_of
+from malta.tuning.judging import judge
 from malta.tuning.search import (
     DIGITS,
     UNSTABLE_RATIO,
@@ -47,14 +48,12 @@ from malta.tuning.search import (
     TrialSearch,
     apply_trial,
     at_least_of,
-    base_of,
     combine,
     distance_outside,
     merge,
     model_and_controller,
     separate,
 )
-from malta.tuning.verify import judge
 
 # Descent by linear programs: the smallest worst ratio, or the least noise that bounds allow.
 #

@@ -12,18 +12,20 @@ from typing import Any
 from malta.arguments import by_name, is_pair
 from malta.errors import CheckError, InputError
 from malta.files import locate
-from malta.gains.file import content_of, read
+from malta.gains.file import content_of
+from malta.gains.stable import read_stable
 from malta.loops.loop import Loop, loop_of_model
 from malta.loops.sampled_loops import LAST_STAGE
 from malta.loops.time_domain import bounded_deviation, noise_of, worst_along
 from malta.loops.windings import CurrentLoops
 from malta.margins.loop_report import BANDWIDTHS, LoopReport, Outcome
 from malta.margins.scheduled_loops import schedule_rate
-from malta.margins.travel import LoopAlong, worst_sensitivities
+from malta.margins.travel import LoopAlong
 from malta.margins.verify import linear_report, staged_report
-from malta.model.data import plant_of
+from malta.margins.worst_case import worst_sensitivities
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import Parameters, Plant
+from malta.model.plants import plant_of
 from malta.model.soundness import unproven
 from malta.proof.margin import Progress, Ranges
 from malta.simulation.experiments import Experiment
@@ -33,10 +35,9 @@ from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.recovery import RecoveryBound
-from malta.synthesis.requirements import Figure, NoiseRms, Requirement, requirements_for
+from malta.synthesis.requirements import Figure, NoiseRms, Requirement, base_of, requirements_for
 from malta.synthesis.spec import Spec
-from malta.tuning.pid import loads_of, loop_figures, whole_machine
-from malta.tuning.search import base_of, model_and_controller
+from malta.tuning.pid_loop import loads_of, loop_figures, whole_machine
 
 # What a design has of what it is asked for: requirements measured on its verified loop and simulated machine.
 
@@ -108,30 +109,14 @@ class SynthesizedDesign:
         return run
 
 
-def judge(
-    spec: Spec,
-    controller: Controller | None = None,
-    *,
-    names: Collection[str] | None = None,
-    verified: LoopReport | None = None,
+def judge_controller(
+    spec: Spec, controller: Controller, names: Collection[str], verified: LoopReport | None = None
 ) -> tuple[Outcome, ...]:
-    """Measure requirements of a design: proven margin, verified loop, covariance, simulated experiments.
-
-    controller : of a gain file, in place of the one that the design file is synthesized to
-    names : entries of the specification; None: all
-    verified : what `malta.verify` found of the controller, with the margin where one is asked for; None: computed
-
-    A PID's load errors come first, which no bound is asked of. What an unstable loop does not have fails.
-
-    Raises InputError for a PID without [cost], and for a requirement that the machine does not have.
-    """
-    if controller is None:
-        model, controller = model_and_controller(spec)
-    else:
-        model = linearize(spec.plant, spec.plant.at(**spec.operating_point))
+    """Measure requirements of a design with a controller: see judging.judge."""
+    model = linearize(spec.plant, spec.plant.at(**spec.operating_point))
     design = SynthesizedDesign(spec, model, controller, verified)
     outcomes = _load_errors(design) if spec.pid else []
-    for name in spec.specification if names is None else names:
+    for name in names:
         outcomes += outcomes_of(design, name)
     return tuple(outcomes)
 
@@ -244,7 +229,7 @@ def verify(
     if isinstance(loop, str | Path):
         stages = True if stages is None else stages
         uncertainty = content_of(locate(loop))[0].uncertainty if uncertainty is None else uncertainty
-        loop = read(loop)
+        loop = read_stable(loop)
     if uncertainty is not None:
         by_name("verify", "uncertainty", uncertainty, '{"m": 0.2} or {"m": (0.1, 0.3)}')
         sides: Mapping[str, Any] = uncertainty
@@ -310,7 +295,7 @@ def with_requirements(found: LoopReport, spec: Spec | None, *, proof: bool, flig
     same = found.current_loops == LAST_STAGE and dict(found.uncertainty) == dict(spec.uncertainty)
     known = "margin" not in names or (same and found.robust is not None)
     try:
-        outcomes = judge(spec, found.controller, names=names, verified=found if known else None)
+        outcomes = judge_controller(spec, found.controller, names, found if known else None)
     except (InputError, CheckError) as error:
         if isinstance(error, CheckError) and not flights:
             raise

@@ -30,8 +30,8 @@ from malta.files import shipped_path
 from malta.margins.travel import travel_loops, travel_margin
 from malta.processes import environment, python_module
 from malta.proof.loss import ray_bound
+from malta.tuning.judging import judge
 from malta.tuning.search import model_and_controller
-from malta.tuning.verify import judge
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

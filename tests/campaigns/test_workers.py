@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from malta.simulation.engine import batch as workers
-from malta.simulation.engine.compiled import LANES, Lanes, Shared, TimeSpan, numbers_in_lanes, repeat_in_lanes
+from malta.simulation.engine.compiled import LANES
+from malta.simulation.engine.lanes import Lanes, Shared, TimeSpan, numbers_in_lanes, repeat_in_lanes
 
 SAMPLES, SUBSTEPS = 100, 4
 

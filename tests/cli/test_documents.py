@@ -187,7 +187,7 @@ def test_the_others(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize("gains", ["calibrated", "halbach", "planar"])
 def test_every_scenario(run: Run, gains: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from malta import gains as gain_files
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
     from malta.simulation.experiments import catalogue
 
     def quick(name: str, plant: Any, c: Any, **options: Any) -> Any:

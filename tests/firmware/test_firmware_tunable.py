@@ -29,11 +29,12 @@ from malta.firmware.period_functions import decide
 from malta.firmware.program import Precision
 from malta.firmware.signals import Target
 from malta.firmware.sources import sources
-from malta.firmware.supervisor_text import NUMBERS, compile_supervised
+from malta.firmware.supervised_flight import compile_supervised
+from malta.firmware.supervisor_text import NUMBERS
 from malta.firmware.vectors import record_vectors
 from malta.margins.tuned_gains import GainBox
 from malta.simulation.engine.compiled import compiler
-from malta.synthesis.controller import gains_of
+from malta.synthesis.law import gains_of
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

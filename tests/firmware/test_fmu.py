@@ -25,8 +25,9 @@ from malta.firmware.fmu import PARTS, Part, build_fmu, unit_of
 from malta.firmware.machine import FirmwareMachine, command_field
 from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of
+from malta.firmware.supervised_flight import Flown, Requests, supervised_engine
 from malta.firmware.supervisor import MONITORS, STATES
-from malta.firmware.supervisor_text import NUMBERS, Flown, Requests, supervised_engine
+from malta.firmware.supervisor_text import NUMBERS
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.simulation import references
 from malta.simulation.engine.compiled import compiler

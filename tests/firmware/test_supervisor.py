@@ -18,11 +18,12 @@ from test_firmware import WARNINGS
 
 import malta
 from malta.errors import InputError
-from malta.firmware import supervisor_text
+from malta.firmware import supervised_flight
 from malta.firmware.flight import call, compile_controller, new_state, view
 from malta.firmware.program import Precision
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.sources import phase_currents, sources
+from malta.firmware.supervised_flight import compile_supervised
 from malta.firmware.supervisor import (
     ENDLESS_SAMPLES,
     IN_FLIGHT,
@@ -43,7 +44,6 @@ from malta.firmware.supervisor import (
 from malta.firmware.supervisor_text import (
     _NUMBERS,
     NUMBERS,
-    compile_supervised,
     monitor_lines,
     supervisor_members,
     supervisor_sources,
@@ -863,7 +863,7 @@ def test_every_cell_of_the_table_of_monitors_has_a_reaction_or_a_reason(name: st
 
 
 def test_it_says_so_where_there_is_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor_text, "compiler", lambda: None)
+    monkeypatch.setattr(supervised_flight, "compiler", lambda: None)
     c = TARGETS["robust"].controller
     with pytest.raises(InputError, match="expected a C compiler: cc"):
         malta.experiment("commissioning", malta.plant_of(c.parameters), c)

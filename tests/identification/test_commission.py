@@ -30,7 +30,7 @@ from malta.identification.commission import (
 from malta.identification.noise import dc_log, noise_table, process_noise
 from malta.machines.tubular import bench as tubular
 from malta.model.equilibrium import trim
-from malta.model.plant import outputs_at
+from malta.model.places import outputs_at
 from malta.report.page.document import binder_page, binder_text
 
 if TYPE_CHECKING:

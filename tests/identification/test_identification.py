@@ -23,7 +23,7 @@ from malta.identification.response import ResponseModel
 from malta.identification.spectra import spectrum_of, straighten
 from malta.machines.tubular.plant import plant as tubular
 from malta.model.plant import Signal
-from malta.simulation.inputs import interleaved_multisine
+from malta.simulation.multisine import interleaved_multisine
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant

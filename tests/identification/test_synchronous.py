@@ -14,7 +14,8 @@ from conftest import ROOT
 import malta
 from malta.identification import Log
 from malta.model import machines
-from malta.model.machines import attribute_of, machine
+from malta.model.machines import machine
+from malta.model.parts import attribute_of
 
 FOLDER = ROOT / "examples" / "rotor"
 SPEED, E_U, L_U = 800.0, 1.2e-6, 0.03

@@ -16,7 +16,7 @@ import malta
 from malta.loops.curves import LoopCurves, loop_curves, respond
 from malta.loops.linear_loops import linear_loop
 from malta.loops.locus import root_locus, stability_changes
-from malta.loops.time_domain import loop_steps, step_figures
+from malta.loops.steps import loop_steps, step_figures
 from malta.simulation.references import Motion
 from malta.synthesis.recovery import StepResponse
 

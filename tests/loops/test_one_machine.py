@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from flight import default_of, derivative_at_rest, poles, without_loads
+from flight import default_of, derivative_at_rest, poles
 from magnets import MACHINES
 
 import malta
@@ -67,12 +67,12 @@ def check_machine_loop(plant: Plant, c: Controller, share: float) -> None:
 
 
 def check_proven_loop(plant: Plant, c: Controller, names: tuple[str, ...], values: Any, share: float) -> None:
-    """The loop of a proof at these parameters, which has no loads, and the flight of that machine without loads."""
+    """The loop of a proof at these parameters and the flight of that machine, both under their loads."""
     at = along(plant, share)
     system, law = machine_system(plant, c, names, at)
     (ours,) = closed_loop(system, law, np.array(values))
-    light, unloaded = without_loads(varied(plant, names, values), c)
-    flown = derivative_at_rest(light, unloaded, light.at(**at).x)
+    there = varied(plant, names, values)
+    flown = derivative_at_rest(there, c, there.at(**at).x)
     T = c.sample_time
     assert distance(poles(np.eye(len(ours)) + T * ours, T), poles(flown, T)) < SAME
 
@@ -149,7 +149,7 @@ def test_the_loop_of_any_magnet_is_the_derivative_of_its_flight(
 
 @pytest.mark.parametrize("name", [name for name in MACHINES if name != "three coils"])
 def test_the_proven_loop_of_any_magnet_is_the_derivative_of_its_flight(name: str) -> None:
-    """In its parameters, where spring and weight are what the magnets are preloaded with."""
+    """In its parameters, under spring and weight."""
     plant, c, at = bench_loop(name, 1, 0.0, 1.1)
     par: Any = plant.parameters
     names, nominal = ("m", "C", "g0"), np.array([par.m, par.C, par.g0])
@@ -158,8 +158,7 @@ def test_the_proven_loop_of_any_magnet_is_the_derivative_of_its_flight(name: str
         values = nominal * (1 + 0.2 * share)
         (ours,) = closed_loop(system, law, values[None])
         there = varied(plant, names, values)
-        carried = replace(there, load=lambda _: par.k * at["x"] - par.preload)
-        flown = derivative_at_rest(carried, c, there.at(**at).x)
+        flown = derivative_at_rest(there, c, there.at(**at).x)
         T = c.sample_time
         assert distance(poles(np.eye(len(ours)) + T * ours, T), poles(flown, T)) < SAME
 
@@ -240,7 +239,7 @@ def test_a_loop_of_another_machine_is_refused() -> None:
     "name", ["robust", "robust_observer", "tubular_pid", "halbach", "halbach_pid", "planar_pid"]
 )
 def test_witnesses_fly(name: str) -> None:
-    """The nonlinear machine without loads, towards the parameters of its loss: at 0.97 it comes to rest, at 1.03 it
+    """The nonlinear machine under its loads, towards the parameters of its loss: at 0.97 it comes to rest, at 1.03 it
     leaves. Deviations so small that nothing saturates, as long as the linear loop takes to tell."""
     plant, c = shipped(name)
     names = BOXES[plant.name]
@@ -253,10 +252,10 @@ def test_witnesses_fly(name: str) -> None:
         values = nominal + share * np.array([margin.moved.get(n, 0.0) for n in names])
         rate = float(instability(system, law, values[None])[0])
         assert np.sign(rate) == np.sign(share - 1)
-        there, alone = without_loads(varied(plant, names, values), c)
+        there = varied(plant, names, values)
         duration = min(max(12 / abs(rate), 400 * c.sample_time), 20.0)
         hold = malta.Scenario("witness", duration, malta.references.hold, start, fidelity=default_of(plant))
-        run = malta.simulate(there, alone, hold)
+        run = malta.simulate(there, c, hold)
         tenth = len(run.p) // 10
         off = np.abs(run.p - run.reference).max(axis=1)
         ends.append(

@@ -44,8 +44,9 @@ from malta.simulation.engine.compiled import compiler
 from malta.simulation.experiments.catalogue import cases_of, experiment
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-from malta.synthesis.controller import Controller, linear_law
+from malta.synthesis.controller import Controller
 from malta.synthesis.filters import sampled_model
+from malta.synthesis.linear_law import linear_law
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

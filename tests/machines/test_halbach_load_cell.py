@@ -14,7 +14,7 @@ from malta.machines.halbach import electronics
 from malta.machines.halbach.load_cell import CELL_NOISE, fit_motor_law, simulated_record
 from malta.machines.halbach.open_loop import identify
 from malta.machines.halbach.plant import Parameters
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 
 PAR: Parameters = malta.read("data/halbach.toml")
 CURRENTS = np.array([0.0, -0.3593, 0.3593])

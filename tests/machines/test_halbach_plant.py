@@ -15,9 +15,9 @@ import malta
 from malta.machines.halbach import electronics, electronics as motor, plant as halbach
 from malta.machines.halbach.electronics import IDEAL_ELECTRONICS, REAL_ELECTRONICS, Options
 from malta.machines.halbach.plant import Parameters
+from malta.model.drive import Electronics
 from malta.model.parameters import shape_parameters
 from malta.model.plant import Plant, symbolic
-from malta.model.signals import Electronics
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

@@ -22,8 +22,8 @@ import malta
 from malta.machines.planar import commutation, field as planar_field, plant as planar
 from malta.machines.planar.field import ODD_X, ODD_Y, Series
 from malta.model.data import published_value, read_published
-from malta.model.equations import rotation
 from malta.model.plant import symbolic
+from malta.model.rigid_body import rotation
 from malta.simulation.engine.engines import translate
 from malta.simulation.references import QUINTIC_DURATION, quintic
 

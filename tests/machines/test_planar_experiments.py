@@ -32,7 +32,8 @@ from malta.report.figures import experiment_figure
 from malta.report.ledger import ledger
 from malta.simulation.experiments import Experiment
 from malta.simulation.experiments.catalogue import cases_of, experiments_of
-from malta.synthesis.controller import law, linear_law
+from malta.synthesis.law import law
+from malta.synthesis.linear_law import linear_law
 from malta.synthesis.synthesize import braking_errors
 
 if TYPE_CHECKING:

@@ -14,10 +14,10 @@ from hypothesis import given, settings, strategies as st
 
 import malta
 from malta.machines.planar import commutation, field as coils, plant as planar
-from malta.model.data import plant_of
 from malta.model.equilibrium import trim
 from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant, symbolic
+from malta.model.plants import plant_of
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

@@ -17,8 +17,8 @@ from scipy.integrate import solve_ivp
 
 import malta
 from malta.machines.tubular import plant as tubular
-from malta.model.equations import cardan_rates, rotation
 from malta.model.parameters import differences
+from malta.model.rigid_body import cardan_rates, rotation
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

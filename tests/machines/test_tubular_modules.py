@@ -27,9 +27,9 @@ from malta.machines.tubular.paper.quantities import (
     radial_deviation,
 )
 from malta.machines.tubular.plant import centre_of_gravity
-from malta.model.data import plant_of
-from malta.model.equations import rotation
 from malta.model.parameters import acting_names, differences, values_of
+from malta.model.plants import plant_of
+from malta.model.rigid_body import rotation
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 

@@ -35,8 +35,8 @@ from malta.loops.sampled_loops import LAST_STAGE, loaded_loop, machine_law, mach
 from malta.margins.loop_report import LoopReport
 from malta.margins.travel import place_margin
 from malta.margins.verify import MACHINE_STAGE, SAMPLED_STAGE, compensators, linear_report, staged_report
-from malta.model.data import plant_of
 from malta.model.linearize import linearize
+from malta.model.plants import plant_of
 from malta.proof.blocks.gain import Gain
 from malta.proof.robust import robust_margin
 from malta.report.figures.margins import chain_figure
@@ -87,7 +87,7 @@ SENSORS = ["x1", "y1", "x2", "y2", "z"]
 def _sampled(name: str, z: float = 0.0) -> tuple[UncertainSystem, Compensator]:
     c = gains.read(f"design/gains/{name}.json")
     plant = plant_of(c.parameters)
-    return uncertain(plant, list(BOX), at={"z": z}), machine_law(plant, c, "lag")
+    return uncertain(plant, list(BOX), at={"z": z}, loaded=False), machine_law(plant, c, "lag")
 
 
 @pytest.mark.parametrize("name", CHAINED)

@@ -24,7 +24,7 @@ from malta.app.worker import outcome_document
 from malta.display import number
 from malta.gains.file import read
 from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, Outcome
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.proof.margin import NOT_PROVEN
 from malta.report.page.analysis import key_figures
 from malta.report.tables.design import requirements_table
@@ -37,8 +37,9 @@ from malta.synthesis.requirements import (
     mean_over_seeds,
     reached_with_every_seed,
 )
+from malta.tuning.judging import judge
 from malta.tuning.search import model_and_controller
-from malta.tuning.verify import SynthesizedDesign, entries_without_flights, judge, outcomes_of
+from malta.tuning.verify import SynthesizedDesign, entries_without_flights, outcomes_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -179,7 +180,7 @@ def test_undecided_ends_tune_with_exit_code_1(monkeypatch: pytest.MonkeyPatch) -
 
     from malta.cli.main import app
 
-    monkeypatch.setattr("malta.tuning.verify.judge", lambda *_: (OPEN,))
+    monkeypatch.setattr("malta.tuning.judging.judge", lambda *_: (OPEN,))
     ended = CliRunner().invoke(app, ["tune", "--check", str(ROOT / "design" / "halbach_pid.toml"), "--json"])
     (row,) = json.loads(ended.stdout)["requirements"]
     assert (row["holds"], row["verdict"], row["interval"]) == (False, "undecided", [0.95, 1.03])

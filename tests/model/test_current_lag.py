@@ -16,12 +16,12 @@ from scipy import linalg
 import malta
 from malta.errors import InputError
 from malta.linear.sampling import add_integrals, delay_inputs, eigenvalues, sample, sample_cost
-from malta.loops.own_model import controller_poles
 from malta.loops.sampled_loops import machine_loop, sampled_loop
 from malta.simulation.inputs import lagging_references
 from malta.synthesis.controller import Controller
 from malta.synthesis.filters import with_lags
 from malta.synthesis.lqg import gains, integrals_of, lqg, weights
+from malta.synthesis.separation import controller_poles
 from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import pytest
 
 import malta
 from malta.machines.tubular.drive import SIGNS
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.simulation.engine.batch import record_run
 from malta.simulation.layout import noise_scales
 from malta.simulation.scenario import Scenario, setup_of

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import malta
-from malta.model import equilibrium
+from malta.model import traced
 from malta.model.linearize import _derivatives
 
 DESIGNS = ("robust", "planar", "halbach")
@@ -21,8 +21,8 @@ def test_a_shared_function_has_the_matrices_of_numbers(name: str) -> None:
     par: Any = malta.read_design(f"design/{name}.toml").parameters
     plant = malta.plant_of(replace(par, m=1.07 * par.m))
     point = plant.at()
-    shared = equilibrium.trace(_derivatives, plant, None, False)
-    alone = equilibrium.trace(_derivatives, replace(plant), None, False)  # a copy is in no family
+    shared = traced.trace(_derivatives, plant, None, False)
+    alone = traced.trace(_derivatives, replace(plant), None, False)  # a copy is in no family
     assert len(shared.values) == 1
     assert not alone.values
     for own, other in zip(shared(point.x, point.u, point.u), alone(point.x, point.u, point.u), strict=True):
@@ -32,7 +32,7 @@ def test_a_shared_function_has_the_matrices_of_numbers(name: str) -> None:
 def test_machines_that_differ_in_numbers_are_traced_once() -> None:
     par: Any = malta.read("examples/ball/ball.toml")
     heavy, light = (malta.plant_of(replace(par, m=factor * par.m)) for factor in (1.5, 0.5))
-    one, other = (equilibrium.trace(_derivatives, plant, None, False) for plant in (heavy, light))
+    one, other = (traced.trace(_derivatives, plant, None, False) for plant in (heavy, light))
     assert one.function is other.function
     assert not np.allclose(np.array(one.values[0]), np.array(other.values[0]))
 

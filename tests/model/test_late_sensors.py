@@ -20,8 +20,8 @@ from malta.linear.uncertain import instability
 from malta.loops.sampled_loops import machine_loop, machine_system
 from malta.loops.time_domain import recovery
 from malta.margins.travel import travel_margin
-from malta.model.data import plant_of
 from malta.model.linearize import linearize
+from malta.model.plants import plant_of
 from malta.model.sensors import Sensors, split_dead_time, with_lags
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate

@@ -19,7 +19,8 @@ from conftest import refusal
 import malta
 from malta.gains import encodings
 from malta.loops.sampled_loops import machine_system
-from malta.model.linear import formula, value_of
+from malta.model.linear.formulas import value_of
+from malta.model.linear.machine import formula
 from malta.model.plant import Plant, Signal
 from malta.simulation.experiments.catalogue import jump
 from malta.synthesis.pid import pid as design_pid

@@ -187,7 +187,7 @@ PROVEN = {  # a machine, what its controller believes otherwise, and whether its
 @pytest.mark.parametrize("differ", [False, True])
 @pytest.mark.parametrize("name", MACHINES)
 def test_a_model_in_parameters_is_the_linear_model_at_each(name: str, differ: bool) -> None:
-    """The command follows the parameters, on which the preload, the currents and the forces depend."""
+    """Rest follows the parameters: the command that holds the machine under its loads, whatever they are."""
     make, par, at = MACHINES[name]
     names = ("m", "C", "g0") if make is bench else ("m", "C")
     plant = make(par)
@@ -198,7 +198,7 @@ def test_a_model_in_parameters_is_the_linear_model_at_each(name: str, differ: bo
     for _ in range(5):
         values = {key: getattr(par, key) * rng.uniform(0.8, 1.2) for key in names}
         other = make(replace(par, **values))
-        model = malta.linearize(other, other.at(**at), believed)
+        model = malta.linearize(other, malta.trim(other, **at), believed)
         A, B, C = system.at(np.array([list(values.values())]))
         np.testing.assert_allclose(A[0], model.A, rtol=0, atol=1e-9 * np.abs(model.A).max())
         np.testing.assert_allclose(B[0], model.B, rtol=0, atol=1e-9 * np.abs(model.B).max())
@@ -215,7 +215,7 @@ def test_the_ball_in_parameters_off_its_middle(q: float) -> None:
     par: Any = ball.parameters
     values = {"m": 0.08, "C": 2.3e-5, "s": 5.6e-3, "I_0": 1.3}
     other = ball.variant(replace(par, **values))
-    model = malta.linearize(other, other.at(q=q), ball)
+    model = malta.linearize(other, malta.trim(other, q=q), ball)
     A, B, _ = system.at(np.array([list(values.values())]))
     np.testing.assert_allclose(A[0], model.A, rtol=1e-12)
     np.testing.assert_allclose(B[0], model.B, rtol=1e-12)
@@ -306,8 +306,8 @@ def test_a_design_off_the_stroke_is_proven_at_the_slopes_there(off_centre: malta
     assert loaded.A[1, 0] == pytest.approx(16888.7, abs=0.1)
     system, _ = machine_system(ball, controller, ("m", "C"), off_centre.operating_point)
     A, B, _ = (M[0] for M in system.at(system.nominal))
-    np.testing.assert_allclose(A, model.A, rtol=1e-12)
-    np.testing.assert_allclose(B, model.B, rtol=1e-12)
+    np.testing.assert_allclose(A, loaded.A, rtol=1e-12)
+    np.testing.assert_allclose(B, loaded.B, rtol=1e-12)
     robust = malta.verify(model, controller, off_centre.uncertainty).robust
     assert robust is not None
     assert robust.lower is not None

@@ -17,8 +17,9 @@ from malta import report
 from malta.campaigns.result import bounds_of
 from malta.margins.travel import NO_EXTENT
 from malta.model import machines
-from malta.model.machines import inputs_of, lateral_outputs, outputs_of, part_of, require_part, stroke_unit
+from malta.model.parts import part_of, require_part
 from malta.model.plant import Signal
+from malta.model.signal_groups import inputs_of, lateral_outputs, outputs_of, stroke_unit
 from malta.report import figures
 from malta.simulation.experiments import Case, Experiment, Merit, PlannedRun, fly, scenario_of
 from malta.simulation.experiments.catalogue import cases_of, main_job, options_of

@@ -15,7 +15,7 @@ import pytest
 from conftest import ROOT, one_sentence
 
 import malta
-from malta.model import machines
+from malta.model import machines, parts
 
 if TYPE_CHECKING:
     from conftest import Run
@@ -212,7 +212,7 @@ def test_a_copy_of_a_machine_has_the_modules_beside_itself(folder: Path, tmp_pat
     for where, value in ((copy, 2), (folder, 1), (copy, 2)):
         module = malta.machine(where / "lev.py")
         plant = module.plant(malta.read(where / "lev.toml"))
-        assert machines.attribute_of(plant, "experiments", "fly")() == value
+        assert parts.attribute_of(plant, "experiments", "fly")() == value
         assert machines.name_of(module) == "lev"
     shutil.rmtree(copy)
     assert malta.machine(folder / "lev.py").__file__ == str((folder / "lev.py").resolve())

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.integrate import solve_ivp
 
-from malta.model.equations import (
+from malta.model.rigid_body import (
     EXACT_TRIG,
     SMALL_ANGLE_TRIG,
     Trig,

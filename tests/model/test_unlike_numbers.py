@@ -15,11 +15,11 @@ import malta
 from malta.errors import CheckError, InputError
 from malta.firmware.flight import view
 from malta.firmware.signals import Target
+from malta.firmware.supervised_flight import Flown, Interference, Requests, supervised_engine
 from malta.firmware.supervisor import STATES, prediction_correction
-from malta.firmware.supervisor_text import Flown, Interference, Requests, supervised_engine
-from malta.loops.own_model import controller_poles
-from malta.synthesis.controller import law
+from malta.synthesis.law import law
 from malta.synthesis.pid import pid
+from malta.synthesis.separation import controller_poles
 from malta.synthesis.spec import Pid
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import malta
-from malta.model.machines import require_part
+from malta.model.parts import require_part
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "docs"))

@@ -12,9 +12,10 @@ from filterpy.kalman import KalmanFilter
 
 import malta
 from malta.linear.sampling import eigenvalues, sample, sample_noise
-from malta.loops.own_model import controller_poles
 from malta.loops.sampled_loops import sampled_loop
-from malta.synthesis.controller import law, linear_law
+from malta.synthesis.law import law
+from malta.synthesis.linear_law import linear_law
+from malta.synthesis.separation import controller_poles
 
 if TYPE_CHECKING:
     from conftest import Design

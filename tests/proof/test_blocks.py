@@ -184,7 +184,7 @@ def test_compliance_of_the_flagship_in_its_travel() -> None:
     """Axial compliance of the sampled loop, by frequency responses of 60 machines."""
     from malta import gains
     from malta.margins.travel import travel_loops
-    from malta.model.data import plant_of
+    from malta.model.plants import plant_of
 
     c = gains.read("design/gains/robust.json")
     plant = plant_of(c.parameters)

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import control
 import numpy as np
 import pytest
-from flint import arb
+from flint import arb, fmpq
 
 import malta
-from malta.errors import InputError
+from malta.checker.check import check, require_conditions
+from malta.checker.file import read
+from malta.checker.loop import Refused
 from malta.linear.branches import INTERVALS, Interval, resolve_branches, without_branches
 from malta.linear.expressions import POINTS, NotAnalytic, program
+from malta.linear.uncertain import DOMAIN_END_TEXT, UncertainSystem
 from malta.loops.parametric_plants import of_plant
 from malta.model import Actuator, Plant, Signal, si
-from malta.proof.box import DOMAIN_END_TEXT, SEARCH_LIMIT, box_of, within_branches
-from malta.proof.certificate import certificate_of
+from malta.proof.box import SEARCH_LIMIT, box_of, within_branches
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ def slopes(p: Any, lift: float = 0.0) -> tuple[float, float]:
 @pytest.mark.parametrize("guarded", [False, True])
 def test_roots_and_guards_leave_short_rational_matrices(guarded: bool) -> None:
     plant = levitated(PAR, guarded)
-    system = of_plant(plant, list(RANGES), believed=plant)
+    system = of_plant(plant, list(RANGES), believed=plant, loaded=False)
     assert program(system.matrices).rational
     assert system.matrices.n_instructions() < 60
     rng = np.random.default_rng(3)
@@ -89,7 +94,7 @@ def test_roots_and_guards_leave_short_rational_matrices(guarded: bool) -> None:
 @pytest.mark.parametrize("guarded", [False, True])
 def test_the_margin_is_proven_up_to_the_witness(law: Any, guarded: bool) -> None:
     plant = levitated(PAR, guarded)
-    m = malta.robust_margin(of_plant(plant, list(RANGES), believed=plant), law, RANGES)
+    m = malta.robust_margin(of_plant(plant, list(RANGES), believed=plant, loaded=False), law, RANGES)
     assert m.lower is not None
     assert m.lower > 0.998 * m.upper
     sign = np.array(list(itertools.product((-1, 1), repeat=3)))
@@ -120,19 +125,30 @@ def poles_are_stable(p: Any, law: Any) -> bool:
 def test_the_margin_ends_where_the_branch_does() -> None:
     """With a permanent magnet of 0.49 N the command is zero at half the mass, where the guard begins to act."""
     plant = levitated(replace(PAR, lift=0.4905))
-    m = malta.robust_margin(of_plant(plant, ["m"], believed=plant), LAW, {"m": (0.08, 0.12)})
+    m = malta.robust_margin(of_plant(plant, ["m"], believed=plant, loaded=False), LAW, {"m": (0.08, 0.12)})
     assert m.lower == pytest.approx(2.5, rel=1e-3)
     assert m.lower is not None
     assert m.lower < 2.5
     assert str(m).endswith(f"no unstable machine found up to t = 2.5, where {DOMAIN_END_TEXT}")
 
 
-def test_certificates_do_not_cover_branches() -> None:
-    plant = levitated(PAR)
-    system = of_plant(plant, list(RANGES), believed=plant)
-    m = malta.robust_margin(system, LAW, RANGES)
-    with pytest.raises(InputError, match="branch"):
-        certificate_of([(system, LAW)], RANGES, None, m)
+def test_a_certificate_says_where_its_branch_ends(tmp_path: Path) -> None:
+    """The checker shows that the guard does not act on the box; beyond it the certificate does not hold."""
+    plant = levitated(replace(PAR, lift=0.4905))
+    system, box = of_plant(plant, ["m"], believed=plant, loaded=False), {"m": (0.08, 0.12)}
+    m = malta.robust_margin(system, LAW, box)
+    path = malta.proof.write_certificate(tmp_path / "c.json", [(system, LAW)], box, None, m)
+    assert check(path).ok
+    (loop,) = read(path).loops
+    assert len(loop.conditions.above) == 1
+    require_conditions(loop.conditions, [(fmpq(51, 1000), fmpq(1, 10))])
+    with pytest.raises(Refused, match="not shown to have a rest"):
+        require_conditions(loop.conditions, [(fmpq(49, 1000), fmpq(1, 10))])
+
+
+def conditioned(positive: ca.Function | None) -> UncertainSystem:
+    """A system of which these conditions alone count."""
+    return UncertainSystem(("x", "y"), np.zeros(2), None, positive=positive)
 
 
 def test_branches_of_any_model_are_those_at_the_nominal_place() -> None:
@@ -157,10 +173,10 @@ def test_branches_of_any_model_are_those_at_the_nominal_place() -> None:
             inside += 1
     assert 20 < inside < 180
     whole = box_of(("x", "y"), np.array([2.0, 0.9]), (), {"x": 0.1, "y": 0.1}, {})
-    ended = within_branches(whole, positive)
+    ended = within_branches(whole, conditioned(positive))
     assert ended.ends == DOMAIN_END_TEXT
     assert ended.most == pytest.approx(10 / 9, rel=1e-6)  # y < 1
-    assert within_branches(whole, None).limit == SEARCH_LIMIT
+    assert within_branches(whole, conditioned(None)).limit == SEARCH_LIMIT
 
 
 def test_what_has_no_branch_is_left_as_it_is() -> None:
@@ -179,7 +195,7 @@ def test_conditions_of_places_without_a_branch_leave_nothing() -> None:
     p = ca.SX.sym("p", 2)
     positive = ca.Function("positive", [p], [p[1] - 0.5])
     box = box_of(("x", "y"), np.array([2.0, 1.0]), (), {"x": 0.1}, {"y": (0.4, 1.5)})
-    assert within_branches(box, positive).most == 0.0
+    assert within_branches(box, conditioned(positive)).most == 0.0
 
 
 def test_intervals_contain_what_is_computed_in_them() -> None:

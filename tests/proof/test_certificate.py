@@ -394,7 +394,7 @@ def test_whatever_is_changed_is_refused(
         ("[" * 100_000, "no JSON"),
         ("[]", "a table"),
         ("{}", "format: found nothing"),
-        ('{"format": "malta margin certificate", "version": 1}', "version 2"),
+        ('{"format": "malta margin certificate", "version": 1}', "version: found 1"),
     ],
 )
 def test_files_that_are_no_certificates(tmp_path: Path, text: str, why: str) -> None:

@@ -14,7 +14,7 @@ from malta import dynamic_margin, gains
 from malta.errors import InputError
 from malta.linear.uncertain import responses
 from malta.margins.travel import travel_loops
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.proof import Dynamic
 
 

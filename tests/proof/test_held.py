@@ -16,22 +16,24 @@ import malta
 from malta import gains
 from malta.linear.sampling import sample
 from malta.linear.uncertain import UncertainSystem, closed_loop, responses
-from malta.loops.own_model import controller_poles, unstable_gain
+from malta.loops.own_model import unstable_gain
 from malta.loops.parametric_plants import uncertain
 from malta.loops.sampled_loops import machine_loop, machine_system, sampled_law, sampled_loop
 from malta.loops.windings import left_out
 from malta.margins.travel import travel_margin
 from malta.margins.verify import linear_report
-from malta.model.data import plant_of
 from malta.model.linearize import LinearModel
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-from malta.synthesis.controller import Controller, linear_law
+from malta.synthesis.controller import Controller
 from malta.synthesis.filters import between_samples, sampled_model
+from malta.synthesis.linear_law import linear_law
 from malta.synthesis.lqg import lqg
 from malta.synthesis.pid import pid
+from malta.synthesis.separation import controller_poles
 from malta.synthesis.spec import Pid, Weights
 
 ROOT = Path(__file__).parents[2]

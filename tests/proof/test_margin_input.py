@@ -19,7 +19,7 @@ from malta import gains
 from malta.errors import InputError
 from malta.linear.expressions import program
 from malta.linear.uncertain import UncertainSystem
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.proof.box import box_of
 from malta.proof.problem import CoefficientPolynomial
 from malta.proof.robust import common_margin

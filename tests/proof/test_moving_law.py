@@ -11,7 +11,7 @@ from flint import arb
 from scipy import linalg
 
 import malta
-from malta.linear.systems import compensator_of
+from malta.linear.compensators import compensator_of
 from malta.linear.uncertain import Compensator
 from malta.margins import schedule_rate, scheduled_loops
 from malta.margins.scheduled_loops import loops_between_places, rate_of_cells

@@ -21,7 +21,7 @@ from malta.loops.parametric_plants import uncertain
 from malta.loops.sampled_loops import machine_law, machine_system
 from malta.margins.travel import travel_margin
 from malta.margins.verify import compensators
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.proof import Budget
 from malta.proof.robust import robust_margin
 
@@ -163,7 +163,7 @@ def test_the_published_margin_is_that_of_full_state_feedback(
 ) -> None:
     """5/3 of the 20 % box: K_A +33.3 %, K_B -33.3 % at w = 0."""
     plant, c = regulators["table2"]
-    s = uncertain(plant, list(BOX), states=True)
+    s = uncertain(plant, list(BOX), states=True, loaded=False)
     m = robust_margin(s, c, BOX)
     assert m.lower == pytest.approx(5 / 3, rel=1e-3)
     assert m.upper == pytest.approx(5 / 3, rel=1e-5)
@@ -184,13 +184,18 @@ def test_each_parameter_alone_of_full_state_feedback(
 ) -> None:
     """K_B down by a half (the LQR's gain margin), K_A doubled, m never."""
     plant, c = regulators["table2"]
-    found = {name: robust_margin(uncertain(plant, [name], states=True), c, {name: 0.2}) for name in BOX}
+    found = {
+        name: robust_margin(uncertain(plant, [name], states=True, loaded=False), c, {name: 0.2})
+        for name in BOX
+    }
     assert found["K_B"].upper == pytest.approx(2.5, rel=1e-3)
     assert found["K_B"].lower == pytest.approx(2.5, rel=1e-3)
     assert found["m"].exhausted
     assert found["m"].lower == pytest.approx(5, rel=2e-4)  # m = 0
     # K_A upwards alone: its lower end is zero attraction, just there
-    up = robust_margin(uncertain(plant, ["K_A"], states=True), c, {"K_A": (8626.7, 1.2 * 8626.7)})
+    up = robust_margin(
+        uncertain(plant, ["K_A"], states=True, loaded=False), c, {"K_A": (8626.7, 1.2 * 8626.7)}
+    )
     assert up.upper == pytest.approx(5, rel=1e-3)
     assert up.lower == pytest.approx(5, rel=1e-3)
     assert found["K_A"].lower == pytest.approx(5, rel=1e-3)
@@ -200,7 +205,7 @@ def test_each_parameter_alone_of_full_state_feedback(
 
 def test_full_state_margins_of_the_other_designs(regulators: dict[str, tuple[Plant, Compensator]]) -> None:
     plant, c = regulators["calibrated"]
-    m = robust_margin(uncertain(plant, list(BOX), states=True), c, BOX)
+    m = robust_margin(uncertain(plant, list(BOX), states=True, loaded=False), c, BOX)
     assert m.lower == pytest.approx(3.0, rel=0.01)
     assert m.upper == pytest.approx(3.0, rel=0.01)
 
@@ -209,10 +214,10 @@ def test_the_published_observer_keeps_a_fifth_of_it() -> None:
     """Doyle 1978 on the published machine: a third of the box in place of 5/3."""
     c, plant = shipped("table2")
     law, _ = compensators(plant, c)["LQG"]
-    m = robust_margin(uncertain(plant, list(BOX)), law, BOX)
+    m = robust_margin(uncertain(plant, list(BOX), loaded=False), law, BOX)
     assert m.lower == pytest.approx(0.334, abs=0.005)
     assert m.upper == pytest.approx(0.334, abs=0.005)
-    P, _, _, F = responses(uncertain(plant, []), law, np.zeros(0), np.geomspace(1, 1e4, 2000))
+    P, _, _, F = responses(uncertain(plant, [], loaded=False), law, np.zeros(0), np.geomspace(1, 1e4, 2000))
     assert np.linalg.norm(np.linalg.inv(np.eye(5) - P @ F), 2, axis=(1, 2)).max() == pytest.approx(
         7, rel=0.05
     )
@@ -276,7 +281,9 @@ def test_a_hundred_thousand_machines_of_the_proven_box_are_stable(name: str) -> 
 def test_stability_that_is_lost_at_zero_frequency(regulators: dict[str, tuple[Plant, Compensator]]) -> None:
     """A grid of frequencies from 1 rad/s on does not see it; the proof covers w = 0."""
     plant, c = regulators["table2"]
-    m = robust_margin(uncertain(plant, ["K_A", "K_B"], states=True), c, {"K_A": 0.2, "K_B": 0.2})
+    m = robust_margin(
+        uncertain(plant, ["K_A", "K_B"], states=True, loaded=False), c, {"K_A": 0.2, "K_B": 0.2}
+    )
     assert m.upper == pytest.approx(5 / 3, rel=1e-6)
     assert m.lower == pytest.approx(5 / 3, rel=1e-5)
     assert m.frequency == 0
@@ -466,7 +473,7 @@ def test_parameters_of_the_geometry_and_twins() -> None:
     """l_B enters squared, I_xx stands for I_yy as well, z couples: all of it in one proof."""
     c, plant = shipped("calibrated")
     names = ["I_xx", "l_B", "K_A", "z"]
-    s, law = uncertain(plant, names), machine_law(plant, c, "lag")
+    s, law = uncertain(plant, names, loaded=False), machine_law(plant, c, "lag")
     ranges: dict[str, float | tuple[float, float]] = {"I_xx": 0.2, "l_B": 0.1, "K_A": 0.2, "z": (-5e-3, 5e-3)}
     m = robust_margin(s, law, ranges)
     assert m.lower is not None

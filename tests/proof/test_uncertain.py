@@ -25,7 +25,7 @@ NAMES = ("m", "K_A", "K_D", "K_B", "l_B", "l_S", "I_xx")
 
 
 def linear(plant: Plant, z: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    model = malta.linearize(plant, plant.at(z=z))
+    model = malta.linearize(plant, malta.trim(plant, z=z))
     return model.A, model.B, model.C
 
 
@@ -66,7 +66,9 @@ def test_a_machine_that_the_controller_does_not_know(designs: dict[str, Design])
     weak = malta.plant_of(replace(design.spec.parameters, K_B=4.0))
     law = machine_law(weak, design.controller, "lag")
     system = uncertain(weak, ["m"], believed=design.plant)
-    expected = sampled_loop(malta.linearize(weak, weak.at()), design.controller, delay=1, current_loops="lag")
+    expected = sampled_loop(
+        malta.linearize(weak, malta.trim(weak)), design.controller, delay=1, current_loops="lag"
+    )
     w = np.geomspace(1, 6e4, 30)
     P, _, _, F = responses(system, law, system.nominal, w)
     assert np.linalg.inv(np.eye(5) - P @ F) == pytest.approx(expected.sensitivity(w), rel=1e-6, abs=1e-8)
@@ -81,7 +83,7 @@ def test_the_closed_loop_is_verifys(design: Design) -> None:
     """Poles, sensitivity and spectral radius of the sampled machine, by the other route."""
     law = machine_law(design.plant, design.controller, "lag")
     system = uncertain(design.plant, ["m", "K_A"], at={"z": 4e-3})
-    model = malta.linearize(design.plant, design.plant.at(z=4e-3))
+    model = malta.linearize(design.plant, malta.trim(design.plant, z=4e-3))
     expected = sampled_loop(model, design.controller, delay=1, current_loops="lag")
     (ours,) = closed_loop(system, law, system.nominal)
     z = np.sort_complex(1 + 50e-6 * np.linalg.eigvals(ours))

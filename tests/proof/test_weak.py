@@ -20,7 +20,7 @@ from malta.linear.expressions import NotAnalytic, program
 from malta.linear.uncertain import closed_loop, instability
 from malta.loops.parametric_plants import model_of
 from malta.margins.travel import NOT_BETWEEN_TEXT, LoopAlong, margin_anywhere, travel_margin
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.proof.box import box_of
 from malta.proof.weak_coupling import HeldLoop, coupling_bounds, taylor
 from malta.proof.weak_coupling.axes import members_of, state_matrix

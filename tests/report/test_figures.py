@@ -18,7 +18,7 @@ import malta
 from malta import report
 from malta.cli.options import read_shares
 from malta.errors import InputError
-from malta.model.machines import outputs_of
+from malta.model.signal_groups import outputs_of
 from malta.report import encode_figure, figures, new_figure
 from malta.report.page import document
 from malta.simulation.experiments import Case, Experiment

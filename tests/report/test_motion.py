@@ -16,7 +16,7 @@ from PIL import Image
 
 import malta
 from malta.machines.tubular.plant import measure_outputs
-from malta.model.equations import Body
+from malta.model.rigid_body import Body
 from malta.report.page.motion import (
     VIEW,
     arrow_size,

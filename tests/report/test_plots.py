@@ -22,7 +22,7 @@ from malta.cli.documents.published import output_schema
 from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.locus import root_locus
 from malta.margins.margin_map import margin_map_of
-from malta.model.machines import axis_units
+from malta.model.signal_groups import axis_units
 from malta.report.plots.plane import Window, branch_paths
 
 if TYPE_CHECKING:

@@ -15,16 +15,17 @@ from conftest import ROOT, refusal
 import malta
 from malta import gains
 from malta.gains.encodings import content_sha256
-from malta.gains.file import document
+from malta.gains.writing import document
 from malta.loops.sampled_loops import machine_law, machine_loop
 from malta.machines.planar import motions
-from malta.model.data import plant_of
-from malta.model.parameters import fingerprint
+from malta.model.fingerprint import fingerprint
+from malta.model.plants import plant_of
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-from malta.synthesis.controller import Commutation, linear_law
+from malta.synthesis.controller import Commutation
 from malta.synthesis.feedforward import commutate_ahead
+from malta.synthesis.linear_law import linear_law
 
 if TYPE_CHECKING:
     from malta.model.linearize import LinearModel

@@ -21,7 +21,7 @@ from hypothesis import given, strategies as st
 
 import malta
 from malta import references
-from malta.simulation.engine import compiled, engines, engines as translate
+from malta.simulation.engine import compiled, engines, engines as translate, lanes as lanes_of
 from malta.simulation.engine.compiled import LANES, process_folder
 from malta.simulation.engine.engines import engine_of, library_of, shape_of
 from malta.simulation.engine.instructions import Counts
@@ -120,14 +120,14 @@ def _digests(
 ) -> FloatArray:
     states = np.hstack([states, np.zeros((LANES, 1))])
     theta, start, digests = (
-        compiled.arrange_in_lanes(rows, 1)
+        lanes_of.arrange_in_lanes(rows, 1)
         for rows in (thetas, states, np.zeros((LANES, trial.parts.decide.size1_out(2))))
     )
-    lanes = compiled.Lanes(
+    lanes = lanes_of.Lanes(
         theta, start, np.zeros((1, 1, LANES)), np.zeros((1, LANES), dtype=np.uint64), digests
     )
-    shared = compiled.Shared(np.ascontiguousarray(given), table, 1, False)
-    compiled.run_many(trial.many, slice(0, 1), lanes, shared)
+    shared = lanes_of.Shared(np.ascontiguousarray(given), table, 1, False)
+    lanes_of.run_many(trial.many, slice(0, 1), lanes, shared)
     return np.asarray(digests[0].T)
 
 
@@ -949,9 +949,9 @@ def test_machines_are_dealt_out_to_lanes(runs: int) -> None:
     groups = -(-runs // LANES)
     rows = np.random.default_rng(0).normal(size=(runs, 3))
     rows[:, 1] = 0.5
-    arranged = compiled.arrange_in_lanes(rows, groups)
+    arranged = lanes_of.arrange_in_lanes(rows, groups)
     assert arranged.shape == (groups, 3, LANES)
     for k in range(groups * LANES):
         assert arranged[k // LANES, :, k % LANES].tolist() == rows[min(k, runs - 1)].tolist()
     own = {0: rows[:, 0], 2: rows[:, 2]}
-    assert np.array_equal(compiled.repeat_in_lanes(np.array([9.0, 0.5, 9.0]), own, groups), arranged)
+    assert np.array_equal(lanes_of.repeat_in_lanes(np.array([9.0, 0.5, 9.0]), own, groups), arranged)

@@ -18,7 +18,7 @@ from malta.arrays import FloatArray
 from malta.machines.halbach import electronics
 from malta.simulation.current_control import duty_cycles
 from malta.simulation.period import limited_currents
-from malta.synthesis.controller import command_forces, gains_of
+from malta.synthesis.law import command_forces, gains_of
 
 CASES = 400
 EPS = np.finfo(float).eps

@@ -18,10 +18,11 @@ from malta.simulation.engine import compiled
 from malta.simulation.engine.batch import record_run, replay_run, simulate_many
 from malta.simulation.engine.digest import Batch, verdicts
 from malta.simulation.engine.engines import engine_of, library_of
+from malta.simulation.flown_strokes import stroke_figures
 from malta.simulation.layout import FIDELITIES, Fidelity
 from malta.simulation.readings import keys, normals, starts_of_parts
 from malta.simulation.scenario import Correction, Fault, Scenario
-from malta.simulation.trajectory import Trajectory, stroke_figures
+from malta.simulation.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from conftest import Design

@@ -12,7 +12,7 @@ from conftest import Run
 
 import malta
 from malta import gains
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.simulation.experiments.catalogue import FINENESS, flown_payload, held_payload, payload
 from malta.synthesis.requirements import Payload
 

@@ -22,7 +22,7 @@ from malta.campaigns.plan import Plan, planned_run, revision_of
 from malta.campaigns.result import Campaign
 from malta.campaigns.run import campaign
 from malta.campaigns.store import MANIFEST, block_name, read_plan, seal
-from malta.model.parameters import fingerprint
+from malta.model.fingerprint import fingerprint
 from malta.simulation.engine.digest import Batch
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from malta.app.files import open_design
 from malta.report.page.analysis import design_entries
 from malta.report.page.report import subject_of
 from malta.structured.design import structured_text, tune_design
-from malta.synthesis.controller import linear_law
+from malta.synthesis.linear_law import linear_law
 from malta.synthesis.structure import with_values
 from malta.tuning.search import model_and_controller
 

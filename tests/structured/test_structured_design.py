@@ -17,10 +17,10 @@ from malta.app.worker import searched_spec
 from malta.report.page.analysis import design_entries
 from malta.report.page.report import subject_of
 from malta.structured.design import design_goals, structured_text, tune_design
-from malta.synthesis.controller import linear_law
+from malta.synthesis.linear_law import linear_law
 from malta.synthesis.structure import with_values
+from malta.tuning.judging import judge
 from malta.tuning.search import model_and_controller
-from malta.tuning.verify import judge
 
 if TYPE_CHECKING:
     from malta.synthesis.spec import Spec

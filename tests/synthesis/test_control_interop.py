@@ -20,7 +20,7 @@ from scipy import linalg
 import malta
 from malta.gains import encodings
 from malta.loops.sampled_loops import machine_loop
-from malta.model.parameters import fingerprint
+from malta.model.fingerprint import fingerprint
 from malta.simulation.experiments.catalogue import jump
 from malta.synthesis import filters, lqg, riccati
 

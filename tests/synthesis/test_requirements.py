@@ -19,8 +19,8 @@ from malta.machines.tubular.requirements import REQUIREMENTS
 from malta.synthesis.requirements import GENERIC_REQUIREMENTS, requirements_for
 from malta.synthesis.spec import Loads, Pid, Spec
 from malta.tuning.groups import figures_of, groups_of
+from malta.tuning.judging import judge
 from malta.tuning.search import Effort, at_least_of, merge, model_and_controller
-from malta.tuning.verify import judge
 
 
 def motor_file(folder: Path, *lines: str) -> Path:

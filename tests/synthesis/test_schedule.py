@@ -19,10 +19,12 @@ from malta.linear.sampling import sample
 from malta.linear.uncertain import instability
 from malta.loops.sampled_loops import machine_system
 from malta.margins.scheduled_loops import loops_between_places
-from malta.margins.travel import travel_margin, worst_sensitivities
+from malta.margins.travel import travel_margin
+from malta.margins.worst_case import worst_sensitivities
 from malta.simulation.references import Motion
-from malta.synthesis.controller import Controller, law, law_at
-from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule, point_at
+from malta.synthesis.controller import Controller
+from malta.synthesis.law import law, law_at, point_at
+from malta.synthesis.schedule import SCHEDULED_MATRICES, Schedule
 
 MAGNET = "examples/magnet/design/scheduled.toml"
 RISE = 0.1  # s

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import malta
-from malta.loops.own_model import controller_poles
 from malta.synthesis.feedforward import pi_current_loop, static_feedforward
 from malta.synthesis.filters import sampled_model
+from malta.synthesis.separation import controller_poles
 
 if TYPE_CHECKING:
     from conftest import Design

@@ -24,23 +24,15 @@ from malta.margins.loop_report import Outcome
 from malta.report import ledger as claims
 from malta.report.ledger import Row
 from malta.simulation.experiments.catalogue import experiment
-from malta.simulation.trajectory import stroke_figures
-from malta.synthesis.controller import law
+from malta.simulation.flown_strokes import stroke_figures
+from malta.synthesis.law import law
 from malta.synthesis.pid import axes_of, pid
 from malta.synthesis.spec import Pid
-from malta.tuning.pid import (
-    CORNER_TOLERANCE,
-    close_loop,
-    estimates_of,
-    loads_of,
-    loop_figures,
-    name_of,
-    outputs_of,
-    parts_of,
-    whole_machine,
-)
+from malta.tuning.judging import judge
+from malta.tuning.pid import CORNER_TOLERANCE, close_loop, estimates_of, name_of, outputs_of, parts_of
+from malta.tuning.pid_loop import loads_of, loop_figures, whole_machine
 from malta.tuning.search import model_and_controller
-from malta.tuning.verify import SynthesizedDesign, judge
+from malta.tuning.verify import SynthesizedDesign
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

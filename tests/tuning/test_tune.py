@@ -23,10 +23,11 @@ from malta.loops.time_domain import noise_of, noise_variance
 from malta.machines.tubular.requirements import DRIVE
 from malta.margins.loop_report import BANDWIDTHS, Outcome
 from malta.simulation.experiments.catalogue import experiment
-from malta.synthesis.controller import linear_law, linear_law_of
+from malta.synthesis.linear_law import linear_law, linear_law_of
 from malta.synthesis.requirements import requirements_for
 from malta.tuning import tune as lqg
 from malta.tuning.groups import figures_of
+from malta.tuning.judging import judge
 from malta.tuning.search import Effort, Journal, Trial, apply_trial, at_least_of, merge
 from malta.tuning.tune import (
     TuningResult,
@@ -37,7 +38,6 @@ from malta.tuning.tune import (
     tune as tuned,
     worst_ratio,
 )
-from malta.tuning.verify import judge
 
 if TYPE_CHECKING:
     from malta.margins.loop_report import LoopReport

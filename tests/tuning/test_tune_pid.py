@@ -22,10 +22,11 @@ from malta.loops.sampled_loops import machine_loop
 from malta.machines.halbach import electronics, plant as halbach
 from malta.synthesis.spec import Pid
 from malta.tuning import pid, verify
-from malta.tuning.pid import close_loop, goal_value, loads_of, loop_figures, parts_of, whole_machine
+from malta.tuning.judging import judge
+from malta.tuning.pid import close_loop, goal_value, parts_of
+from malta.tuning.pid_loop import loads_of, loop_figures, whole_machine
 from malta.tuning.search import Effort, Journal, TrialSearch, model_and_controller, separate
 from malta.tuning.tune import design_text, problem_sha256, tune as tuned
-from malta.tuning.verify import judge
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from malta.margins.loop_report import LoopReport
     from malta.simulation.experiments import Experiment
 
-
 Manifest = dict[str, Any]
 
 
@@ -444,7 +443,7 @@ def experiment_fields(experiment: Experiment) -> dict[str, Any]:
 
 
 def _stroke(experiment: Experiment) -> StrokePart:
-    from malta.simulation.trajectory import stroke_figures
+    from malta.simulation.flown_strokes import stroke_figures
 
     run = experiment.run
     found, units = stroke_figures(run), {signal.name: signal.unit for signal in run.plant.outputs}

@@ -287,7 +287,7 @@ def _poles_part(curves: LoopCurves) -> PoleZeroPart:
 
 def _answers(curves: LoopCurves, kinds: Sequence[str], outputs: dict[str, int]) -> dict[str, Any]:
     """The answers to steps and loads."""
-    from malta.loops.time_domain import loop_steps
+    from malta.loops.steps import loop_steps
 
     found = loop_steps(curves.loop)
     made: dict[str, Any] = {}
@@ -311,7 +311,7 @@ def _answers(curves: LoopCurves, kinds: Sequence[str], outputs: dict[str, int]) 
 
 def _line(answer: StepResponse, output: int, column: int) -> dict[str, Any]:
     """A step response at POINTS times at most until it has settled, and the figures that are read off."""
-    from malta.loops.time_domain import step_figures
+    from malta.loops.steps import step_figures
 
     found = step_figures(answer, output, column)
     end = 1.6 * found.settling if 0 < found.settling < math.inf else float(answer.t[-1])

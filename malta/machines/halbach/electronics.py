@@ -15,9 +15,9 @@ from scipy.special import ndtr
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.machines.halbach.parameters import GAP, Parameters
+from malta.model.drive import Electronics
 from malta.model.equations import note
 from malta.model.plant import Signal
-from malta.model.signals import Electronics
 from malta.simulation.period import runge_kutta
 
 # The Halbach motor: Park transform, forces, motion and voltages of the three phases.

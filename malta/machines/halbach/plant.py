@@ -37,8 +37,8 @@ from malta.machines.halbach.electronics import (
 from malta.machines.halbach.parameters import Parameters as Parameters
 from malta.model.actuator import Actuator
 from malta.model.contacts import Contacts
-from malta.model.equations import Body, Resultant
 from malta.model.plant import Plant, Signal
+from malta.model.rigid_body import Body, Resultant
 from malta.model.sensors import Sensors
 from malta.model.stroke import Stroke
 

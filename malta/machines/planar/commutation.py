@@ -29,7 +29,8 @@ from malta.machines.planar.field import (
     simulation_model,
 )
 from malta.machines.planar.parameters import Parameters
-from malta.model.equations import Equation, is_recording, note, recorded_equations, rotation
+from malta.model.equations import Equation, is_recording, note, recorded_equations
+from malta.model.rigid_body import rotation
 
 STEPS = (-1.5, -0.5, 0.5, 1.5)  # coil pitches from the mover's centre, along x and y
 MAX_CONDITION = 10.0  # of K(p): 2.4 with a pitch of 16/3 tau_n, 20 and more with a bad one

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 EXPERIMENT_NAMES = ("step", "jump", "errors", "timing", "delay")
 TIMES = 5  # the sample rate: how far motion under jumps depends on currents that are held
 RATE = 49.6  # 1/s, approach of Kp = 1.2 N/um with the Kd of planar_pid: how far torques depend on gains
-
-
 AT_ONCE_LABEL = "at once"
 FASTER_CASE, SLOWER_CASE = f"{AT_ONCE_LABEL}, {TIMES} times the rate", f"{AT_ONCE_LABEL}, at {RATE:.0f}/s"
 
@@ -227,8 +225,6 @@ def angles_at_rest(label: str, e: PlanarEvidence) -> float:
 
 SOURCE = "F. Xing et al., 2017"
 REPRODUCING = ("planar_pid",)
-
-
 WRENCH = (("F_x", "N"), ("F_y", "N"), ("F_z", "N"), ("T_x", "N m"), ("T_y", "N m"), ("T_z", "N m"))
 
 

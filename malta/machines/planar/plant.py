@@ -31,8 +31,8 @@ from malta.machines.planar.field import CoilModel, centre_of_force, shape_of, si
 from malta.machines.planar.parameters import Parameters as Parameters
 from malta.model.actuator import Actuator
 from malta.model.contacts import Contacts
-from malta.model.equations import Body, Resultant, acceleration, principal_angles, rotate, rotation
 from malta.model.plant import Plant, Signal, trace
+from malta.model.rigid_body import Body, Resultant, acceleration, principal_angles, rotate, rotation
 from malta.model.sensors import Sensors
 from malta.model.stroke import Stroke
 

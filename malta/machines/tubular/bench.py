@@ -41,8 +41,8 @@ from malta.identification.commission import (
 from malta.identification.log import Log
 from malta.machines.tubular.drive import hall_signals
 from malta.machines.tubular.experiments.lifting import lift_cases, rest_on_bearing
-from malta.model.data import plant_of
 from malta.model.plant import Signal
+from malta.model.plants import plant_of
 from malta.simulation import references
 from malta.simulation.scenario import Scenario
 from malta.synthesis.controller import Controller

@@ -15,9 +15,9 @@ from typing import Any
 import casadi as ca
 
 from malta.machines.tubular.parameters import Parameters
+from malta.model.drive import CurrentSensors, Drive
 from malta.model.equations import note
 from malta.model.plant import Signal
-from malta.model.signals import CurrentSensors, Drive
 
 # Windings: the two-directional dq transformation, and position sensing by Hall sensors.
 #

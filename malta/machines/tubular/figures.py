@@ -18,7 +18,7 @@ from malta.machines.tubular.experiment_figures import (
     supervised_faults_figure,
 )
 from malta.machines.tubular.experiments.disturbances import REST_SAMPLES
-from malta.model.data import plant_of
+from malta.model.plants import plant_of
 from malta.report.figures.drawing import (
     BOUND_STYLE,
     CROSS,
@@ -53,8 +53,9 @@ from malta.report.figures.drawing import (
     runs_of,
     square_axes,
 )
+from malta.simulation.flown_strokes import stroke_figures
 from malta.simulation.references import hold
-from malta.simulation.trajectory import Trajectory, stroke_figures
+from malta.simulation.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

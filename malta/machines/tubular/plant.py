@@ -27,7 +27,8 @@ from malta.machines.tubular.drive import (
 from malta.machines.tubular.parameters import Parameters as Parameters
 from malta.model.actuator import Actuator
 from malta.model.contacts import Contacts
-from malta.model.equations import (
+from malta.model.plant import Plant, Signal, trace
+from malta.model.rigid_body import (
     EXACT_TRIG,
     SMALL_ANGLE_TRIG,
     Body,
@@ -39,7 +40,6 @@ from malta.model.equations import (
     rotate,
     rotation,
 )
-from malta.model.plant import Plant, Signal, trace
 from malta.model.sensors import Sensors
 from malta.model.stroke import Stroke
 

@@ -11,9 +11,9 @@ from typing import get_args
 import numpy as np
 
 from malta.model.plant import Plant
+from malta.simulation.flown_strokes import stroke_figures
 from malta.simulation.scenario import ESTIMATORS, Scenario
 from malta.simulation.simulate import fits_kalman_filter
-from malta.simulation.trajectory import stroke_figures
 from malta.synthesis.requirements import (
     SEEDS,
     Design,

@@ -29,7 +29,6 @@ from malta.work import is_past
 if TYPE_CHECKING:
     from malta.proof.problem import OfLoop
 
-
 STEPS = 24  # of the power iteration
 STARTS = 3
 ROUNDS = 40

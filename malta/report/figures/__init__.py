@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.errors import InputError
-from malta.model.machines import KINDS, SignalGroup, attribute_of, outputs_of
+from malta.model.parts import attribute_of
+from malta.model.signal_groups import KINDS, SignalGroup, outputs_of
 from malta.report.figures.campaign import (
     distributions_figure as distributions_figure,
     worst_figure as worst_figure,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from malta.model.machines import lateral_outputs
+from malta.model.signal_groups import lateral_outputs
 from malta.report.figures.drawing import (
     BOUND_STYLE,
     CROSS,

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from malta.simulation.experiments import Case, Experiment
 
-
 Published = Mapping[str, Any]  # a file of data/published/
 
 STYLES: Sequence[dict[str, Any]] = (  # distinct without colour: by steps of lightness and by dashes

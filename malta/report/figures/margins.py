@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from malta.synthesis.recovery import StepResponse
     from malta.tuning.tune import TuningResult
 
-
 LOOKS: tuple[dict[str, Any], dict[str, Any]] = ({"color": "#c9c9c9"}, {"color": "#5a5a5a"})  # stages, machine
 WITNESS: dict[str, Any] = {"color": "#c1440e", "linewidth": 1.6}
 NO_WITNESS: dict[str, Any] = {"marker": ">", "markersize": 7, "linestyle": "none", "color": "#000000"}

@@ -17,11 +17,11 @@ from malta.loops.curves import LoopCurves, loop_curves
 from malta.loops.sampled_loops import LAST_STAGE
 from malta.margins.loop_report import BANDWIDTH, BANDWIDTHS, LoopReport
 from malta.merits import Merit, in_groups
-from malta.model.data import plant_of
-from malta.model.linear import is_linear
-from malta.model.machines import FINE_UNITS
+from malta.model.linear.parameters import is_linear
 from malta.model.parameters import units_of
 from malta.model.plant import Parameters, Plant, Signal
+from malta.model.plants import plant_of
+from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import micro, number
 from malta.simulation.experiments import Experiment, progress_of_part
 from malta.simulation.experiments.catalogue import experiment, main_job
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
     from malta.loops.windings import CurrentLoops
     from malta.synthesis.controller import Controller
-
 
 Share = Callable[[float], None]  # takes the share of the work that is done, 0 to 1
 

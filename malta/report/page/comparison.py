@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     from malta.campaigns.summary import Summary
 
-
 MIN_DESIGNS, MAX_DESIGNS = 2, 8  # designs
 NOTHING_TEXT = "-"  # the text of a design that has no such entry or figure
 ANY_MACHINE = ("machine", "law", "gains")  # groups of entries that machines have in common

@@ -19,7 +19,7 @@ import numpy as np
 from malta.display import micro, quantity
 from malta.errors import InputError
 from malta.files import read_file, read_packaged
-from malta.model.equations import Body, rotation
+from malta.model.rigid_body import Body, rotation
 from malta.tables import read_npz
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class Animation:
 def mesh_of(body: Body) -> Mesh:
     """The faces of a box or of a cylinder about z.
 
-    >>> from malta.model.equations import Body
+    >>> from malta.model.rigid_body import Body
     >>> len(mesh_of(Body("plate", "box", (1.0, 1.0, 0.1))).faces)
     6
     """

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from malta.arguments import describe, is_number
 from malta.errors import InputError
-from malta.model.machines import FINE_UNITS
+from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import MORE_STYLES, STYLES, draw_line, finish_axes, micro, new_figure
 from malta.report.page.document import Front, Page, render
 from malta.report.page.sections import Illustration, Item, PageTable, Section, distinct_channels, polish
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from malta.report.page.comparison import Comparison, TableLine
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
-
 
 WORK = 0.75  # share of the work that is done when all is computed; the rest is drawing
 
@@ -106,7 +105,8 @@ def subject_of(
 ) -> Subject:
     """Read what a page is about. Raises InputError as `malta.gains.read`."""
     from malta.files import locate
-    from malta.gains.file import content_of, read
+    from malta.gains.file import content_of
+    from malta.gains.stable import read_stable
     from malta.report.page.analysis import Subject
 
     for name, share in (uncertainty or {}).items():
@@ -116,7 +116,7 @@ def subject_of(
         box = dict(uncertainty or {})
         return Subject(gains, parameters or gains.parameters, box, spec, "", changes)
     path = locate(gains)
-    controller = read(path)
+    controller = read_stable(path)
     file, _ = content_of(path)
     box = file.uncertainty if uncertainty is None else dict(uncertainty)
     return Subject(

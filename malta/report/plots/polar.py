@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from malta.loops.classical import ChannelMargins
     from malta.loops.linear_loops import Place
 
-
 MAX_LEFT_REACH = 4.0  # how far left of the origin a Nyquist plot reaches at most
 M_CIRCLES = (12.0, 6.0, 3.0, 1.0, 0.0, -3.0, -6.0, -12.0)  # dB of |T|
 HEIGHTS = (-45.0, 60.0)  # dB, of a Nichols plot

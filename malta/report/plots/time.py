@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
-from malta.loops.time_domain import StepFigures, loop_steps, step_figures
-from malta.model.machines import FINE_UNITS
+from malta.loops.steps import StepFigures, loop_steps, step_figures
+from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import draw_grid, micro, number
 from malta.report.plots.frequency import Channel, title_of
 from malta.report.plots.panels import (

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from malta.merits import Merit
 
-
 EDGES = 2  # columns of a terminal, left and right of a table
 GAPS = (3, 2)  # columns of a terminal between those of a table: if possible, and if need be
 MAX_CELL_LETTERS = 30  # letters; cells that are longer are folded before a table is split

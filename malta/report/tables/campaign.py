@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from rich.console import Group
 from rich.table import Table
 
-from malta.model.machines import lateral_outputs
 from malta.model.parameters import differences
+from malta.model.signal_groups import lateral_outputs
 from malta.report.figures.drawing import Published, number
 from malta.report.tables import Paragraph, add_row, end_cell, new_table
 from malta.simulation.engine.digest import verdicts

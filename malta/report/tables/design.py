@@ -19,8 +19,8 @@ from malta.loops.time_domain import SHARE, Recovery, furthest
 from malta.margins.loop_report import BANDWIDTHS, ZONES, LoopReport, Outcome, zone
 from malta.model.data import published_value
 from malta.model.linearize import LinearModel
-from malta.model.machines import FINE_UNITS
 from malta.model.parameters import box_words
+from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import UNITS, Published, front_lines, number, published_in_unit
 from malta.report.tables import COLOURS, Paragraph, add_row, new_table
 from malta.report.tables.experiments import experiment_table

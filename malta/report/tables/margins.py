@@ -12,8 +12,8 @@ from malta.arguments import is_number
 from malta.bound import at_least, at_most
 from malta.display import RADIANS, frequency
 from malta.margins.loop_report import LoopReport, zone
-from malta.model.machines import axis_units
 from malta.model.parameters import box_words
+from malta.model.signal_groups import axis_units
 from malta.proof.margin import NOT_PROVEN, Margin, unproven
 from malta.report.tables import Paragraph, add_row, new_table
 from malta.report.tables.design import (

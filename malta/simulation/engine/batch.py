@@ -20,21 +20,11 @@ from numpy.typing import NDArray
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
-from malta.model.data import plant_of
 from malta.model.parameters import is_default, shape_parameters, twins_of, units_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.simulation.divergence import rooms_of
-from malta.simulation.engine.compiled import (
-    LANES,
-    Lanes,
-    Shared,
-    TimeSpan,
-    arrange_in_lanes,
-    feedforward_table,
-    foresee_samples,
-    numbers_in_lanes,
-    run_many,
-)
+from malta.simulation.engine.compiled import LANES, feedforward_table
 from malta.simulation.engine.digest import (
     Batch,
     batch_of,
@@ -47,13 +37,23 @@ from malta.simulation.engine.digest import (
     verdicts,
 )
 from malta.simulation.engine.engines import BLOCK, EngineChoice, engine_text, evaluate, library_of, shape_of
+from malta.simulation.engine.lanes import (
+    Lanes,
+    Shared,
+    TimeSpan,
+    arrange_in_lanes,
+    foresee_samples,
+    numbers_in_lanes,
+    run_many,
+)
+from malta.simulation.flown_strokes import stroke_figures
 from malta.simulation.inputs import Inputs, initial_values, inputs_of
 from malta.simulation.layout import electronics_of, flatten, layout_of, noise_scales, numbers_of, with_symbols
 from malta.simulation.period import initial_state, period_of
 from malta.simulation.readings import NOISE_SAMPLES_AT_ONCE, advance_keys, keys, starts_of_parts
 from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of, steps_of
 from malta.simulation.simulate import EngineOf, simulate
-from malta.simulation.trajectory import Trajectory, stroke_figures, trajectory_of
+from malta.simulation.trajectory import Trajectory, trajectory_of
 from malta.synthesis.controller import Controller
 
 # Groups of machines on several threads: each takes the next call of the engine until none is left.

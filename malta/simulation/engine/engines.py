@@ -16,9 +16,9 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.files import read_packaged
-from malta.model.data import plant_of
 from malta.model.parameters import acting_names, shape_parameters, twins_of
 from malta.model.plant import Plant
+from malta.model.plants import plant_of
 from malta.simulation.engine.compiled import address_of, feedforward_table, library
 from malta.simulation.engine.instructions import (
     MASKS,
@@ -36,7 +36,8 @@ from malta.simulation.engine.instructions import (
 from malta.simulation.engine.integration_state import with_working_state
 from malta.simulation.layout import SHARED_NUMBERS, Setup, electronics_of, ending_columns, flatten, numbers_of
 from malta.simulation.period import Period, chain, columns_of, period_of, without_zeros
-from malta.synthesis.controller import Controller, gains_of
+from malta.synthesis.controller import Controller
+from malta.synthesis.law import gains_of
 
 # C text of CasADi functions: the control period inside the loop of engine.c, on the numbers of numbers.c.
 #

@@ -23,7 +23,7 @@ from malta.errors import InputError
 from malta.loops.loop import loop_along
 from malta.merits import Merit as Merit, figure
 from malta.model.linearize import linearize
-from malta.model.machines import attribute_of
+from malta.model.parts import attribute_of
 from malta.model.plant import Plant
 from malta.simulation.inputs import MAX_SAMPLES
 from malta.simulation.references import Reference

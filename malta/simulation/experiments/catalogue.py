@@ -38,11 +38,12 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
-from malta.model.data import plant_of
 from malta.model.equilibrium import balance
-from malta.model.machines import FINE_UNITS
 from malta.model.parameters import units_of
-from malta.model.plant import Plant, Signal, place_states
+from malta.model.places import place_states
+from malta.model.plant import Plant, Signal
+from malta.model.plants import plant_of
+from malta.model.signal_groups import FINE_UNITS
 from malta.simulation import references
 from malta.simulation.engine.engines import EngineChoice
 from malta.simulation.experiments import (

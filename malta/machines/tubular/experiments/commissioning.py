@@ -12,8 +12,9 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import InputError
+from malta.firmware.supervised_flight import Flown, Requests, require_compiler, supervised_engine
 from malta.firmware.supervisor import IN_FLIGHT, State
-from malta.firmware.supervisor_text import NUMBERS, Flown, Requests, require_compiler, supervised_engine
+from malta.firmware.supervisor_text import NUMBERS
 from malta.machines.tubular.experiments.faults import (
     FAULT_TIME,
     MAX_LANDING_SPEED,
@@ -24,7 +25,8 @@ from malta.machines.tubular.experiments.faults import (
 )
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE
-from malta.model.plant import Plant, outputs_at
+from malta.model.places import outputs_at
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     Case,

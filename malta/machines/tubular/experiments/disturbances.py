@@ -199,8 +199,6 @@ def hold_cases(_: Plant, controller: Controller, **options: Any) -> list[Planned
 
 
 hold = experiment_of("hold", "How still does it stand?", hold_cases, merits_of_first)
-
-
 REST_SAMPLES = 2000  # samples of the statistics, Table III
 
 

@@ -20,18 +20,19 @@ from numpy.typing import NDArray
 from malta.arrays import FloatArray
 from malta.errors import InputError
 from malta.firmware.flight import view
-from malta.firmware.supervisor_text import (
-    NUMBERS,
+from malta.firmware.supervised_flight import (
     Flown,
     Interference,
     Requests,
     supervised_engine,
     unsupervised_engine,
 )
+from malta.firmware.supervisor_text import NUMBERS
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE, delayed_stroke
 from malta.model.equilibrium import trim
-from malta.model.plant import Plant, outputs_at
+from malta.model.places import outputs_at
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     Case,

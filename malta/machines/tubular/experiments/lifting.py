@@ -15,7 +15,8 @@ from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.machines.tubular.experiments.strokes import delayed_stroke
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import Plant, outputs_at
+from malta.model.places import outputs_at
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.engine.batch import is_compiled, simulate_many
 from malta.simulation.experiments import (

@@ -32,16 +32,16 @@ from malta.simulation.experiments import (
     rms,
     scenario_of,
 )
+from malta.simulation.flown_strokes import stroke_figures
 from malta.simulation.references import QUINTIC_DURATION, Motion, Profile, Reference, quintic
 from malta.simulation.scenario import Scenario
-from malta.simulation.trajectory import Trajectory, stroke_figures
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import V0_STEP, V0_STEPS
 
 if TYPE_CHECKING:
     from malta.identification.log import Log
     from malta.simulation.experiments.time_optimal import FastestStroke, SigmoidStroke
-
 
 SETTLE = 0.3  # s at rest before the strokes of yields, as on the bench
 DISTANCE, RISE = 10e-3, 16.2e-3  # m, s from 10 to 90 %: the published stroke, Fig. 12

@@ -28,17 +28,19 @@ from malta.machines.tubular.experiments.disturbances import hold
 from malta.machines.tubular.experiments.strokes import delayed_stroke, stroke_merits
 from malta.margins.loop_report import LoopReport
 from malta.margins.verify import compensators
-from malta.model.data import plant_of, published_value, read
+from malta.model.data import published_value, read
 from malta.model.linearize import LinearModel, linearize
+from malta.model.plants import plant_of
 from malta.proof.robust import robust_margin
 from malta.report.ledger import Chance, bandwidth, proven_share, run_design
 from malta.simulation.current_control import link_voltage, open_loop_gain
 from malta.simulation.engine.compiled import compiler
 from malta.simulation.experiments import Experiment, Progress
 from malta.simulation.experiments.catalogue import experiment, flown_payload, held_payload, largest_mass
+from malta.simulation.flown_strokes import StrokeFigures, stroke_figures
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-from malta.simulation.trajectory import StrokeFigures, Trajectory, stroke_figures
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.feedforward import static_feedforward
 from malta.synthesis.lqg import lqr
@@ -49,7 +51,6 @@ if TYPE_CHECKING:
     from malta.arrays import FloatArray
     from malta.machines.tubular.parameters import Parameters
     from malta.model.plant import Plant
-
 
 EXPERIMENT_NAMES = ("stroke", "hold", "tilt", "thermal")
 MACHINES, SAMPLE = 1_000, 200  # of the yields, with and without a C compiler
