@@ -33,7 +33,8 @@ from malta.proof.box import box_of
 from malta.proof.groups import groups, loop_of
 from malta.proof.margin import Ranges
 from malta.proof.robust import robust_margin
-from malta.synthesis.controller import Controller, linear_law, with_forces_read
+from malta.synthesis.controller import Controller
+from malta.synthesis.linear_law import linear_law, with_forces_read
 from malta.work import Budget
 
 FACTOR = "gain factor"  # the name of the further parameter
