@@ -347,7 +347,13 @@ def staged_report(
         tolerance=tolerance,
         mass=mass,
         places=places,
+        notes=(*found.notes, *([] if travel is None else _idle_notes(travel))),
     )
+
+
+def _idle_notes(travel: Margin) -> list[str]:
+    """Which parameters of the box the margin says nothing of."""
+    return [f"the loop does not depend on {name}: the margin says nothing of it" for name in travel.idle]
 
 
 def _links(q: _Question) -> tuple[ChainStage, ...]:
