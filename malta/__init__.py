@@ -40,6 +40,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.loops.parametric_plants import uncertain as uncertain
     from malta.model.data import read as read
     from malta.model.equilibrium import trim as trim
+    from malta.model.inspection import inspect as inspect
     from malta.model.linear.machine import linear_machine as linear_machine
     from malta.model.linearize import linearize as linearize
     from malta.model.machines import machine as machine
@@ -98,6 +99,7 @@ _NAMES = {
     "malta.loops.parametric_plants": "uncertain",
     "malta.model.data": "read",
     "malta.model.equilibrium": "trim",
+    "malta.model.inspection": "inspect",
     "malta.model.linear.machine": "linear_machine",
     "malta.model.linearize": "linearize",
     "malta.model.machines": "machine",

@@ -242,7 +242,7 @@ def _simulate(problem: PictureSubject, view: View) -> dict[str, Any]:
     except (InputError, CheckError) as error:
         return {"kind": "run", "error": str(error)}
     found = curves(name, run.t, run.reference, run.p, run.v)
-    verdict = {"verdict": run.verdict.name, "end": run.verdict.time, "completed": run.verdict.completed}
+    verdict = {"verdict": run.verdict.words, "end": run.verdict.time, "completed": run.verdict.completed}
     return {"kind": "run", "engine": run.engine, "label": planned.label} | found | verdict
 
 

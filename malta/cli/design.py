@@ -222,7 +222,7 @@ def _simulate_gain_file(
     for case in result.cases:
         end = case.run.verdict
         if not end.completed:
-            raise CheckError(f"{file}: the {job} ends at {end.time:.4g} s: {end.name}; gain files unchanged")
+            raise CheckError(f"{file}: the {job} ends at {end.time:.4g} s: {end.words}; gain files unchanged")
     return result
 
 

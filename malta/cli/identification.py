@@ -294,7 +294,7 @@ def _fly(plan: ExcitationPlan, plant: Plant, controller: Controller, path: Path,
     with progress_bar("excited", insists=False) as progress:
         run = simulate(plant, controller, scenario, progress=progress)
     if not run.verdict.completed:
-        raise CheckError(f"the excited machine: {run.verdict.name} at {run.verdict.time:.4g} s")
+        raise CheckError(f"the excited machine: {run.verdict}")
     return write_log(log_of(run), path)
 
 

@@ -23,6 +23,7 @@ from malta.cli.campaign import campaign
 from malta.cli.design import design, new, tune
 from malta.cli.export import export, pil, schema
 from malta.cli.identification import excite, identify, learn, log, replay
+from malta.cli.inspect import inspect
 from malta.cli.output import interruption, print_error, print_note, silence
 from malta.cli.pages import app as live_page, claims, motion
 from malta.cli.report import compare, plot, report
@@ -200,7 +201,7 @@ GROUPS: dict[str, tuple[Callable[..., None], ...]] = {  # the order of the help
     "From the bench": (excite, log, identify, learn, replay, measure, commission),
     "Pages and pictures": (plot, report, compare, motion, live_page, claims),
     "For other programs": (export, pil, schema),
-    "A machine of your own": (new,),
+    "A machine of your own": (new, inspect),
 }
 app = typer.Typer(
     cls=Grouped,

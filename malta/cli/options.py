@@ -395,7 +395,7 @@ def design_files(
         folder = shipped_path("design")
     files = []
     for file in sorted(folder.glob("*.toml"), reverse=reverse):
-        if _is_machine_data(file):
+        if is_machine_data(file):
             print_note(f"{file}: data of a machine, no design: left out")
         else:
             files.append(file)
@@ -406,7 +406,7 @@ def design_files(
     return files
 
 
-def _is_machine_data(file: Path) -> bool:
+def is_machine_data(file: Path) -> bool:
     """Whether a file has what data of machines have and designs have not; a file that cannot be read is no data."""
     try:
         from malta.tables import load_toml  # loads pydantic, which no help needs
@@ -428,12 +428,16 @@ def read_controller(gains: Path, machine_file: Path | None) -> Controller:
     Raises InputError as `malta.machine` and `gains.read`; an unknown machine is named with the option that tells it.
     """
     from malta import gains as gain_files
+    from malta.cli.inspect import note_machine
     from malta.gains.stable import require_held
     from malta.model.machines import machine
+    from malta.model.plants import plant_of
 
     if machine_file is not None:
         machine(machine_file)
-    return require_held(gain_files.read(gains), gains)
+    controller = require_held(gain_files.read(gains), gains)
+    note_machine(plant_of(controller.parameters))
+    return controller
 
 
 def verify_and_write(controller: Controller, gains: Path, folder: Path) -> list[Path]:
@@ -478,11 +482,13 @@ def read_changed_design(file: Path, changes: list[str] | None) -> Spec:
     """
     from dataclasses import replace
 
+    from malta.cli.inspect import note_machine
     from malta.model.parameters import units_of
     from malta.synthesis.design_file import read_design
     from malta.synthesis.design_tables import DesignFile
 
     spec = read_design(file)
+    note_machine(spec.plant)
     if not changes:
         return spec
     units = units_of(spec.parameters)

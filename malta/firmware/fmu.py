@@ -212,6 +212,8 @@ def _machine_parameters(m: FirmwareMachine, part: Part) -> Iterator[VariableGrou
     if noise_channels(m):
         yield VariableGroup(NOISE, "parameter", "tunable", 0.0, 0.0, MOST_NOISE)
         yield VariableGroup(SEED, "parameter", "fixed", 0.0, 0.0, MOST_SEED)
+    if not m.parameters:
+        return
     values = [getattr(m.plant.parameters, name) for name in m.parameters]
     least, most = zip(*(_range(m, name) for name in m.parameters), strict=True)
     yield VariableGroup(parameter_field(m), "parameter", "tunable", values, least, most)

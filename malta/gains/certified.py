@@ -236,6 +236,8 @@ def _of_other_loops(
     if names != places[0][0].names:
         return f"its parameters are not {' '.join(places[0][0].names)}, as in the loop of {gains}"
     try:
+        if why := next((system.approximate for system, _ in places if system.approximate), ""):
+            return f"nothing is proven of the loop of {gains} ({why})"
         wanted = loops_of(places)
     except (InputError, CheckError, NotAnalytic) as error:
         return f"no such loop can be made of {gains} ({error})"

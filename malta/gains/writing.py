@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from malta.arguments import is_number
 from malta.errors import CheckError, InputError
 from malta.files import replace_files, require_plain_name, version
 from malta.gains.contents import LINEAR_MACHINE_NAME
@@ -120,6 +121,11 @@ def _robust(margins: LoopReport) -> dict[str, Any] | None:
     margin = margins.robust
     if margin is None:
         return None
+    box: Mapping[str, Any] = margins.uncertainty
+    for name, share in box.items():
+        if not is_number(share):
+            found = f"the interval {share[0]:g} to {share[1]:g}"
+            raise InputError("gains.write", f"uncertainty.{name}", found, "a share of its value, as 0.2")
     return {
         "uncertainty": dict(margins.uncertainty),
         "lower": margin.lower,

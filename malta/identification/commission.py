@@ -344,7 +344,7 @@ def fly(bench: Bench, scenario: Scenario, *, ends: Iterable[str] = ENDS) -> Log:
     own |= {} if bench.truth.actuator.windings is not None else {"fidelity": "force"}
     run = simulate(bench.truth, bench.controller, scenario.replace(**own))
     if run.verdict.name not in ends:
-        raise CheckError(f"{scenario.name}: {run.verdict.name} at {run.verdict.time:.4g} s")
+        raise CheckError(f"{scenario.name}: {run.verdict}")
     return log_of(run)
 
 

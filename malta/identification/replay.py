@@ -224,7 +224,7 @@ class _Twin:
         )
         run = simulate(plant, self.controller, scenario)
         if not run.verdict.completed:
-            end = f"{run.verdict.name} at {run.verdict.time:.4g} s"
+            end = f"{run.verdict}"
             raise CheckError(f"{self.log.source}: the gain file's machine does not fly this reference: {end}")
         return _run(*self.given, run.y)[1]
 

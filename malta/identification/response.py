@@ -331,6 +331,8 @@ def information(slopes: ComplexArray, inputs: ComplexArray, variance: FloatArray
     inputs : k x currents, Fourier coefficients of the currents
     variance : k x p, of the noise of the outputs' Fourier coefficients
     """
+    if not len(slopes):  # a machine whose parameters are all known
+        return np.zeros((0, 0))
     moved = np.einsum("nkpm,km->nkp", slopes, inputs) / np.sqrt(variance)
     flat = moved.reshape(len(moved), -1)
     return np.asarray(2 * (flat.conj() @ flat.T).real)

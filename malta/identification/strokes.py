@@ -367,5 +367,5 @@ def _fly(plant: Plant, law: Controller, flown: Scenario, thrust: FloatArray | No
     sent = None if thrust is None else sample_excitation(law.sample_time, plant, thrust)
     run = simulate(plant, law, flown.replace(excitation=sent))
     if not run.verdict.completed:
-        raise CheckError(f"a stroke: {run.verdict.name} at {run.verdict.time:.4g} s")
+        raise CheckError(f"a stroke: {run.verdict}")
     return run

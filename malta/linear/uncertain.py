@@ -365,6 +365,7 @@ def open_systems(system: UncertainSystem, law: Compensator, p: FloatArray) -> tu
     return System(A, B, C, D), System(*difference_form(law), law.C, law.D)
 
 
+NUDGE = 1e-9  # of the way to the nominal parameters
 Sides = tuple["FloatArray", "FloatArray", "FloatArray", "FloatArray", "FloatArray | None"]
 
 
@@ -375,7 +376,11 @@ def _plant(system: UncertainSystem, law: Compensator, p: bytes) -> Sides:
     They are stacks, for each row of parameters. With a fraction of a sample of delay, what `_newest` says follows.
     """
     names = len(system.names)
-    A, B, C, D = system.explicit(np.frombuffer(p).reshape(-1, names) if names else np.zeros((1, 0)))
+    places = np.frombuffer(p).reshape(-1, names) if names else np.zeros((1, 0))
+    try:
+        A, B, C, D = system.explicit(places)
+    except np.linalg.LinAlgError:  # a search meets a singular E, as at an end of its box: beside it
+        A, B, C, D = system.explicit(places + NUDGE * (system.nominal - places))
     rows, n, m = B.shape
     k, q = n if law.lag is None else n + m, C.shape[1]
     into, out, through = (np.zeros((rows, *shape)) for shape in ((k, 2 * m), (q + m, k), (q + m, 2 * m)))

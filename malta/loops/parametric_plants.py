@@ -30,6 +30,7 @@ from malta.model.parameters import shape_parameters, twins_of, units_of
 from malta.model.places import position_at, position_in
 from malta.model.plant import Plant, symbolic
 from malta.model.sensors import Sensors, with_lags
+from malta.model.soundness import unproven
 from malta.work import check_clock
 
 MAX_MODEL_OPERATIONS = 20_000  # operations up to which a model is expanded
@@ -124,6 +125,7 @@ def of_plant(
     positive = (
         ca.Function("positive", [p], [ca.vertcat(*(c.above for c in conditions))]) if conditions else None
     )
+    why = unproven(plant, tuple(x0.tolist())) or why
     return UncertainSystem(
         tuple(names), readonly(nominal), matrices,
         limits=limits, approximate=why, positive=positive, ends=tuple(c.ends for c in conditions),

@@ -208,7 +208,7 @@ class LoopReport:
     poles : open loop, regulator, filter and closed loop, rad/s; of sampled systems ln(lambda) / Ts
     stages : peak sensitivities and spectral radius of the loop as designed, with current loops, and of the machine
     bandwidth : rad/s, by definition
-    uncertainty : relative half range of each parameter
+    uncertainty : relative half range of each parameter, or its interval, SI
     robust : the margin anywhere in `extent`; None where it was not asked for
     extent : the intervals that proofs cover beside the uncertainty
     current_loops : of the last stage of the chain: "pi" or "lag"

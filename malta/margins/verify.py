@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -71,7 +71,7 @@ from malta.work import Budget, count_work
 def linear_report(
     model: LinearModel,
     controller: Controller,
-    uncertainty: Mapping[str, float] | None = None,
+    uncertainty: Ranges | None = None,
     current_loops: CurrentLoops = LAST_STAGE,
     *,
     time: float | None = None,
@@ -92,7 +92,7 @@ def linear_report(
     except np.linalg.LinAlgError as error:
         raise CheckError(f"{controller.name}: the loop cannot be computed ({error})") from error
     extent = extent_of(model.plant, uncertainty, controller)
-    return replace(found, uncertainty=dict(uncertainty), robust=robust, extent=extent)
+    return replace(found, uncertainty=dict[str, Any](uncertainty), robust=robust, extent=extent)
 
 
 def _nominal_report(model: LinearModel, controller: Controller, current_loops: CurrentLoops) -> LoopReport:
@@ -236,7 +236,7 @@ class _Question:
     """The arguments of `staged_report`, and results that its parts share."""
 
     loop: LoopAlong  # in uncertain parameters, and the mass for its margin: one model answers all questions
-    uncertainty: Mapping[str, float]
+    uncertainty: Ranges
     time: float | None
     proof: bool
     report: Callable[[], None]  # called after each part
@@ -298,7 +298,7 @@ class _Question:
 @on_one_thread
 def staged_report(
     found: LoopReport,
-    uncertainty: Mapping[str, float],
+    uncertainty: Ranges,
     *,
     progress: Callable[[float], None] | None = None,
     bounds: Progress | None = None,
@@ -337,7 +337,7 @@ def staged_report(
     sensors = [s.name for s in plant.outputs]
     return replace(
         found,
-        uncertainty=dict(uncertainty),
+        uncertainty=dict[str, Any](uncertainty),
         robust=travel,
         extent=loop.whole_extent,
         chain=links,
@@ -347,7 +347,13 @@ def staged_report(
         tolerance=tolerance,
         mass=mass,
         places=places,
+        notes=(*found.notes, *([] if travel is None else _idle_notes(travel))),
     )
+
+
+def _idle_notes(travel: Margin) -> list[str]:
+    """Which parameters of the box the margin says nothing of."""
+    return [f"the loop does not depend on {name}: the margin says nothing of it" for name in travel.idle]
 
 
 def _links(q: _Question) -> tuple[ChainStage, ...]:
@@ -376,13 +382,20 @@ def _links(q: _Question) -> tuple[ChainStage, ...]:
     return tuple(links)
 
 
+NOT_VARIED = replace(NOT_PROVEN, reason="its interval ends at the nominal value")
+
+
 def _tolerances(q: _Question) -> tuple[dict[str, tuple[Margin, Margin]], Margin | None]:
     """How far each parameter alone may go, down and up; and the mass margin of a machine with a mass m, kg."""
     over, tolerance = partial(q.margin_over, brief=not q.whole), {}
     for name, share in q.uncertainty.items():
         nominal = getattr(q.plant.parameters, name)
-        down = over({name: (nominal * (1 - share), nominal)})
-        tolerance[name] = down, over({name: (nominal, nominal * (1 + share))})
+        low, high = (
+            share if isinstance(share, tuple | list) else (nominal * (1 - share), nominal * (1 + share))
+        )
+        sides = ((low, nominal), (nominal, high))
+        down, up = (over({name: side}) if side[0] < side[1] else NOT_VARIED for side in sides)
+        tolerance[name] = down, up
     if "m" not in units_of(q.plant.parameters):
         return tolerance, None
     m: float = getattr(q.plant.parameters, "m")  # noqa: B009  a machine's own field

@@ -125,6 +125,9 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
         )
     if not np.isfinite(point.x).all() or not np.isfinite(point.u).all():
         raise CheckError(f"{plant.name}: a state or a `preload` is not finite: x = {point.x}, u = {point.u}")
+    from malta.model.soundness import require_readings  # which takes slopes by this module
+
+    require_readings(plant)
     point = with_command(plant, point, believed)
     derivatives = trace(_derivatives, plant, believed, point.loaded)
     A, B, C, E, _, ratio = derivatives(point.x, point.u, point.v)

@@ -9,6 +9,7 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
+from malta.arguments import is_number
 from malta.display import quantity
 from malta.errors import InputError
 
@@ -194,18 +195,22 @@ def differences(record: type[Parameters] | Parameters) -> dict[str, str]:
     return units
 
 
-def box_words(box: Mapping[str, float], parameters: Parameters | None = None) -> str:
+def box_words(box: Mapping[str, Any], parameters: Parameters | None = None) -> str:
     """An uncertainty in words: parameters with their half ranges, those of one half range together; "" of none.
 
-    box : shares of the parameters; of differences and offsets half ranges in SI
+    box : shares of the parameters; of differences and offsets half ranges in SI; or intervals (low, high), SI
     parameters : of the machine, which tell the two apart; None: all are shares
 
     >>> box_words({"m": 0.2, "K_A": 0.2, "R": 0.05})
     'm K_A ±20 %, R ±5 %'
     """
     units = {} if parameters is None else differences(parameters)
+    known = {} if parameters is None else units_of(parameters)
     together: dict[str, list[str]] = {}
     for name, half in box.items():
-        size = quantity(half, units[name]) if name in units else f"{100 * half:.4g} %"
+        if not is_number(half):
+            size = f"{half[0]:.4g} to {half[1]:.4g} {known.get(name, '1')}".removesuffix(" 1")
+        else:
+            size = f"±{quantity(half, units[name]) if name in units else f'{100 * half:.4g} %'}"
         together.setdefault(size, []).append(name)
-    return ", ".join(f"{' '.join(names)} ±{size}" for size, names in together.items())
+    return ", ".join(f"{' '.join(names)} {size}" for size, names in together.items())

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -340,6 +340,14 @@ def _zeros(size: int, x: Any) -> Any:
 def outputs_themselves(y: Any) -> Any:
     """The default of `position_of`: the outputs are the positions."""
     return y
+
+
+@lru_cache(maxsize=64)  # plants compare by identity
+def has_feedthrough(plant: Plant) -> bool:
+    """Whether readings follow the inputs at once: h(x, u) has a part of u."""
+    kind = ca.MX if plant.actuator.tabulated else ca.SX
+    x, u = kind.sym("x", len(plant.states)), kind.sym("u", len(plant.inputs))
+    return bool(ca.jacobian(ca.vertcat(plant.h(x, u)), u).nnz())
 
 
 def whole_samples(plant: Plant, Ts: float) -> int:

@@ -121,6 +121,9 @@ def box_of(
             raise InputError(caller, name, "in ranges and in over", "in one of them")
         i = names.index(name)
         nominal = float(at[i])
+        if nominal == 0 and name in ranges and is_number(value) and value != 0:
+            found = f"a share of {value:g} of its value, which is 0"
+            raise InputError(caller, name, found, "an interval, as (-0.1, 0.1)")
         pair = _checked_sides(caller, name, value, nominal)
         low, high = limits[i] if limits else (-math.inf, math.inf)
         if not low < nominal < high or (name in over and not low < pair[0] < pair[1] < high):

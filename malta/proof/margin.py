@@ -53,6 +53,7 @@ class Margin:
     seconds : s, time of the search
     work : units of work that the search took, which do not depend on the computer
     reason : why nothing, or less than asked for, is proven
+    idle : parameters of the box on which the loop does not depend: nothing is said of them
     searched : how far no unstable parameters were found, where `upper` is infinite
 
     >>> import malta
@@ -74,6 +75,7 @@ class Margin:
     reason: str = ""
     searched: str = ""
     work: float = 0.0
+    idle: tuple[str, ...] = ()
 
     @property
     def proven(self) -> Bound:
@@ -102,10 +104,11 @@ class Margin:
 
     def __str__(self) -> str:
         low = f"proven {self.proven.percent()}" if self.lower else unproven(self.reason)
+        rest = f"; does not depend on {' '.join(self.idle)}" if self.idle and self.lower else ""
         if self.exhausted:
-            return f"{low}; no unstable machine found {self.searched}".rstrip()
+            return f"{low}; no unstable machine found {self.searched}".rstrip() + rest
         where = "" if self.frequency is None else f" at {self.frequency:.4g} rad/s"
-        return f"{low}, lost at {self.lost.percent()}{where}"
+        return f"{low}, lost at {self.lost.percent()}{where}{rest}"
 
     @property
     def description(self) -> Description:

@@ -27,7 +27,7 @@ from scipy import linalg
 from malta.arguments import by_name, describe, is_pair, positive
 from malta.errors import InputError
 from malta.linear.compensators import compensator_of
-from malta.linear.expressions import MatrixProgram, NotAnalytic, exact
+from malta.linear.expressions import MatrixProgram, NotAnalytic, exact, program
 from malta.linear.rational import Ratio, Symbolic, product
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.processes import on_one_thread
@@ -451,9 +451,29 @@ def margin_of(problem: Problem, box: Box, effort: ProofEffort) -> Margin:
         found, ended = in_rounds(effort.limits, ask, rank_of)
     except KeyboardInterrupt as stop:
         raise Interrupted(_interrupted_margin(problem, box, standing, clock.monotonic() - begun)) from stop
+    idle = _idle(problem, box)
+    if found.lower and idle and len(idle) == int((box.down + box.up > 0).sum()):
+        return replace(
+            found, lower=None, upper=math.inf, certificate=(), reason=f"{IDLE_TEXT} {' '.join(idle)}"
+        )
     is_open = bool(found.reason) and found.reason not in (UNSTABLE_TEXT, problem.traits.approximate)
     reason = ended.explain(found.reason) if is_open else found.reason
-    return replace(found, seconds=clock.monotonic() - begun, work=ended.work, reason=reason)
+    return replace(found, seconds=clock.monotonic() - begun, work=ended.work, reason=reason, idle=idle)
+
+
+IDLE_TEXT = "the loop does not depend on"
+
+
+def _idle(problem: Problem, box: Box) -> tuple[str, ...]:
+    """The parameters of a box that grow and on which neither matrices nor conditions of the loops depend."""
+    loops = [loop for loop in problem.loops if loop is not None]
+    if len(loops) < len(problem.loops) or not loops:
+        return ()
+    models = [loop.program for loop in loops]
+    models += [program(loop.system.positive) for loop in loops if loop.system.positive is not None]
+    acting = frozenset[int]().union(*(own for model in models for own in model.depends))
+    grows = box.down + box.up > 0
+    return tuple(name for k, name in enumerate(box.names) if grows[k] and k not in acting)
 
 
 def rank_of(found: Margin) -> float:

@@ -35,7 +35,9 @@ from malta.model.parameters import shape_parameters, units_of
 from malta.model.places import place_states
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
+from malta.model.soundness import require_readings
 from malta.simulation import references
+from malta.simulation.divergence import rooms_in, rooms_of
 from malta.simulation.engine.engines import Engine, EngineChoice, engine_of, evaluate, substeps_until
 from malta.simulation.inputs import (
     Inputs,
@@ -262,6 +264,7 @@ class Prepared(NamedTuple):
     substeps: float  # in a sample
     noise: FloatArray  # of the sensors, k x sensors
     fast_noise: FloatArray  # of the electronics, substeps x numbers
+    rooms: FloatArray  # see rooms_of
 
     @property
     def size(self) -> int:
@@ -290,7 +293,7 @@ def prepare(plant: Plant, controller: Controller, scenario: Scenario) -> Prepare
         noise = sensor_noise(run, stages, inputs.t)
         steps = substeps_of(plant, controller, run.setup, scenario)
         fast = electronics_noise(run, substeps_until(len(inputs.t), steps))
-        found = Prepared(run, inputs, state, stages, steps, noise, fast)
+        found = Prepared(run, inputs, state, stages, steps, noise, fast, rooms_of(run, inputs))
         if is_repeatable(scenario) and found.size <= MAX_KEPT_BYTES:
             _memory[key] = found
             if len(_memory) > MAX_KEPT_SIMULATIONS:
@@ -372,6 +375,7 @@ def simulate(
         raise InputError("simulate", "controller", f"gains of a {believed.name}", f"gains of a {plant.name}")
     if not callable(engine) and engine not in get_args(EngineChoice):
         raise InputError("simulate", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
+    require_readings(plant)
     ready = prepare(plant, controller, scenario)
     simulation, inputs = ready.simulation, ready.inputs
     parts: list[FloatArray] = []
@@ -400,7 +404,7 @@ def _portions(
 
     Between portions the machine's parameters may change, and an outer loop may correct the reference.
     """
-    simulation, (t, _, given), state, stages, steps, noise, fast = ready
+    simulation, (t, _, given), state, stages, steps, noise, fast, rooms = ready
     plant, controller, scenario, setup = simulation
     samples, correction = len(t), scenario.correction
     watching = observer(simulation, steps_of(plant, controller, scenario)) if setup.outside else None
@@ -420,7 +424,8 @@ def _portions(
         else:
             state, rows = watching(engine, now, state, given[part], noise[part])
         ended = watching is None and engine.kind == "compiled"
-        rows, verdict = judge(simulation, rows, t[part], ended)
+        used = rooms_in(simulation, rows, given[part][: len(rows)], rooms) if rooms.size else None
+        rows, verdict = judge(simulation, rows, t[part], ended, used)
         done += len(rows)
         yield rows, verdict, engine.kind
         if correction is not None and done < samples and done % every == 0:

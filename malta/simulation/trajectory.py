@@ -17,6 +17,7 @@ from malta.files import replace_files
 from malta.merits import Merit
 from malta.model.plant import Plant, Signal
 from malta.model.signal_groups import FINE_UNITS
+from malta.simulation.divergence import free_outputs, rooms_in, rooms_of
 from malta.simulation.engine.engines import evaluate
 from malta.simulation.inputs import Inputs
 from malta.simulation.layout import columns_of_row, electronics_of
@@ -29,42 +30,61 @@ from malta.synthesis.controller import Controller
 class Verdict(NamedTuple):
     """How a simulation ended, and when (s).
 
-    The name is "completed", "diverged", "interrupted", "not lifted", or the contact that was touched.
+    The name is "completed", "diverged", "interrupted", "not lifted", or the contact that was touched. A run has
+    diverged when a value is no number any more, or an output that no contact bounds leaves the travel, or is a
+    thousand times the scale of the experiment off its reference; the signal names that output.
     """
 
     name: str
     time: float
+    signal: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.words} at {self.time:.4g} s"
 
     @property
     def completed(self) -> bool:
         return self.name == "completed"
 
+    @property
+    def words(self) -> str:
+        """The name, and the signal that diverged."""
+        return f"{self.name} ({self.signal})" if self.signal else self.name
+
 
 def judge(
-    run: Simulation, rows: FloatArray, t: FloatArray, ended: bool = False
+    run: Simulation, rows: FloatArray, t: FloatArray, ended: bool = False, used: FloatArray | None = None
 ) -> tuple[FloatArray, Verdict | None]:
-    """The rows up to the first contact or the first NaN, and the verdict; None where neither occurs.
+    """The rows up to the first contact, the first NaN or a divergence, and the verdict; None where none occurs.
 
     A machine with touchdown bearings goes on after it touches one of them; only other contacts end its run.
 
     ended : rows end with the first in which a contact ends the run, as the compiled engine's do
+    used : from `rooms_in`; None: contacts bound all outputs
     """
+    away = np.zeros(len(rows), dtype=bool) if used is None else np.atleast_1d((used >= 1).any(axis=1))
     columns, last = columns_of_row(run.plant, run.controller, run.setup)["contact"], rows[-1].tolist()
     if all(map(math.isfinite, last)):  # a state that is no number stays none
         largest = max(last[columns], default=0.0) if ended else rows[:, columns].max(initial=0.0)
-        if largest < 1:
+        if largest < 1 and not away.any():
             return rows, None
     plant, contact = run.plant, rows[:, columns]
     lost = np.atleast_1d(~np.isfinite(rows).all(axis=1))
     touching = contact >= 1
     if run.setup.bearing:
         touching = touching & ~np.array(plant.contacts.cushioned)
-    stopped = np.flatnonzero(lost | touching.any(axis=1))
+    stopped = np.flatnonzero(lost | away | touching.any(axis=1))
     if not len(stopped):
         return rows, None
     k = int(stopped[0])
-    name = "diverged" if lost[k] else plant.contacts.names[int(np.where(touching[k], contact[k], 0).argmax())]
-    return rows[: k + 1], Verdict(name, float(t[k]))
+    if not (lost[k] or (away[k] and not touching[k].any())):
+        name = plant.contacts.names[int(np.where(touching[k], contact[k], 0).argmax())]
+        return rows[: k + 1], Verdict(name, float(t[k]))
+    signal = ""
+    if used is not None and away[k]:
+        outputs = [*free_outputs(plant), plant.leading_output]
+        signal = plant.outputs[outputs[int(np.nan_to_num(used[k], nan=np.inf).argmax())]].name
+    return rows[: k + 1], Verdict("diverged", float(t[k]), signal)
 
 
 def bearing_verdict(plant: Plant, contact: FloatArray, t: FloatArray) -> Verdict | None:
@@ -218,7 +238,7 @@ class Trajectory:
     def description(self) -> Description:
         """How it ended, the largest deviations, forces and shares of clearances."""
         plant, Ts, figures = self.plant, self.controller.sample_time, self.figures
-        rows = [("ended", f"{self.verdict.name} at {quantity(self.verdict.time, 's')}, {self.engine}")]
+        rows = [("ended", f"{self.verdict.words} at {quantity(self.verdict.time, 's')}, {self.engine}")]
         for signal, largest, rms in zip(plant.outputs, figures[::2], figures[1::2], strict=False):
             sizes = (quantity(one.value, signal.unit) for one in (largest, rms))
             rows.append((f"p - p* of {signal.name}", "{} at most, {} rms".format(*sizes)))
@@ -240,7 +260,9 @@ SERIES = (
 
 def trajectory_of(run: Simulation, inputs: Inputs, rows: FloatArray, kind: str) -> Trajectory:
     """The trajectory of a run from rows that are there already, one for each sample of the inputs."""
-    rows, verdict = judge(run, rows, inputs.t)
+    rooms = rooms_of(run, inputs)
+    used = rooms_in(run, rows, inputs.given, rooms) if rooms.size else None
+    rows, verdict = judge(run, rows, inputs.t, used=used)
     return label_rows(run, inputs, rows, verdict, kind)
 
 

@@ -44,6 +44,7 @@ TOLERANCE = 1e-6  # relative, of the smallest gamma
 GAMMA_RESERVE = 1e-3  # relative, above the smallest gamma: there the law's numbers stay small
 RESIDUAL = 1e-6  # relative, of a Riccati equation
 RANK = 1e-9
+MAX_SIGN_STEPS = 60  # Newton converges in ten to twenty
 MAX_GAMMA = 1e8  # gamma, beyond which no law is looked for
 
 
@@ -200,6 +201,37 @@ def _normal(whole: System, p2: int, m2: int) -> tuple[_Problem, Callable[[System
     return problem, back
 
 
+def _stable_graph(H: FloatArray) -> FloatArray | None:
+    """X of which the columns of [1; X] span the space of the stable half of a Hamiltonian's poles; None: no such X.
+
+    Where rounding moves poles across the axis while the Schur form is ordered, the sign function of H has no order to
+    find: (sign(H) + 1) [1; X] = 0. Source: Roberts, Int. J. Control 32(4), 1980; Newton's steps are scaled by det H.
+    """
+    n, one = len(H) // 2, np.eye(len(H) // 2)
+    T: Any = H
+    Z: Any = None
+    try:
+        T, Z, stable = linalg.schur(H, output="real", sort="lhp")
+    except linalg.LinAlgError:
+        stable = int((np.linalg.eigvals(H).real < 0).sum())
+    if stable != n or np.abs(linalg.eigvals(T).real).min() < 1e-11 * np.abs(T).max():
+        return None
+    try:
+        if Z is not None:
+            return np.asarray(np.linalg.solve(Z[:n, :n].T, Z[n:, :n].T).T)
+        sign: Any = H
+        for _ in range(MAX_SIGN_STEPS):
+            c = math.exp(-np.linalg.slogdet(sign)[1] / (2 * n))
+            after = (c * sign + np.linalg.inv(c * sign)) / 2
+            moved, sign = np.linalg.norm(after - sign), after
+            if moved < 1e-14 * np.linalg.norm(sign):
+                break
+    except (np.linalg.LinAlgError, OverflowError):
+        return None
+    left, right = np.vstack([sign[:n, n:], sign[n:, n:] + one]), np.vstack([sign[:n, :n] + one, sign[n:, :n]])
+    return np.asarray(-linalg.lstsq(left, right)[0]) if np.isfinite(sign).all() else None
+
+
 def _riccati(
     A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray
 ) -> tuple[FloatArray, float] | None:
@@ -214,13 +246,8 @@ def _riccati(
     t = np.sqrt(scale[:n] / scale[n:])  # symplectic: states by t, costates by 1 / t
     t = 2.0 ** np.round(np.log2(t))
     D = np.concatenate([t, 1 / t])
-    T, Z, stable = linalg.schur(H / D[:, None] * D, output="real", sort="lhp")
-    poles = np.abs(linalg.eigvals(T).real)
-    if stable != n or poles.min() < 1e-11 * np.abs(T).max():
-        return None
-    try:
-        X = np.linalg.solve(Z[:n, :n].T, Z[n:, :n].T).T
-    except np.linalg.LinAlgError:
+    X = _stable_graph(H / D[:, None] * D)
+    if X is None:
         return None
     X = (X + X.T) / 2 / np.outer(t, t)
     terms = [A.T @ X, X @ A, Q, -(X @ B + S) @ np.linalg.solve(R, B.T @ X + S.T)]

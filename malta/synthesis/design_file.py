@@ -136,6 +136,12 @@ def spec_of(
     except CheckError as error:
         raise InputError(path, "preset", str(error), "a machine that can be controlled") from error
     require_known(content.uncertainty, units_of(par), path, "uncertainty.{}", "an unknown parameter")
+    for name, share in content.uncertainty.items():
+        if getattr(par, name) == 0:
+            found = f"a share of {share:g} of its value, which is 0"
+            raise InputError(
+                path, f"uncertainty.{name}", found, "a parameter that is not 0, or in Python an interval"
+            )
     spec = Spec(
         name=content.name,
         summary=content.summary,

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from malta.arguments import by_name, is_pair
 from malta.errors import CheckError, InputError
 from malta.files import locate
 from malta.gains.file import content_of
@@ -25,7 +26,8 @@ from malta.margins.worst_case import worst_sensitivities
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import Parameters, Plant
 from malta.model.plants import plant_of
-from malta.proof.margin import Progress
+from malta.model.soundness import unproven
+from malta.proof.margin import Progress, Ranges
 from malta.simulation.experiments import Experiment
 from malta.simulation.experiments.catalogue import experiment, payload
 from malta.simulation.scenario import Scenario
@@ -166,7 +168,7 @@ MARGIN_SHARE = 0.5  # of the time of a verification, which the margins take
 def verify(
     loop: str | Path | Controller | Plant | LinearModel,
     controller: Controller | None = None,
-    uncertainty: Mapping[str, float] | None = None,
+    uncertainty: Ranges | None = None,
     *,
     stages: bool | None = None,
     spec: Spec | None = None,
@@ -182,7 +184,8 @@ def verify(
 
     loop : a gain file, a controller on its own machine, or a machine: its plant, or its model from `malta.linearize`
     controller : of a machine; None: the first argument has it
-    uncertainty : relative half range of each parameter, the unit of margins, as {"m": 0.2}; None: that of the gain file
+    uncertainty : relative half range of each parameter, the unit of margins, as {"m": 0.2}, or its interval (low, high)
+        in SI; None: that of the gain file
     stages : whether everything is asked for that `malta verify` prints: the margin of each stage and of each parameter
         alone, worst cases, payload, requirements; otherwise the linear figures and the margin over the travel, in a
         fraction of the time; None: of a gain file
@@ -198,8 +201,9 @@ def verify(
 
     Returns a LoopReport, which prints as a short table; its `figures` lists all figures of merit with their meaning.
 
-    Raises InputError for unknown parameters, and for what is no loop; CheckError when numbers overflow or no input
-    holds the machine. An unstable loop raises nothing: it is not `stable`, and its peak sensitivities are NaN.
+    Raises InputError for unknown parameters, and for what is no loop; CheckError when numbers overflow, no input holds
+    the machine, or its linear model at rest is not the machine's (`malta.inspect`). An unstable loop raises nothing: it
+    is not `stable`, and its peak sensitivities are NaN.
 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
@@ -226,7 +230,13 @@ def verify(
         stages = True if stages is None else stages
         uncertainty = content_of(locate(loop))[0].uncertainty if uncertainty is None else uncertainty
         loop = read_stable(loop)
+    if uncertainty is not None:
+        by_name("verify", "uncertainty", uncertainty, '{"m": 0.2} or {"m": (0.1, 0.3)}')
+        sides: Mapping[str, Any] = uncertainty
+        uncertainty = {name: tuple(side) if is_pair(side) else side for name, side in sides.items()}
     model, controller = _model_and_controller(loop, controller)
+    if why := unproven(model.plant, tuple(model.operating_point.x.tolist())):
+        raise CheckError(f"{model.plant.name}: its linear model is not the machine's: {why}")
     if not stages:
         box = uncertainty if proof else None
         return linear_report(model, controller, box, current_loops, time=time)

@@ -87,7 +87,7 @@ def test_json_holds_what_the_table_shows(run: Run, tmp_path: Path) -> None:
     again = json.loads(out)
     assert code == 1
     assert worst["end"] in _sentence(err)
-    assert again["verdict"] == {"name": worst["end"], "time_s": worst["time_s"]}
+    assert again["verdict"] == {"name": worst["end"], "time_s": worst["time_s"], "signal": ""}
     stem = f"table2_stroke_run_{worst['run']}"
     assert {path.name for path in (tmp_path / "again").iterdir()} == {f"{stem}.npz", f"{stem}.png"}
     with np.load(tmp_path / "again" / f"{stem}.npz") as series:

@@ -286,7 +286,7 @@ def test_design_as_json_holds_finite_numbers(run: Run, tmp_path: Path) -> None:
     assert all(map(math.isfinite, found))
     assert result["design"] == "calibrated"
     assert result["stable"] is True
-    assert result["verdict"] == {"name": "completed", "time_s": 0.1}
+    assert result["verdict"] == {"name": "completed", "time_s": 0.1, "signal": ""}
     assert [Path(file).is_file() for file in result["files"]] == [True] * 4
 
 
@@ -568,7 +568,7 @@ def test_simulate_as_json_holds_finite_numbers(run: Run) -> None:
     assert len(found) > 30  # merits of experiment and case, the stroke, and when it ended
     assert (result["engine"], result["fidelity"]) == ("compiled", "dq")
     assert all(map(math.isfinite, found))
-    assert result["verdict"] == {"name": "completed", "time_s": 0.1}
+    assert result["verdict"] == {"name": "completed", "time_s": 0.1, "signal": ""}
     assert result["files"] == []
 
 

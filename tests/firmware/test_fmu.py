@@ -723,3 +723,21 @@ def test_every_signal_has_a_name_and_a_unit_to_wire(name: str, part: Part) -> No
         assert re.fullmatch(r"[A-Za-z]\w*(\.[A-Za-z]\w*)?", v.name), v.name
         assert v.unit, v.name
         assert "set point" not in v.name
+
+
+@BOTH
+def test_a_machine_without_parameters_flies_as_simulated(fmi: int, instance: Callable[..., Unit]) -> None:
+    """Known matrices: the parts machine and loop have no group of the machine's parameters."""
+    plant = malta.linear_machine([[0, 1], [100, 0]], [[0], [1]], [[1, 0]])
+    weights = malta.synthesis.weights(q=[1e4, 1], r=[1], w=[1], v=[1e-8])
+    t = Target(malta.lqg(malta.linearize(plant, plant.at()), weights, Ts=1e-3, name="law"), "double", "force")
+    hold = malta.Scenario("hold", 0.1, references.hold, {"x1": 1e-3}, fidelity="force")
+    run = malta.simulate(plant, t.controller, hold)
+    motion = references.hold(plant)(run.t)
+    loop, machine = instance(t, "loop", fmi), instance(t, "machine", fmi)
+    assert "machine" not in machine.groups
+    loop.begin()
+    loop.set("offset", run.x[0])
+    loop.refer(motion, 0)
+    loop.start()
+    assert fly(loop, run, motion) < 1e-12

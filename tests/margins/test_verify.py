@@ -210,3 +210,26 @@ def test_a_loop_is_verified_by_its_file_its_controller_or_its_machine() -> None:
             malta.InputError, match="a gain file, a controller, or a machine and its controller"
         ):
             malta.verify(*wrong)
+
+
+@pytest.mark.parametrize("interval", [(-50, 50), [-50, 50], (0, 50), (-50, 0)])
+def test_intervals_have_stages_and_print(interval: tuple[float, float]) -> None:
+    """A parameter whose value is 0 varies over an interval; a share of it is refused."""
+    terms = {"k": [[[0, 0], [1, 0]]]}
+    p = malta.linear_machine([[0, 1], [100, 0]], [[0], [1]], [[1, 0]], nominal={"k": 0}, terms=terms)
+    model = malta.linearize(p, p.at())
+    c = malta.lqg(model, malta.synthesis.weights(q=[1e4, 1], r=[1], w=[1], v=[1e-8]), Ts=1e-3)
+    quick, found = (malta.verify(model, c, {"k": interval}, stages=stages) for stages in (False, True))
+    assert quick.robust is not None
+    assert found.robust is not None
+    assert quick.robust.lower == found.robust.lower
+    words = f"uncertainty: k {interval[0]} to {interval[1]}"
+    assert words in str(found)
+    assert words in str(quick)
+    sides = dict(zip(("down", "up"), found.tolerance["k"], strict=True))
+    for side, at in zip(sides.values(), interval, strict=True):
+        assert (side.lower is None) == (at == 0)
+    with pytest.raises(malta.InputError, match=r"uncertainty\.k: found the interval"):
+        malta.gains.document(c, found)
+    with pytest.raises(malta.InputError, match=r"k: found a share of 0\.5 of its value, which is 0"):
+        malta.verify(model, c, {"k": 0.5})

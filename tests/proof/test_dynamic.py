@@ -114,3 +114,14 @@ def test_bad_input_gets_one_sentence(dynamic: Dynamic, says: str) -> None:
     more: dict[str, Any] = {"k": 0.4}
     with pytest.raises(InputError, match=says):
         dynamic_margin(robstab(), pid(2.3, 3, 0.38, 0.001), more, dynamic)
+
+
+def test_a_singular_E_at_the_end_of_a_box_is_met_by_no_traceback() -> None:
+    """m x' = -3 x + u with m from 0 on: the search of a peak evaluates the ends of its box."""
+    light = malta.uncertain(lambda m: ([[-3.0]], [[1.0]], [[1.0]], [[0.0]], [[m]]), {"m": 1.0})
+    ranges = {"m": (0.0, 2.0)}
+    peak = malta.worst_case_gain(light, [[-0.3]], ranges)
+    assert peak.upper is None
+    assert peak.reached.value == pytest.approx(1, rel=1e-3)  # |S| rises from 3 / 3.3 to 1 beyond the pole
+    found = malta.dynamic_margin(light, [[-0.3]], ranges, malta.proof.Dynamic(0.01))
+    assert found.upper > 1

@@ -75,6 +75,7 @@ class End(DocumentPart):
 
     name: str = Field(description='"completed", "diverged", "interrupted" or the contact that was touched')
     time_s: Number
+    signal: str = Field(description='the output that diverged; "": none, or a value that is no number')
 
 
 class ShareOfRuns(DocumentPart):

@@ -1,4 +1,4 @@
-"""The documents of `malta check`, `malta tune`, `malta claims`, `malta export` and `malta pil`."""
+"""The documents of `malta check`, `malta inspect`, `malta tune`, `malta claims`, `malta export` and `malta pil`."""
 
 from __future__ import annotations
 
@@ -67,6 +67,26 @@ class CheckOutput(DocumentPart):
     claim: CertifiedPart
     groups: list[str]
     failures: list[str]
+
+
+class InspectRow(DocumentPart):
+    """A part of a machine, what was found, and what is expected there."""
+
+    part: str
+    found: str
+    change: str
+    unproven: bool = Field(description="nothing is proven because of it")
+
+
+class InspectOutput(DocumentPart):
+    """What `malta inspect --json` prints."""
+
+    kind: Literal["malta-inspect-output"] = Field(default="malta-inspect-output", alias="schema")
+    version: Literal[1] = 1
+    machine: str
+    proves: bool = Field(description="proofs of the linear model are proofs of the machine")
+    rows: list[InspectRow]
+    switches: list[str] = Field(description="of each position: where its slopes change nearest to rest")
 
 
 def certified_part(claim: StabilityClaim) -> CertifiedPart:

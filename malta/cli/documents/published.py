@@ -16,7 +16,7 @@ from malta.schemas.files import DRAFT
 NAMES = (
     "design", "verify", "check", "simulate", "campaign", "status", "rare", "sobol", "tolerance", "tune", "excite",
     "log", "identify", "learn", "learned-strokes", "learned-v0", "replay", "measure", "measure-plan", "commission",
-    "plot", "report", "compare", "export", "pil", "claims",
+    "plot", "report", "compare", "export", "pil", "claims", "inspect",
 )  # fmt: skip
 _KINDS = {
     str(model.model_fields["kind"].default): model

@@ -113,7 +113,7 @@ static void control(unit_data *u, {{ name }}_state *s) {
 static void look(unit_data *u) {
   {{ plant }}_readings r;
   int32_t k;
-  {{ plant }}_look(&u->machine, u->value + {{ at.machine }}{% if noises %}, u->value[{{ at.noise }}], u->value[{{ at.seed }}]{% endif %}, &r);
+  {{ plant }}_look(&u->machine, u->value + {{ at.machine | default(0) }}{% if noises %}, u->value[{{ at.noise }}], u->value[{{ at.seed }}]{% endif %}, &r);
 {% for f in readings %}
 {{ copy("(u->value + " ~ f.at ~ ")", "r." ~ f.field ~ "[k]", f.size) }}
 {%- endfor %}
@@ -140,9 +140,9 @@ static int start(unit_data *u, const char **message) {
 {% if controller %}
   double x[{{ states }}];
   {{ plant }}_place(u->value + {{ at.p_ref }}, u->value + {{ at.dp_ref }}, u->value + {{ at.offset }}, x);
-  {{ plant }}_start(&u->machine, u->value + {{ at.machine }}, x, 0.0{% if volts %}, u_integral{% endif %});
+  {{ plant }}_start(&u->machine, u->value + {{ at.machine | default(0) }}, x, 0.0{% if volts %}, u_integral{% endif %});
 {% else %}
-  {{ plant }}_start(&u->machine, u->value + {{ at.machine }}, u->value + {{ at.x_start }}, u->value[{{ at.cold }}]{% if volts %}, u_integral{% endif %});
+  {{ plant }}_start(&u->machine, u->value + {{ at.machine | default(0) }}, u->value + {{ at.x_start }}, u->value[{{ at.cold }}]{% if volts %}, u_integral{% endif %});
 {% endif %}
   look(u);
 {% endif %}
@@ -294,7 +294,7 @@ static int sample(unit_data *u, const char **message) {
   (void)message;
 {% endif %}
 {% if machine %}
-  {{ plant }}_step(&u->machine, u->value + {{ at.machine }}, u->value + {{ at.command }}{% if wrench %}, u->value + {{ at.w }}{% endif %}{% if delay %}, {{ "1" if controller else "(u->value[" ~ at.late ~ "] != 0.0) ? 1 : 0" }}{% endif %});
+  {{ plant }}_step(&u->machine, u->value + {{ at.machine | default(0) }}, u->value + {{ at.command }}{% if wrench %}, u->value + {{ at.w }}{% endif %}{% if delay %}, {{ "1" if controller else "(u->value[" ~ at.late ~ "] != 0.0) ? 1 : 0" }}{% endif %});
   look(u);
 {% endif %}
   return status;

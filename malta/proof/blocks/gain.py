@@ -200,6 +200,8 @@ class BlockLoop:
 
         Raises Unproven when they cannot be enclosed.
         """
+        if self.system.approximate:
+            raise Unproven(self.system.approximate)
         most = [share * b.weight.most for share, b in zip(shares, self.blocks, strict=True)]
         try:
             with work_limit(until):

@@ -209,7 +209,7 @@ def new_page(runs: Sequence[Trajectory], what: str, found: str, **places: Any) -
 def ending_text(run: Trajectory) -> str:
     """How a run ended, in brackets; empty if it was completed."""
     end = run.verdict
-    return "" if end.completed else f" ({end.name} at {end.time * 1e3:.0f} ms)"
+    return "" if end.completed else f" ({end.words} at {end.time * 1e3:.0f} ms)"
 
 
 def draw_line(axes: Axes, t: FloatArray, values: FloatArray, **style: Any) -> None:
@@ -231,7 +231,7 @@ def mark_end(axes: Axes, run: Trajectory, t: FloatArray, values: FloatArray, *, 
         low, high = axes.get_xlim()
         if not (axes.get_autoscalex_on() or low <= t[k] <= high):
             return
-        label = TOUCHDOWN_LABEL if run.verdict.name.startswith(TOUCHDOWN_LABEL) else run.verdict.name
+        label = TOUCHDOWN_LABEL if run.verdict.name.startswith(TOUCHDOWN_LABEL) else run.verdict.words
         axes.plot(t[k], values[k], **CROSS | ({"label": label} if named else {}))
 
 

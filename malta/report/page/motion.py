@@ -139,7 +139,7 @@ def motion_of(run: Trajectory, title: str, *, frames: int = FRAMES) -> Animation
         for of, values in ((run.plant.outputs, run.p), (run.plant.inputs, run.v))
         for k, signal in enumerate(of)
     }
-    ended = f"{run.verdict.name} at {quantity(run.verdict.time, 's')}"
+    ended = f"{run.verdict.words} at {quantity(run.verdict.time, 's')}"
     return _motion(title, ended, run.plant, (run.t, run.x, run.force), signals, frames)
 
 

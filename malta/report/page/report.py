@@ -8,6 +8,8 @@ from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from malta.arguments import describe, is_number
+from malta.errors import InputError
 from malta.model.signal_groups import FINE_UNITS
 from malta.report.figures.drawing import MORE_STYLES, STYLES, draw_line, finish_axes, micro, new_figure
 from malta.report.page.document import Front, Page, render
@@ -107,6 +109,9 @@ def subject_of(
     from malta.gains.stable import read_stable
     from malta.report.page.analysis import Subject
 
+    for name, share in (uncertainty or {}).items():
+        if not is_number(share):
+            raise InputError("report", f"uncertainty.{name}", describe(share), "a share of its value, as 0.2")
     if not isinstance(gains, str | Path):
         box = dict(uncertainty or {})
         return Subject(gains, parameters or gains.parameters, box, spec, "", changes)

@@ -137,7 +137,7 @@ def _cases_table(e: Experiment, published: Published | None) -> Table:
         end, found = case.run.verdict, {merit.label: merit_text(merit) for merit in case.merits}
         ends: list[str | Text] = []
         if ended:
-            ends = [end_cell(end.name, completed=end.completed), f"{end.time * 1e3:.1f}"]
+            ends = [end_cell(end.words, completed=end.completed), f"{end.time * 1e3:.1f}"]
         add_row(table, case.label, *ends, *(found.get(label, "-") for label in labels))
     if published is not None and any(merit.published for merit in fullest):
         table.add_section()
@@ -155,7 +155,7 @@ def _transpose(e: Experiment, fullest: Sequence[Merit]) -> Table:
     table = new_table(e.question, "figure", *(case.label for case in e.cases))
     found = [{merit.label: merit_text(merit) for merit in case.merits} for case in e.cases]
     ends = [case.run.verdict for case in e.cases]
-    add_row(table, "verdict", *(end_cell(end.name, completed=end.completed) for end in ends))
+    add_row(table, "verdict", *(end_cell(end.words, completed=end.completed) for end in ends))
     add_row(table, "at [ms]", *(f"{end.time * 1e3:.1f}" for end in ends))
     for merit in fullest:
         add_row(table, merit.heading, *(values.get(merit.label, "-") for values in found))
@@ -168,7 +168,7 @@ def _list_of_merits(e: Experiment) -> Table:
     table.columns[1].justify = "left"
     for case in e.cases:
         end = case.run.verdict
-        ended = end_cell(f"{end.name} at {end.time * 1e3:.1f} ms", completed=end.completed)
+        ended = end_cell(f"{end.words} at {end.time * 1e3:.1f} ms", completed=end.completed)
         add_row(table, case.label, "verdict", ended)
         for merit in case.merits:
             add_row(table, "", merit.heading, merit_text(merit))

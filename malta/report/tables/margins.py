@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from malta.arguments import is_number
 from malta.bound import at_least, at_most
 from malta.display import RADIANS, frequency
 from malta.margins.loop_report import LoopReport, zone
@@ -356,7 +357,13 @@ def tolerance_table(found: LoopReport) -> Table:
         cells = []
         for margin, sign in ((down, "-"), (up, "+")):
             proven = margin.lower is not None
-            change = f"{sign}{margin.proven.percent(found.uncertainty[name])}" if proven else "nothing proven"
+            share = found.uncertainty[name]
+            change = (
+                f"{sign}{margin.proven.percent(share)}"
+                if is_number(share)
+                else f"{margin.proven.percent()} of it"
+            )
+            change = change if proven else "nothing proven"
             cells.append(f"{change} and further" if proven and margin.exhausted else change)
         add_row(table, name, *cells, f"{100 * shares.get(name, 0):.0f} %")
     if found.mass is not None:

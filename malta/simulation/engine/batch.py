@@ -23,6 +23,7 @@ from malta.errors import InputError
 from malta.model.parameters import is_default, shape_parameters, twins_of, units_of
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
+from malta.simulation.divergence import rooms_of
 from malta.simulation.engine.compiled import LANES, feedforward_table
 from malta.simulation.engine.digest import (
     Batch,
@@ -177,7 +178,8 @@ def simulate_many(
     if compiled is None:
         return _simulate_one_by_one(alone, variation, progress)
     inputs, shared, lanes, parts = _prepare(simulation, variation)
-    digest, sizes = first_digest(plant, inputs.motion.p), digest_sizes(plant)
+    rooms = rooms_of(alone, inputs)
+    digest, sizes = first_digest(plant, inputs.motion.p, rooms), digest_sizes(plant)
     groups, runs = len(lanes.states), variation.runs
     lanes = lanes._replace(digests=arrange_in_lanes(digest[None], groups))
     shared = shared._replace(foreseen=foresee_samples(compiled[0], lanes, shared))

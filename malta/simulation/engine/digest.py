@@ -13,6 +13,7 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.display import Description, display
 from malta.model.plant import Plant
+from malta.simulation.divergence import free_outputs, strokes, used_rooms
 from malta.simulation.layout import flatten, layout_of, numbers_of
 from malta.simulation.readings import NOISE_SAMPLES_AT_ONCE
 
@@ -86,6 +87,7 @@ def digest_sizes(plant: Plant) -> dict[str, int]:
         "alive": 1,
         "start": 1,  # of the stroke: constant
         "scale": 1,  # 1 / length of the stroke, or 0: constant
+        "rooms": len(free_outputs(plant)) + strokes(plant),  # 1 / what ends the run as diverged: constant
         "samples": 1,
         "reached": len(LEVELS),  # sample at which each level was reached, -1 before
         "below": len(LEVELS),  # share of the stroke one sample before
@@ -105,13 +107,18 @@ def digest_sizes(plant: Plant) -> dict[str, int]:
     }
 
 
-def first_digest(plant: Plant, p_ref: FloatArray) -> FloatArray:
-    """The digest before the first sample of a reference p_ref, k x p; the stroke is that of the leading output."""
+def first_digest(plant: Plant, p_ref: FloatArray, rooms: FloatArray) -> FloatArray:
+    """The digest before the first sample of a reference p_ref, k x p; the stroke is that of the leading output.
+
+    rooms : from `rooms_of`
+    """
     start, end = p_ref[0, plant.leading_output], p_ref[-1, plant.leading_output]
     scale = 1 / (end - start) if end != start else 0
     known = {"alive": 1.0, "start": start, "scale": scale, "reached": -1.0, "touched": -1.0, "culprit": -1.0}
-    sizes = digest_sizes(plant)
-    return np.repeat([known.get(name, 0.0) for name in sizes], [*sizes.values()])
+    parts = [
+        np.full(size, known.get(name, 0.0)) for name, size in digest_sizes(plant).items() if name != "rooms"
+    ]
+    return np.concatenate([*parts[:3], rooms, *parts[3:]])
 
 
 def restart(digests: FloatArray, first: FloatArray, sizes: Mapping[str, int]) -> None:
@@ -133,7 +140,11 @@ def digest_function(shape: Any) -> ca.Function:
     """(digest, row, given, theta) -> digest after one more sample. The first contact ends its updates."""
     kept, row, given, arguments = _symbols(shape)
     after = _digest(shape, kept, row, given, lambda now, before: ca.if_else(kept["alive"], now, before))
-    most, used = (_largest_share(c) for c in (ca.fmax(kept["contact"], row["contact"]), row["contact"]))
+    left, used = (
+        used_rooms(shape.plant, row["p"], given["p_ref"], kept["rooms"]),
+        _largest_share(row["contact"]),
+    )
+    most = _largest_share(ca.vertcat(ca.fmax(kept["contact"], row["contact"]), left))
     alive = kept["alive"]  # 0 after the first contact: nothing else changes then
     after |= {
         "alive": ca.logic_and(alive, most < 1),
@@ -147,7 +158,7 @@ def digest_function(shape: Any) -> ca.Function:
     if shape.setup.bearing:
         touching = used >= 1
         ends = [row["contact"][i] for i, held in enumerate(shape.plant.contacts.cushioned) if not held]
-        after["alive"] = ca.logic_and(alive, _largest_share(ca.vertcat(*ends)) < 1)
+        after["alive"] = ca.logic_and(alive, _largest_share(ca.vertcat(*ends, left)) < 1)
         first = kept["samples"] == 0
         after["resting"] = ca.if_else(first, touching, kept["resting"])
         after["touching"] = ca.if_else(alive, touching, kept["touching"])
@@ -170,7 +181,9 @@ def cruise_functions(shape: Any) -> tuple[ca.Function, ...]:
     after = _digest(shape, kept, row, given, lambda now, _: now) | {"samples": kept["samples"] + 1}
     reached = ca.logic_and(kept["reached"] < 0, after["share"] >= ca.DM(LEVELS))
     events = ca.mmax(ca.vertcat(row["saturated"], reached))
-    premise = ca.logic_and(ca.logic_and(kept["alive"], _largest_share(row["contact"]) < 1), events <= 0)
+    left = used_rooms(shape.plant, row["p"], given["p_ref"], kept["rooms"])
+    near = _largest_share(ca.vertcat(row["contact"], left))
+    premise = ca.logic_and(ca.logic_and(kept["alive"], near < 1), events <= 0)
     idle = ("limited", "reached", "below", "above")
     result = ca.vertcat(*(kept[name] if name in idle else after.get(name, kept[name]) for name in kept))
     return (

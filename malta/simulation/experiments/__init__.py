@@ -116,7 +116,7 @@ class Experiment:
             return f"interrupted after {len(self.cases)} runs"
         if not ends:
             return f"completed at {self.run.verdict.time:.4g} s"
-        verdicts = [f"{case.run.verdict.name} at {case.run.verdict.time:.4g} s" for case in ends]
+        verdicts = [f"{case.run.verdict}" for case in ends]
         if len(self.cases) == 1:
             return verdicts[0]
         return f"{len(ends)} of {len(self.cases)} runs not completed ({ends[0].label}: {verdicts[0]})"
