@@ -92,7 +92,7 @@ def note_machine(plant: Plant) -> None:
             return
         if why := unproven(plant, tuple(plant.at().x.tolist())):
             print_note(
-                shorten(f"malta: {plant.name}: nothing is proven of it: {why}; malta inspect says more")
+                shorten(f"{plant.name}: nothing is proven of it: {why}; malta inspect says more")
             )
         if seen is not None:
             replace_files({seen: b""})

@@ -447,8 +447,12 @@ def margin_of(problem: Problem, box: Box, effort: ProofEffort) -> Margin:
     if not box.most > 0:
         return Margin(None, math.inf, None, None, {}, {}, (), 0.0, box.ends, box.searched)
     ask = partial(_ask, problem, box, effort, standing)
+
+    def rank(found: Margin) -> float:
+        return math.inf if found.reason == problem.traits.approximate else rank_of(found)
+
     try:
-        found, ended = in_rounds(effort.limits, ask, rank_of)
+        found, ended = in_rounds(effort.limits, ask, rank)
     except KeyboardInterrupt as stop:
         raise Interrupted(_interrupted_margin(problem, box, standing, clock.monotonic() - begun)) from stop
     idle = _idle(problem, box)

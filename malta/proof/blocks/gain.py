@@ -121,11 +121,13 @@ def dynamic_margin(
         t = math.inf if lost is None else _size(asked, lost)
         return lost, *_prove_dynamic(asked, min(t, asked.box.limit), tolerance, until)
 
+    settled = ("", system.approximate)  # reasons for which more work proves no more
     with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
         (lost, lower, reason), ended = in_rounds(
-            Budget(time=time), ask, lambda x: x[1] or 0.0 if x[-1] else math.inf
+            Budget(time=time), ask, lambda x: x[1] or 0.0 if x[-1] not in settled else math.inf
         )
-    took, names, reason = clock.monotonic() - begun, box.names, ended.explain(reason)
+    took, names = clock.monotonic() - begun, box.names
+    reason = reason if reason in settled else ended.explain(reason)
     if lost is None:
         return Margin(lower, math.inf, None, None, {}, {}, (), took, reason, box.searched, ended.work)
     t, witness = _size(asked, lost), dict(zip(names, lost.p.tolist(), strict=True))
@@ -348,8 +350,8 @@ def _prove_dynamic(
 ) -> tuple[float | None, str]:
     """The largest t for which stability is proven, and the reason when there is none."""
     parts: list[PolydiscPart] = []
-    reason = ""
-    for step in DYNAMIC_STEPS:
+    reason = asked.system.approximate
+    for step in DYNAMIC_STEPS if not reason else ():
         if is_past(until):
             break
         t = upper / (1 + step * tolerance)
@@ -482,13 +484,14 @@ def worst_case_gain(
         found = _largest(asked, SEARCH * until)
         return found, *_prove(asked, found.value, tolerance, until)
 
+    settled = ("", system.approximate)
     with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
         budget = Budget(time=time)
         ((lower, w, p), upper, cells, reason), ended = in_rounds(
-            budget, ask, lambda x: 0.0 if x[-1] else math.inf
+            budget, ask, lambda x: 0.0 if x[-1] not in settled else math.inf
         )
     named, took = dict(zip(box.names, p.tolist(), strict=True)), clock.monotonic() - begun
-    return Gain(lower, upper, w, named, cells, took, ended.explain(reason))
+    return Gain(lower, upper, w, named, cells, took, reason if reason in settled else ended.explain(reason))
 
 
 def _performance_block(system: UncertainSystem, of: Of, at: At, channel: Any) -> Block:
