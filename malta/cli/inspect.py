@@ -91,9 +91,7 @@ def note_machine(plant: Plant) -> None:
         if seen is not None and seen.exists():
             return
         if why := unproven(plant, tuple(plant.at().x.tolist())):
-            print_note(
-                shorten(f"{plant.name}: nothing is proven of it: {why}; malta inspect says more")
-            )
+            print_note(shorten(f"{plant.name}: nothing is proven of it: {why}; malta inspect says more"))
         if seen is not None:
             replace_files({seen: b""})
     except OSError:
