@@ -259,7 +259,7 @@ def test_the_shipped_gains_are_those_that_the_search_ends_with(spec: Spec) -> No
     for row in judge(spec):
         rows[row.name] = max(row, rows.get(row.name, row), key=lambda r: r.ratio)
         assert row.asked is None or row.holds, row
-    assert rows["margin"].found == pytest.approx(3.0030, abs=1e-3)
+    assert rows["margin"].found == pytest.approx(2.9600, abs=1e-3)
     assert 0.9 < rows["peak_sensitivity"].ratio < 1
     assert rows["force_noise"].ratio > 0.96
     assert rows["lift_off"].how == "steady-state estimator, 4 seeds"
@@ -337,8 +337,8 @@ def test_a_pid_has_no_verdict_on_figures_of_an_lqg(found: TubularEvidence, publi
 
 
 def test_what_the_paper_calls_unsuitable_holds_what_it_claims(found: TubularEvidence) -> None:
-    """300 % of the box, as many as the paper has of full state feedback, with the sampled loop and single axes."""
-    assert claims.machine_share(found) == pytest.approx(3.0030, abs=1e-3)
+    """296 % of the box under its loads, with the sampled loop and single axes."""
+    assert claims.machine_share(found) == pytest.approx(2.9600, abs=1e-3)
     assert claims.peak_sensitivity(found) == pytest.approx(2.0, abs=1e-3)
     plant = found.model.plant
     end = malta.verify(malta.linearize(plant, plant.at(z=plant.stroke.travel)), found.controller)
