@@ -19,7 +19,8 @@ from IPython.display import display
 from scipy.linalg import block_diag
 
 import malta
-from malta.linear.sampling import add_integrals, sample, sample_cost, sample_noise
+from malta.linear.matrices import add_integrals
+from malta.linear.sampling import sample, sample_cost, sample_noise
 from malta.synthesis.lqg import integrals_of
 
 # The project's root, wherever Jupyter was started.

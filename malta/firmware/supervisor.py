@@ -26,7 +26,8 @@ import numpy as np
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
 from malta.firmware.signals import Target, place_of_readings, reading_ranges, used_clearances
-from malta.linear.sampling import eigenvalues, sample
+from malta.linear.matrices import eigenvalues
+from malta.linear.sampling import sample
 from malta.model.places import place_states
 from malta.model.plant import Plant
 from malta.synthesis.controller import Controller, noise_input

@@ -8,7 +8,8 @@ import casadi as ca
 import numpy as np
 from scipy import linalg
 
-from malta.arrays import FloatArray
+from malta.arrays import ComplexArray, FloatArray
+from malta.errors import CheckError
 
 
 def system_matrix(A: Any, B: Any = None, C: Any = None, D: Any = None) -> Any:
@@ -46,3 +47,17 @@ def balanced_units(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     whole[: n + len(C), : n + B.shape[1]] = system_matrix(A, B, C)
     _, (units, _) = linalg.matrix_balance(whole, permute=False, separate=True)
     return np.asarray(units[:n])
+
+
+def eigenvalues(M: FloatArray) -> ComplexArray:
+    """Eigenvalues, complex even where they all are real. CheckError where numbers have overflowed."""
+    if not np.isfinite(M).all():
+        raise CheckError("the model's numbers overflow")
+    return np.asarray(np.linalg.eigvals(M), dtype=complex)
+
+
+def add_integrals(Ad: FloatArray, Bd: FloatArray, Cd: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:
+    """The sampled system with e+ = e - Ts y+ appended, the controller's own sums of the measured errors."""
+    p = len(Cd)
+    A = system_matrix(Ad, None, -Ts * Cd @ Ad, np.eye(p))
+    return A, np.vstack([Bd, -Ts * Cd @ Bd])

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from malta.arrays import ComplexArray, FloatArray
-from malta.linear.matrices import system_matrix
-from malta.linear.sampling import eigenvalues
+from malta.linear.matrices import eigenvalues, system_matrix
 from malta.linear.system import System
 
 RISE = 1e-7  # relative, above the largest gain that was found, at which a search ends

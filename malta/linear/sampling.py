@@ -7,19 +7,12 @@ import math
 import numpy as np
 from scipy import linalg
 
-from malta.arrays import ComplexArray, FloatArray
+from malta.arrays import FloatArray
 from malta.errors import CheckError
 from malta.linear.matrices import system_matrix
 
 WHOLE_TOLERANCE = 1e-9  # samples, or share of a delay, that rounding takes from whole samples
 MAX_EXPONENTIAL_ENTRY = 1e8  # entry of a matrix whose exponential is taken
-
-
-def eigenvalues(M: FloatArray) -> ComplexArray:
-    """Eigenvalues, complex even where they all are real. CheckError where numbers have overflowed."""
-    if not np.isfinite(M).all():
-        raise CheckError("the model's numbers overflow")
-    return np.asarray(np.linalg.eigvals(M), dtype=complex)
 
 
 def split_delay(delay: float) -> tuple[int, float]:
@@ -94,13 +87,6 @@ def add_lags(A: FloatArray, B: FloatArray, rate: float) -> tuple[FloatArray, Flo
     """The continuous system whose inputs follow as first-order lags, rate / (s + rate); they are states after x."""
     n, m = B.shape[-2:]
     return system_matrix(A, B, None, -rate * np.eye(m)), np.vstack([np.zeros((n, m)), rate * np.eye(m)])
-
-
-def add_integrals(Ad: FloatArray, Bd: FloatArray, Cd: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:
-    """The sampled system with e+ = e - Ts y+ appended, the controller's own sums of the measured errors."""
-    p = len(Cd)
-    A = system_matrix(Ad, None, -Ts * Cd @ Ad, np.eye(p))
-    return A, np.vstack([Bd, -Ts * Cd @ Bd])
 
 
 def sample_cost(

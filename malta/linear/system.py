@@ -20,8 +20,8 @@ from scipy import linalg, sparse
 from malta.arguments import describe
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
-from malta.linear.matrices import balanced_units
-from malta.linear.sampling import eigenvalues, sample
+from malta.linear.matrices import balanced_units, eigenvalues
+from malta.linear.sampling import sample
 
 MIN_SCHUR_FREQUENCIES = 32  # frequencies from which on a Schur form is worth its time
 SLOW_FREQUENCY = 1e-6  # of the norm of A: below, the Schur form has lost digits of slow poles

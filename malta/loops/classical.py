@@ -13,6 +13,7 @@ import numpy as np
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import display
 from malta.linear.interconnection import append, connect, series
+from malta.linear.matrices import eigenvalues
 from malta.linear.peaks import (
     Crossing,
     Fall,
@@ -30,7 +31,6 @@ from malta.linear.peaks import (
     phase_crossings,
     response_at,
 )
-from malta.linear.sampling import eigenvalues
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem, instability, open_systems
 

@@ -25,8 +25,7 @@ from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.linear.conversion import from_control
 from malta.linear.interconnection import append, connect, gain
-from malta.linear.matrices import balanced_units, system_matrix
-from malta.linear.sampling import eigenvalues
+from malta.linear.matrices import balanced_units, eigenvalues, system_matrix
 from malta.linear.system import System
 from malta.loops.classical import Nominal
 from malta.loops.loop import Loop, loop_along, loop_from

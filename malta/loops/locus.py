@@ -19,7 +19,7 @@ from scipy import optimize
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError, require_known
-from malta.linear.sampling import eigenvalues
+from malta.linear.matrices import eigenvalues
 from malta.loops.linear_loops import LinearLoop, Place, linear_loop
 from malta.model.parameters import units_of
 from malta.model.plant import Plant

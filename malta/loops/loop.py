@@ -16,7 +16,7 @@ import numpy as np
 from malta.arrays import ComplexArray, FloatArray
 from malta.display import Description, display, quantity
 from malta.errors import InputError, require_known
-from malta.linear.sampling import eigenvalues
+from malta.linear.matrices import eigenvalues
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Classical, Nominal, classical_margins
 from malta.loops.sampled_loops import (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from malta.linear.sampling import eigenvalues
+from malta.linear.matrices import eigenvalues
 from malta.loops.loop import loop_of_model
 from malta.model.linearize import linearize
 from malta.model.plants import plant_of

@@ -23,9 +23,9 @@ import numpy as np
 from malta.arrays import ComplexArray, FloatArray, readonly
 from malta.display import display
 from malta.errors import CheckError
-from malta.linear.matrices import system_matrix
+from malta.linear.matrices import eigenvalues, system_matrix
 from malta.linear.peaks import in_plane, response_at
-from malta.linear.sampling import add_lags, eigenvalues, sample, whole_or_not
+from malta.linear.sampling import add_lags, sample, whole_or_not
 from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal

@@ -15,9 +15,8 @@ from typing import Any, Literal
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.linear.matrices import system_matrix
+from malta.linear.matrices import eigenvalues, system_matrix
 from malta.linear.peaks import peak_gain
-from malta.linear.sampling import eigenvalues
 from malta.linear.uncertain import Compensator
 from malta.loops.classical import (
     Classical,

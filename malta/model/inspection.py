@@ -14,18 +14,14 @@ from malta.errors import CheckError, InputError
 from malta.model.currents import _clearance, _limits
 from malta.model.parameters import units_of
 from malta.model.plant import Plant, has_feedthrough
+from malta.model.readings import Observation, read_outputs, rooms_of, sensor_rows, symbols_of
 from malta.model.soundness import (
     KINK,
     ROUNDING,
-    Observation,
     kink_rows,
     motion_of,
     output_slopes,
-    read_outputs,
     rests_of,
-    rooms_of,
-    sensor_rows,
-    symbols_of,
     uncontrolled_rows,
 )
 from malta.model.traced import trace

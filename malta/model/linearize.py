@@ -21,6 +21,7 @@ from malta.errors import CheckError, InputError
 from malta.linear.system import System
 from malta.model.equilibrium import with_command
 from malta.model.plant import OperatingPoint, Plant
+from malta.model.readings import require_readings
 from malta.model.traced import trace
 
 ROUNDING = 1e-14  # of a slope, beside the others of its row and column
@@ -125,7 +126,6 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
         )
     if not np.isfinite(point.x).all() or not np.isfinite(point.u).all():
         raise CheckError(f"{plant.name}: a state or a `preload` is not finite: x = {point.x}, u = {point.u}")
-    from malta.model.soundness import require_readings  # which takes slopes by this module
 
     require_readings(plant)
     point = with_command(plant, point, believed)

@@ -9,7 +9,6 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
-from malta.arguments import is_number
 from malta.display import quantity
 from malta.errors import InputError
 
@@ -208,7 +207,7 @@ def box_words(box: Mapping[str, Any], parameters: Parameters | None = None) -> s
     known = {} if parameters is None else units_of(parameters)
     together: dict[str, list[str]] = {}
     for name, half in box.items():
-        if not is_number(half):
+        if isinstance(half, tuple | list):
             size = f"{half[0]:.4g} to {half[1]:.4g} {known.get(name, '1')}".removesuffix(" 1")
         else:
             size = f"±{quantity(half, units[name]) if name in units else f'{100 * half:.4g} %'}"

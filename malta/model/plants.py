@@ -8,7 +8,7 @@ from typing import Any
 from malta.model.checks import check_numbers
 from malta.model.machines import build_plant, module_of
 from malta.model.plant import Parameters, Plant
-from malta.model.soundness import require_readings
+from malta.model.readings import require_readings
 from malta.model.traced import check_values, is_checked, register
 
 

@@ -35,7 +35,7 @@ from malta.model.parameters import shape_parameters, units_of
 from malta.model.places import place_states
 from malta.model.plant import Plant
 from malta.model.plants import plant_of
-from malta.model.soundness import require_readings
+from malta.model.readings import require_readings
 from malta.simulation import references
 from malta.simulation.divergence import rooms_in, rooms_of
 from malta.simulation.engine.engines import Engine, EngineChoice, engine_of, evaluate, substeps_until

@@ -19,7 +19,7 @@ import numpy as np
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError
-from malta.linear.sampling import eigenvalues
+from malta.linear.matrices import eigenvalues
 from malta.model.linearize import LinearModel, linearize
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller

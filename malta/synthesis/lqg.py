@@ -34,16 +34,8 @@ from scipy import linalg
 
 from malta.arrays import ComplexArray, FloatArray
 from malta.errors import CheckError, InputError
-from malta.linear.matrices import system_matrix
-from malta.linear.sampling import (
-    add_integrals,
-    eigenvalues,
-    sample,
-    sample_cost,
-    split_delay,
-    stored_blocks,
-    whole_or_not,
-)
+from malta.linear.matrices import add_integrals, eigenvalues, system_matrix
+from malta.linear.sampling import sample, sample_cost, split_delay, stored_blocks, whole_or_not
 from malta.model.linearize import LinearModel
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller, Cost, Noise, disturbances, lagging_forces, stored_forces

@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from malta.errors import CheckError, InputError
-from malta.linear.matrices import system_matrix
-from malta.linear.sampling import eigenvalues
+from malta.linear.matrices import eigenvalues, system_matrix
 
 if TYPE_CHECKING:
     from malta.arrays import FloatArray

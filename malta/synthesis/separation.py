@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from malta.arrays import ComplexArray
-from malta.linear.sampling import add_integrals, eigenvalues
+from malta.linear.matrices import add_integrals, eigenvalues
 from malta.processes import on_one_thread
 from malta.synthesis.controller import Controller
 

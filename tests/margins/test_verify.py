@@ -11,7 +11,7 @@ import pytest
 
 import malta
 from malta.gains.writing import require_stable
-from malta.linear.sampling import eigenvalues
+from malta.linear.matrices import eigenvalues
 from malta.loops.sampled_loops import machine_loop, sampled_loop
 from malta.margins.loop_report import BANDWIDTHS, zone
 

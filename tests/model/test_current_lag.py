@@ -15,7 +15,8 @@ from scipy import linalg
 
 import malta
 from malta.errors import InputError
-from malta.linear.sampling import add_integrals, delay_inputs, eigenvalues, sample, sample_cost
+from malta.linear.matrices import add_integrals, eigenvalues
+from malta.linear.sampling import delay_inputs, sample, sample_cost
 from malta.loops.sampled_loops import machine_loop, sampled_loop
 from malta.simulation.inputs import lagging_references
 from malta.synthesis.controller import Controller

@@ -11,7 +11,8 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 import malta
-from malta.linear.sampling import eigenvalues, sample, sample_noise
+from malta.linear.matrices import eigenvalues
+from malta.linear.sampling import sample, sample_noise
 from malta.loops.sampled_loops import sampled_loop
 from malta.synthesis.law import law
 from malta.synthesis.linear_law import linear_law

@@ -15,7 +15,8 @@ from scipy import linalg
 from scipy.integrate import quad_vec
 
 import malta
-from malta.linear.sampling import delay_inputs, eigenvalues, sample, sample_cost, sample_noise
+from malta.linear.matrices import eigenvalues
+from malta.linear.sampling import delay_inputs, sample, sample_cost, sample_noise
 from malta.synthesis import riccati
 from malta.synthesis.riccati import RESIDUAL, Solver, care, dare
 

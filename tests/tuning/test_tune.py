@@ -17,7 +17,7 @@ from conftest import ROOT, Run, refusal
 
 import malta
 from malta import gains, report
-from malta.linear.sampling import eigenvalues
+from malta.linear.matrices import eigenvalues
 from malta.loops.sampled_loops import machine_loop
 from malta.loops.time_domain import noise_of, noise_variance
 from malta.machines.tubular.requirements import DRIVE

@@ -19,7 +19,7 @@ from malta.errors import CheckError, InputError
 from malta.files import shipped_path
 from malta.identification.learn import learn
 from malta.identification.log import log_of
-from malta.linear.sampling import add_integrals
+from malta.linear.matrices import add_integrals
 from malta.loops.loop import loop_of_model
 from malta.loops.parametric_plants import of_plant
 from malta.loops.time_domain import PLACES, Deviation, noise_of, recovery
