@@ -384,8 +384,8 @@ def digest(content: dict[str, object]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def content_of(path: Path) -> dict[str, Any]:
-    """The JSON of a certificate. Raises Unreadable for what is none, and for pipes and devices."""
+def json_of(path: Path) -> DocumentValue:
+    """The JSON of a certificate of any version. Raises Unreadable for what is none, and for pipes and devices."""
     try:
         if not (path.is_file() or path.is_dir()) and path.exists():
             raise Unreadable(path, "", "a pipe or a device", "a certificate")
@@ -400,14 +400,22 @@ def content_of(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise Unreadable(path, "", f"no JSON ({str(error)[:80]})", "a certificate") from error
     f = DocumentValue(path, "", content)
-    if f["format"].value == FORMAT and f["version"].value in OLD_VERSIONS:
+    if f["format"].value != FORMAT:
+        raise f["version"].wrong(f"{FORMAT}, version {VERSION}")
+    return f
+
+
+def content_of(path: Path) -> dict[str, Any]:
+    """The JSON of a certificate. Raises Unreadable as `json_of`, and for other versions."""
+    f = json_of(path)
+    if f["version"].value in OLD_VERSIONS:
         found = f"{f['version'].value}, of a machine without its loads"
         raise Unreadable(
-            path, "version", found, f"{VERSION}: `malta verify GAINS --certificate` writes it anew"
+            path, "version", found, f"{VERSION}: `malta verify GAINS --renew {path.name}` proves it anew"
         )
-    if f["format"].value != FORMAT or f["version"].value != VERSION:
+    if f["version"].value != VERSION:
         raise f["version"].wrong(f"{FORMAT}, version {VERSION}")
-    assert isinstance(content, dict)
+    content: dict[str, Any] = f.value
     return content
 
 

@@ -73,6 +73,10 @@ def verify(
         Path | None,
         typer.Option(metavar="CERTIFICATE", help="Write the proof of the margin, for `malta check`."),
     ] = None,
+    renew: Annotated[
+        Path | None,
+        typer.Option(metavar="CERTIFICATE", help="Prove a certificate anew, as one of an older version."),
+    ] = None,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder for the figures (.png).")] = None,
     design: DesignFile = None,
     identified: Annotated[
@@ -110,6 +114,7 @@ def verify(
     plant = plant_of(change_machine(parameters, change))
     published = published_figures(plant.name)
     box = measured.shares if measured else read_uncertainty(gains, uncertain, plant.parameters)
+    certificate = _certificate_of(certificate, renew)
     _require_options(time, certificate, proof=not no_proof)
     spec = find_design(gains, controller, design)
     try:
@@ -163,6 +168,20 @@ def _read_identified(
         f"{path}: margins count in 95 % intervals; all parameters together are within {joint:.0f} % of them"
     )
     return data
+
+
+def _certificate_of(certificate: Path | None, renew: Path | None) -> Path | None:
+    """Where the certificate goes. Raises InputError for one to renew that is none, and for two places."""
+    if renew is None:
+        return certificate
+    if certificate is not None:
+        raise InputError("--renew", "", "--certificate too", "one of them")
+    from malta.checker.file import json_of
+    from malta.proof.certificate import refused_as_input
+
+    with refused_as_input():
+        json_of(renew)
+    return renew
 
 
 def _require_options(time: float | None, certificate: Path | None, *, proof: bool) -> None:

@@ -385,7 +385,7 @@ def test_numbers_that_no_gain_file_may_have_are_those_of_the_design(
     def refuse(path: Path) -> None:
         raise InputError(path, "feedforward.v0", "up to [9.0]", "at most limits.force, [8.0]")
 
-    monkeypatch.setattr(gains, "read", refuse)
+    monkeypatch.setattr("malta.gains.stable.read_stable", refuse)
     code, _, err = run("design", "design/table2.toml", "--out", tmp_path, "--figures", tmp_path)
     said = "design/table2.toml: feedforward.v0: found up to [9.0], expected at most limits.force, [8.0]"
     assert (code, one_sentence(err)) == (2, said)

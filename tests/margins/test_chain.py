@@ -38,7 +38,7 @@ from malta.margins.verify import MACHINE_STAGE, SAMPLED_STAGE, compensators, lin
 from malta.model.linearize import linearize
 from malta.model.plants import plant_of
 from malta.proof.blocks.gain import Gain
-from malta.proof.robust import robust_margin
+from malta.proof.robust import UNSTABLE_TEXT, robust_margin
 from malta.report.figures.margins import chain_figure
 
 if TYPE_CHECKING:
@@ -104,9 +104,12 @@ def test_margins_go_where_the_chain_says(name: str) -> None:
     for link in found.chain:
         assert link.margin.lower is not None
         assert link.margin.lower <= link.margin.upper <= 1.0011 * link.margin.lower
-    assert found.travel.lower is not None
-    assert found.travel.lower <= min(place.margin.upper for place in found.places)
-    expected = {"table2": (5 / 3, 0.334), "calibrated": (3.0, 1.62)}[name]
+    if name == "table2":  # its integrals do not hold it against the slope of the cogging at 10 mm
+        assert (found.travel.lower, found.travel.upper, found.travel.reason) == (0.0, 0.0, UNSTABLE_TEXT)
+    else:
+        assert found.travel.lower is not None
+        assert found.travel.lower <= min(place.margin.upper for place in found.places)
+    expected = {"table2": (5 / 3, 0.1414), "calibrated": (3.0, 1.62)}[name]
     assert (by_name["LQR"].margin.upper, by_name["sampled"].margin.upper) == pytest.approx(expected, rel=0.01)
 
 

@@ -561,6 +561,19 @@ def test_a_first_look_without_the_proof(run: Run) -> None:
     assert (code, err) == (0, "")
     assert "not proven" in out
     assert run("verify", str(HALBACH), "--no-proof", "--certificate", "c.json")[0] == 2
+
+
+def test_an_old_certificate_is_renewed_in_its_place(run: Run, tmp_path: Path) -> None:
+    """It says what it does not cover; `--renew` proves it anew, and takes nothing but certificates."""
+    old = tmp_path / "old.json"
+    old.write_text('{"format": "malta margin certificate", "version": 2}')
+    code, _, err = run("check", str(old))
+    assert (code, "of a machine without its loads" in err, "--renew old.json" in err) == (2, True, True)
+    assert run("verify", str(HALBACH), "--uncertain", "b=20%", "--renew", str(old))[0] == 0
+    assert run("check", str(old))[0] == 0
+    code, _, err = run("verify", str(HALBACH), "--renew", str(HALBACH))
+    assert (code, "format: found nothing" in err) == (2, True)
+    assert run("verify", str(HALBACH), "--renew", str(old), "--certificate", "c.json")[0] == 2
     assert run("verify", str(HALBACH), "--time", "0")[0] == 2
 
 
