@@ -264,6 +264,9 @@ def test_each_parameter_alone(name: str) -> None:
     c = gains.read(f"design/gains/{name}.json")
     plant = plant_of(c.parameters)
     system, law = machine_system(plant, c, list(BOX), {"z": -15e-3})
+    if name == "table2":  # unstable at 10 mm whatever its parameters
+        assert all(side.upper == 0.0 for sides in chain_of(name).tolerance.values() for side in sides)
+        return
     for i, (key, sides) in enumerate(chain_of(name).tolerance.items()):
         for sign, margin in zip((-1, 1), sides, strict=True):
             assert margin.lower is not None
@@ -275,7 +278,9 @@ def test_each_parameter_alone(name: str) -> None:
                 beyond[i] *= 1 + sign * 0.2 * margin.upper
                 there, _ = machine_system(plant, c, [*BOX, "z"], {"z": 0.0})
                 assert margin.witness is not None
-                beyond = np.r_[beyond, margin.witness["z"]]
+                assert there.derived is not None
+                z = margin.witness["z"]
+                beyond = np.r_[beyond, z, there.derived.values(z)]
                 assert instability(there, law, beyond)[0] > 0
     heavier = chain_of(name).mass
     assert heavier is not None
@@ -316,7 +321,7 @@ def test_cogging_that_is_stiffer_than_the_axial_loop_shows() -> None:
     by_name = {link.name: link.peak for link in found.chain}
     assert by_name["+ current loops"] == pytest.approx(6.93, abs=0.01)
     assert by_name[SAMPLED_STAGE] == pytest.approx(36.0, abs=0.1)
-    assert [math.isnan(place.peak) for place in found.places] == [False, False, True, True]
+    assert [math.isnan(place.peak) for place in found.places] == [False, False, True, False]
     quiet = plant_of(replace(c.parameters, F_c=0.0))
     smooth = replace(c, feedforward=replace(c.feedforward, v0=c.feedforward.v0 * [1, 1, 1, 1, 0]))
     assert robustness(quiet, smooth, BOX, proof=False).chain[-1].peak == pytest.approx(6.93, abs=0.02)
@@ -538,8 +543,8 @@ def test_margins_without_parameters_are_the_smallest_along_the_travel(name: str)
         for z in (-15e-3, -10e-3, -5e-3, 0.0, 5e-3, 10e-3, 15e-3)
     ]
     found = chain_of(name)
-    if name == "table2":  # unstable at 10 and 15 mm under its cogging
-        assert [loop.stable for loop in loops[3:]] == [True, True, False, False]
+    if name == "table2":  # unstable at 10 mm under its cogging
+        assert [loop.stable for loop in loops[3:]] == [True, True, False, True]
         assert (found.disks, found.gang) == ((), {})
         return
     places = [classical_margins(loop, SENSORS) for loop in loops]
