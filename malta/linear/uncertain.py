@@ -62,6 +62,7 @@ class UncertainSystem:
     positive : a casadi.Function p -> values that are above zero wherever `matrices` hold; None: they hold everywhere
     ends : what happens where each of these is not, in words
     derived : the last parameters, where these follow another one
+    left_out : what of a machine the matrices have not, in words; "": nothing
 
     >>> import malta
     >>> def motor(J, b):
@@ -81,6 +82,7 @@ class UncertainSystem:
     positive: ca.Function | None = None
     ends: tuple[str, ...] = ()
     derived: Derived | None = None
+    left_out: str = ""
 
     def spread(self, over: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
         """The intervals of some parameters, with those of the parameters that follow one of them.

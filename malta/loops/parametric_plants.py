@@ -132,6 +132,32 @@ def of_plant(
     )  # fmt: skip
 
 
+MIN_DEAR_STATES = (
+    6  # of a machine, from which on a parameter and its inverse in one entry are too many places
+)
+
+
+def is_dear(system: UncertainSystem) -> bool:
+    """Whether an entry of A has a parameter and its inverse, as a stiffness that the weight changes: c k / m + d m / k.
+
+    No expansion in p or in 1 / p holds over more than some percent of such a parameter.
+    """
+    if system.matrices.size1_out(0) < MIN_DEAR_STATES or not program(system.matrices).rational:
+        return False
+    try:
+        A = rational.symbolic(program(system.matrices)).entries[0]
+    except (TooLarge, NotAnalytic):
+        return False
+    for r in A.values():
+        if r.den is None:
+            continue
+        powers, below = zip(*r.num.monoms(), strict=True), zip(*r.den.monoms(), strict=True)
+        for own, under in zip(powers, below, strict=True):
+            if min(own) < min(under) and max(own) > max(under):
+                return True
+    return False
+
+
 def _command_at(plant: Plant, x: FloatArray, believed: Plant | None, loaded: bool) -> FloatArray:
     """The command at rest at nominal parameters. Raises CheckError where none holds the machine."""
     point = balance(plant, x) if loaded else plant.at(**position_at(plant, x))

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -30,7 +30,7 @@ from malta.linear.system import System
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.loops.classical import Nominal
 from malta.loops.feedforward_along import along_stroke, slopes_along
-from malta.loops.parametric_plants import held_gain, of_plant
+from malta.loops.parametric_plants import held_gain, is_dear, of_plant
 from malta.loops.windings import (
     Caught,
     CurrentControl,
@@ -479,6 +479,11 @@ def machine_system(
     return system, machine_law(plant, controller, current_loops, use=use, point=plant.at(**at))
 
 
+LOADS_LEFT_OUT = (
+    "without the slopes that its forces have under its loads at rest, which take too long to enclose"
+)
+
+
 @lru_cache(maxsize=16)  # every controller of a machine has it; plants compare by identity
 def _commanded_system(
     plant: Plant, believed: Plant, names: tuple[str, ...], at: tuple[tuple[str, float], ...], driven: bool
@@ -490,7 +495,11 @@ def _commanded_system(
     states = dict(at)
     H = held_gain(believed, states) if is_commutated(believed) else None
     windings = windings_of(plant, believed, plant.at(**states), force_modes(believed)) if driven else None
-    system = of_plant(plant, names, at=states, believed=believed, held=H, late=True, windings=windings)
+    made = partial(of_plant, plant, names, at=states, believed=believed, held=H, late=True, windings=windings)
+    system = made()
+    if is_dear(system):
+        limits = {"positive": system.positive, "ends": system.ends}
+        system = replace(made(loaded=False), left_out=LOADS_LEFT_OUT, **limits)
     return system, H
 
 

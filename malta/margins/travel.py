@@ -40,6 +40,7 @@ from malta.proof.robust import (
     problem_of,
     rank_of,
     robust_margin,
+    without,
 )
 from malta.proof.weak_coupling import HeldLoop
 from malta.proof.weak_coupling.held_currents import held_machine
@@ -261,7 +262,7 @@ def travel_margin(
     along = _margin_along if controller.schedule is None else _scheduled_margin
     begun = clock.monotonic()
     found, ended = in_rounds(effort.limits, partial(along, loop, ranges, progress), rank_of)
-    return replace(found, seconds=clock.monotonic() - begun, work=ended.work)
+    return without(loop.loops[0][0], replace(found, seconds=clock.monotonic() - begun, work=ended.work))
 
 
 def _margin_along(

@@ -289,7 +289,13 @@ def robust_margin(
     over = by_name("robust_margin", "over", {} if over is None else over, '{"k": (1, 2)}')
     named, law, ranges = _either_form(system, compensator, ranges, over)
     box = box_of(named.names, named.nominal, named.limits, ranges, named.spread(over))
-    return margin_of(problem_of(named, law), within_branches(box, named), effort)
+    return without(named, margin_of(problem_of(named, law), within_branches(box, named), effort))
+
+
+def without(system: UncertainSystem, found: Margin) -> Margin:
+    """The margin, which says what the system leaves out of its machine."""
+    reason = "; ".join(filter(None, (system.left_out, found.reason)))
+    return replace(found, reason=reason) if system.left_out else found
 
 
 def _either_form(
