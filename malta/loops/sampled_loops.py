@@ -498,8 +498,8 @@ def _commanded_system(
     made = partial(of_plant, plant, names, at=states, believed=believed, held=H, late=True, windings=windings)
     system = made()
     if is_dear(system):
-        limits = {"positive": system.positive, "ends": system.ends}
-        system = replace(made(loaded=False), left_out=LOADS_LEFT_OUT, **limits)
+        light = made(loaded=False)
+        system = replace(light, left_out=LOADS_LEFT_OUT, positive=system.positive, ends=system.ends)
     return system, H
 
 
