@@ -250,3 +250,14 @@ def test_what_is_proven_of_any_machine_is_its_loop() -> None:
     proven = [check_box(random_axis(rng), 200, rng) for _ in range(16)]
     assert sum(x > 0 for x in proven) >= 10
     assert math.isfinite(max(proven))
+
+
+def test_what_is_too_dear_to_enclose_is_named() -> None:
+    """A rotor whose weight adds to the stiffness of its bearings as m / k_s: that slope is left out, and said."""
+    spec = malta.read_design("examples/rotor/design/rotor.toml")
+    law = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    system, _ = malta.loop(spec.plant, law).uncertain(("m", "k_s"))
+    assert system.left_out.startswith("without the slopes")
+    assert "nothing holds it at rest within the limit of i_Ay" in system.ends  # limits at rest are in it
+    without, _ = malta.loop(spec.plant, law).uncertain(("k_i",))
+    assert without.left_out == ""
