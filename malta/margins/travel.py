@@ -294,6 +294,7 @@ def _margin_along(
 
 SCANNED = 129  # places of the travel at which a witness is looked for
 JUST_BEYOND = 1e-3  # of its distance, at which a witness is unstable
+HALVINGS = 24  # of the way to a loss at a position
 REACHES = 24  # of boxes beyond a witness that no place has, up to the limit of the search
 NOWHERE_TEXT = "what is unstable has values that no position has together"
 
@@ -313,23 +314,25 @@ def at_a_place(system: UncertainSystem, law: Compensator, box: Box, found: Margi
     places[:, index] = np.linspace(first, end, SCANNED)
     places[:, -len(derived.intervals) :] = [derived.values(z) for z in places[:, index].tolist()]
 
-    def unstable(t: float) -> Any:
-        rows = places if found.upper == 0 else box.stretch(places, t / found.upper)
-        values = instability(system, law, rows)
-        return rows[int(values.argmax())] if values.max() >= 0 else None
+    def at(t: float, rows: FloatArray) -> FloatArray:
+        return box.stretch(rows, t / found.upper) if found.upper else rows
 
-    beyond = (
-        np.geomspace(found.upper * (1 + JUST_BEYOND), max(box.limit, 2e-9), REACHES).tolist()
-        if found.upper
-        else [0.0]
-    )
-    for t in [t for t in beyond if t <= box.limit]:
-        if (p := unstable(t)) is not None:
-            upper = found.upper if t == beyond[0] else t
-            named = {name: x for name, x in zip(box.names, p.tolist(), strict=True) if name in own}
-            moved = {name: x - c for (name, x), c in zip(named.items(), box.nominal.tolist(), strict=False)}
-            shares = {name: x for name, x in found.sensitivity.items() if name in own}
-            return replace(found, upper=upper, witness=named, moved=moved, sensitivity=shares)
+    last = max(box.limit, 2 * found.upper)
+    for t in np.geomspace(found.upper * (1 + JUST_BEYOND), last, REACHES) if found.upper else [0.0]:
+        values = instability(system, law, at(t, places))
+        if t > box.limit or values.max() < 0:
+            continue
+        place, low, high = places[[int(values.argmax())]], found.upper, float(t)
+        for _ in range(HALVINGS if high > low else 0):
+            middle = (low + high) / 2
+            low, high = (
+                (low, middle) if instability(system, law, at(middle, place))[0] >= 0 else (middle, high)
+            )
+        (p,) = at(high, place)
+        named = {name: x for name, x in zip(box.names, p.tolist(), strict=True) if name in own}
+        moved = {name: x - c for (name, x), c in zip(named.items(), box.nominal.tolist(), strict=False)}
+        shares = {name: x for name, x in found.sensitivity.items() if name in own}
+        return replace(found, upper=high, witness=named, moved=moved, sensitivity=shares)
     reason = "; ".join(filter(None, (found.reason, NOWHERE_TEXT)))
     return replace(
         found, upper=math.inf, frequency=None, witness=None, moved={}, sensitivity={}, reason=reason,
