@@ -501,16 +501,15 @@ def scheduled() -> Figure:
 def bending() -> Figure:
     """How much larger the mover's first bending mode may be, as a block, over its frequency; gain file robust."""
     from malta.machines.tubular.bending import bending_block, first_bending
-    from malta.margins.travel import travel_loops
 
     controller = malta.gains.read("design/gains/robust.json")
     own: Any = controller.parameters
-    ((system, law),), over = travel_loops(malta.plant_of(own), controller, ("m",))
+    system, law = malta.loop(malta.plant_of(own), controller).uncertain(("m",))
     frequencies = np.array([8e3, 12e3, 16e3, 20e3, 24e3, 28e3])
     figure, (axes,) = new_figure(width=5.0, height=3.0)
     for zeta, style in ((0.005, STYLES[0]), (0.02, STYLES[1])):
         blocks = [bending_block(own, system, (0, 2), w, zeta) for w in frequencies]
-        proven = [malta.dynamic_margin(system, law, {}, block, over=over).lower for block in blocks]
+        proven = [malta.dynamic_margin(system, law, {}, block).lower for block in blocks]
         axes.loglog(frequencies / (2e3 * np.pi), proven, marker="o", label=f"damping {zeta:.1%}", **style)
     axes.axhline(1, color="#b5432a", linewidth=1, linestyle="--", label="the mode itself")
     for E, text in ((30e9, "30 GPa"), (160e9, "160 GPa")):

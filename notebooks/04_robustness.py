@@ -54,24 +54,29 @@ lqr = {name: result.chain[0].margin.upper for name, result in found.items()}
 machine = {name: result.travel for name, result in found.items()}
 assert abs(lqr["table2"] - 5 / 3) < 1e-3 * 5 / 3
 assert abs(lqr["calibrated"] - 3) < 0.03
-assert machine["table2"].upper < 0.34
+assert machine["table2"].upper == 0
+assert found["table2"].chain[-1].margin.upper < 0.15
 assert machine["robust"].lower is not None
 assert machine["robust"].lower >= 3.5
 
 # %% [markdown]
 # **Judgement.** The claimed 300 % is that of full state feedback with a gain four times as stiff as the attraction
 # pulls (`calibrated`). The observer takes half of it, and with the printed noise (`table2`) it takes all but a third
-# of the box. Current loops, hold and delay cost little after that. `robust` has a fast observer for the bearings and
-# a slow one for the noisy axial sensor. It was tuned with first-order lags in place of the current controllers, and
-# keeps more than the claim with these lags (`sampled`); with the PI controllers of the machine (`machine`) its margin
-# is a little smaller. Margins are without the loads; |S| of the last stage is with them, and shows that the axial
-# loop of `table2` is softer than the cogging that v0(z) cancels.
+# of the box. `robust` has a fast observer for the bearings and a slow one for the noisy axial sensor. It was tuned
+# with first-order lags in place of the current controllers, and keeps the claim with these lags (`sampled`) and with
+# the PI controllers of the machine (`machine`).
+#
+# From `sampled` on the machine rests under its loads, against v0(z). `table2` holds the axis z with 10.8 N/m, and a
+# force constant K_D that is off by 2.8 % leaves 6 N/m of the 209 N/m of the cogging: 14 % of the box are left in
+# the middle. Between the corners of v0(z) up to 10.96 N/m are left without any error: over the travel it has no
+# margin at all.
 
 # %% [markdown]
 # ## A witness flies
 # The nonlinear machine should agree with the eigenvalues: just inside the boundary of stability the answer to a small
 # step dies out, just beyond the boundary it grows. The simulation has the current controllers of the gain file, as
-# the proof does, and no loads.
+# the proof does, and no loads: these witnesses are lost at a radial axis, which cogging does not touch, and a weight
+# that differs from v0 would hide the step.
 
 # %%
 nominal: Any = plant.parameters
