@@ -32,6 +32,7 @@ from malta.synthesis.controller import Controller
 GRID, COARSE_STEP = 25, 4  # values of each parameter; every so many of them are looked at first
 BOX_FACTORS = (0.97, 1.0, 1.01, 1.03)  # of the proven box: values beside those of the grid
 MOST_PLACES = 9  # ends and middle of what does not grow with the margin
+DERIVED_PLACES = 9  # of a parameter that others follow, as the position that a cogging has
 MOST_SIDES = 9  # corners and middle of the box of the parameters that are not drawn
 MIN_SIZE, MAX_SIZE, LOSS_FACTOR = 1.5, 8.0, 1.6  # of the box: the map; times the lost margin
 ROOM = 1e-3  # of a nominal value, to a limit of its parameter
@@ -88,9 +89,22 @@ class Plane:
 
     def _ends(self, system: UncertainSystem) -> list[tuple[tuple[float, ...], FloatArray]]:
         """Ends and middles of the intervals that do not grow, each with all sides of the box of the others."""
-        ranges = [ends for name, ends in self.over.items() if name in system.names]
-        places = itertools.product(*((low, high, (low + high) / 2) for low, high in ranges))
-        return [*itertools.product(itertools.islice(places, MOST_PLACES), _sides(len(self.names) - 2))]
+        derived = system.derived
+        free = {n: ends for n, ends in self.over.items() if n in system.names}
+        if derived is not None:
+            free = {n: ends for n, ends in free.items() if n not in derived.intervals}
+        each = (
+            np.linspace(low, high, DERIVED_PLACES).tolist()
+            if derived is not None and name == derived.of
+            else (low, high, (low + high) / 2)
+            for name, (low, high) in free.items()
+        )
+        places = []
+        for values in itertools.islice(itertools.product(*each), MOST_PLACES):
+            at = dict(zip(free, values, strict=True))
+            at |= derived.at(at[derived.of]) if derived is not None and derived.of in at else {}
+            places.append(tuple(at[name] for name in self.over if name in system.names))
+        return [*itertools.product(places, _sides(len(self.names) - 2))]
 
     def _rows(
         self, system: UncertainSystem, points: FloatArray, place: tuple[float, ...], side: FloatArray
