@@ -32,20 +32,25 @@ from malta.model.plant import Plant
 from malta.model.plants import plant_of
 from malta.synthesis.controller import Controller, Feedforward
 
+ROUNDING = 1e-9  # of the largest v0, and of its steepest slope: what a table has of rounding
+
 
 @dataclass(frozen=True, eq=False)
 class SlopesAlong:
     """The slopes of v0 along the stroke: of the forces that have some."""
 
     forces: tuple[int, ...]
-    names: tuple[str, ...]  # of the parameters e
+    rough: tuple[int, ...]  # of these, where the table differs from s by more than rounding
+    names: tuple[str, ...]  # of the parameters e of these
     s: ca.Function  # z -> slopes, N/m
     error: FloatArray  # of each, N/m: the largest |e|
     table: Feedforward
 
     def at(self, z: float) -> FloatArray:
         """The parameters e at a position: the slope of the table there, less s(z)."""
-        return np.asarray(self.table.slope(z)[list(self.forces)] - np.array(self.s(z)).ravel())
+        return np.asarray(self.table.slope(z)[list(self.forces)] - np.array(self.s(z)).ravel())[
+            list(self.rough)
+        ]
 
 
 @lru_cache(maxsize=16)  # plants and controllers compare by identity
@@ -54,10 +59,9 @@ def slopes_along(plant: Plant, controller: Controller) -> SlopesAlong | None:
     grid, v0 = controller.feedforward.z_grid, controller.feedforward.v0
     if not plant.has_stroke or len(grid) < 2:
         return None
-    forces = tuple(np.flatnonzero(np.ptp(v0, axis=0) > 0).tolist())
+    forces = tuple(np.flatnonzero(np.ptp(v0, axis=0) > ROUNDING * np.abs(v0).max()).tolist())
     if not forces:
         return None
-    names = tuple(f"dv0_{plant.inputs[k].name}" for k in forces)
     table = grid, v0[:, list(forces)]
     s = _believed_slopes(plant_of(controller.parameters), forces)
     error = _differences(s, *table, plant.stroke.travel)
@@ -65,7 +69,10 @@ def slopes_along(plant: Plant, controller: Controller) -> SlopesAlong | None:
         z = ca.SX.sym("z")
         s = ca.Function("s", [z], [ca.SX.zeros(len(forces))])
         error = _differences(s, *table, plant.stroke.travel)
-    return SlopesAlong(forces, names, s, readonly(error), controller.feedforward)
+    steepest = np.abs(np.diff(table[1], axis=0) / np.diff(grid)[:, None]).max()
+    rough = tuple(np.flatnonzero(error > ROUNDING * steepest).tolist())
+    names = tuple(f"dv0_{plant.inputs[forces[k]].name}" for k in rough)
+    return SlopesAlong(forces, rough, names, s, readonly(error[list(rough)]), controller.feedforward)
 
 
 def _believed_slopes(believed: Plant, forces: tuple[int, ...]) -> ca.Function:
@@ -110,7 +117,10 @@ def along_stroke(system: UncertainSystem, plant: Plant, slopes: SlopesAlong | No
     A, B, C, *rest = (ca.SX(M) for M in system.matrices.call([own]))
     if slopes is not None:
         readings = len(plant.outputs)
-        more: Any = (slopes.s(z) + p[len(system.names) :]) @ C[plant.stroke_output, :]
+        along: Any = slopes.s(z)
+        for k, index in enumerate(slopes.rough):
+            along[index] += p[len(system.names) + k]
+        more: Any = along @ C[plant.stroke_output, :]
         C = ca.vertcat(C[:readings, :], more, C[readings:, :])
     above = [] if system.positive is None else [system.positive(own)]
     found = _without_waves(

@@ -167,7 +167,7 @@ class Loop:
         return classical_margins(self.nominal, [s.name for s in self.plant.outputs])
 
     def uncertain(self, names: Sequence[str]) -> tuple[UncertainSystem, Compensator]:
-        """The loop without loads in parameters by name: the arguments of malta.robust_margin and its like.
+        """The loop at rest under its loads in parameters by name: the arguments of malta.robust_margin and its like.
 
         names : of the machine's parameters
         """

@@ -15,11 +15,13 @@ for a proof: an operation that no enclosure knows keeps every proof away from su
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from flint.utils.flint_exceptions import DomainError
 
 from malta.arrays import FloatArray
 from malta.linear import rational
@@ -361,6 +363,13 @@ class _RestEquations(NamedTuple):
             )
             for part, least in ((top, powers), (below, powers_below))
         )
+        size = top.leading_coefficient() / below.leading_coefficient()
+        roots = [_perfect_root(part / part.leading_coefficient()) for part in (top, below)]
+        if None not in roots and size > 0:
+            whole = self._expression(Ratio(roots[0]) / Ratio(roots[1]))
+            sign = 1 if float(ca.Function("x", [unknowns.p], [whole])(unknowns.nominal)) > 0 else -1
+            found = before * math.sqrt(int(size.p) / int(size.q)) * sign * whole
+            return found, [] if whole.is_constant() else [Condition(sign * whole)]
         rest = self._expression(Ratio(top) / Ratio(below))
         return before * ca.sqrt(rest), [] if rest.is_constant() else [Condition(rest)]
 
@@ -376,6 +385,14 @@ class _RestEquations(NamedTuple):
             rest = tuple(0 if first <= k < end else e for k, e in enumerate(monomial))
             parts.setdefault(power, {})[rest] = c
         return {power: Ratio(self.s.context.from_dict(terms)) for power, terms in parts.items()}
+
+
+def _perfect_root(polynomial: Any) -> Any | None:
+    """The polynomial whose square this one is; None where it is none."""
+    try:
+        return polynomial.sqrt()
+    except DomainError:
+        return None
 
 
 def _resolve_roots(s: Symbolic, r: Ratio) -> Ratio:

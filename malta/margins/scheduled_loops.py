@@ -271,8 +271,10 @@ def loops_between_places(
         return f"a delay of {delay + part:g} samples, which are not whole"
     found = []
     for a, b in schedule.cells:
-        there = plant_along(plant, variable, (a + b) / 2)
-        system = of_plant(there, [*names, variable], believed=plant_of(controller.parameters), late=True)
+        there, believed = (
+            plant_along(one, variable, (a + b) / 2) for one in (plant, plant_of(controller.parameters))
+        )
+        system = of_plant(there, [*names, variable], believed=believed, late=True)
         law, channels = law_between(controller, schedule.at(a), schedule.at(b), delay)
         found.append(
             ScheduleCell(_with_channels(system, plant.actuator.crossover, (a, b), channels), law, (a, b))
@@ -281,7 +283,7 @@ def loops_between_places(
 
 
 def plant_along(plant: Plant, variable: str, place: float) -> Plant:
-    """The same machine, whose states count from rest where an output is at a place, a parameter of its name."""
+    """The same machine, its states and readings from rest where an output is at a place, a parameter of its name."""
     unit = next(s.unit for s in plant.outputs if s.name == variable)
     own = type(plant.parameters)
     record: Any = make_dataclass(
@@ -310,10 +312,14 @@ def _move_plant(plant: Plant, variable: str, par: Any) -> Plant:
         parameters=par,
         variant=lambda other: _move_plant(plant, variable, other),
         f=lambda x, u, w: base.f(there(x), u, w),
-        h=lambda x, u: base.h(there(x), u),
+        h=lambda x, u: base.h(there(x), u) - y,
         load=lambda x: base.load(there(x)),
         preload=lambda x: base.preload(there(x)),
-        actuator=replace(base.actuator, forces=lambda x, i: base.actuator.forces(there(x), i)),
+        actuator=replace(
+            base.actuator,
+            forces=lambda x, i: base.actuator.forces(there(x), i),
+            currents=lambda read, v: base.actuator.currents(read + y, v),
+        ),
         stroke=replace(base.stroke, name="", thrust=""),
         over={},
     )

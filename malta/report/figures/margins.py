@@ -73,7 +73,7 @@ def chain_figure(found: LoopReport, path: str | Path | None = None) -> Figure:
     >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
     >>> figure = malta.report.chain_figure(found)
     >>> [axes.get_xlabel() for axes in figure.axes]
-    ['proven margin without loads [% of the box]', 'peak |S| [-], zones of ISO 14839-3']
+    ['proven margin [% of the box]', 'peak |S| [-], zones of ISO 14839-3']
     """
     if not found.chain:
         raise InputError(found.controller.name, "stages", "none", "a report of malta.verify with stages=True")
@@ -136,7 +136,7 @@ def _draw_stages(left: Axes, right: Axes, found: LoopReport) -> None:
         _legend(left)
     named = ("of a stage", "of the machine, under its loads")
     _legend(right, 1.07, [Patch(label=label, **look) for look, label in zip(LOOKS, named, strict=True)])
-    left.set_xlabel("proven margin without loads [% of the box]")
+    left.set_xlabel("proven margin [% of the box]")
     right.set_yticks(range(len(rows)), [""] * len(rows))
     right.tick_params(axis="y", length=0)
     right.set_xlim(0, max(5.6, 1.15 * max(link.peak for link in found.chain if not math.isnan(link.peak))))

@@ -110,7 +110,7 @@ def _requirements(found: LoopReport, spec: Spec) -> Iterator[Table | Paragraph]:
 def chain_table(found: LoopReport) -> Table:
     """Tabulate the parametric margin and the peak sensitivity of each stage, from the ideal loop to the machine's.
 
-    Margins are without the loads; `|S|` of the last stage is that of the machine under its loads.
+    The machine of the last stages is under its loads, in its margins and in `|S|`.
 
     found : from `malta.verify`, with `stages`
 
@@ -338,11 +338,12 @@ def tolerance_table(found: LoopReport) -> Table:
     >>> rich.print(malta.report.tolerance_table(found))
     One at a time, proven
     <BLANKLINE>
-     parameter                   down to        up to   share in the margin
-     ──────────────────────────────────────────────────────────────────────
-     m                          -78.13 %   +1663.93 %                 100 %
-     mass margin, linear loop                1.663 kg
-     payload held at rest                   0.6339 kg
+                                                                   share in the
+     parameter                   down to                   up to         margin
+     ──────────────────────────────────────────────────────────────────────────
+     m                          -78.13 %   +633.88 % and further          100 %
+     mass margin, linear loop                 0.6338 kg and more
+     payload held at rest                              0.6339 kg
     <BLANKLINE>
     """
     anywhere = ["anywhere in the travel"] if found.extent.stroke else []
@@ -401,7 +402,7 @@ def worst_case_table(gains: Mapping[str, Gain]) -> Table:
      y        2.105   3.026 (0.482)          2.112      A
     <BLANKLINE>
     """
-    title = "Worst-case peak |S| over the uncertainty and all that the margin covers, without loads"
+    title = "Worst-case peak |S| over the uncertainty and all that the margin covers"
     table = new_table(title, "sensor", "found", f"at {RADIANS}", "proven below", "zone")
     for name, gain in gains.items():
         found, at = (
@@ -428,7 +429,7 @@ def places_table(found: LoopReport) -> Table:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
     >>> rich.print(malta.report.places_table(found))
-    The machine's loop: margins without the loads, the rest under them
+    The machine's loop under its loads
     <BLANKLINE>
                                             peak        disk,
      at            proven   lost at  rad/s   |S|  zone    all         delay
@@ -445,7 +446,7 @@ def places_table(found: LoopReport) -> Table:
     else:
         title = "In the middle of the travel and at its ends (margin: at the positive one)"
     proven = any(place.margin is not NOT_PROVEN for place in found.places)
-    title += ": margins without the loads, the rest under them" if proven else ", under its loads"
+    title += ", under its loads"
     table = new_table(
         title,
         f"at [{'mm' if extent.stroke else extent.unit}]" if extent.course else "at",

@@ -69,7 +69,7 @@ POLES_AND_LQR: tuple[Row, ...] = (
         "the same, sampled, with observer, delay and current loops",
         "proven percent",
         machine_share,
-        note="proven anywhere in the travel, without loads; the paper's is of full state feedback",
+        note="proven anywhere in the travel, under its loads; the paper's is of full state feedback",
     ),
 )
 LOOPS: tuple[Row, ...] = (
