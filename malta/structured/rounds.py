@@ -7,8 +7,7 @@
 
 What a law is tuned for: systems, an uncertain system, or a machine; its models at parameters, and what proves a law.
 
-A machine's models for goals are its loops under load, as `malta verify` measures them; those for stability are the
-loops without loads that the proof of the margin is of.
+A machine's models for goals and for stability are its loops under load, as `malta verify` measures and proves them.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from malta.linear.uncertain import closed_loop, instability
 from malta.loops.sampled_loops import loaded_model, machine_loop, machine_system
 from malta.margins.travel import place_margin
 from malta.model.parameters import twins_of
+from malta.simulation.experiments.catalogue import settle_feedforward
 
 if TYPE_CHECKING:
     from malta.arrays import ComplexArray
@@ -258,7 +259,7 @@ def test_witnesses_fly(name: str) -> None:
         there = varied(plant, names, values)
         duration = min(max(12 / abs(rate), 400 * c.sample_time), 20.0)
         hold = malta.Scenario("witness", duration, malta.references.hold, start, fidelity=default_of(plant))
-        run = malta.simulate(there, c, hold)
+        run = malta.simulate(there, settle_feedforward(c, there, there.at(**along(there, 0.0)).x), hold)
         tenth = len(run.p) // 10
         off = np.abs(run.p - run.reference).max(axis=1)
         ends.append(

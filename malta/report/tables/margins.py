@@ -394,8 +394,7 @@ def worst_case_table(gains: Mapping[str, Gain]) -> Table:
     >>> system = malta.uncertain(spring, {"k": 4.0})
     >>> gain = malta.worst_case_gain(system, [[-5.0]], {"k": 0.2})
     >>> rich.print(malta.report.worst_case_table({"y": gain}))
-    Worst-case peak |S| over the uncertainty and all that the margin covers, without
-    loads
+    Worst-case peak |S| over the uncertainty and all that the margin covers
     <BLANKLINE>
      sensor   found   at rad/s (Hz)   proven below   zone
      ────────────────────────────────────────────────────

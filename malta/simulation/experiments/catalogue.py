@@ -38,9 +38,9 @@ import numpy as np
 
 from malta.arrays import FloatArray
 from malta.errors import CheckError, InputError
-from malta.model.equilibrium import balance
+from malta.model.equilibrium import balance, with_command
 from malta.model.parameters import units_of
-from malta.model.places import place_states
+from malta.model.places import place_states, position_in
 from malta.model.plant import Plant, Signal
 from malta.model.plants import plant_of
 from malta.model.signal_groups import FINE_UNITS
@@ -184,8 +184,8 @@ def witness_flights(plant: Plant, controller: Controller, witness: Mapping[str, 
 
     witness : values (SI) with which the linear loop is at its limit of stability; an output among them is where it is
 
-    Returns two runs, one inside and one beyond the margin, without the loads that the margin leaves out: weight and
-    cogging.
+    Returns two runs, one inside and one beyond the margin, under the machine's loads. They begin beside rest: v0 of the
+    law is what holds the machine there, as its integrals find it.
 
     Example: `witness_flights(plant, controller, margin.witness)[1].run.verdict`
     """
@@ -213,23 +213,25 @@ def _fly_beside(
     start = {s.name: held.get(s.name, 0.0) + PUSH[s.unit] for s in plant.design_states if s.unit in PUSH}
     options: dict[str, Any] = {"start": start} | _with_fidelity(plant, {})
     at = there.at(**{name: value for name, value in held.items() if name in {s.name for s in there.states}})
-    if not np.array(ca.DM(there.preload(ca.DM(at.x)))).any():  # else a preload carries the loads
-        load = np.array(ca.DM(there.load(ca.DM(at.x)))).ravel()
-        options["disturbance"] = partial(_constant, wrench=-load)
-        feedforward = replace(controller.feedforward, v0=0 * controller.feedforward.v0)
-        controller = replace(controller, feedforward=feedforward)
+    controller = settle_feedforward(controller, there, at.x)
     duration = samples * controller.sample_time
     return simulate(
         there, controller, scenario_of("witness", duration, partial(_hold_at, outputs=held), options)
     )
 
 
+def settle_feedforward(controller: Controller, plant: Plant, x: FloatArray) -> Controller:
+    """The law with v0 moved by what its integrals add until a machine rests at the states x. Raises CheckError."""
+    wanted = with_command(plant, balance(plant, x), plant_of(controller.parameters)).v
+    known = controller.feedforward
+    held = known.at(position_in(plant, x))
+    if known.position.size:
+        held = held + known.position @ x[list(plant.controlled)][: known.position.shape[1]]
+    return replace(controller, feedforward=replace(known, v0=known.v0 + (np.asarray(wanted) - held)))
+
+
 def _hold_at(plant: Plant, outputs: Mapping[str, float]) -> Reference:
     return references.hold(plant, **outputs)
-
-
-def _constant(t: FloatArray, wrench: FloatArray) -> FloatArray:
-    return np.tile(wrench, (len(t), 1))
 
 
 def _leaves(run: Trajectory) -> bool:
