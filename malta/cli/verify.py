@@ -75,7 +75,7 @@ def verify(
     ] = None,
     renew: Annotated[
         Path | None,
-        typer.Option(metavar="CERTIFICATE", help="Prove a certificate anew, as one of an older version."),
+        typer.Option(metavar="CERTIFICATE", help="Prove an older certificate anew."),
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder for the figures (.png).")] = None,
     design: DesignFile = None,
@@ -93,8 +93,8 @@ def verify(
 
     Poles, bandwidths by definition, peak sensitivities with their ISO 14839-3 zones; real parametric margins with
     their proof, from full state feedback to the sampled loop, and over the travel; disk and delay margins, gang of
-    four, tolerance of each parameter; what a constant load of 1 N or 1 N m from outside does; the payload that the
-    forces hold and the mover carries in flight. Last, what the design file asks for, but for what has to be flown.
+    four, tolerance of each parameter; what a constant load of 1 N or 1 N m does; the payload that is held and carried
+    in flight. Last, what the design file asks for, but for what has to be flown.
 
     The machine is the one in the file, with the changes given by --set, as far as they shape the linear loop (on MALTA
     also windings and DC link; the current controllers are those of the gain file). What it leaves out is said.
