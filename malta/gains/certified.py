@@ -257,7 +257,7 @@ def _units_in(own: LoopOrigin, system: UncertainSystem) -> dict[str, str]:
 
 
 def _nominal(plant: Plant, system: UncertainSystem, name: str) -> float:
-    """The value of a parameter of the loop, SI; else of one of the machine."""
+    """The value of a parameter of the loop, SI; else of one of the machine, whose position is 0."""
     if name in system.names:
         return float(system.nominal[system.names.index(name)])
-    return float(getattr(plant.parameters, name))
+    return 0.0 if name == plant.stroke.name else float(getattr(plant.parameters, name))
