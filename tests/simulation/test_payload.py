@@ -80,7 +80,7 @@ def test_verify_calls_a_mass_margin_by_its_name(run: Run) -> None:
         if name in line
     }
     (margin,), (held,), (carried, dropped) = shown.values()
-    assert carried < dropped < held < margin
+    assert carried < dropped < held <= margin  # which ends where the forces hold no more
 
 
 @pytest.mark.slow
