@@ -31,6 +31,11 @@ FIELD: dict[str, Callable[..., Any]] = {  # operations of any field
 }
 
 
+def is_rational_step(name: str, value: float) -> bool:
+    """Whether a step is one of +, -, *, / and whole powers, a constant or an input."""
+    return name in FIELD or name in ("const", "input") or (name == "constpow" and value == round(value))
+
+
 class NotAnalytic(Exception):
     """An operation has no value, or is not analytic, at its arguments."""
 
@@ -57,10 +62,7 @@ class MatrixProgram:
     @cached_property
     def rational(self) -> bool:
         """Whether p enters by +, -, *, / and whole powers alone."""
-        return all(
-            name in FIELD or name in ("const", "input") or (name == "constpow" and value == round(value))
-            for name, _, _, value in self.steps
-        )
+        return all(is_rational_step(name, value) for name, _, _, value in self.steps)
 
     @cached_property
     def short(self) -> bool:
@@ -73,15 +75,20 @@ class MatrixProgram:
         return tuple(sorted({name for name, *_ in self.steps if name not in KNOWN_OPERATIONS}))
 
     @cached_property
-    def depends(self) -> tuple[frozenset[int], ...]:
-        """The parameters on which each matrix depends."""
+    def reach(self) -> tuple[frozenset[int], ...]:
+        """The parameters on which each step depends."""
         on: list[frozenset[int]] = []
         for name, target, operands, _ in self.steps:
             if name == "input":
                 on.append(frozenset({target}))
             else:
                 on.append(frozenset().union(*(on[k] for k in operands)))
-        return tuple(frozenset().union(*(on[k] for _, _, k in entries)) for entries in self.entries)
+        return tuple(on)
+
+    @cached_property
+    def depends(self) -> tuple[frozenset[int], ...]:
+        """The parameters on which each matrix depends."""
+        return tuple(frozenset().union(*(self.reach[k] for _, _, k in entries)) for entries in self.entries)
 
     def only(self, matrices: tuple[int, ...]) -> MatrixProgram:
         """The program of these matrices alone; the others have no entries."""

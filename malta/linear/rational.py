@@ -16,7 +16,7 @@ from flint import Ordering, acb, fmpq_mpoly_ctx
 
 from malta.arrays import FloatArray
 from malta.linear.branches import resolve_branches
-from malta.linear.expressions import FIELD, MatrixProgram, NotAnalytic, exact, program
+from malta.linear.expressions import FIELD, MatrixProgram, NotAnalytic, exact, is_rational_step, program
 from malta.work import check_clock
 
 MAX_TERMS = 4000  # terms of an expression at most
@@ -143,9 +143,7 @@ def symbolic(program: MatrixProgram) -> Symbolic:
     Raises TooLarge for too many terms, and NotAnalytic for a division by an expression that is identically zero.
     """
     atoms = tuple(
-        k
-        for k, (name, _, _, value) in enumerate(program.steps)
-        if not (name in FIELD or name in ("const", "input") or (name == "constpow" and value == round(value)))
+        k for k, (name, _, _, value) in enumerate(program.steps) if not is_rational_step(name, value)
     )
     names = [f"p{i}" for i in range(program.inputs)] + [f"a{k}" for k in atoms]
     context = fmpq_mpoly_ctx.get(names or ["p0"], Ordering.lex)

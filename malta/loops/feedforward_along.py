@@ -25,7 +25,7 @@ import numpy as np
 from malta.arrays import FloatArray, readonly
 from malta.errors import CheckError
 from malta.linear.branches import INTERVALS, SYMBOLS, Interval
-from malta.linear.expressions import FIELD, MatrixProgram, NotAnalytic, program
+from malta.linear.expressions import MatrixProgram, NotAnalytic, is_rational_step, program
 from malta.linear.uncertain import Derived, UncertainSystem
 from malta.loops.parametric_plants import rest_model
 from malta.model.plant import Plant
@@ -165,12 +165,10 @@ def _without_waves(matrices: ca.Function, index: int) -> _StrokeFunctions:
     p, z = ca.SX.sym("p", model.inputs), ca.SX.sym("z")
     column = ca.vertsplit(p)
     column[index] = z
-    values, on, place = model.cells(column, SYMBOLS), list[frozenset[int]](), dict[str, int]()
+    values, place = model.cells(column, SYMBOLS), dict[str, int]()
     steps, waves = list(model.steps), list[Any]()
-    for k, (name, target, operands, power) in enumerate(model.steps):
-        on.append(frozenset({target}) if name == "input" else frozenset().union(*(on[i] for i in operands)))
-        is_rational = name in FIELD or name == "input" or (name == "constpow" and power == round(power))
-        if on[k] == {index} and not is_rational:
+    for k, (name, _, _, power) in enumerate(model.steps):
+        if model.reach[k] == {index} and not is_rational_step(name, power):
             text = str(values[k])
             if text not in place:
                 place[text] = len(waves)

@@ -93,10 +93,9 @@ def rest_of(
     nominal : values of p
     point : rest at nominal parameters
     """
-    m, n = len(plant.inputs), len(plant.states)
+    m = len(plant.inputs)
     u = ca.SX.sym("u", m)
-    rows = _simplify(rates_at_rest(machine, x, u), ca.vertcat(p, u))
-    rows = rows[[k for k in range(n) if not rows[k].is_zero()]]
+    rows = _rates_left(machine, x, u, p)
     guess = machine.preload(x)
     if rows.numel() == 0 or _vanishes(ca.substitute([rows], [u], [guess])[0], p):
         return x, Formula(guess if rows.numel() else ca.SX.zeros(m))
@@ -107,14 +106,19 @@ def rest_of(
         moved[index] = s[k]
     r = ca.vertcat(u, s)
     if free:
-        rows = _simplify(rates_at_rest(machine, moved, u), ca.vertcat(p, r))
-        rows = rows[[k for k in range(n) if not rows[k].is_zero()]]
+        rows = _rates_left(machine, moved, u, ca.vertcat(p, s))
     near = np.concatenate([point.u, point.x[list(free)]])
     found = solve_rows(rows, Unknowns(r, near, p, nominal), [])
     for k, index in enumerate(free):
         moved[index] = found.values[m + k]
     why = INEXACT_REST if found.why else ""
     return moved, found._replace(values=found.values[:m], why=why)
+
+
+def _rates_left(machine: Plant, x: Any, u: Any, p: Any) -> Any:
+    """The rates at rest that are not zero whatever u and p are."""
+    rows = _simplify(rates_at_rest(machine, x, u), ca.vertcat(p, u))
+    return rows[[k for k in range(rows.numel()) if not rows[k].is_zero()]]
 
 
 def free_states(plant: Plant, point: OperatingPoint) -> tuple[int, ...]:
@@ -284,10 +288,7 @@ class _RestEquations(NamedTuple):
         if s is None:
             return None
         first, count = p.numel(), r.numel()
-        on: list[bool] = []
-        for name, target, operands, _ in s.program.steps:
-            on.append(first <= target if name == "input" else any(on[k] for k in operands))
-        if any(on[k] for k in s.atoms):
+        if any(max(s.program.reach[k], default=-1) >= first for k in s.atoms):
             return None
         zero = Ratio(s.context.constant(0))
         tops = [_resolve_roots(s, s.entries[0].get((i, 0), zero)).num for i in range(rows.numel())]

@@ -211,17 +211,22 @@ def known(run: Any, t: Target, group: str, k: int) -> Any:
     return getattr(run, "i_phase" if group == "i" and t.fidelity == "phase" else group)[k]
 
 
+def fly_loop(instance: Callable[..., Unit], t: Target, s: malta.Scenario, run: Any) -> float:
+    """How far the exported loop is from a run of a scenario, from its first sample on."""
+    motion = s.reference(t.believed)(run.t)
+    loop = instance(t, "loop", 2)
+    loop.begin()
+    loop.refer(motion, 0)
+    loop.start()
+    return fly(loop, run, motion)
+
+
 @pytest.mark.slow
 def test_single_precision_flies_as_the_exported_c(instance: Callable[..., Unit]) -> None:
     t = target("robust", "float")
     s = scenario(t)
     flown = malta.simulate(t.believed, t.controller, s, engine=malta.firmware.engine_of_c("float"))
-    motion = s.reference(t.believed)(flown.t)
-    loop = instance(t, "loop", 2)
-    loop.begin()
-    loop.refer(motion, 0)
-    loop.start()
-    assert fly(loop, flown, motion) < 1e-9
+    assert fly_loop(instance, t, s, flown) < 1e-9
 
 
 @pytest.mark.parametrize("T_d", [61e-6, pytest.param(90e-6, marks=pytest.mark.slow)])
@@ -233,12 +238,7 @@ def test_commands_begin_to_act_within_a_sample(T_d: float, instance: Callable[..
     s = scenario(t)
     run = malta.simulate(t.believed, t.controller, s)
     usual = malta.simulate(target("robust").believed, c, s)
-    motion = s.reference(t.believed)(run.t)
-    loop = instance(t, "loop", 2)
-    loop.begin()
-    loop.refer(motion, 0)
-    loop.start()
-    assert fly(loop, run, motion) < 1e-12
+    assert fly_loop(instance, t, s, run) < 1e-12
     assert np.abs(run.p - usual.p[: len(run.p)]).max() > 1e-9
 
 
@@ -254,12 +254,7 @@ def test_sensors_with_lag_dead_time_and_offsets_are_part_of_the_machine(
     s = scenario(t)
     run = malta.simulate(t.believed, late, s)
     ideal = malta.simulate(target("robust").believed, c, s)
-    motion = s.reference(t.believed)(run.t)
-    loop = instance(t, "loop", 2)
-    loop.begin()
-    loop.refer(motion, 0)
-    loop.start()
-    assert fly(loop, run, motion) < 1e-12
+    assert fly_loop(instance, t, s, run) < 1e-12
     assert np.abs(run.p - ideal.p[: len(run.p)]).max() > 1e-7
 
 

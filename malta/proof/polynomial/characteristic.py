@@ -51,17 +51,7 @@ def sole_power(den: Any, i: int) -> int | None:
 
 def depends(s: Symbolic, atom: int, i: int) -> bool:
     """Whether a further variable depends on p_i."""
-    seen, stack = set(), [s.atoms[atom]]
-    while stack:
-        k = stack.pop()
-        if k in seen:
-            continue
-        seen.add(k)
-        name, target, operands, _ = s.program.steps[k]
-        if name == "input" and target == i:
-            return True
-        stack += operands
-    return False
+    return i in s.program.reach[s.atoms[atom]]
 
 
 def clear_denominators(loop: UncertainLoop, g: StateGroup, s: Symbolic) -> list[dict[Any, Any]]:
