@@ -74,8 +74,7 @@ def verify(
         typer.Option(metavar="CERTIFICATE", help="Write the proof of the margin, for `malta check`."),
     ] = None,
     renew: Annotated[
-        Path | None,
-        typer.Option(metavar="CERTIFICATE", help="Prove an older certificate anew."),
+        Path | None, typer.Option(metavar="CERTIFICATE", help="Prove an older certificate anew.")
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder for the figures (.png).")] = None,
     design: DesignFile = None,

@@ -84,6 +84,13 @@ class UncertainSystem:
     derived: Derived | None = None
     left_out: str = ""
 
+    def reason(self, own: str) -> str:
+        """The reason of an answer about this system, with what the system leaves out of its machine.
+
+        own : why nothing, or less than asked for, is proven; "": as much is
+        """
+        return "; ".join(filter(None, (self.left_out, own)))
+
     def spread(self, over: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
         """The intervals of some parameters, with those of the parameters that follow one of them.
 

@@ -28,7 +28,7 @@ from malta.model.parameters import units_of
 from malta.model.places import off_stroke, outputs_at, position_at
 from malta.model.plants import plant_of
 from malta.processes import on_one_thread
-from malta.proof.box import Box, box_of
+from malta.proof.box import Box, box_of, within_branches
 from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.problem import OfSeveral
 from malta.proof.robust import (
@@ -40,7 +40,6 @@ from malta.proof.robust import (
     problem_of,
     rank_of,
     robust_margin,
-    without,
 )
 from malta.proof.weak_coupling import HeldLoop
 from malta.proof.weak_coupling.held_currents import held_machine
@@ -262,7 +261,10 @@ def travel_margin(
     along = _margin_along if controller.schedule is None else _scheduled_margin
     begun = clock.monotonic()
     found, ended = in_rounds(effort.limits, partial(along, loop, ranges, progress), rank_of)
-    return without(loop.loops[0][0], replace(found, seconds=clock.monotonic() - begun, work=ended.work))
+    found = replace(found, seconds=clock.monotonic() - begun, work=ended.work)
+    if controller.schedule is not None or found.reason == NOT_WRITTEN_TEXT:
+        return found  # of other systems than the loop's own, or of none
+    return replace(found, reason=loop.loops[0][0].reason(found.reason))
 
 
 def _margin_along(
@@ -285,9 +287,8 @@ def _margin_along(
             return found
     found = common_margin(along, ranges, over, budget=budget, progress=progress)
     if len(along) == 1:
-        return at_a_place(
-            *along[0], box_of(*_box_fields(along[0][0]), ranges, over, caller="travel_margin"), found
-        )
+        box = within_branches(_box(along[0][0], ranges, over), along[0][0])
+        return at_a_place(*along[0], box, found)
     here = f"at {len(along)} places of the travel, {NOT_BETWEEN_TEXT}"
     return replace(found, reason=f"{here}; {found.reason}" if found.reason else here)
 
@@ -338,13 +339,6 @@ def at_a_place(system: UncertainSystem, law: Compensator, box: Box, found: Margi
         found, upper=math.inf, frequency=None, witness=None, moved={}, sensitivity={}, reason=reason,
         searched=box.searched,
     )  # fmt: skip
-
-
-def _box_fields(
-    system: UncertainSystem,
-) -> tuple[tuple[str, ...], FloatArray, tuple[tuple[float, float], ...]]:
-    """What a box needs of a system."""
-    return system.names, system.nominal, system.limits
 
 
 CELLS = 0.7  # of the work, for the proofs between the places of a schedule
@@ -447,8 +441,8 @@ def margin_anywhere(loop: LoopAlong, position: float | None = None) -> HeldLoop 
     return HeldLoop(machine, replace(law, delay=0), places)
 
 
-def _box(system: UncertainSystem, ranges: Ranges) -> Box:
-    return box_of(system.names, system.nominal, system.limits, ranges, {}, caller="travel_margin")
+def _box(system: UncertainSystem, ranges: Ranges, over: Mapping[str, Interval] | None = None) -> Box:
+    return box_of(system.names, system.nominal, system.limits, ranges, over or {}, caller="travel_margin")
 
 
 @on_one_thread

@@ -231,6 +231,8 @@ def certificate_of(
     """The certificate of a margin as a JSON document."""
     if margin.lower is None:
         raise CheckError(f"no certificate: nothing is proven ({margin.reason})")
+    if lost := next((system.left_out for system, _ in places if system.left_out), ""):
+        raise CheckError(f"no certificate: the margin is {lost}")
     system = places[0][0]
     box = box_of(system.names, system.nominal, system.limits, ranges, over or {})
     lower, proven = _prove(places, box, margin.lower)
@@ -450,9 +452,9 @@ def _enclose(f: CheckedPolynomial, v: list[tuple[Any, Any]], box: Box, lower: fl
     Raises Refused when it cannot be enclosed, CheckError when zero is not excluded.
     """
     ctx.prec = BITS
-    middle = [[(a + b) / 2] for a, b in v]
+    middle = tuple((a + b) / 2 for a, b in v)
     corners = itertools.product(*([a, b] if i in f.used and a < b else [a] for i, (a, b) in enumerate(v)))
-    places = [f.at([arb(x) for x in place]) for place in (*itertools.product(*middle), *corners)]
+    places = [f.at([arb(x) for x in place]) for place in (middle, *corners)]
     # of each coefficient the largest: one that cancels in the middle asks for no more digits than its neighbours
     size = [max(map(height, each)) for each in zip(*places, strict=True)]
     axes = [_axis(f, v, i, size) for i in range(len(v))]

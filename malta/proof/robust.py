@@ -289,13 +289,8 @@ def robust_margin(
     over = by_name("robust_margin", "over", {} if over is None else over, '{"k": (1, 2)}')
     named, law, ranges = _either_form(system, compensator, ranges, over)
     box = box_of(named.names, named.nominal, named.limits, ranges, named.spread(over))
-    return without(named, margin_of(problem_of(named, law), within_branches(box, named), effort))
-
-
-def without(system: UncertainSystem, found: Margin) -> Margin:
-    """The margin, which says what the system leaves out of its machine."""
-    reason = "; ".join(filter(None, (system.left_out, found.reason)))
-    return replace(found, reason=reason) if system.left_out else found
+    found = margin_of(problem_of(named, law), within_branches(box, named), effort)
+    return replace(found, reason=named.reason(found.reason))
 
 
 def _either_form(
@@ -383,8 +378,10 @@ def margin_at(
         if p is not None and t >= wider.lower:
             named = dict(zip(box.names, p.tolist(), strict=True))
             moved = dict(zip(box.names, (p - box.nominal).tolist(), strict=True))
-            return Margin(wider.lower, t, frequency, named, moved, wider.sensitivity, (), 0.0)
-    return margin_of(problem, box, ProofEffort(tolerance))
+            reason = system.reason("")
+            return Margin(wider.lower, t, frequency, named, moved, wider.sensitivity, (), 0.0, reason)
+    found = margin_of(problem, box, ProofEffort(tolerance))
+    return replace(found, reason=system.reason(found.reason))
 
 
 def law_of(system: UncertainSystem, compensator: Any, caller: str = "robust_margin") -> Compensator:

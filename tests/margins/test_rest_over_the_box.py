@@ -18,6 +18,8 @@ from malta.loops.sampled_loops import machine_system
 from malta.model import Actuator, Plant, Sensors, Signal, check_parameters, si
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from malta.synthesis.controller import Controller
 
 Case = tuple[
@@ -252,12 +254,19 @@ def test_what_is_proven_of_any_machine_is_its_loop() -> None:
     assert math.isfinite(max(proven))
 
 
-def test_what_is_too_dear_to_enclose_is_named() -> None:
+def test_what_is_too_dear_to_enclose_is_named(tmp_path: Path) -> None:
     """A rotor whose weight adds to the stiffness of its bearings as m / k_s: that slope is left out, and said."""
     spec = malta.read_design("examples/rotor/design/rotor.toml")
     law = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     system, _ = malta.loop(spec.plant, law).uncertain(("m", "k_s"))
     assert system.left_out.startswith("without the slopes")
     assert "nothing holds it at rest within the limit of i_Ay" in system.ends  # limits at rest are in it
+    found = malta.robust_margin(malta.loop(spec.plant, law), {"m": 0.1})
+    assert found.lower is not None
+    assert found.reason.startswith(system.left_out)
+    with pytest.raises(malta.CheckError, match="no certificate: the margin is without the slopes"):
+        malta.proof.write_certificate(
+            tmp_path / "c.json", [malta.loop(spec.plant, law).uncertain(("m",))], {"m": 0.1}, None, found
+        )
     without, _ = malta.loop(spec.plant, law).uncertain(("k_i",))
     assert without.left_out == ""

@@ -127,7 +127,7 @@ def dynamic_margin(
             Budget(time=time), ask, lambda x: x[1] or 0.0 if x[-1] not in settled else math.inf
         )
     took, names = clock.monotonic() - begun, box.names
-    reason = reason if reason in settled else ended.explain(reason)
+    reason = system.reason(reason if reason in settled else ended.explain(reason))
     if lost is None:
         return Margin(lower, math.inf, None, None, {}, {}, (), took, reason, box.searched, ended.work)
     t, witness = _size(asked, lost), dict(zip(names, lost.p.tolist(), strict=True))
@@ -491,7 +491,8 @@ def worst_case_gain(
             budget, ask, lambda x: 0.0 if x[-1] not in settled else math.inf
         )
     named, took = dict(zip(box.names, p.tolist(), strict=True)), clock.monotonic() - begun
-    return Gain(lower, upper, w, named, cells, took, reason if reason in settled else ended.explain(reason))
+    reason = system.reason(reason if reason in settled else ended.explain(reason))
+    return Gain(lower, upper, w, named, cells, took, reason)
 
 
 def _performance_block(system: UncertainSystem, of: Of, at: At, channel: Any) -> Block:
