@@ -9,6 +9,7 @@ from typing import Any
 import control
 import numpy as np
 import pytest
+from along_travel import at_place
 from hypothesis import given, settings, strategies as st
 
 import malta
@@ -195,8 +196,8 @@ def test_compliance_of_the_flagship_in_its_travel() -> None:
     rng, w, worst = np.random.default_rng(5), np.geomspace(1, 3000, 300), 0.0
     block = Block("compliance", "sensors", (4,), (4,), ONE)
     for _ in range(60):
-        p = s.nominal * (1 + np.array([0.2, 0.2, 0]) * np.clip(rng.uniform(-2, 2, 3), -1, 1))
-        p[-1] = rng.uniform(-plant.stroke.travel, plant.stroke.travel)
+        shares = 0.2 * np.clip(rng.uniform(-2, 2, 3), -1, 1)[:2]
+        p = at_place(s, shares, float(rng.uniform(-plant.stroke.travel, plant.stroke.travel)))
         worst = max(worst, float(np.abs(transfer(LoopSignals(responses(s, law, p, w)), [block])).max()))
     assert 0.9 * m.lower < worst <= m.upper
 

@@ -7,6 +7,7 @@ from typing import Any
 import control
 import numpy as np
 import pytest
+from along_travel import at_place
 from published_cases import ROBSTAB, Loop, pid
 
 import malta
@@ -85,8 +86,8 @@ def test_dynamics_of_a_machine_over_its_travel() -> None:
     assert law.sample_time is not None
     rng, w = np.random.default_rng(3), np.geomspace(10, np.pi / law.sample_time, 400)
     for _ in range(60):
-        p = s.nominal * (1 + m.lower * np.array([0.2, 0.2, 0]) * rng.uniform(-1, 1, 3))
-        p[-1] = rng.uniform(-plant.stroke.travel, plant.stroke.travel)
+        shares = m.lower * 0.2 * rng.uniform(-1, 1, 3)[:2]
+        p = at_place(s, shares, float(rng.uniform(-plant.stroke.travel, plant.stroke.travel)))
         P, _, _, F = responses(s, law, p, w)
         eye = np.eye(P.shape[1])  # of sensors and currents
         T = np.linalg.inv(eye - P @ F) - eye

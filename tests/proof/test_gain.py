@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import control
 import numpy as np
 import pytest
+from along_travel import at_place
 from hypothesis import given, settings, strategies as st
 
 import malta
@@ -22,10 +23,6 @@ from malta.proof.blocks.gain import BlockLoop
 from malta.proof.blocks.transfer import GainPeak, LoopSignals, frequencies, patterns, transfer
 from malta.proof.polynomial.family import align, combine, family
 from malta.proof.robust import problem_of
-
-if TYPE_CHECKING:
-    from malta.arrays import FloatArray
-    from malta.linear.uncertain import UncertainSystem
 
 
 def first_order(k: float = 1.0) -> malta.proof.UncertainSystem:
@@ -67,12 +64,6 @@ def test_nothing_uncertain_is_the_norm_of_python_control() -> None:
     assert size <= m.upper <= 1.004 * size
 
 
-def at_place(s: UncertainSystem, p: FloatArray, z: float) -> FloatArray:
-    """The parameters at a position, with those that follow it."""
-    values = {s.names[4]: z} | (s.derived.at(z) if s.derived else {})
-    return np.array([values.get(name, x) for name, x in zip(s.names, p.tolist(), strict=True)])
-
-
 @pytest.mark.parametrize("at", ["sensors", "forces"])
 def test_no_machine_of_the_box_exceeds_what_is_proven(at: Any) -> None:
     """The flagship anywhere in its travel: 60 machines at corners and within, on a grid of frequencies."""
@@ -86,9 +77,8 @@ def test_no_machine_of_the_box_exceeds_what_is_proven(at: Any) -> None:
     assert law.sample_time is not None
     rng, w, worst = np.random.default_rng(1), np.geomspace(100, math.pi / law.sample_time, 200), 0.0
     for _ in range(60):
-        p = s.nominal.copy()
-        p[:4] *= 1 + np.array([*box.values()]) * np.clip(rng.uniform(-2, 2, 4), -1, 1)
-        p = at_place(s, p, rng.uniform(-plant.stroke.travel, plant.stroke.travel))
+        shares = np.array([*box.values()]) * np.clip(rng.uniform(-2, 2, 4), -1, 1)
+        p = at_place(s, shares, float(rng.uniform(-plant.stroke.travel, plant.stroke.travel)))
         P, _, _, F = responses(s, law, p, w)
         Q = P @ F if at == "sensors" else F @ P  # with currents among the sensors
         S = np.linalg.inv(np.eye(Q.shape[-1]) - Q)
@@ -120,7 +110,7 @@ def test_no_frequency_is_the_rounding_of_a_real_pole() -> None:
     ((s, law),), _ = travel_loops(plant_of(c.parameters), c, ("m", "K_A", "K_D", "K_B"), "pi")
     problem = problem_of(s, law)
     for x in patterns(5):
-        p = at_place(s, np.r_[s.nominal[:4] * (1 + 0.2 * x[:4]), s.nominal[4:]], 0.015 * float(x[4]))
+        p = at_place(s, 0.2 * x[:4], 0.015 * float(x[4]))
         slowest = np.abs(problem.poles(p)).min()
         assert 1e-9 * slowest < frequencies(problem, p).min() < slowest
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from along_travel import at_place
 from exported import controller
 
 import malta
@@ -85,8 +86,6 @@ def test_gains_of_a_pid_may_scatter_while_the_loop_stays_stable() -> None:
         for axis, value in zip(found.axes, share, strict=True):
             factors[list(axis)] += value
         _, law = machine_system(plant, scaled(c, factors), (*BOX, "z"), {})
-        p, z = system.nominal.copy(), float(rng.uniform(-plant.stroke.travel, plant.stroke.travel))
-        p[: len(BOX)] *= 1 + 0.2 * np.sign(rng.uniform(-1, 1, len(BOX)))
-        assert system.derived is not None
-        p[len(BOX) :] = [z, *system.derived.values(z)]
+        z = float(rng.uniform(-plant.stroke.travel, plant.stroke.travel))
+        p = at_place(system, 0.2 * np.sign(rng.uniform(-1, 1, len(BOX))), z)
         assert instability(system, law, p[None])[0] < 0
