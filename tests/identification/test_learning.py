@@ -184,7 +184,7 @@ def test_errors_are_proven_to_shrink_over_the_box() -> None:
     lifted = [lifted_norm(patterns, one) for one in machines_of(believed, box, 0, samples=0)]
     assert 0.2 < lifted[0] < 0.21  # of the gain file's own machine: 1 - 0.8, and the slope of cogging
     assert max(lifted) == pytest.approx(proven.upper, rel=0.03)
-    assert max(lifted) < proven.upper + 0.01  # the slope of cogging is not in the proof
+    assert max(lifted) < proven.upper + 0.01  # the slope of cogging away from the middle is not in the proof
 
 
 def test_parameters_that_do_not_move_the_stroke_do_not_count() -> None:
@@ -203,16 +203,19 @@ def test_what_is_not_proven_says_why() -> None:
 
 @pytest.mark.slow
 def test_errors_shrink_over_the_whole_box_but_not_beyond() -> None:
-    """K_D / m is one entry of the matrices: the proof of four parameters is one of an interval of that."""
+    """K_D / m is nearly one entry of the matrices: the proof of four parameters is one of an interval of that.
+
+    The slope of cogging by m, 40 1/s^2 of 1e5 in the loop, is the other entry that moves.
+    """
     names = ("m", "K_A", "K_B", "K_D")
     proven = malta.identification.contraction(CONTROLLER, dict.fromkeys(names, 0.2))
     assert proven.upper is not None
-    assert proven.lower == pytest.approx(0.8592, abs=1e-3)
-    assert proven.lower < proven.upper < 0.87
+    assert proven.lower == pytest.approx(0.8642, abs=1e-3)
+    assert proven.lower < proven.upper < 0.875
     assert [proven.witness[name] for name in ("m", "K_D")] == pytest.approx([0.288, 6.24])
     ratio = malta.identification.contraction(CONTROLLER, {"K_D": (5.2 * 0.8 / 1.2, 5.2 * 1.2 / 0.8)})  # type: ignore[dict-item]
     assert ratio.lower == pytest.approx(
-        proven.lower, rel=1e-3
+        proven.lower, rel=2e-3
     )  # the same machines, on the route of one parameter
     patterns, believed = stroke_patterns()
     lifted = [
