@@ -223,7 +223,7 @@ def verdict_text(found: LoopReport, campaigns: Sequence[Summary] = ()) -> Verdic
     loop          stable, with hold
     margin        ██▇▇▇ 390.69 % proven, lost at 390.70 % of m ±20 %
     peak |S|      1.57, zone A, of ISO 14839-3, worst at y; over the uncertainty at
-                  most 1.75, zone A
+                  most 1.749, zone A
     requirements  all 4 hold, nearest their limits: peak sensitivity 98.38 %, margin
                   93.58 %
     yield         not sampled, see malta campaign

@@ -220,7 +220,7 @@ def verify(
     bandwidth, regulator's fastest natural frequency: 39.37 Hz (247.4 rad/s)
     bandwidth, regulator's slowest natural frequency: 39.37 Hz (247.4 rad/s)
     uncertainty: m C ±20 %
-    robust: proven 320... %, lost at 320.61 % at 1047 rad/s
+    robust: proven 320... %, lost at 320.62 % at 1047 rad/s
     >>> found = malta.verify(model, controller, {"m": 0.2}, stages=True)
     >>> down, up = found.tolerance["m"]
     >>> f"the sphere may lose {down.lower * 0.2:.0%} of its mass"

@@ -24,7 +24,7 @@ from malta.proof.polynomial.family import Family, family, nodes
 from malta.work import check_clock, remember, spend
 
 MOST_NODES = 20_000  # places of exact coefficients, at most
-MOST_BALLS = 6000  # places where they take an exponential
+MOST_BALLS = 10_000  # places where they take an exponential: one family of all is cheaper than its halves
 FEW_PLACES_LIMIT = 1500  # places beyond which more may be left out
 TAILS = (1e-9, 1e-7, 3e-6)  # what interpolation may leave out, relative to each coefficient
 MAX_TAIL = 1e-5  # beyond which the box is cut

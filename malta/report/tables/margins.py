@@ -428,7 +428,7 @@ def places_table(found: LoopReport) -> Table:
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> found = malta.verify(spec.plant, controller, {"m": 0.2}, stages=True)
     >>> rich.print(malta.report.places_table(found))
-    The machine's loop under its loads
+    The machine's loop, under its loads
     <BLANKLINE>
                                             peak        disk,
      at            proven   lost at  rad/s   |S|  zone    all         delay
