@@ -3,13 +3,15 @@
 fmax(v, 0) is v as long as v > 0, fabs(x) is x, and sqrt(x)^2 is x. A model is written with the branches that are
 active at its nominal parameters, as expressions without branches; what has to stay above zero for that becomes a
 condition. Derivatives are taken before, so that a branch of a derivative is resolved as well.
+
+Or it is written once for each case: with every choice of branches, and where each of them holds.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 from flint import arb
@@ -79,11 +81,19 @@ def _by_balls(function: Callable[..., Any]) -> Callable[..., Interval]:
 INTERVALS = Arithmetic(lambda x: Interval(x, x), {name: _by_balls(f) for name, f in POINTS.others.items()})
 
 
-class _Resolved:
-    """The steps of a program so far, without branches, their values at nominal parameters, and what is above zero."""
+class _Undecided(Exception):
+    """A case has another branch, whose sign is not given."""
 
-    def __init__(self, nominal: Sequence[float]) -> None:
-        self.nominal = nominal
+
+class _Resolved:
+    """The steps of a program so far, without branches, their values at nominal parameters, and what is above zero.
+
+    signs : of what branches hang on, in the order in which they are met; None: those at nominal parameters
+    """
+
+    def __init__(self, nominal: Sequence[float], signs: Sequence[int] | None = None) -> None:
+        self.nominal, self.signs = nominal, signs
+        self.chosen: dict[Any, int] = {}
         self.steps: list[tuple[str, int, tuple[int, ...], float]] = []
         self.values: list[Any] = []  # None: not known
         self.positive: list[int] = []
@@ -108,12 +118,25 @@ class _Resolved:
 
     def sign(self, k: int) -> int:
         """1 or -1, the sign that a step has and is assumed to keep; 0 where it is not known."""
+        if self.signs is not None and self.steps[k][0] != "const":
+            return self._given_sign(k)
         x = self.values[k]
         if x is None or not (x > 0 or x < 0):
             return 0
         if self.steps[k][0] != "const":
             self.positive.append(k if x > 0 else self.add("neg", 0, (k,), 0.0))
         return 1 if x > 0 else -1
+
+    def _given_sign(self, k: int) -> int:
+        """The sign of a step in this case. Raises _Undecided where none is given."""
+        assert self.signs is not None
+        own = self.steps[k]
+        if own not in self.chosen:
+            if len(self.chosen) == len(self.signs):
+                raise _Undecided
+            sign = self.chosen[own] = self.signs[len(self.chosen)]
+            self.positive.append(k if sign > 0 else self.add("neg", 0, (k,), 0.0))
+        return self.chosen[own]
 
     def resolve(self, name: str, operands: tuple[int, ...]) -> int | None:
         """The step that stands for an operation with branches; None for any other, or where the branch is not known."""
@@ -125,7 +148,9 @@ class _Resolved:
             if name in ("lt", "le"):
                 return self.constant(float(sign < 0))
             return one if (sign > 0) == (name == "fmax") else two
-        if name in ("fabs", "sign"):
+        if name == "fabs" or (
+            name == "sign" and self.signs is None
+        ):  # which is zero at zero, in neither case
             sign = self.sign(operands[0])
             if not sign or (name == "fabs" and sign > 0):
                 return operands[0] if sign else None
@@ -144,7 +169,11 @@ def resolve_branches(model: MatrixProgram, nominal: Sequence[float]) -> tuple[Ma
     A last matrix of one column is added: first the conditions, which are above zero where the programs agree, then the
     arguments of all roots, which are above zero where sqrt(x)^2 is x.
     """
-    found, place = _Resolved(nominal), list[int]()
+    return _resolve(model, _Resolved(nominal))
+
+
+def _resolve(model: MatrixProgram, found: _Resolved) -> tuple[MatrixProgram, int]:
+    place = list[int]()
     roots: dict[int, int] = {}
     for name, target, operands, value in model.steps:
         own = tuple(place[k] for k in operands)
@@ -173,15 +202,58 @@ def without_branches(
     model = program(function)
     if not model.foreign:
         return function, None
-    resolved, count = resolve_branches(model, nominal)
-    p = ca.SX.sym("p", model.inputs)
     try:
-        *entries, above = resolved.run(ca.vertsplit(p), SYMBOLS)
+        matrices, positive, count = _functions(model, *resolve_branches(model, nominal))
     except NotAnalytic:
         return function, None
+    return matrices, positive if count else None
+
+
+def _functions(
+    model: MatrixProgram, resolved: MatrixProgram, count: int
+) -> tuple[ca.Function, ca.Function, int]:
+    """p -> matrices, p -> conditions, and how many these are. Raises NotAnalytic for branches that are not known."""
+    p = ca.SX.sym("p", model.inputs)
+    *entries, above = resolved.run(ca.vertsplit(p), SYMBOLS)
     matrices = [ca.SX(*shape) for shape in model.shapes]
     for matrix, own in zip(matrices, entries, strict=True):
         for i, j, x in own:
             matrix[i, j] = x
-    positive = ca.vertcat(*(x for i, _, x in above if i < count))
-    return ca.Function("matrices", [p], matrices), ca.Function("positive", [p], [positive]) if count else None
+    positive = ca.SX(count, 1)
+    for i, _, x in above:
+        if i < count:
+            positive[i] = x
+    return ca.Function("matrices", [p], matrices), ca.Function("positive", [p], [positive]), count
+
+
+class BranchCase(NamedTuple):
+    """A function with one choice of branches, and what is zero or above where it is the function."""
+
+    matrices: ca.Function
+    positive: ca.Function
+
+
+MAX_CASES = 64
+
+
+def branch_cases(function: ca.Function) -> list[BranchCase]:
+    """A function with each choice of its branches; none where these are more than MAX_CASES, or are not known.
+
+    At each p the function is that of a case whose conditions are zero or above there.
+    """
+    model, found, todo = program(function), list[BranchCase](), [tuple[int, ...]()]
+    while todo:
+        signs = todo.pop()
+        if len(todo) + len(found) >= MAX_CASES:
+            return []
+        try:
+            matrices, positive, _ = _functions(
+                model, *_resolve(model, _Resolved([0.0] * model.inputs, signs))
+            )
+        except _Undecided:
+            todo += [(*signs, 1), (*signs, -1)]
+        except NotAnalytic:
+            return []
+        else:
+            found.append(BranchCase(matrices, positive))
+    return found if len(found) > 1 else []

@@ -172,9 +172,49 @@ def _require_off_cut(z: Any) -> Any:
 
 
 def _require_within_unit(z: Any) -> Any:
-    if not abs(z) < 1:
-        raise NotAnalytic("an inverse sine or tangent beyond 1")
+    """z. Raises NotAnalytic when its real part reaches 1 or -1, from where the real axis is a cut."""
+    if not abs(z.real) < 1:
+        raise NotAnalytic("an inverse sine, cosine or hyperbolic tangent at 1 or beyond")
     return z
+
+
+def _require_off_imaginary_cuts(z: Any) -> Any:
+    """z. Raises NotAnalytic when its ball touches the imaginary axis at i or beyond, either way."""
+    if z.real.contains(0) and not abs(z.imag) < 1:
+        raise NotAnalytic("an inverse tangent or hyperbolic sine near a pole of its slope")
+    return z
+
+
+def _require_above_one(z: Any) -> Any:
+    """z. Raises NotAnalytic when its real part reaches 1, from where the real axis to the left is a cut."""
+    if not z.real > 1:
+        raise NotAnalytic("an inverse hyperbolic cosine at 1 or below")
+    return z
+
+
+def _angle(y: Any, x: Any) -> Any:
+    """The angle of a point, in the half plane where it lies. Raises NotAnalytic where that is not known."""
+    if x.real > 0:
+        return _require_off_imaginary_cuts(finite(y / x)).atan()
+    if not (y.real > 0 or y.real < 0):
+        raise NotAnalytic("an angle whose point may be at zero or cross the negative axis")
+    half = acb.pi() / 2
+    return (half if y.real > 0 else -half) - _require_off_imaginary_cuts(finite(x / y)).atan()
+
+
+def _by_slope(function: Callable[[Any], Any], slope: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A function by its value in the middle of a ball and its slope on it: f(z) is in f(m) + (z - m) f'(ball)."""
+
+    def found(z: Any) -> Any:
+        middle = acb(z.real.mid(), z.imag.mid())
+        return function(middle) + (z - middle) * finite(slope(z))
+
+    return found
+
+
+_asinh = _by_slope(lambda z: z.asinh(), lambda z: 1 / _require_off_cut(z * z + 1).sqrt())
+_acosh = _by_slope(lambda z: z.acosh(), lambda z: 1 / ((z - 1).sqrt() * (z + 1).sqrt()))
+_atanh = _by_slope(lambda z: z.atanh(), lambda z: 1 / (1 - z * z))
 
 
 def finite(z: Any) -> Any:
@@ -199,11 +239,14 @@ _BALLS: dict[str, Callable[..., Any]] = {
     "pow": lambda z, w: (_require_off_cut(z).log() * w).exp(),
     "asin": lambda z: _require_within_unit(z).asin(),
     "acos": lambda z: _require_within_unit(z).acos(),
-    "atan": lambda z: _require_within_unit(z).atan(),
+    "atan": lambda z: _require_off_imaginary_cuts(z).atan(),
+    "atan2": _angle,
+    "asinh": lambda z: _asinh(_require_off_imaginary_cuts(z)),
+    "acosh": lambda z: _acosh(_require_above_one(z)),
+    "atanh": lambda z: _atanh(_require_within_unit(z)),
+    "erf": lambda z: z.erf(),
     "hypot": lambda a, b: _require_off_cut(a * a + b * b).sqrt(),
 }
-# On the real axis no branch is near.
-_POINTS = _BALLS | {"atan": lambda x: x.atan(), "asin": lambda x: x.asin(), "acos": lambda x: x.acos()}
 KNOWN_OPERATIONS = frozenset({*FIELD, *_BALLS, "const", "input", "constpow"})
 EXACT_ARITHMETIC = Arithmetic(exact, {})
 
@@ -230,7 +273,7 @@ def _at_points(functions: dict[str, Callable[..., Any]]) -> dict[str, Callable[.
     return {name: wrap(function) for name, function in functions.items()}
 
 
-POINTS = _Checked(lambda x: arb(exact(x)), _at_points(_POINTS))
+POINTS = _Checked(lambda x: arb(exact(x)), _at_points(_BALLS))
 BALLS = _Checked(_ball, _BALLS)
 
 

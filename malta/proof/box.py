@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -239,13 +239,26 @@ def _failing_corner(box: Box, system: UncertainSystem, t: float) -> tuple[int, F
 
 def _hold(conditions: MatrixProgram, sides: FloatArray) -> bool:
     """Whether the conditions are proven on a box (P x 2), or on all its parts."""
+    count = conditions.shapes[0][0]
+    return every_part(
+        conditions, sides, lambda values: len(values) == count and all(x.low > 0 for _, _, x in values)
+    )
+
+
+def every_part(
+    conditions: MatrixProgram, sides: FloatArray, test: Callable[[list[tuple[int, int, Interval]]], bool]
+) -> bool:
+    """Whether a test of intervals of the conditions is passed on a box (P x 2), or on all parts of it.
+
+    test : of (row, column, interval) of each condition that is not zero everywhere
+    """
     todo, count = [sides], 0
     while todo:
         own = todo.pop()
         count += 1
         try:
             (values,) = conditions.run([Interval(a, b) for a, b in own.tolist()], INTERVALS)
-            if len(values) == conditions.shapes[0][0] and all(x.low > 0 for _, _, x in values):
+            if test(values):
                 continue
         except NotAnalytic:
             pass

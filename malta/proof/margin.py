@@ -125,6 +125,11 @@ class Margin:
         return Description(f"Margin: {self}", tuple(rows))
 
 
+IDLE_TEXT = (
+    "the loop does not depend on"  # begins the reason of a loop that is stable, and of which nothing is said
+)
+
+
 def unproven(reason: str) -> str:
     """The words for a bound that is not proven."""
     return f"nothing proven ({reason})" if reason else "nothing proven"

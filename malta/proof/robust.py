@@ -26,15 +26,17 @@ from scipy import linalg
 
 from malta.arguments import by_name, describe, is_pair, positive
 from malta.errors import InputError
+from malta.linear.branches import branch_cases
 from malta.linear.compensators import compensator_of
 from malta.linear.expressions import MatrixProgram, NotAnalytic, exact, program
 from malta.linear.rational import Ratio, Symbolic, product
 from malta.linear.uncertain import Compensator, UncertainSystem
 from malta.processes import on_one_thread
 from malta.proof.box import Box, box_of, within_branches
+from malta.proof.branch_cases import margin_by_cases
 from malta.proof.groups import A, B, C, E, UncertainLoop, loop_of
 from malta.proof.loss import first_loss, loss_beside
-from malta.proof.margin import Margin, Progress, Ranges
+from malta.proof.margin import IDLE_TEXT, NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.problem import OfLoop, OfSeveral, Problem, is_nominal_stable
 from malta.proof.question import Question, Standing
 from malta.proof.search import search
@@ -289,7 +291,13 @@ def robust_margin(
     over = by_name("robust_margin", "over", {} if over is None else over, '{"k": (1, 2)}')
     named, law, ranges = _either_form(system, compensator, ranges, over)
     box = box_of(named.names, named.nominal, named.limits, ranges, named.spread(over))
-    found = margin_of(problem_of(named, law), within_branches(box, named), effort)
+    box = within_branches(box, named)
+    cases = branch_cases(named.matrices) if program(named.matrices).foreign else []
+    if cases:
+        lost = _by_poles(problem_of(named, law), box, "")
+        found = margin_by_cases(named, cases, box, lost, partial(_margin_of_case, law, effort))
+    else:
+        found = margin_of(problem_of(named, law), box, effort)
     return replace(found, reason=named.reason(found.reason))
 
 
@@ -437,6 +445,13 @@ class ProofEffort:
         if self.time is not None:
             positive(self.caller, "time", self.time, endless=True)
 
+    def of(self, count: int) -> ProofEffort:
+        """The effort of each of some searches that share it, without progress."""
+        time, budget = self.limits.time, self.limits
+        if budget.work is not None:
+            budget = replace(budget, work=budget.work / count)
+        return replace(self, time=None if time is None else time / count, budget=budget, progress=None)
+
     @property
     def limits(self) -> Budget:
         """The budget with the time."""
@@ -466,9 +481,6 @@ def margin_of(problem: Problem, box: Box, effort: ProofEffort) -> Margin:
     is_open = bool(found.reason) and found.reason not in (UNSTABLE_TEXT, problem.traits.approximate)
     reason = ended.explain(found.reason) if is_open else found.reason
     return replace(found, seconds=clock.monotonic() - begun, work=ended.work, reason=reason, idle=idle)
-
-
-IDLE_TEXT = "the loop does not depend on"
 
 
 def _idle(problem: Problem, box: Box) -> tuple[str, ...]:
@@ -501,13 +513,28 @@ def _ask(
             where = dict(zip(box.names, places[k + int(unstable.argmax())].tolist(), strict=True))
             return Margin(0.0, 0.0, None, where, {}, {}, (), 0.0, UNSTABLE_TEXT)
     if why := problem.traits.approximate:
-        upper, frequency, witness = first_loss(problem, box, box.limit)
-        named = None if witness is None else dict(zip(box.names, witness.tolist(), strict=True))
-        return Margin(None, upper, frequency, named, {}, {}, (), 0.0, why)
+        return _by_poles(problem, box, why)
     tolerance, fixed = effort.tolerance or TOLERANCE, effort.tolerance is not None
     question = Question(problem, box, tolerance, fixed, work, effort.limits.cells, patient, standing)
     with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
         return search(question)
+
+
+def _by_poles(problem: Problem, box: Box, why: str) -> Margin:
+    """A margin of which nothing is proven, with the first loss along the diagonals of the box."""
+    upper, frequency, witness = first_loss(problem, box, box.limit)
+    named = None if witness is None else dict(zip(box.names, witness.tolist(), strict=True))
+    return Margin(None, upper, frequency, named, {}, {}, (), 0.0, why)
+
+
+def _margin_of_case(
+    law: Compensator, effort: ProofEffort, case: UncertainSystem, box: Box, count: int
+) -> Margin:
+    """The margin of one case of branches. Raises Interrupted, with nothing that is known of the loop, on Ctrl-C."""
+    try:
+        return margin_of(problem_of(case, law), box, effort.of(count))
+    except Interrupted as stop:
+        raise Interrupted(replace(NOT_PROVEN, reason=stop.margin.reason)) from stop
 
 
 def _interrupted_margin(problem: Problem, box: Box, standing: Standing, seconds: float) -> Margin:
