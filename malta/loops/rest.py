@@ -29,7 +29,8 @@ from malta.linear.branches import SYMBOLS
 from malta.linear.expressions import NotAnalytic, program
 from malta.linear.rational import Ratio, Symbolic, TooLarge, symbolic as rational_functions
 from malta.model.equilibrium import rates_at_rest
-from malta.model.plant import OperatingPoint, Plant
+from malta.model.parameters import symbolic_names
+from malta.model.plant import OperatingPoint, Plant, symbolic
 
 MAX_FORCE_OPERATIONS = 5_000  # operations up to which the forces are expanded
 MAX_MINORS = 6  # unknowns up to which equations are solved by minors
@@ -99,6 +100,8 @@ def rest_of(
     guess = machine.preload(x)
     if rows.numel() == 0 or _vanishes(ca.substitute([rows], [u], [guess])[0], p):
         return x, Formula(guess if rows.numel() else ca.SX.zeros(m))
+    if _preload_holds(plant, x):
+        return x, Formula(guess)
     free = free_states(plant, point)
     s = ca.SX.sym("s", len(free))
     moved = ca.SX(x)
@@ -119,6 +122,18 @@ def _rates_left(machine: Plant, x: Any, u: Any, p: Any) -> Any:
     """The rates at rest that are not zero whatever u and p are."""
     rows = _simplify(rates_at_rest(machine, x, u), ca.vertcat(p, u))
     return rows[[k for k in range(rows.numel()) if not rows[k].is_zero()]]
+
+
+def _preload_holds(plant: Plant, x: Any) -> bool:
+    """Whether the preload holds the machine at x whatever its parameters are: all of them are symbols here.
+
+    What cancels does so exactly then, where numbers leave their rounding: 0.0002^2 is not 4e-08.
+    """
+    names = symbolic_names(plant.parameters)
+    q = ca.SX.sym("q", len(names))
+    machine = plant.variant(symbolic(plant.parameters, dict(zip(names, ca.vertsplit(q), strict=True))))
+    rows = ca.densify(rates_at_rest(machine, x, machine.preload(x)))
+    return _vanishes(rows, ca.vertcat(q, *ca.symvar(x)))
 
 
 def free_states(plant: Plant, point: OperatingPoint) -> tuple[int, ...]:
