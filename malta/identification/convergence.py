@@ -24,8 +24,9 @@ moves the stroke, by the structure of the matrices.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -116,13 +117,14 @@ def contraction(controller: Controller, box: Mapping[str, float], *, time: float
     missed = _bound_of_miss(axis, *inverse)
     if missed is None or not missed < MODEL_TOLERANCE:
         return _unproven("the inverse of the stroke's response is not proven to be near enough")
-    system, law = _learning_loop(axis, *inverse, FORCE)
+    learning, law = _learning_loop(axis, *inverse, FORCE)
     channel = (law.C.shape[0] - 1, law.B.shape[1] - 1)
-    entries = _as_entries(system, law, box)
-    system, ranges = (system, dict(box)) if entries is None else entries
-    gain = worst_case_gain(system, law, ranges, of="effort", channel=channel, tolerance=TOLERANCE, time=time)
+    entries = _as_entries(learning, law, box)
+    system, ranges = (learning, dict(box)) if entries is None else entries
+    asked = partial(worst_case_gain, of="effort", channel=channel, tolerance=TOLERANCE)
+    gain = asked(system, law, ranges, time=time)
     if entries is not None:
-        gain = replace(gain, witness=_corner(axis.system, system, box, gain))
+        gain = _at_corner(gain, learning, box, lambda corner, fixed: asked(corner, law, fixed))
     if gain.upper is None:
         return gain
     return replace(gain, upper=gain.upper + (1 + gain.upper) * missed / (1 - missed))
@@ -160,20 +162,21 @@ def _as_entries(
     return made, {name: (cells[k].low, cells[k].high) for name, k in zip(names, steps, strict=True)}
 
 
-def _corner(
-    system: UncertainSystem, entries: UncertainSystem, box: Mapping[str, float], gain: Gain
-) -> dict[str, float]:
-    """The corner of the box, or its middle, whose matrices are nearest to those of a gain's witness."""
-    wanted = entries.every(np.array([gain.witness[name] for name in entries.names]))
+def _at_corner(
+    gain: Gain, system: UncertainSystem, box: Mapping[str, float], ask: Callable[..., Gain]
+) -> Gain:
+    """The gain with the largest one of the box's corners: the entries of its own witness may be those of no machine."""
     shares = np.array([box[name] for name in system.names])
-    signs = np.array(list(product((0.0, -1.0, 1.0), repeat=len(shares))))
-    places = system.nominal * (1 + signs * shares)
-    found = system.every(places)
-    off = [
-        np.abs(M - W[:, : M.shape[1], : M.shape[2]]).sum(axis=(1, 2))
-        for M, W in zip(found, wanted, strict=False)
-    ]
-    return dict(zip(system.names, places[int(sum(off).argmin())].tolist(), strict=True))
+    corners = system.nominal * (1 + np.array(list(product((-1.0, 1.0), repeat=len(shares)))) * shares)
+    flat = np.hstack([M.reshape(len(corners), -1) for M in system.every(corners)])
+    _, first = np.unique(flat, axis=0, return_index=True)
+    found = []
+    for p in corners[first]:
+        fixed = {name: (x, x) for name, x in zip(system.names, p.tolist(), strict=True)}
+        found.append(ask(replace(system, nominal=p), fixed))
+    best = max(found, key=lambda one: one.lower)
+    witness = dict(zip(system.names, corners[first][found.index(best)].tolist(), strict=True))
+    return replace(gain, lower=best.lower, frequency=best.frequency, witness=witness)
 
 
 def _unproven(reason: str) -> Gain:
