@@ -275,6 +275,9 @@ def _is_cheap(q: Question, known: Findings, count: int) -> bool:
     )
 
 
+ADVICE = "a smaller box or a parameter less may be"
+
+
 def _explain_rest(q: Question, known: Findings, searches: Searches) -> Findings:
     worst = min((s for _, s in searches), key=lambda s: s.lower)
     if known.is_near(worst.lower, q):
@@ -282,5 +285,7 @@ def _explain_rest(q: Question, known: Findings, searches: Searches) -> Findings:
     if q.problem.traits.is_bounded:
         return known.because(BOUNDED_TEXT)
     count = sum(s.count for _, s in searches)
-    why = "not settled within the work" if q.is_late() else f"not settled within {count} cells"
-    return known.because(why + replace(q.standing, searches=searches).where(q.problem))
+    where = replace(q.standing, searches=searches).where(q.problem)
+    if q.is_late():
+        return known.because(f"not settled within the work{where}")
+    return known.because(f"not settled within {count} cells{where}; {ADVICE}")
