@@ -91,8 +91,11 @@ def of_plant(
         short = _expanded_matrices(of, p, z, np.array(nominal, dtype=float), held)
     check_clock()
     if short is not None:
-        A, B, C, above = short
+        A, B, C, above, v = short
         conditions += [Condition(one, DOMAIN_END_TEXT) for one in ca.vertsplit(above)]
+        if loaded and v is not None:
+            machine = in_symbols(plant, symbols)
+            conditions += limits_at_rest(machine, believed or plant, rest.function(p[own], z)[0], v)
     else:
         acting = of(p[own], z, ca.DM.zeros(len(plant.inputs)))[-1]
         q = ca.SX.sym("v", len(plant.inputs))
@@ -199,10 +202,10 @@ def _check_names(plant: Plant, names: Any) -> None:
 
 def _expanded_matrices(
     of: ca.Function, p: Any, z: Any, nominal: FloatArray, held: FloatArray | None
-) -> tuple[Any, Any, Any, Any] | None:
-    """A, B and C of held currents as short rational functions of p, and what is above zero where these hold.
+) -> tuple[Any, Any, Any, Any, Any] | None:
+    """A, B and C of held currents as short rational functions of p, what is above zero where these hold, and v at rest.
 
-    None when they are not such functions.
+    None when they are not such functions; v alone: when it is none.
     """
     k, m = p.numel(), of.numel_in(2)
     q = ca.SX.sym("q", k + m)
@@ -243,7 +246,10 @@ def _expanded_matrices(
     if rest:
         b = ca.horzcat(b, rational.matrix_of(rest, (n, outputs), p))
     a, c = rational.matrix_of(A, (n, n), p), rational.matrix_of(C, (outputs, n), p)
-    return a, b, c, ca.vertcat(*(rational.expression(r, p) for r in held_above.values()))
+    above_zero = ca.vertcat(*(rational.expression(r, p) for r in held_above.values()))
+    command = {(i, 0): wanted[k + i] for i in range(m)}
+    v = rational.matrix_of(command, (m, 1), p) if rational.is_free_of_functions(s, (command,)) else None
+    return a, b, c, above_zero, v
 
 
 def held_gain(plant: Plant, states: Mapping[str, float]) -> FloatArray:

@@ -17,6 +17,7 @@ import malta
 from malta.linear.uncertain import closed_loop
 from malta.loops.sampled_loops import machine_system
 from malta.model import Actuator, Plant, Sensors, Signal, check_parameters, si
+from malta.proof.box import box_of, within_branches
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -269,3 +270,17 @@ def test_what_is_too_dear_to_enclose_is_named(tmp_path: Path) -> None:
         )
     without, _ = malta.loop(spec.plant, law).uncertain(("k_i",))
     assert without.left_out == ""
+
+
+def test_a_box_of_commutated_forces_ends_where_the_weight_exceeds_them() -> None:
+    """The planar motor: m g B_r0 / B_r is what the law commands, at most the limit of F_z."""
+    c = malta.gains.read("design/gains/planar_pid.json")
+    planar = malta.plant_of(c.parameters)
+    system, _ = machine_system(planar, c, ("m", "B_r"), {})
+    box = within_branches(
+        box_of(system.names, system.nominal, system.limits, {"m": 0.1, "B_r": 0.1}, {}), system
+    )
+    par: Any = planar.parameters
+    times = planar.actuator.force_limit[[one.name for one in planar.inputs].index("F_z")] / (par.m * par.g)
+    assert box.most == pytest.approx((times - 1) / (times + 1) / 0.1, rel=1e-6)
+    assert box.ends.startswith("nothing holds it at rest within the limit of F_z (m = ")

@@ -111,7 +111,7 @@ def designed() -> tuple[Plant, Controller]:
     return machine, malta.lqg(malta.linearize(machine, machine.at()), weights, TS, delay=1)
 
 
-def stable(values: dict[str, float]) -> bool:
+def stable(values: dict[str, Any]) -> bool:
     """Whether the loop of the unit with other parameters is stable at rest under its loads."""
     machine, law = designed()
     return malta.loop(machine.variant(replace(UNIT, **values)), law).stable
