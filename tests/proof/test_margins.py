@@ -108,11 +108,11 @@ def test_a_narrow_bump_is_enclosed(width: float) -> None:
 
 
 def test_what_cannot_be_enclosed_is_not_proven() -> None:
-    system = malta.uncertain(lambda p: ([[-1 + ca.if_else(p > 2, 2, 0)]], [[0]], [[1]]), {"p": 0.0})
+    system = malta.uncertain(lambda p: ([[ca.sign(p - 2)]], [[0]], [[1]]), {"p": 0.0})
     m = malta.robust_margin(system, [[0.0]], {"p": (-1.0, 1.0)})
     assert m.lower is None
     assert m.upper == pytest.approx(2, rel=1e-6)
-    assert "if_else" in m.reason
+    assert "sign" in m.reason
     assert str(m).startswith(f"nothing proven ({m.reason}), lost at 200.0")
 
 
