@@ -148,9 +148,8 @@ class _Resolved:
             if name in ("lt", "le"):
                 return self.constant(float(sign < 0))
             return one if (sign > 0) == (name == "fmax") else two
-        if name == "fabs" or (
-            name == "sign" and self.signs is None
-        ):  # which is zero at zero, in neither case
+        # A sign is zero at zero, where neither case is the function.
+        if name == "fabs" or (name == "sign" and self.signs is None):
             sign = self.sign(operands[0])
             if not sign or (name == "fabs" and sign > 0):
                 return operands[0] if sign else None
@@ -233,7 +232,7 @@ class BranchCase(NamedTuple):
     positive: ca.Function
 
 
-MAX_CASES = 64
+MAX_CASES = 64  # of a function, beyond which none is looked at: six switches
 
 
 def branch_cases(function: ca.Function) -> list[BranchCase]:
