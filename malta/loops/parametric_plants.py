@@ -135,16 +135,19 @@ def of_plant(
     )  # fmt: skip
 
 
-MIN_DEAR_STATES = (
-    6  # of a machine, from which on a parameter and its inverse in one entry are too many places
+MIN_DEAR_STATES = 6  # of a machine, from which on a parameter and its inverse in one entry are dear
+MAX_DEAR_PARAMETERS = (
+    2  # of such a machine, which take a minute or two; three take more places than there is work for
 )
 
 
 def is_dear(system: UncertainSystem) -> bool:
     """Whether an entry of A has a parameter and its inverse, as a stiffness that the weight changes: c k / m + d m / k.
 
-    No expansion in p or in 1 / p holds over more than some percent of such a parameter.
+    Neither p nor 1 / p makes polynomials of such matrices, and each parameter takes some ten places.
     """
+    if len(system.names) <= MAX_DEAR_PARAMETERS:
+        return False
     if system.matrices.size1_out(0) < MIN_DEAR_STATES or not program(system.matrices).rational:
         return False
     try:

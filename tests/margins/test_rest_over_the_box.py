@@ -254,22 +254,37 @@ def test_what_is_proven_of_any_machine_is_its_loop() -> None:
     assert math.isfinite(max(proven))
 
 
+@pytest.mark.slow
 def test_what_is_too_dear_to_enclose_is_named(tmp_path: Path) -> None:
-    """A rotor whose weight adds to the stiffness of its bearings as m / k_s: that slope is left out, and said."""
+    """A rotor whose weight adds m / k_s to the stiffness of its bearings: left out of three parameters, and said."""
     spec = malta.read_design("examples/rotor/design/rotor.toml")
     law = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    system, _ = malta.loop(spec.plant, law).uncertain(("m", "k_s"))
+    system, own = malta.loop(spec.plant, law).uncertain(("m", "k_s", "k_i"))
     assert system.left_out.startswith("without the slopes")
     assert "nothing holds it at rest within the limit of i_Ay" in system.ends  # limits at rest are in it
-    found = malta.robust_margin(malta.loop(spec.plant, law), {"m": 0.1})
+    found = malta.robust_margin(system, own, {"m": 0.1})
     assert found.lower is not None
     assert found.reason.startswith(system.left_out)
     with pytest.raises(malta.CheckError, match="no certificate: the margin is without the slopes"):
-        malta.proof.write_certificate(
-            tmp_path / "c.json", [malta.loop(spec.plant, law).uncertain(("m",))], {"m": 0.1}, None, found
-        )
-    without, _ = malta.loop(spec.plant, law).uncertain(("k_i",))
-    assert without.left_out == ""
+        malta.proof.write_certificate(tmp_path / "c.json", [(system, own)], {"m": 0.1}, None, found)
+
+
+@pytest.mark.slow
+def test_a_rotor_is_proven_under_its_weight() -> None:
+    """One parameter, with the slope m / k_i that its weight makes; the loops of flights agree on either side."""
+    spec = malta.read_design("examples/rotor/design/rotor.toml")
+    law = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    system, own = malta.loop(spec.plant, law).uncertain(("m",))
+    assert system.left_out == ""
+    found = malta.robust_margin(system, own, {"m": 0.1})
+    assert found.lower is not None
+    assert 0.998 * found.upper < found.lower <= found.upper
+    assert found.witness is not None
+    par: Any = spec.plant.parameters
+    for share, stable in ((0.999 * found.lower / found.upper, True), (1.001, False)):
+        m = par.m + share * (found.witness["m"] - par.m)
+        there = spec.plant.variant(replace(par, m=m))
+        assert malta.loop(there, law).stable is stable
 
 
 def test_a_box_of_commutated_forces_ends_where_the_weight_exceeds_them() -> None:

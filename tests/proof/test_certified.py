@@ -175,7 +175,7 @@ TAMPERED: dict[str, tuple[Change, str]] = {
     "delay": (every("delay", 1), "the loops are not those of"),
     "two loops": (two_loops, "x is no parameter of the loop of"),
     "no machine": (no_machine, "is of matrices alone and names no machine"),
-    "order": (lambda c: c["claim"]["parameters"].reverse(), "its parameters are not R b A m x x_1 x_2, as in the loop of"),
+    "order": (lambda c: c["claim"]["parameters"].reverse(), "its parameters are not R b A m x x_1 x_2, as in"),
 }  # fmt: skip
 
 
