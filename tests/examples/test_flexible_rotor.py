@@ -183,6 +183,7 @@ def test_the_sampled_loop_of_44_states_is_proven_at_every_speed(
     """Force constants within a box, in the machine's own loop: lost where the continuous one is, at zero frequency."""
     controller = example("law").controller(plant)
     par: Any = plant.parameters
-    found = malta.robust_margin(malta.loop(plant, controller), {"k_i": 0.1}, {"Omega": (0.0, par.Omega_max)})
+    over = {"Omega": (0.0, par.Omega_max)}
+    found = malta.robust_margin(malta.loop(plant, controller), {"k_i": 0.1}, over=over)
     assert found.lower is not None
     assert 0.99 * found.upper < found.lower <= found.upper == pytest.approx(2.29056, rel=1e-4)
