@@ -162,17 +162,17 @@ class _Resolved:
         return None
 
 
-def resolve_branches(model: MatrixProgram, nominal: Sequence[float]) -> tuple[MatrixProgram, int]:
+def resolve_branches(
+    model: MatrixProgram, nominal: Sequence[float], signs: Sequence[int] | None = None
+) -> tuple[MatrixProgram, int]:
     """The program with the branches that are active at nominal parameters, and how many conditions these have.
+
+    signs : in place of those at nominal parameters, see _Resolved
 
     A last matrix of one column is added: first the conditions, which are above zero where the programs agree, then the
     arguments of all roots, which are above zero where sqrt(x)^2 is x.
     """
-    return _resolve(model, _Resolved(nominal))
-
-
-def _resolve(model: MatrixProgram, found: _Resolved) -> tuple[MatrixProgram, int]:
-    place = list[int]()
+    found, place = _Resolved(nominal, signs), list[int]()
     roots: dict[int, int] = {}
     for name, target, operands, value in model.steps:
         own = tuple(place[k] for k in operands)
@@ -202,27 +202,10 @@ def without_branches(
     if not model.foreign:
         return function, None
     try:
-        matrices, positive, count = _functions(model, *resolve_branches(model, nominal))
+        made = _functions(model, *resolve_branches(model, nominal))
     except NotAnalytic:
         return function, None
-    return matrices, positive if count else None
-
-
-def _functions(
-    model: MatrixProgram, resolved: MatrixProgram, count: int
-) -> tuple[ca.Function, ca.Function, int]:
-    """p -> matrices, p -> conditions, and how many these are. Raises NotAnalytic for branches that are not known."""
-    p = ca.SX.sym("p", model.inputs)
-    *entries, above = resolved.run(ca.vertsplit(p), SYMBOLS)
-    matrices = [ca.SX(*shape) for shape in model.shapes]
-    for matrix, own in zip(matrices, entries, strict=True):
-        for i, j, x in own:
-            matrix[i, j] = x
-    positive = ca.SX(count, 1)
-    for i, _, x in above:
-        if i < count:
-            positive[i] = x
-    return ca.Function("matrices", [p], matrices), ca.Function("positive", [p], [positive]), count
+    return made.matrices, made.positive if made.positive.size1_out(0) else None
 
 
 class BranchCase(NamedTuple):
@@ -230,6 +213,18 @@ class BranchCase(NamedTuple):
 
     matrices: ca.Function
     positive: ca.Function
+
+
+def _functions(model: MatrixProgram, resolved: MatrixProgram, count: int) -> BranchCase:
+    """The functions of a resolved program with its first conditions. Raises NotAnalytic for branches that stayed."""
+    p = ca.SX.sym("p", model.inputs)
+    *entries, above = resolved.run(ca.vertsplit(p), SYMBOLS)
+    matrices = [ca.SX(*shape) for shape in model.shapes]
+    for matrix, own in zip(matrices, entries, strict=True):
+        for i, j, x in own:
+            matrix[i, j] = x
+    positive = ca.vertcat(ca.SX(0, 1), *(x for i, _, x in above if i < count))
+    return BranchCase(ca.Function("matrices", [p], matrices), ca.Function("positive", [p], [positive]))
 
 
 MAX_CASES = 64  # of a function, beyond which none is looked at: six switches
@@ -246,13 +241,9 @@ def branch_cases(function: ca.Function) -> list[BranchCase]:
         if len(todo) + len(found) >= MAX_CASES:
             return []
         try:
-            matrices, positive, _ = _functions(
-                model, *_resolve(model, _Resolved([0.0] * model.inputs, signs))
-            )
+            found.append(_functions(model, *resolve_branches(model, [0.0] * model.inputs, signs)))
         except _Undecided:
             todo += [(*signs, 1), (*signs, -1)]
         except NotAnalytic:
             return []
-        else:
-            found.append(BranchCase(matrices, positive))
     return found if len(found) > 1 else []

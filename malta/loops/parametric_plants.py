@@ -93,9 +93,6 @@ def of_plant(
     if short is not None:
         A, B, C, above, v = short
         conditions += [Condition(one, DOMAIN_END_TEXT) for one in ca.vertsplit(above)]
-        if loaded and v is not None:
-            machine = in_symbols(plant, symbols)
-            conditions += limits_at_rest(machine, believed or plant, rest.function(p[own], z)[0], v)
     else:
         acting = of(p[own], z, ca.DM.zeros(len(plant.inputs)))[-1]
         q = ca.SX.sym("v", len(plant.inputs))
@@ -104,13 +101,13 @@ def of_plant(
         command = command_of(chain, p, acting, np.array(nominal, dtype=float), wanted)
         v, why = command.values, why or command.why
         conditions += command.conditions
-        if loaded and not why:
-            machine = in_symbols(plant, symbols)
-            conditions += limits_at_rest(machine, believed or plant, rest.function(p[own], z)[0], v)
         A, B, C, E = of(p[own], z, v)[:4]
         if held is not None:
             A, left = A - E @ C, E - B @ ca.DM(held)
             B = ca.horzcat(B, left)
+    if loaded and not why and v is not None:
+        machine = in_symbols(plant, symbols)
+        conditions += limits_at_rest(machine, believed or plant, rest.function(p[own], z)[0], v)
     if late:
         A, B, C = with_lags(_sensors_in(plant, symbols), A, B, C)
     if windings is not None:

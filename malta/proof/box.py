@@ -205,10 +205,16 @@ def within_branches(box: Box, system: UncertainSystem) -> Box:
         return box
     if not hold(0.0):
         return replace(box, most=0.0, ends=_end_at(box, system, 0.0))
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if hold(middle) else (low, middle)
+    low = last_passed(hold, low, high)
     return replace(box, most=low, ends=_end_at(box, system, low))
+
+
+def last_passed(test: Callable[[float], bool], low: float, high: float, steps: int = BISECTIONS) -> float:
+    """The last number that passes a test on the way from `low`, which does, to `high`, which does not, by bisection."""
+    for _ in range(steps):
+        middle = (low + high) / 2
+        low, high = (middle, high) if test(middle) else (low, middle)
+    return low
 
 
 def _end_at(box: Box, system: UncertainSystem, t: float) -> str:

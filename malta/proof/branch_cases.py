@@ -19,7 +19,7 @@ import numpy as np
 from malta.linear.branches import BranchCase, Interval
 from malta.linear.expressions import program
 from malta.linear.uncertain import UncertainSystem
-from malta.proof.box import BISECTIONS, Box, every_part
+from malta.proof.box import Box, every_part, last_passed
 from malta.proof.margin import IDLE_TEXT, Margin
 
 BEYOND_LOSS = 1.01  # times the first loss that poles show, up to which cases are looked at
@@ -45,13 +45,17 @@ def margin_by_cases(
     reaches = sorted((_reach_without(case, box, end), k) for k, case in enumerate(cases))
     near = [(reach, cases[k]) for reach, k in reaches if reach < end]
     reason, found, within = "", [lost], replace(box, most=min(box.most, end))
+
+    def asked(loop: UncertainSystem, parts: int, some: Box) -> Margin:
+        found.append(ask(loop, some, parts * len(near)))
+        return found[-1]
+
     lower = within.limit
     for reach, case in near:
         if reach >= lower:
             break
-        asked = partial(ask, replace(system, matrices=case.matrices))
-        one = asked(within, len(near))
-        found.append(one)
+        loop = replace(system, matrices=case.matrices)
+        one = asked(loop, 2, within)
         meets = one.witness is not None and _meets(case, [one.witness[name] for name in box.names])
         if meets and one.upper < lost.upper:
             lost = one
@@ -60,13 +64,14 @@ def margin_by_cases(
         proven = max(reach, math.inf if one.reason.startswith(IDLE_TEXT) else one.lower or 0.0)
         top = min(within.limit, lost.upper, lower)
         if not meets and proven < top:
-            proven = _proven_where_it_acts(case, within, (proven, top), partial(asked, count=4 * len(near)))
+            parts = partial(asked, loop, 2 * PARTS_ASKED)
+            proven = _proven_where_it_acts(case, within, (proven, top), parts)
         if proven < lower:
             lower, reason = proven, "" if meets and not one.reason else _open_text(one, reach)
     lower = min(lower, lost.upper)
     return replace(
         lost,
-        lower=lower if lower or not lost.upper else None, certificate=(), reason=reason, idle=(),
+        lower=lower if lower or not lost.upper else None, certificate=(), reason=reason,
         seconds=sum(one.seconds for one in found), work=sum(one.work for one in found),
     )  # fmt: skip
 
@@ -76,37 +81,26 @@ def _proven_where_it_acts(
 ) -> float:
     """The t up to which a case is proven on the part of box(t) where it may act: between these two."""
     low, high = between
-    for k in range(PARTS_ASKED):
-        t = high if k == 0 else (low + high) / 2
-        if (ask(_part(case, box, t)).lower or 0.0) >= 1:
-            low = t
-        else:
-            high = t
-        if low == high:
-            break
-    return low
+
+    def passes(t: float) -> bool:
+        return (ask(_part(case, box, t)).lower or 0.0) >= 1
+
+    return high if passes(high) else last_passed(passes, low, high, PARTS_ASKED - 1)
 
 
 def _part(case: BranchCase, box: Box, t: float) -> Box:
     """The part of box(t) outside of which a case acts nowhere, as a box about its middle whose size is 1."""
     conditions, sides = program(case.positive), box.sides(t)
 
-    def misses(i: int, low: float, high: float) -> bool:
+    def misses(i: int, end: float, cut: float) -> bool:
         part = sides.copy()
-        part[i] = low, high
+        part[i] = sorted((end, cut))
         return every_part(conditions, part, _is_excluded)
 
     for i in np.flatnonzero(box.down + box.up > 0).tolist():
         for side in (0, 1):
-            end, kept = sides[i, side], sides[i, 1 - side]
-            cut = end
-            for _ in range(CUTS):
-                middle = (cut + kept) / 2
-                if misses(i, *sorted((middle, end))):
-                    cut = middle
-                else:
-                    kept = middle
-            sides[i, side] = cut
+            end, other = sides[i, side], sides[i, 1 - side]
+            sides[i, side] = last_passed(partial(misses, i, end), end, other, CUTS)
     grows = box.down + box.up > 0
     middle = np.where(grows, sides.mean(axis=1), box.nominal)
     half = np.nextafter(np.maximum(sides[:, 1] - middle, middle - sides[:, 0]), math.inf)
@@ -140,12 +134,7 @@ def _reach_without(case: BranchCase, box: Box, end: float) -> float:
     def misses(t: float) -> bool:
         return every_part(conditions, box.sides(t), _is_excluded)
 
-    low, high = 0.0, min(end, MAX_REACH)
+    high = min(end, MAX_REACH)
     if misses(high):
         return end
-    if not misses(low):
-        return low
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if misses(middle) else (low, middle)
-    return low
+    return last_passed(misses, 0.0, high) if misses(0.0) else 0.0

@@ -125,9 +125,8 @@ class Margin:
         return Description(f"Margin: {self}", tuple(rows))
 
 
-IDLE_TEXT = (
-    "the loop does not depend on"  # begins the reason of a loop that is stable, and of which nothing is said
-)
+# Begins the reason of a loop that is stable, and of which nothing is said.
+IDLE_TEXT = "the loop does not depend on"
 
 
 def unproven(reason: str) -> str:

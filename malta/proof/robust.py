@@ -40,7 +40,7 @@ from malta.proof.margin import IDLE_TEXT, NOT_PROVEN, Margin, Progress, Ranges
 from malta.proof.problem import OfLoop, OfSeveral, Problem, is_nominal_stable
 from malta.proof.question import Question, Standing
 from malta.proof.search import search
-from malta.work import GROWTH, MORE_WORK, Budget, in_rounds, is_past
+from malta.work import GROWTH, MORE_WORK, WORK, Budget, in_rounds, is_past
 
 # A loop in the coordinates in which its parameters act apart: x = S x', exactly, found from how the parameters enter.
 #
@@ -293,11 +293,13 @@ def robust_margin(
     box = box_of(named.names, named.nominal, named.limits, ranges, named.spread(over))
     box = within_branches(box, named)
     cases = branch_cases(named.matrices) if program(named.matrices).foreign else []
+    problem = problem_of(named, law)
     if cases:
-        lost = _by_poles(problem_of(named, law), box, "")
+        lost = _lost_by_poles(problem, box, "")
         found = margin_by_cases(named, cases, box, lost, partial(_margin_of_case, law, effort))
+        found = _name_idle(found, problem, box)
     else:
-        found = margin_of(problem_of(named, law), box, effort)
+        found = margin_of(problem, box, effort)
     return replace(found, reason=named.reason(found.reason))
 
 
@@ -447,10 +449,11 @@ class ProofEffort:
 
     def of(self, count: int) -> ProofEffort:
         """The effort of each of some searches that share it, without progress."""
-        time, budget = self.limits.time, self.limits
-        if budget.work is not None:
-            budget = replace(budget, work=budget.work / count)
-        return replace(self, time=None if time is None else time / count, budget=budget, progress=None)
+        budget = self.limits
+        if budget.work is None and budget.time is None:
+            budget = replace(budget, work=WORK, patient=bool(budget.patient))
+        work, time = (None if x is None else x / count for x in (budget.work, budget.time))
+        return replace(self, time=time, budget=replace(budget, work=work), progress=None)
 
     @property
     def limits(self) -> Budget:
@@ -473,14 +476,21 @@ def margin_of(problem: Problem, box: Box, effort: ProofEffort) -> Margin:
         found, ended = in_rounds(effort.limits, ask, rank)
     except KeyboardInterrupt as stop:
         raise Interrupted(_interrupted_margin(problem, box, standing, clock.monotonic() - begun)) from stop
-    idle = _idle(problem, box)
-    if found.lower and idle and len(idle) == int((box.down + box.up > 0).sum()):
-        return replace(
-            found, lower=None, upper=math.inf, certificate=(), reason=f"{IDLE_TEXT} {' '.join(idle)}"
-        )
+    found = _name_idle(found, problem, box)
+    if found.reason.startswith(IDLE_TEXT):
+        return found
     is_open = bool(found.reason) and found.reason not in (UNSTABLE_TEXT, problem.traits.approximate)
     reason = ended.explain(found.reason) if is_open else found.reason
-    return replace(found, seconds=clock.monotonic() - begun, work=ended.work, reason=reason, idle=idle)
+    return replace(found, seconds=clock.monotonic() - begun, work=ended.work, reason=reason)
+
+
+def _name_idle(found: Margin, problem: Problem, box: Box) -> Margin:
+    """The margin with the parameters that do not act; nothing is proven where none does."""
+    idle = _idle(problem, box)
+    if found.lower and idle and len(idle) == int((box.down + box.up > 0).sum()):
+        reason = f"{IDLE_TEXT} {' '.join(idle)}"
+        return replace(found, lower=None, upper=math.inf, certificate=(), reason=reason)
+    return replace(found, idle=idle)
 
 
 def _idle(problem: Problem, box: Box) -> tuple[str, ...]:
@@ -513,14 +523,14 @@ def _ask(
             where = dict(zip(box.names, places[k + int(unstable.argmax())].tolist(), strict=True))
             return Margin(0.0, 0.0, None, where, {}, {}, (), 0.0, UNSTABLE_TEXT)
     if why := problem.traits.approximate:
-        return _by_poles(problem, box, why)
+        return _lost_by_poles(problem, box, why)
     tolerance, fixed = effort.tolerance or TOLERANCE, effort.tolerance is not None
     question = Question(problem, box, tolerance, fixed, work, effort.limits.cells, patient, standing)
     with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
         return search(question)
 
 
-def _by_poles(problem: Problem, box: Box, why: str) -> Margin:
+def _lost_by_poles(problem: Problem, box: Box, why: str) -> Margin:
     """A margin of which nothing is proven, with the first loss along the diagonals of the box."""
     upper, frequency, witness = first_loss(problem, box, box.limit)
     named = None if witness is None else dict(zip(box.names, witness.tolist(), strict=True))

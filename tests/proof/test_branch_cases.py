@@ -91,6 +91,16 @@ def test_what_another_branch_loses_is_not_lost() -> None:
     assert found.lower >= 99
 
 
+def test_a_parameter_that_no_branch_has_is_named() -> None:
+    system = malta.uncertain(
+        lambda k, q: ([[0, 1], [3 * ca.fabs(k - 2.5), -1 + 0 * q]], [[0], [1]], [[1, 0]]),
+        {"k": 3.0, "q": 1.0},
+    )
+    found = malta.robust_margin(system, LAW, {"k": 0.2, "q": 0.2})
+    assert found.idle == ("q",)
+    assert found.lower == pytest.approx(0.5 / 0.6, rel=1e-3)
+
+
 def test_an_unstable_loop_with_branches_is_that() -> None:
     found = malta.robust_margin(column(lambda k: 4 + ca.fabs(k), 1.0), LAW, {"k": 0.2})
     assert (found.lower, found.upper, found.reason) == (0.0, 0.0, "the nominal loop is unstable")
